@@ -1,0 +1,9 @@
+//! perturb's learner: trains policies over environment servers and tests whether they still work when the physics
+//! changes.
+#![forbid(unsafe_code)]
+
+/// The protocol: generated from `proto/perturb/v1/perturb.proto`, whose comments specify every field.
+#[allow(missing_docs, clippy::all)]
+pub mod proto {
+    tonic::include_proto!("perturb.v1");
+}

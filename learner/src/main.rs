@@ -1,0 +1,4 @@
+//! The program `perturb`.
+#![forbid(unsafe_code)]
+
+fn main() {}

@@ -1,0 +1,65 @@
+//! What can be wrong with a request about environments.
+
+/// A refused request. Nothing was changed.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// No environment has this name.
+    #[error("environment {name:?} is unknown; this server has {known}")]
+    UnknownEnvironment {
+        /// What was asked for.
+        name: String,
+        /// The names there are, separated by commas.
+        known: String,
+    },
+    /// The environment has no parameter of this name.
+    #[error("{environment} has no parameter {name:?}; it has {known}")]
+    UnknownParameter {
+        /// The environment.
+        environment: &'static str,
+        /// What was asked for.
+        name: String,
+        /// The names there are, separated by commas.
+        known: String,
+    },
+    /// A distribution is not a union of intervals.
+    #[error("the distribution of {parameter:?} is {got}; expected {expected}")]
+    Distribution {
+        /// The parameter.
+        parameter: String,
+        /// What came.
+        got: String,
+        /// What would be right.
+        expected: &'static str,
+    },
+    /// A parameter leaves its physical range.
+    #[error("parameter {parameter:?} of {environment} may reach {got} {unit}; give values within [{low}, {high}]")]
+    OutOfRange {
+        /// The environment.
+        environment: &'static str,
+        /// The parameter.
+        parameter: &'static str,
+        /// The offending end of an interval.
+        got: f64,
+        /// The parameter's unit.
+        unit: &'static str,
+        /// Least accepted value.
+        low: f64,
+        /// Greatest accepted value.
+        high: f64,
+    },
+    /// A snapshot cannot be restored.
+    #[error("the snapshot cannot be restored: {reason}; take a new one from a session of the same environment")]
+    Snapshot {
+        /// Why.
+        reason: String,
+    },
+    /// The environment could not be built.
+    #[error("{environment} cannot be built: {reason}")]
+    Model {
+        /// The environment.
+        environment: &'static str,
+        /// Why.
+        reason: String,
+    },
+}

@@ -1,0 +1,75 @@
+//! Random streams that depend on nothing but their address.
+//!
+//! Every draw comes from Philox 4×64-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", 2011), a
+//! function of a key and a counter with no other state. The key is `[seed, environment index]`, the counter
+//! `[block, index, purpose, 0]`, with `block` counting from 1: what ran before, on which thread or server, cannot
+//! matter. The layout is that of NumPy, so one line of Python repeats any stream:
+//!
+//! ```python
+//! numpy.random.Generator(numpy.random.Philox(key=[seed, environment_index], counter=[0, index, purpose, 0])).random()
+//! ```
+//!
+//! | purpose | index | draws, in order |
+//! |---|---|---|
+//! | 0 | trial | one number u in [0, 1) for each parameter, in the catalogue's order |
+//! | 1 | episode | the initial state's numbers, in the order of the environment's document |
+
+/// What a stream is for: the third word of the counter.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Purpose {
+    /// A trial's parameters.
+    Parameters = 0,
+    /// An episode's initial state.
+    InitialState = 1,
+}
+
+const MULTIPLIERS: [u64; 2] = [0xD2E7_470E_E14C_6C93, 0xCA5A_8263_9512_1157];
+const WEYL: [u64; 2] = [0x9E37_79B9_7F4A_7C15, 0xBB67_AE85_84CA_A73B];
+const ROUNDS: usize = 10;
+
+/// A stream of uniform numbers.
+#[derive(Debug, Clone)]
+pub struct Stream {
+    key: [u64; 2],
+    counter: [u64; 4],
+    block: [u64; 4],
+    used: usize,
+}
+
+impl Stream {
+    /// The stream of environment `environment_index` for its trial or episode number `index`.
+    pub fn new(seed: u64, environment_index: u64, purpose: Purpose, index: u64) -> Self {
+        Self { key: [seed, environment_index], counter: [0, index, purpose as u64, 0], block: [0; 4], used: 4 }
+    }
+
+    /// The next 64 bits.
+    pub fn next_u64(&mut self) -> u64 {
+        if self.used == self.block.len() {
+            self.counter[0] += 1; // 2^64 blocks: no episode gets there
+            self.block = philox(self.counter, self.key);
+            self.used = 0;
+        }
+        self.used += 1;
+        self.block[self.used - 1]
+    }
+
+    /// Uniform in [0, 1): the upper 53 bits over 2^53.
+    pub fn unit(&mut self) -> f64 {
+        (self.next_u64() >> 11) as f64 * (1.0 / (1u64 << 53) as f64)
+    }
+
+    /// Uniform in [low, high).
+    pub fn uniform(&mut self, low: f64, high: f64) -> f64 {
+        low + (high - low) * self.unit()
+    }
+}
+
+fn philox(mut counter: [u64; 4], mut key: [u64; 2]) -> [u64; 4] {
+    for _ in 0..ROUNDS {
+        let a = u128::from(MULTIPLIERS[0]) * u128::from(counter[0]);
+        let b = u128::from(MULTIPLIERS[1]) * u128::from(counter[2]);
+        counter = [(b >> 64) as u64 ^ counter[1] ^ key[0], b as u64, (a >> 64) as u64 ^ counter[3] ^ key[1], a as u64];
+        key = [key[0].wrapping_add(WEYL[0]), key[1].wrapping_add(WEYL[1])];
+    }
+    counter
+}

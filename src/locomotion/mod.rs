@@ -1,0 +1,1 @@
+//! Hopper and HalfCheetah: Roboschool's task on MuJoCo.

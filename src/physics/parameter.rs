@@ -1,0 +1,82 @@
+//! A physical parameter, and the three versions of an environment.
+
+use super::{Distribution, Interval};
+use crate::env::{EnvironmentSpec, Error};
+
+/// Where parameters come from: the three versions of every environment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Version {
+    /// D: the defaults.
+    Default,
+    /// R: drawn from the R interval.
+    Random,
+    /// E: drawn from the E set, two intervals around R.
+    Extreme,
+}
+
+/// A physical parameter with its bounds and the sets of its versions (the paper, table of parameter ranges).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Parameter {
+    /// Unique within its environment.
+    pub name: &'static str,
+    /// SI unit, `"1"` if dimensionless.
+    pub unit: &'static str,
+    /// What it is.
+    pub description: &'static str,
+    /// Version D.
+    pub default: f64,
+    /// Version R.
+    pub random: Interval,
+    /// Version E.
+    pub extreme: [Interval; 2],
+    /// The physical range: nothing outside is accepted.
+    pub bounds: Interval,
+}
+
+impl Parameter {
+    /// The distribution of a version.
+    pub fn distribution(&self, version: Version) -> Distribution {
+        let intervals: &[Interval] = match version {
+            Version::Default => return Distribution::fixed(self.default),
+            Version::Random => &[self.random],
+            Version::Extreme => &self.extreme,
+        };
+        Distribution::union(self.name, intervals).expect("the table holds valid sets; a test checks each")
+    }
+}
+
+/// Replaces in `base` (one distribution a parameter, in the spec's order) those that `overrides` names.
+///
+/// # Errors
+/// [`Error::UnknownParameter`] and [`Error::OutOfRange`]; `base` is unchanged then.
+pub fn resolve<'a>(
+    spec: &'static EnvironmentSpec,
+    base: &mut [Distribution],
+    overrides: impl IntoIterator<Item = (&'a str, Distribution)>,
+) -> Result<(), Error> {
+    let mut replaced = Vec::new();
+    for (name, distribution) in overrides {
+        let position = spec.parameters.iter().position(|p| p.name == name).ok_or_else(|| Error::UnknownParameter {
+            environment: spec.name,
+            name: name.into(),
+            known: spec.parameters.iter().map(|p| p.name).collect::<Vec<_>>().join(", "),
+        })?;
+        let parameter = &spec.parameters[position];
+        let (low, high) = distribution.range();
+        if low < parameter.bounds.low || high > parameter.bounds.high {
+            return Err(Error::OutOfRange {
+                environment: spec.name,
+                parameter: parameter.name,
+                got: if low < parameter.bounds.low { low } else { high },
+                unit: parameter.unit,
+                low: parameter.bounds.low,
+                high: parameter.bounds.high,
+            });
+        }
+        replaced.push((position, distribution));
+    }
+    for (position, distribution) in replaced {
+        base[position] = distribution;
+    }
+    Ok(())
+}
