@@ -41,6 +41,7 @@ pub static ACROBOT: EnvironmentSpec = EnvironmentSpec {
     ],
     step_limit: 500,
     control_timestep: DT,
+    step_cost: 0.3,
     success: SuccessRule::ReachedWithin(80),
     success_description: "the height was reached within 80 steps",
 };

@@ -40,6 +40,7 @@ pub static CART_POLE: EnvironmentSpec = EnvironmentSpec {
     ],
     step_limit: 200,
     control_timestep: TAU,
+    step_cost: 0.04,
     success: SuccessRule::Lasted(195),
     success_description: "the episode lasted at least 195 steps",
 };

@@ -28,6 +28,7 @@ pub static MOUNTAIN_CAR: EnvironmentSpec = EnvironmentSpec {
     applied: &[Quantity { name: "force", unit: "1" }, Quantity { name: "mass", unit: "1" }],
     step_limit: 200,
     control_timestep: 1.0,
+    step_cost: 0.04,
     success: SuccessRule::ReachedWithin(110),
     success_description: "the goal was reached within 110 steps",
 };

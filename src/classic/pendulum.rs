@@ -36,6 +36,7 @@ pub static PENDULUM: EnvironmentSpec = EnvironmentSpec {
     applied: &[Quantity { name: "length", unit: "m" }, Quantity { name: "mass", unit: "kg" }],
     step_limit: 200,
     control_timestep: DT,
+    step_cost: 0.05,
     success: SuccessRule::HeldForLast(100),
     success_description: "the angle was within π/3 of vertical after each of the last 100 steps",
 };
