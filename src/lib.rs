@@ -13,11 +13,13 @@
 #![forbid(unsafe_code)]
 
 pub mod classic;
+pub mod config;
 pub mod env;
 #[cfg(feature = "mujoco")]
 pub mod locomotion;
 pub mod physics;
 pub mod pool;
+pub mod server;
 
 /// The protocol: generated from `proto/perturb/v1/perturb.proto`, whose comments specify every field.
 #[allow(missing_docs, clippy::all)]

@@ -172,6 +172,11 @@ impl Batch {
         Ok(self.observations(&slots))
     }
 
+    /// The distributions in force in a slot, one for each parameter.
+    pub fn distributions(&self, slot: usize) -> Vec<Distribution> {
+        lock(&self.job.shards[slot / self.shard_size]).distributions(slot).to_vec()
+    }
+
     async fn run(&mut self) -> Result<(), Error> {
         self.workers.run(&self.job).await
     }
