@@ -17,6 +17,7 @@ pub mod env;
 #[cfg(feature = "mujoco")]
 pub mod locomotion;
 pub mod physics;
+pub mod pool;
 
 /// The protocol: generated from `proto/perturb/v1/perturb.proto`, whose comments specify every field.
 #[allow(missing_docs, clippy::all)]

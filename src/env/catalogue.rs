@@ -45,8 +45,8 @@ pub fn make(name: &str) -> Result<Box<dyn Environment>, Error> {
 }
 
 fn entry(name: &str) -> Result<&'static (&'static EnvironmentSpec, Make), Error> {
-    CATALOGUE.iter().find(|(spec, _)| spec.name == name).ok_or_else(|| Error::UnknownEnvironment {
-        name: name.into(),
-        known: names().collect::<Vec<_>>().join(", "),
-    })
+    CATALOGUE
+        .iter()
+        .find(|(spec, _)| spec.name == name)
+        .ok_or_else(|| Error::UnknownEnvironment { name: name.into(), known: names().collect::<Vec<_>>().join(", ") })
 }

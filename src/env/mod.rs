@@ -4,10 +4,11 @@ mod catalogue;
 mod episode;
 mod error;
 mod seeding;
+mod snapshot;
 mod spaces;
 
 pub use catalogue::{find, make, names, specs};
-pub use episode::{EpisodeEnd, EpisodeId, EpisodeStart, Episodes, Receipt, Settings};
+pub use episode::{EpisodeEnd, EpisodeId, EpisodeStart, Episodes, Outcome, Receipt, Settings};
 pub use error::Error;
 pub use seeding::{Purpose, Stream};
 pub use spaces::{Action, ActionSpace, Channel, EnvironmentSpec, Quantity, RewardTerm, SuccessRule};

@@ -108,6 +108,8 @@ pub struct EnvironmentSpec {
     pub step_limit: u32,
     /// Simulated seconds in one step.
     pub control_timestep: f64,
+    /// What a step costs on one core, in µs, roughly: the pool cuts batches by it. Results never depend on it.
+    pub step_cost: f64,
     /// When an episode is a success.
     pub success: SuccessRule,
     /// The same, as a sentence.

@@ -5,5 +5,5 @@ mod parameter;
 mod table;
 
 pub use distribution::{Distribution, Interval};
-pub use parameter::{Parameter, Version, resolve};
+pub use parameter::{Parameter, Version, check_bounds, resolve};
 pub use table::*;

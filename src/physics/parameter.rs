@@ -45,6 +45,25 @@ impl Parameter {
     }
 }
 
+/// Checks that values from `low` to `high` lie within the parameter's physical range. NaN does not.
+///
+/// # Errors
+/// [`Error::OutOfRange`].
+pub fn check_bounds(spec: &EnvironmentSpec, parameter: &Parameter, (low, high): (f64, f64)) -> Result<(), Error> {
+    let bounds = parameter.bounds;
+    if low >= bounds.low && high <= bounds.high {
+        return Ok(());
+    }
+    Err(Error::OutOfRange {
+        environment: spec.name,
+        parameter: parameter.name,
+        got: if low >= bounds.low { high } else { low },
+        unit: parameter.unit,
+        low: bounds.low,
+        high: bounds.high,
+    })
+}
+
 /// Replaces in `base` (one distribution a parameter, in the spec's order) those that `overrides` names.
 ///
 /// # Errors
@@ -62,17 +81,7 @@ pub fn resolve<'a>(
             known: spec.parameters.iter().map(|p| p.name).collect::<Vec<_>>().join(", "),
         })?;
         let parameter = &spec.parameters[position];
-        let (low, high) = distribution.range();
-        if low < parameter.bounds.low || high > parameter.bounds.high {
-            return Err(Error::OutOfRange {
-                environment: spec.name,
-                parameter: parameter.name,
-                got: if low < parameter.bounds.low { low } else { high },
-                unit: parameter.unit,
-                low: parameter.bounds.low,
-                high: parameter.bounds.high,
-            });
-        }
+        check_bounds(spec, parameter, distribution.range())?;
         replaced.push((position, distribution));
     }
     for (position, distribution) in replaced {

@@ -55,14 +55,8 @@ const DENSITY: Parameter = parameter(
     1500.0,
     (10.0, 100_000.0),
 );
-const FRICTION: Parameter = parameter(
-    ("friction", "1", "sliding friction of the robot's geoms"),
-    0.8,
-    0.2,
-    (0.5, 1.1),
-    1.4,
-    (0.0, 10.0),
-);
+const FRICTION: Parameter =
+    parameter(("friction", "1", "sliding friction of the robot's geoms"), 0.8, 0.2, (0.5, 1.1), 1.4, (0.0, 10.0));
 
 /// HalfCheetah: power, density, friction.
 pub const HALF_CHEETAH: &[Parameter] = &[

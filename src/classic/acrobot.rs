@@ -1,0 +1,176 @@
+//! Acrobot: a two-link pendulum, driven at the elbow, swings its tip above a line.
+//!
+//! Source: Sutton (1996); Gymnasium 1.4 `Acrobot-v1` ("book" equations, fourth-order Runge-Kutta). As in the paper's
+//! code the links' centres of mass stay at 0.5 m when `length` changes.
+
+use crate::{
+    env::{
+        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Quantity, RewardTerm, Stream, SuccessRule,
+        Transition,
+    },
+    physics,
+};
+use std::f64::consts::PI;
+
+/// What is fixed about Acrobot.
+pub static ACROBOT: EnvironmentSpec = EnvironmentSpec {
+    name: "Acrobot",
+    revision: 0,
+    description: "Swing the tip of a two-link pendulum above a line.",
+    parameters: physics::ACROBOT,
+    observation: &[
+        Channel::new("cos_theta1", "1", -1.0, 1.0),
+        Channel::new("sin_theta1", "1", -1.0, 1.0),
+        Channel::new("cos_theta2", "1", -1.0, 1.0),
+        Channel::new("sin_theta2", "1", -1.0, 1.0),
+        Channel::new("theta1_velocity", "rad/s", -MAX_VELOCITY_1, MAX_VELOCITY_1),
+        Channel::new("theta2_velocity", "rad/s", -MAX_VELOCITY_2, MAX_VELOCITY_2),
+    ],
+    action: ActionSpace::Discrete(&["torque_minus_1", "torque_0", "torque_plus_1"]),
+    state: &[
+        Channel::new("theta1", "rad", -PI, PI),
+        Channel::new("theta2", "rad", -PI, PI),
+        Channel::new("theta1_velocity", "rad/s", -MAX_VELOCITY_1, MAX_VELOCITY_1),
+        Channel::new("theta2_velocity", "rad/s", -MAX_VELOCITY_2, MAX_VELOCITY_2),
+    ],
+    reward_terms: &[RewardTerm { name: "time", description: "-1 for every step, 0 for the one that ends the task" }],
+    applied: &[
+        Quantity { name: "length", unit: "m" },
+        Quantity { name: "mass", unit: "kg" },
+        Quantity { name: "moi", unit: "kg m²" },
+    ],
+    step_limit: 500,
+    control_timestep: DT,
+    step_cost: 0.3,
+    success: SuccessRule::ReachedWithin(80),
+    success_description: "the height was reached within 80 steps",
+};
+
+const DT: f64 = 0.2;
+const GRAVITY: f64 = 9.8;
+const CENTRE_OF_MASS: f64 = 0.5;
+const MAX_VELOCITY_1: f64 = 4.0 * PI;
+const MAX_VELOCITY_2: f64 = 9.0 * PI;
+const HEIGHT: f64 = 1.0;
+const RESET_RANGE: f64 = 0.1;
+
+/// Both links.
+#[derive(Debug, Clone)]
+pub struct Acrobot {
+    link_length: f64,
+    link_mass: f64,
+    link_moi: f64,
+    /// Angle of link 1 from hanging, angle of link 2 relative to link 1, and their velocities.
+    state: [f64; 4],
+}
+
+impl Acrobot {
+    /// With default parameters, hanging.
+    pub fn new() -> Self {
+        let [link_length, link_mass, link_moi] = [0, 1, 2].map(|i: usize| physics::ACROBOT[i].default);
+        Self { link_length, link_mass, link_moi, state: [0.0; 4] }
+    }
+
+    /// Time derivative of the state under `torque` (Sutton and Barto, "book" version).
+    fn derivative(&self, [theta1, theta2, dtheta1, dtheta2]: [f64; 4], torque: f64) -> [f64; 4] {
+        let (m1, m2) = (self.link_mass, self.link_mass);
+        let (lc1, lc2) = (CENTRE_OF_MASS, CENTRE_OF_MASS);
+        let (i1, i2) = (self.link_moi, self.link_moi);
+        let l1 = self.link_length;
+        let g = GRAVITY;
+        let (sin2, cos2) = theta2.sin_cos();
+        let d1 = m1 * lc1 * lc1 + m2 * (l1 * l1 + lc2 * lc2 + 2.0 * l1 * lc2 * cos2) + i1 + i2;
+        let d2 = m2 * (lc2 * lc2 + l1 * lc2 * cos2) + i2;
+        let phi2 = m2 * lc2 * g * (theta1 + theta2 - PI / 2.0).cos();
+        let phi1 = -m2 * l1 * lc2 * dtheta2 * dtheta2 * sin2 - 2.0 * m2 * l1 * lc2 * dtheta2 * dtheta1 * sin2
+            + (m1 * lc1 + m2 * l1) * g * (theta1 - PI / 2.0).cos()
+            + phi2;
+        let ddtheta2 = (torque + d2 / d1 * phi1 - m2 * l1 * lc2 * dtheta1 * dtheta1 * sin2 - phi2)
+            / (m2 * lc2 * lc2 + i2 - d2 * d2 / d1);
+        let ddtheta1 = -(d2 * ddtheta2 + phi1) / d1;
+        [dtheta1, dtheta2, ddtheta1, ddtheta2]
+    }
+
+    fn runge_kutta(&self, state: [f64; 4], torque: f64) -> [f64; 4] {
+        let along = |k: [f64; 4], h: f64| std::array::from_fn(|i| state[i] + h * k[i]);
+        let k1 = self.derivative(state, torque);
+        let k2 = self.derivative(along(k1, DT / 2.0), torque);
+        let k3 = self.derivative(along(k2, DT / 2.0), torque);
+        let k4 = self.derivative(along(k3, DT), torque);
+        std::array::from_fn(|i| state[i] + DT / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]))
+    }
+}
+
+impl Default for Acrobot {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+/// Brings an angle into [-π, π] by whole turns: by a loop as in Gymnasium, since a remainder rounds otherwise, unless
+/// absurd parameters turned a joint so far in one step that the loop would not end.
+fn wrap(mut angle: f64) -> f64 {
+    if angle.abs() > 1000.0 * PI {
+        return (angle + PI).rem_euclid(2.0 * PI) - PI;
+    }
+    while angle > PI {
+        angle -= 2.0 * PI;
+    }
+    while angle < -PI {
+        angle += 2.0 * PI;
+    }
+    angle
+}
+
+impl Environment for Acrobot {
+    fn spec(&self) -> &'static EnvironmentSpec {
+        &ACROBOT
+    }
+
+    fn set_parameters(&mut self, values: &[f64]) {
+        (self.link_length, self.link_mass, self.link_moi) = (values[0], values[1], values[2]);
+    }
+
+    fn applied(&self, out: &mut [f64]) {
+        out.copy_from_slice(&[self.link_length, self.link_mass, self.link_moi]);
+    }
+
+    fn reset(&mut self, stream: &mut Stream) {
+        self.state = super::draw(stream, -RESET_RANGE, RESET_RANGE);
+    }
+
+    fn reset_to(&mut self, state: &[f64]) {
+        self.state.copy_from_slice(state);
+    }
+
+    fn observe(&self, out: &mut [f32]) {
+        let [theta1, theta2, dtheta1, dtheta2] = self.state;
+        let values = [theta1.cos(), theta1.sin(), theta2.cos(), theta2.sin(), dtheta1, dtheta2];
+        out.copy_from_slice(&values.map(|x| x as f32));
+    }
+
+    fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
+        let torque = f64::from(super::choice(action)) - 1.0;
+        let [theta1, theta2, dtheta1, dtheta2] = self.runge_kutta(self.state, torque);
+        let next = [
+            wrap(theta1),
+            wrap(theta2),
+            dtheta1.clamp(-MAX_VELOCITY_1, MAX_VELOCITY_1),
+            dtheta2.clamp(-MAX_VELOCITY_2, MAX_VELOCITY_2),
+        ];
+        let diverged = super::advance(&mut self.state, next);
+
+        let goal = -self.state[0].cos() - (self.state[1] + self.state[0]).cos() > HEIGHT;
+        reward_terms[0] = if goal { 0.0 } else { -1.0 };
+        Transition { terminated: goal || diverged, goal, diverged }
+    }
+
+    fn save(&self, out: &mut Vec<f64>) {
+        out.extend_from_slice(&self.state);
+    }
+
+    fn load(&mut self, state: &[f64]) -> Result<(), Error> {
+        self.state = super::load(state)?;
+        Ok(())
+    }
+}

@@ -1,0 +1,137 @@
+//! CartPole: a pole hinged on a cart that is pushed left or right.
+//!
+//! Source: Barto, Sutton and Anderson (1983); Gymnasium 1.4 `CartPole-v1` (explicit Euler) with the paper's step limit.
+
+use crate::{
+    env::{
+        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Quantity, RewardTerm, Stream, SuccessRule,
+        Transition,
+    },
+    physics,
+};
+
+/// What is fixed about CartPole. The last observation of an episode lies beyond the limits that ended it, which is why
+/// the observation has no bounds.
+pub static CART_POLE: EnvironmentSpec = EnvironmentSpec {
+    name: "CartPole",
+    revision: 0,
+    description: "Balance a pole on a cart by pushing the cart left or right.",
+    parameters: physics::CART_POLE,
+    observation: &[
+        Channel::unbounded("cart_position", "m"),
+        Channel::unbounded("cart_velocity", "m/s"),
+        Channel::unbounded("pole_angle", "rad"),
+        Channel::unbounded("pole_angular_velocity", "rad/s"),
+    ],
+    action: ActionSpace::Discrete(&["push_left", "push_right"]),
+    state: &[
+        Channel::new("cart_position", "m", -POSITION_LIMIT, POSITION_LIMIT),
+        Channel::new("cart_velocity", "m/s", -100.0, 100.0),
+        Channel::new("pole_angle", "rad", -ANGLE_LIMIT, ANGLE_LIMIT),
+        Channel::new("pole_angular_velocity", "rad/s", -100.0, 100.0),
+    ],
+    reward_terms: &[RewardTerm { name: "survival", description: "1 for every step, the last included" }],
+    applied: &[
+        Quantity { name: "force", unit: "N" },
+        Quantity { name: "length", unit: "m" },
+        Quantity { name: "mass", unit: "kg" },
+        Quantity { name: "total_mass", unit: "kg" },
+        Quantity { name: "pole_mass_length", unit: "kg m" },
+    ],
+    step_limit: 200,
+    control_timestep: TAU,
+    step_cost: 0.04,
+    success: SuccessRule::Lasted(195),
+    success_description: "the episode lasted at least 195 steps",
+};
+
+const GRAVITY: f64 = 9.8;
+const CART_MASS: f64 = 1.0;
+const TAU: f64 = 0.02;
+const ANGLE_LIMIT: f64 = 12.0 * 2.0 * std::f64::consts::PI / 360.0;
+const POSITION_LIMIT: f64 = 2.4;
+const RESET_RANGE: f64 = 0.05;
+
+/// The cart and its pole.
+#[derive(Debug, Clone)]
+pub struct CartPole {
+    force: f64,
+    half_pole_length: f64,
+    pole_mass: f64,
+    /// Position, velocity, angle, angular velocity.
+    state: [f64; 4],
+}
+
+impl CartPole {
+    /// With default parameters, at rest.
+    pub fn new() -> Self {
+        let [force, length, mass] = [0, 1, 2].map(|i: usize| physics::CART_POLE[i].default);
+        Self { force, half_pole_length: length, pole_mass: mass, state: [0.0; 4] }
+    }
+
+    fn total_mass(&self) -> f64 {
+        self.pole_mass + CART_MASS
+    }
+
+    fn pole_mass_length(&self) -> f64 {
+        self.pole_mass * self.half_pole_length
+    }
+}
+
+impl Default for CartPole {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Environment for CartPole {
+    fn spec(&self) -> &'static EnvironmentSpec {
+        &CART_POLE
+    }
+
+    fn set_parameters(&mut self, values: &[f64]) {
+        (self.force, self.half_pole_length, self.pole_mass) = (values[0], values[1], values[2]);
+    }
+
+    fn applied(&self, out: &mut [f64]) {
+        let values = [self.force, self.half_pole_length, self.pole_mass, self.total_mass(), self.pole_mass_length()];
+        out.copy_from_slice(&values);
+    }
+
+    fn reset(&mut self, stream: &mut Stream) {
+        self.state = super::draw(stream, -RESET_RANGE, RESET_RANGE);
+    }
+
+    fn reset_to(&mut self, state: &[f64]) {
+        self.state.copy_from_slice(state);
+    }
+
+    fn observe(&self, out: &mut [f32]) {
+        out.copy_from_slice(&self.state.map(|x| x as f32));
+    }
+
+    fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
+        let [x, x_dot, theta, theta_dot] = self.state;
+        let force = if super::choice(action) == 1 { self.force } else { -self.force };
+        let (sin, cos) = theta.sin_cos();
+        let temp = (force + self.pole_mass_length() * (theta_dot * theta_dot) * sin) / self.total_mass();
+        let theta_acc = (GRAVITY * sin - cos * temp)
+            / (self.half_pole_length * (4.0 / 3.0 - self.pole_mass * (cos * cos) / self.total_mass()));
+        let x_acc = temp - self.pole_mass_length() * theta_acc * cos / self.total_mass();
+        let next = [x + TAU * x_dot, x_dot + TAU * x_acc, theta + TAU * theta_dot, theta_dot + TAU * theta_acc];
+        let diverged = super::advance(&mut self.state, next);
+
+        reward_terms[0] = 1.0;
+        let inside = self.state[0].abs() <= POSITION_LIMIT && self.state[2].abs() <= ANGLE_LIMIT;
+        Transition { terminated: !inside || diverged, goal: inside, diverged }
+    }
+
+    fn save(&self, out: &mut Vec<f64>) {
+        out.extend_from_slice(&self.state);
+    }
+
+    fn load(&mut self, state: &[f64]) -> Result<(), Error> {
+        self.state = super::load(state)?;
+        Ok(())
+    }
+}

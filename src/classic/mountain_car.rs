@@ -1,0 +1,115 @@
+//! MountainCar: an engine too weak for the hill must swing the car up.
+//!
+//! Source: Moore (1990); Gymnasium 1.4 `MountainCar-v0`.
+
+use crate::{
+    env::{
+        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Quantity, RewardTerm, Stream, SuccessRule,
+        Transition,
+    },
+    physics,
+};
+
+const STATE: &[Channel] = &[
+    Channel::new("position", "m", MIN_POSITION, MAX_POSITION),
+    Channel::new("velocity", "m/step", -MAX_SPEED, MAX_SPEED),
+];
+
+/// What is fixed about MountainCar.
+pub static MOUNTAIN_CAR: EnvironmentSpec = EnvironmentSpec {
+    name: "MountainCar",
+    revision: 0,
+    description: "Swing an underpowered car up a hill.",
+    parameters: physics::MOUNTAIN_CAR,
+    observation: STATE,
+    action: ActionSpace::Discrete(&["push_left", "coast", "push_right"]),
+    state: STATE,
+    reward_terms: &[RewardTerm { name: "time", description: "-1 for every step" }],
+    applied: &[Quantity { name: "force", unit: "1" }, Quantity { name: "mass", unit: "1" }],
+    step_limit: 200,
+    control_timestep: 1.0,
+    step_cost: 0.04,
+    success: SuccessRule::ReachedWithin(110),
+    success_description: "the goal was reached within 110 steps",
+};
+
+const MIN_POSITION: f64 = -1.2;
+const MAX_POSITION: f64 = 0.6;
+const MAX_SPEED: f64 = 0.07;
+const GOAL_POSITION: f64 = 0.5;
+const GOAL_VELOCITY: f64 = 0.0;
+
+/// The car.
+#[derive(Debug, Clone)]
+pub struct MountainCar {
+    force: f64,
+    /// The factor of the gravity term, which the paper calls mass.
+    gravity: f64,
+    /// Position, velocity.
+    state: [f64; 2],
+}
+
+impl MountainCar {
+    /// With default parameters, at the valley's bottom.
+    pub fn new() -> Self {
+        let [force, gravity] = [0, 1].map(|i: usize| physics::MOUNTAIN_CAR[i].default);
+        Self { force, gravity, state: [-0.5, 0.0] }
+    }
+}
+
+impl Default for MountainCar {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Environment for MountainCar {
+    fn spec(&self) -> &'static EnvironmentSpec {
+        &MOUNTAIN_CAR
+    }
+
+    fn set_parameters(&mut self, values: &[f64]) {
+        (self.force, self.gravity) = (values[0], values[1]);
+    }
+
+    fn applied(&self, out: &mut [f64]) {
+        out.copy_from_slice(&[self.force, self.gravity]);
+    }
+
+    fn reset(&mut self, stream: &mut Stream) {
+        self.state = [stream.uniform(-0.6, -0.4), 0.0];
+    }
+
+    fn reset_to(&mut self, state: &[f64]) {
+        self.state.copy_from_slice(state);
+    }
+
+    fn observe(&self, out: &mut [f32]) {
+        out.copy_from_slice(&self.state.map(|x| x as f32));
+    }
+
+    fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
+        let [mut position, mut velocity] = self.state;
+        let push = f64::from(super::choice(action)) - 1.0;
+        velocity += push * self.force + (3.0 * position).cos() * -self.gravity;
+        velocity = velocity.clamp(-MAX_SPEED, MAX_SPEED);
+        position = (position + velocity).clamp(MIN_POSITION, MAX_POSITION);
+        if position == MIN_POSITION && velocity < 0.0 {
+            velocity = 0.0; // the left end is a wall
+        }
+        self.state = [position, velocity];
+
+        reward_terms[0] = -1.0;
+        let goal = position >= GOAL_POSITION && velocity >= GOAL_VELOCITY;
+        Transition { terminated: goal, goal, diverged: false }
+    }
+
+    fn save(&self, out: &mut Vec<f64>) {
+        out.extend_from_slice(&self.state);
+    }
+
+    fn load(&mut self, state: &[f64]) -> Result<(), Error> {
+        self.state = super::load(state)?;
+        Ok(())
+    }
+}

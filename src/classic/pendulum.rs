@@ -1,0 +1,128 @@
+//! Pendulum: swing a rod up with a weak torque and hold it there.
+//!
+//! Source: Gymnasium 1.4 `Pendulum-v1`, g = 10. The speed is clipped before it moves the angle; the Gym of 2018, which
+//! the paper used, clipped it after.
+
+use crate::{
+    env::{
+        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Quantity, RewardTerm, Stream, SuccessRule,
+        Transition,
+    },
+    physics,
+};
+use std::f64::consts::PI;
+
+/// What is fixed about Pendulum.
+pub static PENDULUM: EnvironmentSpec = EnvironmentSpec {
+    name: "Pendulum",
+    revision: 0,
+    description: "Swing a rod up with a weak torque and hold it upright.",
+    parameters: physics::PENDULUM,
+    observation: &[
+        Channel::new("cos_theta", "1", -1.0, 1.0),
+        Channel::new("sin_theta", "1", -1.0, 1.0),
+        Channel::new("theta_velocity", "rad/s", -MAX_SPEED, MAX_SPEED),
+    ],
+    action: ActionSpace::Continuous(&[Channel::new("torque", "N m", -MAX_TORQUE, MAX_TORQUE)]),
+    state: &[
+        Channel::new("theta", "rad", -10_000.0, 10_000.0),
+        Channel::new("theta_velocity", "rad/s", -MAX_SPEED, MAX_SPEED),
+    ],
+    reward_terms: &[
+        RewardTerm { name: "angle", description: "-θ², θ wrapped into [-π, π), before the step" },
+        RewardTerm { name: "velocity", description: "-0.1 θ̇², before the step" },
+        RewardTerm { name: "torque", description: "-0.001 u², u clipped to ±2" },
+    ],
+    applied: &[Quantity { name: "length", unit: "m" }, Quantity { name: "mass", unit: "kg" }],
+    step_limit: 200,
+    control_timestep: DT,
+    step_cost: 0.05,
+    success: SuccessRule::HeldForLast(100),
+    success_description: "the angle was within π/3 of vertical after each of the last 100 steps",
+};
+
+const DT: f64 = 0.05;
+const GRAVITY: f64 = 10.0;
+const MAX_SPEED: f64 = 8.0;
+const MAX_TORQUE: f64 = 2.0;
+const UPRIGHT: f64 = PI / 3.0;
+
+/// The rod.
+#[derive(Debug, Clone)]
+pub struct Pendulum {
+    length: f64,
+    mass: f64,
+    /// Angle from upright, not wrapped, and its velocity.
+    state: [f64; 2],
+}
+
+impl Pendulum {
+    /// With default parameters, upright.
+    pub fn new() -> Self {
+        let [length, mass] = [0, 1].map(|i: usize| physics::PENDULUM[i].default);
+        Self { length, mass, state: [0.0; 2] }
+    }
+}
+
+impl Default for Pendulum {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+/// The angle in [-π, π), by a floored remainder as Python's `%`.
+fn normalise(angle: f64) -> f64 {
+    (angle + PI).rem_euclid(2.0 * PI) - PI
+}
+
+impl Environment for Pendulum {
+    fn spec(&self) -> &'static EnvironmentSpec {
+        &PENDULUM
+    }
+
+    fn set_parameters(&mut self, values: &[f64]) {
+        (self.length, self.mass) = (values[0], values[1]);
+    }
+
+    fn applied(&self, out: &mut [f64]) {
+        out.copy_from_slice(&[self.length, self.mass]);
+    }
+
+    fn reset(&mut self, stream: &mut Stream) {
+        self.state = [stream.uniform(-PI, PI), stream.uniform(-1.0, 1.0)];
+    }
+
+    fn reset_to(&mut self, state: &[f64]) {
+        self.state.copy_from_slice(state);
+    }
+
+    fn observe(&self, out: &mut [f32]) {
+        let [theta, velocity] = self.state;
+        out.copy_from_slice(&[theta.cos() as f32, theta.sin() as f32, velocity as f32]);
+    }
+
+    fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
+        let Action::Continuous(&[torque]) = action else {
+            unreachable!("Pendulum is stepped with one validated torque")
+        };
+        let [theta, velocity] = self.state;
+        let (m, l) = (self.mass, self.length);
+        let u = f64::from(torque).clamp(-MAX_TORQUE, MAX_TORQUE);
+        let angle = normalise(theta);
+        reward_terms.copy_from_slice(&[-(angle * angle), -(0.1 * (velocity * velocity)), -(0.001 * (u * u))]);
+
+        let acceleration = 3.0 * GRAVITY / (2.0 * l) * theta.sin() + 3.0 / (m * (l * l)) * u;
+        let velocity = (velocity + acceleration * DT).clamp(-MAX_SPEED, MAX_SPEED);
+        let diverged = super::advance(&mut self.state, [theta + velocity * DT, velocity]);
+        Transition { terminated: diverged, goal: normalise(self.state[0]).abs() < UPRIGHT, diverged }
+    }
+
+    fn save(&self, out: &mut Vec<f64>) {
+        out.extend_from_slice(&self.state);
+    }
+
+    fn load(&mut self, state: &[f64]) -> Result<(), Error> {
+        self.state = super::load(state)?;
+        Ok(())
+    }
+}

@@ -1,0 +1,244 @@
+//! One environment and its episodes: trials, step limit, success, receipts, snapshots.
+
+use super::{Action, Environment, EnvironmentSpec, Purpose, Stream, SuccessRule};
+use crate::physics::Distribution;
+
+/// What fixes an environment's episodes.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Settings {
+    /// The seed.
+    pub seed: u64,
+    /// The environment's index: with the seed and an episode's number it fixes all randomness.
+    pub environment_index: u32,
+    /// One for each parameter, in the spec's order, within the parameters' bounds.
+    pub distributions: Vec<Distribution>,
+    /// Episodes in a trial, at least 1. Parameters are drawn when a trial begins.
+    pub episodes_per_trial: u32,
+}
+
+/// Names an episode.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct EpisodeId {
+    /// The environment's index.
+    pub environment_index: u32,
+    /// Counts the environment's trials from 0.
+    pub trial_index: u64,
+    /// Counts the environment's episodes from 0.
+    pub episode_index: u64,
+    /// Counts the trial's episodes from 0.
+    pub episode_in_trial: u32,
+}
+
+/// What physics an episode ran with.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Receipt {
+    /// The parameters that were drawn or given, in the spec's order.
+    pub requested: Vec<f64>,
+    /// The values read back from the physics, in the order of [`EnvironmentSpec::applied`].
+    pub applied: Vec<f64>,
+    /// The model's hash, or empty.
+    pub model_hash: String,
+}
+
+/// An episode that began.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EpisodeStart {
+    /// Which one.
+    pub id: EpisodeId,
+    /// Its receipt, if wanted.
+    pub receipt: Option<Receipt>,
+}
+
+/// An episode that ended.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EpisodeEnd {
+    /// Which one.
+    pub id: EpisodeId,
+    /// Undiscounted sum of rewards.
+    pub total_reward: f64,
+    /// Steps.
+    pub length: u32,
+    /// Whether the spec's rule holds.
+    pub success: bool,
+    /// Whether the physics diverged.
+    pub diverged: bool,
+    /// Its receipt, if wanted.
+    pub receipt: Option<Receipt>,
+}
+
+/// What one step did to an episode.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Outcome {
+    /// Sum of the reward's terms.
+    pub reward: f64,
+    /// The task ended the episode.
+    pub terminated: bool,
+    /// The step limit ended it.
+    pub truncated: bool,
+}
+
+/// Where an environment stands in its episodes.
+#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize, serde::Deserialize)]
+pub(super) struct Progress {
+    pub(super) trial: u64,
+    pub(super) episode: u64,
+    pub(super) episode_in_trial: u32,
+    pub(super) length: u32,
+    pub(super) total_reward: f64,
+    /// The first step after which the goal held, counted from 1; 0 if none.
+    pub(super) reached_at: u32,
+    /// The number of last steps after all of which the goal held.
+    pub(super) held_for: u32,
+    pub(super) ended: bool,
+    pub(super) diverged: bool,
+}
+
+/// An environment that runs one episode after another.
+pub struct Episodes {
+    pub(super) environment: Box<dyn Environment>,
+    pub(super) settings: Settings,
+    /// The parameters in force.
+    pub(super) values: Vec<f64>,
+    pub(super) progress: Progress,
+}
+
+impl Episodes {
+    /// Takes an environment and begins its first episode.
+    pub fn new(environment: Box<dyn Environment>, settings: Settings) -> Self {
+        debug_assert_eq!(settings.distributions.len(), environment.spec().parameters.len());
+        let values = vec![0.0; settings.distributions.len()];
+        let mut episodes = Self { environment, settings, values, progress: Progress::default() };
+        episodes.start(None);
+        episodes
+    }
+
+    /// What is fixed about the environment.
+    pub fn spec(&self) -> &'static EnvironmentSpec {
+        self.environment.spec()
+    }
+
+    /// What fixes the episodes.
+    pub fn settings(&self) -> &Settings {
+        &self.settings
+    }
+
+    /// Begins the next episode, from an exact state `[S]` if one is given.
+    pub fn begin(&mut self, state: Option<&[f64]>) {
+        let Progress { trial, episode, episode_in_trial, .. } = self.progress;
+        let same_trial = episode_in_trial + 1 < self.settings.episodes_per_trial;
+        self.progress = Progress {
+            trial: if same_trial { trial } else { trial + 1 },
+            episode: episode + 1,
+            episode_in_trial: if same_trial { episode_in_trial + 1 } else { 0 },
+            ..Progress::default()
+        };
+        self.start(state);
+    }
+
+    /// Begins a new trial: with new distributions, or with a new seed, which restarts the counts at 0, or both.
+    pub fn begin_trial(&mut self, seed: Option<u64>, distributions: Option<&[Distribution]>, state: Option<&[f64]>) {
+        if let Some(distributions) = distributions {
+            self.settings.distributions.clone_from_slice(distributions);
+        }
+        self.progress = match seed {
+            Some(seed) => {
+                self.settings.seed = seed;
+                Progress::default()
+            }
+            None => {
+                Progress { trial: self.progress.trial + 1, episode: self.progress.episode + 1, ..Progress::default() }
+            }
+        };
+        self.start(state);
+    }
+
+    fn start(&mut self, state: Option<&[f64]>) {
+        let Settings { seed, environment_index, ref distributions, .. } = self.settings;
+        if self.progress.episode_in_trial == 0 {
+            let mut stream = Stream::new(seed, environment_index.into(), Purpose::Parameters, self.progress.trial);
+            for (value, distribution) in self.values.iter_mut().zip(distributions) {
+                *value = distribution.at(stream.unit());
+            }
+            self.environment.set_parameters(&self.values);
+        }
+        match state {
+            Some(state) => self.environment.reset_to(state),
+            None => {
+                let episode = self.progress.episode;
+                let mut stream = Stream::new(seed, environment_index.into(), Purpose::InitialState, episode);
+                self.environment.reset(&mut stream);
+            }
+        }
+    }
+
+    /// Advances the running episode by one step. `reward_terms` is scratch of the spec's number of terms.
+    pub fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Outcome {
+        debug_assert!(!self.progress.ended, "the pool never steps an ended episode");
+        let transition = self.environment.step(action, reward_terms);
+        let reward = reward_terms.iter().sum();
+        let progress = &mut self.progress;
+        progress.length += 1;
+        progress.total_reward += reward;
+        if transition.goal {
+            progress.held_for += 1;
+            if progress.reached_at == 0 {
+                progress.reached_at = progress.length;
+            }
+        } else {
+            progress.held_for = 0;
+        }
+        let truncated = progress.length >= self.environment.spec().step_limit;
+        progress.diverged = transition.diverged;
+        progress.ended = transition.terminated || truncated;
+        Outcome { reward, terminated: transition.terminated, truncated }
+    }
+
+    /// Writes the current observation, `[O]`.
+    pub fn observe(&self, out: &mut [f32]) {
+        self.environment.observe(out);
+    }
+
+    /// Whether the current episode has ended.
+    pub fn ended(&self) -> bool {
+        self.progress.ended
+    }
+
+    /// The current episode's name.
+    pub fn id(&self) -> EpisodeId {
+        EpisodeId {
+            environment_index: self.settings.environment_index,
+            trial_index: self.progress.trial,
+            episode_index: self.progress.episode,
+            episode_in_trial: self.progress.episode_in_trial,
+        }
+    }
+
+    /// The physics of the current episode.
+    pub fn receipt(&self) -> Receipt {
+        let mut applied = vec![0.0; self.spec().applied.len()];
+        self.environment.applied(&mut applied);
+        Receipt { requested: self.values.clone(), applied, model_hash: self.environment.model_hash().into() }
+    }
+
+    /// The current episode as one that began.
+    pub fn started(&self, receipt: bool) -> EpisodeStart {
+        EpisodeStart { id: self.id(), receipt: receipt.then(|| self.receipt()) }
+    }
+
+    /// The current episode as one that ended.
+    pub fn finished(&self, receipt: bool) -> EpisodeEnd {
+        let progress = &self.progress;
+        EpisodeEnd {
+            id: self.id(),
+            total_reward: progress.total_reward,
+            length: progress.length,
+            success: match self.spec().success {
+                SuccessRule::Lasted(steps) => progress.length >= steps,
+                SuccessRule::ReachedWithin(steps) => (1..=steps).contains(&progress.reached_at),
+                SuccessRule::HeldForLast(steps) => progress.held_for >= steps,
+            },
+            diverged: progress.diverged,
+            receipt: receipt.then(|| self.receipt()),
+        }
+    }
+}

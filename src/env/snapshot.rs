@@ -1,0 +1,124 @@
+//! Saving an environment whole, and bringing it back in another session, process or server.
+
+use super::{EnvironmentSpec, Episodes, Error, Settings, episode::Progress};
+use crate::physics::{Distribution, Interval, check_bounds};
+use serde::{Deserialize, Serialize};
+
+/// Raised by every change of the layout below.
+const FORMAT: u32 = 1;
+
+/// Everything that an environment's future depends on, besides the actions. Random streams need no state of their own:
+/// they follow from the seed, the index and the counts.
+#[derive(Serialize, Deserialize)]
+struct Saved {
+    format: u32,
+    environment: String,
+    revision: u32,
+    model_hash: String,
+    seed: u64,
+    environment_index: u32,
+    episodes_per_trial: u32,
+    /// (low, high) of every interval of every parameter's distribution.
+    distributions: Vec<Vec<(f64, f64)>>,
+    values: Vec<f64>,
+    progress: Progress,
+    state: Vec<f64>,
+}
+
+impl Episodes {
+    /// Saves the environment: physics, parameters, counters and random streams.
+    pub fn snapshot(&self) -> Vec<u8> {
+        let spec = self.spec();
+        let mut state = Vec::new();
+        self.environment.save(&mut state);
+        let pairs = |d: &Distribution| d.intervals().iter().map(|i| (i.low, i.high)).collect();
+        let saved = Saved {
+            format: FORMAT,
+            environment: spec.name.into(),
+            revision: spec.revision,
+            model_hash: self.environment.model_hash().into(),
+            seed: self.settings.seed,
+            environment_index: self.settings.environment_index,
+            episodes_per_trial: self.settings.episodes_per_trial,
+            distributions: self.settings.distributions.iter().map(pairs).collect(),
+            values: self.values.clone(),
+            progress: self.progress,
+            state,
+        };
+        postcard::to_stdvec(&saved).expect("plain numbers and strings always encode into a growing buffer")
+    }
+
+    /// Brings a saved environment back: what follows is what followed the snapshot, byte for byte.
+    ///
+    /// # Errors
+    /// [`Error::Snapshot`]; nothing was changed then.
+    pub fn restore(&mut self, snapshot: &[u8]) -> Result<(), Error> {
+        let (saved, distributions) = self.check(snapshot)?;
+        let before = self.snapshot_parts();
+        self.environment.set_parameters(&saved.values);
+        if let Err(error) = self.environment.load(&saved.state) {
+            self.environment.set_parameters(&self.values);
+            self.environment.load(&before)?;
+            return Err(error);
+        }
+        self.values = saved.values;
+        self.progress = saved.progress;
+        self.settings = Settings {
+            seed: saved.seed,
+            environment_index: saved.environment_index,
+            distributions,
+            episodes_per_trial: saved.episodes_per_trial,
+        };
+        Ok(())
+    }
+
+    fn snapshot_parts(&self) -> Vec<f64> {
+        let mut state = Vec::new();
+        self.environment.save(&mut state);
+        state
+    }
+
+    /// Decodes a snapshot and checks all that can be wrong with it, short of the physics' own state.
+    fn check(&self, snapshot: &[u8]) -> Result<(Saved, Vec<Distribution>), Error> {
+        let refuse = |reason: String| Err(Error::Snapshot { reason });
+        let Ok(saved) = postcard::from_bytes::<Saved>(snapshot) else {
+            return refuse(format!("its {} bytes are not a snapshot", snapshot.len()));
+        };
+        let spec = self.spec();
+        if saved.format != FORMAT {
+            return refuse(format!("its format is {}, this server reads {FORMAT}", saved.format));
+        }
+        if (saved.environment.as_str(), saved.revision) != (spec.name, spec.revision) {
+            let Saved { environment, revision, .. } = saved;
+            return refuse(format!("it is of {environment}-v{revision}, this is {}-v{}", spec.name, spec.revision));
+        }
+        if saved.model_hash != self.environment.model_hash() {
+            return refuse("it was taken with another model".into());
+        }
+        if saved.distributions.len() != spec.parameters.len() || saved.values.len() != spec.parameters.len() {
+            return refuse(format!("it does not have the {} parameters of {}", spec.parameters.len(), spec.name));
+        }
+        let distributions = Self::distributions(spec, &saved)?;
+        let Progress { episode_in_trial, length, total_reward, ended, .. } = saved.progress;
+        if episode_in_trial >= saved.episodes_per_trial || !total_reward.is_finite() {
+            return refuse("its counters contradict each other".into());
+        }
+        if length > spec.step_limit || (length == spec.step_limit && !ended) {
+            return refuse(format!("its episode is {length} steps long, the limit is {}", spec.step_limit));
+        }
+        Ok((saved, distributions))
+    }
+
+    fn distributions(spec: &'static EnvironmentSpec, saved: &Saved) -> Result<Vec<Distribution>, Error> {
+        let bad = |error: Error| Error::Snapshot { reason: error.to_string() };
+        let each = spec.parameters.iter().zip(&saved.distributions).zip(&saved.values);
+        each.map(|((parameter, pairs), &value)| {
+            let intervals: Vec<Interval> = pairs.iter().map(|&(low, high)| Interval { low, high }).collect();
+            let distribution = Distribution::union(parameter.name, &intervals).map_err(bad)?;
+            check_bounds(spec, parameter, distribution.range()).map_err(bad)?;
+            check_bounds(spec, parameter, (value, value)).map_err(bad)?;
+            Ok(distribution)
+        })
+        .collect()
+    }
+}

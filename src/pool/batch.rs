@@ -1,0 +1,303 @@
+//! A session's environments: requests in, gathered replies out.
+
+use super::{
+    Autoreset, Error, Pool,
+    shard::{Command, Shard, SlotReset},
+    workers::{Job, Shared, lock},
+};
+use crate::{
+    env::{ActionSpace, EnvironmentSpec, EpisodeEnd, EpisodeStart, Settings},
+    physics::Distribution,
+};
+use bytes::{Bytes, BytesMut};
+use std::sync::{Arc, Mutex, atomic::Ordering};
+
+/// What one shard should cost, in µs: long enough to hide the queue, short enough that sessions take turns.
+const SHARD_COST: f64 = 50.0;
+
+/// What a batch is opened with.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BatchSettings {
+    /// The environment.
+    pub spec: &'static EnvironmentSpec,
+    /// N, at least 1.
+    pub size: usize,
+    /// Fixes all randomness; `environment_index` is that of slot 0, and slot N-1's fits a u32.
+    pub episodes: Settings,
+    /// What happens to ended episodes.
+    pub autoreset: Autoreset,
+    /// Whether episodes carry receipts.
+    pub receipts: bool,
+    /// Whether steps report the reward's terms.
+    pub reward_terms: bool,
+}
+
+/// One environment's part of a reset: a new episode, or with a seed or distributions a new trial.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ResetEntry {
+    /// Where in the batch.
+    pub slot: usize,
+    /// A new seed.
+    pub seed: Option<u64>,
+    /// New distributions, one for each parameter.
+    pub distributions: Option<Arc<[Distribution]>>,
+    /// An exact initial state, `[S]`, finite.
+    pub state: Option<Vec<f64>>,
+}
+
+/// The outcome of a step; arrays are little-endian, as on the wire.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Stepped {
+    /// f32 `[N, O]`
+    pub observations: Bytes,
+    /// f32 `[N]`
+    pub rewards: Bytes,
+    /// u8 `[N]`
+    pub terminated: Bytes,
+    /// u8 `[N]`
+    pub truncated: Bytes,
+    /// f32 `[N, terms]`, or empty
+    pub reward_terms: Bytes,
+    /// f32 `[K, O]`
+    pub final_observations: Bytes,
+    /// `[K]`: slot and episode.
+    pub ended: Vec<(u32, EpisodeEnd)>,
+    /// Slot and episode; only with receipts.
+    pub started: Vec<(u32, EpisodeStart)>,
+}
+
+/// A batch of environments. Dropping it frees them at once, or as soon as the shards under way have finished.
+pub struct Batch {
+    settings: BatchSettings,
+    shard_size: usize,
+    job: Arc<Job>,
+    workers: Arc<Shared>,
+    buffer: BytesMut,
+}
+
+impl Batch {
+    /// Makes the environments, on the pool's workers, and begins their first episodes. Returns the batch with its first
+    /// observations, f32 `[N, O]`, and the episodes begun (only with receipts).
+    ///
+    /// # Errors
+    /// [`Error::Full`], or [`Error::Environment`] if a model cannot be loaded.
+    pub async fn open(pool: &Pool, settings: BatchSettings) -> Result<(Self, Bytes, Vec<(u32, EpisodeStart)>), Error> {
+        let workers = pool.queue();
+        let permit = workers.reserve(settings.size)?;
+        let shard_size = shard_size(settings.spec, settings.size, pool.workers());
+        let shard = |first: usize| {
+            let size = shard_size.min(settings.size - first);
+            let BatchSettings { spec, ref episodes, autoreset, receipts, .. } = settings;
+            Mutex::new(Shard::new(spec, episodes, (first, size), autoreset, receipts))
+        };
+        let shards = (0..settings.size).step_by(shard_size).map(shard).collect();
+        let job = Arc::new(Job::new(shards, permit));
+        let mut batch = Self { settings, shard_size, job, workers, buffer: BytesMut::new() };
+        batch.run().await?;
+        batch.check_failures()?;
+        let observations = batch.all_observations();
+        let started = batch.collect(|shard| &mut shard.started);
+        Ok((batch, observations, started))
+    }
+
+    /// What the batch was opened with.
+    pub fn settings(&self) -> &BatchSettings {
+        &self.settings
+    }
+
+    /// Advances every environment by one step. Discrete actions are i32 `[N]`, each a choice of the space; continuous
+    /// ones f32 `[N, A]`, finite: the caller has checked them.
+    ///
+    /// # Errors
+    /// [`Error::Ended`] in [`Autoreset::Disabled`], [`Error::Defect`].
+    pub async fn step(&mut self, actions: &[u8]) -> Result<Stepped, Error> {
+        if self.settings.autoreset == Autoreset::Disabled {
+            self.refuse_ended()?;
+        }
+        self.put_actions(actions);
+        self.run().await?;
+        Ok(self.gather())
+    }
+
+    /// Begins new episodes, in order of slots. Returns their first observations, f32 `[M, O]`, and, with receipts, the
+    /// episodes.
+    ///
+    /// # Errors
+    /// [`Error::Defect`].
+    pub async fn reset(&mut self, entries: Vec<ResetEntry>) -> Result<(Bytes, Vec<(u32, EpisodeStart)>), Error> {
+        let slots: Vec<usize> = entries.iter().map(|entry| entry.slot).collect();
+        let commands = self.split(entries, |entry| entry.slot);
+        self.command(commands, |first, entries| {
+            let local = |ResetEntry { slot, seed, distributions, state }| SlotReset {
+                slot: slot - first,
+                seed,
+                distributions,
+                state,
+            };
+            Command::Reset(entries.into_iter().map(local).collect())
+        });
+        self.run().await?;
+        Ok((self.observations(&slots), self.collect(|shard| &mut shard.started)))
+    }
+
+    /// Saves environments, in order of slots.
+    ///
+    /// # Errors
+    /// [`Error::Defect`].
+    pub async fn snapshot(&mut self, slots: Vec<usize>) -> Result<Vec<Bytes>, Error> {
+        let commands = self.split(slots, |&slot| slot);
+        self.command(commands, |first, slots| Command::Snapshot(slots.iter().map(|slot| slot - first).collect()));
+        self.run().await?;
+        Ok(self.collect(|shard| &mut shard.snapshots).into_iter().map(Bytes::from).collect())
+    }
+
+    /// Restores environments, in order of slots: all, or none if one cannot be. Returns their observations, f32
+    /// `[M, O]`.
+    ///
+    /// # Errors
+    /// [`Error::Environment`] for a snapshot that cannot be restored, [`Error::Defect`].
+    pub async fn restore(&mut self, entries: Vec<(usize, Bytes)>) -> Result<Bytes, Error> {
+        let slots: Vec<usize> = entries.iter().map(|entry| entry.0).collect();
+        let commands = self.split(entries, |entry| entry.0);
+        self.command(commands, |first, entries| {
+            Command::Restore(entries.into_iter().map(|(slot, snapshot)| (slot - first, snapshot)).collect())
+        });
+        self.run().await?;
+        if let Err(refused) = self.check_failures() {
+            self.command(Vec::new(), |_, _: Vec<()>| Command::RollBack);
+            self.run().await?;
+            self.check_failures()?;
+            return Err(refused);
+        }
+        Ok(self.observations(&slots))
+    }
+
+    async fn run(&mut self) -> Result<(), Error> {
+        self.workers.run(&self.job).await
+    }
+
+    fn check_failures(&self) -> Result<(), Error> {
+        let failure = self.job.shards.iter().find_map(|shard| lock(shard).failure.clone());
+        failure.map_or(Ok(()), |error| Err(error.into()))
+    }
+
+    fn refuse_ended(&self) -> Result<(), Error> {
+        const SHOWN: usize = 8;
+        let mut ended: Vec<String> = Vec::new();
+        for shard in &self.job.shards {
+            ended.extend(lock(shard).ended_slots().map(|slot| slot.to_string()));
+        }
+        if ended.is_empty() {
+            return Ok(());
+        }
+        let more = ended.len().saturating_sub(SHOWN);
+        ended.truncate(SHOWN);
+        let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+        Err(Error::Ended { slots: ended.join(", ") + &more })
+    }
+
+    fn put_actions(&self, actions: &[u8]) {
+        let width = match self.settings.spec.action {
+            ActionSpace::Discrete(_) => 4,
+            ActionSpace::Continuous(channels) => 4 * channels.len(),
+        };
+        for shard in &self.job.shards {
+            let mut shard = lock(shard);
+            let part = &actions[width * shard.first_slot..][..width * shard.size];
+            let words = part.as_chunks::<4>().0;
+            shard.choices.iter_mut().zip(words).for_each(|(to, from)| *to = u32::from_le_bytes(*from));
+            shard.vectors.iter_mut().zip(words).for_each(|(to, from)| *to = f32::from_le_bytes(*from));
+        }
+    }
+
+    /// One list for each shard, by the slot that `slot_of` reads from an entry.
+    fn split<T>(&self, entries: Vec<T>, slot_of: impl Fn(&T) -> usize) -> Vec<Vec<T>> {
+        let mut lists: Vec<Vec<T>> = self.job.shards.iter().map(|_| Vec::new()).collect();
+        for entry in entries {
+            lists[slot_of(&entry) / self.shard_size].push(entry);
+        }
+        lists
+    }
+
+    /// Gives each shard a command, made from its first slot and its list.
+    fn command<T>(&self, lists: Vec<Vec<T>>, make: impl Fn(usize, Vec<T>) -> Command) {
+        let mut lists = lists.into_iter();
+        for shard in &self.job.shards {
+            let mut shard = lock(shard);
+            shard.command = make(shard.first_slot, lists.next().unwrap_or_default());
+        }
+    }
+
+    fn collect<T>(&self, field: impl Fn(&mut Shard) -> &mut Vec<T>) -> Vec<T> {
+        let mut all = Vec::new();
+        for shard in &self.job.shards {
+            all.append(field(&mut lock(shard)));
+        }
+        all
+    }
+
+    fn all_observations(&mut self) -> Bytes {
+        self.gather_f32(|shard| &shard.observations)
+    }
+
+    fn observations(&mut self, slots: &[usize]) -> Bytes {
+        let n = self.settings.spec.observation.len();
+        for &slot in slots {
+            let shard = lock(&self.job.shards[slot / self.shard_size]);
+            put(&mut self.buffer, &shard.observations[(slot - shard.first_slot) * n..][..n]);
+        }
+        self.buffer.split().freeze()
+    }
+
+    fn gather(&mut self) -> Stepped {
+        Stepped {
+            observations: self.all_observations(),
+            rewards: self.gather_f32(|shard| &shard.rewards),
+            terminated: self.gather_u8(|shard| &shard.terminated),
+            truncated: self.gather_u8(|shard| &shard.truncated),
+            reward_terms: if self.settings.reward_terms {
+                self.gather_f32(|shard| &shard.reward_terms)
+            } else {
+                Bytes::new()
+            },
+            final_observations: self.gather_f32(|shard| &shard.final_observations),
+            ended: self.collect(|shard| &mut shard.ended),
+            started: self.collect(|shard| &mut shard.started),
+        }
+    }
+
+    fn gather_f32(&mut self, field: impl Fn(&Shard) -> &Vec<f32>) -> Bytes {
+        for shard in &self.job.shards {
+            put(&mut self.buffer, field(&lock(shard)));
+        }
+        self.buffer.split().freeze()
+    }
+
+    fn gather_u8(&mut self, field: impl Fn(&Shard) -> &Vec<u8>) -> Bytes {
+        for shard in &self.job.shards {
+            self.buffer.extend_from_slice(field(&lock(shard)));
+        }
+        self.buffer.split().freeze()
+    }
+}
+
+impl Drop for Batch {
+    fn drop(&mut self) {
+        self.job.abandoned.store(true, Ordering::Relaxed);
+    }
+}
+
+/// Appends little-endian f32.
+fn put(buffer: &mut BytesMut, values: &[f32]) {
+    let start = buffer.len();
+    buffer.resize(start + 4 * values.len(), 0);
+    let words = buffer[start..].as_chunks_mut::<4>().0;
+    words.iter_mut().zip(values).for_each(|(to, from)| *to = from.to_le_bytes());
+}
+
+/// Environments in a shard: by cost, but so many shards that every worker has one, if a shard is worth a wake-up.
+fn shard_size(spec: &EnvironmentSpec, batch: usize, workers: usize) -> usize {
+    let by_cost = (SHARD_COST / spec.step_cost).ceil() as usize;
+    let by_workers = batch.div_ceil(workers);
+    if spec.step_cost * by_workers as f64 >= SHARD_COST / 5.0 { by_cost.min(by_workers).max(1) } else { by_cost.max(1) }
+}

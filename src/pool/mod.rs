@@ -1,0 +1,48 @@
+//! Batches of environments, stepped by worker threads.
+//!
+//! A batch is cut into shards, each with its environments and its own output buffers. A request puts the batch into the
+//! workers' queue; a worker takes one shard of the batch at the queue's head and puts the batch back at its tail if
+//! shards remain, so that batches of different sessions take turns, whatever their sizes. The last shard to finish wakes
+//! the session, which gathers the outputs into one reply. Which worker ran which shard cannot be seen from outside.
+
+mod batch;
+mod shard;
+mod workers;
+
+pub use batch::{Batch, BatchSettings, ResetEntry, Stepped};
+pub use shard::Autoreset;
+pub use workers::Pool;
+
+use crate::env;
+
+/// A refused or failed request.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// The environments refuse it. Nothing was changed.
+    #[error(transparent)]
+    Environment(#[from] env::Error),
+    /// The pool has no room. Nothing was changed.
+    #[error(
+        "{requested} environments were asked for, but {used} of this server's {limit} are in use; open fewer, or later"
+    )]
+    Full {
+        /// The batch size that was asked for.
+        requested: usize,
+        /// Environments in use.
+        used: usize,
+        /// The most there may be.
+        limit: usize,
+    },
+    /// Autoreset is disabled and some environments have ended. Nothing was changed.
+    #[error(
+        "the episodes of slots {slots} have ended and autoreset is disabled; reset these slots before the next step"
+    )]
+    Ended {
+        /// The first few, separated by commas.
+        slots: String,
+    },
+    /// A worker panicked: a defect of the server. The batch is lost.
+    #[error("the simulation failed from a defect of the server; open a new session, and report what its log says")]
+    Defect,
+}

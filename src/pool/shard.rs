@@ -1,0 +1,243 @@
+//! A part of a batch: what one worker runs at a time.
+
+use crate::{
+    env::{self, Action, ActionSpace, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings},
+    physics::Distribution,
+};
+use bytes::Bytes;
+use std::sync::Arc;
+
+/// What happens to an environment whose episode has ended (Gymnasium's three modes).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Autoreset {
+    /// The next step ignores its action and resets.
+    NextStep,
+    /// The last step itself resets.
+    SameStep,
+    /// Nothing: the client resets.
+    Disabled,
+}
+
+/// What a shard is asked to do. Slots are counted within the shard.
+pub(super) enum Command {
+    Open,
+    Step,
+    Reset(Vec<SlotReset>),
+    Snapshot(Vec<usize>),
+    /// Restores all, keeping what was there for [`Command::RollBack`].
+    Restore(Vec<(usize, Bytes)>),
+    /// Undoes the last restore.
+    RollBack,
+}
+
+/// One environment's part of a reset.
+pub(super) struct SlotReset {
+    pub(super) slot: usize,
+    pub(super) seed: Option<u64>,
+    pub(super) distributions: Option<Arc<[Distribution]>>,
+    pub(super) state: Option<Vec<f64>>,
+}
+
+/// Environments of neighbouring slots with their inputs and outputs. `n` is their number.
+pub(super) struct Shard {
+    pub(super) first_slot: usize,
+    pub(super) size: usize,
+    spec: &'static EnvironmentSpec,
+    settings: Settings,
+    autoreset: Autoreset,
+    receipts: bool,
+    pub(super) command: Command,
+    slots: Vec<Episodes>,
+    backups: Vec<(usize, Vec<u8>)>,
+    /// Discrete: `[n]`, validated.
+    pub(super) choices: Vec<u32>,
+    /// Continuous: `[n, A]`, validated.
+    pub(super) vectors: Vec<f32>,
+    /// `[n, O]`
+    pub(super) observations: Vec<f32>,
+    /// `[n]`
+    pub(super) rewards: Vec<f32>,
+    /// `[n]`
+    pub(super) terminated: Vec<u8>,
+    /// `[n]`
+    pub(super) truncated: Vec<u8>,
+    /// `[n, terms]`
+    pub(super) reward_terms: Vec<f32>,
+    /// `[k, O]`
+    pub(super) final_observations: Vec<f32>,
+    /// `[k]`: slot of the batch and what ended there.
+    pub(super) ended: Vec<(u32, EpisodeEnd)>,
+    /// Slot of the batch and what began there.
+    pub(super) started: Vec<(u32, EpisodeStart)>,
+    pub(super) snapshots: Vec<Vec<u8>>,
+    pub(super) failure: Option<env::Error>,
+    terms: Vec<f64>,
+}
+
+impl Shard {
+    /// A shard whose environments are yet to be made by [`Command::Open`].
+    pub(super) fn new(
+        spec: &'static EnvironmentSpec,
+        settings: &Settings,
+        (first_slot, size): (usize, usize),
+        autoreset: Autoreset,
+        receipts: bool,
+    ) -> Self {
+        let (choices, vectors) = match spec.action {
+            ActionSpace::Discrete(_) => (size, 0),
+            ActionSpace::Continuous(channels) => (0, size * channels.len()),
+        };
+        Self {
+            first_slot,
+            size,
+            spec,
+            settings: settings.clone(),
+            autoreset,
+            receipts,
+            command: Command::Open,
+            slots: Vec::new(),
+            backups: Vec::new(),
+            choices: vec![0; choices],
+            vectors: vec![0.0; vectors],
+            observations: vec![0.0; size * spec.observation.len()],
+            rewards: vec![0.0; size],
+            terminated: vec![0; size],
+            truncated: vec![0; size],
+            reward_terms: vec![0.0; size * spec.reward_terms.len()],
+            final_observations: Vec::new(),
+            ended: Vec::new(),
+            started: Vec::new(),
+            snapshots: Vec::new(),
+            failure: None,
+            terms: vec![0.0; spec.reward_terms.len()],
+        }
+    }
+
+    /// The slots of the batch whose episodes have ended.
+    pub(super) fn ended_slots(&self) -> impl Iterator<Item = usize> {
+        let ended = self.slots.iter().enumerate().filter(|(_, episodes)| episodes.ended());
+        ended.map(|(slot, _)| self.first_slot + slot)
+    }
+
+    /// Carries out the command.
+    pub(super) fn run(&mut self) {
+        self.ended.clear();
+        self.started.clear();
+        self.final_observations.clear();
+        self.snapshots.clear();
+        self.failure = None;
+        match std::mem::replace(&mut self.command, Command::Step) {
+            Command::Step => self.step(),
+            Command::Open => self.open(),
+            Command::Reset(resets) => resets.iter().for_each(|reset| self.reset(reset)),
+            Command::Snapshot(slots) => self.snapshots.extend(slots.iter().map(|&slot| self.slots[slot].snapshot())),
+            Command::Restore(entries) => self.restore(&entries),
+            Command::RollBack => self.roll_back(),
+        }
+    }
+
+    fn open(&mut self) {
+        for slot in 0..self.size {
+            match env::make(self.spec.name) {
+                Ok(environment) => {
+                    // The batch has checked that the last index fits.
+                    let environment_index = self.settings.environment_index + (self.first_slot + slot) as u32;
+                    let settings = Settings { environment_index, ..self.settings.clone() };
+                    self.slots.push(Episodes::new(environment, settings));
+                }
+                Err(error) => {
+                    self.failure = Some(error);
+                    return;
+                }
+            }
+            self.note_start(slot);
+            self.observe(slot);
+        }
+    }
+
+    fn step(&mut self) {
+        let n_terms = self.terms.len();
+        for slot in 0..self.size {
+            let episodes = &mut self.slots[slot];
+            if episodes.ended() {
+                // Only next-step mode gets here: same-step leaves none ended, and disabled refuses the step.
+                episodes.begin(None);
+                self.rewards[slot] = 0.0;
+                self.terminated[slot] = 0;
+                self.truncated[slot] = 0;
+                self.reward_terms[slot * n_terms..][..n_terms].fill(0.0);
+                self.note_start(slot);
+                self.observe(slot);
+                continue;
+            }
+            let action = match self.spec.action {
+                ActionSpace::Discrete(_) => Action::Discrete(self.choices[slot]),
+                ActionSpace::Continuous(a) => Action::Continuous(&self.vectors[slot * a.len()..][..a.len()]),
+            };
+            let outcome = episodes.step(action, &mut self.terms);
+            self.rewards[slot] = outcome.reward as f32;
+            self.terminated[slot] = outcome.terminated.into();
+            self.truncated[slot] = outcome.truncated.into();
+            for (out, term) in self.reward_terms[slot * n_terms..][..n_terms].iter_mut().zip(&self.terms) {
+                *out = *term as f32;
+            }
+            self.observe(slot);
+            if outcome.terminated || outcome.truncated {
+                self.finish(slot);
+            }
+        }
+    }
+
+    fn finish(&mut self, slot: usize) {
+        let n = self.spec.observation.len();
+        self.final_observations.extend_from_slice(&self.observations[slot * n..][..n]);
+        self.ended.push(((self.first_slot + slot) as u32, self.slots[slot].finished(self.receipts)));
+        if self.autoreset == Autoreset::SameStep {
+            self.slots[slot].begin(None);
+            self.note_start(slot);
+            self.observe(slot);
+        }
+    }
+
+    fn reset(&mut self, reset: &SlotReset) {
+        let episodes = &mut self.slots[reset.slot];
+        if reset.seed.is_some() || reset.distributions.is_some() {
+            episodes.begin_trial(reset.seed, reset.distributions.as_deref(), reset.state.as_deref());
+        } else {
+            episodes.begin(reset.state.as_deref());
+        }
+        self.note_start(reset.slot);
+        self.observe(reset.slot);
+    }
+
+    fn restore(&mut self, entries: &[(usize, Bytes)]) {
+        self.backups.clear();
+        for (slot, snapshot) in entries {
+            self.backups.push((*slot, self.slots[*slot].snapshot()));
+            if let Err(error) = self.slots[*slot].restore(snapshot) {
+                self.failure = Some(error);
+                return;
+            }
+            self.observe(*slot);
+        }
+    }
+
+    fn roll_back(&mut self) {
+        for (slot, snapshot) in std::mem::take(&mut self.backups) {
+            self.failure = self.slots[slot].restore(&snapshot).err();
+            self.observe(slot);
+        }
+    }
+
+    fn note_start(&mut self, slot: usize) {
+        // Without receipts clients count episodes themselves, and an id would cost every reset a message.
+        if self.receipts {
+            self.started.push(((self.first_slot + slot) as u32, self.slots[slot].started(true)));
+        }
+    }
+
+    fn observe(&mut self, slot: usize) {
+        let n = self.spec.observation.len();
+        self.slots[slot].observe(&mut self.observations[slot * n..][..n]);
+    }
+}

@@ -1,0 +1,213 @@
+//! The worker threads and their queue.
+
+use super::{Error, shard::Shard};
+use std::{
+    collections::VecDeque,
+    io,
+    panic::{AssertUnwindSafe, catch_unwind},
+    sync::{
+        Arc, Condvar, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicBool, AtomicUsize, Ordering},
+    },
+    thread::{self, JoinHandle},
+};
+use tokio::sync::Notify;
+
+/// How often an idle worker offers its core before it sleeps. A sleeping worker costs the next request a wake-up, which
+/// is more than a step of many small environments.
+const YIELDS_BEFORE_SLEEP: usize = 200;
+
+/// Worker threads that step batches, and the count of environments they may hold.
+pub struct Pool {
+    shared: Arc<Shared>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+impl Pool {
+    /// Starts `workers` threads (at least 1) for at most `max_environments` environments at a time.
+    ///
+    /// # Errors
+    /// If the operating system starts no thread.
+    pub fn new(workers: usize, max_environments: usize) -> io::Result<Self> {
+        let shared = Arc::new(Shared {
+            queue: Mutex::new(Queue { jobs: VecDeque::with_capacity(1024), closed: false }),
+            waiting: AtomicUsize::new(0),
+            ready: Condvar::new(),
+            used: AtomicUsize::new(0),
+            max_environments,
+        });
+        let mut pool = Self { shared, threads: Vec::new() };
+        for i in 0..workers.max(1) {
+            let shared = Arc::clone(&pool.shared);
+            let thread = thread::Builder::new().name(format!("physics-{i}")).spawn(move || shared.work())?;
+            pool.threads.push(thread);
+        }
+        Ok(pool)
+    }
+
+    /// The number of worker threads.
+    pub fn workers(&self) -> usize {
+        self.threads.len()
+    }
+
+    /// The most environments there may be.
+    pub fn max_environments(&self) -> usize {
+        self.shared.max_environments
+    }
+
+    /// Environments in use.
+    pub fn environments(&self) -> usize {
+        self.shared.used.load(Ordering::Relaxed)
+    }
+
+    pub(super) fn queue(&self) -> Arc<Shared> {
+        Arc::clone(&self.shared)
+    }
+}
+
+impl Drop for Pool {
+    fn drop(&mut self) {
+        lock(&self.shared.queue).closed = true;
+        self.shared.ready.notify_all();
+        for thread in self.threads.drain(..) {
+            // A worker never panics: shards run inside catch_unwind.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// What the workers and the batches share.
+pub(super) struct Shared {
+    queue: Mutex<Queue>,
+    /// Jobs in the queue, to be looked at without its lock.
+    waiting: AtomicUsize,
+    ready: Condvar,
+    used: AtomicUsize,
+    max_environments: usize,
+}
+
+struct Queue {
+    jobs: VecDeque<Arc<Job>>,
+    closed: bool,
+}
+
+impl Shared {
+    /// Takes `requested` environments out of the pool's budget until the permit is dropped.
+    pub(super) fn reserve(self: &Arc<Self>, requested: usize) -> Result<Permit, Error> {
+        let limit = self.max_environments;
+        let fits = |used: usize| used.checked_add(requested).filter(|&sum| sum <= limit);
+        match self.used.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits) {
+            Ok(_) => Ok(Permit { shared: Arc::clone(self), count: requested }),
+            Err(used) => Err(Error::Full { requested, used, limit }),
+        }
+    }
+
+    /// Runs every shard of the job on the workers and waits for the last.
+    pub(super) async fn run(&self, job: &Arc<Job>) -> Result<(), Error> {
+        job.next.store(0, Ordering::Relaxed);
+        job.left.store(job.shards.len(), Ordering::Relaxed);
+        self.push(Arc::clone(job)); // its lock publishes the two counters
+        if job.shards.len() > 1 {
+            self.ready.notify_all();
+        }
+        job.done.notified().await;
+        if job.failed.load(Ordering::Relaxed) { Err(Error::Defect) } else { Ok(()) }
+    }
+
+    fn push(&self, job: Arc<Job>) {
+        let mut queue = lock(&self.queue);
+        queue.jobs.push_back(job);
+        self.waiting.store(queue.jobs.len(), Ordering::Release);
+        drop(queue);
+        self.ready.notify_one();
+    }
+
+    fn pop(&self) -> Option<Arc<Job>> {
+        for _ in 0..YIELDS_BEFORE_SLEEP {
+            if self.waiting.load(Ordering::Acquire) > 0 {
+                break;
+            }
+            thread::yield_now();
+        }
+        let mut queue = lock(&self.queue);
+        loop {
+            if let Some(job) = queue.jobs.pop_front() {
+                self.waiting.store(queue.jobs.len(), Ordering::Release);
+                return Some(job);
+            }
+            if queue.closed {
+                return None;
+            }
+            queue = self.ready.wait(queue).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    fn work(&self) {
+        while let Some(job) = self.pop() {
+            let index = job.next.fetch_add(1, Ordering::Relaxed);
+            if index + 1 < job.shards.len() {
+                self.push(Arc::clone(&job));
+            }
+            job.run(index);
+        }
+    }
+}
+
+/// A batch's shards and the state of its current request. A batch has at most one request under way.
+pub(super) struct Job {
+    pub(super) shards: Vec<Mutex<Shard>>,
+    /// The next shard to be taken.
+    next: AtomicUsize,
+    /// Shards that have not finished.
+    left: AtomicUsize,
+    done: Notify,
+    /// The session is gone: what has not run need not.
+    pub(super) abandoned: AtomicBool,
+    failed: AtomicBool,
+    _permit: Permit,
+}
+
+impl Job {
+    pub(super) fn new(shards: Vec<Mutex<Shard>>, permit: Permit) -> Self {
+        Self {
+            shards,
+            next: AtomicUsize::new(0),
+            left: AtomicUsize::new(0),
+            done: Notify::new(),
+            abandoned: AtomicBool::new(false),
+            failed: AtomicBool::new(false),
+            _permit: permit,
+        }
+    }
+
+    fn run(&self, index: usize) {
+        if !self.abandoned.load(Ordering::Relaxed) {
+            let run = AssertUnwindSafe(|| lock(&self.shards[index]).run());
+            if catch_unwind(run).is_err() {
+                tracing::error!(shard = index, "a worker panicked; the batch is lost");
+                self.failed.store(true, Ordering::Relaxed);
+            }
+        }
+        // Release: the session that sees 0 sees what every shard wrote.
+        if self.left.fetch_sub(1, Ordering::AcqRel) == 1 {
+            self.done.notify_one();
+        }
+    }
+}
+
+/// A part of the pool's budget of environments.
+pub(super) struct Permit {
+    shared: Arc<Shared>,
+    count: usize,
+}
+
+impl Drop for Permit {
+    fn drop(&mut self) {
+        self.shared.used.fetch_sub(self.count, Ordering::Relaxed);
+    }
+}
+
+/// Locks, also after a panic: a batch whose worker panicked is refused by its `failed` flag.
+pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
