@@ -87,7 +87,9 @@ impl Model {
                 message.len() as c_int,
             )
         };
-        NonNull::new(pointer).map(|pointer| Self { pointer }).ok_or_else(|| Error::Compile { reason: text_of(&message) })
+        NonNull::new(pointer)
+            .map(|pointer| Self { pointer })
+            .ok_or_else(|| Error::Compile { reason: text_of(&message) })
     }
 
     /// A copy that shares nothing with this model.

@@ -51,7 +51,10 @@ fn fatal_errors_in_several_threads_at_once_are_returned_and_survived() {
                 for _ in 0..50 {
                     barrier.wait();
                     let error = fall(&mut simulation).unwrap_err();
-                    assert!(matches!(&error, Error::Fatal { message } if message.contains("Stack overflow")), "{error}");
+                    assert!(
+                        matches!(&error, Error::Fatal { message } if message.contains("Stack overflow")),
+                        "{error}"
+                    );
                     assert!(simulation.time() > 0.0, "the error comes at the impact");
                     for refused in [simulation.step1(), simulation.step2(), simulation.forward(), simulation.reset()] {
                         assert_eq!(refused, Err(Error::Poisoned));
