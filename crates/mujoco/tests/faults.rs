@@ -1,5 +1,7 @@
 //! What MuJoCo does when it fails: nothing ends the process, nothing is passed over.
 
+#![allow(clippy::unwrap_used)]
+
 use perturb_mujoco::{Error, Model, Simulation, Warning};
 use std::{sync::Barrier, thread};
 
@@ -76,8 +78,8 @@ fn fatal_errors_in_several_threads_at_once_are_returned_and_survived() {
 fn a_bad_state_is_divergence_until_the_next_reset() {
     let not_a_number = |simulation: &mut Simulation| simulation.qpos_mut()[0] = f64::NAN;
     let infinite = |simulation: &mut Simulation| simulation.qvel_mut()[0] = f64::INFINITY;
-    let cases: [(fn(&mut Simulation), Warning); 2] =
-        [(not_a_number, Warning::BadPosition), (infinite, Warning::BadVelocity)];
+    type Spoil = fn(&mut Simulation);
+    let cases: [(Spoil, Warning); 2] = [(not_a_number, Warning::BadPosition), (infinite, Warning::BadVelocity)];
     for (spoil, warning) in cases {
         let mut simulation = simulation(PENDULUM);
         simulation.step1().unwrap();

@@ -1,4 +1,5 @@
 //! What an environment costs in memory. Alone in its process, so that no other test's memory counts.
+#![allow(clippy::unwrap_used)]
 #![cfg(target_os = "linux")]
 
 use perturb_mujoco::{Model, Simulation};
