@@ -11,13 +11,16 @@
 //!
 //! [`config`] is the server's configuration and [`proto`] the generated protocol.
 #![forbid(unsafe_code)]
+#![deny(clippy::disallowed_methods)]
 
 pub mod classic;
+pub mod config;
 pub mod env;
 #[cfg(feature = "mujoco")]
 pub mod locomotion;
 pub mod physics;
 pub mod pool;
+pub mod server;
 
 /// The protocol: generated from `proto/perturb/v1/perturb.proto`, whose comments specify every field.
 #[allow(missing_docs, clippy::all)]

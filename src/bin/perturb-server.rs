@@ -1,2 +1,88 @@
-//! x
-fn main() {}
+//! The program `perturb-server`.
+#![forbid(unsafe_code)]
+
+use clap::Parser;
+use perturb::{
+    config::{Arguments, Config},
+    server::{self, listen::Listener},
+};
+use std::{
+    error::Error,
+    io::{self, IsTerminal, Read},
+    process::ExitCode,
+};
+use tokio::{
+    signal::unix::{SignalKind, signal},
+    sync::oneshot,
+};
+
+fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    let config = match Config::load(&arguments) {
+        Ok(config) => config,
+        Err(error) => {
+            eprintln!("perturb-server: {error}");
+            return ExitCode::from(2);
+        }
+    };
+    tracing_subscriber::fmt()
+        .with_writer(io::stderr)
+        .with_ansi(io::stderr().is_terminal())
+        .with_env_filter(tracing_subscriber::EnvFilter::new(&config.log))
+        .init();
+    match run(&config) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("perturb-server: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(config: &Config) -> Result<(), Box<dyn Error>> {
+    // One thread for I/O: physics has threads of its own, and a hand-over between runtime threads doubles latency.
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let result = runtime.block_on(async {
+        let mut listeners = Vec::new();
+        for address in &config.listen {
+            let listener = Listener::bind(address).await?;
+            println!("listening on {}", listener.address()?);
+            listeners.push(listener);
+        }
+        let shutdown = shutdown(config.exit_with_stdin)?;
+        server::run(listeners, config, shutdown).await?;
+        Ok(())
+    });
+    // Connections that did not close by themselves must not keep the program.
+    runtime.shutdown_background();
+    result
+}
+
+/// Resolves at SIGTERM, SIGINT, or, if asked for, when standard input closes. A second signal exits at once.
+fn shutdown(exit_with_stdin: bool) -> io::Result<impl Future<Output = ()>> {
+    let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
+    let (closed, stdin) = oneshot::channel::<()>();
+    if exit_with_stdin {
+        std::thread::Builder::new().name("stdin".into()).spawn(move || {
+            // Whatever is written there means nothing; its end, or an error, does.
+            let _ = io::copy(&mut io::stdin().lock().by_ref(), &mut io::sink());
+            drop(closed);
+        })?;
+    } else {
+        std::mem::forget(closed);
+    }
+    Ok(async move {
+        tokio::select! {
+            _ = terminate.recv() => {}
+            _ = interrupt.recv() => {}
+            _ = stdin => {}
+        }
+        tokio::spawn(async move {
+            tokio::select! {
+                _ = terminate.recv() => {}
+                _ = interrupt.recv() => {}
+            }
+            std::process::exit(1);
+        });
+    })
+}

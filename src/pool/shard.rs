@@ -119,6 +119,11 @@ impl Shard {
         ended.map(|(slot, _)| self.first_slot + slot)
     }
 
+    /// The distributions in force in a slot of the batch.
+    pub(super) fn distributions(&self, slot: usize) -> &[Distribution] {
+        &self.slots[slot - self.first_slot].settings().distributions
+    }
+
     /// Carries out the command.
     pub(super) fn run(&mut self) {
         self.ended.clear();

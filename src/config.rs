@@ -1,0 +1,217 @@
+//! The server's configuration: defaults, then a TOML file, then environment variables, then flags.
+
+use clap::Parser;
+use config::{Environment, File, FileFormat};
+use serde::{Deserialize, Serialize};
+use std::{fmt, net::SocketAddr, path::PathBuf, time::Duration};
+
+const ENV_PREFIX: &str = "PERTURB_SERVER";
+
+/// Serves reinforcement-learning environments whose physics can be changed, over gRPC.
+///
+/// Every flag may also stand in the TOML file given by --config (`max_envs = 64`) or in an environment variable
+/// (`PERTURB_SERVER_MAX_ENVS=64`). A flag beats a variable, a variable beats the file.
+#[derive(Debug, Default, Parser, Serialize)]
+#[command(name = "perturb-server", version)]
+pub struct Arguments {
+    /// A TOML file with settings.
+    #[arg(long, value_name = "FILE", env = "PERTURB_SERVER_CONFIG")]
+    #[serde(skip)]
+    pub config: Option<PathBuf>,
+    /// Where to listen: unix:/path/to/socket, or tcp://address:port; port 0 takes a free one. Repeatable. The addresses
+    /// in use are printed on standard output. [default: tcp://127.0.0.1:7447]
+    #[arg(long, value_name = "ADDRESS")]
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub listen: Vec<String>,
+    /// Physics threads. [default: one a core]
+    #[arg(long, value_name = "N")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub workers: Option<usize>,
+    /// The most environments, over all sessions. [default: 16384]
+    #[arg(long, value_name = "N")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_envs: Option<usize>,
+    /// The most sessions at a time. [default: 1024]
+    #[arg(long, value_name = "N")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_sessions: Option<usize>,
+    /// The largest request, in bytes. [default: 67108864]
+    #[arg(long, value_name = "BYTES")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_message_bytes: Option<usize>,
+    /// How long running sessions may go on after SIGTERM. [default: 30]
+    #[arg(long, value_name = "SECONDS")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub grace_seconds: Option<u64>,
+    /// Ends sessions that send nothing for so long; 0 = never. [default: 0]
+    #[arg(long, value_name = "SECONDS")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub idle_seconds: Option<u64>,
+    /// How often a silent connection is asked whether it lives; one that does not answer within this time is closed and
+    /// its environments are freed. [default: 20]
+    #[arg(long, value_name = "SECONDS")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub keepalive_seconds: Option<u64>,
+    /// What to log on standard error: error, warn, info, debug, trace, or a filter such as perturb=debug.
+    /// [default: info]
+    #[arg(long, value_name = "FILTER")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub log: Option<String>,
+    /// Shut down when standard input closes: a program that starts a server through a pipe takes it along, however it
+    /// ends itself.
+    #[arg(long)]
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub exit_with_stdin: bool,
+}
+
+/// The configuration in force, validated.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// Where to listen, at least one.
+    pub listen: Vec<Address>,
+    /// Physics threads, 1 … 1024.
+    pub workers: usize,
+    /// The most environments, over all sessions, 1 … 2^24.
+    pub max_envs: usize,
+    /// The most sessions at a time, at least 1.
+    pub max_sessions: usize,
+    /// The largest request in bytes, at least 1024.
+    pub max_message_bytes: usize,
+    /// How long running sessions may go on after SIGTERM, s.
+    pub grace_seconds: u64,
+    /// Ends sessions that send nothing for so long, s; 0 = never.
+    pub idle_seconds: u64,
+    /// How often a silent connection is asked whether it lives, s, at least 1.
+    pub keepalive_seconds: u64,
+    /// The log filter.
+    pub log: String,
+    /// Whether to shut down when standard input closes.
+    pub exit_with_stdin: bool,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            listen: vec![Address::Tcp(SocketAddr::from(([127, 0, 0, 1], 7447)))],
+            workers: std::thread::available_parallelism().map_or(1, usize::from),
+            max_envs: 16_384,
+            max_sessions: 1024,
+            max_message_bytes: 64 << 20,
+            grace_seconds: 30,
+            idle_seconds: 0,
+            keepalive_seconds: 20,
+            log: "info".into(),
+            exit_with_stdin: false,
+        }
+    }
+}
+
+/// Where to listen.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Deserialize)]
+#[serde(try_from = "String")]
+pub enum Address {
+    /// A TCP address and port; port 0 = any free one.
+    Tcp(SocketAddr),
+    /// The path of a Unix socket.
+    Unix(PathBuf),
+}
+
+impl TryFrom<String> for Address {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        if let Some(path) = text.strip_prefix("unix:") {
+            let path = path.strip_prefix("//").unwrap_or(path);
+            if !path.is_empty() {
+                return Ok(Self::Unix(path.into()));
+            }
+        } else if let Ok(address) = text.strip_prefix("tcp://").unwrap_or(&text).parse() {
+            return Ok(Self::Tcp(address));
+        }
+        Err(format!("{text:?} is no address to listen at; expected tcp://127.0.0.1:7447 or unix:/path/to/socket"))
+    }
+}
+
+impl fmt::Display for Address {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Tcp(address) => write!(f, "http://{address}"),
+            Self::Unix(path) => write!(f, "unix:{}", path.display()),
+        }
+    }
+}
+
+/// Why a configuration was refused.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// A source cannot be read, or has an unknown key or a value of a wrong type.
+    #[error("the configuration cannot be read: {0}; --help lists the settings")]
+    Source(#[from] config::ConfigError),
+    /// A value is out of its range.
+    #[error("{key} is {got}; expected {expected}")]
+    Value {
+        /// The setting.
+        key: &'static str,
+        /// What came.
+        got: String,
+        /// What would be right.
+        expected: &'static str,
+    },
+}
+
+impl Config {
+    /// Merges defaults, file, environment variables and flags, and validates the result.
+    ///
+    /// # Errors
+    /// [`Error`]: nothing has been bound or started.
+    pub fn load(arguments: &Arguments) -> Result<Self, Error> {
+        let mut builder = config::Config::builder();
+        if let Some(path) = &arguments.config {
+            builder = builder.add_source(File::from(path.as_path()).format(FileFormat::Toml));
+        }
+        let variables = Environment::with_prefix(ENV_PREFIX)
+            .prefix_separator("_")
+            .try_parsing(true)
+            .list_separator(",")
+            .with_list_parse_key("listen");
+        // The variable that names the file is no setting.
+        let variables = variables.source(Some(
+            std::env::vars().filter(|(name, _)| !name.eq_ignore_ascii_case("PERTURB_SERVER_CONFIG")).collect(),
+        ));
+        let merged = builder.add_source(variables).add_source(config::Config::try_from(arguments)?).build()?;
+        merged.try_deserialize::<Self>()?.validated()
+    }
+
+    fn validated(self) -> Result<Self, Error> {
+        let refuse = |key, got: &dyn ToString, expected| Err(Error::Value { key, got: got.to_string(), expected });
+        if self.listen.is_empty() {
+            return refuse("listen", &"empty", "at least one address");
+        }
+        if !(1..=1024).contains(&self.workers) {
+            return refuse("workers", &self.workers, "1 … 1024");
+        }
+        if !(1..=1 << 24).contains(&self.max_envs) {
+            return refuse("max_envs", &self.max_envs, "1 … 16777216");
+        }
+        if self.max_sessions == 0 {
+            return refuse("max_sessions", &self.max_sessions, "at least 1");
+        }
+        if self.max_message_bytes < 1024 {
+            return refuse("max_message_bytes", &self.max_message_bytes, "at least 1024");
+        }
+        if self.keepalive_seconds == 0 {
+            return refuse("keepalive_seconds", &self.keepalive_seconds, "at least 1");
+        }
+        if tracing_subscriber::EnvFilter::try_new(&self.log).is_err() {
+            return refuse("log", &self.log, "error, warn, info, debug, trace, or a filter such as perturb=debug");
+        }
+        Ok(self)
+    }
+
+    /// The grace period.
+    pub fn grace(&self) -> Duration {
+        Duration::from_secs(self.grace_seconds)
+    }
+}

@@ -1,0 +1,283 @@
+//! Between the protocol and the domain. All validation of what clients send is here: what leaves this file is legal.
+
+use super::status::Refusal;
+use crate::{
+    env::{self, ActionSpace, Channel, EnvironmentSpec, EpisodeEnd, EpisodeId, EpisodeStart, Receipt, Settings},
+    physics::{Distribution, Interval, Parameter, Version, resolve},
+    pool::{Autoreset, BatchSettings, ResetEntry, Stepped},
+    proto,
+};
+use bytes::Bytes;
+use std::{collections::HashMap, sync::Arc};
+
+/// Checks an `open`.
+pub fn open(request: proto::Open) -> Result<BatchSettings, Refusal> {
+    let spec = env::find(&request.environment)?;
+    let version = match request.version() {
+        proto::Version::Default => Version::Default,
+        proto::Version::Random => Version::Random,
+        proto::Version::Extreme => Version::Extreme,
+        proto::Version::Unspecified => {
+            let expected = "VERSION_DEFAULT (1), VERSION_RANDOM (2) or VERSION_EXTREME (3)";
+            return Err(Refusal::value("open.version", request.version, expected));
+        }
+    };
+    let autoreset = match request.autoreset_mode() {
+        proto::AutoresetMode::NextStep => Autoreset::NextStep,
+        proto::AutoresetMode::SameStep => Autoreset::SameStep,
+        proto::AutoresetMode::Disabled => Autoreset::Disabled,
+        proto::AutoresetMode::Unspecified => {
+            let expected = "AUTORESET_MODE_NEXT_STEP (1), _SAME_STEP (2) or _DISABLED (3)";
+            return Err(Refusal::value("open.autoreset_mode", request.autoreset_mode, expected));
+        }
+    };
+    if request.batch_size == 0 {
+        return Err(Refusal::value("open.batch_size", 0, "at least 1"));
+    }
+    let first = request.first_environment_index;
+    if first.checked_add(request.batch_size - 1).is_none() {
+        let got = format!("{first} for a batch of {}", request.batch_size);
+        return Err(Refusal::value("open.first_environment_index", got, "the last environment's index below 2^32"));
+    }
+    let mut distributions: Vec<_> = spec.parameters.iter().map(|p| p.distribution(version)).collect();
+    override_parameters(spec, &mut distributions, &request.parameters)?;
+    Ok(BatchSettings {
+        spec,
+        size: request.batch_size as usize,
+        episodes: Settings {
+            seed: request.seed,
+            environment_index: first,
+            distributions,
+            episodes_per_trial: request.episodes_per_trial.max(1),
+        },
+        autoreset,
+        receipts: request.receipts,
+        reward_terms: request.reward_terms,
+    })
+}
+
+fn override_parameters(
+    spec: &'static EnvironmentSpec,
+    base: &mut [Distribution],
+    parameters: &HashMap<String, proto::Distribution>,
+) -> Result<(), Refusal> {
+    // In order of names, so that the same request always gets the same refusal.
+    let mut parameters: Vec<_> = parameters.iter().collect();
+    parameters.sort_by_key(|(name, _)| *name);
+    let mut overrides = Vec::with_capacity(parameters.len());
+    for (name, distribution) in parameters {
+        let intervals: Vec<_> = distribution.intervals.iter().map(|i| Interval::new(i.low, i.high)).collect();
+        overrides.push((name.as_str(), Distribution::union(name, &intervals)?));
+    }
+    Ok(resolve(spec, base, overrides)?)
+}
+
+/// Checks a step's actions for a batch of `size` environments.
+pub fn actions(spec: &EnvironmentSpec, size: usize, actions: &Bytes) -> Result<(), Refusal> {
+    const FIELD: &str = "step.actions";
+    let (element, width) = match spec.action {
+        ActionSpace::Discrete(_) => ("int32 [N]", 1),
+        ActionSpace::Continuous(channels) => ("float32 [N, A]", channels.len()),
+    };
+    if actions.len() != 4 * width * size {
+        let expected = format!("{} bytes: {element} with N = {size}, A = {width}", 4 * width * size);
+        return Err(Refusal::value(FIELD, format!("{} bytes", actions.len()), expected));
+    }
+    let words = actions.as_chunks::<4>().0;
+    match spec.action {
+        ActionSpace::Discrete(names) => {
+            let legal = |word: &[u8; 4]| (0..names.len() as i32).contains(&i32::from_le_bytes(*word));
+            if let Some(slot) = words.iter().position(|word| !legal(word)) {
+                let got = format!("{} in slot {slot}", i32::from_le_bytes(words[slot]));
+                return Err(Refusal::value(FIELD, got, format!("a choice in 0 … {}", names.len() - 1)));
+            }
+        }
+        ActionSpace::Continuous(_) => {
+            if let Some(i) = words.iter().position(|word| !f32::from_le_bytes(*word).is_finite()) {
+                let got = format!("{} in slot {}, entry {}", f32::from_le_bytes(words[i]), i / width, i % width);
+                return Err(Refusal::value(FIELD, got, "finite numbers"));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The slots that a mask selects.
+pub fn mask(field: &'static str, size: usize, mask: &[u8]) -> Result<Vec<usize>, Refusal> {
+    if mask.is_empty() {
+        return Ok((0..size).collect());
+    }
+    if mask.len() != size {
+        let expected = format!("one byte for each of the {size} environments, or none for all");
+        return Err(Refusal::value(field, format!("{} bytes", mask.len()), expected));
+    }
+    if let Some(slot) = mask.iter().position(|&byte| byte > 1) {
+        return Err(Refusal::value(field, format!("{} in slot {slot}", mask[slot]), "0 or 1"));
+    }
+    Ok((0..size).filter(|&slot| mask[slot] == 1).collect())
+}
+
+/// Checks a `reset` of a batch. `in_force` tells the distributions of a slot.
+pub fn reset(
+    settings: &BatchSettings,
+    request: proto::Reset,
+    in_force: impl Fn(usize) -> Vec<Distribution>,
+) -> Result<Vec<ResetEntry>, Refusal> {
+    let spec = settings.spec;
+    let slots = mask("reset.mask", settings.size, &request.mask)?;
+    if !request.seeds.is_empty() && request.seeds.len() != slots.len() {
+        let expected = format!("one for each of the {} selected environments, or none", slots.len());
+        return Err(Refusal::value("reset.seeds", format!("{} seeds", request.seeds.len()), expected));
+    }
+    let mut states = states(spec, &request.states, slots.len())?.into_iter();
+    // Neighbours mostly share their distributions, which are then overridden once.
+    let mut edited: (Vec<Distribution>, Arc<[Distribution]>) = (Vec::new(), Arc::new([]));
+    let mut entries = Vec::with_capacity(slots.len());
+    for (i, slot) in slots.into_iter().enumerate() {
+        let mut distributions = None;
+        if !request.parameters.is_empty() {
+            let old = in_force(slot);
+            if old != edited.0 {
+                let mut new = old.clone();
+                override_parameters(spec, &mut new, &request.parameters)?;
+                edited = (old, new.into());
+            }
+            distributions = Some(Arc::clone(&edited.1));
+        }
+        entries.push(ResetEntry { slot, seed: request.seeds.get(i).copied(), distributions, state: states.next() });
+    }
+    Ok(entries)
+}
+
+fn states(spec: &EnvironmentSpec, bytes: &Bytes, selected: usize) -> Result<Vec<Vec<f64>>, Refusal> {
+    const FIELD: &str = "reset.states";
+    if bytes.is_empty() {
+        return Ok(Vec::new());
+    }
+    let n = spec.state.len();
+    if bytes.len() != 8 * n * selected {
+        let expected = format!("{} bytes: float64 [M, S] with M = {selected}, S = {n}", 8 * n * selected);
+        return Err(Refusal::value(FIELD, format!("{} bytes", bytes.len()), expected));
+    }
+    let numbers: Vec<f64> = bytes.as_chunks::<8>().0.iter().map(|word| f64::from_le_bytes(*word)).collect();
+    for (i, &x) in numbers.iter().enumerate() {
+        let Channel { name, unit, low, high } = spec.state[i % n];
+        if !x.is_finite() || x < low || x > high {
+            let got = format!("{x} {unit} for {name} in row {}", i / n);
+            return Err(Refusal::value(FIELD, got, format!("a finite number within [{low}, {high}]")));
+        }
+    }
+    Ok(numbers.chunks_exact(n).map(<[f64]>::to_vec).collect())
+}
+
+/// Pairs a restore's snapshots with their slots.
+pub fn restore(size: usize, request: proto::Restore) -> Result<Vec<(usize, Bytes)>, Refusal> {
+    let slots = mask("restore.mask", size, &request.mask)?;
+    if request.snapshots.len() != slots.len() {
+        let got = format!("{} snapshots", request.snapshots.len());
+        let expected = format!("one for each of the {} selected environments", slots.len());
+        return Err(Refusal::value("restore.snapshots", got, expected));
+    }
+    Ok(slots.into_iter().zip(request.snapshots).collect())
+}
+
+/// An environment's entry in the catalogue.
+pub fn environment(spec: &EnvironmentSpec, model_hash: &str) -> proto::Environment {
+    let quantity = |q: &env::Quantity| proto::Quantity { name: q.name.into(), unit: q.unit.into() };
+    let term = |t: &env::RewardTerm| proto::RewardTerm { name: t.name.into(), description: t.description.into() };
+    proto::Environment {
+        name: spec.name.into(),
+        revision: spec.revision,
+        description: spec.description.into(),
+        parameters: spec.parameters.iter().map(parameter).collect(),
+        observation: channels(spec.observation),
+        action: Some(action_space(spec.action)),
+        state: channels(spec.state),
+        reward_terms: spec.reward_terms.iter().map(term).collect(),
+        applied: spec.applied.iter().map(quantity).collect(),
+        step_limit: spec.step_limit,
+        control_timestep: spec.control_timestep,
+        success: Some(proto::Success { description: spec.success_description.into(), steps: spec.success.steps() }),
+        model_hash: model_hash.into(),
+    }
+}
+
+fn channels(channels: &[Channel]) -> Vec<proto::Channel> {
+    let channel = |c: &Channel| proto::Channel { name: c.name.into(), unit: c.unit.into(), low: c.low, high: c.high };
+    channels.iter().map(channel).collect()
+}
+
+fn parameter(p: &Parameter) -> proto::Parameter {
+    let set = |version| {
+        let distribution = p.distribution(version);
+        let interval = |i: &Interval| proto::Interval { low: i.low, high: i.high };
+        Some(proto::Distribution { intervals: distribution.intervals().iter().map(interval).collect() })
+    };
+    proto::Parameter {
+        name: p.name.into(),
+        unit: p.unit.into(),
+        description: p.description.into(),
+        default_value: p.default,
+        low: p.bounds.low,
+        high: p.bounds.high,
+        random: set(Version::Random),
+        extreme: set(Version::Extreme),
+    }
+}
+
+fn action_space(space: ActionSpace) -> proto::ActionSpace {
+    use proto::action_space::Kind;
+    let kind = match space {
+        ActionSpace::Discrete(names) => {
+            Kind::Discrete(proto::Discrete { names: names.iter().map(|name| (*name).into()).collect() })
+        }
+        ActionSpace::Continuous(list) => Kind::Continuous(proto::Continuous { channels: channels(list) }),
+    };
+    proto::ActionSpace { kind: Some(kind) }
+}
+
+/// A step's outcome.
+pub fn stepped(stepped: Stepped) -> proto::Stepped {
+    proto::Stepped {
+        observations: stepped.observations,
+        rewards: stepped.rewards,
+        terminated: stepped.terminated,
+        truncated: stepped.truncated,
+        final_observations: stepped.final_observations,
+        ended: stepped.ended.into_iter().map(ended).collect(),
+        started: started(stepped.started),
+        reward_terms: stepped.reward_terms,
+    }
+}
+
+/// Episodes that began.
+pub fn started(episodes: Vec<(u32, EpisodeStart)>) -> Vec<proto::EpisodeStart> {
+    let start = |(slot, start): (u32, EpisodeStart)| proto::EpisodeStart {
+        slot,
+        episode: Some(episode(start.id)),
+        receipt: start.receipt.map(receipt),
+    };
+    episodes.into_iter().map(start).collect()
+}
+
+fn ended((slot, end): (u32, EpisodeEnd)) -> proto::EpisodeEnd {
+    proto::EpisodeEnd {
+        slot,
+        episode: Some(episode(end.id)),
+        r#return: end.total_reward,
+        length: end.length,
+        success: end.success,
+        diverged: end.diverged,
+        receipt: end.receipt.map(receipt),
+    }
+}
+
+fn episode(id: EpisodeId) -> proto::Episode {
+    let EpisodeId { environment_index, trial_index, episode_index, episode_in_trial } = id;
+    proto::Episode { environment_index, trial_index, episode_index, episode_in_trial }
+}
+
+fn receipt(receipt: Receipt) -> proto::Receipt {
+    let Receipt { requested, applied, model_hash } = receipt;
+    proto::Receipt { requested, applied, model_hash }
+}

@@ -1,0 +1,67 @@
+//! Shutting down in order: no new sessions, a grace period for running ones, then the end.
+
+use tokio::sync::watch;
+
+/// How far the shutdown is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Phase {
+    /// Serving.
+    Running,
+    /// New sessions are refused, running ones go on.
+    Draining,
+    /// Running sessions are ended.
+    Closed,
+}
+
+/// A view of the shutdown. Those made by [`Drain::enter`] count as running sessions.
+#[derive(Clone)]
+pub struct Drain {
+    phase: watch::Receiver<Phase>,
+    /// Held by sessions: when the last clone is gone, no session runs.
+    _session: Option<watch::Receiver<()>>,
+    sessions: watch::Sender<()>,
+}
+
+/// Drives the shutdown.
+pub struct Controller {
+    phase: watch::Sender<Phase>,
+    sessions: watch::Sender<()>,
+}
+
+impl Controller {
+    /// A controller in [`Phase::Running`], and a view of it.
+    pub fn new() -> (Self, Drain) {
+        let (phase, view) = watch::channel(Phase::Running);
+        let sessions = watch::Sender::new(());
+        (Self { phase, sessions: sessions.clone() }, Drain { phase: view, _session: None, sessions })
+    }
+
+    /// Moves on to a phase.
+    pub fn set(&self, phase: Phase) {
+        self.phase.send_replace(phase);
+    }
+
+    /// Waits until no session runs.
+    pub async fn idle(&self) {
+        self.sessions.closed().await;
+    }
+}
+
+impl Drain {
+    /// A view for a session, which counts as running as long as it holds it.
+    pub fn enter(&self) -> Self {
+        Self { _session: Some(self.sessions.subscribe()), ..self.clone() }
+    }
+
+    /// How far the shutdown is.
+    pub fn phase(&self) -> Phase {
+        *self.phase.borrow()
+    }
+
+    /// Waits for [`Phase::Closed`].
+    pub async fn closed(&mut self) {
+        if self.phase.wait_for(|phase| *phase == Phase::Closed).await.is_err() {
+            std::future::pending().await // the controller is gone: nobody will close
+        }
+    }
+}

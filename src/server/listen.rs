@@ -1,0 +1,60 @@
+//! Binding addresses: TCP ports and Unix sockets.
+
+use crate::config::Address;
+use std::{
+    io::{self, ErrorKind},
+    os::unix::{fs::FileTypeExt, net::UnixStream as StdUnixStream},
+    path::PathBuf,
+};
+use tokio::net::{TcpListener, UnixListener};
+
+/// A bound address.
+pub enum Listener {
+    /// A TCP port.
+    Tcp(TcpListener),
+    /// A Unix socket, whose file is removed when this is dropped.
+    Unix(UnixListener, SocketFile),
+}
+
+/// Removes a socket's file when it is dropped.
+pub struct SocketFile(PathBuf);
+
+impl Drop for SocketFile {
+    fn drop(&mut self) {
+        // Gone already is as good.
+        let _ = std::fs::remove_file(&self.0);
+    }
+}
+
+impl Listener {
+    /// Binds an address. A Unix socket that a dead server left behind is replaced.
+    ///
+    /// # Errors
+    /// If the address is in use or may not be bound; the message names it.
+    pub async fn bind(address: &Address) -> io::Result<Self> {
+        let explain = |error: io::Error| io::Error::new(error.kind(), format!("cannot listen at {address}: {error}"));
+        match address {
+            Address::Tcp(tcp) => Ok(Self::Tcp(TcpListener::bind(tcp).await.map_err(explain)?)),
+            Address::Unix(path) => {
+                let is_socket = std::fs::symlink_metadata(path).is_ok_and(|m| m.file_type().is_socket());
+                let refused = |e: io::Error| e.kind() == ErrorKind::ConnectionRefused;
+                if is_socket && StdUnixStream::connect(path).is_err_and(refused) {
+                    std::fs::remove_file(path).map_err(explain)?;
+                }
+                let listener = UnixListener::bind(path).map_err(explain)?;
+                Ok(Self::Unix(listener, SocketFile(path.clone())))
+            }
+        }
+    }
+
+    /// The address that was bound, with the port that was found.
+    ///
+    /// # Errors
+    /// If the operating system does not tell the port.
+    pub fn address(&self) -> io::Result<Address> {
+        match self {
+            Self::Tcp(listener) => listener.local_addr().map(Address::Tcp),
+            Self::Unix(_, file) => Ok(Address::Unix(file.0.clone())),
+        }
+    }
+}

@@ -1,0 +1,126 @@
+//! The server: gRPC in, gRPC out.
+//!
+//! - [`service`]: one short method for each call, and the transport of a session.
+//! - [`session`]: the legal order of a session's requests.
+//! - [`convert`]: the protocol to the domain and back, with all validation.
+//! - [`status`]: every refusal, and its gRPC code.
+//! - [`listen`] and [`drain`]: how it begins and how it ends.
+
+pub mod convert;
+pub mod drain;
+pub mod listen;
+pub mod service;
+pub mod session;
+pub mod status;
+
+use crate::{
+    config::Config,
+    env,
+    pool::Pool,
+    proto::{self, perturb_server::PerturbServer},
+};
+use drain::{Controller, Phase};
+use listen::Listener;
+use service::Service;
+use std::{future::Future, io, sync::Arc, time::Duration};
+use tokio_stream::wrappers::UnixListenerStream;
+use tonic::transport::{Server, server::TcpIncoming};
+use tonic_health::ServingStatus;
+
+/// A session's reply to a large batch should not wait for the window: 4 MiB.
+const WINDOW: u32 = 4 << 20;
+/// How long connections may take to notice the end.
+const FAREWELL: Duration = Duration::from_secs(1);
+
+/// Why the server stopped.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// An environment cannot be built.
+    #[error(transparent)]
+    Environment(#[from] env::Error),
+    /// The operating system refused something.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    /// A connection could not be served.
+    #[error("the transport failed: {0}")]
+    Transport(#[from] tonic::transport::Error),
+    /// The descriptors for reflection cannot be read.
+    #[error("reflection failed: {0}")]
+    Reflection(#[from] tonic_reflection::server::Error),
+}
+
+/// Serves on the listeners until `shutdown` resolves; then drains: new sessions are refused, running ones may go on for
+/// the grace period, and connections are closed. Must run on a tokio runtime; a current-thread one is fastest.
+///
+/// # Errors
+/// [`Error`], before anything is served, or when a listener fails.
+pub async fn run(listeners: Vec<Listener>, config: &Config, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
+    let catalogue = catalogue()?;
+    let pool = Arc::new(Pool::new(config.workers, config.max_envs)?);
+    let (controller, drain) = Controller::new();
+    let idle = (config.idle_seconds > 0).then(|| Duration::from_secs(config.idle_seconds));
+    let service = Service::new(pool, catalogue, config.max_sessions, idle, drain.clone());
+    let service = PerturbServer::new(service)
+        .max_decoding_message_size(config.max_message_bytes)
+        .max_encoding_message_size(usize::MAX);
+    let (health, health_service) = tonic_health::server::health_reporter();
+    health.set_serving::<PerturbServer<Service>>().await;
+    let reflection = || {
+        tonic_reflection::server::Builder::configure()
+            .register_encoded_file_descriptor_set(proto::DESCRIPTORS)
+            .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+    };
+    let keepalive = Duration::from_secs(config.keepalive_seconds);
+    let router = Server::builder()
+        .http2_keepalive_interval(Some(keepalive))
+        .http2_keepalive_timeout(Some(keepalive))
+        .initial_stream_window_size(WINDOW)
+        .initial_connection_window_size(WINDOW)
+        .add_service(service)
+        .add_service(health_service)
+        .add_service(reflection().build_v1()?)
+        .add_service(reflection().build_v1alpha()?);
+
+    let mut servers = tokio::task::JoinSet::new();
+    for listener in listeners {
+        let (router, mut closed) = (router.clone(), drain.clone());
+        servers.spawn(async move {
+            let end = async move { closed.closed().await };
+            match listener {
+                Listener::Tcp(listener) => {
+                    let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
+                    router.serve_with_incoming_shutdown(incoming, end).await
+                }
+                Listener::Unix(listener, _file) => {
+                    router.serve_with_incoming_shutdown(UnixListenerStream::new(listener), end).await
+                }
+            }
+        });
+    }
+    tokio::select! {
+        () = shutdown => {}
+        // A listener ends by itself only if it fails.
+        Some(ended) = servers.join_next() => return Ok(ended.map_err(io::Error::other)??),
+    }
+
+    tracing::info!(grace_seconds = config.grace_seconds, "shutting down: no new sessions");
+    controller.set(Phase::Draining);
+    health.set_not_serving::<PerturbServer<Service>>().await;
+    health.set_service_status("", ServingStatus::NotServing).await;
+    if tokio::time::timeout(config.grace(), controller.idle()).await.is_err() {
+        tracing::warn!("the grace period is over: ending the sessions that still run");
+    }
+    controller.set(Phase::Closed);
+    let farewell = async { while servers.join_next().await.is_some() {} };
+    if tokio::time::timeout(FAREWELL, farewell).await.is_err() {
+        tracing::debug!("some connections did not close by themselves");
+    }
+    Ok(())
+}
+
+/// The catalogue as the protocol tells it. Builds each environment once, so that a model that cannot be loaded is known
+/// before anything is served.
+fn catalogue() -> Result<Arc<[proto::Environment]>, env::Error> {
+    env::specs().map(|spec| Ok(convert::environment(spec, env::make(spec.name)?.model_hash()))).collect()
+}

@@ -1,0 +1,90 @@
+//! Every refusal, and the only place that turns one into a gRPC code.
+
+use crate::{env, pool, proto};
+use tonic::{Code, Status};
+
+/// Why a request was refused. It changed nothing.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Refusal {
+    /// The environments refuse it.
+    #[error(transparent)]
+    Environment(#[from] env::Error),
+    /// The pool refuses it.
+    #[error(transparent)]
+    Pool(#[from] pool::Error),
+    /// A field has a value that it cannot have.
+    #[error("{field} is {got}; expected {expected}")]
+    Value {
+        /// The field, by its path in the protocol.
+        field: &'static str,
+        /// What came.
+        got: String,
+        /// What would be right, and what to do.
+        expected: String,
+    },
+    /// A request other than `open` on a session that is not open.
+    #[error("{request} came before open; send open first")]
+    NotOpen {
+        /// The request.
+        request: &'static str,
+    },
+    /// A second `open`.
+    #[error("open came on a session that is open already; use reset, or start another session")]
+    AlreadyOpen,
+    /// The server is full of sessions.
+    #[error("all of this server's {limit} sessions are in use; close one, or try again later")]
+    TooManySessions {
+        /// The most there may be.
+        limit: usize,
+    },
+    /// The session sent nothing for too long.
+    #[error("the session was idle for {seconds} s, the most this server allows; start a new one")]
+    Idle {
+        /// The limit.
+        seconds: u64,
+    },
+    /// The server takes no new work.
+    #[error("this server is shutting down; use another, or try again later")]
+    Draining,
+}
+
+impl Refusal {
+    /// A [`Refusal::Value`].
+    pub fn value(field: &'static str, got: impl ToString, expected: impl ToString) -> Self {
+        Self::Value { field, got: got.to_string(), expected: expected.to_string() }
+    }
+
+    /// The gRPC code of this refusal.
+    pub fn code(&self) -> Code {
+        match self {
+            Self::Environment(error) | Self::Pool(pool::Error::Environment(error)) => match error {
+                env::Error::UnknownEnvironment { .. } | env::Error::UnknownParameter { .. } => Code::NotFound,
+                env::Error::Model { .. } => Code::Internal,
+                _ => Code::InvalidArgument,
+            },
+            Self::Pool(pool::Error::Full { .. }) | Self::TooManySessions { .. } => Code::ResourceExhausted,
+            Self::Pool(pool::Error::Ended { .. }) | Self::NotOpen { .. } | Self::AlreadyOpen => {
+                Code::FailedPrecondition
+            }
+            Self::Pool(pool::Error::Defect) => Code::Internal,
+            Self::Value { .. } => Code::InvalidArgument,
+            Self::Idle { .. } => Code::DeadlineExceeded,
+            Self::Draining => Code::Unavailable,
+        }
+    }
+}
+
+/// The refusal in-band: the session lives on.
+impl From<Refusal> for proto::Error {
+    fn from(refusal: Refusal) -> Self {
+        Self { code: refusal.code() as i32, message: refusal.to_string() }
+    }
+}
+
+/// The refusal as the end of a call.
+impl From<Refusal> for Status {
+    fn from(refusal: Refusal) -> Self {
+        Status::new(refusal.code(), refusal.to_string())
+    }
+}
