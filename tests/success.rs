@@ -7,7 +7,7 @@ use common::{episodes, observe, settings, step};
 use perturb::{
     env::{
         self, Action, ActionSpace, Channel, Environment, EnvironmentSpec, EpisodeEnd, Episodes, Error, Outcome,
-        RewardTerm, Stream, SuccessRule, Transition,
+        Purpose, RewardTerm, Stream, SuccessRule, Transition,
     },
     physics::Version,
 };
@@ -147,10 +147,18 @@ fn divergence_is_reported_with_the_episode() {
 #[test]
 fn a_state_beyond_f32_ends_the_episode_with_the_last_one_that_was_not() {
     for (name, state) in [("CartPole", [0.0, 0.0, 0.1, 1e30]), ("Acrobot", [0.1, 0.1, 1e300, 1e300])] {
-        let (outcome, end) = drive(name, &state, |_, _| 1);
-        assert!(end.diverged && outcome.terminated && !end.success, "{name}");
-        assert_eq!(end.length, 1, "{name}");
-        assert!(outcome.reward.is_finite(), "{name}");
+        let mut environment = env::make(name).unwrap();
+        environment.reset_to(&state);
+        let mut terms = vec![f64::NAN; 1];
+        let transition = environment.step(Action::Discrete(1), &mut terms);
+        assert!(transition.diverged && transition.terminated, "{name}");
+        assert!(terms[0].is_finite(), "{name}");
+        let mut kept = Vec::new();
+        environment.save(&mut kept);
+        assert_eq!(kept, state, "{name}");
+
+        let (_, end) = drive(name, &state, |_, _| 1);
+        assert!(end.diverged && !end.success && end.length == 1, "{name}");
     }
 }
 
@@ -277,4 +285,73 @@ fn pendulum_succeeds_if_the_last_100_steps_were_near_upright() {
         entries.push(held);
     }
     assert!(entries.contains(&99) && entries.contains(&100), "both sides were seen: {entries:?}");
+}
+
+// The predicates themselves, on both sides of their thresholds.
+
+/// Steps from states drawn between `low` and `high` and compares what the environment says of the new state with what
+/// `expected` does: (terminated, goal). Some new states lie within 1e-3 of the threshold, on either side: `margin` is
+/// positive where the goal holds.
+fn check_goal(
+    name: &str,
+    low: &[f64],
+    high: &[f64],
+    expected: impl Fn(&[f64]) -> (bool, bool),
+    margin: impl Fn(&[f64]) -> f64,
+) {
+    let mut environment = env::make(name).unwrap();
+    let mut stream = Stream::new(1, 0, Purpose::InitialState, 0);
+    let mut terms = vec![0.0; environment.spec().reward_terms.len()];
+    let mut near = [0, 0];
+    for _ in 0..100_000 {
+        let state: Vec<f64> = low.iter().zip(high).map(|(low, high)| stream.uniform(*low, *high)).collect();
+        environment.reset_to(&state);
+        let action = match environment.spec().action {
+            ActionSpace::Discrete(_) => Action::Discrete(1),
+            ActionSpace::Continuous(_) => Action::Continuous(&[0.0]),
+        };
+        let transition = environment.step(action, &mut terms);
+        let mut state = Vec::new();
+        environment.save(&mut state);
+        assert_eq!((transition.terminated, transition.goal), expected(&state), "{name} at {state:?}");
+        if margin(&state).abs() < 1e-3 {
+            near[usize::from(margin(&state) > 0.0)] += 1;
+        }
+    }
+    assert!(near[0] > 10 && near[1] > 10, "{name}: {near:?} states close to the threshold");
+}
+
+#[test]
+fn cart_pole_ends_beyond_2_4_m_or_12_degrees() {
+    let inside = |s: &[f64]| s[0].abs() <= 2.4 && s[2].abs() <= 12.0_f64.to_radians();
+    let angle = |s: &[f64]| 12.0_f64.to_radians() - s[2].abs();
+    check_goal("CartPole", &[-0.1, -1.0, -0.25, -1.0], &[0.1, 1.0, 0.25, 1.0], |s| (!inside(s), inside(s)), angle);
+    let position = |s: &[f64]| 2.4 - s[0].abs();
+    check_goal("CartPole", &[2.3, -1.0, -0.1, -1.0], &[2.5, 1.0, 0.1, 1.0], |s| (!inside(s), inside(s)), position);
+    check_goal("CartPole", &[-2.5, -1.0, -0.1, -1.0], &[-2.3, 1.0, 0.1, 1.0], |s| (!inside(s), inside(s)), position);
+}
+
+#[test]
+fn mountain_car_ends_at_0_5_m_unless_it_moves_back() {
+    let there = |s: &[f64]| s[0] >= 0.5 && s[1] >= 0.0;
+    check_goal("MountainCar", &[0.45, -0.07], &[0.55, 0.07], |s| (there(s), there(s)), |s| s[0] - 0.5);
+}
+
+#[test]
+fn acrobot_ends_when_its_tip_is_a_link_above_the_joint() {
+    let height = |s: &[f64]| -s[0].cos() - (s[0] + s[1]).cos() - 1.0;
+    check_goal(
+        "Acrobot",
+        &[-3.1, -3.1, -4.0, -4.0],
+        &[3.1, 3.1, 4.0, 4.0],
+        |s| (height(s) > 0.0, height(s) > 0.0),
+        height,
+    );
+}
+
+#[test]
+fn pendulum_is_near_upright_within_a_third_of_pi_and_never_ends() {
+    // By the cosine, which knows nothing of wrapping.
+    let near = |s: &[f64]| s[0].cos() - 0.5;
+    check_goal("Pendulum", &[-20.0, -8.0], &[20.0, 8.0], |s| (false, near(s) > 0.0), near);
 }
