@@ -2,6 +2,12 @@
 //! changes.
 #![forbid(unsafe_code)]
 
+pub mod algorithm;
+pub mod error;
+pub mod policy;
+pub mod random;
+pub mod rollout;
+
 /// The protocol: generated from `proto/perturb/v1/perturb.proto`, whose comments specify every field.
 #[allow(missing_docs, clippy::all)]
 pub mod proto {
