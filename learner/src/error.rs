@@ -44,6 +44,22 @@ pub enum Error {
         /// Index of the gradient step, from 0.
         update: u64,
     },
+    /// A policy gave a log-probability or a value that is infinite or NaN.
+    #[error(
+        "the policy's output in environment {environment} is not finite; its weights or observation hold NaN or inf"
+    )]
+    PolicyOutput {
+        /// Which of the N environments.
+        environment: usize,
+    },
+    /// An input that must be finite is not.
+    #[error("{name} hold {value}; the environment's numbers must be finite")]
+    Input {
+        /// The array, with its axes.
+        name: &'static str,
+        /// The first such element.
+        value: f32,
+    },
     /// A rollout was pushed to when full, or used before it was full.
     #[error("the rollout holds {got} of {expected} steps: {what}")]
     RolloutLength {
@@ -64,11 +80,7 @@ pub type Result<T> = std::result::Result<T, Error>;
 
 /// `Ok` if `value` is finite and `accepted`; otherwise an [`Error::Setting`].
 pub(crate) fn check(name: &'static str, value: f64, accepted: bool, expected: &'static str) -> Result<()> {
-    if value.is_finite() && accepted {
-        Ok(())
-    } else {
-        Err(Error::Setting { name, got: value.to_string(), expected })
-    }
+    if value.is_finite() && accepted { Ok(()) } else { Err(Error::Setting { name, got: value.to_string(), expected }) }
 }
 
 /// `Ok` if a slice has the expected length; otherwise an [`Error::Length`].

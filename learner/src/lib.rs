@@ -4,6 +4,9 @@
 
 pub mod algorithm;
 pub mod error;
+#[cfg(test)]
+mod fixture;
+pub mod loss;
 pub mod policy;
 pub mod random;
 pub mod rollout;

@@ -1,6 +1,7 @@
 //! Algorithms: what turns a rollout into better weights.
 
 mod a2c;
+mod optimiser;
 mod ppo;
 
 pub use a2c::{A2c, A2cConfig};
@@ -8,18 +9,20 @@ pub use ppo::{Ppo, PpoConfig};
 
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
+use tch::Tensor;
 
-use crate::error::Result;
+use crate::error::{Error, Result, check, check_length};
 use crate::policy::{NamedArray, Policy};
 use crate::rollout::Rollout;
 
 /// Learns from rollouts.
-pub trait Algorithm {
+pub trait Algorithm: Send {
     /// T: steps of each environment between two updates.
     fn n_steps(&self) -> usize;
 
-    /// Improves `policy` by a full, finished rollout. `progress_remaining` falls from 1 at the start of training to 0
-    /// at its end.
+    /// Improves `policy` by a finished rollout. `progress_remaining` falls from 1 at the start of training to 0 at its
+    /// end. A loss or gradient that is not finite is an error, after which the policy is as it was before that gradient
+    /// step.
     fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats>;
 
     /// Everything beside the policy's weights that a later update depends on.
@@ -50,6 +53,18 @@ pub enum Schedule {
     Linear,
 }
 
+impl Schedule {
+    /// The learning rate when `progress_remaining`, 1 … 0, of the training is left.
+    fn at(self, learning_rate: f64, progress_remaining: f64) -> Result<f64> {
+        let in_range = (0.0..=1.0).contains(&progress_remaining);
+        check("progress_remaining", progress_remaining, in_range, "between 0 and 1")?;
+        Ok(match self {
+            Schedule::Constant => learning_rate,
+            Schedule::Linear => learning_rate * progress_remaining,
+        })
+    }
+}
+
 /// What happened in an update, by stable-baselines3's names. Averages are over the update's gradient steps.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct UpdateStats {
@@ -77,4 +92,45 @@ pub struct UpdateStats {
     pub n_updates: u64,
     /// Mean standard deviation of the actions; continuous actions only.
     pub std: Option<f64>,
+}
+
+/// Whether a rollout's axes fit the algorithm and the policy.
+fn check_rollout(rollout: &Rollout, policy: &Policy, n_steps: usize) -> Result<()> {
+    check_length("the rollout's axis T", rollout.n_steps(), n_steps)?;
+    check_length("the rollout's axis O", rollout.observation_size(), policy.spec().observation_size)?;
+    check_length("the rollout's axis A", rollout.action_width(), policy.spec().action.width())
+}
+
+/// The rollout's samples as tensors: observations [T·N, O] and actions [T·N, A].
+fn samples(rollout: &Rollout) -> Result<(Tensor, Tensor)> {
+    let rows = |data: &[f32], width: usize| Tensor::f_of_slice(data)?.f_view((-1, width as i64));
+    let observations = rows(rollout.observations(), rollout.observation_size())?;
+    Ok((observations, rows(rollout.actions(), rollout.action_width())?))
+}
+
+/// Copies scalar tensors out, at the cost of one transfer.
+fn scalars<const K: usize>(tensors: [&Tensor; K]) -> Result<[f64; K]> {
+    let mut numbers = [0.0f32; K];
+    Tensor::f_stack(&tensors, 0)?.f_copy_data(&mut numbers, K)?;
+    Ok(numbers.map(f64::from))
+}
+
+/// `Ok` if `value` is at least 1.
+fn check_count(name: &'static str, value: usize) -> Result<()> {
+    if value > 0 { Ok(()) } else { Err(Error::Setting { name, got: value.to_string(), expected: "at least 1" }) }
+}
+
+/// `Ok` if `value` is a positive number.
+fn check_positive(name: &'static str, value: f64) -> Result<()> {
+    check(name, value, value > 0.0, "a positive number")
+}
+
+/// `Ok` if `value` is a number that is not negative.
+fn check_not_negative(name: &'static str, value: f64) -> Result<()> {
+    check(name, value, value >= 0.0, "a number that is not negative")
+}
+
+/// `Ok` if `value` is between 0 and 1.
+fn check_fraction(name: &'static str, value: f64) -> Result<()> {
+    check(name, value, (0.0..=1.0).contains(&value), "between 0 and 1")
 }

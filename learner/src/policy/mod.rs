@@ -2,8 +2,11 @@
 //! ([`Actor`], plain f32 loops).
 
 mod act;
+mod distribution;
 mod ff;
+mod initial;
 mod normaliser;
+mod tanh;
 
 pub use act::{Actor, Acts};
 pub use ff::{Evaluated, Policy};
