@@ -10,10 +10,8 @@ use super::tanh::tanh;
 use super::{ActionKind, NamedArray, PolicySpec, Weights};
 use crate::error::{Error, Result};
 
-/// Outputs that are computed together: two SSE registers.
-const LANES: usize = 8;
-/// Observations that are computed together, so that each weight is loaded once for all of them.
-const ROWS: usize = 4;
+/// Outputs that are computed together: four SSE registers, whose sums do not wait for each other.
+const LANES: usize = 16;
 
 /// Computes actions, log-probabilities and values. Allocates nothing after its creation for batches of at most
 /// `max_batch`, except where the caller's outputs grow.
@@ -102,7 +100,7 @@ impl Actor {
             return Err(Error::Length { name: "observations [N, O]", got: observations.len(), expected });
         }
         out.clear();
-        out.extend(self.value.forward(observations, n_envs).chunks_exact(LANES).map(|head| head[0]));
+        out.extend(self.value.forward(observations, n_envs).chunks_exact(padded(1)).map(|head| head[0]));
         Ok(())
     }
 }
@@ -202,41 +200,29 @@ impl Dense {
         }
     }
 
-    /// Computes rows of `outputs` from the first `n` rows of `from`, `stride` apart.
+    /// Computes `n` rows of `outputs`, which are [`padded`], from the first `n` rows of `from`, `stride` apart. Every
+    /// output is bias + Σ_i input_i weight_i, added up in order of i.
     fn apply(&self, from: &[f32], stride: usize, n: usize, hidden: bool, outputs: &mut [f32]) {
-        let row = |r: usize| &from[r * stride..][..self.inputs];
-        let whole = n - n % ROWS;
-        for r in (0..whole).step_by(ROWS) {
-            self.apply_rows::<ROWS>(std::array::from_fn(|k| row(r + k)), hidden, &mut outputs[r * self.width()..]);
-        }
-        for r in whole..n {
-            self.apply_rows::<1>([row(r)], hidden, &mut outputs[r * self.width()..]);
-        }
-    }
-
-    fn width(&self) -> usize {
-        self.biases.len() * LANES
-    }
-
-    /// Computes R rows. Every output is bias + Σ_i input_i weight_i, added up in order of i, whatever R is.
-    #[inline(always)]
-    fn apply_rows<const R: usize>(&self, rows: [&[f32]; R], hidden: bool, outputs: &mut [f32]) {
-        for (group, (weights, bias)) in self.weights.chunks_exact(self.inputs).zip(&self.biases).enumerate() {
-            let mut sums = [*bias; R];
-            for (i, weights) in weights.iter().enumerate() {
-                for (sum, row) in sums.iter_mut().zip(&rows) {
-                    let input = row[i];
-                    for (sum, weight) in sum.iter_mut().zip(weights) {
-                        *sum += input * weight;
-                    }
-                }
+        let rows = from.chunks_exact(stride).zip(outputs.chunks_exact_mut(padded(self.outputs)));
+        for (inputs, outputs) in rows.take(n) {
+            let groups = self.weights.chunks_exact(self.inputs).zip(&self.biases);
+            for ((weights, biases), outputs) in groups.zip(outputs.chunks_exact_mut(LANES)) {
+                outputs.copy_from_slice(&weighted_sum(inputs, weights, *biases));
             }
-            for (r, sum) in sums.iter_mut().enumerate() {
-                if hidden {
-                    sum.iter_mut().for_each(|x| *x = tanh(*x));
-                }
-                outputs[r * self.width() + group * LANES..][..LANES].copy_from_slice(sum);
+            if hidden {
+                outputs.iter_mut().for_each(|x| *x = tanh(*x));
             }
         }
     }
+}
+
+/// `sums` + Σ_i input_i weights_i. A function of its own, for inlined the compiler does not always vectorise it.
+#[inline(never)]
+fn weighted_sum(inputs: &[f32], weights: &[[f32; LANES]], mut sums: [f32; LANES]) -> [f32; LANES] {
+    for (input, weights) in inputs.iter().zip(weights) {
+        for (sum, weight) in sums.iter_mut().zip(weights) {
+            *sum += input * weight;
+        }
+    }
+    sums
 }
