@@ -18,6 +18,8 @@ pub enum Purpose {
     Actions = 3,
     /// Actions in testing.
     TestActions = 4,
+    /// Seeds of test environments.
+    TestEnvironments = 5,
 }
 
 /// The stream of `seed` for `purpose`.

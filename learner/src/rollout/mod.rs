@@ -2,6 +2,8 @@
 
 mod advantage;
 mod buffer;
+mod collector;
 
 pub use advantage::{Estimates, Trajectories, gae, n_step_returns};
 pub use buffer::{Rollout, RolloutStep};
+pub use collector::{CollectError, Collector, Normalisers, Times};
