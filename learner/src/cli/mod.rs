@@ -8,6 +8,7 @@ mod bar;
 mod demo;
 mod envs;
 mod evaluate;
+mod single_thread;
 mod train;
 
 use std::process::ExitCode;
@@ -39,6 +40,9 @@ pub fn main() -> ExitCode {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn"));
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    if matches!(cli.command, Command::Train(_) | Command::Demo(_)) {
+        single_thread::ensure();
+    }
     let result = match cli.command {
         Command::Envs(args) => envs::run(&args),
         Command::Train(args) => train::run(&args),
