@@ -2,6 +2,23 @@
 //! changes.
 #![forbid(unsafe_code)]
 
+pub mod algorithm;
+pub mod checkpoint;
+pub mod cli;
+pub mod client;
+pub mod config;
+pub mod error;
+pub mod evaluation;
+#[cfg(test)]
+mod fixture;
+pub mod interrupt;
+pub mod logging;
+pub mod loss;
+pub mod policy;
+pub mod random;
+pub mod rollout;
+pub mod training;
+
 /// The protocol: generated from `proto/perturb/v1/perturb.proto`, whose comments specify every field.
 #[allow(missing_docs, clippy::all)]
 pub mod proto {

@@ -1,4 +1,8 @@
 //! The program `perturb`.
 #![forbid(unsafe_code)]
 
-fn main() {}
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    perturb_learner::cli::main()
+}

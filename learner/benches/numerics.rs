@@ -1,0 +1,113 @@
+//! Times of acting and of updates: `cargo bench -p perturb-learner --bench numerics [filter]`.
+//!
+//! Each line is the fastest and the median of the repetitions. Every timed answer is asserted.
+
+use std::time::Instant;
+
+use perturb_learner::algorithm::{A2c, A2cConfig, Algorithm, Ppo, PpoConfig};
+use perturb_learner::policy::{ActionKind, Actor, Acts, ObservationNormaliser, Policy, PolicySpec};
+use perturb_learner::random::{Purpose, normal, stream};
+use perturb_learner::rollout::{Rollout, RolloutStep};
+
+const TASKS: [(&str, usize, ActionKind); 2] =
+    [("cart_pole", 4, ActionKind::Discrete { n: 2 }), ("half_cheetah", 17, ActionKind::Continuous { size: 6 })];
+
+/// Prints the time of one `run`.
+fn time(id: &str, repetitions: usize, mut run: impl FnMut()) {
+    if std::env::args().skip(1).any(|filter| !filter.starts_with('-') && !id.contains(&filter)) {
+        return;
+    }
+    for _ in 0..repetitions / 10 {
+        run();
+    }
+    let mut times: Vec<f64> = Vec::with_capacity(repetitions);
+    for _ in 0..repetitions {
+        let start = Instant::now();
+        run();
+        times.push(start.elapsed().as_secs_f64() * 1e6);
+    }
+    times.sort_by(f64::total_cmp);
+    println!("{id:40} {:10.2} µs fastest {:10.2} µs median", times[0], times[repetitions / 2]);
+}
+
+fn policy(observation_size: usize, action: ActionKind) -> Policy {
+    Policy::new(PolicySpec { observation_size, action, hidden: vec![64, 64] }, 1).expect("a policy")
+}
+
+fn observations(size: usize) -> Vec<f32> {
+    let mut rng = stream(1, Purpose::Weights);
+    (0..size).map(|_| normal(&mut rng) as f32).collect()
+}
+
+/// A rollout of the policy itself on noise.
+fn rollout(policy: &Policy, n_steps: usize, n_envs: usize) -> Rollout {
+    let spec = policy.spec();
+    let mut actor = Actor::new(spec, n_envs);
+    actor.load(&policy.weights()).expect("weights that fit");
+    let mut rng = stream(1, Purpose::Actions);
+    let mut acts = Acts::new(spec.action, n_envs);
+    let mut rollout = Rollout::new(n_steps, n_envs, spec.observation_size, spec.action.width());
+    for rows in observations(n_steps * n_envs * spec.observation_size).chunks(n_envs * spec.observation_size) {
+        actor.act(rows, &mut rng, &mut acts).expect("actions");
+        let step = RolloutStep {
+            observations: rows,
+            actions: &acts.actions,
+            log_probs: &acts.log_probs,
+            values: &acts.values,
+            rewards: &rows[..n_envs],
+            terminated: &vec![false; n_envs],
+            truncated: &vec![false; n_envs],
+            truncation_values: &vec![0.0; n_envs],
+        };
+        rollout.push(step).expect("a step that fits");
+    }
+    rollout.finish(&acts.values).expect("a full rollout");
+    rollout
+}
+
+fn main() {
+    for (task, observation_size, action) in TASKS {
+        for n_envs in [1, 16, 64, 256] {
+            let policy = policy(observation_size, action);
+            let mut actor = Actor::new(policy.spec(), n_envs);
+            let weights = policy.weights();
+            actor.load(&weights).expect("weights that fit");
+            let rows = observations(n_envs * observation_size);
+            let (mut rng, mut acts) = (stream(1, Purpose::Actions), Acts::new(action, n_envs));
+            time(&format!("act/{task}/{n_envs}"), 2000, || {
+                actor.act(&rows, &mut rng, &mut acts).expect("actions");
+                assert_eq!(acts.values.len(), n_envs);
+            });
+            let mut normaliser = ObservationNormaliser::new(observation_size);
+            let mut normal_rows = rows.clone();
+            time(&format!("normalise/{task}/{n_envs}"), 2000, || {
+                normal_rows.copy_from_slice(&rows);
+                normaliser.update(&rows).expect("finite numbers");
+                normaliser.normalise(&mut normal_rows).expect("whole observations");
+                assert!(normal_rows[0].is_finite());
+            });
+        }
+        let policy_for_load = policy(observation_size, action);
+        let mut actor = Actor::new(policy_for_load.spec(), 1);
+        time(&format!("load/{task}"), 2000, || actor.load(&policy_for_load.weights()).expect("weights that fit"));
+        for (n_steps, n_envs) in [(5, 1), (5, 16), (15, 16), (5, 64)] {
+            let mut policy = policy(observation_size, action);
+            let rollout = rollout(&policy, n_steps, n_envs);
+            let mut a2c = A2c::new(A2cConfig { n_steps, ..A2cConfig::default() }, &policy).expect("valid settings");
+            time(&format!("a2c/{task}/{n_steps}x{n_envs}"), 1000, || {
+                let stats = a2c.update(&mut policy, &rollout, 1.0).expect("an update");
+                assert!(stats.grad_norm > 0.0);
+            });
+        }
+        for (n_steps, n_envs) in [(128, 1), (512, 1), (128, 8), (128, 16)] {
+            let mut policy = policy(observation_size, action);
+            let rollout = rollout(&policy, n_steps, n_envs);
+            let config = PpoConfig { n_steps, n_epochs: 1, learning_rate: 1e-6, ..PpoConfig::default() };
+            let mut ppo = Ppo::new(config, &policy, 1).expect("valid settings");
+            time(&format!("ppo_epoch/{task}/{n_steps}x{n_envs}"), 300, || {
+                let stats = ppo.update(&mut policy, &rollout, 1.0).expect("an update");
+                assert!(stats.grad_norm > 0.0);
+            });
+        }
+    }
+}

@@ -1,0 +1,136 @@
+//! Algorithms: what turns a rollout into better weights.
+
+mod a2c;
+mod optimiser;
+mod ppo;
+
+pub use a2c::{A2c, A2cConfig};
+pub use ppo::{Ppo, PpoConfig};
+
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+use tch::Tensor;
+
+use crate::error::{Error, Result, check, check_length};
+use crate::policy::{NamedArray, Policy};
+use crate::rollout::Rollout;
+
+/// Learns from rollouts.
+pub trait Algorithm: Send {
+    /// T: steps of each environment between two updates.
+    fn n_steps(&self) -> usize;
+
+    /// Improves `policy` by a finished rollout. `progress_remaining` falls from 1 at the start of training to 0 at its
+    /// end. A loss or gradient that is not finite is an error, after which the policy is as it was before that gradient
+    /// step.
+    fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats>;
+
+    /// Everything beside the policy's weights that a later update depends on.
+    fn state(&self) -> AlgorithmState;
+
+    /// Goes on from a saved state: later updates give the same bytes as if there had been no break.
+    fn load_state(&mut self, state: &AlgorithmState) -> Result<()>;
+}
+
+/// The state of an algorithm, for exact resumption.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct AlgorithmState {
+    /// Gradient steps so far.
+    pub n_updates: u64,
+    /// The optimiser's running averages.
+    pub optimiser: Vec<NamedArray>,
+    /// The stream of minibatch orders, where there is one.
+    pub rng: Option<ChaCha8Rng>,
+}
+
+/// How a learning rate moves.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Schedule {
+    /// Stays.
+    Constant,
+    /// Falls linearly to 0 at the end of training.
+    Linear,
+}
+
+impl Schedule {
+    /// The learning rate when `progress_remaining`, 1 … 0, of the training is left.
+    fn at(self, learning_rate: f64, progress_remaining: f64) -> Result<f64> {
+        let in_range = (0.0..=1.0).contains(&progress_remaining);
+        check("progress_remaining", progress_remaining, in_range, "between 0 and 1")?;
+        Ok(match self {
+            Schedule::Constant => learning_rate,
+            Schedule::Linear => learning_rate * progress_remaining,
+        })
+    }
+}
+
+/// What happened in an update, by stable-baselines3's names. Averages are over the update's gradient steps.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct UpdateStats {
+    /// The optimiser's step size.
+    pub learning_rate: f64,
+    /// The policy's part of the loss.
+    pub policy_gradient_loss: f64,
+    /// The value network's part of the loss, before `vf_coef`.
+    pub value_loss: f64,
+    /// Minus the mean entropy, before `ent_coef`, in nats.
+    pub entropy_loss: f64,
+    /// The sum that was minimised.
+    pub loss: f64,
+    /// Estimate of the KL divergence of the new from the acting policy, in nats; PPO only.
+    pub approx_kl: Option<f64>,
+    /// Share of samples whose ratio was outside `1 ± clip_range`; PPO only.
+    pub clip_fraction: Option<f64>,
+    /// `clip_range`; PPO only.
+    pub clip_range: Option<f64>,
+    /// Share of the variance of the returns that the rollout's values explain; None if the returns are constant.
+    pub explained_variance: Option<f64>,
+    /// Global norm of the gradient, before clipping.
+    pub grad_norm: f64,
+    /// Gradient steps so far, this update's included.
+    pub n_updates: u64,
+    /// Mean standard deviation of the actions; continuous actions only.
+    pub std: Option<f64>,
+}
+
+/// Whether a rollout's axes fit the algorithm and the policy.
+fn check_rollout(rollout: &Rollout, policy: &Policy, n_steps: usize) -> Result<()> {
+    check_length("the rollout's axis T", rollout.n_steps(), n_steps)?;
+    check_length("the rollout's axis O", rollout.observation_size(), policy.spec().observation_size)?;
+    check_length("the rollout's axis A", rollout.action_width(), policy.spec().action.width())
+}
+
+/// The rollout's samples as tensors: observations [T·N, O] and actions [T·N, A].
+fn samples(rollout: &Rollout) -> Result<(Tensor, Tensor)> {
+    let rows = |data: &[f32], width: usize| Tensor::f_of_slice(data)?.f_view((-1, width as i64));
+    let observations = rows(rollout.observations(), rollout.observation_size())?;
+    Ok((observations, rows(rollout.actions(), rollout.action_width())?))
+}
+
+/// Copies scalar tensors out, at the cost of one transfer.
+fn scalars<const K: usize>(tensors: [&Tensor; K]) -> Result<[f64; K]> {
+    let mut numbers = [0.0f32; K];
+    Tensor::f_stack(&tensors, 0)?.f_copy_data(&mut numbers, K)?;
+    Ok(numbers.map(f64::from))
+}
+
+/// `Ok` if `value` is at least 1.
+fn check_count(name: &'static str, value: usize) -> Result<()> {
+    if value > 0 { Ok(()) } else { Err(Error::Setting { name, got: value.to_string(), expected: "at least 1" }) }
+}
+
+/// `Ok` if `value` is a positive number.
+fn check_positive(name: &'static str, value: f64) -> Result<()> {
+    check(name, value, value > 0.0, "a positive number")
+}
+
+/// `Ok` if `value` is a number that is not negative.
+fn check_not_negative(name: &'static str, value: f64) -> Result<()> {
+    check(name, value, value >= 0.0, "a number that is not negative")
+}
+
+/// `Ok` if `value` is between 0 and 1.
+fn check_fraction(name: &'static str, value: f64) -> Result<()> {
+    check(name, value, (0.0..=1.0).contains(&value), "between 0 and 1")
+}

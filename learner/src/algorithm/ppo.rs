@@ -1,0 +1,256 @@
+//! Proximal policy optimisation.
+
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+use tch::{Kind, Tensor};
+
+use super::optimiser::{Adam, Descent};
+use super::{
+    Algorithm, AlgorithmState, Schedule, UpdateStats, check_count, check_fraction, check_not_negative, check_positive,
+    check_rollout, samples, scalars,
+};
+use crate::error::{Error, Result};
+use crate::loss;
+use crate::policy::Policy;
+use crate::random::{Purpose, stream, uniform};
+use crate::rollout::{Rollout, gae};
+
+/// Settings of [`Ppo`]. The defaults are the paper's, which searches `learning_rate` and `n_steps`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PpoConfig {
+    /// Step size of Adam, above 0 (default: `3e-4`). Larger learns faster, until the policy collapses.
+    pub learning_rate: f64,
+    /// How the learning rate moves: "constant", or "linear" to 0 over the training (default: `"constant"`).
+    pub learning_rate_schedule: Schedule,
+    /// T: steps of each environment between two updates, at least 1 (default: `128`).
+    pub n_steps: usize,
+    /// Passes over a rollout, at least 1 (default: `10`). More takes more from each sample, until clipping stops it.
+    pub n_epochs: usize,
+    /// Minibatches in a pass, which T·N must be a multiple of (default: `1`). More means more and noisier steps.
+    pub n_minibatches: usize,
+    /// Discount factor per step, 0 … 1 (default: `0.99`). Rewards 1/(1-γ) steps ahead count for about a third.
+    pub gamma: f64,
+    /// λ of generalised advantage estimation, 0 … 1 (default: `0.95`). Smaller trusts the values more than the returns.
+    pub gae_lambda: f64,
+    /// How far the ratio of new to old probability may gain from moving away from 1, above 0 (default: `0.2`).
+    pub clip_range: f64,
+    /// How far a value may gain from moving away from the rollout's, in units of the normalised reward; 0 = as far as it
+    /// wants (default: `0.2`).
+    pub clip_range_vf: f64,
+    /// Whether advantages get mean 0 and standard deviation 1 in every minibatch (default: `true`).
+    pub normalize_advantage: bool,
+    /// Weight of the entropy in nats, not negative (default: `0`). Larger keeps actions random for longer.
+    pub ent_coef: f64,
+    /// Weight of the value loss ½·MSE, not negative (default: `0.5`). Policy and value networks share no weights, so it
+    /// acts through the clipping of the common gradient only.
+    pub vf_coef: f64,
+    /// Global norm that longer gradients are scaled down to, above 0 (default: `0.5`).
+    pub max_grad_norm: f64,
+    /// Adam's ε, above 0 (default: `1e-5`). Limits the step of weights with small gradients.
+    pub adam_eps: f64,
+    /// Whether V(final observation) follows the last reward of a truncated episode (default: `true`). `false` treats a
+    /// time limit as the task's end, as the reference does.
+    pub bootstrap_truncation: bool,
+}
+
+impl Default for PpoConfig {
+    fn default() -> Self {
+        PpoConfig {
+            learning_rate: 3e-4,
+            learning_rate_schedule: Schedule::Constant,
+            n_steps: 128,
+            n_epochs: 10,
+            n_minibatches: 1,
+            gamma: 0.99,
+            gae_lambda: 0.95,
+            clip_range: 0.2,
+            clip_range_vf: 0.2,
+            normalize_advantage: true,
+            ent_coef: 0.0,
+            vf_coef: 0.5,
+            max_grad_norm: 0.5,
+            adam_eps: 1e-5,
+            bootstrap_truncation: true,
+        }
+    }
+}
+
+impl PpoConfig {
+    /// Refuses values outside their ranges, NaN included.
+    pub fn validate(&self) -> Result<()> {
+        check_positive("learning_rate", self.learning_rate)?;
+        check_count("n_steps", self.n_steps)?;
+        check_count("n_epochs", self.n_epochs)?;
+        check_count("n_minibatches", self.n_minibatches)?;
+        check_fraction("gamma", self.gamma)?;
+        check_fraction("gae_lambda", self.gae_lambda)?;
+        check_positive("clip_range", self.clip_range)?;
+        check_not_negative("clip_range_vf", self.clip_range_vf)?;
+        check_not_negative("ent_coef", self.ent_coef)?;
+        check_not_negative("vf_coef", self.vf_coef)?;
+        check_positive("max_grad_norm", self.max_grad_norm)?;
+        check_positive("adam_eps", self.adam_eps)
+    }
+}
+
+/// Proximal policy optimisation with a clipped ratio, Schulman et al. (2017), arXiv:1707.06347: `n_epochs` passes over a
+/// rollout's T·N samples, each in `n_minibatches` random parts with one gradient step,
+///
+/// loss = clipped surrogate - ent_coef · mean entropy + vf_coef · clipped value loss,
+///
+/// with [`gae`]'s advantages and returns, computed once from the rollout's values.
+pub struct Ppo {
+    config: PpoConfig,
+    descent: Descent,
+    rng: ChaCha8Rng,
+}
+
+/// A rollout, or a minibatch of it, as tensors of B samples.
+struct Batch {
+    /// [B, O].
+    observations: Tensor,
+    /// [B, A].
+    actions: Tensor,
+    /// [B].
+    old_log_probs: Tensor,
+    /// [B].
+    old_values: Tensor,
+    /// [B].
+    advantages: Tensor,
+    /// [B].
+    returns: Tensor,
+}
+
+impl Batch {
+    /// The samples at `indices`.
+    fn select(&self, indices: &[i64]) -> Result<Batch> {
+        let indices = Tensor::f_of_slice(indices)?;
+        let select = |tensor: &Tensor| tensor.f_index_select(0, &indices);
+        Ok(Batch {
+            observations: select(&self.observations)?,
+            actions: select(&self.actions)?,
+            old_log_probs: select(&self.old_log_probs)?,
+            old_values: select(&self.old_values)?,
+            advantages: select(&self.advantages)?,
+            returns: select(&self.returns)?,
+        })
+    }
+}
+
+/// What a gradient step reports: policy loss, value loss, entropy loss, loss, KL, clip fraction, gradient norm.
+type Report = [f64; 7];
+
+impl Ppo {
+    /// Checks the settings and starts with fresh optimiser state for `policy`; `seed` fixes the order of minibatches.
+    pub fn new(config: PpoConfig, policy: &Policy, seed: u64) -> Result<Self> {
+        config.validate()?;
+        let optimiser = Adam::new(config.adam_eps, policy.n_weights());
+        let descent = Descent::new(optimiser, config.max_grad_norm, policy);
+        Ok(Ppo { config, descent, rng: stream(seed, Purpose::Minibatches) })
+    }
+
+    /// One gradient step on `batch`.
+    fn step(&mut self, policy: &mut Policy, batch: &Batch, learning_rate: f64) -> Result<Report> {
+        let PpoConfig { clip_range, clip_range_vf, ent_coef, vf_coef, .. } = self.config;
+        let normalized = self.config.normalize_advantage.then(|| loss::normalize_advantages(&batch.advantages));
+        let advantages = normalized.as_ref().unwrap_or(&batch.advantages);
+        let evaluated = policy.evaluate(&batch.observations, &batch.actions);
+        let surrogate = loss::clipped_surrogate(&evaluated.log_probs, &batch.old_log_probs, advantages, clip_range);
+        let value_loss = if clip_range_vf > 0.0 {
+            loss::clipped_value(&evaluated.values, &batch.old_values, &batch.returns, clip_range_vf)
+        } else {
+            loss::value(&evaluated.values, &batch.returns)
+        };
+        let entropy_loss = -evaluated.entropy.mean(Kind::Float);
+        let loss = &surrogate.loss + &entropy_loss * ent_coef + &value_loss * vf_coef;
+        let grad_norm = self.descent.step(policy, &loss, learning_rate)?;
+        let [policy, value, entropy, loss, kl, clip] = scalars([
+            &surrogate.loss,
+            &value_loss,
+            &entropy_loss,
+            &loss,
+            &surrogate.approx_kl,
+            &surrogate.clip_fraction,
+        ])?;
+        Ok([policy, value, entropy, loss, kl, clip, grad_norm])
+    }
+}
+
+impl Algorithm for Ppo {
+    fn n_steps(&self) -> usize {
+        self.config.n_steps
+    }
+
+    fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats> {
+        let PpoConfig { n_epochs, n_minibatches, .. } = self.config;
+        check_rollout(rollout, policy, self.config.n_steps)?;
+        let n_samples = rollout.n_steps() * rollout.n_envs();
+        if n_samples % n_minibatches != 0 {
+            let got = format!("{n_minibatches} with {n_samples} samples");
+            return Err(Error::Setting { name: "n_minibatches", got, expected: "a divisor of n_steps times num_envs" });
+        }
+        let learning_rate = self.config.learning_rate_schedule.at(self.config.learning_rate, progress_remaining)?;
+        let trajectories = rollout.trajectories()?;
+        let estimates = gae(&trajectories, self.config.gamma, self.config.gae_lambda, self.config.bootstrap_truncation);
+        let (observations, actions) = samples(rollout)?;
+        let batch = Batch {
+            observations,
+            actions,
+            old_log_probs: Tensor::f_of_slice(rollout.log_probs())?,
+            old_values: Tensor::f_of_slice(rollout.values())?,
+            advantages: Tensor::f_of_slice(&estimates.advantages)?,
+            returns: Tensor::f_of_slice(&estimates.returns)?,
+        };
+
+        let mut sums: Report = [0.0; 7];
+        let mut add = |report: Report| sums.iter_mut().zip(report).for_each(|(sum, x)| *sum += x);
+        let mut indices: Vec<i64> = (0..n_samples as i64).collect();
+        for _ in 0..n_epochs {
+            if n_minibatches == 1 {
+                add(self.step(policy, &batch, learning_rate)?); // the order of a mean's samples does not matter
+                continue;
+            }
+            shuffle(&mut indices, &mut self.rng);
+            for part in indices.chunks_exact(n_samples / n_minibatches) {
+                add(self.step(policy, &batch.select(part)?, learning_rate)?);
+            }
+        }
+        let [policy_gradient_loss, value_loss, entropy_loss, loss, approx_kl, clip_fraction, grad_norm] =
+            sums.map(|sum| sum / (n_epochs * n_minibatches) as f64);
+        Ok(UpdateStats {
+            learning_rate,
+            policy_gradient_loss,
+            value_loss,
+            entropy_loss,
+            loss,
+            approx_kl: Some(approx_kl),
+            clip_fraction: Some(clip_fraction),
+            clip_range: Some(self.config.clip_range),
+            explained_variance: loss::explained_variance(rollout.values(), &estimates.returns),
+            grad_norm,
+            n_updates: self.descent.n_updates(),
+            std: policy.mean_std(),
+        })
+    }
+
+    fn state(&self) -> AlgorithmState {
+        let (n_updates, optimiser) = (self.descent.n_updates(), self.descent.state());
+        AlgorithmState { n_updates, optimiser, rng: Some(self.rng.clone()) }
+    }
+
+    fn load_state(&mut self, state: &AlgorithmState) -> Result<()> {
+        let missing = Error::Setting { name: "rng", got: "missing".to_owned(), expected: "the saved minibatch stream" };
+        let rng = state.rng.clone().ok_or(missing)?;
+        self.descent.load_state(state.n_updates, &state.optimiser)?;
+        self.rng = rng;
+        Ok(())
+    }
+}
+
+/// Puts `indices` in random order (Fisher and Yates).
+fn shuffle(indices: &mut [i64], rng: &mut ChaCha8Rng) {
+    for last in (1..indices.len()).rev() {
+        indices.swap(last, (uniform(rng) * (last + 1) as f64) as usize);
+    }
+}

@@ -1,0 +1,89 @@
+//! `perturb train`.
+
+use anyhow::{Context, Result};
+use toml::{Table, Value};
+
+use super::args::TrainArgs;
+use super::bar::Bar;
+use super::{Ending, UsageError, servers};
+use crate::config::{Sources, TrainConfig};
+use crate::interrupt::StopFlag;
+use crate::logging::Progress;
+use crate::training::{RunDirectory, train};
+
+pub(super) fn run(args: &TrainArgs) -> Result<Ending> {
+    let flags = flags(args)?;
+    let config = TrainConfig::load(&Sources { file: args.config.as_deref(), sets: &args.set, flags })?;
+    let stop = StopFlag::on_signals().context("cannot wait for signals")?;
+    let servers = servers(&args.server)?;
+    servers.environment(&config.common.environment)?; // before anything is deleted or created
+    let directory = RunDirectory::create(&args.out, args.overwrite)?;
+    let mut bar = Bar::new(describe(&config), config.common.episodes);
+    let outcome = train(&servers, &config, &directory, &stop, |progress| bar.training(progress))?;
+    bar.finish();
+    summarise(&outcome.progress);
+    match outcome.signal {
+        Some(number) => {
+            eprintln!(
+                "stopped by signal {number} after {} of {} episodes; the checkpoint is in {}",
+                outcome.progress.episodes,
+                config.common.episodes,
+                directory.checkpoint().display()
+            );
+            Ok(Ending::Signal(number))
+        }
+        None => {
+            println!("trained policy: {}", directory.checkpoint().display());
+            println!("test it: perturb evaluate --checkpoint {}", directory.path().display());
+            Ok(Ending::Done)
+        }
+    }
+}
+
+/// What is trained, in a few words.
+pub(super) fn describe(config: &TrainConfig) -> String {
+    let common = &config.common;
+    format!("{} {} {} {}", common.environment, common.version, common.algorithm, common.architecture)
+}
+
+/// A line of figures, with the shares of the time.
+pub(super) fn summarise(progress: &Progress) {
+    let [acting, waiting, updating] = progress.shares.map(|seconds| 100.0 * seconds / progress.elapsed.max(1e-9));
+    let recent = match progress.recent {
+        Some([episode_return, length, success]) => format!(
+            "; the last 100: return {episode_return:.1}, length {length:.1}, success {:.1} %",
+            100.0 * success
+        ),
+        None => String::new(),
+    };
+    eprintln!(
+        "{} episodes, {} steps in {:.1} s{recent}",
+        progress.episodes, progress.timesteps, progress.elapsed
+    );
+    eprintln!(
+        "{:.0} steps/s: {acting:.0} % acting, {waiting:.0} % waiting for the server, {updating:.0} % updating",
+        progress.fps()
+    );
+}
+
+/// The settings among the flags.
+fn flags(args: &TrainArgs) -> Result<Table, UsageError> {
+    let number = |name: &str, value: u64| {
+        let refuse = |_| UsageError(format!("--{name} {value} is too large: the most is {}", i64::MAX));
+        i64::try_from(value).map(Value::Integer).map_err(refuse)
+    };
+    let mut table = Table::new();
+    let mut text = |key: &str, value: Option<String>| {
+        value.map(|value| table.insert(key.to_owned(), Value::String(value)));
+    };
+    text("environment", args.env.clone());
+    text("version", args.version.map(|version| version.to_string()));
+    text("algorithm", args.algorithm.map(|algorithm| algorithm.to_string()));
+    text("architecture", args.architecture.map(|architecture| architecture.to_string()));
+    for (key, value) in [("episodes", args.episodes), ("seed", args.seed)] {
+        if let Some(value) = value {
+            table.insert(key.to_owned(), number(key, value)?);
+        }
+    }
+    Ok(table)
+}

@@ -1,0 +1,158 @@
+//! Addresses of environment servers.
+
+use std::fmt;
+use std::path::PathBuf;
+use std::str::FromStr;
+
+/// The longest path that a Unix socket can have on Linux, in bytes.
+const LONGEST_SOCKET_PATH: usize = 107;
+
+/// Where a server listens.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub enum Address {
+    /// A Unix socket, written `unix:/path`.
+    Unix(PathBuf),
+    /// A TCP port, written `host:port`, `http://host:port` or `tcp://host:port`. An IPv6 host is written in brackets.
+    Tcp {
+        /// A host name or an IP address, without brackets.
+        host: String,
+        /// The port, at least 1.
+        port: u16,
+    },
+}
+
+/// Why a text is not an address.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "`{text}` is not a server's address: {reason}; write `unix:/path`, `host:port`, `http://host:port` or `tcp://host:port`"
+)]
+pub struct AddressError {
+    /// What was given.
+    pub text: String,
+    /// What is wrong with it.
+    pub reason: String,
+}
+
+impl FromStr for Address {
+    type Err = AddressError;
+
+    fn from_str(text: &str) -> Result<Self, AddressError> {
+        parse(text).map_err(|reason| AddressError { text: text.to_owned(), reason })
+    }
+}
+
+impl fmt::Display for Address {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Unix(path) => write!(f, "unix:{}", path.display()),
+            Self::Tcp { host, port } if host.contains(':') => write!(f, "http://[{host}]:{port}"),
+            Self::Tcp { host, port } => write!(f, "http://{host}:{port}"),
+        }
+    }
+}
+
+fn parse(text: &str) -> Result<Address, String> {
+    if text.is_empty() {
+        return Err("it is empty".into());
+    }
+    if let Some(path) = text.strip_prefix("unix:") {
+        return parse_unix(path);
+    }
+    if text.starts_with("https://") {
+        return Err("encrypted connections are not supported, tunnel them instead".into());
+    }
+    let rest = text.strip_prefix("http://").or_else(|| text.strip_prefix("tcp://")).unwrap_or(text);
+    if let Some((scheme, _)) = rest.split_once("://") {
+        return Err(format!("the scheme `{scheme}` is unknown"));
+    }
+    parse_tcp(rest.strip_suffix('/').unwrap_or(rest))
+}
+
+fn parse_unix(path: &str) -> Result<Address, String> {
+    let path = path.strip_prefix("//").unwrap_or(path);
+    if !path.starts_with('/') {
+        return Err("the path of the socket must be absolute".into());
+    }
+    if path.len() > LONGEST_SOCKET_PATH {
+        return Err(format!(
+            "the path of the socket has {} bytes, the most that Linux allows is {LONGEST_SOCKET_PATH}",
+            path.len()
+        ));
+    }
+    Ok(Address::Unix(path.into()))
+}
+
+fn parse_tcp(text: &str) -> Result<Address, String> {
+    let Some((host, port)) = text.rsplit_once(':') else {
+        return Err("the port is missing".into());
+    };
+    let port = match port.parse::<u16>() {
+        Ok(0) => return Err("port 0 means any free port, the real one is needed".into()),
+        Ok(port) => port,
+        Err(_) => return Err(format!("`{port}` is not a port (1 to 65535)")),
+    };
+    let host = match host.strip_prefix('[').and_then(|inner| inner.strip_suffix(']')) {
+        Some(inner) if inner.parse::<std::net::Ipv6Addr>().is_ok() => inner,
+        Some(inner) => return Err(format!("`{inner}` is not an IPv6 address")),
+        None if host.contains(':') => return Err("an IPv6 address must stand in brackets".into()),
+        None => host,
+    };
+    let plausible = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | '_' | ':');
+    if host.is_empty() {
+        return Err("the host is missing".into());
+    }
+    if !host.chars().all(plausible) {
+        return Err(format!("`{host}` is not a host name"));
+    }
+    Ok(Address::Tcp { host: host.to_owned(), port })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn tcp(host: &str, port: u16) -> Address {
+        Address::Tcp { host: host.into(), port }
+    }
+
+    #[test]
+    fn every_documented_form_is_understood() {
+        assert_eq!("unix:/run/perturb.sock".parse(), Ok(Address::Unix("/run/perturb.sock".into())));
+        assert_eq!("unix:///run/perturb.sock".parse(), Ok(Address::Unix("/run/perturb.sock".into())));
+        for text in ["worker-1:50051", "http://worker-1:50051", "tcp://worker-1:50051", "http://worker-1:50051/"] {
+            assert_eq!(text.parse(), Ok(tcp("worker-1", 50051)), "{text}");
+        }
+        assert_eq!("[::1]:80".parse(), Ok(tcp("::1", 80)));
+    }
+
+    #[test]
+    fn an_address_reads_back_from_its_text() {
+        for text in ["unix:/a/b", "127.0.0.1:1", "[::1]:80", "tcp://host:65535"] {
+            let address: Address = text.parse().unwrap();
+            assert_eq!(address.to_string().parse(), Ok(address));
+        }
+    }
+
+    #[test]
+    fn a_wrong_address_says_what_is_wrong() {
+        for (text, part) in [
+            ("", "empty"),
+            ("unix:relative", "absolute"),
+            ("unix:", "absolute"),
+            ("https://host:1", "encrypted"),
+            ("ftp://host:1", "scheme `ftp`"),
+            ("localhost", "port is missing"),
+            ("host:99999", "`99999` is not a port"),
+            ("host:0", "port 0"),
+            (":80", "host is missing"),
+            ("::1:80", "brackets"),
+            ("[nonsense]:80", "not an IPv6"),
+            ("two words:80", "not a host name"),
+        ] {
+            let error = text.parse::<Address>().unwrap_err().to_string();
+            assert!(error.contains(part), "{text}: {error}");
+        }
+        let long = format!("unix:/{}", "x".repeat(200));
+        assert!(long.parse::<Address>().unwrap_err().to_string().contains("201 bytes"));
+    }
+}

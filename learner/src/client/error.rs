@@ -1,0 +1,99 @@
+//! What can go wrong between the learner and its servers.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use super::address::Address;
+
+/// A failure of a server, of the connection to it, or of a request.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ClientError {
+    /// Nobody answers at the address.
+    #[error("no server answers at {address}: {reason}; start one with `perturb-server --listen …` or correct --server")]
+    Connect {
+        /// Where.
+        address: Address,
+        /// The transport's words.
+        reason: String,
+    },
+    /// The server understood a request and refused it. The session lives on.
+    #[error("the server at {address} refused {request}: {message}")]
+    Refused {
+        /// Which server.
+        address: Address,
+        /// Which request.
+        request: &'static str,
+        /// A gRPC status code.
+        code: i32,
+        /// The server's sentence.
+        message: String,
+    },
+    /// The connection or the server is gone, and with it the session's environments.
+    #[error("lost the server at {address} during {request}: {reason}")]
+    Lost {
+        /// Which server.
+        address: Address,
+        /// Which request.
+        request: &'static str,
+        /// The transport's words.
+        reason: String,
+    },
+    /// The server is there, but a reply did not come in time.
+    #[error("the server at {address} did not answer {request} within {} s", limit.as_secs_f64())]
+    TimedOut {
+        /// Which server.
+        address: Address,
+        /// Which request.
+        request: &'static str,
+        /// How long the learner waited.
+        limit: Duration,
+    },
+    /// A reply does not follow the protocol.
+    #[error("the server at {address} answered {request} with {got}, expected {expected}: are both of one version?")]
+    Protocol {
+        /// Which server.
+        address: Address,
+        /// Which request.
+        request: &'static str,
+        /// What came.
+        got: String,
+        /// What the protocol promises.
+        expected: String,
+    },
+    /// Servers of one run must serve the same environment.
+    #[error("the servers at {first} and {other} describe {environment} differently: run one version of perturb-server")]
+    Disagreement {
+        /// A server.
+        first: Address,
+        /// Another one.
+        other: Address,
+        /// The environment.
+        environment: String,
+    },
+    /// The program `perturb-server` was not found.
+    #[error(
+        "the program `perturb-server` was not found ({tried}): run `cargo build --release` first, set PERTURB_SERVER \
+         to its path, or name a running server with --server"
+    )]
+    NoServerProgram {
+        /// Where it was looked for.
+        tried: String,
+    },
+    /// The private server did not start.
+    #[error("the private server {} did not start: {reason}", program.display())]
+    Start {
+        /// The program.
+        program: PathBuf,
+        /// What happened instead.
+        reason: String,
+    },
+    /// The operating system refused something that the learner needs.
+    #[error("cannot {action}: {source}")]
+    System {
+        /// What was tried.
+        action: &'static str,
+        /// Its answer.
+        source: std::io::Error,
+    },
+}

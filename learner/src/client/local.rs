@@ -1,0 +1,167 @@
+//! A server of the learner's own, on a private Unix socket.
+
+use std::fs::Permissions;
+use std::io::{BufRead, BufReader};
+use std::os::unix::fs::PermissionsExt;
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use tempfile::TempDir;
+
+use super::address::Address;
+use super::error::ClientError;
+
+const PROGRAM: &str = "perturb-server";
+/// Overrides where the program is looked for.
+const VARIABLE: &str = "PERTURB_SERVER";
+/// How long a start may take.
+const START_LIMIT: Duration = Duration::from_secs(20);
+/// How long a server may take to end before it is killed.
+const END_LIMIT: Duration = Duration::from_secs(5);
+
+/// How to start a [`LocalServer`].
+#[derive(Clone, Copy, Debug, Default)]
+pub struct LocalServerOptions {
+    /// Physics threads; `None` leaves it to the server: one a core.
+    pub workers: Option<usize>,
+}
+
+/// A `perturb-server` that lives no longer than this value, and no longer than this process: it holds the other end of
+/// the server's standard input, whose closing ends the server even if this process is killed.
+///
+/// It runs in a process group of its own, so that Ctrl-C reaches the learner alone, which can then finish its iteration.
+#[derive(Debug)]
+pub struct LocalServer {
+    child: Child,
+    address: Address,
+    /// Holds the socket; only its owner may enter.
+    _directory: TempDir,
+}
+
+impl LocalServer {
+    /// Starts a server and waits until it listens.
+    ///
+    /// # Errors
+    /// [`ClientError::NoServerProgram`] if there is none, [`ClientError::Start`] if it ends or does not listen within 20 s.
+    pub fn start(options: LocalServerOptions) -> Result<Self, ClientError> {
+        let program = find_program()?;
+        let system = |action| move |source| ClientError::System { action, source };
+        let directory = tempfile::Builder::new()
+            .prefix("perturb-")
+            .permissions(Permissions::from_mode(0o700))
+            .tempdir()
+            .map_err(system("create a private directory for the server's socket"))?;
+        let path = directory.path().join("server.sock");
+        let address: Address = format!("unix:{}", path.display())
+            .parse()
+            .map_err(|error| ClientError::Start { program: program.clone(), reason: format!("{error}; set TMPDIR") })?;
+
+        let mut command = Command::new(&program);
+        command.arg("--listen").arg(address.to_string()).args(["--exit-with-stdin", "--log", "warn"]);
+        // Between two steps the learner may compute for long; its death closes the socket and the pipe anyway.
+        command.args(["--keepalive-seconds", "3600"]);
+        if let Some(workers) = options.workers {
+            command.args(["--workers", &workers.to_string()]);
+        }
+        // Settings for servers that people run themselves do not reach this one.
+        for (name, _) in std::env::vars_os() {
+            if name.to_string_lossy().starts_with("PERTURB_SERVER_") {
+                command.env_remove(name);
+            }
+        }
+        let mut child = command
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .process_group(0)
+            .spawn()
+            .map_err(|error| ClientError::Start { program: program.clone(), reason: error.to_string() })?;
+        let lines = child.stdout.take().map(read_lines);
+        let server = Self { child, address, _directory: directory };
+        server.wait_until_ready(&program, lines)
+    }
+
+    /// Where it listens.
+    pub fn address(&self) -> &Address {
+        &self.address
+    }
+
+    /// The operating system's number of the process.
+    pub fn process_id(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// How it ended; `None` while it runs.
+    pub fn exit_status(&mut self) -> Option<ExitStatus> {
+        self.child.try_wait().ok().flatten()
+    }
+
+    fn wait_until_ready(mut self, program: &Path, lines: Option<Receiver<String>>) -> Result<Self, ClientError> {
+        let fail = |reason| Err(ClientError::Start { program: program.to_owned(), reason });
+        let Some(lines) = lines else { return fail("its output cannot be read".into()) };
+        let deadline = Instant::now() + START_LIMIT;
+        loop {
+            match lines.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
+                Ok(line) if line.starts_with("listening on ") => return Ok(self),
+                Ok(_) => {}
+                Err(RecvTimeoutError::Timeout) => {
+                    return fail(format!("it did not listen within {} s", START_LIMIT.as_secs()));
+                }
+                Err(RecvTimeoutError::Disconnected) => {
+                    let status = self.child.wait().map_or_else(|error| error.to_string(), |status| status.to_string());
+                    return fail(format!("it ended with {status} before it listened"));
+                }
+            }
+        }
+    }
+}
+
+impl Drop for LocalServer {
+    fn drop(&mut self) {
+        drop(self.child.stdin.take());
+        let deadline = Instant::now() + END_LIMIT;
+        while Instant::now() < deadline {
+            match self.child.try_wait() {
+                Ok(None) => thread::sleep(Duration::from_millis(5)),
+                _ => return,
+            }
+        }
+        // It had its time; an error means that it ended in this very moment.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// The output's lines, read to its end, so that the server never waits for a reader.
+fn read_lines(output: ChildStdout) -> Receiver<String> {
+    let (sender, receiver) = channel();
+    thread::spawn(move || {
+        for line in BufReader::new(output).lines().map_while(Result::ok) {
+            let _ = sender.send(line); // nobody listens once the server is ready
+        }
+    });
+    receiver
+}
+
+/// `$PERTURB_SERVER`, else beside the running program, else in its parent directory (tests run in
+/// `target/release/deps`), else on the PATH.
+fn find_program() -> Result<PathBuf, ClientError> {
+    if let Some(path) = std::env::var_os(VARIABLE) {
+        let path = PathBuf::from(path);
+        let tried = format!("{VARIABLE} names {}, which is no file", path.display());
+        return if path.is_file() { Ok(path) } else { Err(ClientError::NoServerProgram { tried }) };
+    }
+    let executable = std::env::current_exe().ok();
+    let directories = executable.iter().flat_map(|path| path.ancestors().skip(1).take(2));
+    let mut candidates: Vec<PathBuf> = directories.map(|directory| directory.join(PROGRAM)).collect();
+    let tried: Vec<String> = candidates.iter().map(|path| path.display().to_string()).collect();
+    if let Some(path) = std::env::var_os("PATH") {
+        candidates.extend(std::env::split_paths(&path).map(|directory| directory.join(PROGRAM)));
+    }
+    candidates.into_iter().find(|path| path.is_file()).ok_or_else(|| ClientError::NoServerProgram {
+        tried: format!("neither {} nor anywhere on the PATH", tried.join(" nor ")),
+    })
+}

@@ -1,0 +1,382 @@
+//! A batch of environments, spread over one or several servers.
+
+use std::ops::Range;
+
+use bytes::{Bytes, BytesMut};
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::Streaming;
+
+use super::address::Address;
+use super::error::ClientError;
+use super::servers::{Link, REPLY_LIMIT, Servers};
+use crate::proto::{
+    self, AutoresetMode, SessionRequest, SessionResponse, session_request::Request, session_response::Response,
+};
+
+/// What to open.
+#[derive(Clone, Debug)]
+pub struct OpenOptions {
+    /// A name from the catalogue.
+    pub environment: String,
+    /// Where parameters come from.
+    pub version: proto::Version,
+    /// N, at least 1.
+    pub num_envs: usize,
+    /// Fixes all randomness of the environments.
+    pub seed: u64,
+    /// Episodes in a trial.
+    pub episodes_per_trial: u32,
+}
+
+/// An episode that ended, with the parameters that it ran with.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EndedEpisode {
+    /// Where in the batch, 0 … N-1.
+    pub slot: usize,
+    /// The environment's index; equal to `slot` unless environments were restored from elsewhere.
+    pub environment_index: u32,
+    /// Counts the environment's episodes from 0.
+    pub episode_index: u64,
+    /// The undiscounted sum of its rewards.
+    pub episode_return: f64,
+    /// Its number of steps.
+    pub length: u32,
+    /// Whether it was a success.
+    pub success: bool,
+    /// Whether the task ended it, as opposed to the step limit alone.
+    pub terminated: bool,
+    /// The parameters, in the catalogue's order.
+    pub parameters: Vec<f64>,
+}
+
+/// The outcome of a step, in buffers that are used again.
+#[derive(Clone, Debug, Default)]
+pub struct StepReply {
+    /// [N, O] observations; where an episode ended, the first one of the next.
+    pub observations: Vec<f32>,
+    /// [N] rewards.
+    pub rewards: Vec<f32>,
+    /// [N] whether the task ended the episode.
+    pub terminated: Vec<bool>,
+    /// [N] whether the step limit ended it.
+    pub truncated: Vec<bool>,
+    /// [K, O] last observations of the episodes that ended, in the order of `ended`.
+    pub final_observations: Vec<f32>,
+    /// The K episodes that ended, in order of slots.
+    pub ended: Vec<EndedEpisode>,
+}
+
+/// N environments in same-step autoreset mode. Environment i of the batch has index i and gives the same bytes however
+/// many servers share the batch: each server owns a contiguous range.
+#[derive(Debug)]
+pub struct Session<'a> {
+    servers: &'a Servers,
+    shards: Vec<Shard>,
+    environment: proto::Environment,
+    observation_size: usize,
+    num_envs: usize,
+}
+
+/// The part of a batch that one server owns.
+#[derive(Debug)]
+struct Shard {
+    address: Address,
+    range: Range<usize>,
+    requests: mpsc::Sender<SessionRequest>,
+    replies: Streaming<SessionResponse>,
+    /// Encoded actions; its memory comes back when a request has been sent.
+    actions: BytesMut,
+}
+
+impl<'a> Session<'a> {
+    /// Opens the environments and writes their first observations [N, O] to `observations`.
+    ///
+    /// # Errors
+    /// [`ClientError::Refused`] with the server's sentence, [`ClientError::Disagreement`] between servers, and the
+    /// failures of a connection.
+    pub fn open(
+        servers: &'a Servers,
+        options: &OpenOptions,
+        observations: &mut Vec<f32>,
+    ) -> Result<Self, ClientError> {
+        let ranges = split(options.num_envs, servers.links().len());
+        let mut shards: Vec<Shard> = Vec::new();
+        let mut environment: Option<proto::Environment> = None;
+        observations.clear();
+        for (link, range) in servers.links().iter().zip(ranges) {
+            if range.is_empty() {
+                continue; // more servers than environments
+            }
+            let (shard, opened) = servers.runtime().block_on(open_shard(servers, link, options, range))?;
+            let described = opened.environment.unwrap_or_default();
+            let expected = shard.range.len() * described.observation.len();
+            let first = observations.len();
+            observations.resize(first + expected, 0.0);
+            shard.decode("open", "observations", &opened.observations, &mut observations[first..])?;
+            match &environment {
+                Some(known) if *known != described => {
+                    return Err(ClientError::Disagreement {
+                        first: shards[0].address.clone(),
+                        other: shard.address,
+                        environment: options.environment.clone(),
+                    });
+                }
+                _ => environment = Some(described),
+            }
+            shards.push(shard);
+        }
+        let environment = environment.unwrap_or_default();
+        let observation_size = environment.observation.len();
+        Ok(Self { servers, shards, environment, observation_size, num_envs: options.num_envs })
+    }
+
+    /// What was opened.
+    pub fn environment(&self) -> &proto::Environment {
+        &self.environment
+    }
+
+    /// N.
+    pub fn num_envs(&self) -> usize {
+        self.num_envs
+    }
+
+    /// O.
+    pub fn observation_size(&self) -> usize {
+        self.observation_size
+    }
+
+    /// Advances every environment. `actions` are those of all N environments as the protocol wants them, i32 [N] or
+    /// f32 [N, A]. All servers compute at the same time. Replaces what is in `reply`.
+    ///
+    /// # Errors
+    /// [`ClientError::Refused`] if the actions are wrong: then no environment of that server has moved. The failures of
+    /// a connection, after which the environments are gone.
+    pub fn step(&mut self, actions: &[u8], reply: &mut StepReply) -> Result<(), ClientError> {
+        let width = actions.len() / self.num_envs.max(1);
+        reply.resize(self.num_envs, self.observation_size);
+        let Self { servers, shards, observation_size, .. } = self;
+        servers.runtime().block_on(async {
+            for shard in shards.iter_mut() {
+                shard.actions.clear();
+                shard.actions.extend_from_slice(&actions[shard.range.start * width..shard.range.end * width]);
+                let actions = shard.actions.split().freeze();
+                shard.send("a step", Request::Step(proto::Step { actions }), servers).await?;
+            }
+            for shard in shards.iter_mut() {
+                match shard.receive("a step", servers).await? {
+                    Response::Stepped(stepped) => shard.store(stepped, *observation_size, reply)?,
+                    other => return Err(shard.unexpected("a step", &other, "Stepped")),
+                }
+            }
+            Ok(())
+        })
+    }
+
+    /// Begins a new episode in every environment and writes its first observations [N, O].
+    ///
+    /// # Errors
+    /// The failures of a connection.
+    pub fn reset(&mut self, observations: &mut [f32]) -> Result<(), ClientError> {
+        let Self { servers, shards, observation_size, .. } = self;
+        servers.runtime().block_on(async {
+            for shard in shards.iter_mut() {
+                shard.send("a reset", Request::Reset(proto::Reset::default()), servers).await?;
+            }
+            for shard in shards.iter_mut() {
+                let range = shard.range.start * *observation_size..shard.range.end * *observation_size;
+                match shard.receive("a reset", servers).await? {
+                    Response::Reset(done) => {
+                        shard.decode("a reset", "observations", &done.observations, &mut observations[range])?;
+                    }
+                    other => return Err(shard.unexpected("a reset", &other, "ResetDone")),
+                }
+            }
+            Ok(())
+        })
+    }
+}
+
+impl StepReply {
+    fn resize(&mut self, num_envs: usize, observation_size: usize) {
+        self.observations.resize(num_envs * observation_size, 0.0);
+        self.rewards.resize(num_envs, 0.0);
+        self.terminated.resize(num_envs, false);
+        self.truncated.resize(num_envs, false);
+        self.final_observations.clear();
+        self.ended.clear();
+    }
+}
+
+impl Shard {
+    async fn send(&self, what: &'static str, request: Request, servers: &Servers) -> Result<(), ClientError> {
+        let message = SessionRequest { request: Some(request) };
+        // The channel has room for a request, and is closed only after the stream has ended.
+        self.requests.send(message).await.map_err(|_| {
+            let status = tonic::Status::unavailable("the stream has ended");
+            servers.lost(&self.address, what, &status)
+        })
+    }
+
+    async fn receive(&mut self, what: &'static str, servers: &Servers) -> Result<Response, ClientError> {
+        let address = || self.address.clone();
+        let message = tokio::time::timeout(REPLY_LIMIT, self.replies.message())
+            .await
+            .map_err(|_| ClientError::TimedOut { address: address(), request: what, limit: REPLY_LIMIT })?
+            .map_err(|status| servers.lost(&self.address, what, &status))?;
+        match message.map(|message| message.response) {
+            Some(Some(Response::Error(error))) => {
+                Err(ClientError::Refused { address: address(), request: what, code: error.code, message: error.message })
+            }
+            Some(Some(response)) => Ok(response),
+            Some(None) => Err(self.mismatch(what, "an empty reply".into(), "a reply".into())),
+            None => Err(servers.lost(&self.address, what, &tonic::Status::unavailable("the server ended the stream"))),
+        }
+    }
+
+    /// Puts this shard's part of a reply in its place.
+    fn store(&self, stepped: proto::Stepped, size: usize, reply: &mut StepReply) -> Result<(), ClientError> {
+        let what = "a step";
+        let Range { start, end } = self.range;
+        self.decode(what, "observations", &stepped.observations, &mut reply.observations[start * size..end * size])?;
+        self.decode(what, "rewards", &stepped.rewards, &mut reply.rewards[start..end])?;
+        self.decode_flags("terminated", &stepped.terminated, &mut reply.terminated[start..end])?;
+        self.decode_flags("truncated", &stepped.truncated, &mut reply.truncated[start..end])?;
+        let first = reply.final_observations.len();
+        reply.final_observations.resize(first + stepped.ended.len() * size, 0.0);
+        let finals = &mut reply.final_observations[first..];
+        self.decode(what, "final_observations", &stepped.final_observations, finals)?;
+        for end in stepped.ended {
+            let slot = start + end.slot as usize;
+            let Some(episode) = end.episode.filter(|_| self.range.contains(&slot)) else {
+                return Err(self.mismatch(what, format!("an ended episode of slot {slot}"), "a named episode".into()));
+            };
+            reply.ended.push(EndedEpisode {
+                slot,
+                environment_index: episode.environment_index,
+                episode_index: episode.episode_index,
+                episode_return: end.r#return,
+                length: end.length,
+                success: end.success,
+                terminated: reply.terminated[slot],
+                parameters: end.receipt.map(|receipt| receipt.requested).unwrap_or_default(),
+            });
+        }
+        Ok(())
+    }
+
+    /// Little-endian f32 numbers, exactly as many as `out` takes.
+    fn decode(
+        &self,
+        request: &'static str,
+        field: &'static str,
+        bytes: &Bytes,
+        out: &mut [f32],
+    ) -> Result<(), ClientError> {
+        let (numbers, rest) = bytes.as_chunks::<4>();
+        if numbers.len() != out.len() || !rest.is_empty() {
+            return Err(self.wrong_length(request, field, bytes.len(), out.len() * 4));
+        }
+        for (out, number) in out.iter_mut().zip(numbers) {
+            *out = f32::from_le_bytes(*number);
+        }
+        Ok(())
+    }
+
+    fn decode_flags(&self, field: &'static str, bytes: &Bytes, out: &mut [bool]) -> Result<(), ClientError> {
+        if bytes.len() != out.len() {
+            return Err(self.wrong_length("a step", field, bytes.len(), out.len()));
+        }
+        out.iter_mut().zip(bytes.iter()).for_each(|(out, byte)| *out = *byte != 0);
+        Ok(())
+    }
+
+    fn wrong_length(&self, request: &'static str, field: &'static str, got: usize, expected: usize) -> ClientError {
+        self.mismatch(request, format!("{got} bytes of {field}"), format!("{expected}"))
+    }
+
+    fn unexpected(&self, request: &'static str, got: &Response, expected: &str) -> ClientError {
+        let got = match got {
+            Response::Opened(_) => "Opened",
+            Response::Stepped(_) => "Stepped",
+            Response::Reset(_) => "ResetDone",
+            Response::Snapshot(_) => "Snapshotted",
+            Response::Restore(_) => "Restored",
+            Response::Error(_) => "Error",
+        };
+        self.mismatch(request, got.into(), expected.into())
+    }
+
+    fn mismatch(&self, request: &'static str, got: String, expected: String) -> ClientError {
+        ClientError::Protocol { address: self.address.clone(), request, got, expected }
+    }
+}
+
+async fn open_shard(
+    servers: &Servers,
+    link: &Link,
+    options: &OpenOptions,
+    range: Range<usize>,
+) -> Result<(Shard, proto::Opened), ClientError> {
+    let what = "to open a session";
+    let (requests, receiver) = mpsc::channel(4);
+    let index = |index: usize| {
+        u32::try_from(index).map_err(|_| ClientError::Refused {
+            address: link.address.clone(),
+            request: what,
+            code: tonic::Code::InvalidArgument as i32,
+            message: format!("{index} environments are more than the protocol can number (2^32 - 1)"),
+        })
+    };
+    let open = proto::Open {
+        environment: options.environment.clone(),
+        version: options.version.into(),
+        batch_size: index(range.len())?,
+        seed: options.seed,
+        first_environment_index: index(range.start)?,
+        episodes_per_trial: options.episodes_per_trial,
+        autoreset_mode: AutoresetMode::SameStep.into(),
+        receipts: true,
+        ..proto::Open::default()
+    };
+    // The request lies in the channel before the call is made: a server may wait for it before it answers at all.
+    let message = SessionRequest { request: Some(Request::Open(open)) };
+    requests.try_send(message).map_err(|error| servers.lost(&link.address, what, &closed(&error.to_string())))?;
+    let mut client = link.client.clone();
+    let call = client.session(ReceiverStream::new(receiver));
+    let replies = tokio::time::timeout(REPLY_LIMIT, call)
+        .await
+        .map_err(|_| ClientError::TimedOut { address: link.address.clone(), request: what, limit: REPLY_LIMIT })?
+        .map_err(|status| servers.lost(&link.address, what, &status))?
+        .into_inner();
+    let mut shard = Shard { address: link.address.clone(), range, requests, replies, actions: BytesMut::new() };
+    match shard.receive(what, servers).await? {
+        Response::Opened(opened) => Ok((shard, opened)),
+        other => Err(shard.unexpected(what, &other, "Opened")),
+    }
+}
+
+fn closed(reason: &str) -> tonic::Status {
+    tonic::Status::internal(reason)
+}
+
+/// Cuts 0 … `num_envs` into `parts` contiguous ranges, whose lengths differ by at most 1.
+fn split(num_envs: usize, parts: usize) -> Vec<Range<usize>> {
+    (0..parts).map(|part| part * num_envs / parts..(part + 1) * num_envs / parts).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_cover_the_batch_in_order() {
+        for (num_envs, parts) in [(8, 1), (8, 2), (7, 3), (2, 5), (1, 2)] {
+            let ranges = split(num_envs, parts);
+            let all: Vec<usize> = ranges.iter().cloned().flatten().collect();
+            assert_eq!(all, (0..num_envs).collect::<Vec<_>>());
+            let lengths = ranges.iter().map(ExactSizeIterator::len);
+            assert!(lengths.clone().max().unwrap() - lengths.min().unwrap() <= 1);
+        }
+    }
+}

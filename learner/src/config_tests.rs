@@ -1,0 +1,90 @@
+use super::*;
+
+fn load(file: Option<&str>, sets: &[&str], flags: &str) -> Result<TrainConfig, ConfigError> {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("config.toml");
+    std::fs::write(&path, file.unwrap_or_default()).unwrap();
+    let sets: Vec<String> = sets.iter().map(|&set| set.to_owned()).collect();
+    let flags = flags.parse().unwrap();
+    TrainConfig::load(&Sources { file: file.map(|_| path.as_path()), sets: &sets, flags })
+}
+
+fn refusal(file: Option<&str>, sets: &[&str]) -> String {
+    load(file, sets, "environment = 'CartPole'").unwrap_err().to_string()
+}
+
+fn ppo(config: &TrainConfig) -> &PpoConfig {
+    match &config.settings {
+        Settings::Ppo(settings) => settings,
+        Settings::A2c(_) => panic!("not PPO"),
+    }
+}
+
+#[test]
+fn a_flag_beats_a_set_beats_the_file_beats_the_default() {
+    let file = "environment = 'CartPole'\nseed = 2\nn_steps = 256\ngamma = 0.9";
+    let config = load(Some(file), &["seed=3", "n_steps=512", "n_steps=64"], "seed = 4").unwrap();
+    assert_eq!(config.common.seed, 4);
+    assert_eq!(ppo(&config).n_steps, 64, "the later --set");
+    assert_eq!(ppo(&config).gamma, 0.9);
+    assert_eq!(ppo(&config).gae_lambda, PpoConfig::default().gae_lambda);
+}
+
+#[test]
+fn an_algorithm_brings_its_own_defaults_and_keys() {
+    let config = load(None, &["algorithm=a2c", "rms_alpha=0.9"], "environment = 'Pendulum'").unwrap();
+    let expected = Settings::A2c(A2cConfig { rms_alpha: 0.9, ..A2cConfig::default() });
+    assert_eq!(config.settings, expected);
+    assert!(refusal(None, &["rms_alpha=0.9"]).contains("unknown key `rms_alpha`; ppo's keys are"));
+}
+
+#[test]
+fn the_written_configuration_gives_the_same_again() {
+    let sets = ["learning_rate=1e-3", "normalize_rewards=false", "learning_rate_schedule=linear", "ent_coef=1"];
+    for algorithm in ["ppo", "a2c"] {
+        let flags = format!("environment = 'Hopper'\nversion = 'E'\nalgorithm = '{algorithm}'\nepisodes = 7");
+        let config = load(None, &sets, &flags).unwrap();
+        assert_eq!(load(Some(&config.to_toml()), &[], "").unwrap(), config);
+    }
+}
+
+#[test]
+fn an_unknown_key_is_refused_with_all_valid_ones() {
+    let message = refusal(Some("learning_rat = 0.1"), &[]);
+    assert!(message.contains("config.toml: unknown key `learning_rat`"), "{message}");
+    for key in ["learning_rate,", "n_steps", "num_envs", "normalize_observations", "checkpoint_interval"] {
+        assert!(message.contains(key), "{key}: {message}");
+    }
+    assert!(refusal(Some("[nested]\nkey = 1"), &[]).contains("unknown key `nested`"));
+}
+
+#[test]
+fn a_wrong_type_is_refused_with_the_right_one() {
+    for (set, part) in [
+        ("learning_rate=fast", "learning_rate is \"fast\", but must be a number"),
+        ("n_steps=12.5", "n_steps is 12.5, but must be a whole number"),
+        ("n_steps=-1", "n_steps is -1, but must be a whole number that is not negative"),
+        ("normalize_rewards=1", "normalize_rewards is 1, but must be true or false"),
+        ("environment=3", "environment is 3, but must be a text"),
+        ("version=X", "version is \"X\", but must be one of \"D\", \"R\", \"E\""),
+        ("algorithm=rl2-ppo", "algorithm is \"rl2-ppo\", but must be one of \"a2c\", \"ppo\""),
+        ("architecture=rc", "architecture is \"rc\", but must be one of \"ff\""),
+        ("learning_rate_schedule=cosine", "must be one of \"constant\", \"linear\""),
+        ("num_envs=0", "num_envs is 0, but must be between 1 and 65536"),
+        ("episodes=0", "episodes is 0, but must be at least 1"),
+        ("gamma=2", "gamma is 2, but must be between 0 and 1"),
+        ("learning_rate=nan", "learning_rate is NaN"),
+        ("n_steps", "expected key=value"),
+    ] {
+        let message = refusal(None, &[set]);
+        assert!(message.contains(part), "{set}: {message}");
+    }
+}
+
+#[test]
+fn what_is_missing_or_not_toml_is_named() {
+    assert!(matches!(load(None, &[], ""), Err(ConfigError::NoEnvironment)));
+    assert!(refusal(Some("= 1"), &[]).contains("config.toml"));
+    let sources = Sources { file: Some(Path::new("/nonexistent.toml")), ..Sources::default() };
+    assert!(TrainConfig::load(&sources).unwrap_err().to_string().contains("cannot read /nonexistent.toml"));
+}

@@ -1,0 +1,73 @@
+//! Figures over episodes.
+
+/// 97.5 % of a standard normal lies below.
+const Z_95: f64 = 1.959_963_984_540_054;
+
+/// The 95 % confidence interval of a share of which `successes` of `trials` were seen, after Wilson (1927), as (low,
+/// high) in 0 … 1. Unlike the textbook interval it is right near 0 and 1. (0, 1) if nothing was tried.
+pub fn wilson(successes: u64, trials: u64) -> (f64, f64) {
+    if trials == 0 {
+        return (0.0, 1.0);
+    }
+    let (n, z2) = (trials as f64, Z_95 * Z_95);
+    let share = successes as f64 / n;
+    let centre = (share + z2 / (2.0 * n)) / (1.0 + z2 / n);
+    let half = Z_95 / (1.0 + z2 / n) * (share * (1.0 - share) / n + z2 / (4.0 * n * n)).sqrt();
+    // At the ends the interval is exactly closed; rounding must not leave it open.
+    let low = if successes == 0 { 0.0 } else { (centre - half).max(0.0) };
+    let high = if successes == trials { 1.0 } else { (centre + half).min(1.0) };
+    (low, high)
+}
+
+/// (∏ xᵢ)^(1/n) of numbers that are not negative: 0 if one of them is 0, NaN if there are none.
+pub fn geometric_mean(numbers: &[f64]) -> f64 {
+    if numbers.contains(&0.0) {
+        return 0.0;
+    }
+    (numbers.iter().map(|x| x.ln()).sum::<f64>() / numbers.len() as f64).exp()
+}
+
+/// Arithmetic mean; NaN if there are none.
+pub fn mean(numbers: impl ExactSizeIterator<Item = f64>) -> f64 {
+    let n = numbers.len() as f64;
+    numbers.sum::<f64>() / n
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn close(got: f64, expected: f64) {
+        assert!((got - expected).abs() < 5e-5, "{got} is not {expected}");
+    }
+
+    #[test]
+    fn wilson_gives_published_intervals() {
+        // Newcombe (1998), Statistics in Medicine 17, table I, method 3: to four digits.
+        for (successes, trials, low, high) in
+            [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)]
+        {
+            let (got_low, got_high) = wilson(successes, trials);
+            close(got_low, low);
+            close(got_high, high);
+        }
+    }
+
+    #[test]
+    fn wilson_is_closed_at_the_ends_and_mirrored() {
+        assert_eq!(wilson(0, 0), (0.0, 1.0));
+        assert_eq!(wilson(0, 1000).0, 0.0);
+        assert_eq!(wilson(1000, 1000).1, 1.0);
+        let ((low, high), (mirrored_low, mirrored_high)) = (wilson(3, 10), wilson(7, 10));
+        close(low, 1.0 - mirrored_high);
+        close(high, 1.0 - mirrored_low);
+    }
+
+    #[test]
+    fn the_geometric_mean_is_the_root_of_the_product() {
+        close(geometric_mean(&[1.0, 10.0, 100.0]), 10.0);
+        close(geometric_mean(&[27.0]), 27.0);
+        assert_eq!(geometric_mean(&[0.0, 50.0, 100.0]), 0.0);
+        assert!(geometric_mean(&[]).is_nan());
+    }
+}

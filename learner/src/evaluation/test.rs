@@ -1,0 +1,217 @@
+//! Testing a checkpoint on a version of its environment.
+
+use rand::Rng;
+use serde::Serialize;
+
+use super::protocol::Version;
+use super::statistics::{mean, wilson};
+use crate::checkpoint::{Checkpoint, EnvironmentSummary};
+use crate::client::{ClientError, EndedEpisode, OpenOptions, Servers, Session, StepReply};
+use crate::interrupt::StopFlag;
+use crate::policy::{Actor, Acts};
+use crate::random::{Purpose, stream};
+
+/// The most environments that are tested together.
+const MOST_ENVS: u64 = 100;
+
+/// Figures over test episodes.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct TestResult {
+    /// Episodes tested.
+    pub episodes: u64,
+    /// Successes, %.
+    pub success_percent: f64,
+    /// The 95 % Wilson interval of `success_percent`, [low, high], %.
+    pub success_percent_95: [f64; 2],
+    /// Mean undiscounted return, never normalised.
+    pub mean_return: f64,
+    /// Mean number of steps.
+    pub mean_length: f64,
+}
+
+/// Why a checkpoint could not be tested.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum TestError {
+    /// A server or the connection to it failed.
+    #[error(transparent)]
+    Client(#[from] ClientError),
+    /// The policy gives numbers that are not finite, or does not fit.
+    #[error(transparent)]
+    Numbers(#[from] crate::error::Error),
+    /// The environment is no longer what the policy was trained in.
+    #[error("the checkpoint was trained in {environment} with {what} {trained}, the server's has {served}: {advice}")]
+    Changed {
+        /// The environment.
+        environment: String,
+        /// What differs.
+        what: &'static str,
+        /// In training.
+        trained: String,
+        /// On the server.
+        served: String,
+        /// What to do.
+        advice: &'static str,
+    },
+    /// The program was asked to end.
+    #[error("stopped before all episodes were tested")]
+    Stopped {
+        /// The signal.
+        signal: i32,
+    },
+}
+
+/// The seed of the test environments on `version`.
+///
+/// It is the first, second or third number (D, R, E) of the stream of `seed` for [`Purpose::TestEnvironments`], so that
+/// a policy never meets its training episodes again, whatever seeds are used, and the versions are independent.
+pub fn environment_seed(seed: u64, version: Version) -> u64 {
+    let mut rng = stream(seed, Purpose::TestEnvironments);
+    let drawn: [u64; 3] = std::array::from_fn(|_| rng.next_u64());
+    drawn[version as usize]
+}
+
+/// Tests `checkpoint` on `version`: `episodes` episodes with sampled actions and frozen statistics. Calls `report` with
+/// the number of episodes done.
+///
+/// Which episodes count is fixed beforehand: the first ones of each of at most 100 environments, as evenly as possible.
+/// Counting the first to end instead would favour short ones. The result depends on the checkpoint, the version, the
+/// number of episodes and the seed alone.
+///
+/// # Errors
+/// [`TestError`].
+pub fn test(
+    servers: &Servers,
+    checkpoint: &Checkpoint,
+    version: Version,
+    episodes: u64,
+    seed: u64,
+    stop: &StopFlag,
+    mut report: impl FnMut(u64),
+) -> Result<TestResult, TestError> {
+    let state = &checkpoint.state;
+    let quotas = quotas(episodes);
+    let options = OpenOptions {
+        environment: state.environment.clone(),
+        version: version.to_proto(),
+        num_envs: quotas.len(),
+        seed: environment_seed(seed, version),
+        episodes_per_trial: 1,
+    };
+    let mut reply = StepReply::default();
+    let mut session = Session::open(servers, &options, &mut reply.observations)?;
+    check_unchanged(checkpoint, EnvironmentSummary::of(session.environment()))?;
+    let mut actor = Actor::new(&state.policy, quotas.len());
+    actor.load(&checkpoint.weights)?;
+    let mut rng = stream(seed, Purpose::TestActions);
+    let mut acts = Acts::new(state.policy.action, quotas.len());
+    let mut actions = Vec::new();
+    let mut counted: Vec<EndedEpisode> = Vec::new();
+    while (counted.len() as u64) < episodes {
+        if let Some(signal) = stop.signal() {
+            return Err(TestError::Stopped { signal });
+        }
+        if let Some(normaliser) = &state.observation_normaliser {
+            normaliser.normalise(&mut reply.observations)?;
+        }
+        actor.act(&reply.observations, &mut rng, &mut acts)?;
+        acts.write_bytes(&mut actions);
+        session.step(&actions, &mut reply)?;
+        // Environments that are done go on, unseen: they cost less than a smaller batch would save.
+        counted.extend(reply.ended.drain(..).filter(|end| end.episode_index < quotas[end.slot]));
+        report(counted.len() as u64);
+    }
+    Ok(summarise(&counted))
+}
+
+/// How many episodes each environment is tested for.
+fn quotas(episodes: u64) -> Vec<u64> {
+    let n = episodes.clamp(1, MOST_ENVS);
+    (0..n).map(|i| episodes / n + u64::from(i < episodes % n)).collect()
+}
+
+fn summarise(episodes: &[EndedEpisode]) -> TestResult {
+    let n = episodes.len() as u64;
+    let successes = episodes.iter().filter(|episode| episode.success).count() as u64;
+    let (low, high) = wilson(successes, n);
+    TestResult {
+        episodes: n,
+        success_percent: 100.0 * successes as f64 / n as f64,
+        success_percent_95: [100.0 * low, 100.0 * high],
+        mean_return: mean(episodes.iter().map(|episode| episode.episode_return)),
+        mean_length: mean(episodes.iter().map(|episode| f64::from(episode.length))),
+    }
+}
+
+fn check_unchanged(checkpoint: &Checkpoint, served: Option<EnvironmentSummary>) -> Result<(), TestError> {
+    let (trained, environment) = (&checkpoint.state.environment_spec, &checkpoint.state.environment);
+    let changed = |what, trained: String, served: String| {
+        let advice = "test with the version of perturb that trained it, or train again";
+        Err(TestError::Changed { environment: environment.clone(), what, trained, served, advice })
+    };
+    let Some(served) = served else {
+        return changed("actions", format!("{:?}", trained.action), "none".into());
+    };
+    if served.revision != trained.revision {
+        return changed("revision", trained.revision.to_string(), served.revision.to_string());
+    }
+    if served.observation != trained.observation || served.action != trained.action {
+        return changed("spaces", show_spaces(trained), show_spaces(&served));
+    }
+    if served.model_hash != trained.model_hash {
+        return changed("model", trained.model_hash.clone(), served.model_hash);
+    }
+    Ok(())
+}
+
+fn show_spaces(summary: &EnvironmentSummary) -> String {
+    format!("observations of {} numbers and {:?} actions", summary.observation.len(), summary.action)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_environment_gets_its_share_beforehand() {
+        assert_eq!(quotas(3), [1, 1, 1]);
+        assert_eq!(quotas(1000), vec![10; 100]);
+        let uneven = quotas(250);
+        assert_eq!((uneven.len(), uneven.iter().sum::<u64>()), (100, 250));
+        assert_eq!((uneven[0], uneven[49], uneven[50], uneven[99]), (3, 3, 2, 2));
+    }
+
+    #[test]
+    fn test_environments_have_seeds_of_their_own() {
+        let seeds: Vec<u64> =
+            (0..100).flat_map(|seed| Version::ALL.map(|version| environment_seed(seed, version))).collect();
+        let distinct: std::collections::HashSet<u64> = seeds.iter().copied().collect();
+        assert_eq!(distinct.len(), 300);
+        assert!(seeds.iter().all(|&seed| seed > 1000), "none is a seed that people train with");
+        assert_eq!(environment_seed(1, Version::R), environment_seed(1, Version::R));
+    }
+
+    #[test]
+    fn figures_are_means_over_the_episodes() {
+        let episode = |success: bool, episode_return: f64, length: u32| EndedEpisode {
+            slot: 0,
+            environment_index: 0,
+            episode_index: 0,
+            episode_return,
+            length,
+            success,
+            terminated: false,
+            parameters: Vec::new(),
+        };
+        let result = summarise(&[
+            episode(true, 4.0, 10),
+            episode(false, -2.0, 20),
+            episode(true, 1.0, 60),
+            episode(true, 1.0, 10),
+        ]);
+        assert_eq!((result.episodes, result.success_percent), (4, 75.0));
+        assert_eq!((result.mean_return, result.mean_length), (1.0, 25.0));
+        let [low, high] = result.success_percent_95;
+        assert!((low - 30.064).abs() < 1e-3 && (high - 95.441).abs() < 1e-3, "{low} {high}");
+    }
+}

@@ -1,0 +1,94 @@
+//! `monitor.csv`: a line for every episode.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::Path;
+use std::time::Instant;
+
+use crate::client::EndedEpisode;
+
+/// Writes stable-baselines3's Monitor format: a line of JSON after `#`, a header, and a line an episode with its return
+/// `r`, its length `l` and the seconds `t` since the start; then `success`, `terminated` (0 or 1), `episode_index`,
+/// `environment_index`, and a column for each parameter.
+#[derive(Debug)]
+pub struct Monitor {
+    writer: csv::Writer<BufWriter<File>>,
+    start: Instant,
+}
+
+impl Monitor {
+    /// Creates the file. `t_start` is the time of day in seconds since 1970.
+    ///
+    /// # Errors
+    /// The operating system's.
+    pub fn create(path: &Path, environment: &str, parameters: &[String], t_start: f64) -> std::io::Result<Self> {
+        let mut file = BufWriter::new(File::create(path)?);
+        writeln!(file, "#{}", serde_json::json!({ "t_start": t_start, "env_id": environment }))?;
+        let mut writer = csv::Writer::from_writer(file);
+        let columns = ["r", "l", "t", "success", "terminated", "episode_index", "environment_index"];
+        writer.write_record(columns.into_iter().chain(parameters.iter().map(String::as_str)))?;
+        Ok(Self { writer, start: Instant::now() })
+    }
+
+    /// Adds an episode.
+    ///
+    /// # Errors
+    /// The operating system's.
+    pub fn write(&mut self, episode: &EndedEpisode) -> std::io::Result<()> {
+        let flag = |flag: bool| u8::from(flag).to_string();
+        let fixed = [
+            format!("{:.6}", episode.episode_return),
+            episode.length.to_string(),
+            format!("{:.6}", self.start.elapsed().as_secs_f64()),
+            flag(episode.success),
+            flag(episode.terminated),
+            episode.episode_index.to_string(),
+            episode.environment_index.to_string(),
+        ];
+        let parameters = episode.parameters.iter().map(f64::to_string);
+        Ok(self.writer.write_record(fixed.into_iter().chain(parameters))?)
+    }
+
+    /// Hands what was written to the operating system.
+    ///
+    /// # Errors
+    /// Its answer.
+    pub fn flush(&mut self) -> std::io::Result<()> {
+        self.writer.flush()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_file_is_one_that_stable_baselines3_reads() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("monitor.csv");
+        let parameters = ["mass".to_owned(), "length".to_owned()];
+        let mut monitor = Monitor::create(&path, "CartPole", &parameters, 12.5).unwrap();
+        let episode = EndedEpisode {
+            slot: 1,
+            environment_index: 3,
+            episode_index: 4,
+            episode_return: 17.5,
+            length: 18,
+            success: false,
+            terminated: true,
+            parameters: vec![0.1, 0.25],
+        };
+        monitor.write(&episode).unwrap();
+        monitor.flush().unwrap();
+        let text = std::fs::read_to_string(&path).unwrap();
+        let lines: Vec<&str> = text.lines().collect();
+        let first: serde_json::Value = serde_json::from_str(lines[0].strip_prefix('#').unwrap()).unwrap();
+        assert_eq!(first, serde_json::json!({ "t_start": 12.5, "env_id": "CartPole" }));
+        assert_eq!(lines[1], "r,l,t,success,terminated,episode_index,environment_index,mass,length");
+        let fields: Vec<&str> = lines[2].split(',').collect();
+        assert_eq!(fields[..2], ["17.500000", "18"]);
+        assert!(fields[2].parse::<f64>().unwrap() >= 0.0);
+        assert_eq!(fields[3..], ["0", "1", "4", "3", "0.1", "0.25"]);
+        assert_eq!(lines.len(), 3);
+    }
+}

@@ -1,0 +1,147 @@
+//! TensorBoard event files, without TensorFlow.
+//!
+//! A file is a sequence of TFRecords: the length of the data as u64, a checksum of the length, the data, and a checksum
+//! of the data, all little-endian. The data is a protobuf `Event`.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::Path;
+
+use prost::Message;
+
+/// The parts of tensorflow/core/util/event.proto that scalars need.
+#[derive(Clone, PartialEq, Message)]
+struct Event {
+    /// Seconds since 1970.
+    #[prost(double, tag = "1")]
+    wall_time: f64,
+    #[prost(int64, tag = "2")]
+    step: i64,
+    #[prost(string, optional, tag = "3")]
+    file_version: Option<String>,
+    #[prost(message, optional, tag = "5")]
+    summary: Option<Summary>,
+}
+
+/// Of tensorflow/core/framework/summary.proto.
+#[derive(Clone, PartialEq, Message)]
+struct Summary {
+    #[prost(message, repeated, tag = "1")]
+    value: Vec<Value>,
+}
+
+/// A scalar with its name.
+#[derive(Clone, PartialEq, Message)]
+struct Value {
+    #[prost(string, tag = "1")]
+    tag: String,
+    // In a oneof, so present even if 0.
+    #[prost(float, optional, tag = "2")]
+    simple_value: Option<f32>,
+}
+
+/// Writes scalars for TensorBoard.
+#[derive(Debug)]
+pub struct EventWriter {
+    file: BufWriter<File>,
+    t_start: f64,
+}
+
+impl EventWriter {
+    /// Creates an events file in `directory`. `t_start` is the time of day in seconds since 1970.
+    ///
+    /// # Errors
+    /// The operating system's.
+    pub fn create(directory: &Path, t_start: f64) -> std::io::Result<Self> {
+        let name = format!("events.out.tfevents.{}.perturb", t_start as u64);
+        let mut writer = Self { file: BufWriter::new(File::create(directory.join(name))?), t_start };
+        let first = Event { wall_time: t_start, file_version: Some("brain.Event:2".into()), ..Event::default() };
+        writer.record(&first)?;
+        Ok(writer)
+    }
+
+    /// Adds scalars at `step`, `elapsed` seconds after the start, and hands them to the operating system.
+    ///
+    /// # Errors
+    /// The operating system's.
+    pub fn write<'a>(
+        &mut self,
+        step: u64,
+        elapsed: f64,
+        scalars: impl Iterator<Item = (&'a str, f64)>,
+    ) -> std::io::Result<()> {
+        let value = scalars
+            .map(|(tag, value)| Value { tag: tag.to_owned(), simple_value: Some(value as f32) })
+            .collect();
+        self.record(&Event {
+            wall_time: self.t_start + elapsed,
+            step: i64::try_from(step).unwrap_or(i64::MAX),
+            file_version: None,
+            summary: Some(Summary { value }),
+        })
+    }
+
+    fn record(&mut self, event: &Event) -> std::io::Result<()> {
+        self.file.write_all(&frame(&event.encode_to_vec()))?;
+        self.file.flush()
+    }
+}
+
+/// A TFRecord.
+fn frame(data: &[u8]) -> Vec<u8> {
+    let length = (data.len() as u64).to_le_bytes();
+    let mut record = Vec::with_capacity(data.len() + 16);
+    record.extend(length);
+    record.extend(masked_crc(&length).to_le_bytes());
+    record.extend(data);
+    record.extend(masked_crc(data).to_le_bytes());
+    record
+}
+
+/// CRC-32C, rotated and shifted, so that a checksum of data that holds checksums stays a good one.
+fn masked_crc(data: &[u8]) -> u32 {
+    crc32c::crc32c(data).rotate_right(15).wrapping_add(0xa282_ead8)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The records of a file, with their checksums verified.
+    fn read(mut bytes: &[u8]) -> Vec<Event> {
+        let mut events = Vec::new();
+        while !bytes.is_empty() {
+            let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+            let data = &bytes[12..12 + length];
+            let number = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap());
+            assert_eq!(number(8), masked_crc(&bytes[..8]));
+            assert_eq!(number(12 + length), masked_crc(data));
+            events.push(Event::decode(data).unwrap());
+            bytes = &bytes[16 + length..];
+        }
+        events
+    }
+
+    #[test]
+    fn scalars_read_back() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut writer = EventWriter::create(directory.path(), 100.0).unwrap();
+        writer.write(128, 2.5, [("rollout/ep_rew_mean", 0.0), ("train/loss", -1.5)].into_iter()).unwrap();
+        let path = directory.path().join("events.out.tfevents.100.perturb");
+        let events = read(&std::fs::read(path).unwrap());
+        assert_eq!(events[0].file_version.as_deref(), Some("brain.Event:2"));
+        assert_eq!((events[1].step, events[1].wall_time), (128, 102.5));
+        let values = &events[1].summary.as_ref().unwrap().value;
+        let values: Vec<(&str, Option<f32>)> = values.iter().map(|v| (v.tag.as_str(), v.simple_value)).collect();
+        assert_eq!(values, [("rollout/ep_rew_mean", Some(0.0)), ("train/loss", Some(-1.5))]);
+    }
+
+    #[test]
+    fn checksums_are_those_of_tensorflow() {
+        // The record that tf.io.TFRecordWriter writes for b"abc".
+        let crc = |value: u32| (value >> 15 | value << 17).wrapping_add(0xa282_ead8).to_le_bytes();
+        // CRC-32C of "123456789" is 0xe3069283 (RFC 3720, appendix B.4 gives the polynomial).
+        assert_eq!(masked_crc(b"123456789").to_le_bytes(), crc(0xe306_9283));
+        assert_eq!(frame(b"abc").len(), 8 + 4 + 3 + 4);
+    }
+}

@@ -1,0 +1,311 @@
+//! The training loop: rollout, update, log, checkpoint.
+//!
+//! Randomness: the environments' seed is the training's seed; initial weights, minibatch order and sampled actions have
+//! streams of their own (see [`crate::random`]). One thread computes everything in one order, so that equal
+//! configurations give equal weights, byte for byte, whatever the number of servers and of their workers.
+
+use std::collections::VecDeque;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use anyhow::{Context, Result, bail};
+
+use crate::algorithm::{Algorithm, UpdateStats};
+use crate::checkpoint::{Checkpoint, Counters, EnvironmentSummary, State};
+use crate::client::{EndedEpisode, OpenOptions, Servers, Session};
+use crate::config::TrainConfig;
+use crate::interrupt::StopFlag;
+use crate::logging::{Monitor, Progress, ProgressLog};
+use crate::policy::{ObservationNormaliser, Policy, PolicySpec, RewardNormaliser, Weights};
+use crate::rollout::{Collector, Normalisers, Rollout};
+
+/// Means are over so many episodes, as in stable-baselines3.
+const RECENT: usize = 100;
+
+/// What a training came to.
+#[derive(Debug)]
+pub struct Outcome {
+    /// The last checkpoint, as written.
+    pub checkpoint: Checkpoint,
+    /// The last figures.
+    pub progress: Progress,
+    /// The signal that ended the training before its budget; `None` if it ran to its end.
+    pub signal: Option<i32>,
+}
+
+/// The directory of a run.
+#[derive(Debug)]
+pub struct RunDirectory {
+    path: PathBuf,
+}
+
+impl RunDirectory {
+    /// Takes `path` for a new run: creates it, or empties it of an earlier run if `overwrite`.
+    ///
+    /// # Errors
+    /// If it holds a run and `overwrite` is off; the operating system's.
+    pub fn create(path: &Path, overwrite: bool) -> Result<Self> {
+        if path.exists() && !path.is_dir() {
+            bail!("--out {} is a file; give a directory", path.display());
+        }
+        let old = files_of_a_run(path)?;
+        if let (Some(file), false) = (old.first(), overwrite) {
+            bail!(
+                "{} already holds a run ({}): choose another --out, or give --overwrite to delete that run",
+                path.display(),
+                file.file_name().unwrap_or_default().to_string_lossy()
+            );
+        }
+        for file in old {
+            let removed = if file.is_dir() { fs::remove_dir_all(&file) } else { fs::remove_file(&file) };
+            removed.with_context(|| format!("cannot delete {}", file.display()))?;
+        }
+        fs::create_dir_all(path).with_context(|| format!("cannot create {}", path.display()))?;
+        Ok(Self { path: path.to_owned() })
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Where its checkpoint is.
+    pub fn checkpoint(&self) -> PathBuf {
+        self.path.join("checkpoint")
+    }
+}
+
+/// What a run has written in `path`; other files are left alone.
+fn files_of_a_run(path: &Path) -> Result<Vec<PathBuf>> {
+    if !path.exists() {
+        return Ok(Vec::new());
+    }
+    let mut files = Vec::new();
+    for entry in fs::read_dir(path).with_context(|| format!("cannot list {}", path.display()))? {
+        let entry = entry.with_context(|| format!("cannot list {}", path.display()))?;
+        let name = entry.file_name();
+        let name = name.to_string_lossy();
+        let known = ["config.toml", "progress.csv", "monitor.csv", "checkpoint"].contains(&name.as_ref());
+        if known || name.starts_with("events.out.tfevents.") {
+            files.push(entry.path());
+        }
+    }
+    files.sort();
+    Ok(files)
+}
+
+/// Trains as `config` says and writes everything to `directory`; calls `report` after every iteration. When `stop` is
+/// raised, the iteration is finished and the checkpoint written.
+///
+/// # Errors
+/// A server that is lost, numbers that are not finite, a full disk. The checkpoint of the last whole iteration has then
+/// been written, unless writing itself fails.
+pub fn train(
+    servers: &Servers,
+    config: &TrainConfig,
+    directory: &RunDirectory,
+    stop: &StopFlag,
+    mut report: impl FnMut(&Progress),
+) -> Result<Outcome> {
+    let mut training = Training::begin(servers, config, directory)?;
+    let mut log = Logs::create(config, directory, &training.summary)?;
+    fs::write(directory.path().join("config.toml"), config.to_toml()).context("cannot write config.toml")?;
+    let mut saved_at = None;
+    loop {
+        let progress = match training.iterate(&mut log) {
+            Ok(progress) => progress,
+            Err(error) => {
+                log.flush()?;
+                let counters = training.whole.state.counters;
+                let context = if counters.iterations == 0 {
+                    "training failed in its first iteration".to_owned()
+                } else {
+                    training.whole.save(&directory.checkpoint())?;
+                    format!(
+                        "training failed; the policy after {} episodes is kept in {}",
+                        counters.episodes,
+                        directory.checkpoint().display()
+                    )
+                };
+                return Err(error.context(context));
+            }
+        };
+        report(&progress);
+        let signal = stop.signal();
+        let finished = progress.episodes >= config.common.episodes || signal.is_some();
+        let interval = config.common.checkpoint_interval;
+        let due = saved_at.is_none_or(|saved: u64| progress.episodes / interval > saved / interval);
+        if finished || due {
+            log.flush()?;
+            training.whole.save(&directory.checkpoint())?;
+            saved_at = Some(progress.episodes);
+        }
+        if finished || progress.iterations.is_multiple_of(config.common.log_interval) {
+            log.progress.write(&progress).context("cannot write progress.csv")?;
+        }
+        if finished {
+            return Ok(Outcome { checkpoint: training.whole, progress, signal });
+        }
+    }
+}
+
+/// A training between two iterations.
+struct Training<'a> {
+    config: &'a TrainConfig,
+    summary: EnvironmentSummary,
+    collector: Collector<'a>,
+    rollout: Rollout,
+    policy: Policy,
+    algorithm: Box<dyn Algorithm>,
+    /// The policy after the last whole iteration.
+    whole: Checkpoint,
+    recent: VecDeque<[f64; 3]>,
+    start: Instant,
+    updating: Duration,
+}
+
+impl<'a> Training<'a> {
+    fn begin(servers: &'a Servers, config: &'a TrainConfig, directory: &RunDirectory) -> Result<Self> {
+        let common = &config.common;
+        let options = OpenOptions {
+            environment: common.environment.clone(),
+            version: common.version.to_proto(),
+            num_envs: common.num_envs,
+            seed: common.seed,
+            episodes_per_trial: 1,
+        };
+        let mut observations = Vec::new();
+        let session = Session::open(servers, &options, &mut observations)?;
+        let summary = EnvironmentSummary::of(session.environment())
+            .context("the server does not say what actions the environment takes: are both of one version?")?;
+        let spec = PolicySpec {
+            observation_size: session.observation_size(),
+            action: summary.action,
+            hidden: common.architecture.hidden(),
+        };
+        let policy = Policy::new(spec.clone(), common.seed)?;
+        let algorithm = config.algorithm(&policy)?;
+        let normalisers = Normalisers {
+            observations: common.normalize_observations.then(|| ObservationNormaliser::new(spec.observation_size)),
+            rewards: common.normalize_rewards.then(|| RewardNormaliser::new(common.num_envs, config.gamma())),
+        };
+        let rollout =
+            Rollout::new(algorithm.n_steps(), common.num_envs, spec.observation_size, spec.action.width());
+        let collector = Collector::new(session, observations, &spec, normalisers, common.seed)?;
+        let whole = Checkpoint {
+            state: State {
+                environment: common.environment.clone(),
+                environment_spec: summary.clone(),
+                algorithm: common.algorithm,
+                architecture: common.architecture,
+                policy: spec,
+                train_version: common.version,
+                seed: common.seed,
+                observation_normaliser: None,
+                reward_normaliser: None,
+                counters: Counters::default(),
+                config: config.table(),
+            },
+            weights: policy.weights(),
+        };
+        tracing::debug!(directory = %directory.path().display(), "training begins");
+        Ok(Self {
+            config,
+            summary,
+            collector,
+            rollout,
+            policy,
+            algorithm,
+            whole,
+            recent: VecDeque::with_capacity(RECENT),
+            start: Instant::now(),
+            updating: Duration::ZERO,
+        })
+    }
+
+    /// A rollout and an update.
+    fn iterate(&mut self, log: &mut Logs) -> Result<Progress> {
+        let mut counters = self.whole.state.counters;
+        let mut written = Ok(());
+        let recent = &mut self.recent;
+        self.collector.collect(&self.whole.weights, &mut self.rollout, |episode| {
+            counters.episodes += 1;
+            remember(recent, episode);
+            if written.is_ok() {
+                written = log.monitor.write(episode);
+            }
+        })?;
+        written.context("cannot write monitor.csv")?;
+
+        let updating = Instant::now();
+        let progress_remaining = self.progress_remaining(self.whole.state.counters.timesteps);
+        let update = self.algorithm.update(&mut self.policy, &self.rollout, progress_remaining)?;
+        let weights = self.policy.weights();
+        self.updating += updating.elapsed();
+
+        counters.iterations += 1;
+        counters.timesteps += (self.rollout.n_steps() * self.rollout.n_envs()) as u64;
+        self.keep(weights, counters);
+        Ok(self.progress(update))
+    }
+
+    /// 1 at the start, 0 when as many steps were made as the budget's episodes can have at most.
+    fn progress_remaining(&self, timesteps: u64) -> f64 {
+        let most = self.config.common.episodes as f64 * f64::from(self.summary.step_limit);
+        (1.0 - timesteps as f64 / most).max(0.0)
+    }
+
+    /// Remembers the state after a whole iteration.
+    fn keep(&mut self, weights: Weights, counters: Counters) {
+        let Normalisers { observations, rewards } = self.collector.normalisers().clone();
+        self.whole.weights = weights;
+        self.whole.state.observation_normaliser = observations;
+        self.whole.state.reward_normaliser = rewards;
+        self.whole.state.counters = counters;
+    }
+
+    fn progress(&self, update: UpdateStats) -> Progress {
+        let Counters { iterations, timesteps, episodes } = self.whole.state.counters;
+        let times = self.collector.times();
+        let mean = |i: usize| self.recent.iter().map(|episode| episode[i]).sum::<f64>() / self.recent.len() as f64;
+        Progress {
+            iterations,
+            timesteps,
+            elapsed: self.start.elapsed().as_secs_f64(),
+            shares: [times.acting, times.waiting, self.updating].map(|time| time.as_secs_f64()),
+            episodes,
+            recent: (!self.recent.is_empty()).then(|| [mean(0), mean(1), mean(2)]),
+            update,
+        }
+    }
+}
+
+fn remember(recent: &mut VecDeque<[f64; 3]>, episode: &EndedEpisode) {
+    if recent.len() == RECENT {
+        recent.pop_front();
+    }
+    recent.push_back([episode.episode_return, f64::from(episode.length), f64::from(u8::from(episode.success))]);
+}
+
+/// The files that grow.
+struct Logs {
+    monitor: Monitor,
+    progress: ProgressLog,
+}
+
+impl Logs {
+    fn create(config: &TrainConfig, directory: &RunDirectory, summary: &EnvironmentSummary) -> Result<Self> {
+        let t_start = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64();
+        let path = directory.path().join("monitor.csv");
+        let monitor = Monitor::create(&path, &config.common.environment, &summary.parameters, t_start)
+            .with_context(|| format!("cannot create {}", path.display()))?;
+        let progress = ProgressLog::create(directory.path(), t_start)
+            .with_context(|| format!("cannot create the logs in {}", directory.path().display()))?;
+        Ok(Self { monitor, progress })
+    }
+
+    fn flush(&mut self) -> Result<()> {
+        self.monitor.flush().context("cannot write monitor.csv")
+    }
+}

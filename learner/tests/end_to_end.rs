@@ -1,0 +1,321 @@
+//! The learner against real servers. Needs the program `perturb-server`: run `cargo build --release` first.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use perturb_learner::checkpoint::Checkpoint;
+use perturb_learner::client::{Address, LocalServer, LocalServerOptions, OpenOptions, Servers, Session, StepReply};
+use perturb_learner::config::TrainConfig;
+use perturb_learner::evaluation::{Version, environment_seed, test};
+use perturb_learner::interrupt::StopFlag;
+use perturb_learner::proto;
+use perturb_learner::training::{Outcome, RunDirectory, train};
+use tempfile::TempDir;
+
+/// How long anything may take that must not hang.
+const SECONDS: Duration = Duration::from_secs(20);
+
+fn server(workers: usize) -> LocalServer {
+    LocalServer::start(LocalServerOptions { workers: Some(workers) }).unwrap_or_else(|error| panic!("{error}"))
+}
+
+fn addresses(servers: &[LocalServer]) -> Vec<Address> {
+    servers.iter().map(|server| server.address().clone()).collect()
+}
+
+fn config(text: &str) -> TrainConfig {
+    TrainConfig::from_table("the test", text.parse().expect("TOML")).unwrap_or_else(|error| panic!("{error}"))
+}
+
+/// Trains in a fresh directory.
+fn run(servers: &Servers, text: &str) -> (TempDir, Outcome) {
+    let out = tempfile::tempdir().expect("a directory");
+    let directory = RunDirectory::create(out.path(), false).expect("an empty directory");
+    let outcome = train(servers, &config(text), &directory, &StopFlag::default(), |_| {});
+    (out, outcome.unwrap_or_else(|error| panic!("{error:#}")))
+}
+
+fn perturb(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_perturb"));
+    command.args(arguments).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// Waits until `condition` holds.
+fn wait_for(what: &str, mut condition: impl FnMut() -> bool) {
+    let start = Instant::now();
+    while !condition() {
+        assert!(start.elapsed() < SECONDS, "{what} did not happen within {SECONDS:?}");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// The process that `parent` started and that is called perturb-server.
+fn child_server(parent: u32) -> Option<u32> {
+    let children = std::fs::read_to_string(format!("/proc/{parent}/task/{parent}/children")).ok()?;
+    let is_server = |id: &u32| {
+        std::fs::read_to_string(format!("/proc/{id}/comm")).is_ok_and(|name| name.trim().starts_with("perturb-serv"))
+    };
+    children.split_whitespace().filter_map(|id| id.parse().ok()).find(is_server)
+}
+
+/// Whether a process runs; one that has ended and waits for its parent does not.
+fn is_running(id: u32) -> bool {
+    std::fs::read_to_string(format!("/proc/{id}/stat")).is_ok_and(|stat| !stat.contains(") Z "))
+}
+
+fn kill(signal: &str, id: u32) {
+    let status = Command::new("kill").args([signal, &id.to_string()]).status().expect("kill");
+    assert!(status.success());
+}
+
+fn read(directory: &Path, name: &str) -> String {
+    std::fs::read_to_string(directory.join(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
+}
+
+#[test]
+fn a_policy_is_trained_written_and_tested_with_both_algorithms() {
+    let server = [server(1)];
+    let servers = Servers::connect(&addresses(&server)).expect("a connection");
+    for algorithm in ["ppo", "a2c"] {
+        let text = format!(
+            "environment = 'CartPole'\nversion = 'R'\nalgorithm = '{algorithm}'\nepisodes = 50\nnum_envs = 4\nlog_interval = 1\n"
+        );
+        let (out, outcome) = run(&servers, &text);
+        assert!(outcome.progress.episodes >= 50, "{algorithm}");
+        assert_eq!(outcome.signal, None);
+
+        let monitor = read(out.path(), "monitor.csv");
+        let lines: Vec<Vec<f64>> = monitor
+            .lines()
+            .skip(2)
+            .map(|line| line.split(',').map(|field| field.parse().expect("a number")).collect())
+            .collect();
+        assert_eq!(lines.len() as u64, outcome.progress.episodes);
+        assert_eq!(
+            monitor.lines().nth(1),
+            Some("r,l,t,success,terminated,episode_index,environment_index,force,length,mass")
+        );
+        for line in &lines {
+            assert_eq!(line[0], line[1], "CartPole pays 1 a step");
+            assert!((5.0..=15.0).contains(&line[7]) && (0.25..=0.75).contains(&line[8]), "R's intervals");
+        }
+        let progress = read(out.path(), "progress.csv");
+        assert_eq!(progress.lines().count() as u64, 1 + outcome.progress.iterations);
+        assert_eq!(config(&read(out.path(), "config.toml")), config(&text), "the run can be repeated");
+
+        let checkpoint = Checkpoint::load(out.path()).expect("a checkpoint");
+        assert_eq!(checkpoint, outcome.checkpoint);
+        let result = test(&servers, &checkpoint, Version::D, 30, 1, &StopFlag::default(), |_| {}).expect("a test");
+        assert_eq!(result.episodes, 30);
+        assert_eq!(result.mean_return, result.mean_length);
+        assert!((8.0..=200.0).contains(&result.mean_length), "{}", result.mean_length);
+    }
+}
+
+#[test]
+fn continuous_actions_are_learned_from() {
+    let server = [server(1)];
+    let servers = Servers::connect(&addresses(&server)).expect("a connection");
+    let (_out, outcome) = run(&servers, "environment = 'Pendulum'\nepisodes = 8\nn_steps = 64");
+    assert!(outcome.progress.update.std.is_some_and(|std| std != 1.0), "the standard deviation moved");
+    let test = |episodes| test(&servers, &outcome.checkpoint, Version::E, episodes, 1, &StopFlag::default(), |_| {});
+    assert_eq!(test(4).expect("a test").mean_length, 200.0);
+}
+
+#[test]
+fn equal_seeds_give_equal_weights_with_any_number_of_servers_and_workers() {
+    let text = "environment = 'CartPole'\nversion = 'E'\nepisodes = 40\nnum_envs = 5\nn_steps = 32";
+    let train_on = |servers: &[LocalServer], text: &str| {
+        let servers = Servers::connect(&addresses(servers)).expect("connections");
+        run(&servers, text).1.checkpoint
+    };
+    let reference = train_on(&[server(1)], text);
+    assert_eq!(train_on(&[server(2)], text), reference, "two workers");
+    assert_eq!(train_on(&[server(1), server(2)], text), reference, "two servers");
+    let many: Vec<LocalServer> = (0..7).map(|_| server(1)).collect();
+    assert_eq!(train_on(&many, text), reference, "more servers than environments");
+    let other = train_on(&[server(1)], &format!("{text}\nseed = 2"));
+    assert_ne!(other.weights, reference.weights, "another seed");
+}
+
+#[test]
+fn a_test_gives_the_same_figures_on_any_number_of_servers_and_others_with_another_seed() {
+    let both = [server(1), server(1)];
+    let one = Servers::connect(&addresses(&both[..1])).expect("a connection");
+    let two = Servers::connect(&addresses(&both)).expect("connections");
+    let (_out, outcome) = run(&one, "environment = 'CartPole'\nepisodes = 20");
+    let figures = |servers: &Servers, seed| {
+        test(servers, &outcome.checkpoint, Version::E, 150, seed, &StopFlag::default(), |_| {}).expect("a test")
+    };
+    assert_eq!(figures(&one, 1), figures(&two, 1));
+    assert_ne!(figures(&one, 1), figures(&one, 2));
+}
+
+#[test]
+fn test_environments_are_not_those_of_training() {
+    let server = [server(1)];
+    let servers = Servers::connect(&addresses(&server)).expect("a connection");
+    let first_observations = |seed| {
+        let options = OpenOptions {
+            environment: "CartPole".into(),
+            version: proto::Version::Extreme,
+            num_envs: 3,
+            seed,
+            episodes_per_trial: 1,
+        };
+        let mut observations = Vec::new();
+        Session::open(&servers, &options, &mut observations).expect("a session");
+        observations
+    };
+    assert_eq!(first_observations(1), first_observations(1));
+    assert_ne!(first_observations(1), first_observations(environment_seed(1, Version::E)));
+}
+
+#[test]
+fn a_refused_request_is_told_in_the_servers_words_and_the_session_lives_on() {
+    let server = [server(1)];
+    let servers = Servers::connect(&addresses(&server)).expect("a connection");
+    let options = OpenOptions {
+        environment: "CartPole".into(),
+        version: proto::Version::Default,
+        num_envs: 2,
+        seed: 1,
+        episodes_per_trial: 1,
+    };
+    let mut observations = Vec::new();
+    let mut session = Session::open(&servers, &options, &mut observations).expect("a session");
+    let mut reply = StepReply::default();
+    let error = session.step(&[9, 0, 0, 0, 0, 0, 0, 0], &mut reply).expect_err("there is no action 9").to_string();
+    assert!(error.contains("refused a step") && error.contains('9'), "{error}");
+    session.step(&[1, 0, 0, 0, 0, 0, 0, 0], &mut reply).expect("a step");
+    assert_eq!(reply.rewards, [1.0, 1.0]);
+    session.reset(&mut observations).expect("a reset");
+    assert!(observations.iter().all(|x| x.abs() <= 0.05), "CartPole starts near 0");
+
+    let wrong = OpenOptions { environment: "CartPool".into(), ..options };
+    let error = Session::open(&servers, &wrong, &mut observations).expect_err("no such environment").to_string();
+    assert!(error.contains("CartPool"), "{error}");
+}
+
+#[test]
+fn a_server_that_is_killed_ends_the_training_soon_and_leaves_a_checkpoint() {
+    let out = tempfile::tempdir().expect("a directory");
+    let path = out.path().to_str().expect("a path");
+    let arguments = ["train", "--env", "CartPole", "--episodes", "1000000", "--out", path];
+    let child = perturb(&arguments).spawn().expect("perturb");
+    wait_for("a checkpoint", || out.path().join("checkpoint/checkpoint.json").exists());
+    let server = child_server(child.id()).expect("a private server");
+    let killed = Instant::now();
+    kill("-KILL", server);
+    let output = child.wait_with_output().expect("perturb ends");
+    assert!(killed.elapsed() < SECONDS, "{:?}", killed.elapsed());
+    assert_eq!(output.status.code(), Some(1));
+    let message = stderr(&output);
+    assert!(message.contains("lost the server at unix:") && message.contains("signal: 9"), "{message}");
+    assert!(message.contains("is kept in"), "{message}");
+    Checkpoint::load(out.path()).expect("a whole checkpoint");
+}
+
+#[test]
+fn a_learner_that_is_killed_takes_its_server_along() {
+    let out = tempfile::tempdir().expect("a directory");
+    let path = out.path().to_str().expect("a path");
+    let arguments = ["train", "--env", "CartPole", "--episodes", "1000000", "--out", path];
+    let mut child = perturb(&arguments).spawn().expect("perturb");
+    wait_for("a checkpoint", || out.path().join("checkpoint/checkpoint.json").exists());
+    let server = child_server(child.id()).expect("a private server");
+    child.kill().expect("kill -9");
+    child.wait().expect("it ends");
+    wait_for("the server's end", || !is_running(server));
+    Checkpoint::load(out.path()).expect("a whole checkpoint");
+}
+
+#[test]
+fn a_signal_ends_a_training_after_the_iteration_with_its_checkpoint() {
+    for (signal, status) in [("-INT", 130), ("-TERM", 143)] {
+        let out = tempfile::tempdir().expect("a directory");
+        let path = out.path().to_str().expect("a path");
+        let arguments = ["train", "--env", "CartPole", "--episodes", "1000000", "--out", path];
+        let child = perturb(&arguments).spawn().expect("perturb");
+        wait_for("a checkpoint", || out.path().join("checkpoint/checkpoint.json").exists());
+        let server = child_server(child.id()).expect("a private server");
+        kill(signal, child.id());
+        let output = child.wait_with_output().expect("perturb ends");
+        assert_eq!(output.status.code(), Some(status), "{}", stderr(&output));
+        assert!(stderr(&output).contains("stopped by signal"), "{}", stderr(&output));
+        assert!(!is_running(server));
+        let episodes = Checkpoint::load(out.path()).expect("a whole checkpoint").state.counters.episodes;
+        assert_eq!(read(out.path(), "monitor.csv").lines().count() as u64, 2 + episodes);
+    }
+}
+
+#[test]
+fn the_program_trains_tests_and_refuses_with_sentences() {
+    let out = tempfile::tempdir().expect("a directory");
+    let run = out.path().join("run");
+    let run = run.to_str().expect("a path");
+    let call = |arguments: &[&str]| perturb(arguments).output().expect("perturb runs");
+    let refused = |arguments: &[&str], status: i32, part: &str| {
+        let output = call(arguments);
+        assert_eq!(output.status.code(), Some(status), "{arguments:?}: {}", stderr(&output));
+        assert!(stderr(&output).contains(part), "{arguments:?}: {}", stderr(&output));
+    };
+
+    let base = ["train", "--env", "CartPole", "--episodes", "20", "--out", run];
+    let output = call(&base);
+    assert!(output.status.success(), "{}", stderr(&output));
+    refused(&base, 1, "already holds a run");
+    refused(&["train", "--env", "CartPole", "--out", run, "--algorithm", "rl2-ppo"], 2, "possible values: a2c, ppo");
+    refused(&["train", "--env", "CartPole", "--out", run, "--architecture", "rc"], 2, "possible values: ff");
+    refused(&["train", "--env", "CartPole", "--out", run, "--set", "foo=1"], 2, "unknown key `foo`");
+    refused(&["train", "--out", run], 2, "no environment was named");
+    refused(&["train", "--env", "Pong", "--out", run, "--overwrite"], 1, "there is no environment `Pong`");
+    refused(&["evaluate", "--checkpoint", "/nonexistent"], 1, "holds no checkpoint");
+    refused(&["envs", "--server", "nowhere"], 2, "the port is missing");
+    refused(&["envs", "--server", "127.0.0.1:1"], 1, "no server answers at http://127.0.0.1:1");
+    assert!(Path::new(run).join("checkpoint").exists(), "refusals delete nothing");
+
+    let json: PathBuf = out.path().join("result.json");
+    let json_text = json.to_str().expect("a path");
+    let output = call(&["evaluate", "--checkpoint", run, "--versions", "D,E", "--episodes", "20", "--json", json_text]);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let value: serde_json::Value = serde_json::from_str(&read(out.path(), "result.json")).expect("JSON");
+    for (key, expected) in [
+        ("environment", serde_json::json!("CartPole")),
+        ("algorithm", "ppo".into()),
+        ("architecture", "ff".into()),
+        ("train_version", "D".into()),
+        ("seed", 1.into()),
+    ] {
+        assert_eq!(value[key], expected);
+    }
+    let results = value["results"].as_object().expect("results");
+    assert_eq!(results.keys().collect::<Vec<_>>(), ["D", "E"]);
+    assert_eq!(results["E"]["episodes"], 20);
+    for key in ["success_percent", "mean_return", "mean_length"] {
+        assert!(results["D"][key].is_number(), "{key}");
+    }
+
+    let output = call(&["envs", "--json"]);
+    let catalogue: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(catalogue["environments"][0]["parameters"][0]["name"], "force");
+    assert_eq!(catalogue["environments"][0]["parameters"][0]["E"], serde_json::json!([[1.0, 5.0], [15.0, 20.0]]));
+}
+
+#[test]
+fn the_demo_prints_nine_rates_and_the_papers_row() {
+    let output = perturb(&["demo", "--episodes", "20", "--test-episodes", "20"]).output().expect("perturb runs");
+    assert!(output.status.success(), "{}", stderr(&output));
+    let text = String::from_utf8_lossy(&output.stdout);
+    for part in
+        ["Reduced budget: 20 episodes in each training", "train D", "train R", "train E", "Default (DD)", "86.2 ± 12.6"]
+    {
+        assert!(text.contains(part), "{part}: {text}");
+    }
+}

@@ -1,0 +1,317 @@
+//! Whether the algorithms learn, on tasks of seconds; and what their updates promise.
+
+use perturb_learner::algorithm::{A2c, A2cConfig, Algorithm, AlgorithmState, Ppo, PpoConfig, Schedule};
+use perturb_learner::error::Error;
+use perturb_learner::policy::{ActionKind, Actor, Acts, Policy, PolicySpec};
+use perturb_learner::random::{Purpose, normal, stream, uniform};
+use perturb_learner::rollout::{Rollout, RolloutStep};
+use rand_chacha::ChaCha8Rng;
+
+const N_ENVS: usize = 16;
+const DISCRETE: ActionKind = ActionKind::Discrete { n: 4 };
+const CONTINUOUS: ActionKind = ActionKind::Continuous { size: 2 };
+
+/// Stable-baselines3's identity task: the best action is the observation. Every step is an episode.
+///
+/// Discrete: one of four observations, one-hot; reward 1 for its index, else 0. Continuous: two numbers from [-1, 1];
+/// reward minus the squared distance.
+struct Identity {
+    action: ActionKind,
+    rng: ChaCha8Rng,
+    observations: Vec<f32>,
+}
+
+impl Identity {
+    fn new(action: ActionKind) -> Self {
+        let mut task = Identity { action, rng: stream(11, Purpose::Weights), observations: vec![] };
+        task.draw();
+        task
+    }
+
+    fn size(&self) -> usize {
+        self.action.outputs()
+    }
+
+    fn draw(&mut self) {
+        self.observations.clear();
+        for _ in 0..N_ENVS {
+            match self.action {
+                ActionKind::Discrete { n } => {
+                    let best = (uniform(&mut self.rng) * n as f64) as usize;
+                    self.observations.extend((0..n).map(|i| f32::from(u8::from(i == best))));
+                }
+                ActionKind::Continuous { size } => {
+                    let rng = &mut self.rng;
+                    self.observations.extend((0..size).map(|_| (2.0 * uniform(rng) - 1.0) as f32));
+                }
+            }
+        }
+    }
+
+    fn rewards(&self, actions: &[f32]) -> Vec<f32> {
+        let reward = |(observation, action): (&[f32], &[f32])| match self.action {
+            ActionKind::Discrete { .. } => observation[action[0] as usize],
+            ActionKind::Continuous { .. } => -observation.iter().zip(action).map(|(o, a)| (o - a).powi(2)).sum::<f32>(),
+        };
+        self.observations.chunks(self.size()).zip(actions.chunks(self.action.width())).map(reward).collect()
+    }
+}
+
+/// A policy, the task, and what a training loop has.
+struct Training {
+    policy: Policy,
+    actor: Actor,
+    task: Identity,
+    rng: ChaCha8Rng,
+    rollout: Rollout,
+}
+
+impl Training {
+    fn new(action: ActionKind, n_steps: usize) -> Self {
+        let spec = PolicySpec { observation_size: action.outputs(), action, hidden: vec![32, 32] };
+        Training {
+            policy: Policy::new(spec.clone(), 5).expect("a policy"),
+            actor: Actor::new(&spec, N_ENVS),
+            task: Identity::new(action),
+            rng: stream(5, Purpose::Actions),
+            rollout: Rollout::new(n_steps, N_ENVS, spec.observation_size, action.width()),
+        }
+    }
+
+    /// Fills the rollout; gives the mean reward.
+    fn collect(&mut self) -> f64 {
+        self.actor.load(&self.policy.weights()).expect("weights that fit");
+        self.rollout.clear();
+        let mut acts = Acts::new(self.task.action, N_ENVS);
+        let mut sum = 0.0;
+        while !self.rollout.is_full() {
+            self.actor.act(&self.task.observations, &mut self.rng, &mut acts).expect("actions");
+            let rewards = self.task.rewards(&acts.actions);
+            sum += rewards.iter().map(|&r| f64::from(r)).sum::<f64>();
+            let step = RolloutStep {
+                observations: &self.task.observations,
+                actions: &acts.actions,
+                log_probs: &acts.log_probs,
+                values: &acts.values,
+                rewards: &rewards,
+                terminated: &[true; N_ENVS],
+                truncated: &[false; N_ENVS],
+                truncation_values: &[0.0; N_ENVS],
+            };
+            self.rollout.push(step).expect("a step that fits");
+            self.task.draw();
+        }
+        self.rollout.finish(&[0.0; N_ENVS]).expect("a full rollout");
+        sum / (self.rollout.n_steps() * N_ENVS) as f64
+    }
+
+    /// Collects and updates `updates` times; gives the mean reward of the last rollout.
+    fn train(&mut self, algorithm: &mut dyn Algorithm, updates: usize) -> f64 {
+        for update in 0..updates {
+            self.collect();
+            let progress_remaining = 1.0 - update as f64 / updates as f64;
+            algorithm.update(&mut self.policy, &self.rollout, progress_remaining).expect("an update");
+        }
+        self.collect()
+    }
+}
+
+fn a2c(training: &Training) -> A2c {
+    let n_steps = training.rollout.n_steps();
+    let config = A2cConfig { n_steps, learning_rate: 7e-3, ent_coef: 0.0, ..A2cConfig::default() };
+    A2c::new(config, &training.policy).expect("valid settings")
+}
+
+fn ppo(training: &Training, n_minibatches: usize) -> Ppo {
+    let n_steps = training.rollout.n_steps();
+    let config = PpoConfig { n_steps, n_minibatches, learning_rate: 3e-3, n_epochs: 5, ..PpoConfig::default() };
+    Ppo::new(config, &training.policy, 5).expect("valid settings")
+}
+
+#[test]
+fn a2c_learns_the_identity() {
+    // Chance is 0.25; the best discrete policy gets 1, the best continuous one of deviation σ gets -2σ² (at first -2.7).
+    for (action, updates, enough) in [(DISCRETE, 1500, 0.95), (CONTINUOUS, 2000, -0.4)] {
+        let mut training = Training::new(action, 5);
+        let mut algorithm = a2c(&training);
+        let reward = training.train(&mut algorithm, updates);
+        assert!(reward > enough, "{action:?}: {reward}");
+    }
+}
+
+#[test]
+fn ppo_learns_the_identity() {
+    for (action, updates, enough) in [(DISCRETE, 40, 0.95), (CONTINUOUS, 100, -0.2)] {
+        for n_minibatches in [1, 4] {
+            let mut training = Training::new(action, 32);
+            let mut algorithm = ppo(&training, n_minibatches);
+            let reward = training.train(&mut algorithm, updates);
+            assert!(reward > enough, "{action:?}, {n_minibatches} minibatches: {reward}");
+        }
+    }
+}
+
+#[test]
+fn ppo_begins_with_ratio_1_and_clips_nothing() {
+    for action in [DISCRETE, CONTINUOUS] {
+        let mut training = Training::new(action, 32);
+        training.collect();
+        let config = PpoConfig { n_steps: 32, n_epochs: 1, ..PpoConfig::default() };
+        let mut first = Ppo::new(config.clone(), &training.policy, 1).expect("valid settings");
+        let stats = first.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
+        assert_eq!(stats.clip_fraction, Some(0.0));
+        // The actor's log-probabilities are off by 1e-6 at most, the divergence by half the square of that; but its
+        // f32 terms are rounded to 2⁻²⁴ each.
+        assert!(stats.approx_kl.expect("PPO's").abs() < 2e-7, "{stats:?}");
+        // With ratio 1, the surrogate is minus the mean of the normalised advantages, 0 but for the ratios' error.
+        assert!(stats.policy_gradient_loss.abs() < 1e-5, "{stats:?}");
+        let mut later =
+            Ppo::new(PpoConfig { n_epochs: 10, learning_rate: 1e-2, ..config }, &training.policy, 1).expect("valid");
+        training.collect();
+        let stats = later.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
+        assert!(stats.clip_fraction > Some(0.0) && stats.approx_kl > Some(1e-4), "a moved policy: {stats:?}");
+    }
+}
+
+#[test]
+fn the_same_seed_learns_the_same_bytes_and_a_resumed_training_too() {
+    let start = |action| {
+        let training = Training::new(action, 8);
+        let algorithms: [Box<dyn Algorithm>; 2] = [Box::new(a2c(&training)), Box::new(ppo(&training, 2))];
+        (training, algorithms)
+    };
+    for action in [DISCRETE, CONTINUOUS] {
+        for which in 0..2 {
+            let run = |resume: bool| {
+                let (mut training, mut algorithms) = start(action);
+                training.train(algorithms[which].as_mut(), 3);
+                if resume {
+                    let json = serde_json::to_string(&algorithms[which].state()).expect("JSON");
+                    let state: AlgorithmState = serde_json::from_str(&json).expect("a state");
+                    let (spec, weights) = (training.policy.spec().clone(), training.policy.weights());
+                    training.policy = Policy::from_weights(spec, &weights).expect("a policy");
+                    (_, algorithms) = start(action);
+                    algorithms[which].load_state(&state).expect("a state that fits");
+                }
+                training.train(algorithms[which].as_mut(), 3);
+                training.policy.weights()
+            };
+            assert_eq!(run(false), run(false));
+            assert_eq!(run(false), run(true));
+        }
+    }
+}
+
+#[test]
+fn a_state_of_another_algorithm_is_refused() {
+    let training = Training::new(DISCRETE, 8);
+    let (mut a2c, mut ppo) = (a2c(&training), ppo(&training, 1));
+    assert!(matches!(a2c.load_state(&ppo.state()), Err(Error::Arrays { .. })));
+    assert!(ppo.load_state(&a2c.state()).is_err());
+}
+
+#[test]
+fn a_loss_that_is_not_finite_is_an_error_and_leaves_the_policy_alone() {
+    let mut training = Training::new(DISCRETE, 8);
+    training.collect();
+    let mut rollout = Rollout::new(8, N_ENVS, 4, 1);
+    for _ in 0..8 {
+        let step = RolloutStep {
+            observations: &[0.5; 4 * N_ENVS],
+            actions: &[1.0; N_ENVS],
+            log_probs: &[-1.0; N_ENVS],
+            values: &[0.0; N_ENVS],
+            rewards: &[f32::MAX; N_ENVS],
+            terminated: &[false; N_ENVS],
+            truncated: &[false; N_ENVS],
+            truncation_values: &[0.0; N_ENVS],
+        };
+        rollout.push(step).expect("a step that fits");
+    }
+    rollout.finish(&[0.0; N_ENVS]).expect("a full rollout");
+    let before = training.policy.weights();
+    let algorithms: [Box<dyn Algorithm>; 2] = [Box::new(a2c(&training)), Box::new(ppo(&training, 2))];
+    for mut algorithm in algorithms {
+        let result = algorithm.update(&mut training.policy, &rollout, 1.0);
+        assert!(matches!(result, Err(Error::NotFinite { update: 0, .. })), "{result:?}");
+        assert_eq!(training.policy.weights(), before);
+    }
+}
+
+#[test]
+fn the_learning_rate_falls_linearly_or_stays() {
+    let mut training = Training::new(DISCRETE, 8);
+    training.collect();
+    for (learning_rate_schedule, expected) in [(Schedule::Linear, 0.25e-3), (Schedule::Constant, 1e-3)] {
+        let config = A2cConfig { n_steps: 8, learning_rate: 1e-3, learning_rate_schedule, ..A2cConfig::default() };
+        let mut algorithm = A2c::new(config, &training.policy).expect("valid settings");
+        let stats = algorithm.update(&mut training.policy, &training.rollout, 0.25).expect("an update");
+        assert_eq!(stats.learning_rate, expected);
+        assert!(algorithm.update(&mut training.policy, &training.rollout, 1.5).is_err());
+    }
+    // A2C's last learning rate is 0, and then nothing moves.
+    let mut algorithm = a2c(&training);
+    let before = training.policy.weights();
+    algorithm.update(&mut training.policy, &training.rollout, 0.0).expect("an update");
+    assert_eq!(training.policy.weights(), before);
+}
+
+#[test]
+fn rollouts_that_do_not_fit_are_refused() {
+    let mut training = Training::new(DISCRETE, 8);
+    let mut algorithm = a2c(&training);
+    let result = algorithm.update(&mut training.policy, &training.rollout, 1.0);
+    assert!(matches!(result, Err(Error::RolloutLength { got: 0, expected: 8, .. })), "{result:?}");
+    training.collect();
+    let mut short = A2c::new(A2cConfig::default(), &training.policy).expect("valid settings");
+    assert!(matches!(short.update(&mut training.policy, &training.rollout, 1.0), Err(Error::Length { .. })));
+    let mut odd = ppo(&training, 3);
+    let result = odd.update(&mut training.policy, &training.rollout, 1.0);
+    assert!(matches!(result, Err(Error::Setting { name: "n_minibatches", .. })), "{result:?}");
+    assert!(matches!(training.rollout.finish(&[0.0; 3]), Err(Error::Length { .. })));
+}
+
+#[test]
+fn settings_outside_their_ranges_are_refused_by_name() {
+    let refused = |result: Result<(), Error>, setting| {
+        assert!(matches!(result, Err(Error::Setting { name, .. }) if name == setting), "{setting}: {result:?}");
+    };
+    A2cConfig::default().validate().expect("defaults are valid");
+    PpoConfig::default().validate().expect("defaults are valid");
+    for bad in [f64::NAN, f64::INFINITY, -1.0] {
+        refused(A2cConfig { learning_rate: bad, ..A2cConfig::default() }.validate(), "learning_rate");
+        refused(A2cConfig { gamma: bad, ..A2cConfig::default() }.validate(), "gamma");
+        refused(A2cConfig { ent_coef: bad, ..A2cConfig::default() }.validate(), "ent_coef");
+        refused(A2cConfig { vf_coef: bad, ..A2cConfig::default() }.validate(), "vf_coef");
+        refused(A2cConfig { max_grad_norm: bad, ..A2cConfig::default() }.validate(), "max_grad_norm");
+        refused(A2cConfig { rms_alpha: bad, ..A2cConfig::default() }.validate(), "rms_alpha");
+        refused(A2cConfig { rms_eps: bad, ..A2cConfig::default() }.validate(), "rms_eps");
+        refused(PpoConfig { learning_rate: bad, ..PpoConfig::default() }.validate(), "learning_rate");
+        refused(PpoConfig { gamma: bad, ..PpoConfig::default() }.validate(), "gamma");
+        refused(PpoConfig { gae_lambda: bad, ..PpoConfig::default() }.validate(), "gae_lambda");
+        refused(PpoConfig { clip_range: bad, ..PpoConfig::default() }.validate(), "clip_range");
+        refused(PpoConfig { clip_range_vf: bad, ..PpoConfig::default() }.validate(), "clip_range_vf");
+        refused(PpoConfig { ent_coef: bad, ..PpoConfig::default() }.validate(), "ent_coef");
+        refused(PpoConfig { vf_coef: bad, ..PpoConfig::default() }.validate(), "vf_coef");
+        refused(PpoConfig { max_grad_norm: bad, ..PpoConfig::default() }.validate(), "max_grad_norm");
+        refused(PpoConfig { adam_eps: bad, ..PpoConfig::default() }.validate(), "adam_eps");
+    }
+    refused(A2cConfig { n_steps: 0, ..A2cConfig::default() }.validate(), "n_steps");
+    refused(PpoConfig { n_steps: 0, ..PpoConfig::default() }.validate(), "n_steps");
+    refused(PpoConfig { n_epochs: 0, ..PpoConfig::default() }.validate(), "n_epochs");
+    refused(PpoConfig { n_minibatches: 0, ..PpoConfig::default() }.validate(), "n_minibatches");
+    let unknown = toml::from_str::<PpoConfig>("learning_rat = 1e-3").expect_err("a misspelt setting");
+    assert!(unknown.to_string().contains("learning_rat"), "{unknown}");
+    let config: PpoConfig = toml::from_str("learning_rate = 1e-3").expect("other settings have defaults");
+    assert_eq!(config, PpoConfig { learning_rate: 1e-3, ..PpoConfig::default() });
+}
+
+#[test]
+fn streams_of_one_seed_are_independent() {
+    let draw = |purpose| -> Vec<f64> {
+        let mut rng = stream(3, purpose);
+        (0..4).map(|_| normal(&mut rng)).collect()
+    };
+    assert_eq!(draw(Purpose::Actions), draw(Purpose::Actions));
+    assert_ne!(draw(Purpose::Actions), draw(Purpose::Minibatches));
+}
