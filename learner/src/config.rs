@@ -150,7 +150,9 @@ pub enum ConfigError {
         expected: String,
     },
     /// No environment was named.
-    #[error("no environment was named: give --env NAME, or `environment` in the configuration file; `perturb envs` lists them")]
+    #[error(
+        "no environment was named: give --env NAME, or `environment` in the configuration file; `perturb envs` lists them"
+    )]
     NoEnvironment,
     /// The layers cannot be merged.
     #[error("cannot merge the configuration: {0}")]
@@ -180,8 +182,8 @@ impl TrainConfig {
         let mut layers: Vec<(String, Table)> = Vec::new();
         if let Some(path) = sources.file {
             let shown = path.display().to_string();
-            let text = std::fs::read_to_string(path)
-                .map_err(|source| ConfigError::File { path: shown.clone(), source })?;
+            let text =
+                std::fs::read_to_string(path).map_err(|source| ConfigError::File { path: shown.clone(), source })?;
             let table = text
                 .parse::<Table>()
                 .map_err(|error| ConfigError::Syntax { origin: shown.clone(), reason: error.to_string() })?;
@@ -272,8 +274,7 @@ impl TrainConfig {
             ("checkpoint_interval", checkpoint_interval, u64::MAX),
         ] {
             if value == 0 || value > most {
-                let expected =
-                    if most == u64::MAX { "at least 1".to_owned() } else { format!("between 1 and {most}") };
+                let expected = if most == u64::MAX { "at least 1".to_owned() } else { format!("between 1 and {most}") };
                 return Err(ConfigError::Value { key: key.into(), got: value.to_string(), expected });
             }
         }

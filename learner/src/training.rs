@@ -190,8 +190,7 @@ impl<'a> Training<'a> {
             observations: common.normalize_observations.then(|| ObservationNormaliser::new(spec.observation_size)),
             rewards: common.normalize_rewards.then(|| RewardNormaliser::new(common.num_envs, config.gamma())),
         };
-        let rollout =
-            Rollout::new(algorithm.n_steps(), common.num_envs, spec.observation_size, spec.action.width());
+        let rollout = Rollout::new(algorithm.n_steps(), common.num_envs, spec.observation_size, spec.action.width());
         let collector = Collector::new(session, observations, &spec, normalisers, common.seed)?;
         let whole = Checkpoint {
             state: State {

@@ -153,10 +153,12 @@ fn ppo_learns_the_identity() {
 
 #[test]
 fn ppo_begins_with_ratio_1_and_clips_nothing() {
-    for action in [DISCRETE, CONTINUOUS] {
+    for (action, n_minibatches) in [(DISCRETE, 1), (DISCRETE, 4), (CONTINUOUS, 1), (CONTINUOUS, 4)] {
         let mut training = Training::new(action, 32);
         training.collect();
-        let config = PpoConfig { n_steps: 32, n_epochs: 1, ..PpoConfig::default() };
+        // A learning rate that moves no weight by a rounding, so that each of four minibatches is a first one.
+        let config =
+            PpoConfig { n_steps: 32, n_epochs: 1, n_minibatches, learning_rate: 1e-12, ..PpoConfig::default() };
         let mut first = Ppo::new(config.clone(), &training.policy, 1).expect("valid settings");
         let stats = first.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
         assert_eq!(stats.clip_fraction, Some(0.0));
@@ -165,11 +167,36 @@ fn ppo_begins_with_ratio_1_and_clips_nothing() {
         assert!(stats.approx_kl.expect("PPO's").abs() < 2e-7, "{stats:?}");
         // With ratio 1, the surrogate is minus the mean of the normalised advantages, 0 but for the ratios' error.
         assert!(stats.policy_gradient_loss.abs() < 1e-5, "{stats:?}");
-        let mut later =
-            Ppo::new(PpoConfig { n_epochs: 10, learning_rate: 1e-2, ..config }, &training.policy, 1).expect("valid");
-        training.collect();
+        // The rollout's own values lie inside any clipping interval.
+        let mut unclipped =
+            Ppo::new(PpoConfig { clip_range_vf: 0.0, ..config.clone() }, &training.policy, 1).expect("valid settings");
+        let value_loss = unclipped.update(&mut training.policy, &training.rollout, 1.0).expect("an update").value_loss;
+        assert!((value_loss - stats.value_loss).abs() < 1e-6 * value_loss, "f32 rounding: {value_loss} {stats:?}");
+        let config = PpoConfig { n_epochs: 10, learning_rate: 1e-2, ..config };
+        let mut later = Ppo::new(config, &training.policy, 1).expect("valid settings");
         let stats = later.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
         assert!(stats.clip_fraction > Some(0.0) && stats.approx_kl > Some(1e-4), "a moved policy: {stats:?}");
+    }
+}
+
+#[test]
+fn the_loss_is_the_weighted_sum_of_its_parts() {
+    for action in [DISCRETE, CONTINUOUS] {
+        let mut training = Training::new(action, 8);
+        training.collect();
+        let (ent_coef, vf_coef) = (0.3, 0.7);
+        let a2c = A2cConfig { n_steps: 8, ent_coef, vf_coef, ..A2cConfig::default() };
+        let ppo = PpoConfig { n_steps: 8, ent_coef, vf_coef, n_epochs: 3, ..PpoConfig::default() };
+        let algorithms: [Box<dyn Algorithm>; 2] = [
+            Box::new(A2c::new(a2c, &training.policy).expect("valid settings")),
+            Box::new(Ppo::new(ppo, &training.policy, 1).expect("valid settings")),
+        ];
+        for mut algorithm in algorithms {
+            let stats = algorithm.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
+            let sum = stats.policy_gradient_loss + ent_coef * stats.entropy_loss + vf_coef * stats.value_loss;
+            assert!((stats.loss - sum).abs() < 1e-6, "f32 rounding of numbers of order 1: {stats:?}");
+            assert!(stats.entropy_loss < 0.0 && stats.value_loss > 0.0, "{stats:?}");
+        }
     }
 }
 

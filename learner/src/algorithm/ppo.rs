@@ -186,7 +186,7 @@ impl Algorithm for Ppo {
         let PpoConfig { n_epochs, n_minibatches, .. } = self.config;
         check_rollout(rollout, policy, self.config.n_steps)?;
         let n_samples = rollout.n_steps() * rollout.n_envs();
-        if n_samples % n_minibatches != 0 {
+        if !n_samples.is_multiple_of(n_minibatches) {
             let got = format!("{n_minibatches} with {n_samples} samples");
             return Err(Error::Setting { name: "n_minibatches", got, expected: "a divisor of n_steps times num_envs" });
         }

@@ -111,8 +111,6 @@ fn environment(environment: &Environment) -> Value {
 fn channels(channels: &[Channel]) -> Vec<Value> {
     channels
         .iter()
-        .map(|channel| {
-            json!({ "name": channel.name, "unit": channel.unit, "low": channel.low, "high": channel.high })
-        })
+        .map(|channel| json!({ "name": channel.name, "unit": channel.unit, "low": channel.low, "high": channel.high }))
         .collect()
 }

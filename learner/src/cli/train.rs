@@ -50,16 +50,12 @@ pub(super) fn describe(config: &TrainConfig) -> String {
 pub(super) fn summarise(progress: &Progress) {
     let [acting, waiting, updating] = progress.shares.map(|seconds| 100.0 * seconds / progress.elapsed.max(1e-9));
     let recent = match progress.recent {
-        Some([episode_return, length, success]) => format!(
-            "; the last 100: return {episode_return:.1}, length {length:.1}, success {:.1} %",
-            100.0 * success
-        ),
+        Some([episode_return, length, success]) => {
+            format!("; the last 100: return {episode_return:.1}, length {length:.1}, success {:.1} %", 100.0 * success)
+        }
         None => String::new(),
     };
-    eprintln!(
-        "{} episodes, {} steps in {:.1} s{recent}",
-        progress.episodes, progress.timesteps, progress.elapsed
-    );
+    eprintln!("{} episodes, {} steps in {:.1} s{recent}", progress.episodes, progress.timesteps, progress.elapsed);
     eprintln!(
         "{:.0} steps/s: {acting:.0} % acting, {waiting:.0} % waiting for the server, {updating:.0} % updating",
         progress.fps()

@@ -95,11 +95,7 @@ impl<'a> Session<'a> {
     /// # Errors
     /// [`ClientError::Refused`] with the server's sentence, [`ClientError::Disagreement`] between servers, and the
     /// failures of a connection.
-    pub fn open(
-        servers: &'a Servers,
-        options: &OpenOptions,
-        observations: &mut Vec<f32>,
-    ) -> Result<Self, ClientError> {
+    pub fn open(servers: &'a Servers, options: &OpenOptions, observations: &mut Vec<f32>) -> Result<Self, ClientError> {
         let ranges = split(options.num_envs, servers.links().len());
         let mut shards: Vec<Shard> = Vec::new();
         let mut environment: Option<proto::Environment> = None;
@@ -225,9 +221,12 @@ impl Shard {
             .map_err(|_| ClientError::TimedOut { address: address(), request: what, limit: REPLY_LIMIT })?
             .map_err(|status| servers.lost(&self.address, what, &status))?;
         match message.map(|message| message.response) {
-            Some(Some(Response::Error(error))) => {
-                Err(ClientError::Refused { address: address(), request: what, code: error.code, message: error.message })
-            }
+            Some(Some(Response::Error(error))) => Err(ClientError::Refused {
+                address: address(),
+                request: what,
+                code: error.code,
+                message: error.message,
+            }),
             Some(Some(response)) => Ok(response),
             Some(None) => Err(self.mismatch(what, "an empty reply".into(), "a reply".into())),
             None => Err(servers.lost(&self.address, what, &tonic::Status::unavailable("the server ended the stream"))),

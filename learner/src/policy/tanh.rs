@@ -13,7 +13,7 @@ pub(super) fn tanh(x: f32) -> f32 {
     const LARGEST: f32 = 9.1;
     /// (ln 2)^i / i! for i = 6 … 0.
     const TAYLOR: [f32; 7] =
-        [1.540_353e-4, 1.333_355_8e-3, 9.618_129e-3, 5.550_410_9e-2, 0.240_226_51, std::f32::consts::LN_2, 1.0];
+        [1.540_353e-4, 1.333_355_8e-3, 9.618_129e-3, 5.550_411e-2, 0.240_226_5, std::f32::consts::LN_2, 1.0];
 
     let magnitude = x.abs();
     let magnitude = if magnitude > LARGEST { LARGEST } else { magnitude }; // f32::min would turn NaN into a number

@@ -97,9 +97,9 @@ fn backward(trajectories: &Trajectories<'_>, bootstrap: bool, estimate: impl Fn(
     let lengths = [values.len(), terminated.len(), truncated.len(), truncation_values.len()];
     assert!(lengths == [size; 4] && last_values.len() == n_envs, "arrays [T, N] have {size} and {lengths:?} elements");
     let mut estimates = Estimates { advantages: vec![0.0; size], returns: vec![0.0; size] };
-    for n in 0..n_envs {
+    for (n, &last_value) in last_values.iter().enumerate() {
         let mut later = (0.0, 0.0);
-        let mut later_value = f64::from(last_values[n]);
+        let mut later_value = f64::from(last_value);
         for i in (n..size).step_by(n_envs).rev() {
             let next_value = match (terminated[i], truncated[i]) {
                 (true, _) => 0.0,
