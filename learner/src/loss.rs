@@ -47,21 +47,18 @@ pub fn clipped_surrogate(
     }
 }
 
-/// The value loss: ½ · 1/B Σ_b (V(s_b) - return_b)².
-///
-/// The factor ½ is the reference's, for A2C and PPO alike; with `vf_coef` 0.5 the mean squared error thus counts a
-/// quarter. stable-baselines3 has no ½.
+/// The value loss: 1/B Σ_b (V(s_b) - return_b)², without the further ½ of some versions of the reference.
 pub fn value(values: &Tensor, returns: &Tensor) -> Tensor {
-    (values - returns).square().mean(Kind::Float) * 0.5
+    (values - returns).square().mean(Kind::Float)
 }
 
 /// The value loss of which no sample's V gains by moving farther than `clip_range` from the rollout's value:
-/// ½ · 1/B Σ_b max((V_b - R_b)², (V_b' - R_b)²), V_b' = old_b + clip(V_b - old_b, -clip_range, clip_range).
+/// 1/B Σ_b max((V_b - R_b)², (V_b' - R_b)²), V_b' = old_b + clip(V_b - old_b, -clip_range, clip_range).
 ///
 /// Not in the paper on PPO, but in the reference. Its unit is that of the normalised rewards.
 pub fn clipped_value(values: &Tensor, old_values: &Tensor, returns: &Tensor, clip_range: f64) -> Tensor {
     let clipped = old_values + (values - old_values).clamp(-clip_range, clip_range);
-    (values - returns).square().maximum(&(clipped - returns).square()).mean(Kind::Float) * 0.5
+    (values - returns).square().maximum(&(clipped - returns).square()).mean(Kind::Float)
 }
 
 /// (advantage_b - mean)/(standard deviation + 10⁻⁸), with the population's standard deviation as in the reference

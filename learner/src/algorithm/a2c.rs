@@ -29,7 +29,7 @@ pub struct A2cConfig {
     pub gamma: f64,
     /// Weight of the entropy in nats, not negative (default: `0.01`). Larger keeps actions random for longer.
     pub ent_coef: f64,
-    /// Weight of the value loss ½·MSE, not negative (default: `0.5`). Policy and value networks share no weights, so it
+    /// Weight of the value loss, not negative (default: `0.5`). Policy and value networks share no weights, so it
     /// acts through the clipping of the common gradient only.
     pub vf_coef: f64,
     /// Global norm that longer gradients are scaled down to, above 0 (default: `0.5`).
@@ -78,7 +78,7 @@ impl A2cConfig {
 /// Synchronous advantage actor-critic, Mnih et al. (2016), arXiv:1602.01783, without asynchrony: one gradient step a
 /// rollout on all its T·N samples,
 ///
-/// loss = policy gradient - ent_coef · mean entropy + vf_coef · ½ mean (V - R)²,
+/// loss = policy gradient - ent_coef · mean entropy + vf_coef · mean (V - R)²,
 ///
 /// with [`n_step_returns`] R and advantages R - V(s_t), where V(s_t) is the rollout's. RMSProp is TensorFlow's form:
 /// averages start at 1 and ε is inside the root.

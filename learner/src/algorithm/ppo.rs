@@ -42,7 +42,7 @@ pub struct PpoConfig {
     pub normalize_advantage: bool,
     /// Weight of the entropy in nats, not negative (default: `0`). Larger keeps actions random for longer.
     pub ent_coef: f64,
-    /// Weight of the value loss ½·MSE, not negative (default: `0.5`). Policy and value networks share no weights, so it
+    /// Weight of the value loss, not negative (default: `0.5`). Policy and value networks share no weights, so it
     /// acts through the clipping of the common gradient only.
     pub vf_coef: f64,
     /// Global norm that longer gradients are scaled down to, above 0 (default: `0.5`).
