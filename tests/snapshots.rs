@@ -51,12 +51,19 @@ fn encode(saved: &Saved) -> Vec<u8> {
     postcard::to_stdvec(saved).unwrap()
 }
 
-/// An environment in the middle of its first trial's second episode, unless it has just ended there.
+/// An environment in the middle of its first trial's second episode, at most 4 steps in: some fall soon.
 fn used(spec: &EnvironmentSpec) -> Episodes {
     let mut e = episodes(spec, Version::Extreme, 31, 5, 3);
-    play(&mut e, 1, 0, 4);
+    step(&mut e, &action_bytes(spec, 1, 0));
     e.begin(None);
-    play(&mut e, 1, 4, 4);
+    for t in 1..=4 {
+        let before = e.snapshot();
+        step(&mut e, &action_bytes(spec, 1, t));
+        if e.ended() {
+            e.restore(&before).unwrap();
+            break;
+        }
+    }
     e
 }
 
@@ -80,13 +87,14 @@ fn a_snapshot_in_mid_episode_continues_with_the_same_bytes() {
         let mut e = used(spec);
         assert!(!e.ended(), "{}", spec.name);
         let snapshot = e.snapshot();
-        let expected = play(&mut e, 3, 0, 700);
+        let steps = u64::from(spec.step_limit) + 100;
+        let expected = play(&mut e, 3, 0, steps);
         assert!(expected.iter().any(|line| line.starts_with("start")), "{}: later episodes are compared", spec.name);
         // Into itself, one with another past, and a fresh one.
         for mut target in [e, other(spec), episodes(spec, Version::Default, 0, 0, 1)] {
             target.restore(&snapshot).unwrap();
             assert_eq!(target.snapshot(), snapshot, "{}", spec.name);
-            assert_eq!(play(&mut target, 3, 0, 700), expected, "{}", spec.name);
+            assert_eq!(play(&mut target, 3, 0, steps), expected, "{}", spec.name);
         }
     }
 }
@@ -322,7 +330,7 @@ fn try_restore(spec: &EnvironmentSpec, bytes: &[u8]) -> Result<(), TestCaseError
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 500, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: 200, ..ProptestConfig::default() })]
 
     #[test]
     fn garbage_does_no_harm(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
