@@ -31,7 +31,7 @@ fn time(id: &str, repetitions: usize, mut run: impl FnMut()) {
 }
 
 fn policy(observation_size: usize, action: ActionKind) -> Policy {
-    Policy::new(PolicySpec { observation_size, action, hidden: vec![64, 64] }, 1).expect("a policy")
+    Policy::new(PolicySpec { observation_size, action, hidden: vec![64, 64], lstm: None }, 1).expect("a policy")
 }
 
 fn observations(size: usize) -> Vec<f32> {
@@ -47,6 +47,7 @@ fn rollout(policy: &Policy, n_steps: usize, n_envs: usize) -> Rollout {
     let mut rng = stream(1, Purpose::Actions);
     let mut acts = Acts::new(spec.action, n_envs);
     let mut rollout = Rollout::new(n_steps, n_envs, spec.observation_size, spec.action.width());
+    rollout.begin(actor.memory());
     for rows in observations(n_steps * n_envs * spec.observation_size).chunks(n_envs * spec.observation_size) {
         actor.act(rows, &mut rng, &mut acts).expect("actions");
         let step = RolloutStep {
@@ -55,6 +56,7 @@ fn rollout(policy: &Policy, n_steps: usize, n_envs: usize) -> Rollout {
             log_probs: &acts.log_probs,
             values: &acts.values,
             rewards: &rows[..n_envs],
+            starts: &vec![false; n_envs],
             terminated: &vec![false; n_envs],
             truncated: &vec![false; n_envs],
             truncation_values: &vec![0.0; n_envs],

@@ -2,7 +2,10 @@ use super::*;
 use crate::policy::Policy;
 
 fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
-    let policy = PolicySpec { observation_size: 3, action: ActionKind::Continuous { size: 2 }, hidden: vec![4, 5] };
+    // Odd seeds feed-forward, even ones recurrent.
+    let lstm = seed.is_multiple_of(2).then_some(3);
+    let action = ActionKind::Continuous { size: 2 };
+    let policy = PolicySpec { observation_size: 3, action, hidden: vec![4, 5], lstm };
     let mut normaliser = ObservationNormaliser::new(3);
     normaliser.update(&[0.1, 1e-7, -3.0, 0.3, 2e-7, 5.0]).unwrap();
     let config = TrainConfig::from_table("test", "environment = 'Toy'".parse().unwrap()).unwrap();
@@ -17,7 +20,7 @@ fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
             model_hash: String::new(),
         },
         algorithm: AlgorithmName::Ppo,
-        architecture: Architecture::Ff,
+        architecture: if lstm.is_some() { Architecture::Rc } else { Architecture::Ff },
         policy: policy.clone(),
         train_version: Version::R,
         seed,
@@ -39,11 +42,13 @@ fn names(directory: &Path) -> Vec<String> {
 #[test]
 fn what_is_saved_is_loaded_bit_for_bit_from_the_run_or_its_folder() {
     let run = tempfile::tempdir().unwrap();
-    let saved = checkpoint(1, 1);
-    saved.save(&run.path().join("checkpoint")).unwrap();
-    assert_eq!(Checkpoint::load(run.path()).unwrap(), saved);
-    assert_eq!(Checkpoint::load(&run.path().join("checkpoint")).unwrap(), saved);
-    assert_eq!(saved.config().unwrap().table(), saved.state.config);
+    for seed in [1, 2] {
+        let saved = checkpoint(seed, seed);
+        saved.save(&run.path().join("checkpoint")).unwrap();
+        assert_eq!(Checkpoint::load(run.path()).unwrap(), saved);
+        assert_eq!(Checkpoint::load(&run.path().join("checkpoint")).unwrap(), saved);
+        assert_eq!(saved.config().unwrap().table(), saved.state.config);
+    }
 }
 
 #[test]

@@ -12,7 +12,7 @@ use toml::{Table, Value};
 
 use crate::algorithm::{A2c, A2cConfig, Algorithm, Ppo, PpoConfig};
 use crate::evaluation::Version;
-use crate::policy::Policy;
+use crate::policy::{ActionKind, Policy, PolicySpec};
 
 /// The most environments of one training.
 const MOST_ENVS: usize = 65_536;
@@ -40,16 +40,20 @@ impl fmt::Display for AlgorithmName {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Architecture {
-    /// Two separate multilayer perceptrons, 64-64, tanh.
+    /// Feed-forward: two separate multilayer perceptrons, 64-64, tanh.
     Ff,
+    /// Recurrent: one multilayer perceptron, 256-256, tanh, an LSTM of 256, two linear heads.
+    Rc,
 }
 
 impl Architecture {
-    /// Widths of the hidden layers.
-    pub fn hidden(self) -> Vec<usize> {
-        match self {
-            Architecture::Ff => vec![64, 64],
-        }
+    /// The shape of a policy for observations of `observation_size` numbers.
+    pub fn spec(self, observation_size: usize, action: ActionKind) -> PolicySpec {
+        let (width, lstm) = match self {
+            Architecture::Ff => (64, None),
+            Architecture::Rc => (256, Some(256)),
+        };
+        PolicySpec { observation_size, action, hidden: vec![width, width], lstm }
     }
 }
 
@@ -57,6 +61,7 @@ impl fmt::Display for Architecture {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.pad(match self {
             Architecture::Ff => "ff",
+            Architecture::Rc => "rc",
         })
     }
 }
@@ -355,7 +360,7 @@ fn check(
     let choices: Option<&[&str]> = match key {
         "version" => Some(&["D", "R", "E"]),
         "algorithm" => Some(&["a2c", "ppo"]),
-        "architecture" => Some(&["ff"]),
+        "architecture" => Some(&["ff", "rc"]),
         "learning_rate_schedule" => Some(&["constant", "linear"]),
         _ => None,
     };

@@ -40,7 +40,13 @@ fn an_algorithm_brings_its_own_defaults_and_keys() {
 
 #[test]
 fn the_written_configuration_gives_the_same_again() {
-    let sets = ["learning_rate=1e-3", "normalize_rewards=false", "learning_rate_schedule=linear", "ent_coef=1"];
+    let sets = [
+        "architecture=rc",
+        "learning_rate=1e-3",
+        "normalize_rewards=false",
+        "learning_rate_schedule=linear",
+        "ent_coef=1",
+    ];
     for algorithm in ["ppo", "a2c"] {
         let flags = format!("environment = 'Hopper'\nversion = 'E'\nalgorithm = '{algorithm}'\nepisodes = 7");
         let config = load(None, &sets, &flags).unwrap();
@@ -68,7 +74,7 @@ fn a_wrong_type_is_refused_with_the_right_one() {
         ("environment=3", "environment is 3, but must be a text"),
         ("version=X", "version is \"X\", but must be one of \"D\", \"R\", \"E\""),
         ("algorithm=rl2-ppo", "algorithm is \"rl2-ppo\", but must be one of \"a2c\", \"ppo\""),
-        ("architecture=rc", "architecture is \"rc\", but must be one of \"ff\""),
+        ("architecture=mlp", "architecture is \"mlp\", but must be one of \"ff\", \"rc\""),
         ("learning_rate_schedule=cosine", "must be one of \"constant\", \"linear\""),
         ("num_envs=0", "num_envs is 0, but must be between 1 and 65536"),
         ("episodes=0", "episodes is 0, but must be at least 1"),

@@ -17,7 +17,7 @@ use crate::client::{EndedEpisode, OpenOptions, Servers, Session};
 use crate::config::TrainConfig;
 use crate::interrupt::StopFlag;
 use crate::logging::{Monitor, Progress, ProgressLog};
-use crate::policy::{ObservationNormaliser, Policy, PolicySpec, RewardNormaliser, Weights};
+use crate::policy::{ObservationNormaliser, Policy, RewardNormaliser, Weights};
 use crate::rollout::{Collector, Normalisers, Rollout};
 
 /// Means are over so many episodes, as in stable-baselines3.
@@ -179,11 +179,7 @@ impl<'a> Training<'a> {
         let session = Session::open(servers, &options, &mut observations)?;
         let summary = EnvironmentSummary::of(session.environment())
             .context("the server does not say what actions the environment takes: are both of one version?")?;
-        let spec = PolicySpec {
-            observation_size: session.observation_size(),
-            action: summary.action,
-            hidden: common.architecture.hidden(),
-        };
+        let spec = common.architecture.spec(session.observation_size(), summary.action);
         let policy = Policy::new(spec.clone(), common.seed)?;
         let algorithm = config.algorithm(&policy)?;
         let normalisers = Normalisers {

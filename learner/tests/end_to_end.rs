@@ -9,8 +9,11 @@ use perturb_learner::client::{Address, LocalServer, LocalServerOptions, OpenOpti
 use perturb_learner::config::TrainConfig;
 use perturb_learner::evaluation::{Version, test};
 use perturb_learner::interrupt::StopFlag;
+use perturb_learner::policy::{ActionKind, Policy, PolicySpec, Sequences};
 use perturb_learner::proto;
+use perturb_learner::rollout::{Collector, Normalisers, Rollout};
 use perturb_learner::training::{Outcome, RunDirectory, train};
+use tch::Tensor;
 use tempfile::TempDir;
 
 /// How long anything may take that must not hang.
@@ -145,6 +148,98 @@ fn equal_seeds_give_equal_weights_with_any_number_of_servers_and_workers() {
 }
 
 #[test]
+fn recurrent_policies_are_trained_and_tested_alike_on_one_server_and_on_two() {
+    let both = [server(1), server(2)];
+    let one = Servers::connect(&addresses(&both[..1])).expect("a connection");
+    let two = Servers::connect(&addresses(&both)).expect("connections");
+    for settings in
+        ["algorithm = 'a2c'\nn_steps = 7", "algorithm = 'ppo'\nn_steps = 40\nn_epochs = 2\nn_minibatches = 3"]
+    {
+        let text = format!(
+            "environment = 'CartPole'\narchitecture = 'rc'\nversion = 'R'\nepisodes = 12\nnum_envs = 3\n{settings}"
+        );
+        let (out, outcome) = run(&one, &text);
+        assert!(outcome.progress.episodes >= 12);
+        let checkpoint = Checkpoint::load(out.path()).expect("a checkpoint");
+        assert_eq!(checkpoint, outcome.checkpoint);
+        assert_eq!(checkpoint.state.policy.lstm, Some(256));
+        assert_eq!(run(&two, &text).1.checkpoint, checkpoint, "{settings}");
+        let figures = |servers: &Servers| {
+            test(servers, &checkpoint, Version::E, 10, 1, &StopFlag::default(), |_| {}).expect("a test")
+        };
+        assert_eq!(figures(&one), figures(&two));
+    }
+}
+
+/// Pendulum's episodes have 200 steps, so that two rollouts of 150 hold one end, and begin in the middle of an episode.
+#[test]
+fn rollouts_keep_what_a_recurrent_policy_remembers() {
+    let server = [server(1)];
+    let servers = Servers::connect(&addresses(&server)).expect("a connection");
+    let (n_envs, n_steps) = (2, 150);
+    let options = OpenOptions {
+        environment: "Pendulum".into(),
+        version: proto::Version::Random,
+        num_envs: n_envs,
+        seed: 3,
+        episodes_per_trial: 1,
+    };
+    let mut observations = Vec::new();
+    let session = Session::open(&servers, &options, &mut observations).expect("a session");
+    let size = session.observation_size();
+    let action = ActionKind::Continuous { size: 1 };
+    let spec = PolicySpec { observation_size: size, action, hidden: vec![16], lstm: Some(8) };
+    let policy = Policy::new(spec.clone(), 1).expect("a policy");
+    let none = Normalisers { observations: None, rewards: None };
+    let mut collector = Collector::new(session, observations, &spec, none, 1).expect("a collector");
+    let rollouts = [(); 2].map(|()| {
+        let mut rollout = Rollout::new(n_steps, n_envs, size, 1);
+        collector.collect(&policy.weights(), &mut rollout, |_| {}).expect("a rollout");
+        rollout
+    });
+    drop(collector);
+
+    let [first, second] = &rollouts;
+    assert_eq!(first.memory(), vec![0.0; n_envs * 16]);
+    assert!(second.memory().iter().all(|&x| x != 0.0), "the episodes go on");
+    let starts: Vec<usize> = second.starts().iter().enumerate().filter(|(_, start)| **start).map(|(i, _)| i).collect();
+    assert_eq!(starts, [100, 101], "after 200 steps");
+    let last_values = first.trajectories().expect("a finished rollout").last_values;
+    assert_eq!(last_values, &second.values()[..n_envs], "looking ahead moves nothing on");
+
+    // libtorch sees the same values: in each rollout from its own memory, and at the end of the episode.
+    let values = |n_steps: usize, observations: &[f32], starts: &[bool], memory: &[f32]| {
+        let sequences = Sequences::new(&spec, n_steps, observations, starts, memory).expect("shapes that fit");
+        Vec::<f32>::from(policy.evaluate(&sequences, &Tensor::of_slice(&vec![0.0f32; starts.len()])).values)
+    };
+    // Values of order 1, as in the tests of the policy.
+    let close = |got: &[f32], expected: &[f32]| {
+        got.len() == expected.len() && got.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-5)
+    };
+    for rollout in &rollouts {
+        let expected = values(n_steps, rollout.observations(), rollout.starts(), rollout.memory());
+        assert!(close(rollout.values(), &expected));
+    }
+
+    let mut replayed = Session::open(&servers, &options, &mut Vec::new()).expect("a session");
+    let mut reply = StepReply::default();
+    let actions: Vec<f32> = rollouts.iter().flat_map(|rollout| rollout.actions().to_vec()).collect();
+    for actions in actions.chunks(n_envs).take(200) {
+        let bytes: Vec<u8> = actions.iter().flat_map(|action| action.to_le_bytes()).collect();
+        replayed.step(&bytes, &mut reply).expect("a step");
+    }
+    let mut episode = observations_of(&rollouts)[..200 * n_envs * size].to_vec();
+    episode.extend(&reply.final_observations);
+    let expected = values(201, &episode, &vec![false; 201 * n_envs], &vec![0.0; n_envs * 16]);
+    let got = second.trajectories().expect("a finished rollout").truncation_values;
+    assert!(close(&got[49 * n_envs..50 * n_envs], &expected[200 * n_envs..]), "{got:?}");
+}
+
+fn observations_of(rollouts: &[Rollout]) -> Vec<f32> {
+    rollouts.iter().flat_map(|rollout| rollout.observations().to_vec()).collect()
+}
+
+#[test]
 fn a_test_gives_the_same_figures_on_any_number_of_servers_and_others_with_another_seed() {
     let both = [server(1), server(1)];
     let one = Servers::connect(&addresses(&both[..1])).expect("a connection");
@@ -254,7 +349,7 @@ fn the_program_trains_tests_and_refuses_with_sentences() {
     assert!(output.status.success(), "{}", stderr(&output));
     refused(&base, 1, "already holds a run");
     refused(&["train", "--env", "CartPole", "--out", run, "--algorithm", "rl2-ppo"], 2, "possible values: a2c, ppo");
-    refused(&["train", "--env", "CartPole", "--out", run, "--architecture", "rc"], 2, "possible values: ff");
+    refused(&["train", "--env", "CartPole", "--out", run, "--architecture", "mlp"], 2, "possible values: ff, rc");
     refused(&["train", "--env", "CartPole", "--out", run, "--set", "foo=1"], 2, "unknown key `foo`");
     refused(&["train", "--out", run], 2, "no environment was named");
     refused(&["train", "--env", "Pong", "--out", run, "--overwrite"], 1, "there is no environment `Pong`");

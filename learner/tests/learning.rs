@@ -68,7 +68,7 @@ struct Training {
 
 impl Training {
     fn new(action: ActionKind, n_steps: usize) -> Self {
-        let spec = PolicySpec { observation_size: action.outputs(), action, hidden: vec![32, 32] };
+        let spec = PolicySpec { observation_size: action.outputs(), action, hidden: vec![32, 32], lstm: None };
         Training {
             policy: Policy::new(spec.clone(), 5).expect("a policy"),
             actor: Actor::new(&spec, N_ENVS),
@@ -94,6 +94,7 @@ impl Training {
                 log_probs: &acts.log_probs,
                 values: &acts.values,
                 rewards: &rewards,
+                starts: &[true; N_ENVS],
                 terminated: &[true; N_ENVS],
                 truncated: &[false; N_ENVS],
                 truncation_values: &[0.0; N_ENVS],
@@ -249,6 +250,7 @@ fn a_loss_that_is_not_finite_is_an_error_and_leaves_the_policy_alone() {
             log_probs: &[-1.0; N_ENVS],
             values: &[0.0; N_ENVS],
             rewards: &[f32::MAX; N_ENVS],
+            starts: &[false; N_ENVS],
             terminated: &[false; N_ENVS],
             truncated: &[false; N_ENVS],
             truncation_values: &[0.0; N_ENVS],

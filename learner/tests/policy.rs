@@ -1,7 +1,7 @@
 //! Policies: how they begin, and that acting and learning see the same distribution.
 
 use perturb_learner::error::Error;
-use perturb_learner::policy::{ActionKind, Actor, Acts, Policy, PolicySpec, Weights};
+use perturb_learner::policy::{ActionKind, Actor, Acts, Policy, PolicySpec, Sequences, Weights};
 use perturb_learner::random::{Purpose, normal, stream};
 use tch::Tensor;
 
@@ -9,7 +9,7 @@ const DISCRETE: ActionKind = ActionKind::Discrete { n: 3 };
 const CONTINUOUS: ActionKind = ActionKind::Continuous { size: 6 };
 
 fn spec(action: ActionKind, hidden: &[usize]) -> PolicySpec {
-    PolicySpec { observation_size: 17, action, hidden: hidden.to_vec() }
+    PolicySpec { observation_size: 17, action, hidden: hidden.to_vec(), lstm: None }
 }
 
 /// Weights that differ from the initial ones everywhere: every number, biases and log_std too, moves by about 0.1.
@@ -103,8 +103,9 @@ fn the_actor_agrees_with_libtorch() {
             for n_envs in [1, 3, 7, 64] {
                 let observations = observations(n_envs);
                 let acts = act(&mut actor, &spec, &observations, 2);
-                let rows = |data: &[f32]| Tensor::of_slice(data).view((n_envs as i64, -1));
-                let evaluated = policy.evaluate(&rows(&observations), &rows(&acts.actions));
+                let sequences =
+                    Sequences::new(&spec, 1, &observations, &vec![false; n_envs], &[]).expect("shapes that fit");
+                let evaluated = policy.evaluate(&sequences, &Tensor::of_slice(&acts.actions));
                 let (log_probs, values) = (Vec::<f32>::from(evaluated.log_probs), Vec::<f32>::from(evaluated.values));
                 for n in 0..n_envs {
                     let (got, expected) = (acts.log_probs[n], log_probs[n]);

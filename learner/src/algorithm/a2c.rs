@@ -29,8 +29,8 @@ pub struct A2cConfig {
     pub gamma: f64,
     /// Weight of the entropy in nats, not negative (default: `0.01`). Larger keeps actions random for longer.
     pub ent_coef: f64,
-    /// Weight of the value loss, not negative (default: `0.5`). Policy and value networks share no weights, so it
-    /// acts through the clipping of the common gradient only.
+    /// Weight of the value loss, not negative (default: `0.5`). Feed-forward policy and value networks share no weights, so
+    /// it acts through the clipping of the common gradient only; recurrent ones share all but their heads.
     pub vf_coef: f64,
     /// Global norm that longer gradients are scaled down to, above 0 (default: `0.5`).
     pub max_grad_norm: f64,
@@ -107,13 +107,13 @@ impl Algorithm for A2c {
         check_rollout(rollout, policy, self.config.n_steps)?;
         let learning_rate = self.config.learning_rate_schedule.at(self.config.learning_rate, progress_remaining)?;
         let estimates = n_step_returns(&rollout.trajectories()?, gamma, bootstrap_truncation);
-        let (observations, actions) = samples(rollout)?;
-        let evaluated = policy.evaluate(&observations, &actions);
+        let (sequences, actions) = samples(rollout, policy)?;
+        let evaluated = policy.evaluate(&sequences, &actions);
         let policy_loss = loss::policy_gradient(&evaluated.log_probs, &Tensor::f_of_slice(&estimates.advantages)?);
         let value_loss = loss::value(&evaluated.values, &Tensor::f_of_slice(&estimates.returns)?);
         let entropy_loss = -evaluated.entropy.mean(Kind::Float);
         let loss = &policy_loss + &entropy_loss * ent_coef + &value_loss * vf_coef;
-        let grad_norm = self.descent.step(policy, &loss, learning_rate)?;
+        let grad_norm = self.descent.step(policy, &evaluated, &loss, learning_rate)?;
         let [policy_gradient_loss, value_loss, entropy_loss, loss] =
             scalars([&policy_loss, &value_loss, &entropy_loss, &loss])?;
         Ok(UpdateStats {

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use tch::Tensor;
 
 use crate::error::{Error, Result, check, check_length};
-use crate::policy::{NamedArray, Policy};
+use crate::policy::{NamedArray, Policy, Sequences};
 use crate::rollout::Rollout;
 
 /// Learns from rollouts.
@@ -98,14 +98,18 @@ pub struct UpdateStats {
 fn check_rollout(rollout: &Rollout, policy: &Policy, n_steps: usize) -> Result<()> {
     check_length("the rollout's axis T", rollout.n_steps(), n_steps)?;
     check_length("the rollout's axis O", rollout.observation_size(), policy.spec().observation_size)?;
-    check_length("the rollout's axis A", rollout.action_width(), policy.spec().action.width())
+    check_length("the rollout's axis A", rollout.action_width(), policy.spec().action.width())?;
+    check_length("the rollout's memory [N, S]", rollout.memory().len(), rollout.n_envs() * policy.spec().memory_size())
 }
 
-/// The rollout's samples as tensors: observations [T·N, O] and actions [T·N, A].
-fn samples(rollout: &Rollout) -> Result<(Tensor, Tensor)> {
-    let rows = |data: &[f32], width: usize| Tensor::f_of_slice(data)?.f_view((-1, width as i64));
-    let observations = rows(rollout.observations(), rollout.observation_size())?;
-    Ok((observations, rows(rollout.actions(), rollout.action_width())?))
+/// The rollout's samples as tensors: what `policy` is evaluated on, and actions [L, M, A].
+fn samples(rollout: &Rollout, policy: &Policy) -> Result<(Sequences, Tensor)> {
+    let spec = policy.spec();
+    let sequences =
+        Sequences::new(spec, rollout.n_steps(), rollout.observations(), rollout.starts(), rollout.memory())?;
+    let shape = (sequences.n_steps(), sequences.count(), spec.action.width() as i64);
+    let actions = Tensor::f_of_slice(rollout.actions())?.f_view(shape)?;
+    Ok((sequences, actions))
 }
 
 /// Copies scalar tensors out, at the cost of one transfer.

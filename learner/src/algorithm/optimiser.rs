@@ -5,7 +5,7 @@
 use tch::Tensor;
 
 use crate::error::{Error, Result};
-use crate::policy::{NamedArray, Policy, check_arrays};
+use crate::policy::{Evaluated, NamedArray, Policy, check_arrays};
 
 /// Numbers that are summed side by side; the order of a sum is fixed by it.
 const LANES: usize = 8;
@@ -130,14 +130,20 @@ impl Descent {
         self.n_updates
     }
 
-    /// One step down `loss`. Gives the gradient's global norm before clipping. A loss or a gradient that is not finite
+    /// One step down `loss`, which was computed from `evaluated`. Gives the gradient's global norm before clipping. A loss or a gradient that is not finite
     /// is an error and changes nothing.
     ///
     /// Clipping scales the whole gradient by max_grad_norm/norm where norm > max_grad_norm, exactly, as TensorFlow's
     /// `clip_by_global_norm`; libtorch adds 1e-6 to the norm.
-    pub(super) fn step(&mut self, policy: &mut Policy, loss: &Tensor, learning_rate: f64) -> Result<f64> {
+    pub(super) fn step(
+        &mut self,
+        policy: &mut Policy,
+        evaluated: &Evaluated,
+        loss: &Tensor,
+        learning_rate: f64,
+    ) -> Result<f64> {
         self.check_finite("the loss", loss.double_value(&[]))?;
-        policy.gradient(loss, &mut self.gradient)?;
+        policy.gradient(evaluated, loss, &mut self.gradient)?;
         let norm = norm(&self.gradient);
         self.check_finite("the norm of the gradient", norm)?;
         if norm > self.max_grad_norm {
@@ -197,7 +203,7 @@ mod tests {
 
     use super::*;
     use crate::fixture::{fixture, fixture_f32};
-    use crate::policy::{ActionKind, PolicySpec};
+    use crate::policy::{ActionKind, PolicySpec, Sequences};
 
     fn run(mut optimiser: impl Optimiser) -> Vec<f32> {
         let mut weights = fixture_f32("optimisers", "weights");
@@ -251,21 +257,24 @@ mod tests {
 
     #[test]
     fn long_gradients_are_scaled_to_the_largest_norm_and_short_ones_left_alone() {
-        let spec = PolicySpec { observation_size: 2, action: ActionKind::Discrete { n: 2 }, hidden: vec![3] };
+        let spec =
+            PolicySpec { observation_size: 2, action: ActionKind::Discrete { n: 2 }, hidden: vec![3], lstm: None };
         let policy = Policy::new(spec, 1).expect("a policy");
-        let one = Tensor::of_slice(&[1.0f32, -2.0]).view((1, 2));
+        let one = Sequences::new(policy.spec(), 1, &[1.0, -2.0], &[true], &[]).expect("one observation");
         let loss = |policy: &Policy| {
             let evaluated = policy.evaluate(&one, &Tensor::of_slice(&[1.0f32]).view((1, 1)));
-            (&evaluated.log_probs + &evaluated.values * 3.0).sum(Kind::Float)
+            let loss = (&evaluated.log_probs + &evaluated.values * 3.0).sum(Kind::Float);
+            (evaluated, loss)
         };
         let mut gradient = vec![0.0; policy.n_weights()];
-        policy.gradient(&loss(&policy), &mut gradient).expect("a gradient");
+        let (evaluated, sum) = loss(&policy);
+        policy.gradient(&evaluated, &sum, &mut gradient).expect("a gradient");
         let full = gradient.iter().map(|&g| f64::from(g).powi(2)).sum::<f64>().sqrt();
         for (largest, scale) in [(0.5, 0.5 / full), (2.0 * full, 1.0)] {
             let mut fresh = Policy::from_weights(policy.spec().clone(), &policy.weights()).expect("a policy");
-            let loss = loss(&fresh);
-            let reported =
-                Descent::new(Recorder(vec![]), largest, &fresh).step(&mut fresh, &loss, 1.0).expect("a step");
+            let (evaluated, loss) = loss(&fresh);
+            let mut descent = Descent::new(Recorder(vec![]), largest, &fresh);
+            let reported = descent.step(&mut fresh, &evaluated, &loss, 1.0).expect("a step");
             assert!((reported - full).abs() < 1e-12 * full, "the sum in another order");
             let mut given = vec![0.0; gradient.len()];
             fresh.read(&mut given);

@@ -11,7 +11,7 @@ use super::{
 };
 use crate::error::{Error, Result};
 use crate::loss;
-use crate::policy::Policy;
+use crate::policy::{Policy, Sequences};
 use crate::random::{Purpose, stream, uniform};
 use crate::rollout::{Rollout, gae};
 
@@ -27,7 +27,8 @@ pub struct PpoConfig {
     pub n_steps: usize,
     /// Passes over a rollout, at least 1 (default: `10`). More takes more from each sample, until clipping stops it.
     pub n_epochs: usize,
-    /// Minibatches in a pass, which T·N must be a multiple of (default: `1`). More means more and noisier steps.
+    /// Minibatches in a pass (default: `1`). More means more and noisier steps. T·N must be a multiple of it; with a
+    /// recurrent policy, whose minibatches are of whole environments, N.
     pub n_minibatches: usize,
     /// Discount factor per step, 0 … 1 (default: `0.99`). Rewards 1/(1-γ) steps ahead count for about a third.
     pub gamma: f64,
@@ -42,8 +43,8 @@ pub struct PpoConfig {
     pub normalize_advantage: bool,
     /// Weight of the entropy in nats, not negative (default: `0`). Larger keeps actions random for longer.
     pub ent_coef: f64,
-    /// Weight of the value loss, not negative (default: `0.5`). Policy and value networks share no weights, so it
-    /// acts through the clipping of the common gradient only.
+    /// Weight of the value loss, not negative (default: `0.5`). Feed-forward policy and value networks share no weights, so
+    /// it acts through the clipping of the common gradient only; recurrent ones share all but their heads.
     pub vf_coef: f64,
     /// Global norm that longer gradients are scaled down to, above 0 (default: `0.5`).
     pub max_grad_norm: f64,
@@ -95,7 +96,8 @@ impl PpoConfig {
 }
 
 /// Proximal policy optimisation with a clipped ratio, Schulman et al. (2017), arXiv:1707.06347: `n_epochs` passes over a
-/// rollout's T·N samples, each in `n_minibatches` random parts with one gradient step,
+/// rollout's T·N samples, each in `n_minibatches` random parts with one gradient step (of samples or, for a recurrent
+/// policy, of environments),
 ///
 /// loss = clipped surrogate - ent_coef · mean entropy + vf_coef · clipped value loss,
 ///
@@ -106,29 +108,29 @@ pub struct Ppo {
     rng: ChaCha8Rng,
 }
 
-/// A rollout, or a minibatch of it, as tensors of B samples.
+/// A rollout, or a minibatch of it, as tensors: M sequences of L steps.
 struct Batch {
-    /// [B, O].
-    observations: Tensor,
-    /// [B, A].
+    /// What the policy is evaluated on.
+    sequences: Sequences,
+    /// [L, M, A].
     actions: Tensor,
-    /// [B].
+    /// [L, M].
     old_log_probs: Tensor,
-    /// [B].
+    /// [L, M].
     old_values: Tensor,
-    /// [B].
+    /// [L, M].
     advantages: Tensor,
-    /// [B].
+    /// [L, M].
     returns: Tensor,
 }
 
 impl Batch {
-    /// The samples at `indices`.
+    /// The sequences at `indices`.
     fn select(&self, indices: &[i64]) -> Result<Batch> {
         let indices = Tensor::f_of_slice(indices)?;
-        let select = |tensor: &Tensor| tensor.f_index_select(0, &indices);
+        let select = |tensor: &Tensor| tensor.f_index_select(1, &indices);
         Ok(Batch {
-            observations: select(&self.observations)?,
+            sequences: self.sequences.select(&indices)?,
             actions: select(&self.actions)?,
             old_log_probs: select(&self.old_log_probs)?,
             old_values: select(&self.old_values)?,
@@ -153,18 +155,21 @@ impl Ppo {
     /// One gradient step on `batch`.
     fn step(&mut self, policy: &mut Policy, batch: &Batch, learning_rate: f64) -> Result<Report> {
         let PpoConfig { clip_range, clip_range_vf, ent_coef, vf_coef, .. } = self.config;
-        let normalized = self.config.normalize_advantage.then(|| loss::normalize_advantages(&batch.advantages));
-        let advantages = normalized.as_ref().unwrap_or(&batch.advantages);
-        let evaluated = policy.evaluate(&batch.observations, &batch.actions);
-        let surrogate = loss::clipped_surrogate(&evaluated.log_probs, &batch.old_log_probs, advantages, clip_range);
+        let flat = |tensor: &Tensor| tensor.f_view((-1,));
+        let (old_log_probs, old_values) = (flat(&batch.old_log_probs)?, flat(&batch.old_values)?);
+        let (advantages, returns) = (flat(&batch.advantages)?, flat(&batch.returns)?);
+        let normalized = self.config.normalize_advantage.then(|| loss::normalize_advantages(&advantages));
+        let advantages = normalized.as_ref().unwrap_or(&advantages);
+        let evaluated = policy.evaluate(&batch.sequences, &batch.actions);
+        let surrogate = loss::clipped_surrogate(&evaluated.log_probs, &old_log_probs, advantages, clip_range);
         let value_loss = if clip_range_vf > 0.0 {
-            loss::clipped_value(&evaluated.values, &batch.old_values, &batch.returns, clip_range_vf)
+            loss::clipped_value(&evaluated.values, &old_values, &returns, clip_range_vf)
         } else {
-            loss::value(&evaluated.values, &batch.returns)
+            loss::value(&evaluated.values, &returns)
         };
         let entropy_loss = -evaluated.entropy.mean(Kind::Float);
         let loss = &surrogate.loss + &entropy_loss * ent_coef + &value_loss * vf_coef;
-        let grad_norm = self.descent.step(policy, &loss, learning_rate)?;
+        let grad_norm = self.descent.step(policy, &evaluated, &loss, learning_rate)?;
         let [policy, value, entropy, loss, kl, clip] = scalars([
             &surrogate.loss,
             &value_loss,
@@ -185,34 +190,36 @@ impl Algorithm for Ppo {
     fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats> {
         let PpoConfig { n_epochs, n_minibatches, .. } = self.config;
         check_rollout(rollout, policy, self.config.n_steps)?;
-        let n_samples = rollout.n_steps() * rollout.n_envs();
-        if !n_samples.is_multiple_of(n_minibatches) {
-            let got = format!("{n_minibatches} with {n_samples} samples");
-            return Err(Error::Setting { name: "n_minibatches", got, expected: "a divisor of n_steps times num_envs" });
+        let trajectories = rollout.trajectories()?;
+        let (sequences, actions) = samples(rollout, policy)?;
+        let (n_steps, count) = (sequences.n_steps(), sequences.count());
+        if !(count as usize).is_multiple_of(n_minibatches) {
+            let got = format!("{n_minibatches}, to part {count}");
+            let expected = "a divisor of n_steps times num_envs, or of num_envs if the policy is recurrent";
+            return Err(Error::Setting { name: "n_minibatches", got, expected });
         }
         let learning_rate = self.config.learning_rate_schedule.at(self.config.learning_rate, progress_remaining)?;
-        let trajectories = rollout.trajectories()?;
         let estimates = gae(&trajectories, self.config.gamma, self.config.gae_lambda, self.config.bootstrap_truncation);
-        let (observations, actions) = samples(rollout)?;
+        let shaped = |data: &[f32]| Tensor::f_of_slice(data)?.f_view((n_steps, count));
         let batch = Batch {
-            observations,
+            sequences,
             actions,
-            old_log_probs: Tensor::f_of_slice(rollout.log_probs())?,
-            old_values: Tensor::f_of_slice(rollout.values())?,
-            advantages: Tensor::f_of_slice(&estimates.advantages)?,
-            returns: Tensor::f_of_slice(&estimates.returns)?,
+            old_log_probs: shaped(rollout.log_probs())?,
+            old_values: shaped(rollout.values())?,
+            advantages: shaped(&estimates.advantages)?,
+            returns: shaped(&estimates.returns)?,
         };
 
         let mut sums: Report = [0.0; 7];
         let mut add = |report: Report| sums.iter_mut().zip(report).for_each(|(sum, x)| *sum += x);
-        let mut indices: Vec<i64> = (0..n_samples as i64).collect();
+        let mut indices: Vec<i64> = (0..count).collect();
         for _ in 0..n_epochs {
             if n_minibatches == 1 {
                 add(self.step(policy, &batch, learning_rate)?); // the order of a mean's samples does not matter
                 continue;
             }
             shuffle(&mut indices, &mut self.rng);
-            for part in indices.chunks_exact(n_samples / n_minibatches) {
+            for part in indices.chunks_exact(count as usize / n_minibatches) {
                 add(self.step(policy, &batch.select(part)?, learning_rate)?);
             }
         }

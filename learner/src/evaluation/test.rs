@@ -111,6 +111,7 @@ pub fn test(
         actor.act(&reply.observations, &mut rng, &mut acts)?;
         acts.write_bytes(&mut actions);
         session.step(&actions, &mut reply)?;
+        reply.ended.iter().for_each(|end| actor.forget(end.slot));
         // Environments that are done go on, unseen: they cost less than a smaller batch would save.
         counted.extend(reply.ended.drain(..).filter(|end| end.episode_index < quotas[end.slot]));
         report(counted.len() as u64);

@@ -5,23 +5,30 @@
 
 use rand_chacha::ChaCha8Rng;
 
+use super::act_rc::Recurrent;
+use super::dense::{Network, padded};
 use super::distribution::{sample_categorical, sample_gaussian};
-use super::tanh::tanh;
-use super::{ActionKind, NamedArray, PolicySpec, Weights};
-use crate::error::{Error, Result};
-
-/// Outputs that are computed together: four SSE registers, whose sums do not wait for each other.
-const LANES: usize = 16;
+use super::{ActionKind, PolicySpec, Weights};
+use crate::error::{Error, Result, check_length};
 
 /// Computes actions, log-probabilities and values. Allocates nothing after its creation for batches of at most
 /// `max_batch`, except where the caller's outputs grow.
+///
+/// A recurrent policy's actor keeps the memory of every environment: [`Actor::act`] moves it on, [`Actor::forget`]
+/// empties it at an episode's end, values leave it alone.
 #[derive(Clone, Debug)]
 pub struct Actor {
     spec: PolicySpec,
     max_batch: usize,
-    policy: Network,
-    value: Network,
+    networks: Networks,
     log_std: Vec<f32>,
+}
+
+/// What an architecture computes with.
+#[derive(Clone, Debug)]
+enum Networks {
+    FeedForward { policy: Network, value: Network },
+    Recurrent(Recurrent),
 }
 
 /// What a policy did in N environments.
@@ -44,22 +51,32 @@ impl Actor {
             ActionKind::Discrete { .. } => Vec::new(),
             ActionKind::Continuous { size } => vec![0.0; size],
         };
-        Actor {
-            spec: spec.clone(),
-            max_batch,
-            policy: Network::new(&spec.policy_layers(), max_batch),
-            value: Network::new(&spec.value_layers(), max_batch),
-            log_std,
-        }
+        let networks = match spec.lstm {
+            Some(width) => Networks::Recurrent(Recurrent::new(spec, width, max_batch)),
+            None => {
+                let network = |outputs| {
+                    let mut layers = spec.hidden_layers();
+                    layers.push((spec.hidden_size(), outputs));
+                    Network::new(&layers, false, max_batch)
+                };
+                Networks::FeedForward { policy: network(spec.action.outputs()), value: network(1) }
+            }
+        };
+        Actor { spec: spec.clone(), max_batch, networks, log_std }
     }
 
-    /// Takes over weights, whose names and shapes must be those of [`PolicySpec::layout`].
+    /// Takes over weights, whose names and shapes must be those of [`PolicySpec::layout`]. Memories stay.
     pub fn load(&mut self, weights: &Weights) -> Result<()> {
         self.spec.check(weights)?;
-        let depth = 2 * (self.spec.hidden.len() + 1);
-        self.policy.load(&weights[..depth]);
-        self.value.load(&weights[depth..2 * depth]);
-        if let Some(log_std) = weights.get(2 * depth) {
+        match &mut self.networks {
+            Networks::FeedForward { policy, value } => {
+                let depth = 2 * (self.spec.hidden.len() + 1);
+                policy.load(&weights[..depth]);
+                value.load(&weights[depth..2 * depth]);
+            }
+            Networks::Recurrent(network) => network.load(weights),
+        }
+        if let (ActionKind::Continuous { .. }, Some(log_std)) = (self.spec.action, weights.last()) {
             self.log_std.copy_from_slice(&log_std.data);
         }
         Ok(())
@@ -67,14 +84,22 @@ impl Actor {
 
     /// Samples an action for each normalised observation of `observations` [N, O], in order of n; draws from `rng` once
     /// per discrete action and twice per element of a continuous one. Replaces what is in `out`.
+    ///
+    /// Row n is environment n: a recurrent policy remembers the observation.
     pub fn act(&mut self, observations: &[f32], rng: &mut ChaCha8Rng, out: &mut Acts) -> Result<()> {
-        self.values(observations, &mut out.values)?;
-        let (n_envs, width, outputs) = (out.values.len(), self.spec.action.width(), self.spec.action.outputs());
+        let n_envs = self.count(observations)?;
+        let (width, outputs) = (self.spec.action.width(), self.spec.action.outputs());
+        let (heads, values) = match &mut self.networks {
+            Networks::FeedForward { policy, value } => {
+                (policy.forward(observations, n_envs), value.forward(observations, n_envs))
+            }
+            Networks::Recurrent(network) => network.advance(observations, n_envs),
+        };
         out.kind = self.spec.action;
         out.actions.resize(n_envs * width, 0.0);
         out.log_probs.resize(n_envs, 0.0);
-        let head = self.policy.forward(observations, n_envs);
-        for (n, head) in head.chunks_exact(padded(outputs)).enumerate() {
+        replace_by_first_column(&mut out.values, values);
+        for (n, head) in heads.chunks_exact(padded(outputs)).enumerate() {
             let (head, action) = (&head[..outputs], &mut out.actions[n * width..][..width]);
             let log_prob = match self.spec.action {
                 ActionKind::Discrete { .. } => {
@@ -92,17 +117,58 @@ impl Actor {
         Ok(())
     }
 
-    /// Values V of the normalised `observations` [N, O]; replaces what is in `out` [N].
+    /// Values V of the normalised `observations` [N, O]; replaces what is in `out` [N]. Row n is environment n, whose
+    /// memory counts, but stays as it is.
     pub fn values(&mut self, observations: &[f32], out: &mut Vec<f32>) -> Result<()> {
-        let n_envs = observations.len() / self.spec.observation_size;
-        if n_envs * self.spec.observation_size != observations.len() || n_envs > self.max_batch {
-            let expected = self.max_batch.min(n_envs) * self.spec.observation_size;
-            return Err(Error::Length { name: "observations [N, O]", got: observations.len(), expected });
-        }
-        out.clear();
-        out.extend(self.value.forward(observations, n_envs).chunks_exact(padded(1)).map(|head| head[0]));
+        let n_envs = self.count(observations)?;
+        let values = match &mut self.networks {
+            Networks::FeedForward { value, .. } => value.forward(observations, n_envs),
+            Networks::Recurrent(network) => network.values(observations, 0..n_envs),
+        };
+        replace_by_first_column(out, values);
         Ok(())
     }
+
+    /// The same where row k is environment `environments[k]`: values of final observations, for which the memory is that
+    /// of the episode that ended, before [`Actor::forget`].
+    pub fn values_in(&mut self, observations: &[f32], environments: &[usize], out: &mut Vec<f32>) -> Result<()> {
+        check_length("environments [K]", environments.len(), self.count(observations)?)?;
+        let values = match &mut self.networks {
+            Networks::FeedForward { value, .. } => value.forward(observations, environments.len()),
+            Networks::Recurrent(network) => network.values(observations, environments.iter().copied()),
+        };
+        replace_by_first_column(out, values);
+        Ok(())
+    }
+
+    /// Empties the memory of `environment`, one of 0 … `max_batch`-1: its episode has ended.
+    pub fn forget(&mut self, environment: usize) {
+        if let Networks::Recurrent(network) = &mut self.networks {
+            network.forget(environment);
+        }
+    }
+
+    /// [`max_batch`, S] what is remembered of every environment, S = [`PolicySpec::memory_size`].
+    pub fn memory(&self) -> &[f32] {
+        match &self.networks {
+            Networks::FeedForward { .. } => &[],
+            Networks::Recurrent(network) => network.memory(),
+        }
+    }
+
+    /// The number of observations.
+    fn count(&self, observations: &[f32]) -> Result<usize> {
+        let n_envs = observations.len() / self.spec.observation_size;
+        let expected = self.max_batch.min(n_envs) * self.spec.observation_size;
+        check_length("observations [N, O]", observations.len(), expected)?;
+        Ok(n_envs)
+    }
+}
+
+/// Replaces `out` by the first numbers of the padded `rows` of a value head.
+fn replace_by_first_column(out: &mut Vec<f32>, rows: &[f32]) {
+    out.clear();
+    out.extend(rows.chunks_exact(padded(1)).map(|row| row[0]));
 }
 
 impl Acts {
@@ -126,103 +192,4 @@ impl Acts {
             ActionKind::Continuous { .. } => bytes.extend(self.actions.iter().flat_map(|action| action.to_le_bytes())),
         }
     }
-}
-
-/// A multilayer perceptron, tanh between its layers.
-#[derive(Clone, Debug)]
-struct Network {
-    layers: Vec<Dense>,
-    /// Inputs and outputs of a layer, by turns.
-    scratch: [Vec<f32>; 2],
-}
-
-impl Network {
-    fn new(layers: &[(usize, usize)], max_batch: usize) -> Self {
-        let widest = layers.iter().map(|&(_, outputs)| padded(outputs)).max().unwrap_or(0);
-        Network {
-            layers: layers.iter().map(|&(inputs, outputs)| Dense::new(inputs, outputs)).collect(),
-            scratch: [vec![0.0; max_batch * widest], vec![0.0; max_batch * widest]],
-        }
-    }
-
-    /// Takes over weights and biases, which alternate.
-    fn load(&mut self, weights: &[NamedArray]) {
-        for (layer, arrays) in self.layers.iter_mut().zip(weights.chunks_exact(2)) {
-            layer.load(&arrays[0].data, &arrays[1].data);
-        }
-    }
-
-    /// The last layer's outputs for `observations` [N, O], in rows of [`padded`] length.
-    fn forward(&mut self, observations: &[f32], n_envs: usize) -> &[f32] {
-        let last = self.layers.len() - 1;
-        let [mut inputs, mut outputs] = self.scratch.each_mut().map(Vec::as_mut_slice);
-        for (i, layer) in self.layers.iter().enumerate() {
-            let (from, stride) =
-                if i == 0 { (observations, layer.inputs) } else { (&inputs[..], padded(layer.inputs)) };
-            layer.apply(from, stride, n_envs, i < last, outputs);
-            std::mem::swap(&mut inputs, &mut outputs);
-        }
-        &inputs[..n_envs * padded(self.layers[last].outputs)]
-    }
-}
-
-/// The next multiple of [`LANES`].
-fn padded(outputs: usize) -> usize {
-    outputs.next_multiple_of(LANES)
-}
-
-/// A linear layer. Weights are stored in the order in which they are read: for each group of [`LANES`] outputs, for
-/// each input, that input's weights; the last group is filled up with zeros.
-#[derive(Clone, Debug)]
-struct Dense {
-    inputs: usize,
-    outputs: usize,
-    /// [outputs / LANES, inputs, LANES].
-    weights: Vec<[f32; LANES]>,
-    /// [outputs / LANES, LANES].
-    biases: Vec<[f32; LANES]>,
-}
-
-impl Dense {
-    fn new(inputs: usize, outputs: usize) -> Self {
-        let groups = padded(outputs) / LANES;
-        Dense { inputs, outputs, weights: vec![[0.0; LANES]; groups * inputs], biases: vec![[0.0; LANES]; groups] }
-    }
-
-    /// Takes over `weights` [outputs, inputs] and `biases` [outputs].
-    fn load(&mut self, weights: &[f32], biases: &[f32]) {
-        for (o, (row, bias)) in weights.chunks_exact(self.inputs).zip(biases).enumerate() {
-            let (group, lane) = (o / LANES, o % LANES);
-            self.biases[group][lane] = *bias;
-            for (i, weight) in row.iter().enumerate() {
-                self.weights[group * self.inputs + i][lane] = *weight;
-            }
-        }
-    }
-
-    /// Computes `n` rows of `outputs`, which are [`padded`], from the first `n` rows of `from`, `stride` apart. Every
-    /// output is bias + Σ_i input_i weight_i, added up in order of i.
-    fn apply(&self, from: &[f32], stride: usize, n: usize, hidden: bool, outputs: &mut [f32]) {
-        let rows = from.chunks_exact(stride).zip(outputs.chunks_exact_mut(padded(self.outputs)));
-        for (inputs, outputs) in rows.take(n) {
-            let groups = self.weights.chunks_exact(self.inputs).zip(&self.biases);
-            for ((weights, biases), outputs) in groups.zip(outputs.chunks_exact_mut(LANES)) {
-                outputs.copy_from_slice(&weighted_sum(inputs, weights, *biases));
-            }
-            if hidden {
-                outputs.iter_mut().for_each(|x| *x = tanh(*x));
-            }
-        }
-    }
-}
-
-/// `sums` + Σ_i input_i weights_i. A function of its own, for inlined the compiler does not always vectorise it.
-#[inline(never)]
-fn weighted_sum(inputs: &[f32], weights: &[[f32; LANES]], mut sums: [f32; LANES]) -> [f32; LANES] {
-    for (input, weights) in inputs.iter().zip(weights) {
-        for (sum, weight) in sums.iter_mut().zip(weights) {
-            *sum += input * weight;
-        }
-    }
-    sums
 }

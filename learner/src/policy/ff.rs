@@ -1,150 +1,28 @@
-//! The feed-forward policy on libtorch.
+//! The feed-forward networks on libtorch.
 
-use tch::{Kind, Tensor};
+use tch::Tensor;
 
-use super::distribution::{categorical, gaussian};
-use super::initial::initial_weights;
-use super::{ActionKind, NamedArray, PolicySpec, Weights};
-use crate::error::{Result, check_length};
-use crate::random::{Purpose, stream};
+use super::PolicySpec;
 
-/// Two separate multilayer perceptrons with tanh between layers: one gives logits or means, the other V(s). Continuous
-/// actions have one more weight each, log_std, the same in every state.
+/// Two separate multilayer perceptrons with tanh between layers: one gives logits or means, the other V(s).
 ///
-/// All weights lie in one tensor [P], of which those of the layers are views: an optimiser reads, changes and writes
-/// P numbers at once.
-pub struct Policy {
-    spec: PolicySpec,
-    layout: Vec<(String, Vec<usize>)>,
-    /// [P], without gradient; shares its storage with `leaves`.
-    all: Tensor,
-    /// In order of `layout`, with gradients.
-    leaves: Vec<Tensor>,
+/// `leaves` are the weights in the order of [`PolicySpec::layout`]. Gives the policy's outputs [B, n or A] and the values
+/// [B] at `observations` [B, O].
+pub(super) fn forward(spec: &PolicySpec, leaves: &[Tensor], observations: &Tensor) -> (Tensor, Tensor) {
+    let depth = 2 * (spec.hidden.len() + 1);
+    let outputs = perceptron(&leaves[..depth], observations, false);
+    let values = perceptron(&leaves[depth..2 * depth], observations, false).squeeze_dim(1);
+    (outputs, values)
 }
 
-/// A policy's view of B observations and actions.
-#[derive(Debug)]
-pub struct Evaluated {
-    /// [B] log-probabilities (densities, if continuous) of the actions.
-    pub log_probs: Tensor,
-    /// [B] entropies of the action distributions, in nats.
-    pub entropy: Tensor,
-    /// [B] values.
-    pub values: Tensor,
-}
-
-impl Policy {
-    /// A policy with initial weights from the stream of `seed`: orthogonal with gain √2 in hidden layers, 0.01 in the
-    /// policy's last and 1 in the value's last layer; biases and log_std 0. Same seed, same bytes.
-    pub fn new(spec: PolicySpec, seed: u64) -> Result<Self> {
-        let weights = initial_weights(&spec, &mut stream(seed, Purpose::Weights));
-        Policy::from_weights(spec, &weights)
-    }
-
-    /// A policy with the given weights, whose names and shapes must be those of [`PolicySpec::layout`].
-    ///
-    /// Sets libtorch to one thread, for the whole process: these networks are too small to share, and sums stay in one
-    /// order.
-    pub fn from_weights(spec: PolicySpec, weights: &Weights) -> Result<Self> {
-        spec.validate()?;
-        spec.check(weights)?;
-        tch::set_num_threads(1);
-        let layout = spec.layout();
-        let data: Vec<f32> = weights.iter().flat_map(|array| array.data.iter().copied()).collect();
-        let all = Tensor::f_of_slice(&data)?;
-        let mut leaves = Vec::with_capacity(layout.len());
-        let mut start = 0;
-        for (_, shape) in &layout {
-            let length = shape.iter().product::<usize>() as i64;
-            let shape: Vec<i64> = shape.iter().map(|&axis| axis as i64).collect();
-            leaves
-                .push(all.f_narrow(0, start, length)?.f_view(shape.as_slice())?.f_detach()?.f_set_requires_grad(true)?);
-            start += length;
-        }
-        Ok(Policy { spec, layout, all, leaves })
-    }
-
-    /// A copy of the weights.
-    pub fn weights(&self) -> Weights {
-        let mut data = vec![0.0; self.n_weights()];
-        self.read(&mut data);
-        let mut start = 0;
-        let copy = |(name, shape): &(String, Vec<usize>)| {
-            let end = start + shape.iter().product::<usize>();
-            let data = data[start..end].to_vec();
-            start = end;
-            NamedArray { name: name.clone(), shape: shape.clone(), data }
-        };
-        self.layout.iter().map(copy).collect()
-    }
-
-    /// The shape.
-    pub fn spec(&self) -> &PolicySpec {
-        &self.spec
-    }
-
-    /// Log-probabilities of `actions` [B, A] (a discrete action is its index, A = 1), entropies, and values at
-    /// `observations` [B, O], all f32 and differentiable in the weights.
-    ///
-    /// # Panics
-    ///
-    /// If a shape is another, or a discrete action is not in 0 … n-1.
-    pub fn evaluate(&self, observations: &Tensor, actions: &Tensor) -> Evaluated {
-        let depth = 2 * (self.spec.hidden.len() + 1);
-        let outputs = forward(&self.leaves[..depth], observations);
-        let values = forward(&self.leaves[depth..2 * depth], observations).squeeze_dim(1);
-        let (log_probs, entropy) = match self.spec.action {
-            ActionKind::Discrete { .. } => categorical(&outputs, actions),
-            ActionKind::Continuous { .. } => gaussian(&outputs, &self.leaves[2 * depth], actions),
-        };
-        Evaluated { log_probs, entropy, values }
-    }
-
-    /// Mean standard deviation of the actions; None for discrete ones.
-    pub fn mean_std(&self) -> Option<f64> {
-        match self.spec.action {
-            ActionKind::Discrete { .. } => None,
-            ActionKind::Continuous { .. } => {
-                self.leaves.last().map(|log_std| log_std.detach().exp().mean(Kind::Double).double_value(&[]))
-            }
-        }
-    }
-
-    /// P: the number of weights.
-    pub fn n_weights(&self) -> usize {
-        self.all.numel()
-    }
-
-    /// Copies the weights to `weights` [P].
-    pub(crate) fn read(&self, weights: &mut [f32]) {
-        self.all.copy_data(weights, self.n_weights());
-    }
-
-    /// Replaces the weights by `weights` [P].
-    pub(crate) fn write(&mut self, weights: &[f32]) -> Result<()> {
-        check_length("weights [P]", weights.len(), self.n_weights())?;
-        Ok(tch::no_grad(|| self.all.f_copy_(&Tensor::f_of_slice(weights)?))?)
-    }
-
-    /// Writes the gradient of `loss` in the weights to `gradient` [P].
-    pub(crate) fn gradient(&self, loss: &Tensor, gradient: &mut [f32]) -> Result<()> {
-        check_length("gradient [P]", gradient.len(), self.n_weights())?;
-        let gradients = Tensor::f_run_backward(&[loss], &self.leaves, false, false)?;
-        let flat = gradients
-            .iter()
-            .map(|part| part.f_reshape([-1i64].as_slice()))
-            .collect::<std::result::Result<Vec<_>, _>>()?;
-        Ok(Tensor::f_cat(&flat, 0)?.f_copy_data(gradient, gradient.len())?)
-    }
-}
-
-/// Runs `observations` [B, O] through the layers whose weights and biases alternate in `leaves`; gives [B, outputs].
-fn forward(leaves: &[Tensor], observations: &Tensor) -> Tensor {
-    let last = leaves.len() / 2 - 1;
+/// Runs `observations` [B, O] through the layers whose weights and biases alternate in `leaves`, with tanh between them
+/// and, if `squash_last`, after the last; gives [B, outputs].
+pub(super) fn perceptron(leaves: &[Tensor], observations: &Tensor, squash_last: bool) -> Tensor {
+    let n_layers = leaves.len() / 2;
     let mut x = observations.shallow_clone();
     for (i, layer) in leaves.chunks_exact(2).enumerate() {
         x = x.linear(&layer[0], Some(&layer[1]));
-        if i < last {
+        if squash_last || i + 1 < n_layers {
             x = x.tanh();
         }
     }

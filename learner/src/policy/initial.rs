@@ -11,6 +11,8 @@ const HIDDEN_GAIN: f64 = std::f64::consts::SQRT_2;
 const POLICY_GAIN: f64 = 0.01;
 /// Gain of the value's last layer.
 const VALUE_GAIN: f64 = 1.0;
+/// Gain of the LSTM: each of its two matrices is orthogonal as a whole, all four gates together, as the reference's.
+const LSTM_GAIN: f64 = 1.0;
 
 /// Orthogonal weights, biases 0, log standard deviations 0.
 pub(super) fn initial_weights(spec: &PolicySpec, rng: &mut ChaCha8Rng) -> Weights {
@@ -26,11 +28,13 @@ pub(super) fn initial_weights(spec: &PolicySpec, rng: &mut ChaCha8Rng) -> Weight
 
 /// The gain of the weights called `name`.
 fn gain(spec: &PolicySpec, name: &str) -> f64 {
-    let last = spec.hidden.len();
-    if name == format!("policy.{last}.weight") {
+    let last = if spec.lstm.is_some() { String::new() } else { format!(".{}", spec.hidden.len()) };
+    if name == format!("policy{last}.weight") {
         POLICY_GAIN
-    } else if name == format!("value.{last}.weight") {
+    } else if name == format!("value{last}.weight") {
         VALUE_GAIN
+    } else if name.starts_with("lstm.") {
+        LSTM_GAIN
     } else {
         HIDDEN_GAIN
     }

@@ -2,15 +2,21 @@
 //! ([`Actor`], plain f32 loops).
 
 mod act;
+mod act_rc;
+mod dense;
 mod distribution;
 mod ff;
 mod initial;
+mod learn;
 mod normaliser;
+mod rc;
+mod sequences;
 mod tanh;
 
 pub use act::{Actor, Acts};
-pub use ff::{Evaluated, Policy};
+pub use learn::{Evaluated, Policy};
 pub use normaliser::{ObservationNormaliser, RewardNormaliser, RunningMoments};
+pub use sequences::Sequences;
 
 use serde::{Deserialize, Serialize};
 
@@ -58,8 +64,12 @@ pub struct PolicySpec {
     pub observation_size: usize,
     /// The actions.
     pub action: ActionKind,
-    /// Widths of the hidden layers, of the policy network and of the value network; the paper uses [64, 64].
+    /// Widths of the hidden layers. Feed-forward: of the policy network and of the value network; the paper uses [64, 64].
+    /// Recurrent: of the one network below the LSTM; the paper uses [256, 256].
     pub hidden: Vec<usize>,
+    /// H: width of the LSTM of a recurrent policy, for which the paper uses 256; None for a feed-forward one.
+    #[serde(default)]
+    pub lstm: Option<usize>,
 }
 
 impl PolicySpec {
@@ -70,33 +80,55 @@ impl PolicySpec {
         };
         positive("observation_size", self.observation_size)?;
         positive("the number of action outputs", self.action.outputs())?;
-        self.hidden.iter().try_for_each(|&width| positive("the width of a hidden layer", width))
+        self.hidden.iter().try_for_each(|&width| positive("the width of a hidden layer", width))?;
+        self.lstm.map_or(Ok(()), |width| positive("the width of the LSTM", width))
     }
 
-    /// Inputs and outputs of each layer of the policy network.
-    pub(crate) fn policy_layers(&self) -> Vec<(usize, usize)> {
-        self.layers(self.action.outputs())
+    /// S: numbers that a policy remembers of an environment's past, 2H: the LSTM's output h, then its cell state c; 0 for
+    /// a feed-forward policy. All 0 is the memory before the first step of an episode.
+    pub fn memory_size(&self) -> usize {
+        self.lstm.map_or(0, |width| 2 * width)
     }
 
-    /// Inputs and outputs of each layer of the value network.
-    pub(crate) fn value_layers(&self) -> Vec<(usize, usize)> {
-        self.layers(1)
-    }
-
-    fn layers(&self, outputs: usize) -> Vec<(usize, usize)> {
+    /// Inputs and outputs of each hidden layer.
+    pub(crate) fn hidden_layers(&self) -> Vec<(usize, usize)> {
         let inputs = std::iter::once(self.observation_size).chain(self.hidden.iter().copied());
-        let ends = self.hidden.iter().copied().chain(std::iter::once(outputs));
-        inputs.zip(ends).collect()
+        inputs.zip(self.hidden.iter().copied()).collect()
     }
 
-    /// Names and shapes of the weights, in order: "policy.0.weight" [out, in], "policy.0.bias" [out], …,
-    /// "value.0.weight", …, and "log_std" [A] for continuous actions.
+    /// Numbers that leave the last hidden layer.
+    pub(crate) fn hidden_size(&self) -> usize {
+        self.hidden.last().copied().unwrap_or(self.observation_size)
+    }
+
+    /// Names and shapes of the weights, in order.
+    ///
+    /// Feed-forward: "policy.0.weight" [out, in], "policy.0.bias" [out], …, "value.0.weight", …. Recurrent:
+    /// "hidden.0.weight" [out, in], "hidden.0.bias" [out], …, "lstm.input.weight" [4H, in], "lstm.recurrent.weight"
+    /// [4H, H], "lstm.bias" [4H], "policy.weight" [out, H], "policy.bias", "value.weight" [1, H], "value.bias"; the rows
+    /// of the LSTM are those of its gates i, f, g, o. Both: "log_std" [A] for continuous actions.
     pub fn layout(&self) -> Vec<(String, Vec<usize>)> {
         let mut layout = Vec::new();
-        for (network, layers) in [("policy", self.policy_layers()), ("value", self.value_layers())] {
-            for (i, (inputs, outputs)) in layers.into_iter().enumerate() {
-                layout.push((format!("{network}.{i}.weight"), vec![outputs, inputs]));
-                layout.push((format!("{network}.{i}.bias"), vec![outputs]));
+        let linear = |name: &str, inputs: usize, outputs: usize| {
+            [(format!("{name}.weight"), vec![outputs, inputs]), (format!("{name}.bias"), vec![outputs])]
+        };
+        let heads = [("policy", self.action.outputs()), ("value", 1)];
+        if let Some(width) = self.lstm {
+            for (i, (inputs, outputs)) in self.hidden_layers().into_iter().enumerate() {
+                layout.extend(linear(&format!("hidden.{i}"), inputs, outputs));
+            }
+            layout.push(("lstm.input.weight".to_owned(), vec![4 * width, self.hidden_size()]));
+            layout.push(("lstm.recurrent.weight".to_owned(), vec![4 * width, width]));
+            layout.push(("lstm.bias".to_owned(), vec![4 * width]));
+            for (name, outputs) in heads {
+                layout.extend(linear(name, width, outputs));
+            }
+        } else {
+            for (name, outputs) in heads {
+                let layers = self.hidden_layers().into_iter().chain([(self.hidden_size(), outputs)]);
+                for (i, (inputs, outputs)) in layers.enumerate() {
+                    layout.extend(linear(&format!("{name}.{i}"), inputs, outputs));
+                }
             }
         }
         if let ActionKind::Continuous { size } = self.action {

@@ -8,6 +8,8 @@ use crate::error::{Error, Result, check_length};
 pub struct RolloutStep<'a> {
     /// [N, O] observations s_t that the actions were chosen on, normalised.
     pub observations: &'a [f32],
+    /// [N] whether s_t is the first that the policy remembers: its memory was emptied before it.
+    pub starts: &'a [bool],
     /// [N, A] actions, as in [`Acts`](crate::policy::Acts).
     pub actions: &'a [f32],
     /// [N] log-probabilities of the actions under the acting policy.
@@ -35,6 +37,7 @@ pub struct Rollout {
     len: usize,
     finished: bool,
     observations: Vec<f32>,
+    starts: Vec<bool>,
     actions: Vec<f32>,
     log_probs: Vec<f32>,
     values: Vec<f32>,
@@ -43,6 +46,7 @@ pub struct Rollout {
     truncated: Vec<bool>,
     truncation_values: Vec<f32>,
     last_values: Vec<f32>,
+    memory: Vec<f32>,
 }
 
 impl Rollout {
@@ -58,6 +62,7 @@ impl Rollout {
             len: 0,
             finished: false,
             observations: Vec::with_capacity(size * observation_size),
+            starts: Vec::with_capacity(size),
             actions: Vec::with_capacity(size * action_width),
             log_probs: Vec::with_capacity(size),
             values: Vec::with_capacity(size),
@@ -66,14 +71,24 @@ impl Rollout {
             truncated: Vec::with_capacity(size),
             truncation_values: Vec::with_capacity(size),
             last_values: Vec::with_capacity(n_envs),
+            memory: Vec::new(),
         }
     }
 
-    /// Forgets all steps; keeps the memory.
+    /// Forgets all steps, and takes over what the policy remembers before the first: `memory` [N, S], empty for a
+    /// feed-forward policy. Allocated room is kept.
+    pub fn begin(&mut self, memory: &[f32]) {
+        self.clear();
+        self.memory.extend_from_slice(memory);
+    }
+
+    /// Forgets all steps; allocated room is kept.
     pub fn clear(&mut self) {
         self.len = 0;
         self.finished = false;
+        self.memory.clear();
         self.observations.clear();
+        self.starts.clear();
         self.actions.clear();
         self.log_probs.clear();
         self.values.clear();
@@ -91,6 +106,7 @@ impl Rollout {
         }
         let n = self.n_envs;
         check_length("observations [N, O]", step.observations.len(), n * self.observation_size)?;
+        check_length("starts [N]", step.starts.len(), n)?;
         check_length("actions [N, A]", step.actions.len(), n * self.action_width)?;
         check_length("log_probs [N]", step.log_probs.len(), n)?;
         check_length("values [N]", step.values.len(), n)?;
@@ -99,6 +115,7 @@ impl Rollout {
         check_length("truncated [N]", step.truncated.len(), n)?;
         check_length("truncation_values [N]", step.truncation_values.len(), n)?;
         self.observations.extend_from_slice(step.observations);
+        self.starts.extend_from_slice(step.starts);
         self.actions.extend_from_slice(step.actions);
         self.log_probs.extend_from_slice(step.log_probs);
         self.values.extend_from_slice(step.values);
@@ -178,6 +195,16 @@ impl Rollout {
     /// [T, N, O].
     pub fn observations(&self) -> &[f32] {
         &self.observations
+    }
+
+    /// [T, N] whether the policy's memory was emptied before the step.
+    pub fn starts(&self) -> &[bool] {
+        &self.starts
+    }
+
+    /// [N, S] what the policy remembered before the first step.
+    pub fn memory(&self) -> &[f32] {
+        &self.memory
     }
 
     /// [T, N, A].

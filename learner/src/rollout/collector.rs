@@ -21,7 +21,8 @@ pub enum CollectError {
     Numbers(#[from] crate::error::Error),
 }
 
-/// Steps N environments with a policy and fills rollouts; episodes run on from one rollout to the next.
+/// Steps N environments with a policy and fills rollouts; episodes run on from one rollout to the next, and with them
+/// what a recurrent policy remembers, which is emptied where an episode ends.
 ///
 /// Every training step updates the statistics of observations and rewards, and is normalised with the updated ones, as
 /// stable-baselines3's VecNormalize does. Final observations are normalised with the same statistics.
@@ -34,6 +35,8 @@ pub struct Collector<'a> {
     observation_size: usize,
     /// [N, O] normalised observations that the next actions are chosen on.
     observations: Vec<f32>,
+    /// [N] whether those are the first of an episode.
+    starts: Vec<bool>,
     times: Times,
     // Buffers of a step.
     reply: StepReply,
@@ -41,6 +44,7 @@ pub struct Collector<'a> {
     actions: Vec<u8>,
     done: Vec<bool>,
     finals: Vec<f32>,
+    truncated: Vec<usize>,
     final_values: Vec<f32>,
     truncation_values: Vec<f32>,
 }
@@ -84,12 +88,14 @@ impl<'a> Collector<'a> {
             rng: stream(seed, Purpose::Actions),
             normalisers,
             observations: first_observations,
+            starts: vec![true; num_envs],
             times: Times::default(),
             reply: StepReply::default(),
             acts: Acts::new(spec.action, num_envs),
             actions: Vec::new(),
             done: vec![false; num_envs],
             finals: Vec::new(),
+            truncated: Vec::new(),
             final_values: Vec::new(),
             truncation_values: vec![0.0; num_envs],
         })
@@ -118,7 +124,7 @@ impl<'a> Collector<'a> {
         let start = Instant::now();
         let waited_before = self.times.waiting;
         self.actor.load(weights)?;
-        rollout.clear();
+        rollout.begin(self.actor.memory());
         while !rollout.is_full() {
             self.actor.act(&self.observations, &mut self.rng, &mut self.acts)?;
             self.acts.write_bytes(&mut self.actions);
@@ -145,18 +151,21 @@ impl<'a> Collector<'a> {
 
         self.truncation_values.fill(0.0);
         let finals = reply.final_observations.chunks_exact(self.observation_size);
-        let truncated = || reply.ended.iter().map(|end| end.slot).filter(|&slot| reply.truncated[slot]);
         self.finals.clear();
-        for (_, observation) in reply.ended.iter().zip(finals).filter(|(end, _)| reply.truncated[end.slot]) {
+        self.truncated.clear();
+        for (end, observation) in reply.ended.iter().zip(finals).filter(|(end, _)| reply.truncated[end.slot]) {
             self.finals.extend_from_slice(observation);
+            self.truncated.push(end.slot);
         }
         if !self.finals.is_empty() {
             self.normalisers.normalise(&mut self.finals)?;
-            self.actor.values(&self.finals, &mut self.final_values)?;
-            truncated().zip(&self.final_values).for_each(|(slot, value)| self.truncation_values[slot] = *value);
+            self.actor.values_in(&self.finals, &self.truncated, &mut self.final_values)?;
+            let values = self.truncated.iter().zip(&self.final_values);
+            values.for_each(|(&slot, value)| self.truncation_values[slot] = *value);
         }
         rollout.push(RolloutStep {
             observations: &self.observations,
+            starts: &self.starts,
             actions: &self.acts.actions,
             log_probs: &self.acts.log_probs,
             values: &self.acts.values,
@@ -166,6 +175,8 @@ impl<'a> Collector<'a> {
             truncation_values: &self.truncation_values,
         })?;
         std::mem::swap(&mut self.observations, &mut reply.observations);
+        reply.ended.iter().for_each(|end| self.actor.forget(end.slot));
+        self.starts.copy_from_slice(&self.done);
         Ok(())
     }
 }

@@ -1,0 +1,158 @@
+//! Learning: a policy on libtorch, with its gradients.
+
+use tch::{Kind, Tensor};
+
+use super::distribution::{categorical, gaussian};
+use super::initial::initial_weights;
+use super::{ActionKind, NamedArray, PolicySpec, Sequences, Weights, ff, rc};
+use crate::error::{Result, check_length};
+use crate::random::{Purpose, stream};
+
+/// A policy of either architecture: feed-forward, two separate multilayer perceptrons of which one gives logits or means
+/// and the other V(s); or recurrent, hidden layers, an LSTM, and two linear heads. Continuous actions have one more weight
+/// each, log_std, the same in every state.
+///
+/// All weights lie in one tensor [P], of which those of the layers are views: an optimiser reads, changes and writes
+/// P numbers at once.
+pub struct Policy {
+    spec: PolicySpec,
+    layout: Vec<(String, Vec<usize>)>,
+    /// [P], without gradient; shares its storage with `leaves`.
+    all: Tensor,
+    /// In order of `layout`, with gradients.
+    leaves: Vec<Tensor>,
+    /// Whether libtorch differentiates the recurrence.
+    plain_autograd: bool,
+}
+
+/// A policy's view of B observations and actions.
+#[derive(Debug)]
+pub struct Evaluated {
+    /// [B] log-probabilities (densities, if continuous) of the actions.
+    pub log_probs: Tensor,
+    /// [B] entropies of the action distributions, in nats.
+    pub entropy: Tensor,
+    /// [B] values.
+    pub values: Tensor,
+    /// What the gradient of a recurrence needs.
+    tape: Option<rc::Tape>,
+}
+
+impl Policy {
+    /// A policy with initial weights from the stream of `seed`: orthogonal with gain √2 in hidden layers, 0.01 in the
+    /// policy's last layer, 1 in the value's last layer and in the LSTM; biases and log_std 0. Same seed, same bytes.
+    pub fn new(spec: PolicySpec, seed: u64) -> Result<Self> {
+        let weights = initial_weights(&spec, &mut stream(seed, Purpose::Weights));
+        Policy::from_weights(spec, &weights)
+    }
+
+    /// A policy with the given weights, whose names and shapes must be those of [`PolicySpec::layout`].
+    ///
+    /// Sets libtorch to one thread, for the whole process: these networks are too small to share, and sums stay in one
+    /// order.
+    pub fn from_weights(spec: PolicySpec, weights: &Weights) -> Result<Self> {
+        spec.validate()?;
+        spec.check(weights)?;
+        tch::set_num_threads(1);
+        let layout = spec.layout();
+        let data: Vec<f32> = weights.iter().flat_map(|array| array.data.iter().copied()).collect();
+        let all = Tensor::f_of_slice(&data)?;
+        let mut leaves = Vec::with_capacity(layout.len());
+        let mut start = 0;
+        for (_, shape) in &layout {
+            let length = shape.iter().product::<usize>() as i64;
+            let shape: Vec<i64> = shape.iter().map(|&axis| axis as i64).collect();
+            leaves
+                .push(all.f_narrow(0, start, length)?.f_view(shape.as_slice())?.f_detach()?.f_set_requires_grad(true)?);
+            start += length;
+        }
+        Ok(Policy { spec, layout, all, leaves, plain_autograd: false })
+    }
+
+    /// Leaves the gradient through a recurrence to libtorch, to compare with: the same but for rounding, and slower.
+    pub fn with_plain_autograd(self) -> Self {
+        Policy { plain_autograd: true, ..self }
+    }
+
+    /// A copy of the weights.
+    pub fn weights(&self) -> Weights {
+        let mut data = vec![0.0; self.n_weights()];
+        self.read(&mut data);
+        let mut start = 0;
+        let copy = |(name, shape): &(String, Vec<usize>)| {
+            let end = start + shape.iter().product::<usize>();
+            let data = data[start..end].to_vec();
+            start = end;
+            NamedArray { name: name.clone(), shape: shape.clone(), data }
+        };
+        self.layout.iter().map(copy).collect()
+    }
+
+    /// The shape.
+    pub fn spec(&self) -> &PolicySpec {
+        &self.spec
+    }
+
+    /// Log-probabilities of `actions` [L, M, A] (a discrete action is its index, A = 1), entropies, and values over
+    /// `sequences`, all f32 [B] and, by [`Policy::gradient`], differentiable in the weights. A recurrent policy begins with
+    /// the sequences' memory, and with none at the start of every episode; nothing flows back to what was before.
+    ///
+    /// # Panics
+    ///
+    /// If a shape is another, or a discrete action is not in 0 … n-1.
+    pub fn evaluate(&self, sequences: &Sequences, actions: &Tensor) -> Evaluated {
+        let (outputs, values, tape) = if self.spec.lstm.is_some() {
+            rc::forward(&self.spec, &self.leaves, sequences, self.plain_autograd)
+        } else {
+            let (outputs, values) = ff::forward(&self.spec, &self.leaves, &sequences.flat_observations());
+            (outputs, values, None)
+        };
+        let actions = actions.view((-1, self.spec.action.width() as i64));
+        let (log_probs, entropy) = match self.spec.action {
+            ActionKind::Discrete { .. } => categorical(&outputs, &actions),
+            ActionKind::Continuous { .. } => gaussian(&outputs, &self.leaves[self.leaves.len() - 1], &actions),
+        };
+        Evaluated { log_probs, entropy, values, tape }
+    }
+
+    /// Mean standard deviation of the actions; None for discrete ones.
+    pub fn mean_std(&self) -> Option<f64> {
+        match self.spec.action {
+            ActionKind::Discrete { .. } => None,
+            ActionKind::Continuous { .. } => {
+                self.leaves.last().map(|log_std| log_std.detach().exp().mean(Kind::Double).double_value(&[]))
+            }
+        }
+    }
+
+    /// P: the number of weights.
+    pub fn n_weights(&self) -> usize {
+        self.all.numel()
+    }
+
+    /// Copies the weights to `weights` [P].
+    pub(crate) fn read(&self, weights: &mut [f32]) {
+        self.all.copy_data(weights, self.n_weights());
+    }
+
+    /// Replaces the weights by `weights` [P].
+    pub(crate) fn write(&mut self, weights: &[f32]) -> Result<()> {
+        check_length("weights [P]", weights.len(), self.n_weights())?;
+        Ok(tch::no_grad(|| self.all.f_copy_(&Tensor::f_of_slice(weights)?))?)
+    }
+
+    /// Writes the gradient of `loss`, which was computed from `evaluated` and from nothing else of this policy, in the
+    /// weights to `gradient` [P]. Uses up the graph: there is one gradient an evaluation.
+    pub fn gradient(&self, evaluated: &Evaluated, loss: &Tensor, gradient: &mut [f32]) -> Result<()> {
+        check_length("gradient [P]", gradient.len(), self.n_weights())?;
+        let gradients = match &evaluated.tape {
+            Some(tape) => rc::backward(&self.spec, &self.leaves, loss, tape)?,
+            None => Tensor::f_run_backward(&[loss], &self.leaves, false, false)?,
+        };
+        let flat = gradients
+            .iter()
+            .map(|part| part.f_reshape([-1i64].as_slice()))
+            .collect::<std::result::Result<Vec<_>, _>>()?;
+        Ok(Tensor::f_cat(&flat, 0)?.f_copy_data(gradient, gradient.len())?)
+    }
+}

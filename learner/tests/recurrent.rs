@@ -1,0 +1,423 @@
+//! Recurrent policies: acting and learning see the same function of the past, its gradient is right, and it can be used
+//! to remember.
+
+use perturb_learner::algorithm::{A2c, A2cConfig, Algorithm, AlgorithmState, Ppo, PpoConfig};
+use perturb_learner::error::Error;
+use perturb_learner::policy::{ActionKind, Actor, Acts, Evaluated, Policy, PolicySpec, Sequences, Weights};
+use perturb_learner::random::{Purpose, normal, stream, uniform};
+use perturb_learner::rollout::{Rollout, RolloutStep};
+use rand_chacha::ChaCha8Rng;
+use tch::{Kind, Tensor};
+
+const DISCRETE: ActionKind = ActionKind::Discrete { n: 3 };
+const CONTINUOUS: ActionKind = ActionKind::Continuous { size: 2 };
+const O: usize = 5;
+
+fn spec(action: ActionKind, hidden: &[usize], width: usize) -> PolicySpec {
+    PolicySpec { observation_size: O, action, hidden: hidden.to_vec(), lstm: Some(width) }
+}
+
+/// Weights that differ from the initial ones everywhere: every number, biases and log_std too, moves by about 0.1.
+fn moved(spec: &PolicySpec) -> Weights {
+    let mut rng = stream(9, Purpose::Weights);
+    let mut weights = Policy::new(spec.clone(), 1).expect("a policy").weights();
+    weights.iter_mut().flat_map(|array| &mut array.data).for_each(|x| *x += 0.1 * normal(&mut rng) as f32);
+    weights
+}
+
+/// A window of acting on noise, with memories from before it and episodes that start in it.
+struct Window {
+    n_envs: usize,
+    observations: Vec<f32>,
+    starts: Vec<bool>,
+    /// Before the first step.
+    memory: Vec<f32>,
+    acts: Vec<Acts>,
+}
+
+impl Window {
+    fn new(spec: &PolicySpec, weights: &Weights, n_steps: usize, n_envs: usize) -> Self {
+        let mut rng = stream(4, Purpose::Weights);
+        let mut actor = Actor::new(spec, n_envs);
+        actor.load(weights).expect("weights that fit");
+        let mut window = Window { n_envs, observations: vec![], starts: vec![], memory: vec![], acts: vec![] };
+        let mut acts = Acts::new(spec.action, n_envs);
+        for t in 0..n_steps + 3 {
+            if t == 3 {
+                window = Window {
+                    memory: actor.memory().to_vec(),
+                    acts: vec![],
+                    starts: vec![],
+                    observations: vec![],
+                    n_envs,
+                };
+            }
+            // About every sixth step starts an episode; in the first step too, and in none of some steps.
+            for n in 0..n_envs {
+                let start = t % 2 == 1 && uniform(&mut rng) < 0.3;
+                if start {
+                    actor.forget(n);
+                }
+                window.starts.push(start);
+            }
+            let observations: Vec<f32> = (0..n_envs * O).map(|_| normal(&mut rng) as f32).collect();
+            actor.act(&observations, &mut rng, &mut acts).expect("actions");
+            window.observations.extend(observations);
+            window.acts.push(acts.clone());
+        }
+        assert!(window.starts[..n_envs].contains(&true) && window.starts.iter().filter(|&&start| start).count() > 3);
+        assert!(window.memory.iter().any(|&x| x != 0.0));
+        window
+    }
+
+    fn evaluate(&self, policy: &Policy) -> Evaluated {
+        let n_steps = self.acts.len();
+        let sequences = Sequences::new(policy.spec(), n_steps, &self.observations, &self.starts, &self.memory);
+        let actions: Vec<f32> = self.acts.iter().flat_map(|acts| acts.actions.clone()).collect();
+        policy.evaluate(&sequences.expect("shapes that fit"), &Tensor::of_slice(&actions))
+    }
+}
+
+/// Acting and learning compute the same function by other means: sums in another order, and a tanh that is off by up to
+/// 3e-7. Over layers of at most 256 that grows to about 1e-6 of values and logits of order 1.
+const TOLERANCE: f32 = 1e-5;
+
+#[test]
+fn evaluating_a_window_equals_acting_step_by_step() {
+    // Odd sizes too: layers and batches that are no multiples of the blocks.
+    for (hidden, width) in [(vec![256, 256], 256), (vec![9, 17], 13), (vec![], 16), (vec![7], 1)] {
+        for action in [DISCRETE, CONTINUOUS] {
+            let spec = spec(action, &hidden, width);
+            let weights = moved(&spec);
+            let window = Window::new(&spec, &weights, 12, 7);
+            let policy = Policy::from_weights(spec.clone(), &weights).expect("a policy");
+            for policy in [policy, Policy::from_weights(spec, &weights).expect("a policy").with_plain_autograd()] {
+                let evaluated = window.evaluate(&policy);
+                let log_probs = Vec::<f32>::from(evaluated.log_probs);
+                let values = Vec::<f32>::from(evaluated.values);
+                for (b, (log_prob, value)) in log_probs.into_iter().zip(values).enumerate() {
+                    let (acts, n) = (&window.acts[b / window.n_envs], b % window.n_envs);
+                    let (got, got_value) = (acts.log_probs[n], acts.values[n]);
+                    assert!((got - log_prob).abs() < TOLERANCE, "{hidden:?} {width} {b}: log π {got} {log_prob}");
+                    assert!((got_value - value).abs() < TOLERANCE, "{hidden:?} {width} {b}: V {got_value} {value}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn the_two_stage_gradient_equals_autograds() {
+    for (hidden, width) in [(vec![256, 256], 256), (vec![9, 17], 13), (vec![], 16)] {
+        for action in [DISCRETE, CONTINUOUS] {
+            let spec = spec(action, &hidden, width);
+            let weights = moved(&spec);
+            let window = Window::new(&spec, &weights, 12, 7);
+            let gradient = |policy: Policy| {
+                let evaluated = window.evaluate(&policy);
+                let weighting = Tensor::of_slice(&window.observations[..12 * 7]); // any numbers
+                let loss = (&evaluated.log_probs * &weighting + evaluated.values.square() + &evaluated.entropy * 0.3)
+                    .mean(Kind::Float);
+                let mut gradient = vec![0.0; policy.n_weights()];
+                policy.gradient(&evaluated, &loss, &mut gradient).expect("a gradient");
+                gradient
+            };
+            let policy = || Policy::from_weights(spec.clone(), &weights).expect("a policy");
+            let (two_stage, plain) = (gradient(policy()), gradient(policy().with_plain_autograd()));
+            let mut start = 0;
+            for array in &weights {
+                let range = start..start + array.data.len();
+                start = range.end;
+                let norm =
+                    |numbers: &mut dyn Iterator<Item = f32>| numbers.map(|x| f64::from(x).powi(2)).sum::<f64>().sqrt();
+                let size = norm(&mut plain[range.clone()].iter().copied());
+                let difference = norm(&mut range.map(|i| two_stage[i] - plain[i]));
+                // Sums of 84 products in another order, each rounded to 2⁻²⁴.
+                assert!(size > 0.0 && difference < 1e-5 * size, "{hidden:?} {}: {difference} of {size}", array.name);
+            }
+            assert_eq!(start, plain.len());
+        }
+    }
+}
+
+#[test]
+fn a_memory_is_emptied_alone_and_values_leave_it_as_it_is() {
+    let spec = spec(DISCRETE, &[16], 16);
+    let mut actor = Actor::new(&spec, 3);
+    actor.load(&moved(&spec)).expect("weights that fit");
+    let fresh = actor.clone();
+    let (mut rng, mut acts) = (stream(1, Purpose::Actions), Acts::new(DISCRETE, 3));
+    let observations: Vec<f32> = (0..3 * O).map(|_| normal(&mut rng) as f32).collect();
+    actor.act(&observations, &mut rng, &mut acts).expect("actions");
+    let remembered = actor.memory().to_vec();
+
+    let (mut values, mut some) = (vec![], vec![]);
+    actor.values(&observations, &mut values).expect("values");
+    actor.values_in(&observations[O..], &[1, 2], &mut some).expect("values");
+    assert_eq!(some, values[1..], "row k belongs to the environment that is named");
+    actor.values_in(&observations[O..2 * O], &[2], &mut some).expect("values");
+    assert_ne!(some[0], values[1], "with another past the value is another");
+    assert_eq!(actor.memory(), remembered);
+    assert!(matches!(actor.values_in(&observations, &[1, 2], &mut some), Err(Error::Length { .. })));
+
+    actor.forget(1);
+    let mut second = Acts::new(DISCRETE, 3);
+    actor.clone().act(&observations, &mut rng, &mut second).expect("actions");
+    fresh.clone().act(&observations, &mut rng, &mut acts).expect("actions");
+    assert_eq!(second.values[1], acts.values[1], "it begins anew");
+    assert_ne!(second.values[0], acts.values[0]);
+    assert_eq!(second.values[0], values[0], "the others go on, as the values said");
+    assert_eq!(second.values[2], values[2]);
+}
+
+#[test]
+fn a_policy_begins_with_orthogonal_weights_and_zero_biases() {
+    let weights = Policy::new(spec(CONTINUOUS, &[32, 24], 16), 3).expect("a policy").weights();
+    let shapes: Vec<_> = weights.iter().map(|array| (array.name.as_str(), array.shape.as_slice())).collect();
+    assert_eq!(
+        shapes[4..],
+        [
+            ("lstm.input.weight", &[64, 24][..]),
+            ("lstm.recurrent.weight", &[64, 16]),
+            ("lstm.bias", &[64]),
+            ("policy.weight", &[2, 16]),
+            ("policy.bias", &[2]),
+            ("value.weight", &[1, 16]),
+            ("value.bias", &[1]),
+            ("log_std", &[2]),
+        ]
+    );
+    for array in &weights {
+        // The shorter side holds that many orthogonal vectors of length gain: their squares add up to count·gain².
+        let squares: f64 = array.data.iter().map(|&x| f64::from(x).powi(2)).sum();
+        let count = array.shape.iter().min().copied().unwrap_or(0) as f64;
+        let expected = match array.name.as_str() {
+            "policy.weight" => count * 1e-4,
+            "value.weight" | "lstm.input.weight" | "lstm.recurrent.weight" => count,
+            name if name.starts_with("hidden") && name.ends_with("weight") => count * 2.0,
+            _ => 0.0,
+        };
+        assert!((squares - expected).abs() <= 1e-6 * expected, "{}: {squares}; f32 rounding", array.name);
+    }
+}
+
+#[test]
+fn nan_is_an_error_not_an_action() {
+    for action in [DISCRETE, CONTINUOUS] {
+        let spec = spec(action, &[16], 8);
+        let mut actor = Actor::new(&spec, 2);
+        actor.load(&moved(&spec)).expect("weights that fit");
+        let mut observations = [0.5; 2 * O];
+        observations[O + 2] = f32::NAN;
+        let result = actor.act(&observations, &mut stream(1, Purpose::Actions), &mut Acts::new(action, 2));
+        assert!(matches!(result, Err(Error::PolicyOutput { environment: 1 })), "{result:?}");
+    }
+}
+
+const N_ENVS: usize = 16;
+/// Steps of an episode of [`Recall`].
+const LENGTH: usize = 4;
+
+/// A task for a memory: the first observation of an episode is (±1, 0), the next are (0, 0), the last is (0, 1). Reward 1
+/// for telling the first one's sign in the last step, else 0; without memory ½ is the best.
+///
+/// The environments' episodes start one after the other, so that windows begin in the middle of some.
+struct Recall {
+    rng: ChaCha8Rng,
+    cues: [usize; N_ENVS],
+    t: usize,
+}
+
+impl Recall {
+    fn step_of(&self, n: usize) -> usize {
+        (self.t + n) % LENGTH
+    }
+
+    fn observations(&mut self) -> Vec<f32> {
+        let mut observations = Vec::new();
+        for n in 0..N_ENVS {
+            let step = self.step_of(n);
+            if step == 0 {
+                self.cues[n] = usize::from(uniform(&mut self.rng) < 0.5);
+            }
+            let cue = if step == 0 { 2.0 * self.cues[n] as f32 - 1.0 } else { 0.0 };
+            observations.extend([cue, f32::from(u8::from(step == LENGTH - 1))]);
+        }
+        observations
+    }
+}
+
+/// A policy, the task, and what a training loop has.
+struct Training {
+    policy: Policy,
+    actor: Actor,
+    task: Recall,
+    observations: Vec<f32>,
+    starts: [bool; N_ENVS],
+    rng: ChaCha8Rng,
+    rollout: Rollout,
+}
+
+const TWO: ActionKind = ActionKind::Discrete { n: 2 };
+
+impl Training {
+    fn new(lstm: Option<usize>, n_steps: usize) -> Self {
+        let spec = PolicySpec { observation_size: 2, action: TWO, hidden: vec![16], lstm };
+        let mut task = Recall { rng: stream(11, Purpose::Weights), cues: [0; N_ENVS], t: 0 };
+        Training {
+            policy: Policy::new(spec.clone(), 5).expect("a policy"),
+            actor: Actor::new(&spec, N_ENVS),
+            observations: task.observations(),
+            task,
+            starts: [true; N_ENVS],
+            rng: stream(5, Purpose::Actions),
+            rollout: Rollout::new(n_steps, N_ENVS, 2, 1),
+        }
+    }
+
+    /// Fills the rollout; gives the share of episodes in which the sign was told.
+    fn collect(&mut self) -> f64 {
+        self.actor.load(&self.policy.weights()).expect("weights that fit");
+        self.rollout.begin(self.actor.memory());
+        let mut acts = Acts::new(TWO, N_ENVS);
+        let (mut told, mut episodes) = (0.0, 0.0);
+        while !self.rollout.is_full() {
+            self.actor.act(&self.observations, &mut self.rng, &mut acts).expect("actions");
+            let done: [bool; N_ENVS] = std::array::from_fn(|n| self.task.step_of(n) == LENGTH - 1);
+            let right = |n: usize| done[n] && acts.actions[n] as usize == self.task.cues[n];
+            let rewards: [f32; N_ENVS] = std::array::from_fn(|n| f32::from(u8::from(right(n))));
+            told += rewards.iter().map(|&r| f64::from(r)).sum::<f64>();
+            episodes += done.iter().filter(|&&done| done).count() as f64;
+            let step = RolloutStep {
+                observations: &self.observations,
+                starts: &self.starts,
+                actions: &acts.actions,
+                log_probs: &acts.log_probs,
+                values: &acts.values,
+                rewards: &rewards,
+                terminated: &done,
+                truncated: &[false; N_ENVS],
+                truncation_values: &[0.0; N_ENVS],
+            };
+            self.rollout.push(step).expect("a step that fits");
+            (0..N_ENVS).filter(|&n| done[n]).for_each(|n| self.actor.forget(n));
+            self.starts = done;
+            self.task.t += 1;
+            self.observations = self.task.observations();
+        }
+        let mut last_values = Vec::new();
+        self.actor.values(&self.observations, &mut last_values).expect("values");
+        self.rollout.finish(&last_values).expect("a full rollout");
+        told / episodes
+    }
+
+    /// Collects and updates `updates` times; gives the share of the last rollout.
+    fn train(&mut self, algorithm: &mut dyn Algorithm, updates: usize) -> f64 {
+        for _ in 0..updates {
+            self.collect();
+            algorithm.update(&mut self.policy, &self.rollout, 1.0).expect("an update");
+        }
+        self.collect()
+    }
+}
+
+fn a2c(training: &Training) -> A2c {
+    let n_steps = training.rollout.n_steps();
+    let config = A2cConfig { n_steps, learning_rate: 3e-3, ..A2cConfig::default() };
+    A2c::new(config, &training.policy).expect("valid settings")
+}
+
+fn ppo(training: &Training, n_minibatches: usize) -> Ppo {
+    let n_steps = training.rollout.n_steps();
+    let config = PpoConfig { n_steps, n_minibatches, learning_rate: 3e-3, n_epochs: 5, ..PpoConfig::default() };
+    Ppo::new(config, &training.policy, 5).expect("valid settings")
+}
+
+#[test]
+fn only_a_recurrent_policy_recalls() {
+    for (lstm, n_minibatches) in [(Some(16), 1), (Some(16), 4), (None, 4)] {
+        let mut training = Training::new(lstm, 30);
+        let mut algorithm = ppo(&training, n_minibatches);
+        let share = training.train(&mut algorithm, 60);
+        // Chance is ½; four standard deviations of 120 episodes are 0.18.
+        let expected = if lstm.is_some() { 0.95..=1.0 } else { 0.0..=0.7 };
+        assert!(expected.contains(&share), "PPO {lstm:?}, {n_minibatches} minibatches: {share}");
+    }
+    for lstm in [Some(16), None] {
+        let mut training = Training::new(lstm, 15);
+        let mut algorithm = a2c(&training);
+        let share = training.train(&mut algorithm, 1000);
+        let expected = if lstm.is_some() { 0.95..=1.0 } else { 0.0..=0.76 }; // 60 episodes
+        assert!(expected.contains(&share), "A2C {lstm:?}: {share}");
+    }
+}
+
+#[test]
+fn ppo_begins_with_ratio_1_and_clips_nothing() {
+    for n_minibatches in [1, 4] {
+        let mut training = Training::new(Some(16), 30);
+        let mut algorithm = ppo(&training, n_minibatches);
+        training.train(&mut algorithm, 20); // ends with a rollout of a policy that uses its memory
+        assert!(training.rollout.memory().iter().any(|&x| x != 0.0));
+        let config =
+            PpoConfig { n_steps: 30, n_epochs: 1, n_minibatches, learning_rate: 1e-12, ..PpoConfig::default() };
+        let mut first = Ppo::new(config.clone(), &training.policy, 1).expect("valid settings");
+        let stats = first.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
+        assert_eq!(stats.clip_fraction, Some(0.0));
+        // The divergence is half the square of the log-probabilities' errors of 1e-6; its f32 terms are rounded to 2⁻²⁴.
+        assert!(stats.approx_kl.expect("PPO's").abs() < 2e-7, "{stats:?}");
+        // With ratio 1, the surrogate is minus the mean of the normalised advantages, 0 but for the ratios' error.
+        assert!(stats.policy_gradient_loss.abs() < 1e-5, "{stats:?}");
+        let config = PpoConfig { n_epochs: 10, learning_rate: 1e-2, ..config };
+        let mut later = Ppo::new(config, &training.policy, 1).expect("valid settings");
+        let stats = later.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
+        assert!(stats.approx_kl > Some(1e-4), "a moved policy: {stats:?}");
+    }
+}
+
+#[test]
+fn the_same_seed_learns_the_same_bytes_and_a_resumed_training_too() {
+    let start = || {
+        let training = Training::new(Some(16), 6);
+        let algorithms: [Box<dyn Algorithm>; 2] = [Box::new(a2c(&training)), Box::new(ppo(&training, 2))];
+        (training, algorithms)
+    };
+    for which in 0..2 {
+        let run = |resume: bool| {
+            let (mut training, mut algorithms) = start();
+            training.train(algorithms[which].as_mut(), 3);
+            if resume {
+                let json = serde_json::to_string(&algorithms[which].state()).expect("JSON");
+                let state: AlgorithmState = serde_json::from_str(&json).expect("a state");
+                let (spec, weights) = (training.policy.spec().clone(), training.policy.weights());
+                training.policy = Policy::from_weights(spec, &weights).expect("a policy");
+                (_, algorithms) = start();
+                algorithms[which].load_state(&state).expect("a state that fits");
+            }
+            training.train(algorithms[which].as_mut(), 3);
+            training.policy.weights()
+        };
+        assert_eq!(run(false), run(false));
+        assert_eq!(run(false), run(true));
+    }
+}
+
+#[test]
+fn what_does_not_fit_a_recurrent_policy_is_refused() {
+    let mut training = Training::new(Some(16), 6);
+    training.collect();
+    let mut odd = ppo(&training, 3); // divides T·N = 96, but not N = 16
+    let result = odd.update(&mut training.policy, &training.rollout, 1.0);
+    assert!(matches!(result, Err(Error::Setting { name: "n_minibatches", .. })), "{result:?}");
+
+    let mut forgetful = Training::new(None, 6);
+    forgetful.collect();
+    let result = a2c(&training).update(&mut training.policy, &forgetful.rollout, 1.0);
+    assert!(matches!(result, Err(Error::Length { name: "the rollout's memory [N, S]", got: 0, expected: 512 })));
+    assert!(matches!(
+        Sequences::new(training.policy.spec(), 2, &[0.0; 8], &[false; 5], &[]),
+        Err(Error::Length { .. })
+    ));
+    let spec = PolicySpec { lstm: Some(0), ..training.policy.spec().clone() };
+    assert!(matches!(Policy::new(spec, 1), Err(Error::Setting { name: "the width of the LSTM", .. })));
+}
