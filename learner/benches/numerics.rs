@@ -5,7 +5,8 @@
 use std::time::Instant;
 
 use perturb_learner::algorithm::{A2c, A2cConfig, Algorithm, Ppo, PpoConfig};
-use perturb_learner::policy::{ActionKind, Actor, Acts, ObservationNormaliser, Policy, PolicySpec};
+use perturb_learner::config::Architecture;
+use perturb_learner::policy::{ActionKind, Actor, Acts, ObservationNormaliser, Policy};
 use perturb_learner::random::{Purpose, normal, stream};
 use perturb_learner::rollout::{Rollout, RolloutStep};
 
@@ -31,7 +32,7 @@ fn time(id: &str, repetitions: usize, mut run: impl FnMut()) {
 }
 
 fn policy(observation_size: usize, action: ActionKind) -> Policy {
-    Policy::new(PolicySpec { observation_size, action, hidden: vec![64, 64], lstm: None }, 1).expect("a policy")
+    Policy::new(Architecture::Ff.spec(observation_size, action), 1).expect("a policy")
 }
 
 fn observations(size: usize) -> Vec<f32> {
@@ -67,8 +68,48 @@ fn rollout(policy: &Policy, n_steps: usize, n_envs: usize) -> Rollout {
     rollout
 }
 
+/// Recurrent policies of the paper's size. `plain` names updates whose gradient is left to libtorch, the measure of the
+/// two-stage one.
+fn recurrent(task: &str, observation_size: usize, action: ActionKind) {
+    let policy = || Policy::new(Architecture::Rc.spec(observation_size, action), 1).expect("a policy");
+    let (first, plain) = (policy(), policy().with_plain_autograd());
+    for n_envs in [1, 16] {
+        let mut actor = Actor::new(first.spec(), n_envs);
+        actor.load(&first.weights()).expect("weights that fit");
+        let rows = observations(n_envs * observation_size);
+        let (mut rng, mut acts) = (stream(1, Purpose::Actions), Acts::new(action, n_envs));
+        time(&format!("act_rc/{task}/{n_envs}"), 300, || {
+            actor.act(&rows, &mut rng, &mut acts).expect("actions");
+            assert_eq!(acts.values.len(), n_envs);
+        });
+    }
+    let mut actor = Actor::new(first.spec(), 1);
+    time(&format!("load_rc/{task}"), 100, || actor.load(&first.weights()).expect("weights that fit"));
+    for (kind, mut policy) in [("two_stage", first), ("plain", plain)] {
+        for (n_steps, n_envs) in [(5, 16), (15, 16)] {
+            let rollout = rollout(&policy, n_steps, n_envs);
+            let config = A2cConfig { n_steps, learning_rate: 1e-6, ..A2cConfig::default() };
+            let mut a2c = A2c::new(config, &policy).expect("valid settings");
+            time(&format!("a2c_rc_{kind}/{task}/{n_steps}x{n_envs}"), 50, || {
+                let stats = a2c.update(&mut policy, &rollout, 1.0).expect("an update");
+                assert!(stats.grad_norm > 0.0);
+            });
+        }
+        for (n_steps, n_envs) in [(128, 1), (128, 16)] {
+            let rollout = rollout(&policy, n_steps, n_envs);
+            let config = PpoConfig { n_steps, n_epochs: 1, learning_rate: 1e-6, ..PpoConfig::default() };
+            let mut ppo = Ppo::new(config, &policy, 1).expect("valid settings");
+            time(&format!("ppo_epoch_rc_{kind}/{task}/{n_steps}x{n_envs}"), 20, || {
+                let stats = ppo.update(&mut policy, &rollout, 1.0).expect("an update");
+                assert!(stats.grad_norm > 0.0);
+            });
+        }
+    }
+}
+
 fn main() {
     for (task, observation_size, action) in TASKS {
+        recurrent(task, observation_size, action);
         for n_envs in [1, 16, 64, 256] {
             let policy = policy(observation_size, action);
             let mut actor = Actor::new(policy.spec(), n_envs);

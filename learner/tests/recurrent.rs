@@ -311,19 +311,19 @@ impl Training {
         told / episodes
     }
 
-    /// Collects and updates `updates` times; gives the share of the last rollout.
+    /// Collects and updates `updates` times; gives the mean share of four more rollouts.
     fn train(&mut self, algorithm: &mut dyn Algorithm, updates: usize) -> f64 {
         for _ in 0..updates {
             self.collect();
             algorithm.update(&mut self.policy, &self.rollout, 1.0).expect("an update");
         }
-        self.collect()
+        (0..4).map(|_| self.collect()).sum::<f64>() / 4.0
     }
 }
 
 fn a2c(training: &Training) -> A2c {
     let n_steps = training.rollout.n_steps();
-    let config = A2cConfig { n_steps, learning_rate: 3e-3, ..A2cConfig::default() };
+    let config = A2cConfig { n_steps, learning_rate: 7e-3, ..A2cConfig::default() };
     A2c::new(config, &training.policy).expect("valid settings")
 }
 
@@ -335,20 +335,19 @@ fn ppo(training: &Training, n_minibatches: usize) -> Ppo {
 
 #[test]
 fn only_a_recurrent_policy_recalls() {
+    // Chance is ½; four standard deviations of the 128 episodes of A2C's four rollouts are 0.18.
+    let expected = |lstm: Option<usize>| if lstm.is_some() { 0.95..=1.0 } else { 0.0..=0.68 };
     for (lstm, n_minibatches) in [(Some(16), 1), (Some(16), 4), (None, 4)] {
         let mut training = Training::new(lstm, 30);
         let mut algorithm = ppo(&training, n_minibatches);
         let share = training.train(&mut algorithm, 60);
-        // Chance is ½; four standard deviations of 120 episodes are 0.18.
-        let expected = if lstm.is_some() { 0.95..=1.0 } else { 0.0..=0.7 };
-        assert!(expected.contains(&share), "PPO {lstm:?}, {n_minibatches} minibatches: {share}");
+        assert!(expected(lstm).contains(&share), "PPO {lstm:?}, {n_minibatches} minibatches: {share}");
     }
     for lstm in [Some(16), None] {
-        let mut training = Training::new(lstm, 15);
+        let mut training = Training::new(lstm, 8);
         let mut algorithm = a2c(&training);
-        let share = training.train(&mut algorithm, 1000);
-        let expected = if lstm.is_some() { 0.95..=1.0 } else { 0.0..=0.76 }; // 60 episodes
-        assert!(expected.contains(&share), "A2C {lstm:?}: {share}");
+        let share = training.train(&mut algorithm, 1600);
+        assert!(expected(lstm).contains(&share), "A2C {lstm:?}: {share}");
     }
 }
 
