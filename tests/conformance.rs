@@ -383,7 +383,8 @@ async fn versions_draw_parameters_from_their_sets_and_receipts_read_them_back() 
                 assert_eq!(receipt.applied.len(), e.applied.len());
                 assert_eq!(receipt.model_hash, e.model_hash);
                 for (quantity, applied) in e.applied.iter().zip(&receipt.applied) {
-                    if let Some(i) = e.parameters.iter().position(|p| p.name == quantity.name && p.unit == quantity.unit)
+                    if let Some(i) =
+                        e.parameters.iter().position(|p| p.name == quantity.name && p.unit == quantity.unit)
                     {
                         assert_eq!(*applied, receipt.requested[i], "{}: {}", e.name, quantity.name);
                     }

@@ -154,7 +154,7 @@ pub async fn within<T>(future: impl Future<Output = T>) -> T {
 }
 
 /// Asks again and again until the answer is yes.
-pub async fn until<F: Future<Output = bool>>(what: &str, mut ask: impl FnMut() -> F) {
+pub async fn until(what: &str, mut ask: impl AsyncFnMut() -> bool) {
     let start = Instant::now();
     while !within(ask()).await {
         assert!(start.elapsed() < DEADLINE, "still waiting until {what}");
