@@ -11,6 +11,7 @@
 //!
 //! [`config`] is the server's configuration and [`proto`] the generated protocol.
 #![forbid(unsafe_code)]
+#![deny(clippy::disallowed_methods)]
 
 pub mod classic;
 pub mod config;

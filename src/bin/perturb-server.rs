@@ -8,7 +8,7 @@ use perturb::{
 };
 use std::{
     error::Error,
-    io::{self, Read},
+    io::{self, IsTerminal, Read},
     process::ExitCode,
 };
 use tokio::{
@@ -27,6 +27,7 @@ fn main() -> ExitCode {
     };
     tracing_subscriber::fmt()
         .with_writer(io::stderr)
+        .with_ansi(io::stderr().is_terminal())
         .with_env_filter(tracing_subscriber::EnvFilter::new(&config.log))
         .init();
     match run(&config) {

@@ -58,6 +58,10 @@ pub struct CartPole {
     force: f64,
     half_pole_length: f64,
     pole_mass: f64,
+    // Derived, by `set_parameters` alone. The reciprocal saves three divisions a step, half of its time, for a
+    // difference of some 1e-16 from Gymnasium.
+    pole_mass_length: f64,
+    inverse_total_mass: f64,
     /// Position, velocity, angle, angular velocity.
     state: [f64; 4],
 }
@@ -65,16 +69,16 @@ pub struct CartPole {
 impl CartPole {
     /// With default parameters, at rest.
     pub fn new() -> Self {
-        let [force, length, mass] = [0, 1, 2].map(|i: usize| physics::CART_POLE[i].default);
-        Self { force, half_pole_length: length, pole_mass: mass, state: [0.0; 4] }
-    }
-
-    fn total_mass(&self) -> f64 {
-        self.pole_mass + CART_MASS
-    }
-
-    fn pole_mass_length(&self) -> f64 {
-        self.pole_mass * self.half_pole_length
+        let mut cart_pole = Self {
+            force: 0.0,
+            half_pole_length: 0.0,
+            pole_mass: 0.0,
+            pole_mass_length: 0.0,
+            inverse_total_mass: 0.0,
+            state: [0.0; 4],
+        };
+        cart_pole.set_parameters(&[0, 1, 2].map(|i: usize| physics::CART_POLE[i].default));
+        cart_pole
     }
 }
 
@@ -91,10 +95,13 @@ impl Environment for CartPole {
 
     fn set_parameters(&mut self, values: &[f64]) {
         (self.force, self.half_pole_length, self.pole_mass) = (values[0], values[1], values[2]);
+        self.pole_mass_length = self.pole_mass * self.half_pole_length;
+        self.inverse_total_mass = 1.0 / (self.pole_mass + CART_MASS);
     }
 
     fn applied(&self, out: &mut [f64]) {
-        let values = [self.force, self.half_pole_length, self.pole_mass, self.total_mass(), self.pole_mass_length()];
+        let total_mass = self.pole_mass + CART_MASS;
+        let values = [self.force, self.half_pole_length, self.pole_mass, total_mass, self.pole_mass_length];
         out.copy_from_slice(&values);
     }
 
@@ -114,10 +121,11 @@ impl Environment for CartPole {
         let [x, x_dot, theta, theta_dot] = self.state;
         let force = if super::choice(action) == 1 { self.force } else { -self.force };
         let (sin, cos) = theta.sin_cos();
-        let temp = (force + self.pole_mass_length() * (theta_dot * theta_dot) * sin) / self.total_mass();
+        let (pole_mass_length, inverse) = (self.pole_mass_length, self.inverse_total_mass);
+        let temp = (force + pole_mass_length * (theta_dot * theta_dot) * sin) * inverse;
         let theta_acc = (GRAVITY * sin - cos * temp)
-            / (self.half_pole_length * (4.0 / 3.0 - self.pole_mass * (cos * cos) / self.total_mass()));
-        let x_acc = temp - self.pole_mass_length() * theta_acc * cos / self.total_mass();
+            / (self.half_pole_length * (4.0 / 3.0 - self.pole_mass * (cos * cos) * inverse));
+        let x_acc = temp - pole_mass_length * theta_acc * cos * inverse;
         let next = [x + TAU * x_dot, x_dot + TAU * x_acc, theta + TAU * theta_dot, theta_dot + TAU * theta_acc];
         let diverged = super::advance(&mut self.state, next);
 

@@ -62,6 +62,21 @@ impl Pendulum {
         let [length, mass] = [0, 1].map(|i: usize| physics::PENDULUM[i].default);
         Self { length, mass, state: [0.0; 2] }
     }
+
+    /// Advances by one step under a torque in N m, clipped to ±2, in full precision: actions arrive as f32, but the
+    /// reference trajectories were computed from f64 torques.
+    pub fn step_with_torque(&mut self, torque: f64, reward_terms: &mut [f64]) -> Transition {
+        let [theta, velocity] = self.state;
+        let (m, l) = (self.mass, self.length);
+        let u = torque.clamp(-MAX_TORQUE, MAX_TORQUE);
+        let angle = normalise(theta);
+        reward_terms.copy_from_slice(&[-(angle * angle), -(0.1 * (velocity * velocity)), -(0.001 * (u * u))]);
+
+        let acceleration = 3.0 * GRAVITY / (2.0 * l) * theta.sin() + 3.0 / (m * (l * l)) * u;
+        let velocity = (velocity + acceleration * DT).clamp(-MAX_SPEED, MAX_SPEED);
+        let diverged = super::advance(&mut self.state, [theta + velocity * DT, velocity]);
+        Transition { terminated: diverged, goal: normalise(self.state[0]).abs() < UPRIGHT, diverged }
+    }
 }
 
 impl Default for Pendulum {
@@ -105,16 +120,7 @@ impl Environment for Pendulum {
         let Action::Continuous(&[torque]) = action else {
             unreachable!("Pendulum is stepped with one validated torque")
         };
-        let [theta, velocity] = self.state;
-        let (m, l) = (self.mass, self.length);
-        let u = f64::from(torque).clamp(-MAX_TORQUE, MAX_TORQUE);
-        let angle = normalise(theta);
-        reward_terms.copy_from_slice(&[-(angle * angle), -(0.1 * (velocity * velocity)), -(0.001 * (u * u))]);
-
-        let acceleration = 3.0 * GRAVITY / (2.0 * l) * theta.sin() + 3.0 / (m * (l * l)) * u;
-        let velocity = (velocity + acceleration * DT).clamp(-MAX_SPEED, MAX_SPEED);
-        let diverged = super::advance(&mut self.state, [theta + velocity * DT, velocity]);
-        Transition { terminated: diverged, goal: normalise(self.state[0]).abs() < UPRIGHT, diverged }
+        self.step_with_torque(f64::from(torque), reward_terms)
     }
 
     fn save(&self, out: &mut Vec<f64>) {

@@ -3,10 +3,13 @@
 //! Every draw comes from Philox 4×64-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", 2011), a
 //! function of a key and a counter with no other state. The key is `[seed, environment index]`, the counter
 //! `[block, index, purpose, 0]`, with `block` counting from 1: what ran before, on which thread or server, cannot
-//! matter. The layout is that of NumPy, so one line of Python repeats any stream:
+//! matter. The layout is that of NumPy, so a few lines of Python repeat any stream (the arrays must be of type uint64:
+//! lists lose digits of words from 2^63 on):
 //!
 //! ```python
-//! numpy.random.Generator(numpy.random.Philox(key=[seed, environment_index], counter=[0, index, purpose, 0])).random()
+//! key = numpy.array([seed, environment_index], dtype=numpy.uint64)
+//! counter = numpy.array([0, index, purpose, 0], dtype=numpy.uint64)
+//! numpy.random.Generator(numpy.random.Philox(key=key, counter=counter)).random()
 //! ```
 //!
 //! | purpose | index | draws, in order |
@@ -72,4 +75,31 @@ fn philox(mut counter: [u64; 4], mut key: [u64; 2]) -> [u64; 4] {
         key = [key[0].wrapping_add(WEYL[0]), key[1].wrapping_add(WEYL[1])];
     }
     counter
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Random123 (Salmon et al.), `tests/kat_vectors`, the three lines `philox4x64 10`: counter, key, result.
+    const KNOWN_ANSWERS: [([u64; 4], [u64; 2], [u64; 4]); 3] = [
+        ([0; 4], [0; 2], [0x16554D9ECA36314C, 0xDB20FE9D672D0FDC, 0xD7E772CEE186176B, 0x7E68B68AEC7BA23B]),
+        (
+            [u64::MAX; 4],
+            [u64::MAX; 2],
+            [0x87B092C3013FE90B, 0x438C3C67BE8D0224, 0x9CC7D7C69CD777B6, 0xA09CAEBF594F0BA0],
+        ),
+        (
+            [0x243F6A8885A308D3, 0x13198A2E03707344, 0xA4093822299F31D0, 0x082EFA98EC4E6C89],
+            [0x452821E638D01377, 0xBE5466CF34E90C6C],
+            [0xA528F45403E61D95, 0x38C72DBD566E9788, 0xA5A1610E72FD18B5, 0x57BD43B5E52B7FE6],
+        ),
+    ];
+
+    #[test]
+    fn philox_gives_the_known_answers_of_random123() {
+        for (counter, key, expected) in KNOWN_ANSWERS {
+            assert_eq!(philox(counter, key), expected, "counter {counter:x?}, key {key:x?}");
+        }
+    }
 }

@@ -7,6 +7,9 @@ use serde::{Deserialize, Serialize};
 /// Raised by every change of the layout below.
 const FORMAT: u32 = 1;
 
+/// More episodes than any environment runs: a snapshot that claims more would let the counts overflow.
+const MAX_EPISODE: u64 = 1 << 63;
+
 /// Everything that an environment's future depends on, besides the actions. Random streams need no state of their own:
 /// they follow from the seed, the index and the counts.
 #[derive(Serialize, Deserialize)]
@@ -99,8 +102,14 @@ impl Episodes {
             return refuse(format!("it does not have the {} parameters of {}", spec.parameters.len(), spec.name));
         }
         let distributions = Self::distributions(spec, &saved)?;
-        let Progress { episode_in_trial, length, total_reward, ended, .. } = saved.progress;
-        if episode_in_trial >= saved.episodes_per_trial || !total_reward.is_finite() {
+        let Progress { trial, episode, episode_in_trial, length, total_reward, reached_at, held_for, ended, .. } =
+            saved.progress;
+        if episode_in_trial >= saved.episodes_per_trial
+            || trial > episode
+            || episode > MAX_EPISODE
+            || reached_at.max(held_for) > length
+            || !total_reward.is_finite()
+        {
             return refuse("its counters contradict each other".into());
         }
         if length > spec.step_limit || (length == spec.step_limit && !ended) {

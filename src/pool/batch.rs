@@ -91,7 +91,7 @@ impl Batch {
             Mutex::new(Shard::new(spec, episodes, (first, size), autoreset, receipts))
         };
         let shards = (0..settings.size).step_by(shard_size).map(shard).collect();
-        let job = Arc::new(Job::new(shards, permit));
+        let job = Arc::new(Job::new(shards, permit, settings.spec.step_cost * settings.size as f64));
         let mut batch = Self { settings, shard_size, job, workers, buffer: BytesMut::new() };
         batch.run().await?;
         batch.check_failures()?;

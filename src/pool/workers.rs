@@ -17,6 +17,11 @@ use tokio::sync::Notify;
 /// is more than a step of many small environments.
 const YIELDS_BEFORE_SLEEP: usize = 200;
 
+/// A job of at most so many µs is short, …
+const SHORT: f64 = 50.0;
+/// … and looked after so often before its session sleeps, about twice that time.
+const POLLS: usize = 50;
+
 /// Worker threads that step batches, and the count of environments they may hold.
 pub struct Pool {
     shared: Arc<Shared>,
@@ -110,6 +115,13 @@ impl Shared {
         if job.shards.len() > 1 {
             self.ready.notify_all();
         }
+        // A job that is nearly done is worth more polls than a sleep: being woken costs more than many steps.
+        for _ in 0..job.patience {
+            if job.left.load(Ordering::Acquire) == 0 {
+                break;
+            }
+            tokio::task::yield_now().await;
+        }
         job.done.notified().await;
         if job.failed.load(Ordering::Relaxed) { Err(Error::Defect) } else { Ok(()) }
     }
@@ -164,11 +176,14 @@ pub(super) struct Job {
     /// The session is gone: what has not run need not.
     pub(super) abandoned: AtomicBool,
     failed: AtomicBool,
+    /// How often the session looks whether a request is done before it sleeps until then.
+    patience: usize,
     _permit: Permit,
 }
 
 impl Job {
-    pub(super) fn new(shards: Vec<Mutex<Shard>>, permit: Permit) -> Self {
+    /// A job of these shards. One that takes about `cost` µs and is short is worth waiting for awake.
+    pub(super) fn new(shards: Vec<Mutex<Shard>>, permit: Permit, cost: f64) -> Self {
         Self {
             shards,
             next: AtomicUsize::new(0),
@@ -176,6 +191,7 @@ impl Job {
             done: Notify::new(),
             abandoned: AtomicBool::new(false),
             failed: AtomicBool::new(false),
+            patience: if cost <= SHORT { POLLS } else { 0 },
             _permit: permit,
         }
     }

@@ -25,6 +25,7 @@ use service::Service;
 use std::{future::Future, io, sync::Arc, time::Duration};
 use tokio_stream::wrappers::UnixListenerStream;
 use tonic::transport::{Server, server::TcpIncoming};
+use tonic_health::ServingStatus;
 
 /// A session's reply to a large batch should not wait for the window: 4 MiB.
 const WINDOW: u32 = 4 << 20;
@@ -106,6 +107,7 @@ pub async fn run(listeners: Vec<Listener>, config: &Config, shutdown: impl Futur
     tracing::info!(grace_seconds = config.grace_seconds, "shutting down: no new sessions");
     controller.set(Phase::Draining);
     health.set_not_serving::<PerturbServer<Service>>().await;
+    health.set_service_status("", ServingStatus::NotServing).await;
     if tokio::time::timeout(config.grace(), controller.idle()).await.is_err() {
         tracing::warn!("the grace period is over: ending the sessions that still run");
     }

@@ -103,12 +103,12 @@ impl Conversation {
     /// The next response; an error ends the stream, and so does the client's end.
     async fn next(&mut self) -> Option<Result<proto::SessionResponse, Status>> {
         let request = tokio::select! {
-            biased;
+            biased; // the end comes first: a client that never pauses must not outlast it
+            () = self.drain.closed() => return Some(Err(Refusal::Draining.into())),
             request = self.requests.message() => match request {
                 Ok(request) => request?,
                 Err(status) => return Some(Err(status)),
             },
-            () = self.drain.closed() => return Some(Err(Refusal::Draining.into())),
             () = idle(self.idle) => {
                 let seconds = self.idle.map_or(0, |idle| idle.as_secs());
                 return Some(Err(Refusal::Idle { seconds }.into()));

@@ -1,0 +1,73 @@
+# perturb's commands; `make` alone lists them. Each installs what it lacks and can be run again.
+
+# Debian 12's packages: a compiler, libclang for bindgen, MuJoCo, libtorch, and a BLAS that is not the slow reference one.
+PACKAGES := build-essential pkg-config libclang-dev libmujoco-dev libtorch-dev libopenblas0-pthread
+CARGO_DENY_VERSION := 0.20.2
+PROGRAMS := $(or $(CARGO_TARGET_DIR),target)/release
+
+# Arguments of `make demo` and `make bench`, e.g. make demo DEMO_ARGS="--episodes 200 --test-episodes 50".
+DEMO_ARGS ?=
+BENCH_ARGS ?=
+
+# The learner's threads are its own; more inside libtorch's matrix products only get in their way.
+export OPENBLAS_NUM_THREADS := 1
+
+# One profile and one selection of packages for programs, tests, lints and benches: libtorch's bindings, which take
+# minutes, are compiled once. The second form is the server without MuJoCo.
+ALL := --workspace --release --locked
+WITHOUT_MUJOCO := --package perturb --no-default-features --release --locked
+
+.DEFAULT_GOAL := help
+.PHONY: help deps toolchain build demo test lint bench audit cargo-deny
+
+help: ## this list
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
+
+deps: toolchain ## install the missing Debian packages, with sudo if need be
+	@missing=; \
+	for package in $(PACKAGES); do \
+		dpkg-query --show --showformat='$${Status}' $$package 2>/dev/null | grep -q 'ok installed' || missing="$$missing $$package"; \
+	done; \
+	[ -n "$$missing" ] || exit 0; \
+	if ! command -v apt-get >/dev/null; then \
+		echo "perturb is built on Debian 12, but apt-get is missing here; install the equivalents of:$$missing" >&2; exit 1; \
+	fi; \
+	if [ "$$(id -u)" = 0 ]; then as_root=; \
+	elif command -v sudo >/dev/null; then as_root=sudo; \
+	else \
+		echo "These packages are missing and neither root nor sudo is at hand; have them installed with: apt-get install$$missing" >&2; exit 1; \
+	fi; \
+	echo "Installing with apt-get:$$missing"; \
+	$$as_root apt-get -q update && $$as_root env DEBIAN_FRONTEND=noninteractive apt-get -qy install --no-install-recommends $$missing
+
+toolchain:
+	@command -v cargo >/dev/null || { echo "cargo is missing; install Rust 1.95 or later, see https://rustup.rs" >&2; exit 1; }
+
+build: deps ## compile the programs perturb-server and perturb
+	cargo build $(ALL)
+
+demo: build ## train and test PPO on CartPole over gRPC; the paper's row beside it
+	$(PROGRAMS)/perturb demo $(DEMO_ARGS)
+
+test: deps ## run all tests, then those of the server without MuJoCo
+	cargo test $(ALL)
+	cargo test $(WITHOUT_MUJOCO)
+
+lint: deps cargo-deny ## check formatting, clippy, documentation and dependencies
+	cargo fmt --all --check
+	cargo clippy $(ALL) --all-targets -- -D warnings
+	cargo clippy $(WITHOUT_MUJOCO) --all-targets -- -D warnings
+	RUSTDOCFLAGS="-D warnings" cargo doc $(ALL) --no-deps --lib
+	cargo deny --locked check bans licenses sources
+
+bench: build ## measure throughput, latency and memory
+	cargo bench --workspace --locked --bench '*' -- $(BENCH_ARGS)
+
+audit: toolchain cargo-deny ## look the dependencies up in the RustSec database, which is downloaded from GitHub
+	cargo deny --locked check advisories
+
+cargo-deny: toolchain
+	@cargo deny --version >/dev/null 2>&1 || { \
+		echo "Installing cargo-deny $(CARGO_DENY_VERSION), which takes some minutes"; \
+		cargo install --locked --version $(CARGO_DENY_VERSION) cargo-deny; \
+	}

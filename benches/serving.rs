@@ -1,0 +1,326 @@
+//! What serving costs, each figure beside its yardstick of the same run:
+//!
+//! - CartPole, batch 256, over a Unix socket, against a bare tonic echo of the same payload;
+//! - Hopper and HalfCheetah, batch 64, two workers, against the bare loop of the same model on one thread;
+//! - the round trip of one environment, and the memory of one Hopper.
+//!
+//! Servers are processes of their own: `perturb-server`, and this program with the argument `echo` and a socket.
+
+use bytes::Bytes;
+use perturb::{
+    env::{self, Action, ActionSpace, EnvironmentSpec, Episodes, Settings},
+    physics::Version,
+    proto::{
+        self, SessionRequest, SessionResponse,
+        perturb_client::PerturbClient,
+        perturb_server::{Perturb, PerturbServer},
+        session_request::Request as Ask,
+        session_response::Response as Answer,
+    },
+};
+use std::{
+    env as process_env, fs,
+    io::{BufRead, BufReader},
+    path::Path,
+    pin::Pin,
+    process::{Child, Command, Stdio},
+    time::Instant,
+};
+use tokio::{net::UnixListener, sync::mpsc};
+use tokio_stream::{
+    Stream, StreamExt,
+    wrappers::{ReceiverStream, UnixListenerStream},
+};
+use tonic::{Request, Response, Status, Streaming, transport::Server};
+
+type Failure = Box<dyn std::error::Error>;
+
+const ROUNDS: usize = 5;
+const MESSAGE_LIMIT: usize = 64 << 20;
+
+fn main() -> Result<(), Failure> {
+    let arguments: Vec<String> = process_env::args().collect();
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    if let [_, kind, socket, ..] = arguments.as_slice()
+        && kind == "echo"
+    {
+        return runtime.block_on(echo(socket.as_ref()));
+    }
+    runtime.block_on(async {
+        classic().await?;
+        for name in env::names().filter(|name| ["Hopper", "HalfCheetah"].contains(name)) {
+            locomotion(name).await?;
+        }
+        round_trip().await?;
+        memory().await
+    })
+}
+
+/// (a) CartPole in batches of 256 against the echo.
+async fn classic() -> Result<(), Failure> {
+    const BATCH: usize = 256;
+    const TRIPS: usize = 4000;
+    let (server, echo) = (Process::server(1)?, Process::echo()?);
+    let mut served = Client::open(&server.socket, "CartPole", BATCH).await?;
+    let mut bare = Client::open(&echo.socket, "CartPole", BATCH).await?;
+    let (mut ratios, mut steps) = (Vec::new(), Vec::new());
+    for _ in 0..ROUNDS {
+        let echoed = TRIPS as f64 / bare.run(TRIPS).await?;
+        let stepped = TRIPS as f64 / served.run(TRIPS).await?;
+        ratios.push(stepped / echoed);
+        steps.push(stepped * BATCH as f64);
+    }
+    println!("step/cart_pole/256      {:>12.0} env steps/s over a Unix socket", median(&mut steps));
+    println!("step/cart_pole/256      {:>12.2} of a bare echo's round trips x 256 (at least 0.5)", median(&mut ratios));
+    Ok(())
+}
+
+/// (b) A MuJoCo model in batches of 64 on two workers against twice the bare loop.
+async fn locomotion(name: &str) -> Result<(), Failure> {
+    const BATCH: usize = 64;
+    const TRIPS: usize = 300;
+    let server = Process::server(2)?;
+    let mut served = Client::open(&server.socket, name, BATCH).await?;
+    let (mut ratios, mut bare, mut steps) = (Vec::new(), Vec::new(), Vec::new());
+    for _ in 0..ROUNDS {
+        let loop_rate = bare_loop(name, TRIPS * BATCH / 4)?;
+        let rate = (TRIPS * BATCH) as f64 / served.run(TRIPS).await?;
+        ratios.push(rate / (2.0 * loop_rate));
+        bare.push(loop_rate);
+        steps.push(rate);
+    }
+    let id = format!("step/{name}/64");
+    println!("{id:<23} {:>12.0} env steps/s, two workers; bare loop {:.0}", median(&mut steps), median(&mut bare));
+    println!("{id:<23} {:>12.2} of twice the bare loop (at least 0.8)", median(&mut ratios));
+    Ok(())
+}
+
+/// (c) One environment.
+async fn round_trip() -> Result<(), Failure> {
+    const TRIPS: usize = 20_000;
+    let server = Process::server(1)?;
+    let mut client = Client::open(&server.socket, "CartPole", 1).await?;
+    client.run(TRIPS / 10).await?;
+    let mut micros = Vec::with_capacity(TRIPS);
+    for _ in 0..TRIPS {
+        micros.push(client.run(1).await? * 1e6);
+    }
+    micros.sort_by(f64::total_cmp);
+    let at = |q: f64| micros[(q * (TRIPS - 1) as f64) as usize];
+    println!("round_trip/cart_pole/1  {:>12.1} us p50, {:.1} us p99", at(0.5), at(0.99));
+    Ok(())
+}
+
+/// (d) Resident memory of a Hopper, stepped so that its pages are in use.
+async fn memory() -> Result<(), Failure> {
+    const BATCH: usize = 2000;
+    if env::find("Hopper").is_err() {
+        return Ok(());
+    }
+    let server = Process::server(2)?;
+    Client::open(&server.socket, "Hopper", 1).await?.run(10).await?;
+    let before = server.resident()?;
+    let mut client = Client::open(&server.socket, "Hopper", BATCH).await?;
+    client.run(50).await?;
+    let each = (server.resident()? - before) / BATCH as f64;
+    println!("memory/hopper           {:>12.1} kB for each environment (at most 150)", each / 1e3);
+    Ok(())
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+/// Steps/s of one environment in this thread, with the same actions that the client sends.
+fn bare_loop(name: &str, steps: usize) -> Result<f64, Failure> {
+    let spec = env::find(name)?;
+    let distributions = spec.parameters.iter().map(|p| p.distribution(Version::Default)).collect();
+    let settings = Settings { seed: 1, environment_index: 0, distributions, episodes_per_trial: 1 };
+    let mut episodes = Episodes::new(env::make(name)?, settings);
+    let (mut terms, mut observation) = (vec![0.0; spec.reward_terms.len()], vec![0.0; spec.observation.len()]);
+    let mut noise = Noise(1);
+    let mut action = vec![0.0; width(spec)];
+    let start = Instant::now();
+    for _ in 0..steps {
+        action.iter_mut().for_each(|a| *a = noise.unit());
+        episodes.step(Action::Continuous(&action), &mut terms);
+        episodes.observe(&mut observation);
+        if episodes.ended() {
+            episodes.begin(None);
+        }
+    }
+    let rate = steps as f64 / start.elapsed().as_secs_f64();
+    assert!(observation.iter().all(|x| x.is_finite()));
+    Ok(rate)
+}
+
+fn width(spec: &EnvironmentSpec) -> usize {
+    match spec.action {
+        ActionSpace::Discrete(_) => 1,
+        ActionSpace::Continuous(channels) => channels.len(),
+    }
+}
+
+/// A small generator for actions: their quality does not matter here, their cost does.
+struct Noise(u64);
+
+impl Noise {
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+        self.0 >> 33
+    }
+
+    fn unit(&mut self) -> f32 {
+        self.next() as f32 / (1u64 << 30) as f32 - 1.0
+    }
+}
+
+/// A session that steps with random actions.
+struct Client {
+    spec: &'static EnvironmentSpec,
+    batch: usize,
+    requests: mpsc::Sender<SessionRequest>,
+    responses: Streaming<SessionResponse>,
+    noise: Noise,
+}
+
+impl Client {
+    async fn open(socket: &Path, name: &str, batch: usize) -> Result<Self, Failure> {
+        let channel = tonic::transport::Endpoint::try_from(format!("unix:{}", socket.display()))?.connect().await?;
+        let mut client = PerturbClient::new(channel).max_decoding_message_size(MESSAGE_LIMIT);
+        let (requests, outgoing) = mpsc::channel(4);
+        let open = proto::Open {
+            environment: name.into(),
+            version: proto::Version::Default.into(),
+            batch_size: batch as u32,
+            seed: 1,
+            autoreset_mode: proto::AutoresetMode::SameStep.into(),
+            ..Default::default()
+        };
+        requests.send(SessionRequest { request: Some(Ask::Open(open)) }).await?;
+        let mut responses = client.session(ReceiverStream::new(outgoing)).await?.into_inner();
+        let opened = responses.message().await?.and_then(|r| r.response);
+        assert!(matches!(opened, Some(Answer::Opened(_))), "{opened:?}");
+        Ok(Self { spec: env::find(name)?, batch, requests, responses, noise: Noise(7) })
+    }
+
+    /// Takes `trips` steps, each after the reply to the last. Returns the seconds.
+    async fn run(&mut self, trips: usize) -> Result<f64, Failure> {
+        let start = Instant::now();
+        for _ in 0..trips {
+            let actions = self.actions();
+            self.requests.send(SessionRequest { request: Some(Ask::Step(proto::Step { actions })) }).await?;
+            match self.responses.message().await?.and_then(|r| r.response) {
+                Some(Answer::Stepped(stepped)) => {
+                    assert_eq!(stepped.observations.len(), 4 * self.batch * self.spec.observation.len());
+                    assert_eq!(stepped.rewards.len(), 4 * self.batch);
+                }
+                other => return Err(format!("{other:?}").into()),
+            }
+        }
+        Ok(start.elapsed().as_secs_f64())
+    }
+
+    fn actions(&mut self) -> Bytes {
+        let mut bytes = Vec::with_capacity(4 * self.batch * width(self.spec));
+        for _ in 0..self.batch * width(self.spec) {
+            match self.spec.action {
+                ActionSpace::Discrete(names) => {
+                    bytes.extend(((self.noise.next() % names.len() as u64) as i32).to_le_bytes());
+                }
+                ActionSpace::Continuous(_) => bytes.extend(self.noise.unit().to_le_bytes()),
+            }
+        }
+        bytes.into()
+    }
+}
+
+/// A server process with a socket of its own.
+struct Process {
+    child: Child,
+    socket: std::path::PathBuf,
+    _directory: tempfile::TempDir,
+}
+
+impl Process {
+    fn server(workers: usize) -> Result<Self, Failure> {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_perturb-server"));
+        command.args(["--log", "warn", "--workers", &workers.to_string()]);
+        Self::start(command, |socket| vec!["--listen".into(), format!("unix:{}", socket.display())])
+    }
+
+    fn echo() -> Result<Self, Failure> {
+        Self::start(Command::new(process_env::current_exe()?), |socket| {
+            vec!["echo".into(), socket.display().to_string()]
+        })
+    }
+
+    fn start(mut command: Command, arguments: impl Fn(&Path) -> Vec<String>) -> Result<Self, Failure> {
+        let directory = tempfile::tempdir()?;
+        let socket = directory.path().join("socket");
+        let mut child = command.args(arguments(&socket)).stdout(Stdio::piped()).spawn()?;
+        let stdout = child.stdout.take().ok_or("no standard output")?;
+        BufReader::new(stdout).read_line(&mut String::new())?;
+        Ok(Self { child, socket, _directory: directory })
+    }
+
+    /// Resident bytes.
+    fn resident(&self) -> Result<f64, Failure> {
+        let status = fs::read_to_string(format!("/proc/{}/status", self.child.id()))?;
+        let line = status.lines().find(|line| line.starts_with("VmRSS:")).ok_or("no VmRSS")?;
+        Ok(line.split_whitespace().nth(1).ok_or("no VmRSS")?.parse::<f64>()? * 1024.0)
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Answers every step with a reply of the same size as the server's, made in advance.
+struct Echo;
+
+#[tonic::async_trait]
+impl Perturb for Echo {
+    type SessionStream = Pin<Box<dyn Stream<Item = Result<SessionResponse, Status>> + Send>>;
+
+    async fn list_environments(
+        &self,
+        _: Request<proto::ListEnvironmentsRequest>,
+    ) -> Result<Response<proto::ListEnvironmentsResponse>, Status> {
+        Err(Status::unimplemented("this is an echo"))
+    }
+
+    async fn session(
+        &self,
+        requests: Request<Streaming<SessionRequest>>,
+    ) -> Result<Response<Self::SessionStream>, Status> {
+        let reply = proto::Stepped {
+            observations: Bytes::from(vec![0; 256 * 16]),
+            rewards: Bytes::from(vec![0; 256 * 4]),
+            terminated: Bytes::from(vec![0; 256]),
+            truncated: Bytes::from(vec![0; 256]),
+            ..Default::default()
+        };
+        let responses = requests.into_inner().map(move |request| {
+            let response = match request?.request {
+                Some(Ask::Open(_)) => Answer::Opened(proto::Opened::default()),
+                _ => Answer::Stepped(reply.clone()),
+            };
+            Ok(SessionResponse { response: Some(response) })
+        });
+        Ok(Response::new(Box::pin(responses)))
+    }
+}
+
+async fn echo(socket: &Path) -> Result<(), Failure> {
+    let listener = UnixListener::bind(socket)?;
+    println!("listening");
+    Ok(Server::builder()
+        .add_service(PerturbServer::new(Echo))
+        .serve_with_incoming(UnixListenerStream::new(listener))
+        .await?)
+}

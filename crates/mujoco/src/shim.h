@@ -1,0 +1,36 @@
+// What the Rust side calls. Every function that may raise a fatal error in MuJoCo returns it as a value.
+#ifndef PERTURB_MUJOCO_SHIM_H_
+#define PERTURB_MUJOCO_SHIM_H_
+
+#include <mujoco/mujoco.h>
+
+// Silences MuJoCo's log file. Idempotent, but not to be raced.
+void perturb_mj_silence(void);
+
+// The message of the last failure on this thread; valid until the next one.
+const char* perturb_mj_last_error(void);
+
+// Compiles MJCF text. NULL on failure, with the reason in `error`. One call at a time in the whole process.
+mjModel* perturb_mj_load(const char* xml, int xml_size, char* error, int error_size);
+
+// NULL on failure.
+mjModel* perturb_mj_copy_model(const mjModel* source);
+mjData* perturb_mj_make_data(const mjModel* model);
+
+// Nonzero on failure.
+int perturb_mj_assign_model(mjModel* destination, const mjModel* source);
+int perturb_mj_set_const(mjModel* model, mjData* data);
+int perturb_mj_reset(const mjModel* model, mjData* data);
+int perturb_mj_step1(const mjModel* model, mjData* data);
+int perturb_mj_step2(const mjModel* model, mjData* data);
+int perturb_mj_forward(const mjModel* model, mjData* data);
+
+// Whether two models have the same sizes, so that one may be assigned to the other or used with its data.
+int perturb_mj_same_sizes(const mjModel* a, const mjModel* b);
+
+// The model's array number `index`: its name, elements, their number, and the bytes of a floating-point element, or 0
+// for other types. Zero is returned beyond the last array.
+int perturb_mj_array(const mjModel* model, int index, const char** name, const void** elements, int* count,
+                     int* float_size);
+
+#endif  // PERTURB_MUJOCO_SHIM_H_

@@ -1,0 +1,98 @@
+//! Hopper: hop forward on one leg.
+
+use super::{
+    channels::{APPLIED, CONTROL_TIMESTEP, REWARD_TERMS, joint_state, position, root_state, speed, torso, velocity},
+    walker::{Posture, Task, Walker},
+};
+use crate::{
+    env::{ActionSpace, Channel, EnvironmentSpec, Error, SuccessRule},
+    physics,
+};
+use std::sync::OnceLock;
+
+/// What is fixed about Hopper.
+///
+/// | observation | value, clipped to ±5 |
+/// |---|---|
+/// | 0 | height of the torso above that at the reset, m |
+/// | 1, 2 | sine and cosine of the angle to the target: 0 and 1 |
+/// | 3 … 5 | 0.3 × the torso's velocity along x, y, z in m/s |
+/// | 6, 7 | roll (0) and pitch of the torso, rad |
+/// | 8 … 13 | thigh, leg, foot: position in the joint's range scaled to ±1, and 0.1 × speed in rad/s |
+/// | 14 | whether the foot touches the floor, one step late |
+///
+/// Actions: the three motors' controls, clipped to ±1, times `power`, times 100 N m. Reward: see
+/// [`Walker`]. Start: joints uniform in ±0.1 rad within their range, at rest. The hopper is alive while its torso is
+/// above 0.8 m and its pitch within ±1 rad.
+///
+/// Revision 0: Roboschool's `RoboschoolHopper-v1` on MuJoCo.
+pub static HOPPER: EnvironmentSpec = EnvironmentSpec {
+    name: "Hopper",
+    revision: 0,
+    description: "Hop forward on one leg without falling.",
+    parameters: physics::HOPPER,
+    observation: &[
+        torso::HEIGHT,
+        torso::TARGET_SIN,
+        torso::TARGET_COS,
+        torso::VELOCITY_X,
+        torso::VELOCITY_Y,
+        torso::VELOCITY_Z,
+        torso::ROLL,
+        torso::PITCH,
+        position("thigh_position"),
+        speed("thigh_speed"),
+        position("leg_position"),
+        speed("leg_speed"),
+        position("foot_position"),
+        speed("foot_speed"),
+        Channel::new("foot_contact", "1", 0.0, 1.0),
+    ],
+    action: ActionSpace::Continuous(&[
+        Channel::new("thigh", "1", -1.0, 1.0),
+        Channel::new("leg", "1", -1.0, 1.0),
+        Channel::new("foot", "1", -1.0, 1.0),
+    ]),
+    state: &[
+        root_state::X,
+        root_state::Z,
+        root_state::PITCH,
+        joint_state("thigh"),
+        joint_state("leg"),
+        joint_state("foot"),
+        root_state::X_VELOCITY,
+        root_state::Z_VELOCITY,
+        root_state::PITCH_VELOCITY,
+        velocity("thigh_velocity"),
+        velocity("leg_velocity"),
+        velocity("foot_velocity"),
+    ],
+    reward_terms: REWARD_TERMS,
+    applied: APPLIED,
+    step_limit: 1000,
+    control_timestep: CONTROL_TIMESTEP,
+    step_cost: 20.0,
+    success: SuccessRule::ReachedWithin(1000),
+    success_description: "the torso's x reached 20 m at any step, the last one included",
+};
+
+static TASK: Task = Task {
+    spec: &HOPPER,
+    mjcf: include_str!("../../models/hopper.xml"),
+    joints: &["thigh", "leg", "foot"],
+    contacts: &["foot"],
+    alive,
+    pristine: OnceLock::new(),
+};
+
+/// A hopper with default parameters.
+///
+/// # Errors
+/// [`Error::Model`] if MuJoCo is of another version or has no memory.
+pub fn hopper() -> Result<Walker, Error> {
+    Walker::new(&TASK)
+}
+
+fn alive(posture: &Posture<'_>) -> bool {
+    posture.height > 0.8 && posture.pitch.abs() < 1.0
+}

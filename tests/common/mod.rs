@@ -1,0 +1,82 @@
+//! What several test files need: environments at their first episode, actions, and transcripts to compare.
+#![allow(dead_code, clippy::unwrap_used, reason = "every test file uses its part")]
+
+use perturb::{
+    env::{self, Action, ActionSpace, EnvironmentSpec, Episodes, Outcome, Purpose, Settings, Stream},
+    physics::Version,
+};
+
+/// Settings of an environment of this version.
+pub fn settings(spec: &EnvironmentSpec, version: Version, seed: u64, index: u32, per_trial: u32) -> Settings {
+    Settings {
+        seed,
+        environment_index: index,
+        distributions: spec.parameters.iter().map(|p| p.distribution(version)).collect(),
+        episodes_per_trial: per_trial,
+    }
+}
+
+/// The environment at the start of its first episode.
+pub fn episodes(spec: &EnvironmentSpec, version: Version, seed: u64, index: u32, per_trial: u32) -> Episodes {
+    Episodes::new(env::make(spec.name).unwrap(), settings(spec, version, seed, index, per_trial))
+}
+
+/// The wire's bytes of the action that actor number `actor` takes at time `t`: random, but a function of these alone.
+/// A vector's entries leave the channels' ranges now and then, as they may.
+pub fn action_bytes(spec: &EnvironmentSpec, actor: u64, t: u64) -> Vec<u8> {
+    let mut stream = Stream::new(0xAC7, actor, Purpose::InitialState, t);
+    match spec.action {
+        ActionSpace::Discrete(names) => ((stream.unit() * names.len() as f64) as i32).to_le_bytes().to_vec(),
+        ActionSpace::Continuous(channels) => {
+            channels.iter().flat_map(|c| (stream.uniform(1.2 * c.low, 1.2 * c.high) as f32).to_le_bytes()).collect()
+        }
+    }
+}
+
+/// The f32 of little-endian bytes.
+pub fn floats(bytes: &[u8]) -> Vec<f32> {
+    bytes.as_chunks::<4>().0.iter().map(|word| f32::from_le_bytes(*word)).collect()
+}
+
+/// Steps with an action given as the wire's bytes; returns also the reward's terms.
+pub fn step(episodes: &mut Episodes, action: &[u8]) -> (Outcome, Vec<f64>) {
+    let mut terms = vec![f64::NAN; episodes.spec().reward_terms.len()];
+    let outcome = match episodes.spec().action {
+        ActionSpace::Discrete(_) => {
+            episodes.step(Action::Discrete(u32::from_le_bytes(action.try_into().unwrap())), &mut terms)
+        }
+        ActionSpace::Continuous(_) => episodes.step(Action::Continuous(&floats(action)), &mut terms),
+    };
+    (outcome, terms)
+}
+
+/// The current observation.
+pub fn observe(episodes: &Episodes) -> Vec<f32> {
+    let mut out = vec![f32::NAN; episodes.spec().observation.len()];
+    episodes.observe(&mut out);
+    out
+}
+
+/// What an episode starts with: its name, its physics, its first observation. Numbers are printed with all digits, so
+/// that equal lines are equal bytes.
+pub fn start_line(episodes: &Episodes) -> String {
+    format!("start {:?} {:?}", episodes.started(true), observe(episodes))
+}
+
+/// Takes the actor's steps from time `from` on, `steps` of them, beginning a new episode where one has ended, and
+/// returns a line for everything that can be seen.
+pub fn play(episodes: &mut Episodes, actor: u64, from: u64, steps: u64) -> Vec<String> {
+    let mut lines = Vec::new();
+    for t in from..from + steps {
+        if episodes.ended() {
+            episodes.begin(None);
+            lines.push(start_line(episodes));
+        }
+        let (outcome, terms) = step(episodes, &action_bytes(episodes.spec(), actor, t));
+        lines.push(format!("{t} {outcome:?} {terms:?} {:?}", observe(episodes)));
+        if episodes.ended() {
+            lines.push(format!("end {:?}", episodes.finished(true)));
+        }
+    }
+    lines
+}

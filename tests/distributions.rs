@@ -1,0 +1,345 @@
+//! Parameters are drawn as the paper says: D exact, R uniform, E uniform over the union around R; nothing else passes.
+#![allow(clippy::unwrap_used)]
+
+mod common;
+
+use perturb::{
+    env::{self, EnvironmentSpec, Error, Purpose, Stream},
+    physics::{Distribution, Interval, Parameter, Version, check_bounds, resolve},
+};
+use proptest::prelude::*;
+
+/// Environment, parameter, unit, D, R, E: docs/environments.md and the paper's table of parameter ranges.
+#[rustfmt::skip]
+#[allow(clippy::type_complexity)]
+const DOCUMENT: &[(&str, &str, &str, f64, (f64, f64), [(f64, f64); 2])] = &[
+    ("CartPole", "force", "N", 10.0, (5.0, 15.0), [(1.0, 5.0), (15.0, 20.0)]),
+    ("CartPole", "length", "m", 0.5, (0.25, 0.75), [(0.05, 0.25), (0.75, 1.0)]),
+    ("CartPole", "mass", "kg", 0.1, (0.05, 0.5), [(0.01, 0.05), (0.5, 1.0)]),
+    ("MountainCar", "force", "1", 0.001, (0.0005, 0.005), [(0.0001, 0.0005), (0.005, 0.01)]),
+    ("MountainCar", "mass", "1", 0.0025, (0.001, 0.005), [(0.0005, 0.001), (0.005, 0.01)]),
+    ("Acrobot", "length", "m", 1.0, (0.75, 1.25), [(0.5, 0.75), (1.25, 1.5)]),
+    ("Acrobot", "mass", "kg", 1.0, (0.75, 1.25), [(0.5, 0.75), (1.25, 1.5)]),
+    ("Acrobot", "moi", "kg m²", 1.0, (0.75, 1.25), [(0.5, 0.75), (1.25, 1.5)]),
+    ("Pendulum", "length", "m", 1.0, (0.75, 1.25), [(0.5, 0.75), (1.25, 1.5)]),
+    ("Pendulum", "mass", "kg", 1.0, (0.75, 1.25), [(0.5, 0.75), (1.25, 1.5)]),
+    ("HalfCheetah", "power", "1", 0.9, (0.7, 1.1), [(0.5, 0.7), (1.1, 1.3)]),
+    ("HalfCheetah", "density", "kg/m³", 1000.0, (750.0, 1250.0), [(500.0, 750.0), (1250.0, 1500.0)]),
+    ("HalfCheetah", "friction", "1", 0.8, (0.5, 1.1), [(0.2, 0.5), (1.1, 1.4)]),
+    ("Hopper", "power", "1", 0.75, (0.6, 0.9), [(0.4, 0.6), (0.9, 1.1)]),
+    ("Hopper", "density", "kg/m³", 1000.0, (750.0, 1250.0), [(500.0, 750.0), (1250.0, 1500.0)]),
+    ("Hopper", "friction", "1", 0.8, (0.5, 1.1), [(0.2, 0.5), (1.1, 1.4)]),
+];
+
+/// Trials drawn for each test of a distribution.
+const DRAWS: u32 = 4000;
+/// Standard deviations beyond which a count is wrong: happens by chance once in 1.7 million comparisons, and the seed is
+/// fixed.
+const SIGMAS: f64 = 5.0;
+/// Bound of √n times the Kolmogorov-Smirnov distance: exceeded by chance with probability 2 exp(-2 · 2.7²) = 9e-7.
+const KOLMOGOROV_SMIRNOV: f64 = 2.7;
+
+fn all_parameters() -> Vec<(&'static str, &'static Parameter)> {
+    use perturb::physics as p;
+    let tables = [
+        ("CartPole", p::CART_POLE),
+        ("MountainCar", p::MOUNTAIN_CAR),
+        ("Acrobot", p::ACROBOT),
+        ("Pendulum", p::PENDULUM),
+        ("HalfCheetah", p::HALF_CHEETAH),
+        ("Hopper", p::HOPPER),
+    ];
+    tables.into_iter().flat_map(|(name, table)| table.iter().map(move |parameter| (name, parameter))).collect()
+}
+
+/// The parameters of `DRAWS` trials, `[DRAWS, P]`, as the receipts of the episodes give them.
+fn drawn(spec: &'static EnvironmentSpec, version: Version) -> Vec<Vec<f64>> {
+    let mut episodes = common::episodes(spec, version, 2026, 3, 1);
+    let draw = |_| {
+        episodes.begin(None);
+        episodes.receipt().requested
+    };
+    (0..DRAWS).map(draw).collect()
+}
+
+fn column(rows: &[Vec<f64>], parameter: usize) -> Vec<f64> {
+    rows.iter().map(|row| row[parameter]).collect()
+}
+
+/// √n times the greatest distance between the values' empirical distribution and the uniform one on `interval`.
+fn distance_from_uniform(mut values: Vec<f64>, interval: Interval) -> f64 {
+    values.sort_by(f64::total_cmp);
+    let n = values.len() as f64;
+    let distance = values.iter().enumerate().map(|(i, value)| {
+        let expected = (value - interval.low) / (interval.high - interval.low);
+        (expected - i as f64 / n).abs().max((expected - (i + 1) as f64 / n).abs())
+    });
+    n.sqrt() * distance.fold(0.0, f64::max)
+}
+
+#[test]
+fn the_table_is_the_document() {
+    let interval = |i: Interval| (i.low, i.high);
+    let table: Vec<_> = all_parameters()
+        .into_iter()
+        .map(|(name, p)| (name, p.name, p.unit, p.default, interval(p.random), p.extreme.map(interval)))
+        .collect();
+    assert_eq!(table, DOCUMENT);
+}
+
+#[test]
+fn the_catalogue_uses_the_table() {
+    for spec in env::specs() {
+        let expected: Vec<_> = all_parameters().into_iter().filter(|(name, _)| *name == spec.name).collect();
+        assert_eq!(spec.parameters.iter().map(|p| (spec.name, p)).collect::<Vec<_>>(), expected);
+    }
+}
+
+#[test]
+fn defaults_lie_in_r_and_r_between_the_two_halves_of_e_and_all_within_bounds() {
+    for (name, p) in all_parameters() {
+        let place = format!("{name}, {}", p.name);
+        assert!(p.random.low <= p.default && p.default <= p.random.high, "{place}");
+        assert!(p.bounds.low <= p.extreme[0].low && p.extreme[1].high <= p.bounds.high, "{place}");
+        assert_eq!((p.extreme[0].high, p.extreme[1].low), (p.random.low, p.random.high), "{place}");
+        assert!(p.extreme[0].low < p.extreme[0].high && p.extreme[1].low < p.extreme[1].high, "{place}");
+        // `distribution` says that these unions are valid.
+        for version in [Version::Default, Version::Random, Version::Extreme] {
+            p.distribution(version);
+        }
+    }
+}
+
+#[test]
+fn d_is_always_the_default() {
+    for spec in env::specs() {
+        let defaults: Vec<f64> = spec.parameters.iter().map(|p| p.default).collect();
+        let mut episodes = common::episodes(spec, Version::Default, 1, 0, 1);
+        for _ in 0..20 {
+            assert_eq!(episodes.receipt().requested, defaults, "{}", spec.name);
+            episodes.begin(None);
+        }
+    }
+}
+
+#[test]
+fn r_is_uniform_on_its_interval() {
+    for spec in env::specs() {
+        let rows = drawn(spec, Version::Random);
+        for (i, p) in spec.parameters.iter().enumerate() {
+            let values = column(&rows, i);
+            assert!(values.iter().all(|v| (p.random.low..=p.random.high).contains(v)), "{} {}", spec.name, p.name);
+            let distance = distance_from_uniform(values, p.random);
+            assert!(distance < KOLMOGOROV_SMIRNOV, "{} {}: {distance}", spec.name, p.name);
+        }
+    }
+}
+
+#[test]
+fn e_draws_each_interval_in_proportion_to_its_length_and_nothing_inside_r() {
+    for spec in env::specs() {
+        let rows = drawn(spec, Version::Extreme);
+        for (i, p) in spec.parameters.iter().enumerate() {
+            let place = format!("{} {}", spec.name, p.name);
+            let [lower, upper] = p.extreme;
+            let (below, above): (Vec<f64>, Vec<f64>) = column(&rows, i).into_iter().partition(|v| *v <= p.random.low);
+            assert!(below.iter().all(|v| *v >= lower.low), "{place}");
+            assert!(above.iter().all(|v| (upper.low..=upper.high).contains(v)), "{place}");
+
+            let share = (lower.high - lower.low) / (lower.high - lower.low + upper.high - upper.low);
+            let n = f64::from(DRAWS);
+            let sigmas = (below.len() as f64 - n * share) / (n * share * (1.0 - share)).sqrt();
+            assert!(sigmas.abs() < SIGMAS, "{place}: {} of {n} in {lower}, {sigmas} σ", below.len());
+
+            for (values, interval) in [(below, lower), (above, upper)] {
+                let distance = distance_from_uniform(values, interval);
+                assert!(distance < KOLMOGOROV_SMIRNOV, "{place} in {interval}: {distance}");
+            }
+        }
+    }
+}
+
+#[test]
+fn parameters_are_drawn_independently() {
+    for spec in env::specs() {
+        let rows = drawn(spec, Version::Random);
+        let scaled = |i: usize| {
+            let interval = spec.parameters[i].random;
+            column(&rows, i).into_iter().map(move |v| (v - interval.low) / (interval.high - interval.low) - 0.5)
+        };
+        for i in 0..spec.parameters.len() {
+            for j in 0..i {
+                // The mean of the product has standard deviation 1 / (12 √n) if the two are independent.
+                let mean = scaled(i).zip(scaled(j)).map(|(a, b)| a * b).sum::<f64>() / f64::from(DRAWS);
+                let sigmas = mean * 12.0 * f64::from(DRAWS).sqrt();
+                assert!(sigmas.abs() < SIGMAS, "{}: parameters {i} and {j}: {sigmas} σ", spec.name);
+            }
+        }
+    }
+}
+
+#[test]
+fn a_union_of_three_draws_each_in_proportion() {
+    let intervals = [Interval::new(-1.0, 0.0), Interval::new(2.0, 5.0), Interval::new(5.0, 11.0)];
+    let distribution = Distribution::union("x", &intervals).unwrap();
+    let mut stream = Stream::new(7, 0, Purpose::Parameters, 0);
+    let n = 20_000;
+    let values: Vec<f64> = (0..n).map(|_| distribution.at(stream.unit())).collect();
+    for (interval, share) in intervals.into_iter().zip([0.1, 0.3, 0.6]) {
+        let count = values.iter().filter(|v| interval.low <= **v && **v < interval.high).count();
+        let sigmas = (count as f64 - f64::from(n) * share) / (f64::from(n) * share * (1.0 - share)).sqrt();
+        assert!(sigmas.abs() < SIGMAS, "{count} in {interval}: {sigmas} σ");
+    }
+}
+
+#[test]
+fn overrides_replace_only_what_they_name() {
+    let spec = env::find("CartPole").unwrap();
+    let mut distributions: Vec<_> = spec.parameters.iter().map(|p| p.distribution(Version::Random)).collect();
+    let union = Distribution::union("mass", &[Interval::new(0.2, 0.3), Interval::new(2.0, 2.1)]).unwrap();
+    let overrides = [("mass", union.clone()), ("force", Distribution::fixed(7.0))];
+    resolve(spec, &mut distributions, overrides).unwrap();
+    assert_eq!(distributions, [Distribution::fixed(7.0), spec.parameters[1].distribution(Version::Random), union]);
+
+    let settings = env::Settings { distributions, ..common::settings(spec, Version::Random, 5, 0, 1) };
+    let mut episodes = env::Episodes::new(env::make(spec.name).unwrap(), settings);
+    let mut lengths = Vec::new();
+    for _ in 0..50 {
+        let [force, length, mass] = episodes.receipt().requested[..] else { panic!("three parameters") };
+        assert_eq!(force, 7.0);
+        assert!((0.2..=0.3).contains(&mass) || (2.0..=2.1).contains(&mass), "{mass}");
+        lengths.push(length);
+        episodes.begin(None);
+    }
+    lengths.sort_by(f64::total_cmp);
+    lengths.dedup();
+    assert_eq!(lengths.len(), 50, "the parameter that was not overridden is still drawn");
+}
+
+#[test]
+fn an_override_does_not_move_the_other_parameters_draws() {
+    let spec = env::find("CartPole").unwrap();
+    let base = common::settings(spec, Version::Extreme, 9, 2, 1);
+    let mut changed = base.clone();
+    resolve(spec, &mut changed.distributions, [("force", Distribution::fixed(7.0))]).unwrap();
+    let receipt = |settings| env::Episodes::new(env::make(spec.name).unwrap(), settings).receipt().requested;
+    assert_eq!(receipt(base)[1..], receipt(changed)[1..]);
+}
+
+#[test]
+fn unions_that_are_none_are_refused() {
+    let (inf, nan) = (f64::INFINITY, f64::NAN);
+    let cases: &[(&[(f64, f64)], &str)] = &[
+        (&[], "at least one interval"),
+        (&[(nan, 1.0)], "finite ends"),
+        (&[(0.0, nan)], "finite ends"),
+        (&[(-inf, 1.0)], "finite ends"),
+        (&[(0.0, inf)], "finite ends"),
+        (&[(0.0, 1.0), (2.0, inf)], "finite ends"),
+        (&[(2.0, 1.0)], "low at most high in every interval"),
+        (&[(0.0, 1.0), (3.0, 2.0)], "low at most high in every interval"),
+        (&[(0.0, 0.0), (1.0, 2.0)], "intervals of positive length; a fixed value stands alone"),
+        (&[(0.0, 1.0), (1.0, 1.0)], "intervals of positive length; a fixed value stands alone"),
+        (&[(0.0, 2.0), (1.0, 3.0)], "ascending intervals that do not overlap"),
+        (&[(2.0, 3.0), (0.0, 1.0)], "ascending intervals that do not overlap"),
+        (&[(0.0, 1.0), (0.0, 1.0)], "ascending intervals that do not overlap"),
+    ];
+    for (pairs, reason) in cases {
+        let intervals: Vec<_> = pairs.iter().map(|&(low, high)| Interval::new(low, high)).collect();
+        match Distribution::union("mass", &intervals) {
+            Err(Error::Distribution { parameter, expected, .. }) => {
+                assert_eq!((parameter.as_str(), expected), ("mass", *reason), "{pairs:?}");
+            }
+            other => panic!("{pairs:?}: {other:?}"),
+        }
+    }
+}
+
+#[test]
+fn intervals_may_touch_and_a_single_one_may_be_a_point() {
+    assert!(Distribution::union("x", &[Interval::new(0.0, 1.0), Interval::new(1.0, 2.0)]).is_ok());
+    assert_eq!(Distribution::union("x", &[Interval::new(3.0, 3.0)]).unwrap(), Distribution::fixed(3.0));
+}
+
+#[test]
+fn overrides_that_are_wrong_change_nothing() {
+    for spec in env::specs() {
+        let base: Vec<_> = spec.parameters.iter().map(|p| p.distribution(Version::Random)).collect();
+        for parameter in spec.parameters {
+            let Interval { low, high } = parameter.bounds;
+            let beyond = [Interval::new(low.next_down(), high), Interval::new(low, high.next_up())];
+            for interval in beyond {
+                let mut distributions = base.clone();
+                // A right one stands before the wrong one.
+                let right = (spec.parameters[0].name, Distribution::fixed(spec.parameters[0].default));
+                let wrong = (parameter.name, Distribution::union(parameter.name, &[interval]).unwrap());
+                let refused = resolve(spec, &mut distributions, [right, wrong]).unwrap_err();
+                assert!(matches!(refused, Error::OutOfRange { .. }), "{refused}");
+                assert!(refused.to_string().contains(parameter.name), "{refused}");
+                assert_eq!(distributions, base);
+            }
+            let mut distributions = base.clone();
+            let whole = Distribution::union(parameter.name, &[parameter.bounds]).unwrap();
+            resolve(spec, &mut distributions, [(parameter.name, whole)]).unwrap();
+            assert!(check_bounds(spec, parameter, (f64::NAN, high)).is_err(), "NaN is in no range");
+            assert!(check_bounds(spec, parameter, (low, f64::NAN)).is_err(), "NaN is in no range");
+        }
+        let mut distributions = base.clone();
+        let right = (spec.parameters[0].name, Distribution::fixed(spec.parameters[0].default));
+        let refused = resolve(spec, &mut distributions, [right, ("colour", Distribution::fixed(1.0))]).unwrap_err();
+        assert!(matches!(refused, Error::UnknownParameter { .. }), "{refused}");
+        assert_eq!(distributions, base);
+    }
+}
+
+/// One to five ascending intervals, some touching, of very different lengths.
+fn unions() -> impl Strategy<Value = Vec<Interval>> {
+    let part = (prop_oneof![Just(0.0), 1e-9..1e-3, 0.0..1e5], prop_oneof![1e-12..1e-6, 0.001..1.0, 1.0..1e5]);
+    (-1e5..1e5, prop::collection::vec(part, 1..6)).prop_map(|(mut at, parts)| {
+        let interval = |(gap, length): (f64, f64)| {
+            let low: f64 = at + gap;
+            let high = (low + length).max(low.next_up());
+            at = high;
+            Interval::new(low, high)
+        };
+        parts.into_iter().map(interval).collect()
+    })
+}
+
+/// Fractions with the extremes: the streams give multiples of 2⁻⁵³ below 1.
+fn fractions() -> impl Strategy<Value = f64> {
+    prop_oneof![8 => 0.0..1.0, 1 => Just(0.0), 1 => Just(1.0_f64.next_down())]
+}
+
+proptest! {
+    #[test]
+    fn a_draw_lies_in_the_union_and_grows_with_the_fraction(
+        intervals in unions(), u in fractions(), v in fractions()
+    ) {
+        let distribution = Distribution::union("x", &intervals).unwrap();
+        let (u, v) = (u.min(v), u.max(v));
+        let (at_u, at_v) = (distribution.at(u), distribution.at(v));
+        for value in [at_u, at_v] {
+            prop_assert!(intervals.iter().any(|i| (i.low..=i.high).contains(&value)), "{value} in {intervals:?}");
+        }
+        prop_assert!(at_u <= at_v, "at({u}) = {at_u}, at({v}) = {at_v}");
+        prop_assert_eq!(distribution.at(0.0), intervals[0].low);
+        prop_assert_eq!(distribution.range(), (intervals[0].low, intervals[intervals.len() - 1].high));
+    }
+
+    #[test]
+    fn a_fixed_value_is_exact(value in -1e300..1e300, u in fractions()) {
+        prop_assert_eq!(Distribution::fixed(value).at(u), value);
+    }
+
+    #[test]
+    fn whatever_is_accepted_can_be_drawn_from(
+        pairs in prop::collection::vec((any::<f64>(), any::<f64>()), 0..4), u in fractions()
+    ) {
+        let intervals: Vec<_> = pairs.iter().map(|&(low, high)| Interval::new(low, high)).collect();
+        if let Ok(distribution) = Distribution::union("x", &intervals) {
+            let value = distribution.at(u);
+            prop_assert!(intervals.iter().any(|i| (i.low..=i.high).contains(&value)), "{value} in {intervals:?}");
+        }
+    }
+}

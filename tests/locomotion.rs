@@ -1,0 +1,456 @@
+//! Hopper and HalfCheetah: physics, task, determinism.
+#![cfg(feature = "mujoco")]
+#![allow(clippy::unwrap_used)]
+
+use perturb::{
+    env::{Action, ActionSpace, Environment, Purpose, Stream},
+    locomotion::{Walker, half_cheetah, hopper},
+};
+use perturb_mujoco::{Kind, Model, Simulation};
+use std::thread;
+
+type Make = fn() -> Walker;
+const ROBOTS: [Make; 2] = [|| hopper().unwrap(), || half_cheetah().unwrap()];
+
+fn stream(index: u64) -> Stream {
+    Stream::new(7, 0, Purpose::InitialState, index)
+}
+
+fn n_actions(walker: &Walker) -> usize {
+    match walker.spec().action {
+        ActionSpace::Continuous(channels) => channels.len(),
+        ActionSpace::Discrete(_) => panic!("walkers have motors"),
+    }
+}
+
+/// The eight corners of the E sets: (power, density, friction).
+fn corners(walker: &Walker) -> Vec<[f64; 3]> {
+    let ends = |i: usize| {
+        let [low, high] = walker.spec().parameters[i].extreme;
+        [low.low, high.high]
+    };
+    let mut corners = Vec::new();
+    for power in ends(0) {
+        for density in ends(1) {
+            for friction in ends(2) {
+                corners.push([power, density, friction]);
+            }
+        }
+    }
+    corners
+}
+
+fn defaults(walker: &Walker) -> [f64; 3] {
+    std::array::from_fn(|i| walker.spec().parameters[i].default)
+}
+
+#[derive(Clone, Copy)]
+enum Actions {
+    Uniform,
+    BangBang,
+}
+
+impl Actions {
+    fn draw(self, stream: &mut Stream, out: &mut [f32]) {
+        for value in out {
+            let u = stream.uniform(-1.0, 1.0) as f32;
+            *value = match self {
+                Self::Uniform => u,
+                Self::BangBang => u.signum(),
+            };
+        }
+    }
+}
+
+/// Everything that a step shows, as bits.
+#[derive(Debug, PartialEq, Clone)]
+struct Seen {
+    observation: Vec<u32>,
+    terms: [u64; 5],
+    terminated: bool,
+    goal: bool,
+    state: Vec<u64>,
+}
+
+fn observation(walker: &Walker) -> Vec<f32> {
+    let mut observation = vec![0.0; walker.spec().observation.len()];
+    walker.observe(&mut observation);
+    observation
+}
+
+fn saved(walker: &Walker) -> Vec<f64> {
+    let mut state = Vec::new();
+    walker.save(&mut state);
+    state
+}
+
+fn rollout(walker: &mut Walker, actions: &mut Stream, n_steps: usize) -> Vec<Seen> {
+    let mut action = vec![0.0; n_actions(walker)];
+    let mut terms = [0.0; 5];
+    (0..n_steps)
+        .map(|_| {
+            Actions::Uniform.draw(actions, &mut action);
+            let transition = walker.step(Action::Continuous(&action), &mut terms);
+            Seen {
+                observation: observation(walker).iter().map(|x| x.to_bits()).collect(),
+                terms: terms.map(f64::to_bits),
+                terminated: transition.terminated,
+                goal: transition.goal,
+                state: saved(walker).iter().map(|x| x.to_bits()).collect(),
+            }
+        })
+        .collect()
+}
+
+#[test]
+fn masses_are_those_of_the_geoms() {
+    // The document gives four digits.
+    let close = |a: f64, b: f64| assert!((a - b).abs() < 5e-4 * b, "{a} is not {b}");
+    let torso_mass = |walker: &Walker| {
+        let mut applied = [0.0; 3];
+        walker.applied(&mut applied);
+        let torso = walker.model().id(Kind::Body, "torso").unwrap();
+        assert_eq!(applied[0], walker.model().body_mass()[torso]);
+        applied[0]
+    };
+    close(torso_mass(&hopper().unwrap()), 3.665);
+    let mut cheetah = half_cheetah().unwrap();
+    close(cheetah.model().body_mass().iter().sum(), 21.18);
+    close(torso_mass(&cheetah), 9.457);
+    let [power, _, friction] = defaults(&cheetah);
+    for (density, mass) in [(500.0, 4.729), (1500.0, 14.186), (1000.0, 9.457)] {
+        cheetah.set_parameters(&[power, density, friction]);
+        close(torso_mass(&cheetah), mass);
+    }
+}
+
+#[test]
+fn an_edit_equals_compiling_the_edited_text() {
+    for make in ROBOTS {
+        let mut walker = make();
+        for corner @ [power, density, friction] in corners(&walker) {
+            // An edit before, to see that nothing accumulates.
+            walker.set_parameters(&[1.0, 1234.0, 0.3]);
+            walker.set_parameters(&corner);
+            let mut xml = walker.mjcf().replacen(r#"friction="0.8 "#, &format!(r#"friction="{friction} "#), 1);
+            for geom in ["torso", "head"] {
+                xml = xml.replace(
+                    &format!(r#"<geom name="{geom}""#),
+                    &format!(r#"<geom name="{geom}" density="{density}""#),
+                );
+            }
+            let compiled = Model::from_xml(&xml).unwrap().float_arrays();
+            let edited = walker.model().float_arrays();
+            assert_eq!(edited.len(), compiled.len());
+            assert!(edited.iter().any(|array| array.name == "stat"));
+            for (a, b) in edited.iter().zip(&compiled) {
+                assert_eq!((a.name, a.values.len()), (b.name, b.values.len()));
+                for (x, y) in a.values.iter().zip(&b.values) {
+                    // Scaling a mass and integrating it from a density round differently, and the derived arrays
+                    // amplify that: 4e-13 is the bound of the definition. Below 1e-6 the numbers are rounding errors.
+                    let error = (x - y).abs() / x.abs().max(y.abs()).max(1e-6);
+                    assert!(error <= 4e-13, "{} at {corner:?}: {x} and {y}", a.name);
+                }
+            }
+            let mut applied = [0.0; 3];
+            walker.applied(&mut applied);
+            assert_eq!(applied[1..], [friction, power]);
+        }
+    }
+}
+
+/// The friction that a sliding robot really feels: lost forward momentum over the floor's push. Holds in any pose as
+/// long as every contact slides.
+fn felt_friction(walker: &mut Walker, friction: f64) -> f64 {
+    let [power, density, _] = defaults(walker);
+    walker.set_parameters(&[power, density, friction]);
+    let mut simulation = Simulation::new(walker.model().try_clone().unwrap()).unwrap();
+    simulation.qvel_mut()[0] = 6.0;
+    simulation.step1().unwrap();
+    let momentum = |simulation: &Simulation| {
+        let mut sum = [0.0; 2];
+        for (body, mass) in simulation.model().body_mass().iter().enumerate() {
+            let velocity = simulation.body_velocity(body);
+            sum[0] += mass * velocity[3];
+            sum[1] += mass * velocity[5];
+        }
+        sum
+    };
+    let [x0, z0] = momentum(&simulation);
+    let mut weight_impulse = 0.0;
+    for _ in 0..40 {
+        simulation.step2().unwrap();
+        simulation.step1().unwrap();
+        weight_impulse += simulation.model().body_mass().iter().sum::<f64>() * 9.8 * simulation.model().timestep();
+    }
+    let [x1, z1] = momentum(&simulation);
+    let push = z1 - z0 + weight_impulse;
+    assert!(push > 0.05 * weight_impulse, "it hardly touched the floor");
+    (x0 - x1) / push
+}
+
+#[test]
+fn friction_decides_how_fast_a_sliding_robot_slows_down() {
+    for make in ROBOTS {
+        let mut walker = make();
+        for friction in [0.2, 0.8, 1.4] {
+            let felt = felt_friction(&mut walker, friction);
+            // MuJoCo's friction is soft: it gives way a little.
+            assert!((felt - friction).abs() < 0.1 * friction, "{} {friction}: {felt}", walker.spec().name);
+        }
+    }
+}
+
+#[test]
+fn density_and_power_change_what_happens() {
+    for make in ROBOTS {
+        let mut walker = make();
+        let outcome = |walker: &mut Walker, parameters: [f64; 3]| {
+            walker.set_parameters(&parameters);
+            walker.reset(&mut stream(0));
+            rollout(walker, &mut stream(1), 30).pop().unwrap()
+        };
+        let plain @ [power, density, friction] = defaults(&walker);
+        let base = outcome(&mut walker, plain);
+        for changed in [[0.5 * power, density, friction], [power, 0.5 * density, friction]] {
+            assert_ne!(outcome(&mut walker, changed), base);
+        }
+        assert_eq!(outcome(&mut walker, plain), base, "an edit leaves no trace");
+    }
+}
+
+/// Poses and contacts of a saved state, computed anew.
+fn recomputed(walker: &Walker, save: &[f64]) -> Simulation {
+    let mut simulation = Simulation::new(walker.model().try_clone().unwrap()).unwrap();
+    let (n_q, n_v) = (walker.model().n_q(), walker.model().n_v());
+    simulation.qpos_mut().copy_from_slice(&save[2..2 + n_q]);
+    simulation.qvel_mut().copy_from_slice(&save[2 + n_q..2 + n_q + n_v]);
+    simulation.step1().unwrap();
+    simulation
+}
+
+#[test]
+fn observation_and_reward_follow_from_the_state() {
+    let flags: [&[&str]; 2] = [&["foot"], &["ffoot", "fshin", "fthigh", "bfoot", "bshin", "bthigh"]];
+    for (make, flags) in ROBOTS.into_iter().zip(flags) {
+        let mut walker = make();
+        let n = n_actions(&walker);
+        let model = walker.model().try_clone().unwrap();
+        let torso = model.id(Kind::Body, "torso").unwrap();
+        let ranges: Vec<(f64, f64)> = model.joint_range().skip(3).collect();
+        let flag_values = |simulation: &Simulation| -> Vec<f32> {
+            let touches = |name: &&str| {
+                let geom = model.id(Kind::Geom, name).unwrap();
+                simulation.contacts().any(|(a, b)| a == geom || b == geom)
+            };
+            flags.iter().map(|name| f32::from(u8::from(touches(name)))).collect()
+        };
+        let place = |simulation: &Simulation| {
+            (1..model.n_body()).map(|body| simulation.xipos(body)[0]).sum::<f64>() / (model.n_body() - 1) as f64
+        };
+        // Aslant, so that also the cheetah falls.
+        let mut start = vec![0.0; walker.spec().state.len()];
+        (start[1], start[2]) = (0.3, 0.9);
+        walker.reset_to(&start);
+        let mut before = recomputed(&walker, &saved(&walker));
+        let initial_height = before.xipos(torso)[2];
+        let mut previous_flags = vec![0.0; flags.len()];
+        let (mut draws, mut action, mut terms) = (stream(1), vec![0.0; n], [0.0; 5]);
+        let (mut touched, mut fell) = (false, false);
+        for _ in 0..300 {
+            // Beyond the motors' range, which costs as received.
+            action.fill_with(|| draws.uniform(-2.0, 2.0) as f32);
+            let transition = walker.step(Action::Continuous(&action), &mut terms);
+            let after = recomputed(&walker, &saved(&walker));
+            let seen = observation(&walker);
+            let height = after.xipos(torso)[2];
+            let pitch = (-after.xmat(torso)[6]).asin();
+            let velocity = after.body_velocity(torso);
+            let mut expected = vec![height - initial_height, 0.0, 1.0];
+            expected.extend(velocity[3..].iter().map(|v| 0.3 * v));
+            expected.extend([0.0, pitch]);
+            let (mut electricity, mut torque, mut at_limit) = (0.0, 0.0, 0.0);
+            for (i, &(low, high)) in ranges.iter().enumerate() {
+                let scaled = 2.0 * (after.qpos()[3 + i] - 0.5 * (low + high)) / (high - low);
+                let speed = 0.1 * after.qvel()[3 + i];
+                expected.extend([scaled, speed]);
+                let a = f64::from(action[i]);
+                electricity += (a * speed).abs() / n as f64;
+                torque += a * a / n as f64;
+                at_limit += if scaled.abs() > 0.99 { 1.0 } else { 0.0 };
+            }
+            for (x, y) in seen.iter().zip(&expected) {
+                assert!((f64::from(*x) - y.clamp(-5.0, 5.0)).abs() < 1e-6, "{seen:?} {expected:?}"); // f32
+            }
+            assert_eq!(seen[8 + 2 * n..], previous_flags, "flags are one step late");
+            let safe = match flags.len() {
+                1 => height > 0.8,
+                _ => [1, 2, 4, 5].into_iter().all(|flag| previous_flags[flag] == 0.0),
+            };
+            let alive = safe && pitch.abs() < 1.0;
+            assert_eq!(transition.terminated, !alive);
+            let progress = (place(&after) - place(&before)) / 0.0165;
+            let alive = if alive { 1.0 } else { -1.0 };
+            let expected = [alive, progress, -2.0 * electricity, -0.1 * torque, -0.2 * at_limit];
+            for (x, y) in terms.iter().zip(expected) {
+                assert!((x - y).abs() < 1e-9 * y.abs().max(1.0), "{terms:?} {expected:?}"); // order of sums
+            }
+            previous_flags = flag_values(&after);
+            touched |= previous_flags.contains(&1.0);
+            fell |= transition.terminated;
+            before = after;
+        }
+        assert!(touched && fell, "{touched} {fell}");
+    }
+}
+
+/// Runs 1000-step episodes whether or not the robot has fallen.
+fn endure(make: Make, corner: [f64; 3], actions: Actions, n_steps: usize) {
+    let mut walker = make();
+    walker.set_parameters(&corner);
+    let mut action = vec![0.0; n_actions(&walker)];
+    let mut observation = vec![0.0; walker.spec().observation.len()];
+    let mut terms = [0.0; 5];
+    let mut draws = stream(1);
+    for step in 0..n_steps {
+        if step % 1000 == 0 {
+            walker.reset(&mut stream(step as u64));
+        }
+        actions.draw(&mut draws, &mut action);
+        let transition = walker.step(Action::Continuous(&action), &mut terms);
+        walker.observe(&mut observation);
+        assert!(!transition.diverged, "{} diverged at {corner:?}, step {step}", walker.spec().name);
+        assert!(terms.iter().all(|x| x.is_finite()) && observation.iter().all(|x| x.abs() <= 5.0));
+    }
+}
+
+#[test]
+fn nothing_diverges_in_the_corners_of_the_extreme_sets() {
+    // 10⁵ steps a corner and robot. Twice that, 10⁵ of each kind, also holds but takes two minutes of one core.
+    const STEPS: usize = 50_000;
+    thread::scope(|scope| {
+        for make in ROBOTS {
+            scope.spawn(move || {
+                for corner in corners(&make()) {
+                    endure(make, corner, Actions::Uniform, STEPS);
+                    endure(make, corner, Actions::BangBang, STEPS);
+                }
+            });
+        }
+    });
+}
+
+#[test]
+fn a_snapshot_replays_to_the_same_bytes() {
+    for make in ROBOTS {
+        for steps in [0, 1, 7, 60] {
+            let mut walker = make();
+            walker.reset(&mut stream(3));
+            let mut actions = stream(4);
+            rollout(&mut walker, &mut actions, steps);
+            let (state, seen) = (saved(&walker), observation(&walker));
+            let expected = rollout(&mut walker, &mut actions.clone(), 200);
+            // Into a used walker and into a new one.
+            for mut other in [walker, make()] {
+                other.load(&state).unwrap();
+                assert_eq!(observation(&other), seen);
+                assert_eq!(saved(&other), state);
+                assert_eq!(rollout(&mut other, &mut actions.clone(), 200), expected, "after {steps} steps");
+            }
+        }
+    }
+}
+
+#[test]
+fn impossible_snapshots_are_refused() {
+    for make in ROBOTS {
+        let mut walker = make();
+        let good = saved(&walker);
+        assert!(walker.load(&good[1..]).is_err());
+        assert!(walker.load(&[]).is_err());
+        for (place, value) in [(2, f64::NAN), (3, f64::INFINITY), (2, 1e300)] {
+            let mut bad = good.clone();
+            bad[place] = value;
+            assert!(walker.load(&bad).is_err(), "{value} in place {place}");
+        }
+        walker.load(&good).unwrap();
+    }
+}
+
+#[test]
+fn a_reset_after_use_equals_a_fresh_one() {
+    for make in ROBOTS {
+        let restart = |walker: &mut Walker| {
+            walker.reset(&mut stream(5));
+            (observation(walker), saved(walker), rollout(walker, &mut stream(6), 200))
+        };
+        let parameters = [0.8, 900.0, 0.6];
+        let mut used = make();
+        used.set_parameters(&parameters);
+        let fresh = restart(&mut used);
+        for corner in corners(&used) {
+            used.set_parameters(&corner);
+            used.reset(&mut stream(1));
+            rollout(&mut used, &mut stream(2), 300);
+            used.set_parameters(&parameters);
+            assert_eq!(restart(&mut used), fresh);
+        }
+        // Without new parameters, as within a trial.
+        assert_eq!(restart(&mut used), fresh);
+        // After divergence.
+        let n = used.spec().state.len();
+        used.reset_to(&vec![1e20; n]);
+        assert_eq!(restart(&mut used), fresh);
+    }
+}
+
+#[test]
+fn an_exact_state_is_taken_over_exactly() {
+    for make in ROBOTS {
+        let mut walker = make();
+        let n = walker.spec().state.len();
+        let state: Vec<f64> = (0..n).map(|i| if i == 1 { 0.3 } else { 0.01 * i as f64 }).collect();
+        walker.reset_to(&state);
+        assert_eq!(saved(&walker)[2..2 + n], state);
+        let seen = observation(&walker);
+        assert_eq!(seen[0], 0.0, "the height counts from the reset");
+        assert!(seen[8 + 2 * n_actions(&walker)..].iter().all(|&flag| flag == 0.0));
+        let first = rollout(&mut walker, &mut stream(0), 50);
+        rollout(&mut walker, &mut stream(1), 50);
+        walker.reset_to(&state);
+        assert_eq!(rollout(&mut walker, &mut stream(0), 50), first);
+    }
+}
+
+#[test]
+fn divergence_ends_the_episode_with_finite_numbers() {
+    for make in ROBOTS {
+        let mut walker = make();
+        let action = vec![1.0; n_actions(&walker)];
+        let check = |walker: &mut Walker, seen: &[f32]| {
+            let mut terms = [0.0; 5];
+            let transition = walker.step(Action::Continuous(&action), &mut terms);
+            assert!(transition.terminated && transition.diverged && !transition.goal);
+            assert_eq!(terms, [-1.0, 0.0, 0.0, 0.0, 0.0]);
+            assert_eq!(observation(walker), seen);
+            let state = saved(walker);
+            walker.load(&state).unwrap();
+            assert_eq!(saved(walker), state);
+        };
+        // During a step: a control beyond what MuJoCo accepts, 1e10.
+        walker.set_parameters(&[1e11, 1000.0, 0.8]);
+        walker.reset(&mut stream(0));
+        let before = observation(&walker);
+        check(&mut walker, &before);
+        check(&mut walker, &before);
+        // At the reset.
+        let n = walker.spec().state.len();
+        walker.reset_to(&vec![1e20; n]);
+        let zeros = vec![0.0; walker.spec().observation.len()];
+        check(&mut walker, &zeros);
+        // And it is over with the next reset.
+        walker.set_parameters(&[1.0, 1000.0, 0.8]);
+        walker.reset(&mut stream(0));
+        assert!(!walker.step(Action::Continuous(&action), &mut [0.0; 5]).diverged);
+    }
+}

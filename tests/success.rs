@@ -1,0 +1,357 @@
+//! Endings and success, at the boundaries of their rules.
+#![allow(clippy::unwrap_used)]
+
+mod common;
+
+use common::{episodes, observe, settings, step};
+use perturb::{
+    env::{
+        self, Action, ActionSpace, Channel, Environment, EnvironmentSpec, EpisodeEnd, Episodes, Error, Outcome,
+        Purpose, RewardTerm, Stream, SuccessRule, Transition,
+    },
+    physics::Version,
+};
+
+const LIMIT: u32 = 8;
+const TIME: &[Channel] = &[Channel::unbounded("time", "1")];
+
+const fn scripted_spec(success: SuccessRule) -> EnvironmentSpec {
+    EnvironmentSpec {
+        name: "Scripted",
+        revision: 0,
+        description: "Plays a script of transitions.",
+        parameters: &[],
+        observation: TIME,
+        action: ActionSpace::Discrete(&["nothing", "something"]),
+        state: TIME,
+        reward_terms: &[RewardTerm { name: "none", description: "0" }],
+        applied: &[],
+        step_limit: LIMIT,
+        control_timestep: 1.0,
+        step_cost: 0.1,
+        success,
+        success_description: "",
+    }
+}
+
+static LASTED_5: EnvironmentSpec = scripted_spec(SuccessRule::Lasted(5));
+static REACHED_WITHIN_5: EnvironmentSpec = scripted_spec(SuccessRule::ReachedWithin(5));
+static HELD_FOR_LAST_3: EnvironmentSpec = scripted_spec(SuccessRule::HeldForLast(3));
+
+/// One character a step: `.` nothing, `g` the goal holds, `T` terminated, `G` both, `D` diverged.
+struct Scripted {
+    spec: &'static EnvironmentSpec,
+    script: &'static [u8],
+    time: usize,
+}
+
+impl Environment for Scripted {
+    fn spec(&self) -> &'static EnvironmentSpec {
+        self.spec
+    }
+
+    fn set_parameters(&mut self, _: &[f64]) {}
+
+    fn applied(&self, _: &mut [f64]) {}
+
+    fn reset(&mut self, _: &mut Stream) {
+        self.time = 0;
+    }
+
+    fn reset_to(&mut self, _: &[f64]) {
+        self.time = 0;
+    }
+
+    fn observe(&self, out: &mut [f32]) {
+        out[0] = self.time as f32;
+    }
+
+    fn step(&mut self, _: Action<'_>, reward_terms: &mut [f64]) -> Transition {
+        reward_terms[0] = 0.0;
+        let mark = self.script[self.time];
+        self.time += 1;
+        Transition { terminated: b"TGD".contains(&mark), goal: b"gG".contains(&mark), diverged: mark == b'D' }
+    }
+
+    fn save(&self, _: &mut Vec<f64>) {}
+
+    fn load(&mut self, _: &[f64]) -> Result<(), Error> {
+        Ok(())
+    }
+}
+
+/// Plays the script, which must end the episode with its last mark; returns the last outcome and the ended episode.
+fn run(spec: &'static EnvironmentSpec, script: &'static str) -> (Outcome, EpisodeEnd) {
+    let scripted = Scripted { spec, script: script.as_bytes(), time: 0 };
+    let mut e = Episodes::new(Box::new(scripted), settings(spec, Version::Default, 0, 0, 1));
+    for t in 1..=script.len() {
+        let (outcome, _) = step(&mut e, &[0; 4]);
+        assert_eq!(e.ended(), t == script.len(), "{script} at step {t}");
+        if e.ended() {
+            return (outcome, e.finished(false));
+        }
+    }
+    panic!("{script} does not end")
+}
+
+fn succeeds(spec: &'static EnvironmentSpec, script: &'static str) -> bool {
+    run(spec, script).1.success
+}
+
+#[test]
+fn lasting_counts_every_step_the_last_included() {
+    assert!(!succeeds(&LASTED_5, "...T"));
+    assert!(succeeds(&LASTED_5, "....T"));
+    assert!(succeeds(&LASTED_5, "........"));
+    assert!(!succeeds(&LASTED_5, "gggG"), "the goal does not matter");
+}
+
+#[test]
+fn reaching_counts_the_first_step_after_which_the_goal_held() {
+    assert!(succeeds(&REACHED_WITHIN_5, "....G"));
+    assert!(!succeeds(&REACHED_WITHIN_5, ".....G"));
+    assert!(succeeds(&REACHED_WITHIN_5, "G"));
+    assert!(!succeeds(&REACHED_WITHIN_5, "........"));
+    assert!(succeeds(&REACHED_WITHIN_5, "....g..."), "it need not hold on, nor end the episode");
+    assert!(!succeeds(&REACHED_WITHIN_5, ".....ggg"));
+    assert!(succeeds(&REACHED_WITHIN_5, "..g...gg"), "the first time counts");
+}
+
+#[test]
+fn holding_counts_the_last_steps_without_a_gap() {
+    assert!(succeeds(&HELD_FOR_LAST_3, ".....ggg"));
+    assert!(!succeeds(&HELD_FOR_LAST_3, "......gg"));
+    assert!(!succeeds(&HELD_FOR_LAST_3, "gggggg.g"));
+    assert!(!succeeds(&HELD_FOR_LAST_3, "ggggg.gg"));
+    assert!(!succeeds(&HELD_FOR_LAST_3, "ggggggg."));
+    assert!(succeeds(&HELD_FOR_LAST_3, "gggggggg"));
+}
+
+#[test]
+fn terminated_and_truncated_are_independent() {
+    let flags = |script| {
+        let (outcome, end) = run(&LASTED_5, script);
+        (outcome.terminated, outcome.truncated, end.length)
+    };
+    assert_eq!(flags("......T"), (true, false, LIMIT - 1));
+    assert_eq!(flags("........"), (false, true, LIMIT));
+    assert_eq!(flags(".......T"), (true, true, LIMIT), "both may be set");
+}
+
+#[test]
+fn divergence_is_reported_with_the_episode() {
+    assert!(run(&LASTED_5, "..D").1.diverged);
+    assert!(!run(&LASTED_5, "..T").1.diverged);
+}
+
+#[test]
+fn a_state_beyond_f32_ends_the_episode_with_the_last_one_that_was_not() {
+    for (name, state) in [("CartPole", [0.0, 0.0, 0.1, 1e30]), ("Acrobot", [0.1, 0.1, 1e300, 1e300])] {
+        let mut environment = env::make(name).unwrap();
+        environment.reset_to(&state);
+        let mut terms = vec![f64::NAN; 1];
+        let transition = environment.step(Action::Discrete(1), &mut terms);
+        assert!(transition.diverged && transition.terminated, "{name}");
+        assert!(terms[0].is_finite(), "{name}");
+        let mut kept = Vec::new();
+        environment.save(&mut kept);
+        assert_eq!(kept, state, "{name}");
+
+        let (_, end) = drive(name, &state, |_, _| 1);
+        assert!(end.diverged && !end.success && end.length == 1, "{name}");
+    }
+}
+
+#[test]
+fn counts_start_anew_with_every_episode() {
+    let scripted = Scripted { spec: &HELD_FOR_LAST_3, script: b"gg......", time: 0 };
+    let mut e = Episodes::new(Box::new(scripted), settings(&HELD_FOR_LAST_3, Version::Default, 0, 0, 1));
+    for _ in 0..3 {
+        step(&mut e, &[0; 4]);
+        step(&mut e, &[0; 4]);
+        let end = e.finished(false);
+        assert_eq!((end.length, end.success), (2, false));
+        e.begin(None);
+    }
+}
+
+// The real environments, driven to both sides of their rules.
+
+/// The discrete environment from this state, acting by `policy` (of the time and the observation) until the end.
+fn drive(name: &str, state: &[f64], policy: impl Fn(u32, &[f32]) -> i32) -> (Outcome, EpisodeEnd) {
+    let mut e = episodes(env::find(name).unwrap(), Version::Default, 0, 0, 1);
+    e.begin(Some(state));
+    for t in 0.. {
+        let action = policy(t, &observe(&e)).to_le_bytes();
+        let (outcome, _) = step(&mut e, &action);
+        if e.ended() {
+            return (outcome, e.finished(false));
+        }
+    }
+    unreachable!("every episode has a step limit")
+}
+
+#[test]
+fn cart_pole_succeeds_from_195_steps_on() {
+    let mut lengths = Vec::new();
+    for fall_from in 150..=200 {
+        for angle in [-0.03, -0.01, 0.01, 0.02, 0.03] {
+            let balance = |t, o: &[f32]| {
+                if t >= fall_from { 1 } else { i32::from(o[0] + 2.0 * o[1] + 20.0 * o[2] + 4.0 * o[3] > 0.0) }
+            };
+            let (outcome, end) = drive("CartPole", &[0.0, 0.0, angle, 0.0], balance);
+            assert_eq!(end.success, end.length >= 195, "{} steps", end.length);
+            assert_eq!((outcome.truncated, end.total_reward), (end.length == 200, f64::from(end.length)));
+            lengths.push(end.length);
+        }
+    }
+    assert!([194, 195, 200].iter().all(|length| lengths.contains(length)), "both sides were seen: {lengths:?}");
+}
+
+/// Waits at the valley's bottom, then swings up with the velocity.
+fn mountain_car(wait: u32, position: f64) -> (Outcome, EpisodeEnd) {
+    drive("MountainCar", &[position, 0.0], |t, o| if t < wait { 1 } else { if o[1] < 0.0 { 0 } else { 2 } })
+}
+
+#[test]
+fn mountain_car_succeeds_up_to_110_steps() {
+    let mut lengths = Vec::new();
+    for wait in 0..60 {
+        for position in [-0.6, -0.55, -0.52, -0.5, -0.45, -0.4] {
+            let (outcome, end) = mountain_car(wait, position);
+            assert_eq!(end.success, outcome.terminated && end.length <= 110, "{} steps", end.length);
+            assert_eq!(end.total_reward, -f64::from(end.length), "-1 for every step, the last included");
+            lengths.push(end.length);
+        }
+    }
+    assert!(lengths.contains(&110) && lengths.contains(&111), "both sides were seen: {lengths:?}");
+}
+
+#[test]
+fn mountain_car_may_reach_the_goal_at_the_limit_and_sets_both_flags() {
+    let mut both = 0;
+    for wait in 60..130 {
+        for position in [-0.6, -0.55, -0.5, -0.45, -0.4] {
+            let (outcome, end) = mountain_car(wait, position);
+            assert_eq!(outcome.truncated, end.length == 200);
+            both += u32::from(outcome.terminated && outcome.truncated);
+        }
+    }
+    assert!(both > 0);
+}
+
+#[test]
+fn acrobot_succeeds_up_to_80_steps() {
+    let mut lengths = Vec::new();
+    for wait in 0..60 {
+        for angle in [-0.1, -0.05, 0.02, 0.1] {
+            // Torque with the sense of the first link's swing puts energy in.
+            let pump = |t, o: &[f32]| if t < wait { 1 } else { if o[4] > 0.0 { 0 } else { 2 } };
+            let (outcome, end) = drive("Acrobot", &[angle, 0.0, 0.0, 0.0], pump);
+            assert_eq!(end.success, outcome.terminated && end.length <= 80, "{} steps", end.length);
+            if outcome.terminated {
+                assert_eq!(end.total_reward, 1.0 - f64::from(end.length), "0 for the step that ends it");
+                lengths.push(end.length);
+            }
+        }
+    }
+    assert!(lengths.contains(&80) && lengths.contains(&81), "both sides were seen: {lengths:?}");
+}
+
+#[test]
+fn pendulum_succeeds_if_the_last_100_steps_were_near_upright() {
+    let spec = env::find("Pendulum").unwrap();
+    // A rod so light that the torque can hold it anywhere.
+    let light =
+        [("length", 1.0), ("mass", 0.1)].map(|(name, value)| (name, perturb::physics::Distribution::fixed(value)));
+    let mut settings = settings(spec, Version::Default, 0, 0, 1);
+    perturb::physics::resolve(spec, &mut settings.distributions, light).unwrap();
+    let mut entries = Vec::new();
+    for release in 80..110 {
+        let mut e = Episodes::new(env::make(spec.name).unwrap(), settings.clone());
+        e.begin(Some(&[1.3, 0.0]));
+        let mut near = Vec::new();
+        for t in 0..spec.step_limit {
+            let [cos, sin, velocity] = observe(&e)[..] else { panic!("three numbers") };
+            let target = if t < release { 1.3 } else { 0.0 };
+            // Gravity's acceleration is 15 sin θ, the torque's 30 u.
+            let torque = -0.5 * sin + 2.0 * (target - sin.atan2(cos)) - 0.4 * velocity;
+            step(&mut e, &torque.to_le_bytes());
+            near.push(observe(&e)[0] > 0.5); // within π/3
+        }
+        assert!(e.ended());
+        let held = near.iter().rev().take_while(|near| **near).count();
+        assert_eq!(e.finished(false).success, held >= 100, "held for {held} steps");
+        entries.push(held);
+    }
+    assert!(entries.contains(&99) && entries.contains(&100), "both sides were seen: {entries:?}");
+}
+
+// The predicates themselves, on both sides of their thresholds.
+
+/// Steps from states drawn between `low` and `high` and compares what the environment says of the new state with what
+/// `expected` does: (terminated, goal). Some new states lie within 1e-3 of the threshold, on either side: `margin` is
+/// positive where the goal holds.
+fn check_goal(
+    name: &str,
+    low: &[f64],
+    high: &[f64],
+    expected: impl Fn(&[f64]) -> (bool, bool),
+    margin: impl Fn(&[f64]) -> f64,
+) {
+    let mut environment = env::make(name).unwrap();
+    let mut stream = Stream::new(1, 0, Purpose::InitialState, 0);
+    let mut terms = vec![0.0; environment.spec().reward_terms.len()];
+    let mut near = [0, 0];
+    for _ in 0..100_000 {
+        let state: Vec<f64> = low.iter().zip(high).map(|(low, high)| stream.uniform(*low, *high)).collect();
+        environment.reset_to(&state);
+        let action = match environment.spec().action {
+            ActionSpace::Discrete(_) => Action::Discrete(1),
+            ActionSpace::Continuous(_) => Action::Continuous(&[0.0]),
+        };
+        let transition = environment.step(action, &mut terms);
+        let mut state = Vec::new();
+        environment.save(&mut state);
+        assert_eq!((transition.terminated, transition.goal), expected(&state), "{name} at {state:?}");
+        if margin(&state).abs() < 1e-3 {
+            near[usize::from(margin(&state) > 0.0)] += 1;
+        }
+    }
+    assert!(near[0] > 10 && near[1] > 10, "{name}: {near:?} states close to the threshold");
+}
+
+#[test]
+fn cart_pole_ends_beyond_2_4_m_or_12_degrees() {
+    let inside = |s: &[f64]| s[0].abs() <= 2.4 && s[2].abs() <= 12.0_f64.to_radians();
+    let angle = |s: &[f64]| 12.0_f64.to_radians() - s[2].abs();
+    check_goal("CartPole", &[-0.1, -1.0, -0.25, -1.0], &[0.1, 1.0, 0.25, 1.0], |s| (!inside(s), inside(s)), angle);
+    let position = |s: &[f64]| 2.4 - s[0].abs();
+    check_goal("CartPole", &[2.3, -1.0, -0.1, -1.0], &[2.5, 1.0, 0.1, 1.0], |s| (!inside(s), inside(s)), position);
+    check_goal("CartPole", &[-2.5, -1.0, -0.1, -1.0], &[-2.3, 1.0, 0.1, 1.0], |s| (!inside(s), inside(s)), position);
+}
+
+#[test]
+fn mountain_car_ends_at_0_5_m_unless_it_moves_back() {
+    let there = |s: &[f64]| s[0] >= 0.5 && s[1] >= 0.0;
+    check_goal("MountainCar", &[0.45, -0.07], &[0.55, 0.07], |s| (there(s), there(s)), |s| s[0] - 0.5);
+}
+
+#[test]
+fn acrobot_ends_when_its_tip_is_a_link_above_the_joint() {
+    let height = |s: &[f64]| -s[0].cos() - (s[0] + s[1]).cos() - 1.0;
+    check_goal(
+        "Acrobot",
+        &[-3.1, -3.1, -4.0, -4.0],
+        &[3.1, 3.1, 4.0, 4.0],
+        |s| (height(s) > 0.0, height(s) > 0.0),
+        height,
+    );
+}
+
+#[test]
+fn pendulum_is_near_upright_within_a_third_of_pi_and_never_ends() {
+    // By the cosine, which knows nothing of wrapping.
+    let near = |s: &[f64]| s[0].cos() - 0.5;
+    check_goal("Pendulum", &[-20.0, -8.0], &[20.0, 8.0], |s| (false, near(s) > 0.0), near);
+}
