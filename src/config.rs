@@ -176,10 +176,12 @@ impl Config {
             .try_parsing(true)
             .list_separator(",")
             .with_list_parse_key("listen");
+        // Other programs' variables need not be UTF-8. A setting that is not is refused with its odd characters replaced.
+        let text =
+            std::env::vars_os().map(|(k, v)| (k.to_string_lossy().into_owned(), v.to_string_lossy().into_owned()));
         // The variable that names the file is no setting.
-        let variables = variables.source(Some(
-            std::env::vars().filter(|(name, _)| !name.eq_ignore_ascii_case("PERTURB_SERVER_CONFIG")).collect(),
-        ));
+        let settings = text.filter(|(name, _)| !name.eq_ignore_ascii_case("PERTURB_SERVER_CONFIG"));
+        let variables = variables.source(Some(settings.collect()));
         let merged = builder.add_source(variables).add_source(config::Config::try_from(arguments)?).build()?;
         merged.try_deserialize::<Self>()?.validated()
     }
