@@ -439,13 +439,28 @@ fn client_that_steps_for_ever() {
     });
 }
 
-fn client_process(address: &str) -> Child {
-    let mut command = Command::new(std::env::current_exe().unwrap());
-    command.args(["--ignored", "--exact", "--nocapture", "client_that_steps_for_ever"]).env(CLIENT, address);
-    let mut child = command.stdout(Stdio::piped()).spawn().unwrap();
-    let lines = server::lines(child.stdout.take().unwrap());
-    while lines.recv_timeout(server::DEADLINE).expect("the client failed") != "stepping" {}
-    child
+/// That client as a process, which is killed when this is dropped.
+struct ClientProcess(Child);
+
+impl ClientProcess {
+    /// Starts it and waits until it steps.
+    async fn start(address: &str) -> Self {
+        let mut command = Command::new(std::env::current_exe().unwrap());
+        command.args(["--ignored", "--exact", "--nocapture", "client_that_steps_for_ever"]).env(CLIENT, address);
+        let mut client = Self(command.stdout(Stdio::piped()).spawn().unwrap());
+        let lines = server::lines(client.0.stdout.take().unwrap());
+        until("the client steps", async || lines.try_iter().any(|line| line == "stepping")).await;
+        // Read on: a closed pipe would end it.
+        std::thread::spawn(move || lines.iter().count());
+        client
+    }
+}
+
+impl Drop for ClientProcess {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
 }
 
 /// Waits until so many environments can be opened at once.
@@ -466,11 +481,10 @@ async fn a_client_killed_in_mid_step_frees_its_environments() {
     let server = Server::start(&["--max-envs", "2003"]);
     let bystander = Bystander::start(server.tcp()).await;
     for address in [server.tcp(), server.unix()] {
-        let mut client = client_process(address);
+        let client = ClientProcess::start(address).await;
         let (code, message) = Session::connect(address).await.refused(Request::Open(open("Acrobot", 1, 1))).await;
         assert_eq!(code, Code::ResourceExhausted, "{message}");
-        client.kill().unwrap();
-        client.wait().unwrap();
+        drop(client);
         room_for(address, 2_000).await;
     }
     bystander.is_unharmed().await;
@@ -480,11 +494,10 @@ async fn a_client_killed_in_mid_step_frees_its_environments() {
 async fn a_client_that_hangs_is_found_out_by_keepalive() {
     let server = Server::start(&["--max-envs", "2003", "--keepalive-seconds", "1"]);
     let bystander = Bystander::start(server.tcp()).await;
-    let mut client = client_process(server.tcp());
-    server::signal(client.id(), "STOP");
+    let client = ClientProcess::start(server.tcp()).await;
+    server::signal(client.0.id(), "STOP");
     room_for(server.unix(), 2_000).await;
-    client.kill().unwrap();
-    client.wait().unwrap();
+    drop(client);
     bystander.is_unharmed().await;
 }
 

@@ -15,7 +15,8 @@ use std::{
         process::ExitStatusExt,
     },
     path::Path,
-    process::Output,
+    process::{Output, Stdio},
+    time::{Duration, Instant},
 };
 use tonic::{Code, Status};
 use tonic_health::pb::{HealthCheckRequest, health_check_response::ServingStatus, health_client::HealthClient};
@@ -28,9 +29,23 @@ async fn health(address: &str, service: &str) -> Result<ServingStatus, Status> {
     Ok(reply.into_inner().status())
 }
 
+/// Runs a server that is expected to end by itself.
+fn finished(command: &mut std::process::Command) -> Output {
+    let mut child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let start = Instant::now();
+    while child.try_wait().unwrap().is_none() {
+        if start.elapsed() > Duration::from_secs(30) {
+            child.kill().unwrap();
+            panic!("{command:?} was not refused: {:?}", child.wait_with_output());
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    child.wait_with_output().unwrap()
+}
+
 /// Runs a server that is expected to refuse; what it said.
 fn refused(mut command: std::process::Command) -> String {
-    let Output { status, stdout, stderr } = command.output().unwrap();
+    let Output { status, stdout, stderr } = finished(&mut command);
     let stderr = String::from_utf8(stderr).unwrap();
     assert_eq!(status.code(), Some(2), "{command:?}: {stderr}");
     assert_eq!(String::from_utf8_lossy(&stdout), "", "{command:?} listened before it refused");
@@ -54,13 +69,14 @@ async fn max_envs(server: &Server) -> u32 {
 #[tokio::test]
 async fn after_sigterm_running_sessions_go_on_new_ones_are_refused_and_the_exit_status_is_0() {
     for signal in ["TERM", "INT"] {
-        let mut server = Server::start(&["--grace-seconds", "100"]);
+        let mut server = Server::start(&["--grace-seconds", "100000"]);
         let e = environment(server.tcp(), "CartPole").await;
         let actor = Actor::new(&e, 4);
         let (mut session, _) = Session::open(server.tcp(), open("CartPole", 4, 1)).await;
-        let (mut reference, _) = Session::open(server.tcp(), open("CartPole", 4, 1)).await;
+        let (mut twin, _) = Session::open(server.tcp(), open("CartPole", 4, 1)).await;
         let mut not_opened = Session::connect(server.tcp()).await;
-        let reference = reference.play(actor, 0, 400).await;
+        let reference = twin.play(actor, 0, 400).await;
+        drop(twin);
         let mut replies = session.play(actor, 0, 200).await;
         let mut client = server::client(server.tcp()).await;
         assert_eq!(health(server.tcp(), SERVICE).await.unwrap(), ServingStatus::Serving);
@@ -185,7 +201,7 @@ async fn a_stale_socket_is_replaced_a_live_one_and_a_file_are_not() {
     let server = Server::spawn(listen(), tempfile::tempdir().unwrap(), 1);
     assert_eq!(server.addresses, [address.clone()]);
 
-    let second = listen().output().unwrap();
+    let second = finished(&mut listen());
     assert_eq!(second.status.code(), Some(1));
     let message = String::from_utf8(second.stderr).unwrap();
     assert!(message.contains("cannot listen at") && message.contains("in use"), "{message}");
@@ -198,7 +214,7 @@ async fn a_stale_socket_is_replaced_a_live_one_and_a_file_are_not() {
 
     std::fs::remove_file(&socket).unwrap();
     std::fs::write(&socket, "precious").unwrap();
-    assert_eq!(listen().output().unwrap().status.code(), Some(1));
+    assert_eq!(finished(&mut listen()).status.code(), Some(1));
     assert_eq!(std::fs::read_to_string(&socket).unwrap(), "precious");
 }
 
@@ -206,7 +222,7 @@ async fn a_stale_socket_is_replaced_a_live_one_and_a_file_are_not() {
 fn a_port_in_use_is_an_error_that_names_it() {
     let taken = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = format!("tcp://{}", taken.local_addr().unwrap());
-    let output = command().args(["--listen", &address]).output().unwrap();
+    let output = finished(command().args(["--listen", &address]));
     let message = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(1));
     assert!(message.contains(&taken.local_addr().unwrap().to_string()) && message.contains("in use"), "{message}");
