@@ -91,13 +91,7 @@ pub fn test(
 ) -> Result<TestResult, TestError> {
     let state = &checkpoint.state;
     let quotas = quotas(episodes);
-    let options = OpenOptions {
-        environment: state.environment.clone(),
-        version: version.to_proto(),
-        num_envs: quotas.len(),
-        seed: environment_seed(seed, version),
-        episodes_per_trial: 1,
-    };
+    let options = open_options(&state.environment, version, quotas.len(), seed);
     let mut reply = StepReply::default();
     let mut session = Session::open(servers, &options, &mut reply.observations)?;
     check_unchanged(checkpoint, EnvironmentSummary::of(session.environment()))?;
@@ -122,6 +116,17 @@ pub fn test(
         report(counted.len() as u64);
     }
     Ok(summarise(&counted))
+}
+
+/// What a test opens.
+fn open_options(environment: &str, version: Version, num_envs: usize, seed: u64) -> OpenOptions {
+    OpenOptions {
+        environment: environment.to_owned(),
+        version: version.to_proto(),
+        num_envs,
+        seed: environment_seed(seed, version),
+        episodes_per_trial: 1,
+    }
 }
 
 /// How many episodes each environment is tested for.
@@ -188,7 +193,11 @@ mod tests {
         let distinct: std::collections::HashSet<u64> = seeds.iter().copied().collect();
         assert_eq!(distinct.len(), 300);
         assert!(seeds.iter().all(|&seed| seed > 1000), "none is a seed that people train with");
-        assert_eq!(environment_seed(1, Version::R), environment_seed(1, Version::R));
+        for version in Version::ALL {
+            let options = open_options("CartPole", version, 3, 5);
+            assert_eq!(options.seed, environment_seed(5, version));
+            assert_eq!(options.version, version.to_proto());
+        }
     }
 
     #[test]
