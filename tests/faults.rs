@@ -73,7 +73,7 @@ impl Bystander {
     }
 
     /// Ends it and compares with an undisturbed run of as many steps.
-    async fn is_unharmed(self) {
+    async fn ends_unharmed(self) {
         self.goes_on().await;
         self.stop.store(true, Ordering::Relaxed);
         let (session, replies) = within(self.task).await.unwrap();
@@ -187,7 +187,7 @@ async fn wrong_requests_before_open_are_refused_and_open_still_works() {
     }
     refused(&mut session, (Request::Open(base()), FailedPrecondition, &["open already", "another session"])).await;
     drop(session);
-    bystander.is_unharmed().await;
+    bystander.ends_unharmed().await;
 }
 
 #[tokio::test]
@@ -215,7 +215,7 @@ async fn wrong_actions_are_refused() {
         (step(f32s(&[0.0, f32::NEG_INFINITY])), Bad, &["-inf in slot 1", "finite"]),
     ];
     all_refused(server.unix(), &environment(server.tcp(), "Pendulum").await, 2, continuous).await;
-    bystander.is_unharmed().await;
+    bystander.ends_unharmed().await;
 }
 
 #[tokio::test]
@@ -269,7 +269,7 @@ async fn wrong_resets_snapshots_and_restores_are_refused() {
         (restore(&[], vec![good[0].slice(1..), good[1].clone(), good[2].clone()]), Bad, &["snapshot cannot"]),
     ];
     all_refused(server.tcp(), &environment(server.tcp(), "CartPole").await, 3, cases).await;
-    bystander.is_unharmed().await;
+    bystander.ends_unharmed().await;
 }
 
 #[tokio::test]
@@ -353,7 +353,7 @@ async fn an_empty_or_unknown_request_is_refused_and_a_malformed_one_ends_its_ses
     assert_eq!(status.code(), Code::Internal, "{status:?}");
     let status = raw(server.tcp(), "/perturb.v1.Perturb/Nothing", SessionRequest::default()).await.unwrap_err();
     assert_eq!(status.code(), Code::Unimplemented, "{status:?}");
-    bystander.is_unharmed().await;
+    bystander.ends_unharmed().await;
 }
 
 #[tokio::test]
@@ -373,7 +373,7 @@ async fn an_oversized_message_ends_its_session_and_frees_its_environments() {
         assert_eq!(status.code(), Code::OutOfRange, "{status:?}");
         assert!(status.message().contains("4096"), "the limit is told: {status:?}");
     }
-    bystander.is_unharmed().await;
+    bystander.ends_unharmed().await;
 }
 
 #[tokio::test]
@@ -411,8 +411,8 @@ async fn garbage_bytes_on_the_port_harm_nobody() {
         open_connections.push(Box::new(connections.remove(0)));
         tcp.goes_on().await;
     }
-    unix.is_unharmed().await;
-    tcp.is_unharmed().await;
+    unix.ends_unharmed().await;
+    tcp.ends_unharmed().await;
     drop(open_connections);
 }
 
@@ -487,7 +487,7 @@ async fn a_client_killed_in_mid_step_frees_its_environments() {
         drop(client);
         room_for(address, 2_000).await;
     }
-    bystander.is_unharmed().await;
+    bystander.ends_unharmed().await;
 }
 
 #[tokio::test]
@@ -498,7 +498,7 @@ async fn a_client_that_hangs_is_found_out_by_keepalive() {
     server::signal(client.0.id(), "STOP");
     room_for(server.unix(), 2_000).await;
     drop(client);
-    bystander.is_unharmed().await;
+    bystander.ends_unharmed().await;
 }
 
 #[tokio::test]
@@ -533,7 +533,7 @@ async fn two_hundred_sessions_opened_and_dropped_leave_nothing_behind() {
         session.send(Request::Open(open("CartPole", 1000, seed))).await;
     }
     room_for(server.tcp(), 200 * EACH).await;
-    bystander.is_unharmed().await;
+    bystander.ends_unharmed().await;
 }
 
 #[tokio::test]
@@ -547,7 +547,7 @@ async fn sessions_beyond_the_limit_are_refused_until_one_ends() {
     assert!(status.message().contains("all of this server's 3 sessions"), "{status:?}");
     drop(first);
     until("there is room for a session", async || Session::start(&mut client).await.is_ok()).await;
-    bystander.is_unharmed().await;
+    bystander.ends_unharmed().await;
 }
 
 #[tokio::test]
@@ -596,7 +596,7 @@ async fn a_client_that_never_reads_costs_bounded_memory_and_its_replies_are_not_
     assert!(replies.len() as u64 >= last, "{} replies to {last} requests", replies.len());
     let (mut reference, _) = Session::open(server.tcp(), open("CartPole", N as u32, 1)).await;
     assert!(reference.play(Actor::new(&environment, N), 0, replies.len() as u64).await == replies);
-    bystander.is_unharmed().await;
+    bystander.ends_unharmed().await;
 }
 
 #[tokio::test]
@@ -611,7 +611,7 @@ async fn an_idle_session_is_ended_and_a_busy_one_is_not() {
         assert!(status.message().contains("idle for 1 s"), "{status:?}");
     }
     room_for(server.tcp(), 100).await;
-    bystander.is_unharmed().await;
+    bystander.ends_unharmed().await;
 }
 
 #[tokio::test]
@@ -630,5 +630,5 @@ async fn a_step_after_the_end_is_refused_when_autoreset_is_disabled() {
         refused(&mut session, case).await;
     }
     assert_eq!(session.snapshot(&[]).await, snapshots, "nothing changed");
-    bystander.is_unharmed().await;
+    bystander.ends_unharmed().await;
 }

@@ -199,7 +199,7 @@ async fn a_stale_socket_is_replaced_a_live_one_and_a_file_are_not() {
     drop(UnixListener::bind(&socket).unwrap());
     assert!(socket.exists(), "a dead server's socket");
     let server = Server::spawn(listen(), tempfile::tempdir().unwrap(), 1);
-    assert_eq!(server.addresses, [address.clone()]);
+    assert_eq!(server.addresses, std::slice::from_ref(&address));
 
     let second = finished(&mut listen());
     assert_eq!(second.status.code(), Some(1));
