@@ -50,7 +50,7 @@ pub struct Arguments {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub idle_seconds: Option<u64>,
     /// How often a silent connection is asked whether it lives; one that does not answer within this time is closed and
-    /// its environments are freed. [default: 20]
+    /// its environments are freed. [default: 60]
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub keepalive_seconds: Option<u64>,
@@ -102,7 +102,7 @@ impl Default for Config {
             max_message_bytes: 64 << 20,
             grace_seconds: 30,
             idle_seconds: 0,
-            keepalive_seconds: 20,
+            keepalive_seconds: 60,
             log: "info".into(),
             exit_with_stdin: false,
         }
