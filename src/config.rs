@@ -6,6 +6,8 @@ use serde::{Deserialize, Serialize};
 use std::{fmt, net::SocketAddr, path::PathBuf, time::Duration};
 
 const ENV_PREFIX: &str = "PERTURB_SERVER";
+/// A day. The transport adds the interval to the present, which must not overflow.
+const MAX_KEEPALIVE_SECONDS: u64 = 86_400;
 
 /// Serves reinforcement-learning environments whose physics can be changed, over gRPC.
 ///
@@ -48,7 +50,7 @@ pub struct Arguments {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub idle_seconds: Option<u64>,
     /// How often a silent connection is asked whether it lives; one that does not answer within this time is closed and
-    /// its environments are freed. [default: 20]
+    /// its environments are freed. [default: 60]
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub keepalive_seconds: Option<u64>,
@@ -82,7 +84,7 @@ pub struct Config {
     pub grace_seconds: u64,
     /// Ends sessions that send nothing for so long, s; 0 = never.
     pub idle_seconds: u64,
-    /// How often a silent connection is asked whether it lives, s, at least 1.
+    /// How often a silent connection is asked whether it lives, s, 1 … 86400.
     pub keepalive_seconds: u64,
     /// The log filter.
     pub log: String,
@@ -100,7 +102,7 @@ impl Default for Config {
             max_message_bytes: 64 << 20,
             grace_seconds: 30,
             idle_seconds: 0,
-            keepalive_seconds: 20,
+            keepalive_seconds: 60,
             log: "info".into(),
             exit_with_stdin: false,
         }
@@ -176,10 +178,12 @@ impl Config {
             .try_parsing(true)
             .list_separator(",")
             .with_list_parse_key("listen");
+        // Other programs' variables need not be UTF-8. A setting that is not is refused with its odd characters replaced.
+        let text =
+            std::env::vars_os().map(|(k, v)| (k.to_string_lossy().into_owned(), v.to_string_lossy().into_owned()));
         // The variable that names the file is no setting.
-        let variables = variables.source(Some(
-            std::env::vars().filter(|(name, _)| !name.eq_ignore_ascii_case("PERTURB_SERVER_CONFIG")).collect(),
-        ));
+        let settings = text.filter(|(name, _)| !name.eq_ignore_ascii_case("PERTURB_SERVER_CONFIG"));
+        let variables = variables.source(Some(settings.collect()));
         let merged = builder.add_source(variables).add_source(config::Config::try_from(arguments)?).build()?;
         merged.try_deserialize::<Self>()?.validated()
     }
@@ -201,8 +205,8 @@ impl Config {
         if self.max_message_bytes < 1024 {
             return refuse("max_message_bytes", &self.max_message_bytes, "at least 1024");
         }
-        if self.keepalive_seconds == 0 {
-            return refuse("keepalive_seconds", &self.keepalive_seconds, "at least 1");
+        if !(1..=MAX_KEEPALIVE_SECONDS).contains(&self.keepalive_seconds) {
+            return refuse("keepalive_seconds", &self.keepalive_seconds, "1 … 86400");
         }
         if tracing_subscriber::EnvFilter::try_new(&self.log).is_err() {
             return refuse("log", &self.log, "error, warn, info, debug, trace, or a filter such as perturb=debug");

@@ -43,13 +43,14 @@ fn run(config: &Config) -> Result<(), Box<dyn Error>> {
     // One thread for I/O: physics has threads of its own, and a hand-over between runtime threads doubles latency.
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let result = runtime.block_on(async {
+        // Before the addresses are told: who reads them may send a signal at once.
+        let shutdown = shutdown(config.exit_with_stdin)?;
         let mut listeners = Vec::new();
         for address in &config.listen {
             let listener = Listener::bind(address).await?;
             println!("listening on {}", listener.address()?);
             listeners.push(listener);
         }
-        let shutdown = shutdown(config.exit_with_stdin)?;
         server::run(listeners, config, shutdown).await?;
         Ok(())
     });

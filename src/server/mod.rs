@@ -27,8 +27,10 @@ use tokio_stream::wrappers::UnixListenerStream;
 use tonic::transport::{Server, server::TcpIncoming};
 use tonic_health::ServingStatus;
 
-/// A session's reply to a large batch should not wait for the window: 4 MiB.
-const WINDOW: u32 = 4 << 20;
+/// A session's request for a large batch should not wait for the window: 4 MiB.
+const STREAM_WINDOW: u32 = 4 << 20;
+/// One session whose requests pile up should not stall the others of its connection: room for 16 such.
+const CONNECTION_WINDOW: u32 = 16 * STREAM_WINDOW;
 /// How long connections may take to notice the end.
 const FAREWELL: Duration = Duration::from_secs(1);
 
@@ -75,8 +77,8 @@ pub async fn run(listeners: Vec<Listener>, config: &Config, shutdown: impl Futur
     let router = Server::builder()
         .http2_keepalive_interval(Some(keepalive))
         .http2_keepalive_timeout(Some(keepalive))
-        .initial_stream_window_size(WINDOW)
-        .initial_connection_window_size(WINDOW)
+        .initial_stream_window_size(STREAM_WINDOW)
+        .initial_connection_window_size(CONNECTION_WINDOW)
         .add_service(service)
         .add_service(health_service)
         .add_service(reflection().build_v1()?)

@@ -1,0 +1,390 @@
+//! A real `perturb-server` in a process of its own, and a client for its sessions.
+#![allow(dead_code, clippy::unwrap_used, reason = "every test file uses its part")]
+
+use bytes::Bytes;
+use perturb::proto::{
+    self, AutoresetMode, Environment, Open, Reset, Restore, SessionRequest, SessionResponse, Snapshot, Step, Stepped,
+    Version, action_space::Kind, perturb_client::PerturbClient, session_request::Request, session_response::Response,
+};
+use std::{
+    future::Future,
+    io::{BufRead, BufReader},
+    path::PathBuf,
+    process::{Child, ChildStdin, Command, ExitStatus, Stdio},
+    sync::mpsc,
+    time::{Duration, Instant},
+};
+use tempfile::TempDir;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{
+    Code, Status, Streaming,
+    transport::{Channel, Endpoint},
+};
+
+/// Nothing here takes nearly as long; only a hang does.
+pub const DEADLINE: Duration = Duration::from_secs(120);
+/// Steps sent ahead of their replies by [`Session::play`].
+const AHEAD: u64 = 32;
+
+/// A running server. It is killed when this is dropped.
+pub struct Server {
+    pub child: Child,
+    /// Where it listens, in the order of its lines.
+    pub addresses: Vec<String>,
+    pub directory: TempDir,
+    /// Kept open, or dropped to close the server's standard input.
+    pub stdin: Option<ChildStdin>,
+}
+
+impl Server {
+    /// A server on a free TCP port and a Unix socket, with these flags.
+    pub fn start(flags: &[&str]) -> Self {
+        let directory = tempfile::tempdir().unwrap();
+        let socket = format!("unix:{}", directory.path().join("socket").display());
+        let mut command = command();
+        command.args(["--listen", "tcp://127.0.0.1:0", "--listen", &socket]).args(flags);
+        Self::spawn(command, directory, 2)
+    }
+
+    /// Runs a command that listens at so many addresses.
+    pub fn spawn(mut command: Command, directory: TempDir, addresses: usize) -> Self {
+        let log = std::fs::File::create(directory.path().join("log")).unwrap();
+        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(log).spawn().unwrap();
+        let lines = lines(child.stdout.take().unwrap());
+        let stdin = child.stdin.take();
+        let mut server = Self { child, addresses: Vec::new(), directory, stdin };
+        for _ in 0..addresses {
+            let line = lines.recv_timeout(DEADLINE).expect("the server ended before it listened");
+            server.addresses.push(line.strip_prefix("listening on ").expect(&line).to_owned());
+        }
+        server
+    }
+
+    /// The TCP address.
+    pub fn tcp(&self) -> &str {
+        self.addresses.iter().find(|a| a.starts_with("http://")).unwrap()
+    }
+
+    /// The TCP address as host and port.
+    pub fn port(&self) -> &str {
+        self.tcp().strip_prefix("http://").unwrap()
+    }
+
+    /// The Unix socket's address.
+    pub fn unix(&self) -> &str {
+        self.addresses.iter().find(|a| a.starts_with("unix:")).unwrap()
+    }
+
+    /// The Unix socket's path.
+    pub fn socket(&self) -> PathBuf {
+        self.unix().strip_prefix("unix:").unwrap().into()
+    }
+
+    /// What it logged so far.
+    pub fn log(&self) -> String {
+        String::from_utf8_lossy(&std::fs::read(self.directory.path().join("log")).unwrap()).into_owned()
+    }
+
+    /// Sends it a signal.
+    pub fn signal(&self, signal: &str) {
+        self::signal(self.child.id(), signal);
+    }
+
+    /// Waits for its end.
+    pub async fn ended(&mut self) -> ExitStatus {
+        let start = Instant::now();
+        loop {
+            if let Some(status) = self.child.try_wait().unwrap() {
+                return status;
+            }
+            assert!(start.elapsed() < DEADLINE, "the server does not end; it logged:\n{}", self.log());
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    }
+
+    /// Its resident memory, in bytes.
+    pub fn memory(&self) -> usize {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
+        let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
+        line.split_whitespace().nth(1).unwrap().parse::<usize>().unwrap() * 1024
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        if std::thread::panicking() {
+            eprintln!("the server logged:\n{}", self.log());
+        }
+    }
+}
+
+/// The server program, not started yet.
+pub fn command() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_perturb-server"));
+    for (name, _) in std::env::vars_os().filter(|(name, _)| name.to_string_lossy().starts_with("PERTURB_SERVER_")) {
+        command.env_remove(name);
+    }
+    command
+}
+
+/// Sends a signal to a process that the test started.
+pub fn signal(process: u32, signal: &str) {
+    let sent = Command::new("kill").args([format!("-{signal}"), process.to_string()]).status().unwrap();
+    assert!(sent.success(), "kill -{signal} {process}: {sent}");
+}
+
+/// The lines that a process prints, as they come.
+pub fn lines(output: impl std::io::Read + Send + 'static) -> mpsc::Receiver<String> {
+    let (sender, lines) = mpsc::channel();
+    std::thread::spawn(move || {
+        for line in BufReader::new(output).lines().map_while(Result::ok) {
+            if sender.send(line).is_err() {
+                return;
+            }
+        }
+    });
+    lines
+}
+
+/// The future's output, or a panic if it hangs.
+pub async fn within<T>(future: impl Future<Output = T>) -> T {
+    tokio::time::timeout(DEADLINE, future).await.expect("no answer before the deadline")
+}
+
+/// Asks again and again until the answer is yes.
+pub async fn until(what: &str, mut ask: impl AsyncFnMut() -> bool) {
+    let start = Instant::now();
+    while !within(ask()).await {
+        assert!(start.elapsed() < DEADLINE, "still waiting until {what}");
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+}
+
+/// A connection of its own.
+pub async fn channel(address: &str) -> Channel {
+    let endpoint = Endpoint::from_shared(address.to_owned()).unwrap().tcp_nodelay(true);
+    within(endpoint.connect()).await.unwrap_or_else(|error| panic!("no connection to {address}: {error:?}"))
+}
+
+/// A client on a connection of its own.
+pub async fn client(address: &str) -> PerturbClient<Channel> {
+    PerturbClient::new(channel(address).await).max_decoding_message_size(usize::MAX)
+}
+
+/// Every environment of the server.
+pub async fn catalogue(address: &str) -> Vec<Environment> {
+    let reply = within(client(address).await.list_environments(proto::ListEnvironmentsRequest {})).await.unwrap();
+    reply.into_inner().environments
+}
+
+/// One environment of the server.
+pub async fn environment(address: &str, name: &str) -> Environment {
+    catalogue(address).await.into_iter().find(|e| e.name == name).unwrap()
+}
+
+/// A session.
+pub struct Session {
+    requests: Option<tokio::sync::mpsc::Sender<SessionRequest>>,
+    responses: Streaming<SessionResponse>,
+}
+
+impl Session {
+    /// A session on a connection of its own, not open yet.
+    pub async fn connect(address: &str) -> Self {
+        Self::start(&mut client(address).await).await.unwrap()
+    }
+
+    /// A session on this connection, not open yet.
+    pub async fn start(client: &mut PerturbClient<Channel>) -> Result<Self, Status> {
+        let (requests, receiver) = tokio::sync::mpsc::channel(1024);
+        let responses = within(client.session(ReceiverStream::new(receiver))).await?.into_inner();
+        Ok(Self { requests: Some(requests), responses })
+    }
+
+    /// An open session on a connection of its own.
+    pub async fn open(address: &str, open: Open) -> (Self, proto::Opened) {
+        let mut session = Self::connect(address).await;
+        match session.ask(Request::Open(open)).await {
+            Response::Opened(opened) => (session, opened),
+            other => panic!("open was answered by {other:?}"),
+        }
+    }
+
+    /// Sends a request; its response is still to be received. If the session is over, receiving tells why.
+    pub async fn send(&self, request: Request) {
+        let requests = self.requests.as_ref().expect("closed already");
+        let _ = within(requests.send(SessionRequest { request: Some(request) })).await;
+    }
+
+    /// Where requests go, for senders of their own.
+    pub fn sender(&self) -> tokio::sync::mpsc::Sender<SessionRequest> {
+        self.requests.clone().unwrap()
+    }
+
+    /// Sends no more.
+    pub fn close(&mut self) {
+        self.requests = None;
+    }
+
+    /// The next response, none at the stream's end.
+    pub async fn receive(&mut self) -> Result<Option<SessionResponse>, Status> {
+        within(self.responses.message()).await
+    }
+
+    /// The status with which the stream ends, after whatever responses are still to come.
+    pub async fn end(&mut self) -> Status {
+        loop {
+            match self.receive().await {
+                Ok(Some(_)) => {}
+                Ok(None) => return Status::ok(""),
+                Err(status) => return status,
+            }
+        }
+    }
+
+    /// The response to a request.
+    pub async fn ask(&mut self, request: Request) -> Response {
+        self.send(request).await;
+        let response = self.receive().await.unwrap().expect("the stream ended");
+        response.response.expect("a response is never empty")
+    }
+
+    /// A step of these actions, as the response that came.
+    pub async fn step(&mut self, actions: Bytes) -> Stepped {
+        match self.ask(Request::Step(Step { actions })).await {
+            Response::Stepped(stepped) => stepped,
+            other => panic!("step was answered by {other:?}"),
+        }
+    }
+
+    /// A reset.
+    pub async fn reset(&mut self, reset: Reset) -> proto::ResetDone {
+        match self.ask(Request::Reset(reset)).await {
+            Response::Reset(done) => done,
+            other => panic!("reset was answered by {other:?}"),
+        }
+    }
+
+    /// A snapshot of the environments that the mask selects.
+    pub async fn snapshot(&mut self, mask: &[u8]) -> Vec<Bytes> {
+        match self.ask(Request::Snapshot(Snapshot { mask: Bytes::copy_from_slice(mask) })).await {
+            Response::Snapshot(done) => done.snapshots,
+            other => panic!("snapshot was answered by {other:?}"),
+        }
+    }
+
+    /// A restore of the environments that the mask selects; their observations.
+    pub async fn restore(&mut self, mask: &[u8], snapshots: Vec<Bytes>) -> Bytes {
+        match self.ask(Request::Restore(Restore { mask: Bytes::copy_from_slice(mask), snapshots })).await {
+            Response::Restore(done) => done.observations,
+            other => panic!("restore was answered by {other:?}"),
+        }
+    }
+
+    /// A request that is refused.
+    pub async fn refused(&mut self, request: Request) -> (Code, String) {
+        match self.ask(request).await {
+            Response::Error(error) => (Code::from_i32(error.code), error.message),
+            other => panic!("was not refused but answered by {other:?}"),
+        }
+    }
+
+    /// Steps with the random actions of times `from` … `to`-1, pipelined; the responses.
+    pub async fn play(&mut self, actor: Actor<'_>, from: u64, to: u64) -> Vec<SessionResponse> {
+        let mut responses = Vec::new();
+        let mut sent = from;
+        for t in from..to {
+            while sent < to && sent < t + AHEAD {
+                self.send(Request::Step(Step { actions: actor.actions(sent) })).await;
+                sent += 1;
+            }
+            responses.push(self.receive().await.unwrap().expect("the stream ended"));
+        }
+        responses
+    }
+}
+
+/// Random actions for a batch of `n` environments, the first of which has index `first`. An environment's action is a
+/// function of its index and the time alone. A vector's entries leave the channels' ranges now and then, as they may.
+#[derive(Clone, Copy)]
+pub struct Actor<'a> {
+    pub environment: &'a Environment,
+    pub first: u64,
+    pub n: usize,
+}
+
+impl<'a> Actor<'a> {
+    /// For a batch whose first index is 0.
+    pub fn new(environment: &'a Environment, n: usize) -> Self {
+        Self { environment, first: 0, n }
+    }
+
+    /// The batch's actions at a time.
+    pub fn actions(self, t: u64) -> Bytes {
+        (self.first..).take(self.n).flat_map(|index| action(self.environment, index, t)).collect()
+    }
+}
+
+/// The wire's bytes of one environment's action.
+pub fn action(environment: &Environment, index: u64, t: u64) -> Vec<u8> {
+    let unit = |entry: u64| mixed(mixed(mixed(index) ^ t) ^ entry) as f64 / u64::MAX as f64 * (1.0 - 1e-9);
+    match environment.action.as_ref().unwrap().kind.as_ref().unwrap() {
+        Kind::Discrete(space) => ((unit(0) * space.names.len() as f64) as i32).to_le_bytes().to_vec(),
+        Kind::Continuous(space) => {
+            let entry = |(i, c): (u64, &proto::Channel)| (1.2 * (c.low + (c.high - c.low) * unit(i))) as f32;
+            (0..).zip(&space.channels).flat_map(|channel| entry(channel).to_le_bytes()).collect()
+        }
+    }
+}
+
+/// SplitMix64's finaliser: a well mixed function of its argument.
+pub fn mixed(x: u64) -> u64 {
+    let x = x.wrapping_add(0x9E37_79B9_7F4A_7C15);
+    let x = (x ^ (x >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    let x = (x ^ (x >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+    x ^ (x >> 31)
+}
+
+/// An `open` with everything on: version R, receipts and reward terms, next-step autoreset.
+pub fn open(environment: &str, batch_size: u32, seed: u64) -> Open {
+    Open {
+        environment: environment.into(),
+        version: Version::Random.into(),
+        batch_size,
+        seed,
+        autoreset_mode: AutoresetMode::NextStep.into(),
+        receipts: true,
+        reward_terms: true,
+        ..Open::default()
+    }
+}
+
+/// The step among these responses.
+pub fn stepped(response: &SessionResponse) -> &Stepped {
+    match &response.response {
+        Some(Response::Stepped(stepped)) => stepped,
+        other => panic!("step was answered by {other:?}"),
+    }
+}
+
+/// The f32 of little-endian bytes.
+pub fn floats(bytes: &[u8]) -> Vec<f32> {
+    bytes.as_chunks::<4>().0.iter().map(|word| f32::from_le_bytes(*word)).collect()
+}
+
+/// Little-endian bytes of f64.
+pub fn doubles(numbers: &[f64]) -> Bytes {
+    numbers.iter().flat_map(|x| x.to_le_bytes()).collect()
+}
+
+/// A distribution over these intervals.
+pub fn union(intervals: &[(f64, f64)]) -> proto::Distribution {
+    proto::Distribution { intervals: intervals.iter().map(|&(low, high)| proto::Interval { low, high }).collect() }
+}
+
+/// Distributions by name.
+pub fn parameters(each: &[(&str, &[(f64, f64)])]) -> std::collections::HashMap<String, proto::Distribution> {
+    each.iter().map(|(name, intervals)| ((*name).into(), union(intervals))).collect()
+}

@@ -1,0 +1,395 @@
+//! How the server begins and ends: configuration, addresses, health, reflection, signals, draining.
+#![allow(clippy::unwrap_used)]
+
+#[path = "common/server.rs"]
+mod server;
+
+use perturb::proto::{Step, session_request::Request, session_response::Response};
+use server::{Actor, Server, Session, command, environment, open, until, within};
+use std::{
+    io::Write,
+    net::{TcpListener, TcpStream},
+    os::unix::{
+        ffi::OsStrExt,
+        net::{UnixListener, UnixStream},
+        process::ExitStatusExt,
+    },
+    path::Path,
+    process::{Output, Stdio},
+    time::{Duration, Instant},
+};
+use tonic::{Code, Status};
+use tonic_health::pb::{HealthCheckRequest, health_check_response::ServingStatus, health_client::HealthClient};
+
+const SERVICE: &str = "perturb.v1.Perturb";
+
+async fn health(address: &str, service: &str) -> Result<ServingStatus, Status> {
+    let mut client = HealthClient::new(server::channel(address).await);
+    let reply = within(client.check(HealthCheckRequest { service: service.into() })).await?;
+    Ok(reply.into_inner().status())
+}
+
+/// Runs a server that is expected to end by itself.
+fn finished(command: &mut std::process::Command) -> Output {
+    let mut child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let start = Instant::now();
+    while child.try_wait().unwrap().is_none() {
+        if start.elapsed() > Duration::from_secs(30) {
+            child.kill().unwrap();
+            panic!("{command:?} was not refused: {:?}", child.wait_with_output());
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    child.wait_with_output().unwrap()
+}
+
+/// Runs a server that is expected to refuse; what it said.
+fn refused(mut command: std::process::Command) -> String {
+    let Output { status, stdout, stderr } = finished(&mut command);
+    let stderr = String::from_utf8(stderr).unwrap();
+    assert_eq!(status.code(), Some(2), "{command:?}: {stderr}");
+    assert_eq!(String::from_utf8_lossy(&stdout), "", "{command:?} listened before it refused");
+    assert!(!stderr.contains("panicked"), "{stderr}");
+    stderr
+}
+
+fn file(directory: &Path, text: &str) -> std::path::PathBuf {
+    let path = directory.join("server.toml");
+    std::fs::write(&path, text).unwrap();
+    path
+}
+
+/// The most environments that one session may open.
+async fn max_envs(server: &Server) -> u32 {
+    let mut client = server::client(server.tcp()).await;
+    let reply = within(client.list_environments(perturb::proto::ListEnvironmentsRequest {})).await.unwrap();
+    reply.into_inner().max_batch_size
+}
+
+#[tokio::test]
+async fn after_sigterm_running_sessions_go_on_new_ones_are_refused_and_the_exit_status_is_0() {
+    for signal in ["TERM", "INT"] {
+        let mut server = Server::start(&["--grace-seconds", "100000"]);
+        let e = environment(server.tcp(), "CartPole").await;
+        let actor = Actor::new(&e, 4);
+        let (mut session, _) = Session::open(server.tcp(), open("CartPole", 4, 1)).await;
+        let (mut twin, _) = Session::open(server.tcp(), open("CartPole", 4, 1)).await;
+        let mut not_opened = Session::connect(server.tcp()).await;
+        let reference = twin.play(actor, 0, 400).await;
+        drop(twin);
+        let mut replies = session.play(actor, 0, 200).await;
+        let mut client = server::client(server.tcp()).await;
+        assert_eq!(health(server.tcp(), SERVICE).await.unwrap(), ServingStatus::Serving);
+        assert_eq!(health(server.tcp(), "").await.unwrap(), ServingStatus::Serving);
+
+        server.signal(signal);
+        until("health tells of the end", async || {
+            health(server.tcp(), SERVICE).await.unwrap() == ServingStatus::NotServing
+        })
+        .await;
+        assert_eq!(health(server.unix(), "").await.unwrap(), ServingStatus::NotServing, "the whole server drains");
+        let status = Session::start(&mut client).await.err().expect("a new session is refused");
+        assert_eq!(status.code(), Code::Unavailable, "{status:?}");
+        assert!(status.message().contains("shutting down"), "{status:?}");
+        let status = Session::start(&mut server::client(server.unix()).await).await.err().expect("is refused");
+        assert_eq!(status.code(), Code::Unavailable, "also on a new connection: {status:?}");
+        not_opened.send(Request::Open(open("CartPole", 1, 1))).await;
+        let status = not_opened.end().await;
+        assert_eq!(status.code(), Code::Unavailable, "nothing is opened any more: {status:?}");
+
+        replies.extend(session.play(actor, 200, 400).await);
+        assert!(replies == reference, "the running session goes on as if nothing had happened");
+        assert!(server.child.try_wait().unwrap().is_none(), "the server waits for its session");
+        session.close();
+        assert_eq!(session.receive().await.unwrap(), None);
+        assert_eq!(server.ended().await.code(), Some(0));
+        assert!(!server.socket().exists(), "the socket's file is gone");
+    }
+}
+
+#[tokio::test]
+async fn after_the_grace_period_sessions_end_with_unavailable_and_the_exit_status_is_0() {
+    let mut server = Server::start(&["--grace-seconds", "1"]);
+    let (mut silent, _) = Session::open(server.tcp(), open("CartPole", 4, 1)).await;
+    // This one always has requests on their way.
+    let (mut busy, opened) = Session::open(server.unix(), open("Acrobot", 200, 1)).await;
+    let sender = busy.sender();
+    busy.close();
+    let sending = tokio::spawn(async move {
+        let environment = opened.environment.unwrap();
+        for t in 0.. {
+            let actions = Actor::new(&environment, 200).actions(t % 100);
+            let request = Some(Request::Step(Step { actions }));
+            if sender.send(perturb::proto::SessionRequest { request }).await.is_err() {
+                return;
+            }
+        }
+    });
+    for _ in 0..50 {
+        busy.receive().await.unwrap().unwrap();
+    }
+    server.signal("TERM");
+    let (silent, busy) = tokio::join!(silent.end(), busy.end());
+    for status in [silent, busy] {
+        assert_eq!(status.code(), Code::Unavailable, "{status:?}");
+        assert!(status.message().contains("this server is shutting down"), "{status:?}");
+    }
+    assert_eq!(server.ended().await.code(), Some(0));
+    sending.abort();
+}
+
+#[tokio::test]
+async fn a_server_without_sessions_ends_at_once_whatever_its_grace_period() {
+    // Connections without a session do not keep it.
+    let mut server = Server::start(&["--grace-seconds", "100000"]);
+    let _idle = server::client(server.tcp()).await;
+    let mut half = TcpStream::connect(server.port()).unwrap();
+    half.write_all(b"PRI * HTTP/2.0\r\n").unwrap();
+    server.signal("TERM");
+    assert_eq!(server.ended().await.code(), Some(0));
+}
+
+#[tokio::test]
+async fn sigterm_right_after_the_address_is_printed_is_an_orderly_end() {
+    for _ in 0..10 {
+        let mut server = Server::start(&[]);
+        server.signal("TERM");
+        let status = server.ended().await;
+        assert_eq!((status.code(), status.signal()), (Some(0), None));
+    }
+}
+
+#[tokio::test]
+async fn a_second_signal_ends_the_server_at_once() {
+    let mut server = Server::start(&["--grace-seconds", "100000"]);
+    let (_session, _) = Session::open(server.tcp(), open("CartPole", 4, 1)).await;
+    server.signal("TERM");
+    until("the server drains", async || health(server.tcp(), SERVICE).await.unwrap() == ServingStatus::NotServing)
+        .await;
+    server.signal("INT");
+    assert_eq!(server.ended().await.code(), Some(1));
+}
+
+#[tokio::test]
+async fn exit_with_stdin_ends_the_server_when_its_input_closes_and_only_then() {
+    let mut server = Server::start(&["--exit-with-stdin"]);
+    server.stdin.as_mut().unwrap().write_all(b"words mean nothing\n").unwrap();
+    assert_eq!(health(server.tcp(), SERVICE).await.unwrap(), ServingStatus::Serving);
+    server.stdin = None;
+    assert_eq!(server.ended().await.code(), Some(0));
+
+    let mut server = Server::start(&[]);
+    server.stdin = None;
+    for _ in 0..20 {
+        assert_eq!(health(server.tcp(), SERVICE).await.unwrap(), ServingStatus::Serving, "without the flag it stays");
+    }
+    assert!(server.child.try_wait().unwrap().is_none());
+}
+
+#[tokio::test]
+async fn a_stale_socket_is_replaced_a_live_one_and_a_file_are_not() {
+    let directory = tempfile::tempdir().unwrap();
+    let socket = directory.path().join("perturb.sock");
+    let address = format!("unix:{}", socket.display());
+    let listen = || {
+        let mut command = command();
+        command.args(["--listen", &address]);
+        command
+    };
+    drop(UnixListener::bind(&socket).unwrap());
+    assert!(socket.exists(), "a dead server's socket");
+    let server = Server::spawn(listen(), tempfile::tempdir().unwrap(), 1);
+    assert_eq!(server.addresses, std::slice::from_ref(&address));
+
+    let second = finished(&mut listen());
+    assert_eq!(second.status.code(), Some(1));
+    let message = String::from_utf8(second.stderr).unwrap();
+    assert!(message.contains("cannot listen at") && message.contains("in use"), "{message}");
+    assert_eq!(health(&address, SERVICE).await.unwrap(), ServingStatus::Serving, "the first is still there");
+    drop(server); // killed: its socket stays
+    assert!(UnixStream::connect(&socket).is_err() && socket.exists());
+    let server = Server::spawn(listen(), tempfile::tempdir().unwrap(), 1);
+    assert_eq!(health(&address, SERVICE).await.unwrap(), ServingStatus::Serving);
+    drop(server);
+
+    std::fs::remove_file(&socket).unwrap();
+    std::fs::write(&socket, "precious").unwrap();
+    assert_eq!(finished(&mut listen()).status.code(), Some(1));
+    assert_eq!(std::fs::read_to_string(&socket).unwrap(), "precious");
+}
+
+#[test]
+fn a_port_in_use_is_an_error_that_names_it() {
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = format!("tcp://{}", taken.local_addr().unwrap());
+    let output = finished(command().args(["--listen", &address]));
+    let message = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    assert!(message.contains(&taken.local_addr().unwrap().to_string()) && message.contains("in use"), "{message}");
+}
+
+#[test]
+fn a_bad_flag_is_refused_before_any_port_is_bound() {
+    let cases: &[(&[&str], &[&str])] = &[
+        (&["--workers", "0"], &["workers is 0", "1 … 1024"]),
+        (&["--workers", "1025"], &["workers is 1025"]),
+        (&["--workers", "-1"], &["-1"]),
+        (&["--workers", "two"], &["two", "--workers"]),
+        (&["--max-envs", "0"], &["max_envs is 0"]),
+        (&["--max-envs", "16777217"], &["max_envs is 16777217", "16777216"]),
+        (&["--max-sessions", "0"], &["max_sessions is 0"]),
+        (&["--max-message-bytes", "1023"], &["max_message_bytes is 1023", "1024"]),
+        (&["--keepalive-seconds", "0"], &["keepalive_seconds is 0"]),
+        (&["--keepalive-seconds", "18446744073709551615"], &["keepalive_seconds is 18446744073709551615"]),
+        (&["--grace-seconds", "-1"], &["-1"]),
+        (&["--log", "perturb=loud"], &["log is perturb=loud"]),
+        (&["--listen", "127.0.0.1"], &["127.0.0.1", "no address to listen at", "unix:/path"]),
+        (&["--listen", "http://127.0.0.1:0"], &["http://", "no address"]),
+        (&["--listen", "unix:"], &["no address"]),
+        (&["--colour", "red"], &["--colour"]),
+        (&["--config", "/nowhere/server.toml"], &["/nowhere/server.toml"]),
+    ];
+    for (flags, words) in cases {
+        let mut command = command();
+        command.args(["--listen", "tcp://127.0.0.1:0"]).args(*flags);
+        let message = refused(command);
+        for word in *words {
+            assert!(message.contains(word), "{flags:?}: {message:?} does not say {word:?}");
+        }
+    }
+}
+
+#[test]
+fn a_bad_file_or_variable_is_refused_before_any_port_is_bound() {
+    let directory = tempfile::tempdir().unwrap();
+    let cases = [
+        ("max_env = 3", "max_env"),
+        ("workers = 0", "workers is 0"),
+        ("workers = \"many\"", "workers"),
+        ("workers = -3", "workers"),
+        ("listen = [\"127.0.0.1\"]", "no address to listen at"),
+        ("listen = []", "listen is empty"),
+        ("workers = ", "server.toml"),
+        ("[server]\nworkers = 1", "server"),
+    ];
+    for (text, word) in cases {
+        let mut command = command();
+        command.arg("--config").arg(file(directory.path(), text));
+        let message = refused(command);
+        assert!(message.contains(word), "{text:?}: {message:?} does not say {word:?}");
+    }
+    let cases = [
+        ("PERTURB_SERVER_MAX_ENV", "3", "max_env"),
+        ("PERTURB_SERVER_WORKERS", "0", "workers is 0"),
+        ("PERTURB_SERVER_WORKERS", "many", "many"),
+        ("PERTURB_SERVER_LISTEN", "tcp://127.0.0.1:0,somewhere", "somewhere"),
+        ("PERTURB_SERVER_CONFIG", "/nowhere/server.toml", "/nowhere/server.toml"),
+    ];
+    for (name, value, word) in cases {
+        let mut command = command();
+        command.env(name, value);
+        let message = refused(command);
+        assert!(message.contains(word), "{name}={value}: {message:?} does not say {word:?}");
+    }
+}
+
+#[tokio::test]
+async fn a_flag_beats_a_variable_and_a_variable_beats_the_file() {
+    let start = |file_has: Option<&str>, variable: Option<&str>, flag: Option<&str>| {
+        let directory = tempfile::tempdir().unwrap();
+        let mut command = command();
+        // The address comes from the file or from a variable, too.
+        match file_has {
+            Some(n) => {
+                let text = format!("max_envs = {n}\nlisten = [\"tcp://127.0.0.1:0\", \"tcp://[::1]:0\"]\n");
+                command.env("PERTURB_SERVER_CONFIG", file(directory.path(), &text));
+            }
+            None => {
+                command.env("PERTURB_SERVER_LISTEN", "tcp://127.0.0.1:0,127.0.0.1:0");
+            }
+        }
+        variable.map(|n| command.env("PERTURB_SERVER_MAX_ENVS", n));
+        flag.map(|n| command.args(["--max-envs", n]));
+        Server::spawn(command, directory, 2)
+    };
+    assert_eq!(max_envs(&start(None, None, None)).await, 16_384);
+    assert_eq!(max_envs(&start(Some("11"), None, None)).await, 11);
+    assert_eq!(max_envs(&start(Some("11"), Some("22"), None)).await, 22);
+    assert_eq!(max_envs(&start(Some("11"), Some("22"), Some("33"))).await, 33);
+    assert_eq!(max_envs(&start(Some("11"), None, Some("33"))).await, 33);
+}
+
+#[tokio::test]
+async fn variables_of_other_programs_are_none_of_its_business() {
+    let mut command = command();
+    command.env("SOMETHING", std::ffi::OsStr::from_bytes(b"\xFF\xFE")).args(["--listen", "tcp://127.0.0.1:0"]);
+    let server = Server::spawn(command, tempfile::tempdir().unwrap(), 1);
+    assert_eq!(health(server.tcp(), SERVICE).await.unwrap(), ServingStatus::Serving);
+}
+
+#[tokio::test]
+async fn health_knows_the_service_and_no_other() {
+    let server = Server::start(&[]);
+    for address in [server.tcp(), server.unix()] {
+        assert_eq!(health(address, SERVICE).await.unwrap(), ServingStatus::Serving);
+        assert_eq!(health(address, "").await.unwrap(), ServingStatus::Serving);
+        assert_eq!(health(address, "perturb.v1.Other").await.unwrap_err().code(), Code::NotFound);
+    }
+}
+
+/// Asks a version of reflection for its services and for the file of one of its symbols.
+macro_rules! reflect {
+    ($version:ident, $address:expr) => {{
+        use tonic_reflection::pb::$version::{
+            ServerReflectionRequest, server_reflection_client::ServerReflectionClient,
+            server_reflection_request::MessageRequest, server_reflection_response::MessageResponse,
+        };
+        let mut client = ServerReflectionClient::new(server::channel($address).await);
+        let ask = |request| ServerReflectionRequest { message_request: Some(request), ..Default::default() };
+        let requests = [
+            ask(MessageRequest::ListServices(String::new())),
+            ask(MessageRequest::FileContainingSymbol(format!("{SERVICE}.Session"))),
+            ask(MessageRequest::FileContainingSymbol("perturb.v1.Interval".into())),
+        ];
+        let mut replies =
+            within(client.server_reflection_info(tokio_stream::iter(requests))).await.unwrap().into_inner();
+        let mut next = async || within(replies.message()).await.unwrap().unwrap().message_response.unwrap();
+        let names: Vec<String> = match next().await {
+            MessageResponse::ListServicesResponse(list) => list.service.into_iter().map(|s| s.name).collect(),
+            other => panic!("{other:?}"),
+        };
+        for name in [SERVICE, "grpc.health.v1.Health"] {
+            assert!(names.iter().any(|listed| listed == name), "{name} is not in {names:?}");
+        }
+        for _ in 0..2 {
+            match next().await {
+                MessageResponse::FileDescriptorResponse(file) => {
+                    let file = String::from_utf8_lossy(&file.file_descriptor_proto[0]).into_owned();
+                    assert!(file.contains("perturb/v1/perturb.proto") && file.contains("AutoresetMode"));
+                }
+                other => panic!("{other:?}"),
+            }
+        }
+    }};
+}
+
+#[tokio::test]
+async fn reflection_lists_and_describes_the_service_in_v1_and_v1alpha() {
+    let server = Server::start(&[]);
+    reflect!(v1, server.tcp());
+    reflect!(v1alpha, server.unix());
+}
+
+#[tokio::test]
+async fn many_sessions_share_a_connection() {
+    let server = Server::start(&[]);
+    let mut client = server::client(server.unix()).await;
+    let mut sessions = Vec::new();
+    for seed in 0..500 {
+        let mut session = Session::start(&mut client).await.unwrap();
+        match session.ask(Request::Open(open("MountainCar", 1, seed))).await {
+            Response::Opened(_) => sessions.push(session),
+            other => panic!("{other:?}"),
+        }
+    }
+}
