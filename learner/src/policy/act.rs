@@ -28,7 +28,7 @@ pub struct Actor {
 #[derive(Clone, Debug)]
 enum Networks {
     FeedForward { policy: Network, value: Network },
-    Recurrent(Recurrent),
+    Recurrent(Box<Recurrent>),
 }
 
 /// What a policy did in N environments.
@@ -52,7 +52,7 @@ impl Actor {
             ActionKind::Continuous { size } => vec![0.0; size],
         };
         let networks = match spec.lstm {
-            Some(width) => Networks::Recurrent(Recurrent::new(spec, width, max_batch)),
+            Some(width) => Networks::Recurrent(Box::new(Recurrent::new(spec, width, max_batch))),
             None => {
                 let network = |outputs| {
                     let mut layers = spec.hidden_layers();

@@ -183,21 +183,16 @@ fn deltas(recurrent: &Tensor, of_hidden: &Tensor, tape: &Tape) -> Tensor {
     let hidden_to_cell = o * tanh_slope(&tanh_c);
     let cell_to_cell = f * &tape.keep;
 
-    let mut from_later: Option<(Tensor, Tensor)> = None;
+    let mut later_h = of_hidden.select(0, 0).zeros_like();
+    let mut later_c = later_h.zeros_like();
     for t in (0..steps).rev() {
-        let mut of_h = of_hidden.select(0, t);
-        let mut of_c = hidden_to_cell.select(0, t);
-        if let Some((later_h, later_c)) = from_later {
-            of_h = of_h + later_h;
-            of_c = later_c.addcmul(&of_h, &of_c);
-        } else {
-            of_c = of_c * &of_h;
-        }
+        let of_h = of_hidden.select(0, t) + later_h;
+        let of_c = later_c.addcmul(&of_h, &hidden_to_cell.select(0, t));
         let delta = deltas.select(0, t);
         let _ = delta.narrow(1, 0, 3).g_mul_(&of_c.unsqueeze(1));
         let _ = delta.select(1, 3).g_mul_(&of_h);
-        let back = delta.view((count, 4 * width)).mm(recurrent) * tape.keep.select(0, t);
-        from_later = Some((back, of_c * cell_to_cell.select(0, t)));
+        later_h = delta.view((count, 4 * width)).mm(recurrent) * tape.keep.select(0, t);
+        later_c = of_c * cell_to_cell.select(0, t);
     }
     deltas.view((-1, 4 * width))
 }
