@@ -152,7 +152,7 @@ pub(super) fn backward(spec: &PolicySpec, leaves: &[Tensor], loss: &Tensor, tape
     let places = Places::of(spec);
     let heads: Vec<&Tensor> = leaves[places.heads..].iter().chain([&tape.hidden]).collect();
     let mut of_heads = Tensor::f_run_backward(&[loss], &heads, false, false)?;
-    let Some(of_hidden) = of_heads.pop() else { return Ok(of_heads) };
+    let of_hidden = of_heads.remove(of_heads.len() - 1);
 
     let (deltas, of_recurrent) = tch::no_grad(|| {
         let deltas = deltas(&leaves[places.recurrent].detach(), &of_hidden, tape);
