@@ -12,8 +12,11 @@ use crate::{
 use bytes::{Bytes, BytesMut};
 use std::sync::{Arc, Mutex, atomic::Ordering};
 
-/// What one shard should cost, in µs: long enough to hide the queue, short enough that sessions take turns.
-const SHARD_COST: f64 = 50.0;
+/// What one shard should cost, in µs: long enough to hide the queue, short enough that workers end together and
+/// sessions take turns.
+const SHARD_COST: f64 = 20.0;
+/// What each worker's share should at least cost, in µs, for more than one to be set to work.
+const LEAST_SHARE: f64 = 10.0;
 
 /// What a batch is opened with.
 #[derive(Debug, Clone, PartialEq)]
@@ -91,7 +94,7 @@ impl Batch {
             Mutex::new(Shard::new(spec, episodes, (first, size), autoreset, receipts))
         };
         let shards = (0..settings.size).step_by(shard_size).map(shard).collect();
-        let job = Arc::new(Job::new(shards, permit, settings.spec.step_cost * settings.size as f64));
+        let job = Arc::new(Job::new(shards, pool.workers(), permit, settings.spec.step_cost * settings.size as f64));
         let mut batch = Self { settings, shard_size, job, workers, buffer: BytesMut::new() };
         batch.run().await?;
         batch.check_failures()?;
@@ -304,5 +307,5 @@ fn put(buffer: &mut BytesMut, values: &[f32]) {
 fn shard_size(spec: &EnvironmentSpec, batch: usize, workers: usize) -> usize {
     let by_cost = (SHARD_COST / spec.step_cost).ceil() as usize;
     let by_workers = batch.div_ceil(workers);
-    if spec.step_cost * by_workers as f64 >= SHARD_COST / 5.0 { by_cost.min(by_workers).max(1) } else { by_cost.max(1) }
+    if spec.step_cost * by_workers as f64 >= LEAST_SHARE { by_cost.min(by_workers).max(1) } else { by_cost.max(1) }
 }

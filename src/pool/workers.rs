@@ -4,6 +4,7 @@ use super::{Error, shard::Shard};
 use std::{
     collections::VecDeque,
     io,
+    ops::Range,
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{
         Arc, Condvar, Mutex, MutexGuard, PoisonError,
@@ -44,7 +45,7 @@ impl Pool {
         let mut pool = Self { shared, threads: Vec::new() };
         for i in 0..workers.max(1) {
             let shared = Arc::clone(&pool.shared);
-            let thread = thread::Builder::new().name(format!("physics-{i}")).spawn(move || shared.work())?;
+            let thread = thread::Builder::new().name(format!("physics-{i}")).spawn(move || shared.work(i))?;
             pool.threads.push(thread);
         }
         Ok(pool)
@@ -109,9 +110,8 @@ impl Shared {
 
     /// Runs every shard of the job on the workers and waits for the last.
     pub(super) async fn run(&self, job: &Arc<Job>) -> Result<(), Error> {
-        job.next.store(0, Ordering::Relaxed);
-        job.left.store(job.shards.len(), Ordering::Relaxed);
-        self.push(Arc::clone(job)); // its lock publishes the two counters
+        job.prepare();
+        self.push(Arc::clone(job)); // its lock publishes the job's counters
         if job.shards.len() > 1 {
             self.ready.notify_all();
         }
@@ -154,13 +154,12 @@ impl Shared {
         }
     }
 
-    fn work(&self) {
+    fn work(&self, worker: usize) {
         while let Some(job) = self.pop() {
-            let index = job.next.fetch_add(1, Ordering::Relaxed);
-            if index + 1 < job.shards.len() {
+            if job.unclaimed.fetch_sub(1, Ordering::Relaxed) > 1 {
                 self.push(Arc::clone(&job));
             }
-            job.run(index);
+            job.run(job.claim(worker));
         }
     }
 }
@@ -168,8 +167,11 @@ impl Shared {
 /// A batch's shards and the state of its current request. A batch has at most one request under way.
 pub(super) struct Job {
     pub(super) shards: Vec<Mutex<Shard>>,
-    /// The next shard to be taken.
-    next: AtomicUsize,
+    /// For each worker the shards that it takes first, and the next of them. A worker that meets the same environments
+    /// again finds them in its core's cache; one that is done helps the others.
+    ranges: Vec<(Range<usize>, AtomicUsize)>,
+    /// Shards that no worker has promised to take.
+    unclaimed: AtomicUsize,
     /// Shards that have not finished.
     left: AtomicUsize,
     done: Notify,
@@ -182,17 +184,42 @@ pub(super) struct Job {
 }
 
 impl Job {
-    /// A job of these shards. One that takes about `cost` µs and is short is worth waiting for awake.
-    pub(super) fn new(shards: Vec<Mutex<Shard>>, permit: Permit, cost: f64) -> Self {
+    /// A job of these shards for so many workers. One that takes about `cost` µs and is short is worth waiting for awake.
+    pub(super) fn new(shards: Vec<Mutex<Shard>>, workers: usize, permit: Permit, cost: f64) -> Self {
+        let bound = |worker: usize| worker * shards.len() / workers;
+        let range = |worker: usize| (bound(worker)..bound(worker + 1), AtomicUsize::new(0));
         Self {
+            ranges: (0..workers).map(range).collect(),
+            unclaimed: AtomicUsize::new(0),
             shards,
-            next: AtomicUsize::new(0),
             left: AtomicUsize::new(0),
             done: Notify::new(),
             abandoned: AtomicBool::new(false),
             failed: AtomicBool::new(false),
             patience: if cost <= SHORT { POLLS } else { 0 },
             _permit: permit,
+        }
+    }
+
+    /// Makes every shard ready to be taken.
+    fn prepare(&self) {
+        for (range, next) in &self.ranges {
+            next.store(range.start, Ordering::Relaxed);
+        }
+        self.unclaimed.store(self.shards.len(), Ordering::Relaxed);
+        self.left.store(self.shards.len(), Ordering::Relaxed);
+    }
+
+    /// A shard that nobody has taken: the worker's own first. The caller has taken one off `unclaimed`, so there is one.
+    fn claim(&self, worker: usize) -> usize {
+        loop {
+            for i in 0..self.ranges.len() {
+                let (range, next) = &self.ranges[(worker + i) % self.ranges.len()];
+                let shard = next.fetch_add(1, Ordering::Relaxed);
+                if shard < range.end {
+                    return shard;
+                }
+            }
         }
     }
 
