@@ -17,7 +17,7 @@ pub enum Error {
     /// An array has the wrong number of elements.
     #[error("{name} has {got} elements, expected {expected}")]
     Length {
-        /// The array, with its axes, e.g. "observations [N, O]".
+        /// The array, with its axes, e.g. "observations `[N, O]`".
         name: &'static str,
         /// Elements that were given.
         got: usize,

@@ -1,4 +1,4 @@
-//! Losses, as pure functions. Tensors are f32 [B] over the samples of a batch, b = 0 … B-1; results have no axes.
+//! Losses, as pure functions. Tensors are f32 `[B]` over the samples of a batch, b = 0 … B-1; results have no axes.
 
 use tch::{Kind, Tensor};
 

@@ -102,7 +102,7 @@ fn check_rollout(rollout: &Rollout, policy: &Policy, n_steps: usize) -> Result<(
     check_length("the rollout's memory [N, S]", rollout.memory().len(), rollout.n_envs() * policy.spec().memory_size())
 }
 
-/// The rollout's samples as tensors: what `policy` is evaluated on, and actions [L, M, A].
+/// The rollout's samples as tensors: what `policy` is evaluated on, and actions `[L, M, A]`.
 fn samples(rollout: &Rollout, policy: &Policy) -> Result<(Sequences, Tensor)> {
     let spec = policy.spec();
     let sequences =

@@ -12,10 +12,10 @@ const LANES: usize = 8;
 
 /// Changes weights against a gradient.
 pub(super) trait Optimiser: Send {
-    /// One step on `weights` [P] against `gradient` [P]; `update` counts the steps before this one.
+    /// One step on `weights` `[P]` against `gradient` `[P]`; `update` counts the steps before this one.
     fn step(&mut self, update: u64, learning_rate: f64, weights: &mut [f32], gradient: &[f32]);
 
-    /// The running averages, by name, each [P].
+    /// The running averages, by name, each `[P]`.
     fn averages(&self) -> Vec<(&'static str, &[f32])>;
 
     /// The same, to be overwritten.
@@ -112,9 +112,9 @@ pub(super) struct Descent {
     optimiser: Box<dyn Optimiser>,
     max_grad_norm: f64,
     n_updates: u64,
-    /// [P] room for the weights.
+    /// `[P]` room for the weights.
     weights: Vec<f32>,
-    /// [P] room for the gradient.
+    /// `[P]` room for the gradient.
     gradient: Vec<f32>,
 }
 
@@ -161,7 +161,7 @@ impl Descent {
         if value.is_finite() { Ok(()) } else { Err(Error::NotFinite { what, value, update: self.n_updates }) }
     }
 
-    /// The running averages as named arrays, each [P].
+    /// The running averages as named arrays, each `[P]`.
     pub(super) fn state(&self) -> Vec<NamedArray> {
         let array = |(name, data): (&str, &[f32])| NamedArray {
             name: name.to_owned(),

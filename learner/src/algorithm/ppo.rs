@@ -112,15 +112,15 @@ pub struct Ppo {
 struct Batch {
     /// What the policy is evaluated on.
     sequences: Sequences,
-    /// [L, M, A].
+    /// `[L, M, A]`.
     actions: Tensor,
-    /// [L, M].
+    /// `[L, M]`.
     old_log_probs: Tensor,
-    /// [L, M].
+    /// `[L, M]`.
     old_values: Tensor,
-    /// [L, M].
+    /// `[L, M]`.
     advantages: Tensor,
-    /// [L, M].
+    /// `[L, M]`.
     returns: Tensor,
 }
 

@@ -53,15 +53,15 @@ pub struct EndedEpisode {
 /// The outcome of a step, in buffers that are used again.
 #[derive(Clone, Debug, Default)]
 pub struct StepReply {
-    /// [N, O] observations; where an episode ended, the first one of the next.
+    /// `[N, O]` observations; where an episode ended, the first one of the next.
     pub observations: Vec<f32>,
-    /// [N] rewards.
+    /// `[N]` rewards.
     pub rewards: Vec<f32>,
-    /// [N] whether the task ended the episode.
+    /// `[N]` whether the task ended the episode.
     pub terminated: Vec<bool>,
-    /// [N] whether the step limit ended it.
+    /// `[N]` whether the step limit ended it.
     pub truncated: Vec<bool>,
-    /// [K, O] last observations of the episodes that ended, in the order of `ended`.
+    /// `[K, O]` last observations of the episodes that ended, in the order of `ended`.
     pub final_observations: Vec<f32>,
     /// The K episodes that ended, in order of slots.
     pub ended: Vec<EndedEpisode>,
@@ -90,7 +90,7 @@ struct Shard {
 }
 
 impl<'a> Session<'a> {
-    /// Opens the environments and writes their first observations [N, O] to `observations`.
+    /// Opens the environments and writes their first observations `[N, O]` to `observations`.
     ///
     /// # Errors
     /// [`ClientError::Refused`] with the server's sentence, [`ClientError::Disagreement`] between servers, and the
@@ -142,8 +142,8 @@ impl<'a> Session<'a> {
         self.observation_size
     }
 
-    /// Advances every environment. `actions` are those of all N environments as the protocol wants them, i32 [N] or
-    /// f32 [N, A]. All servers compute at the same time. Replaces what is in `reply`.
+    /// Advances every environment. `actions` are those of all N environments as the protocol wants them, i32 `[N]` or
+    /// f32 `[N, A]`. All servers compute at the same time. Replaces what is in `reply`.
     ///
     /// # Errors
     /// [`ClientError::Refused`] if the actions are wrong: then no environment of that server has moved. The failures of
@@ -169,7 +169,7 @@ impl<'a> Session<'a> {
         })
     }
 
-    /// Begins a new episode in every environment and writes its first observations [N, O].
+    /// Begins a new episode in every environment and writes its first observations `[N, O]`.
     ///
     /// # Errors
     /// The failures of a connection.

@@ -36,11 +36,11 @@ enum Networks {
 pub struct Acts {
     /// The kind of the actions.
     pub kind: ActionKind,
-    /// [N, A] actions as sampled, not clipped. A discrete action is its index as f32, exact below 2²⁴, with A = 1.
+    /// `[N, A]` actions as sampled, not clipped. A discrete action is its index as f32, exact below 2²⁴, with A = 1.
     pub actions: Vec<f32>,
-    /// [N] log-probabilities (densities, if continuous) of the actions.
+    /// `[N]` log-probabilities (densities, if continuous) of the actions.
     pub log_probs: Vec<f32>,
-    /// [N] values of the observations.
+    /// `[N]` values of the observations.
     pub values: Vec<f32>,
 }
 
@@ -82,7 +82,7 @@ impl Actor {
         Ok(())
     }
 
-    /// Samples an action for each normalised observation of `observations` [N, O], in order of n; draws from `rng` once
+    /// Samples an action for each normalised observation of `observations` `[N, O]`, in order of n; draws from `rng` once
     /// per discrete action and twice per element of a continuous one. Replaces what is in `out`.
     ///
     /// Row n is environment n: a recurrent policy remembers the observation.
@@ -117,7 +117,7 @@ impl Actor {
         Ok(())
     }
 
-    /// Values V of the normalised `observations` [N, O]; replaces what is in `out` [N]. Row n is environment n, whose
+    /// Values V of the normalised `observations` `[N, O]`; replaces what is in `out` `[N]`. Row n is environment n, whose
     /// memory counts, but stays as it is.
     pub fn values(&mut self, observations: &[f32], out: &mut Vec<f32>) -> Result<()> {
         let n_envs = self.count(observations)?;
@@ -182,7 +182,7 @@ impl Acts {
         }
     }
 
-    /// Replaces `bytes` by the actions as the protocol wants them: little-endian i32 [N], or f32 [N, A].
+    /// Replaces `bytes` by the actions as the protocol wants them: little-endian i32 `[N]`, or f32 `[N, A]`.
     pub fn write_bytes(&self, bytes: &mut Vec<u8>) {
         bytes.clear();
         match self.kind {

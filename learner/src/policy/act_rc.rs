@@ -16,7 +16,7 @@ pub(super) struct Recurrent {
     n_outputs: usize,
     /// None without hidden layers.
     hidden: Option<Network>,
-    /// From x and h together, [X + H], to i, f, g and o, [4H].
+    /// From x and h together, `[X + H]`, to i, f, g and o, `[4H]`.
     gates: Dense,
     policy: Dense,
     value: Dense,

@@ -38,7 +38,7 @@ impl Network {
         }
     }
 
-    /// The last layer's outputs for `observations` [N, O], in rows of [`padded`] length.
+    /// The last layer's outputs for `observations` `[N, O]`, in rows of [`padded`] length.
     pub(super) fn forward(&mut self, observations: &[f32], n_envs: usize) -> &[f32] {
         let last = self.layers.len() - 1;
         let [mut inputs, mut outputs] = self.scratch.each_mut().map(Vec::as_mut_slice);

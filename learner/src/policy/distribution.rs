@@ -12,7 +12,7 @@ use crate::random::{normal, uniform};
 /// log 2π.
 const LOG_TAU: f64 = 1.837_877_066_409_345_3;
 
-/// Log-probabilities [B] of `actions` [B, 1] and entropies [B] of the categorical distributions of `logits` [B, n].
+/// Log-probabilities `[B]` of `actions` `[B, 1]` and entropies `[B]` of the categorical distributions of `logits` [B, n].
 pub(super) fn categorical(logits: &Tensor, actions: &Tensor) -> (Tensor, Tensor) {
     let log_probs = logits.log_softmax(-1, Kind::Float);
     let chosen = log_probs.gather(1, &actions.to_kind(Kind::Int64), false).squeeze_dim(1);
@@ -20,8 +20,8 @@ pub(super) fn categorical(logits: &Tensor, actions: &Tensor) -> (Tensor, Tensor)
     (chosen, entropy)
 }
 
-/// Log-densities [B] of `actions` [B, A] and differential entropies [B] of the Gaussians of `means` [B, A] and
-/// `log_std` [A].
+/// Log-densities `[B]` of `actions` `[B, A]` and differential entropies `[B]` of the Gaussians of `means` `[B, A]` and
+/// `log_std` `[A]`.
 pub(super) fn gaussian(means: &Tensor, log_std: &Tensor, actions: &Tensor) -> (Tensor, Tensor) {
     let (batch, size) = (means.size()[0], means.size()[1] as f64);
     let distances = (actions - means) * (-log_std).exp();
@@ -50,7 +50,7 @@ pub(super) fn sample_categorical(logits: &[f32], rng: &mut ChaCha8Rng) -> (usize
     (choice, logits[choice] - greatest - total.ln())
 }
 
-/// Draws an action [A] from the Gaussian of `means` [A] and `log_std` [A] into `action`; two uniform numbers an
+/// Draws an action `[A]` from the Gaussian of `means` `[A]` and `log_std` `[A]` into `action`; two uniform numbers an
 /// element. Gives the log-density.
 pub(super) fn sample_gaussian(means: &[f32], log_std: &[f32], rng: &mut ChaCha8Rng, action: &mut [f32]) -> f32 {
     let mut log_prob = -0.5 * LOG_TAU as f32 * means.len() as f32;

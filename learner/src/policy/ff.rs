@@ -7,7 +7,7 @@ use super::PolicySpec;
 /// Two separate multilayer perceptrons with tanh between layers: one gives logits or means, the other V(s).
 ///
 /// `leaves` are the weights in the order of [`PolicySpec::layout`]. Gives the policy's outputs [B, n or A] and the values
-/// [B] at `observations` [B, O].
+/// `[B]` at `observations` `[B, O]`.
 pub(super) fn forward(spec: &PolicySpec, leaves: &[Tensor], observations: &Tensor) -> (Tensor, Tensor) {
     let depth = 2 * (spec.hidden.len() + 1);
     let outputs = perceptron(&leaves[..depth], observations, false);
@@ -15,7 +15,7 @@ pub(super) fn forward(spec: &PolicySpec, leaves: &[Tensor], observations: &Tenso
     (outputs, values)
 }
 
-/// Runs `observations` [B, O] through the layers whose weights and biases alternate in `leaves`, with tanh between them
+/// Runs `observations` `[B, O]` through the layers whose weights and biases alternate in `leaves`, with tanh between them
 /// and, if `squash_last`, after the last; gives [B, outputs].
 pub(super) fn perceptron(leaves: &[Tensor], observations: &Tensor, squash_last: bool) -> Tensor {
     let n_layers = leaves.len() / 2;

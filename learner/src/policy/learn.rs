@@ -12,12 +12,12 @@ use crate::random::{Purpose, stream};
 /// and the other V(s); or recurrent, hidden layers, an LSTM, and two linear heads. Continuous actions have one more weight
 /// each, log_std, the same in every state.
 ///
-/// All weights lie in one tensor [P], of which those of the layers are views: an optimiser reads, changes and writes
+/// All weights lie in one tensor `[P]`, of which those of the layers are views: an optimiser reads, changes and writes
 /// P numbers at once.
 pub struct Policy {
     spec: PolicySpec,
     layout: Vec<(String, Vec<usize>)>,
-    /// [P], without gradient; shares its storage with `leaves`.
+    /// `[P]`, without gradient; shares its storage with `leaves`.
     all: Tensor,
     /// In order of `layout`, with gradients.
     leaves: Vec<Tensor>,
@@ -28,11 +28,11 @@ pub struct Policy {
 /// A policy's view of B observations and actions.
 #[derive(Debug)]
 pub struct Evaluated {
-    /// [B] log-probabilities (densities, if continuous) of the actions.
+    /// `[B]` log-probabilities (densities, if continuous) of the actions.
     pub log_probs: Tensor,
-    /// [B] entropies of the action distributions, in nats.
+    /// `[B]` entropies of the action distributions, in nats.
     pub entropy: Tensor,
-    /// [B] values.
+    /// `[B]` values.
     pub values: Tensor,
     /// What the gradient of a recurrence needs.
     tape: Option<rc::Tape>,
@@ -93,8 +93,8 @@ impl Policy {
         &self.spec
     }
 
-    /// Log-probabilities of `actions` [L, M, A] (a discrete action is its index, A = 1), entropies, and values over
-    /// `sequences`, all f32 [B] and, by [`Policy::gradient`], differentiable in the weights. A recurrent policy begins with
+    /// Log-probabilities of `actions` `[L, M, A]` (a discrete action is its index, A = 1), entropies, and values over
+    /// `sequences`, all f32 `[B]` and, by [`Policy::gradient`], differentiable in the weights. A recurrent policy begins with
     /// the sequences' memory, and with none at the start of every episode; nothing flows back to what was before.
     ///
     /// # Panics
@@ -130,19 +130,19 @@ impl Policy {
         self.all.numel()
     }
 
-    /// Copies the weights to `weights` [P].
+    /// Copies the weights to `weights` `[P]`.
     pub(crate) fn read(&self, weights: &mut [f32]) {
         self.all.copy_data(weights, self.n_weights());
     }
 
-    /// Replaces the weights by `weights` [P].
+    /// Replaces the weights by `weights` `[P]`.
     pub(crate) fn write(&mut self, weights: &[f32]) -> Result<()> {
         check_length("weights [P]", weights.len(), self.n_weights())?;
         Ok(tch::no_grad(|| self.all.f_copy_(&Tensor::f_of_slice(weights)?))?)
     }
 
     /// Writes the gradient of `loss`, which was computed from `evaluated` and from nothing else of this policy, in the
-    /// weights to `gradient` [P]. Uses up the graph: there is one gradient an evaluation.
+    /// weights to `gradient` `[P]`. Uses up the graph: there is one gradient an evaluation.
     pub fn gradient(&self, evaluated: &Evaluated, loss: &Tensor, gradient: &mut [f32]) -> Result<()> {
         check_length("gradient [P]", gradient.len(), self.n_weights())?;
         let gradients = match &evaluated.tape {

@@ -64,8 +64,8 @@ pub struct PolicySpec {
     pub observation_size: usize,
     /// The actions.
     pub action: ActionKind,
-    /// Widths of the hidden layers. Feed-forward: of the policy network and of the value network; the paper uses [64, 64].
-    /// Recurrent: of the one network below the LSTM; the paper uses [256, 256].
+    /// Widths of the hidden layers. Feed-forward: of the policy network and of the value network; the paper uses `[64, 64]`.
+    /// Recurrent: of the one network below the LSTM; the paper uses `[256, 256]`.
     pub hidden: Vec<usize>,
     /// H: width of the LSTM of a recurrent policy, for which the paper uses 256; None for a feed-forward one.
     #[serde(default)]
@@ -103,10 +103,10 @@ impl PolicySpec {
 
     /// Names and shapes of the weights, in order.
     ///
-    /// Feed-forward: "policy.0.weight" [out, in], "policy.0.bias" [out], …, "value.0.weight", …. Recurrent:
-    /// "hidden.0.weight" [out, in], "hidden.0.bias" [out], …, "lstm.input.weight" [4H, in], "lstm.recurrent.weight"
-    /// [4H, H], "lstm.bias" [4H], "policy.weight" [out, H], "policy.bias", "value.weight" [1, H], "value.bias"; the rows
-    /// of the LSTM are those of its gates i, f, g, o. Both: "log_std" [A] for continuous actions.
+    /// Feed-forward: "policy.0.weight" [out, in], "policy.0.bias" `[out]`, …, "value.0.weight", …. Recurrent:
+    /// "hidden.0.weight" [out, in], "hidden.0.bias" `[out]`, …, "lstm.input.weight" [4H, in], "lstm.recurrent.weight"
+    /// `[4H, H]`, "lstm.bias" `[4H]`, "policy.weight" [out, H], "policy.bias", "value.weight" `[1, H]`, "value.bias"; the rows
+    /// of the LSTM are those of its gates i, f, g, o. Both: "log_std" `[A]` for continuous actions.
     pub fn layout(&self) -> Vec<(String, Vec<usize>)> {
         let mut layout = Vec::new();
         let linear = |name: &str, inputs: usize, outputs: usize| {

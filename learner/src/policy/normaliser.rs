@@ -98,7 +98,7 @@ impl ObservationNormaliser {
         &self.moments
     }
 
-    /// Adds `observations` [N, O] to the statistics. Infinite numbers and NaN are refused and change nothing.
+    /// Adds `observations` `[N, O]` to the statistics. Infinite numbers and NaN are refused and change nothing.
     pub fn update(&mut self, observations: &[f32]) -> Result<()> {
         let size = self.moments.mean.len();
         check_length("observations [N, O]", observations.len(), observations.len() / size * size)?;
@@ -110,7 +110,7 @@ impl ObservationNormaliser {
         self.moments.merge(&RunningMoments::of(&rows, size))
     }
 
-    /// Normalises `observations` [N, O] in place. The statistics stay.
+    /// Normalises `observations` `[N, O]` in place. The statistics stay.
     pub fn normalise(&self, observations: &mut [f32]) -> Result<()> {
         let size = self.moments.mean.len();
         check_length("observations [N, O]", observations.len(), observations.len() / size * size)?;
@@ -132,7 +132,7 @@ impl ObservationNormaliser {
 #[serde(deny_unknown_fields)]
 pub struct RewardNormaliser {
     gamma: f64,
-    /// [N] R of the running episodes.
+    /// `[N]` R of the running episodes.
     returns: Vec<f64>,
     moments: RunningMoments,
 }
@@ -148,7 +148,7 @@ impl RewardNormaliser {
         &self.moments
     }
 
-    /// Adds a step's `rewards` [N] to the statistics. Where `done` [N], terminated or truncated, the discounted return
+    /// Adds a step's `rewards` `[N]` to the statistics. Where `done` `[N]`, terminated or truncated, the discounted return
     /// starts again from 0 in the next step. Infinite numbers and NaN are refused and change nothing.
     pub fn update(&mut self, rewards: &[f32], done: &[bool]) -> Result<()> {
         check_length("rewards [N]", rewards.len(), self.returns.len())?;

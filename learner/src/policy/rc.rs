@@ -30,11 +30,11 @@ use crate::error::Result;
 
 /// The weights by their places, in the order of [`PolicySpec::layout`].
 struct Places {
-    /// W_x [4H, X]; all before it are hidden layers.
+    /// W_x `[4H, X]`; all before it are hidden layers.
     input: usize,
-    /// W_h [4H, H].
+    /// W_h `[4H, H]`.
     recurrent: usize,
-    /// b [4H].
+    /// b `[4H]`.
     bias: usize,
     /// Weight and bias of the policy's head, then of the value's; all after it belongs to the heads' graph too.
     heads: usize,
@@ -50,23 +50,23 @@ impl Places {
 /// What the second stage needs of the first.
 #[derive(Debug)]
 pub(super) struct Tape {
-    /// W_x x + b [L·M, 4H], with a graph to the layers below.
+    /// W_x x + b `[L·M, 4H]`, with a graph to the layers below.
     driven: Tensor,
-    /// h [L·M, H], where the heads' graph begins.
+    /// h `[L·M, H]`, where the heads' graph begins.
     hidden: Tensor,
-    /// σ(i), σ(f), tanh g, σ(o) [L, M, 4H].
+    /// σ(i), σ(f), tanh g, σ(o) `[L, M, 4H]`.
     gates: Tensor,
-    /// c [L, M, H].
+    /// c `[L, M, H]`.
     cells: Tensor,
-    /// h' [L, M, H].
+    /// h' `[L, M, H]`.
     hidden_before: Tensor,
-    /// c' [L, M, H].
+    /// c' `[L, M, H]`.
     cells_before: Tensor,
-    /// [L, M, 1]: 0 where an episode starts, else 1.
+    /// `[L, M, 1]`: 0 where an episode starts, else 1.
     keep: Tensor,
 }
 
-/// Gives the policy's outputs [B, n or A] and the values [B] over `sequences`, B = L·M, and the tape; `plain` leaves all
+/// Gives the policy's outputs [B, n or A] and the values `[B]` over `sequences`, B = L·M, and the tape; `plain` leaves all
 /// to libtorch, for comparison, and gives none.
 pub(super) fn forward(
     spec: &PolicySpec,
@@ -91,7 +91,7 @@ pub(super) fn forward(
     (outputs, values, tape)
 }
 
-/// The loop over time, for autograd: h [L·M, H].
+/// The loop over time, for autograd: h `[L·M, H]`.
 fn unrolled(driven: &Tensor, recurrent: &Tensor, sequences: &Sequences) -> Tensor {
     let (steps, count, width) = (sequences.n_steps(), sequences.count(), recurrent.size()[1]);
     let keep = sequences.keep();
@@ -168,7 +168,7 @@ pub(super) fn backward(spec: &PolicySpec, leaves: &[Tensor], loss: &Tensor, tape
     Ok(gradients)
 }
 
-/// D [L·M, 4H] from ∂loss/∂h [L·M, H], the loop backwards in time.
+/// D `[L·M, 4H]` from ∂loss/∂h `[L·M, H]`, the loop backwards in time.
 fn deltas(recurrent: &Tensor, of_hidden: &Tensor, tape: &Tape) -> Tensor {
     let [steps, count, width] = [0, 1, 2].map(|axis: usize| tape.cells.size()[axis]);
     let of_hidden = of_hidden.view((steps, count, width));

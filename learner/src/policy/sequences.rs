@@ -12,17 +12,17 @@ use crate::error::{Result, check_length};
 /// and minibatches of sequences are right for both.
 #[derive(Debug)]
 pub struct Sequences {
-    /// [L, M, O].
+    /// `[L, M, O]`.
     observations: Tensor,
-    /// [L, M]: 1 where an episode starts, else 0.
+    /// `[L, M]`: 1 where an episode starts, else 0.
     starts: Tensor,
-    /// [M, S], S = [`PolicySpec::memory_size`].
+    /// `[M, S]`, S = [`PolicySpec::memory_size`].
     memory: Tensor,
 }
 
 impl Sequences {
-    /// The sequences of T steps of N environments: normalised `observations` [T, N, O], `starts` [T, N], whether an
-    /// episode starts with that step, and `memory` [N, S] before the first. N is the length of `starts` / `n_steps`.
+    /// The sequences of T steps of N environments: normalised `observations` `[T, N, O]`, `starts` `[T, N]`, whether an
+    /// episode starts with that step, and `memory` `[N, S]` before the first. N is the length of `starts` / `n_steps`.
     ///
     /// # Errors
     /// Lengths that do not fit.
@@ -65,23 +65,23 @@ impl Sequences {
         })
     }
 
-    /// The observations of all samples [B, O].
+    /// The observations of all samples `[B, O]`.
     pub(super) fn flat_observations(&self) -> Tensor {
         self.observations.flatten(0, 1)
     }
 
-    /// [L, M, 1]: 0 where an episode starts, else 1.
+    /// `[L, M, 1]`: 0 where an episode starts, else 1.
     pub(super) fn keep(&self) -> Tensor {
         (1f64 - &self.starts).unsqueeze(2)
     }
 
-    /// [L]: whether an episode starts in any sequence.
+    /// `[L]`: whether an episode starts in any sequence.
     pub(super) fn steps_with_starts(&self) -> Vec<bool> {
         let counts = self.starts.sum_dim_intlist(Some([1i64].as_slice()), false, Kind::Float);
         Vec::<f32>::from(counts).into_iter().map(|count| count > 0.0).collect()
     }
 
-    /// The memory's halves before the first step, h and c, [M, H] each.
+    /// The memory's halves before the first step, h and c, `[M, H]` each.
     pub(super) fn initial_memory(&self, width: i64) -> (Tensor, Tensor) {
         (self.memory.narrow(1, 0, width), self.memory.narrow(1, width, width))
     }

@@ -17,26 +17,26 @@
 pub struct Trajectories<'a> {
     /// N.
     pub n_envs: usize,
-    /// [T, N] rewards r_t, received after the action at s_t.
+    /// `[T, N]` rewards r_t, received after the action at s_t.
     pub rewards: &'a [f32],
-    /// [T, N] values V(s_t).
+    /// `[T, N]` values V(s_t).
     pub values: &'a [f32],
-    /// [T, N] whether the task ended the episode in step t.
+    /// `[T, N]` whether the task ended the episode in step t.
     pub terminated: &'a [bool],
-    /// [T, N] whether the time limit did.
+    /// `[T, N]` whether the time limit did.
     pub truncated: &'a [bool],
-    /// [T, N] V(final observation) where truncated; ignored elsewhere.
+    /// `[T, N]` V(final observation) where truncated; ignored elsewhere.
     pub truncation_values: &'a [f32],
-    /// [N] V(s_T); ignored where step T-1 ended an episode.
+    /// `[N]` V(s_T); ignored where step T-1 ended an episode.
     pub last_values: &'a [f32],
 }
 
 /// Advantages and value targets.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Estimates {
-    /// [T, N] how much better the action was than expected.
+    /// `[T, N]` how much better the action was than expected.
     pub advantages: Vec<f32>,
-    /// [T, N] what V(s_t) should have been.
+    /// `[T, N]` what V(s_t) should have been.
     pub returns: Vec<f32>,
 }
 

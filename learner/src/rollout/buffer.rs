@@ -6,23 +6,23 @@ use crate::error::{Error, Result, check_length};
 /// One step of N environments, as it is pushed.
 #[derive(Clone, Copy, Debug)]
 pub struct RolloutStep<'a> {
-    /// [N, O] observations s_t that the actions were chosen on, normalised.
+    /// `[N, O]` observations s_t that the actions were chosen on, normalised.
     pub observations: &'a [f32],
-    /// [N] whether s_t is the first that the policy remembers: its memory was emptied before it.
+    /// `[N]` whether s_t is the first that the policy remembers: its memory was emptied before it.
     pub starts: &'a [bool],
-    /// [N, A] actions, as in [`Acts`](crate::policy::Acts).
+    /// `[N, A]` actions, as in [`Acts`](crate::policy::Acts).
     pub actions: &'a [f32],
-    /// [N] log-probabilities of the actions under the acting policy.
+    /// `[N]` log-probabilities of the actions under the acting policy.
     pub log_probs: &'a [f32],
-    /// [N] V(s_t).
+    /// `[N]` V(s_t).
     pub values: &'a [f32],
-    /// [N] rewards r_t that the actions brought, normalised.
+    /// `[N]` rewards r_t that the actions brought, normalised.
     pub rewards: &'a [f32],
-    /// [N] whether the task ended the episode.
+    /// `[N]` whether the task ended the episode.
     pub terminated: &'a [bool],
-    /// [N] whether the time limit ended it.
+    /// `[N]` whether the time limit ended it.
     pub truncated: &'a [bool],
-    /// [N] V(final observation) where truncated; ignored elsewhere.
+    /// `[N]` V(final observation) where truncated; ignored elsewhere.
     pub truncation_values: &'a [f32],
 }
 
@@ -75,7 +75,7 @@ impl Rollout {
         }
     }
 
-    /// Forgets all steps, and takes over what the policy remembers before the first: `memory` [N, S], empty for a
+    /// Forgets all steps, and takes over what the policy remembers before the first: `memory` `[N, S]`, empty for a
     /// feed-forward policy. Allocated room is kept.
     pub fn begin(&mut self, memory: &[f32]) {
         self.clear();
@@ -127,7 +127,7 @@ impl Rollout {
         Ok(())
     }
 
-    /// Sets `last_values` [N] = V(s_T), where s_T are the observations after the last step. Comes after the last
+    /// Sets `last_values` `[N]` = V(s_T), where s_T are the observations after the last step. Comes after the last
     /// [`Rollout::push`] and before an update.
     pub fn finish(&mut self, last_values: &[f32]) -> Result<()> {
         if !self.is_full() {
@@ -192,32 +192,32 @@ impl Rollout {
         self.action_width
     }
 
-    /// [T, N, O].
+    /// `[T, N, O]`.
     pub fn observations(&self) -> &[f32] {
         &self.observations
     }
 
-    /// [T, N] whether the policy's memory was emptied before the step.
+    /// `[T, N]` whether the policy's memory was emptied before the step.
     pub fn starts(&self) -> &[bool] {
         &self.starts
     }
 
-    /// [N, S] what the policy remembered before the first step.
+    /// `[N, S]` what the policy remembered before the first step.
     pub fn memory(&self) -> &[f32] {
         &self.memory
     }
 
-    /// [T, N, A].
+    /// `[T, N, A]`.
     pub fn actions(&self) -> &[f32] {
         &self.actions
     }
 
-    /// [T, N].
+    /// `[T, N]`.
     pub fn log_probs(&self) -> &[f32] {
         &self.log_probs
     }
 
-    /// [T, N].
+    /// `[T, N]`.
     pub fn values(&self) -> &[f32] {
         &self.values
     }

@@ -33,9 +33,9 @@ pub struct Collector<'a> {
     rng: ChaCha8Rng,
     normalisers: Normalisers,
     observation_size: usize,
-    /// [N, O] normalised observations that the next actions are chosen on.
+    /// `[N, O]` normalised observations that the next actions are chosen on.
     observations: Vec<f32>,
-    /// [N] whether those are the first of an episode.
+    /// `[N]` whether those are the first of an episode.
     starts: Vec<bool>,
     times: Times,
     // Buffers of a step.
@@ -68,7 +68,7 @@ pub struct Times {
 }
 
 impl<'a> Collector<'a> {
-    /// Collects from `session`, whose first observations [N, O] are given. `seed` fixes the sampled actions.
+    /// Collects from `session`, whose first observations `[N, O]` are given. `seed` fixes the sampled actions.
     ///
     /// # Errors
     /// [`CollectError::Numbers`] if an observation is not finite.
@@ -182,7 +182,7 @@ impl<'a> Collector<'a> {
 }
 
 impl Normalisers {
-    /// Adds `observations` [N, O] to the statistics and normalises them.
+    /// Adds `observations` `[N, O]` to the statistics and normalises them.
     fn take_observations(&mut self, observations: &mut [f32]) -> crate::error::Result<()> {
         match &mut self.observations {
             Some(normaliser) => normaliser.update(observations).and_then(|()| normaliser.normalise(observations)),
@@ -190,7 +190,7 @@ impl Normalisers {
         }
     }
 
-    /// Adds `rewards` [N] to the statistics and normalises them.
+    /// Adds `rewards` `[N]` to the statistics and normalises them.
     fn take_rewards(&mut self, rewards: &mut [f32], done: &[bool]) -> crate::error::Result<()> {
         if let Some(normaliser) = &mut self.rewards {
             normaliser.update(rewards, done)?;
