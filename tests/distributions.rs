@@ -230,7 +230,7 @@ fn an_override_does_not_move_the_other_parameters_draws() {
 fn unions_that_are_none_are_refused() {
     let (inf, nan) = (f64::INFINITY, f64::NAN);
     let cases: &[(&[(f64, f64)], &str)] = &[
-        (&[], "at least one interval"),
+        (&[], "1 to 64 intervals"),
         (&[(nan, 1.0)], "finite ends"),
         (&[(0.0, nan)], "finite ends"),
         (&[(-inf, 1.0)], "finite ends"),
@@ -252,6 +252,22 @@ fn unions_that_are_none_are_refused() {
             }
             other => panic!("{pairs:?}: {other:?}"),
         }
+    }
+}
+
+#[test]
+fn a_distribution_has_at_most_64_intervals_and_refusals_stay_short() {
+    let intervals = |n: u32| (0..n).map(|i| Interval::new(i.into(), f64::from(i) + 0.5)).collect::<Vec<_>>();
+    assert!(Distribution::union("mass", &intervals(64)).is_ok());
+    let long = "m".repeat(1_000_000);
+    let refusals = [
+        Distribution::union("mass", &intervals(65)).unwrap_err(),
+        Distribution::union(&long, &intervals(100_000)).unwrap_err(),
+        env::find(&long).unwrap_err(),
+        resolve(env::find("Pendulum").unwrap(), &mut [], [(long.as_str(), Distribution::fixed(1.0))]).unwrap_err(),
+    ];
+    for refusal in refusals {
+        assert!(refusal.to_string().len() < 600, "{} bytes", refusal.to_string().len());
     }
 }
 

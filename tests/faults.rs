@@ -161,7 +161,7 @@ async fn wrong_requests_before_open_are_refused_and_open_still_works() {
         (bad(|o| o.first_environment_index = u32::MAX - 2), InvalidArgument, &["below 2^32"]),
         (set("Force", &[(1.0, 1.0)]), NotFound, &["\"Force\"", "force, length, mass"]),
         (set("", &[(1.0, 1.0)]), NotFound, &["force, length, mass"]),
-        (set("force", &[]), InvalidArgument, &["\"force\"", "empty", "at least one interval"]),
+        (set("force", &[]), InvalidArgument, &["\"force\"", "empty", "1 to 64 intervals"]),
         (set("force", &[(nan, 1.0)]), InvalidArgument, &["\"force\"", "NaN", "finite"]),
         (set("force", &[(1.0, inf)]), InvalidArgument, &["inf", "finite"]),
         (set("force", &[(-inf, inf)]), InvalidArgument, &["-inf", "finite"]),

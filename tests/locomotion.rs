@@ -326,8 +326,7 @@ fn endure(make: Make, corner: [f64; 3], actions: Actions, n_steps: usize) {
 
 #[test]
 fn nothing_diverges_in_the_corners_of_the_extreme_sets() {
-    // 10⁵ steps a corner and robot. Twice that, 10⁵ of each kind, also holds but takes two minutes of one core.
-    const STEPS: usize = 50_000;
+    const STEPS: usize = 100_000;
     thread::scope(|scope| {
         for make in ROBOTS {
             scope.spawn(move || {

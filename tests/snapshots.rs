@@ -308,6 +308,13 @@ fn every_truncated_snapshot_is_refused() {
     }
 }
 
+#[test]
+fn a_snapshot_with_something_behind_it_is_refused() {
+    for spec in env::specs() {
+        refused(other(spec).restore(&[used(spec).snapshot(), vec![0]].concat()));
+    }
+}
+
 /// Restores what may be no snapshot: refused without a change, or taken without harm.
 fn try_restore(spec: &EnvironmentSpec, bytes: &[u8]) -> Result<(), TestCaseError> {
     let mut e = other(spec);
@@ -447,6 +454,22 @@ async fn a_refused_restore_of_several_changes_nothing_in_any_shard() {
         batch.restore(before.into_iter().enumerate().collect()).await.unwrap();
         assert!(run(&mut batch, 9..30).await == after, "{}", spec.name);
     }
+}
+
+#[tokio::test]
+async fn an_environment_saved_after_its_end_is_restored_in_next_step_mode_and_refused_in_same_step_mode() {
+    let spec = env::find("CartPole").unwrap();
+    let pool = Pool::new(1, 2).unwrap();
+    let (mut next, ..) = Batch::open(&pool, batch_settings(spec, 1, 1, Autoreset::NextStep)).await.unwrap();
+    while next.step(&0_i32.to_le_bytes()).await.unwrap().ended.is_empty() {}
+    let ended = next.snapshot(vec![0]).await.unwrap().remove(0);
+    next.step(&0_i32.to_le_bytes()).await.unwrap();
+    next.restore(vec![(0, ended.clone())]).await.unwrap();
+    let (mut same, ..) = Batch::open(&pool, batch_settings(spec, 1, 1, Autoreset::SameStep)).await.unwrap();
+    let before = same.snapshot(vec![0]).await.unwrap();
+    let refused = same.restore(vec![(0, ended)]).await;
+    assert!(matches!(refused, Err(pool::Error::Environment(Error::Snapshot { .. }))), "{refused:?}");
+    assert_eq!(same.snapshot(vec![0]).await.unwrap(), before);
 }
 
 #[tokio::test]

@@ -8,7 +8,7 @@ use perturb::{
 };
 use std::{
     error::Error,
-    io::{self, IsTerminal, Read},
+    io::{self, IsTerminal, Read, Write},
     process::ExitCode,
 };
 use tokio::{
@@ -48,7 +48,8 @@ fn run(config: &Config) -> Result<(), Box<dyn Error>> {
         let mut listeners = Vec::new();
         for address in &config.listen {
             let listener = Listener::bind(address).await?;
-            println!("listening on {}", listener.address()?);
+            // Whoever started the server need not read on.
+            let _ = writeln!(io::stdout(), "listening on {}", listener.address()?);
             listeners.push(listener);
         }
         server::run(listeners, config, shutdown).await?;

@@ -1,6 +1,6 @@
 //! Every environment there is, by name.
 
-use super::{Environment, EnvironmentSpec, Error};
+use super::{Environment, EnvironmentSpec, Error, shorten};
 use crate::classic;
 #[cfg(feature = "mujoco")]
 use crate::locomotion;
@@ -48,5 +48,5 @@ fn entry(name: &str) -> Result<&'static (&'static EnvironmentSpec, Make), Error>
     CATALOGUE
         .iter()
         .find(|(spec, _)| spec.name == name)
-        .ok_or_else(|| Error::UnknownEnvironment { name: name.into(), known: names().collect::<Vec<_>>().join(", ") })
+        .ok_or_else(|| Error::UnknownEnvironment { name: shorten(name), known: names().collect::<Vec<_>>().join(", ") })
 }

@@ -105,7 +105,7 @@ pub struct Episodes {
 impl Episodes {
     /// Takes an environment and begins its first episode.
     pub fn new(environment: Box<dyn Environment>, settings: Settings) -> Self {
-        debug_assert_eq!(settings.distributions.len(), environment.spec().parameters.len());
+        assert_eq!(settings.distributions.len(), environment.spec().parameters.len(), "one for each parameter");
         let values = vec![0.0; settings.distributions.len()];
         let mut episodes = Self { environment, settings, values, progress: Progress::default() };
         episodes.start(None);
@@ -173,7 +173,6 @@ impl Episodes {
 
     /// Advances the running episode by one step. `reward_terms` is scratch of the spec's number of terms.
     pub fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Outcome {
-        debug_assert!(!self.progress.ended, "the pool never steps an ended episode");
         let transition = self.environment.step(action, reward_terms);
         let reward = reward_terms.iter().sum();
         let progress = &mut self.progress;

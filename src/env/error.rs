@@ -1,5 +1,16 @@
 //! What can be wrong with a request about environments.
 
+/// The most characters of a client's text that a refusal repeats.
+const MOST_SHOWN: usize = 100;
+
+/// A client's text, short enough to be repeated to it.
+pub(crate) fn shorten(text: &str) -> String {
+    match text.char_indices().nth(MOST_SHOWN) {
+        Some((end, _)) => format!("{}…", &text[..end]),
+        None => text.into(),
+    }
+}
+
 /// A refused request. Nothing was changed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]

@@ -10,6 +10,7 @@ mod spaces;
 pub use catalogue::{find, make, names, specs};
 pub use episode::{EpisodeEnd, EpisodeId, EpisodeStart, Episodes, Outcome, Receipt, Settings};
 pub use error::Error;
+pub(crate) use error::shorten;
 pub use seeding::{Purpose, Stream};
 pub use spaces::{Action, ActionSpace, Channel, EnvironmentSpec, Quantity, RewardTerm, SuccessRule};
 

@@ -84,7 +84,7 @@ impl Episodes {
     /// Decodes a snapshot and checks all that can be wrong with it, short of the physics' own state.
     fn check(&self, snapshot: &[u8]) -> Result<(Saved, Vec<Distribution>), Error> {
         let refuse = |reason: String| Err(Error::Snapshot { reason });
-        let Ok(saved) = postcard::from_bytes::<Saved>(snapshot) else {
+        let Ok((saved, [])) = postcard::take_from_bytes::<Saved>(snapshot) else {
             return refuse(format!("its {} bytes are not a snapshot", snapshot.len()));
         };
         let spec = self.spec();

@@ -80,8 +80,8 @@ impl Joint {
 impl Pristine {
     fn compile(task: &Task) -> Result<Self, SimulationError> {
         let model = Model::from_xml(task.mjcf)?;
-        debug_assert_eq!(model.timestep(), TIMESTEP);
-        debug_assert_eq!((model.n_q(), model.n_act()), (N_ROOT + task.joints.len(), 0));
+        assert_eq!(model.timestep(), TIMESTEP, "the control timestep is four of these");
+        assert_eq!((model.n_q(), model.n_act()), (N_ROOT + task.joints.len(), 0), "the model does not fit the task");
         let (qpos, dof) = (model.joint_qpos_address(), model.joint_dof_address());
         let all: Vec<Joint> = qpos
             .zip(dof)

@@ -1,7 +1,12 @@
 //! Uniform distributions over unions of intervals, as data.
 
-use crate::env::Error;
+use crate::env::{Error, shorten};
 use std::fmt;
+
+/// The most intervals of one distribution: every environment holds its own copy.
+const MOST_INTERVALS: usize = 64;
+/// The most intervals that a refusal repeats.
+const SHOWN_INTERVALS: usize = 8;
 
 /// The closed interval [low, high].
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -35,25 +40,33 @@ impl fmt::Display for Interval {
 pub struct Distribution(Vec<Interval>);
 
 impl Distribution {
-    /// Always `value`, which must be finite.
+    /// Always `value`.
+    ///
+    /// # Panics
+    /// If it is not finite.
     pub fn fixed(value: f64) -> Self {
-        debug_assert!(value.is_finite());
+        assert!(value.is_finite(), "a fixed value of {value}");
         Self(vec![Interval::new(value, value)])
     }
 
     /// Over the union of `intervals`, for the parameter of that name.
     ///
     /// # Errors
-    /// [`Error::Distribution`] unless there is at least one interval, all ends are finite, each `low` is at most its
+    /// [`Error::Distribution`] unless there are 1 to 64 intervals, all ends are finite, each `low` is at most its
     /// `high`, they ascend without overlap, and of several each has a positive length.
     pub fn union(parameter: &str, intervals: &[Interval]) -> Result<Self, Error> {
         let refuse = |expected| {
-            let got = intervals.iter().map(Interval::to_string).collect::<Vec<_>>().join(" ∪ ");
-            let got = if got.is_empty() { "empty".into() } else { got };
-            Err(Error::Distribution { parameter: parameter.into(), got, expected })
+            let shown = &intervals[..intervals.len().min(SHOWN_INTERVALS)];
+            let mut got = shown.iter().map(Interval::to_string).collect::<Vec<_>>().join(" ∪ ");
+            if intervals.is_empty() {
+                got = "empty".into();
+            } else if intervals.len() > SHOWN_INTERVALS {
+                got = format!("{got} ∪ … ({} intervals)", intervals.len());
+            }
+            Err(Error::Distribution { parameter: shorten(parameter), got, expected })
         };
-        if intervals.is_empty() {
-            return refuse("at least one interval");
+        if !(1..=MOST_INTERVALS).contains(&intervals.len()) {
+            return refuse("1 to 64 intervals");
         }
         if intervals.iter().any(|i| !i.low.is_finite() || !i.high.is_finite()) {
             return refuse("finite ends");

@@ -1,7 +1,7 @@
 //! A physical parameter, and the three versions of an environment.
 
 use super::{Distribution, Interval};
-use crate::env::{EnvironmentSpec, Error};
+use crate::env::{EnvironmentSpec, Error, shorten};
 
 /// Where parameters come from: the three versions of every environment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -77,7 +77,7 @@ pub fn resolve<'a>(
     for (name, distribution) in overrides {
         let position = spec.parameters.iter().position(|p| p.name == name).ok_or_else(|| Error::UnknownParameter {
             environment: spec.name,
-            name: name.into(),
+            name: shorten(name),
             known: spec.parameters.iter().map(|p| p.name).collect::<Vec<_>>().join(", "),
         })?;
         let parameter = &spec.parameters[position];

@@ -165,7 +165,7 @@ impl Shard {
         for slot in 0..self.size {
             let episodes = &mut self.slots[slot];
             if episodes.ended() {
-                // Only next-step mode gets here: same-step leaves none ended, and disabled refuses the step.
+                // Only next-step mode gets here: same-step leaves none ended and restores none, disabled refuses the step.
                 episodes.begin(None);
                 self.rewards[slot] = 0.0;
                 self.terminated[slot] = 0;
@@ -219,7 +219,11 @@ impl Shard {
         self.backups.clear();
         for (slot, snapshot) in entries {
             self.backups.push((*slot, self.slots[*slot].snapshot()));
-            if let Err(error) = self.slots[*slot].restore(snapshot) {
+            let restored = self.slots[*slot].restore(snapshot);
+            let ended = self.autoreset == Autoreset::SameStep && self.slots[*slot].ended();
+            let refused =
+                || env::Error::Snapshot { reason: "its episode has ended, which same-step mode resets".into() };
+            if let Err(error) = restored.and_then(|()| if ended { Err(refused()) } else { Ok(()) }) {
                 self.failure = Some(error);
                 return;
             }

@@ -1,12 +1,17 @@
 //! Binding addresses: TCP ports and Unix sockets.
 
 use crate::config::Address;
+use futures_util::{Stream, stream};
+use std::time::Duration;
 use std::{
     io::{self, ErrorKind},
     os::unix::{fs::FileTypeExt, net::UnixStream as StdUnixStream},
     path::PathBuf,
 };
-use tokio::net::{TcpListener, UnixListener};
+use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
+
+/// How long to wait where the system has no room for another connection.
+const PAUSE: Duration = Duration::from_millis(200);
 
 /// A bound address.
 pub enum Listener {
@@ -14,6 +19,38 @@ pub enum Listener {
     Tcp(TcpListener),
     /// A Unix socket, whose file is removed when this is dropped.
     Unix(UnixListener, SocketFile),
+}
+
+/// Connections as they come, without Nagle's delay: a step is one small message each way.
+pub fn tcp_connections(listener: TcpListener) -> impl Stream<Item = io::Result<TcpStream>> {
+    stream::unfold(listener, |listener| async {
+        let connection = loop {
+            match listener.accept().await {
+                Ok((connection, _)) => break connection,
+                Err(error) => pause(&error).await,
+            }
+        };
+        Some((connection.set_nodelay(true).map(|()| connection), listener))
+    })
+}
+
+/// Connections as they come. The socket's file is removed when the stream is dropped.
+pub fn unix_connections(listener: UnixListener, file: SocketFile) -> impl Stream<Item = io::Result<UnixStream>> {
+    stream::unfold((listener, file), |(listener, file)| async {
+        let connection = loop {
+            match listener.accept().await {
+                Ok((connection, _)) => break connection,
+                Err(error) => pause(&error).await,
+            }
+        };
+        Some((Ok(connection), (listener, file)))
+    })
+}
+
+/// Out of file descriptors, most likely: trying again at once would keep the thread from those it serves.
+async fn pause(error: &io::Error) {
+    tracing::warn!(%error, "cannot accept a connection");
+    tokio::time::sleep(PAUSE).await;
 }
 
 /// Removes a socket's file when it is dropped.

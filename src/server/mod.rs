@@ -23,8 +23,7 @@ use drain::{Controller, Phase};
 use listen::Listener;
 use service::Service;
 use std::{future::Future, io, sync::Arc, time::Duration};
-use tokio_stream::wrappers::UnixListenerStream;
-use tonic::transport::{Server, server::TcpIncoming};
+use tonic::transport::Server;
 use tonic_health::ServingStatus;
 
 /// A session's request for a large batch should not wait for the window: 4 MiB.
@@ -91,11 +90,10 @@ pub async fn run(listeners: Vec<Listener>, config: &Config, shutdown: impl Futur
             let end = async move { closed.closed().await };
             match listener {
                 Listener::Tcp(listener) => {
-                    let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
-                    router.serve_with_incoming_shutdown(incoming, end).await
+                    router.serve_with_incoming_shutdown(listen::tcp_connections(listener), end).await
                 }
-                Listener::Unix(listener, _file) => {
-                    router.serve_with_incoming_shutdown(UnixListenerStream::new(listener), end).await
+                Listener::Unix(listener, file) => {
+                    router.serve_with_incoming_shutdown(listen::unix_connections(listener, file), end).await
                 }
             }
         });

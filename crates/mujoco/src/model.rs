@@ -154,11 +154,6 @@ impl Model {
         self.raw().opt.timestep
     }
 
-    /// The initial coordinates, `[Q]`.
-    pub fn qpos0(&self) -> &[f64] {
-        self.array(self.raw().qpos0, self.n_q())
-    }
-
     /// Masses in kg, `[B]`.
     pub fn body_mass(&self) -> &[f64] {
         self.array(self.raw().body_mass, self.n_body())
@@ -172,11 +167,6 @@ impl Model {
     /// Sliding, torsional and rolling friction, `[G, 3]`.
     pub fn geom_friction(&self) -> &[f64] {
         self.array(self.raw().geom_friction, 3 * self.n_geom())
-    }
-
-    /// The body that each geom belongs to, `[G]`.
-    pub fn geom_body(&self) -> impl ExactSizeIterator<Item = usize> {
-        self.array(self.raw().geom_bodyid, self.n_geom()).iter().map(|&id| id as usize)
     }
 
     /// Where each joint's coordinates begin in `qpos`, `[J]`.
