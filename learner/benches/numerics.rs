@@ -11,7 +11,7 @@ use perturb_learner::random::{Purpose, normal, stream};
 use perturb_learner::rollout::{Rollout, RolloutStep};
 
 const TASKS: [(&str, usize, ActionKind); 2] =
-    [("cart_pole", 4, ActionKind::Discrete { n: 2 }), ("half_cheetah", 17, ActionKind::Continuous { size: 6 })];
+    [("cart_pole", 4, ActionKind::Discrete { n: 2 }), ("half_cheetah", 26, ActionKind::Continuous { size: 6 })];
 
 /// Prints the time of one `run`.
 fn time(id: &str, repetitions: usize, mut run: impl FnMut()) {

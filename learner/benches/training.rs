@@ -22,7 +22,7 @@ fn main() -> anyhow::Result<()> {
     let servers = Servers::local(LocalServerOptions::default())?;
     let config = TrainConfig::from_table("the bench", CONFIG.parse()?)?;
     let out = tempfile::tempdir()?;
-    let directory = RunDirectory::create(out.path(), false)?;
+    let directory = RunDirectory::choose(out.path(), false)?;
     let stop = StopFlag::default();
     let outcome = train(&servers, &config, &directory, &stop, |progress| {
         if progress.iterations == ITERATIONS {

@@ -187,6 +187,15 @@ impl Checkpoint {
         }
         let state: State = serde_json::from_value(document.rest)
             .map_err(|error| damaged(&json, format!("it is not understood: {error}")))?;
+        let wrong = |name: &str, reason: String| damaged(&json, format!("{name}: {reason}"));
+        if let Some(normaliser) = &state.observation_normaliser {
+            normaliser
+                .check(state.policy.observation_size)
+                .map_err(|reason| wrong("observation_normaliser", reason))?;
+        }
+        if let Some(normaliser) = &state.reward_normaliser {
+            normaliser.check().map_err(|reason| wrong("reward_normaliser", reason))?;
+        }
 
         let file = Path::new(&document.weights.file).file_name().unwrap_or_default();
         let file = directory.join(file);

@@ -120,3 +120,40 @@ fn damage_is_named() {
     };
     assert!(spoil("checkpoint.json", &later).contains("it has format 9, this program reads 1"));
 }
+
+#[test]
+fn statistics_that_cannot_be_are_refused() {
+    let refusal = |pointer: &str, value: serde_json::Value| {
+        let directory = tempfile::tempdir().unwrap();
+        checkpoint(1, 1).save(directory.path()).unwrap();
+        let path = directory.path().join(JSON);
+        let mut document: serde_json::Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
+        *document.pointer_mut(pointer).unwrap() = value;
+        fs::write(&path, document.to_string()).unwrap();
+        let error = Checkpoint::load(directory.path()).unwrap_err();
+        assert!(matches!(error, CheckpointError::Damaged { .. }), "{error}");
+        error.to_string()
+    };
+    let observations = "/observation_normaliser/moments";
+    for (pointer, value, part) in [
+        (
+            format!("{observations}/mean"),
+            serde_json::json!([]),
+            "observation_normaliser: mean has 0 numbers, expected 3",
+        ),
+        (format!("{observations}/squares"), serde_json::json!([1.0, 2.0]), "squares has 2 numbers, expected 3"),
+        (format!("{observations}/squares"), serde_json::json!([1.0, -2.0, 3.0]), "squares holds -2"),
+        (format!("{observations}/mean"), serde_json::json!([1.0, null, 3.0]), "not understood"),
+        (format!("{observations}/count"), serde_json::json!(0), "count is 0, but there are statistics"),
+        (format!("{observations}/count"), serde_json::json!(-1), "not understood"),
+        (
+            "/reward_normaliser/moments/mean".into(),
+            serde_json::json!([0.0, 0.0]),
+            "reward_normaliser: mean has 2 numbers",
+        ),
+        ("/reward_normaliser/gamma".into(), serde_json::json!(2.0), "reward_normaliser: gamma is 2"),
+    ] {
+        let message = refusal(&pointer, value);
+        assert!(message.contains(part), "{pointer}: {message}");
+    }
+}

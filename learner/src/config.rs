@@ -90,13 +90,15 @@ pub struct Common {
     pub episodes: u64,
     /// Fixes all randomness, 0 … 2⁶³-1 (default: `1`).
     pub seed: u64,
-    /// N: environments that are stepped together, 1 … 65536. More makes a step cheaper and updates rarer.
+    /// N: environments that are stepped together, 1 … 65536 (default: `16` with A2C, `8` with PPO). More makes a step
+    /// cheaper and updates rarer.
     pub num_envs: usize,
     /// Whether observations are normalised by their running mean and variance (default: `true`).
     pub normalize_observations: bool,
     /// Whether rewards are divided by the running deviation of the discounted return (default: `true`).
     pub normalize_rewards: bool,
-    /// Iterations between two lines of progress.csv, at least 1. Figures are averages over the iterations between.
+    /// Iterations between two lines of progress.csv, at least 1 (default: `100` with A2C, `1` with PPO). A line has the
+    /// figures of the last update, and means over the last 100 ended episodes.
     pub log_interval: u64,
     /// Ended episodes between two checkpoints, at least 1 (default: `500`). The first iteration and the last always
     /// write one.
@@ -285,9 +287,29 @@ impl TrainConfig {
         }
         match &self.settings {
             Settings::A2c(settings) => settings.validate()?,
-            Settings::Ppo(settings) => settings.validate()?,
+            Settings::Ppo(settings) => {
+                settings.validate()?;
+                self.check_minibatches(settings)?;
+            }
         }
         Ok(())
+    }
+
+    /// Whether a pass over a rollout can be parted evenly.
+    fn check_minibatches(&self, settings: &PpoConfig) -> Result<(), ConfigError> {
+        let Common { architecture, num_envs, .. } = self.common;
+        let PpoConfig { n_steps, n_minibatches, .. } = *settings;
+        let (whole, count) = match architecture {
+            Architecture::Ff => ("n_steps · num_envs,", n_steps as u128 * num_envs as u128),
+            Architecture::Rc => {
+                ("num_envs, because a recurrent policy learns from whole environments,", num_envs as u128)
+            }
+        };
+        if count.is_multiple_of(n_minibatches as u128) {
+            return Ok(());
+        }
+        let expected = format!("a divisor of {whole} which is {count}");
+        Err(ConfigError::Value { key: "n_minibatches".into(), got: n_minibatches.to_string(), expected })
     }
 }
 

@@ -88,6 +88,18 @@ fn a_wrong_type_is_refused_with_the_right_one() {
 }
 
 #[test]
+fn minibatches_must_part_a_rollout_evenly() {
+    assert!(load(None, &["n_steps=5", "num_envs=6", "n_minibatches=10"], "environment = 'CartPole'").is_ok());
+    let message = refusal(None, &["n_steps=5", "num_envs=6", "n_minibatches=4"]);
+    assert_eq!(message, "n_minibatches is 4, but must be a divisor of n_steps · num_envs, which is 30");
+    let recurrent = ["architecture=rc", "n_steps=5", "num_envs=6"];
+    assert!(load(None, &[&recurrent[..], &["n_minibatches=3"]].concat(), "environment = 'CartPole'").is_ok());
+    let message = refusal(None, &[&recurrent[..], &["n_minibatches=10"]].concat());
+    assert!(message.starts_with("n_minibatches is 10, but must be a divisor of num_envs, "), "{message}");
+    assert!(message.ends_with(" which is 6"), "{message}");
+}
+
+#[test]
 fn what_is_missing_or_not_toml_is_named() {
     assert!(matches!(load(None, &[], ""), Err(ConfigError::NoEnvironment)));
     assert!(refusal(Some("= 1"), &[]).contains("config.toml"));

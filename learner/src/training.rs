@@ -22,6 +22,8 @@ use crate::rollout::{Collector, Normalisers, Rollout};
 
 /// Means are over so many episodes, as in stable-baselines3.
 const RECENT: usize = 100;
+/// During longer updates the connections are kept alive; servers wait for seconds at least.
+const LONG_UPDATE: Duration = Duration::from_millis(100);
 
 /// What a training came to.
 #[derive(Debug)]
@@ -38,31 +40,45 @@ pub struct Outcome {
 #[derive(Debug)]
 pub struct RunDirectory {
     path: PathBuf,
+    overwrite: bool,
 }
 
 impl RunDirectory {
-    /// Takes `path` for a new run: creates it, or empties it of an earlier run if `overwrite`.
+    /// Chooses `path` for a new run; if it holds an earlier run, `overwrite` allows its deletion. Changes nothing yet:
+    /// [`train`] empties the directory when the environments are open and all settings have proved to work.
     ///
     /// # Errors
     /// If it holds a run and `overwrite` is off; the operating system's.
-    pub fn create(path: &Path, overwrite: bool) -> Result<Self> {
+    pub fn choose(path: &Path, overwrite: bool) -> Result<Self> {
         if path.exists() && !path.is_dir() {
             bail!("--out {} is a file; give a directory", path.display());
         }
-        let old = files_of_a_run(path)?;
-        if let (Some(file), false) = (old.first(), overwrite) {
+        let directory = Self { path: path.to_owned(), overwrite };
+        directory.earlier_run()?;
+        Ok(directory)
+    }
+
+    /// The files of an earlier run, which may be deleted.
+    fn earlier_run(&self) -> Result<Vec<PathBuf>> {
+        let files = files_of_a_run(&self.path)?;
+        if let (Some(file), false) = (files.first(), self.overwrite) {
             bail!(
                 "{} already holds a run ({}): choose another --out, or give --overwrite to delete that run",
-                path.display(),
+                self.path.display(),
                 file.file_name().unwrap_or_default().to_string_lossy()
             );
         }
-        for file in old {
+        Ok(files)
+    }
+
+    /// Creates it, or empties it of the earlier run.
+    fn prepare(&self) -> Result<()> {
+        let path = &self.path;
+        for file in self.earlier_run()? {
             let removed = if file.is_dir() { fs::remove_dir_all(&file) } else { fs::remove_file(&file) };
             removed.with_context(|| format!("cannot delete {}", file.display()))?;
         }
-        fs::create_dir_all(path).with_context(|| format!("cannot create {}", path.display()))?;
-        Ok(Self { path: path.to_owned() })
+        fs::create_dir_all(path).with_context(|| format!("cannot create {}", path.display()))
     }
 
     /// Where it is.
@@ -108,7 +124,9 @@ pub fn train(
     stop: &StopFlag,
     mut report: impl FnMut(&Progress),
 ) -> Result<Outcome> {
-    let mut training = Training::begin(servers, config, directory)?;
+    let mut training = Training::begin(servers, config)?;
+    directory.prepare()?; // from here on an earlier run is gone
+    tracing::debug!(directory = %directory.path().display(), "training begins");
     let mut log = Logs::create(config, directory, &training.summary)?;
     fs::write(directory.path().join("config.toml"), config.to_toml()).context("cannot write config.toml")?;
     let mut saved_at = None;
@@ -152,6 +170,7 @@ pub fn train(
 
 /// A training between two iterations.
 struct Training<'a> {
+    servers: &'a Servers,
     config: &'a TrainConfig,
     summary: EnvironmentSummary,
     collector: Collector<'a>,
@@ -163,10 +182,12 @@ struct Training<'a> {
     recent: VecDeque<[f64; 3]>,
     start: Instant,
     updating: Duration,
+    /// How long the last update took.
+    last_update: Option<Duration>,
 }
 
 impl<'a> Training<'a> {
-    fn begin(servers: &'a Servers, config: &'a TrainConfig, directory: &RunDirectory) -> Result<Self> {
+    fn begin(servers: &'a Servers, config: &'a TrainConfig) -> Result<Self> {
         let common = &config.common;
         let options = OpenOptions {
             environment: common.environment.clone(),
@@ -204,8 +225,8 @@ impl<'a> Training<'a> {
             },
             weights: policy.weights(),
         };
-        tracing::debug!(directory = %directory.path().display(), "training begins");
         Ok(Self {
+            servers,
             config,
             summary,
             collector,
@@ -216,6 +237,7 @@ impl<'a> Training<'a> {
             recent: VecDeque::with_capacity(RECENT),
             start: Instant::now(),
             updating: Duration::ZERO,
+            last_update: None,
         })
     }
 
@@ -235,9 +257,17 @@ impl<'a> Training<'a> {
 
         let updating = Instant::now();
         let progress_remaining = self.progress_remaining(self.whole.state.counters.timesteps);
-        let update = self.algorithm.update(&mut self.policy, &self.rollout, progress_remaining)?;
+        let Self { algorithm, policy, rollout, .. } = self;
+        let mut update = || algorithm.update(policy, rollout, progress_remaining);
+        // A thread for it would cost more than the shortest updates; all updates of a training take about as long.
+        let update = match self.last_update {
+            Some(last) if last < LONG_UPDATE => update()?,
+            _ => self.servers.keep_alive_during(update)?,
+        };
         let weights = self.policy.weights();
-        self.updating += updating.elapsed();
+        let elapsed = updating.elapsed();
+        self.last_update = Some(elapsed);
+        self.updating += elapsed;
 
         counters.iterations += 1;
         counters.timesteps += (self.rollout.n_steps() * self.rollout.n_envs()) as u64;

@@ -20,7 +20,8 @@ use tempfile::TempDir;
 const SECONDS: Duration = Duration::from_secs(20);
 
 fn server(workers: usize) -> LocalServer {
-    LocalServer::start(LocalServerOptions { workers: Some(workers) }).unwrap_or_else(|error| panic!("{error}"))
+    LocalServer::start(LocalServerOptions { workers: Some(workers), ..LocalServerOptions::default() })
+        .unwrap_or_else(|error| panic!("{error}"))
 }
 
 fn addresses(servers: &[LocalServer]) -> Vec<Address> {
@@ -34,7 +35,7 @@ fn config(text: &str) -> TrainConfig {
 /// Trains in a fresh directory.
 fn run(servers: &Servers, text: &str) -> (TempDir, Outcome) {
     let out = tempfile::tempdir().expect("a directory");
-    let directory = RunDirectory::create(out.path(), false).expect("an empty directory");
+    let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
     let outcome = train(servers, &config(text), &directory, &StopFlag::default(), |_| {});
     (out, outcome.unwrap_or_else(|error| panic!("{error:#}")))
 }
@@ -383,6 +384,11 @@ fn the_program_trains_tests_and_refuses_with_sentences() {
     refused(&["train", "--env", "CartPole", "--out", run, "--set", "foo=1"], 2, "unknown key `foo`");
     refused(&["train", "--out", run], 2, "no environment was named");
     refused(&["train", "--env", "Pong", "--out", run, "--overwrite"], 1, "there is no environment `Pong`");
+    let overwrite = ["train", "--env", "CartPole", "--out", run, "--overwrite"];
+    refused(&[&overwrite[..], &["--set", "n_minibatches=3"]].concat(), 2, "a divisor of n_steps · num_envs");
+    let other = server(1);
+    let too_many = ["--server", &other.address().to_string(), "--set", "num_envs=20000"];
+    refused(&[&overwrite[..], &too_many].concat(), 1, "refused to open a session");
     refused(&["evaluate", "--checkpoint", "/nonexistent"], 1, "holds no checkpoint");
     refused(&["envs", "--server", "nowhere"], 2, "the port is missing");
     refused(&["envs", "--server", "127.0.0.1:1"], 1, "no server answers at http://127.0.0.1:1");
@@ -413,6 +419,76 @@ fn the_program_trains_tests_and_refuses_with_sentences() {
     let catalogue: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!(catalogue["environments"][0]["parameters"][0]["name"], "force");
     assert_eq!(catalogue["environments"][0]["parameters"][0]["E"], serde_json::json!([[1.0, 5.0], [15.0, 20.0]]));
+}
+
+#[test]
+fn a_private_server_takes_as_many_environments_as_the_training_has() {
+    let out = tempfile::tempdir().expect("a directory");
+    let path = out.path().to_str().expect("a path");
+    let settings = ["--set", "num_envs=20000", "--set", "n_steps=10", "--set", "n_epochs=1"];
+    let arguments = [&["train", "--env", "CartPole", "--episodes", "1", "--out", path][..], &settings].concat();
+    let output = perturb(&arguments).output().expect("perturb runs");
+    assert!(output.status.success(), "{}", stderr(&output));
+}
+
+#[test]
+fn a_reader_that_has_read_enough_ends_the_program_quietly() {
+    let out = tempfile::tempdir().expect("a directory");
+    let run = out.path().join("run");
+    let run = run.to_str().expect("a path");
+    let json = out.path().join("result.json");
+    let json = json.to_str().expect("a path");
+    let evaluate = ["evaluate", "--checkpoint", run, "--versions", "D,E", "--episodes", "5"];
+    for arguments in [
+        &["envs"][..],
+        &["train", "--env", "CartPole", "--episodes", "5", "--out", run],
+        &evaluate,
+        &[&evaluate[..], &["--json", json]].concat(),
+        &["demo", "--episodes", "5", "--test-episodes", "5"],
+    ] {
+        let mut child = perturb(arguments).spawn().expect("perturb");
+        drop(child.stdout.take());
+        let output = child.wait_with_output().expect("perturb ends");
+        assert!(output.status.success(), "{arguments:?}: {}", stderr(&output));
+        assert!(!stderr(&output).contains("panicked"), "{}", stderr(&output));
+    }
+    assert!(Path::new(json).exists(), "the file was asked for");
+}
+
+/// A server that asks every second whether its learner lives, and gives it a second to answer.
+#[test]
+fn a_server_keeps_a_learner_that_computes_for_long() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let socket = directory.path().join("server.sock");
+    let address: Address = format!("unix:{}", socket.display()).parse().expect("an address");
+    let program = std::env::var_os("PERTURB_SERVER").map(PathBuf::from).unwrap_or_else(|| {
+        let test = std::env::current_exe().expect("this test's path");
+        test.parent().and_then(Path::parent).expect("target/release").join("perturb-server")
+    });
+    let mut server = Command::new(program)
+        .args(["--listen", &address.to_string(), "--keepalive-seconds", "1", "--exit-with-stdin", "--log", "error"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .spawn()
+        .expect("perturb-server");
+    wait_for("the socket", || socket.exists());
+    let servers = Servers::connect(&[address]).expect("a connection");
+    let options = OpenOptions {
+        environment: "CartPole".into(),
+        version: proto::Version::Default,
+        num_envs: 1,
+        seed: 1,
+        episodes_per_trial: 1,
+    };
+    let mut session = Session::open(&servers, &options, &mut Vec::new()).expect("a session");
+    let compute = || std::thread::sleep(Duration::from_secs(4));
+    servers.keep_alive_during(compute);
+    session.step(&[1, 0, 0, 0], &mut StepReply::default()).expect("the session lives");
+    compute();
+    let error = session.step(&[1, 0, 0, 0], &mut StepReply::default()).expect_err("nobody answered the server");
+    assert!(error.to_string().contains("lost the server"), "{error}");
+    drop(server.stdin.take());
+    server.wait().expect("it ends");
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! `perturb demo`: the paper's protocol on CartPole, small.
 
+use std::io::Write;
 use std::path::Path;
 use std::time::Instant;
 
@@ -29,13 +30,14 @@ const ENVIRONMENT: &str = "CartPole";
 pub(super) fn run(args: &DemoArgs) -> Result<Ending> {
     let start = Instant::now();
     let stop = StopFlag::on_signals().context("cannot wait for signals")?;
-    let servers = servers(&args.server)?;
+    let servers = servers(&args.server, 0)?;
     let scratch = tempfile::tempdir().context("cannot create a temporary directory")?;
+    let mut out = std::io::stdout();
     let directory = args.out.clone().unwrap_or_else(|| scratch.path().to_owned());
 
-    println!("PPO with feed-forward networks on {ENVIRONMENT}: three trainings, nine tests.");
-    budget("training", args.episodes, PAPER_EPISODES);
-    budget("test", args.test_episodes, PAPER_TEST_EPISODES);
+    writeln!(out, "PPO with feed-forward networks on {ENVIRONMENT}: three trainings, nine tests.")?;
+    budget(&mut out, "training", args.episodes, PAPER_EPISODES)?;
+    budget(&mut out, "test", args.test_episodes, PAPER_TEST_EPISODES)?;
     let mut rates = Rates([[0.0; 3]; 3]);
     for version in Version::ALL {
         let outcome = train_on(&servers, args, version, &directory.join(version.to_string()), &stop)?;
@@ -45,23 +47,23 @@ pub(super) fn run(args: &DemoArgs) -> Result<Ending> {
         }
         rates.0[version as usize] = test_on_all(&servers, args, &outcome.checkpoint, &stop)?;
     }
-    println!();
-    print_rates(&rates);
-    println!();
-    print_metrics(&rates.metrics());
-    println!("\n{:.0} s in all, seed {}", start.elapsed().as_secs_f64(), args.seed);
-    if let Some(out) = &args.out {
-        println!("the runs are kept in {}", out.display());
+    writeln!(out)?;
+    print_rates(&mut out, &rates)?;
+    writeln!(out)?;
+    print_metrics(&mut out, &rates.metrics())?;
+    writeln!(out, "\n{:.0} s in all, seed {}", start.elapsed().as_secs_f64(), args.seed)?;
+    if let Some(kept) = &args.out {
+        writeln!(out, "the runs are kept in {}", kept.display())?;
     }
     Ok(Ending::Done)
 }
 
-fn budget(what: &str, episodes: u64, paper: u64) {
+fn budget(out: &mut impl Write, what: &str, episodes: u64, paper: u64) -> std::io::Result<()> {
     match episodes.cmp(&paper) {
         std::cmp::Ordering::Less => {
-            println!("Reduced budget: {episodes} episodes in each {what}, where the paper has {paper}.");
+            writeln!(out, "Reduced budget: {episodes} episodes in each {what}, where the paper has {paper}.")
         }
-        _ => println!("{episodes} episodes in each {what} (the paper: {paper})."),
+        _ => writeln!(out, "{episodes} episodes in each {what} (the paper: {paper})."),
     }
 }
 
@@ -78,13 +80,18 @@ fn train_on(
     config.common.episodes = args.episodes;
     config.common.seed = args.seed;
     let config = TrainConfig::from_table("the demo", Table::clone(&config.table()))?;
-    let directory = RunDirectory::create(directory, false)?;
+    let directory = RunDirectory::choose(directory, false)?;
     let start = Instant::now();
     let mut bar = Bar::new(describe(&config), args.episodes);
     let outcome = train(servers, &config, &directory, stop, |progress| bar.training(progress))?;
     drop(bar);
     let (progress, seconds) = (&outcome.progress, start.elapsed().as_secs_f64());
-    println!("trained on {version}: {} episodes, {} steps, {seconds:.0} s", progress.episodes, progress.timesteps);
+    writeln!(
+        std::io::stdout(),
+        "trained on {version}: {} episodes, {} steps, {seconds:.0} s",
+        progress.episodes,
+        progress.timesteps
+    )?;
     Ok(outcome)
 }
 
@@ -100,22 +107,24 @@ fn test_on_all(servers: &Servers, args: &DemoArgs, checkpoint: &Checkpoint, stop
     Ok(percent)
 }
 
-fn print_rates(rates: &Rates) {
-    println!("success, %    test D   test R   test E");
+fn print_rates(out: &mut impl Write, rates: &Rates) -> std::io::Result<()> {
+    writeln!(out, "success, %    test D   test R   test E")?;
     for (train, row) in Version::ALL.into_iter().zip(rates.0) {
-        println!("train {train}      {:>8.1} {:>8.1} {:>8.1}", row[0], row[1], row[2]);
+        writeln!(out, "train {train}      {:>8.1} {:>8.1} {:>8.1}", row[0], row[1], row[2])?;
     }
+    Ok(())
 }
 
-fn print_metrics(metrics: &Metrics) {
+fn print_metrics(out: &mut impl Write, metrics: &Metrics) -> std::io::Result<()> {
     let row = paper::row(ENVIRONMENT, "PPO", "FF");
     let paper = |cell: Option<paper::Cell>| cell.map_or_else(|| "not given".to_owned(), |cell| cell.to_string());
-    println!("                              here   paper (mean ± std of 5 runs)");
+    writeln!(out, "                              here   paper (mean ± std of 5 runs)")?;
     for (name, here, cell) in [
         ("Default (DD)", metrics.default, row.map(|row| row.default)),
         ("Interpolation (RR)", metrics.interpolation, row.map(|row| row.interpolation)),
         ("Extrapolation (DR, DE, RE)", metrics.extrapolation, row.map(|row| row.extrapolation)),
     ] {
-        println!("{name:<26} {here:>7.1}   {}", paper(cell));
+        writeln!(out, "{name:<26} {here:>7.1}   {}", paper(cell))?;
     }
+    Ok(())
 }

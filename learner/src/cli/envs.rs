@@ -10,7 +10,7 @@ use super::{Ending, servers};
 use crate::proto::{Channel, Distribution, Environment, ListEnvironmentsResponse, action_space::Kind};
 
 pub(super) fn run(args: &EnvsArgs) -> Result<Ending> {
-    let catalogue = servers(&args.server)?.catalogue()?;
+    let catalogue = servers(&args.server, 0)?.catalogue()?;
     let mut out = std::io::stdout().lock();
     if args.json {
         writeln!(out, "{}", serde_json::to_string_pretty(&document(&catalogue))?)?;

@@ -1,5 +1,6 @@
 //! `perturb evaluate`.
 
+use std::io::{ErrorKind, Write};
 use std::path::Path;
 
 use anyhow::{Context, Result};
@@ -19,13 +20,19 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
     versions.dedup();
     let seed = args.seed.unwrap_or(checkpoint.state.seed);
     let stop = StopFlag::on_signals().context("cannot wait for signals")?;
-    let servers = servers(&args.server)?;
+    let servers = servers(&args.server, 0)?;
     let state = &checkpoint.state;
-    println!(
+    let mut out = std::io::stdout();
+    let mut print = |line: String| match writeln!(out, "{line}") {
+        // Whoever has read enough still gets the file that was asked for.
+        Err(error) if error.kind() == ErrorKind::BrokenPipe && args.json.is_some() => Ok(()),
+        printed => printed,
+    };
+    print(format!(
         "{} {} {}, trained on {} with seed {}, {} test episodes each",
         state.environment, state.algorithm, state.architecture, state.train_version, state.seed, args.episodes
-    );
-    println!("version  success   95 % interval   mean return  mean length");
+    ))?;
+    print("version  success   95 % interval   mean return  mean length".into())?;
     let mut results = Vec::new();
     for version in versions {
         let mut bar = Bar::new(format!("testing on {version}"), args.episodes);
@@ -33,10 +40,10 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
             test(&servers, &checkpoint, version, args.episodes, seed, &stop, |episodes| bar.testing(episodes))?;
         drop(bar);
         let [low, high] = result.success_percent_95;
-        println!(
+        print(format!(
             "{version:<7} {:>7.1} %  {low:>5.1} … {high:>5.1} %  {:>12.2} {:>12.2}",
             result.success_percent, result.mean_return, result.mean_length
-        );
+        ))?;
         results.push((version, result));
     }
     if let Some(path) = &args.json {

@@ -77,10 +77,10 @@ fn signal_code(number: i32) -> ExitCode {
     ExitCode::from(u8::try_from(128 + number).unwrap_or(1))
 }
 
-/// The servers that were named, or one of our own.
-fn servers(args: &ServerArgs) -> Result<Servers> {
+/// The servers that were named, or one of our own that takes `num_envs` environments.
+fn servers(args: &ServerArgs, num_envs: usize) -> Result<Servers> {
     if args.server.is_empty() {
-        let options = LocalServerOptions { workers: args.workers };
+        let options = LocalServerOptions { workers: args.workers, num_envs };
         return Servers::local(options).context("cannot start a server for this run");
     }
     if args.workers.is_some() {

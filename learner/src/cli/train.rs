@@ -1,5 +1,7 @@
 //! `perturb train`.
 
+use std::io::Write;
+
 use anyhow::{Context, Result};
 use toml::{Table, Value};
 
@@ -15,9 +17,9 @@ pub(super) fn run(args: &TrainArgs) -> Result<Ending> {
     let flags = flags(args)?;
     let config = TrainConfig::load(&Sources { file: args.config.as_deref(), sets: &args.set, flags })?;
     let stop = StopFlag::on_signals().context("cannot wait for signals")?;
-    let servers = servers(&args.server)?;
-    servers.environment(&config.common.environment)?; // before anything is deleted or created
-    let directory = RunDirectory::create(&args.out, args.overwrite)?;
+    let directory = RunDirectory::choose(&args.out, args.overwrite)?;
+    let servers = servers(&args.server, config.common.num_envs)?;
+    servers.environment(&config.common.environment)?; // its refusal lists the names
     let mut bar = Bar::new(describe(&config), config.common.episodes);
     let outcome = train(&servers, &config, &directory, &stop, |progress| bar.training(progress))?;
     bar.finish();
@@ -33,8 +35,9 @@ pub(super) fn run(args: &TrainArgs) -> Result<Ending> {
             Ok(Ending::Signal(number))
         }
         None => {
-            println!("trained policy: {}", directory.checkpoint().display());
-            println!("test it: perturb evaluate --checkpoint {}", directory.path().display());
+            let mut out = std::io::stdout();
+            writeln!(out, "trained policy: {}", directory.checkpoint().display())?;
+            writeln!(out, "test it: perturb evaluate --checkpoint {}", directory.path().display())?;
             Ok(Ending::Done)
         }
     }

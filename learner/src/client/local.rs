@@ -23,11 +23,16 @@ const START_LIMIT: Duration = Duration::from_secs(20);
 /// How long a server may take to end before it is killed.
 const END_LIMIT: Duration = Duration::from_secs(5);
 
+/// As many environments a server takes unless told otherwise.
+const DEFAULT_MAX_ENVS: usize = 16_384;
+
 /// How to start a [`LocalServer`].
 #[derive(Clone, Copy, Debug, Default)]
 pub struct LocalServerOptions {
     /// Physics threads; `None` leaves it to the server: one a core.
     pub workers: Option<usize>,
+    /// How many environments must be able to run at once; more may.
+    pub num_envs: usize,
 }
 
 /// A `perturb-server` that lives no longer than this value, and no longer than this process: it holds the other end of
@@ -66,6 +71,9 @@ impl LocalServer {
         command.args(["--keepalive-seconds", "3600"]);
         if let Some(workers) = options.workers {
             command.args(["--workers", &workers.to_string()]);
+        }
+        if options.num_envs > DEFAULT_MAX_ENVS {
+            command.args(["--max-envs", &options.num_envs.to_string()]);
         }
         // Settings for servers that people run themselves do not reach this one.
         for (name, _) in std::env::vars_os() {

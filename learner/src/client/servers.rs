@@ -4,6 +4,7 @@ use std::sync::Mutex;
 use std::time::Duration;
 
 use tokio::runtime::{Builder, Runtime};
+use tokio::sync::oneshot;
 use tonic::transport::{Channel, Endpoint};
 
 use super::address::Address;
@@ -76,9 +77,19 @@ impl Servers {
         &self.runtime
     }
 
-    /// The private server's process, if there is one.
-    pub fn local_process_id(&self) -> Option<u32> {
-        self.local.as_ref().and_then(|server| server.lock().ok().map(|server| server.process_id()))
+    /// Does `work`, which may take long, on this thread, and meanwhile answers on another one when servers ask whether
+    /// the learner lives. Without it a server drops its sessions after its `--keepalive-seconds`, because otherwise the
+    /// connections are driven only while a request waits.
+    pub fn keep_alive_during<T>(&self, work: impl FnOnce() -> T) -> T {
+        let (done, end) = oneshot::channel::<()>();
+        let runtime = &self.runtime;
+        std::thread::scope(|scope| {
+            // Either way of its ending, by `done` or by a panic in `work`, is the end.
+            scope.spawn(move || drop(runtime.block_on(end)));
+            let result = work();
+            drop(done);
+            result
+        })
     }
 
     /// The catalogue of the first server.

@@ -72,7 +72,7 @@ pub struct StepReply {
 #[derive(Debug)]
 pub struct Session<'a> {
     servers: &'a Servers,
-    shards: Vec<Shard>,
+    parts: Vec<Part>,
     environment: proto::Environment,
     observation_size: usize,
     num_envs: usize,
@@ -80,7 +80,7 @@ pub struct Session<'a> {
 
 /// The part of a batch that one server owns.
 #[derive(Debug)]
-struct Shard {
+struct Part {
     address: Address,
     range: Range<usize>,
     requests: mpsc::Sender<SessionRequest>,
@@ -97,34 +97,34 @@ impl<'a> Session<'a> {
     /// failures of a connection.
     pub fn open(servers: &'a Servers, options: &OpenOptions, observations: &mut Vec<f32>) -> Result<Self, ClientError> {
         let ranges = split(options.num_envs, servers.links().len());
-        let mut shards: Vec<Shard> = Vec::new();
+        let mut parts: Vec<Part> = Vec::new();
         let mut environment: Option<proto::Environment> = None;
         observations.clear();
         for (link, range) in servers.links().iter().zip(ranges) {
             if range.is_empty() {
                 continue; // more servers than environments
             }
-            let (shard, opened) = servers.runtime().block_on(open_shard(servers, link, options, range))?;
+            let (part, opened) = servers.runtime().block_on(open_part(servers, link, options, range))?;
             let described = opened.environment.unwrap_or_default();
-            let expected = shard.range.len() * described.observation.len();
+            let expected = part.range.len() * described.observation.len();
             let first = observations.len();
             observations.resize(first + expected, 0.0);
-            shard.decode("open", "observations", &opened.observations, &mut observations[first..])?;
+            part.decode("open", "observations", &opened.observations, &mut observations[first..])?;
             match &environment {
                 Some(known) if *known != described => {
                     return Err(ClientError::Disagreement {
-                        first: shards[0].address.clone(),
-                        other: shard.address,
+                        first: parts[0].address.clone(),
+                        other: part.address,
                         environment: options.environment.clone(),
                     });
                 }
                 _ => environment = Some(described),
             }
-            shards.push(shard);
+            parts.push(part);
         }
         let environment = environment.unwrap_or_default();
         let observation_size = environment.observation.len();
-        Ok(Self { servers, shards, environment, observation_size, num_envs: options.num_envs })
+        Ok(Self { servers, parts, environment, observation_size, num_envs: options.num_envs })
     }
 
     /// What was opened.
@@ -151,18 +151,18 @@ impl<'a> Session<'a> {
     pub fn step(&mut self, actions: &[u8], reply: &mut StepReply) -> Result<(), ClientError> {
         let width = actions.len() / self.num_envs.max(1);
         reply.resize(self.num_envs, self.observation_size);
-        let Self { servers, shards, observation_size, .. } = self;
+        let Self { servers, parts, observation_size, .. } = self;
         servers.runtime().block_on(async {
-            for shard in shards.iter_mut() {
-                shard.actions.clear();
-                shard.actions.extend_from_slice(&actions[shard.range.start * width..shard.range.end * width]);
-                let actions = shard.actions.split().freeze();
-                shard.send("a step", Request::Step(proto::Step { actions }), servers).await?;
+            for part in parts.iter_mut() {
+                part.actions.clear();
+                part.actions.extend_from_slice(&actions[part.range.start * width..part.range.end * width]);
+                let actions = part.actions.split().freeze();
+                part.send("a step", Request::Step(proto::Step { actions }), servers).await?;
             }
-            for shard in shards.iter_mut() {
-                match shard.receive("a step", servers).await? {
-                    Response::Stepped(stepped) => shard.store(stepped, *observation_size, reply)?,
-                    other => return Err(shard.unexpected("a step", &other, "Stepped")),
+            for part in parts.iter_mut() {
+                match part.receive("a step", servers).await? {
+                    Response::Stepped(stepped) => part.store(stepped, *observation_size, reply)?,
+                    other => return Err(part.unexpected("a step", &other, "Stepped")),
                 }
             }
             Ok(())
@@ -174,18 +174,18 @@ impl<'a> Session<'a> {
     /// # Errors
     /// The failures of a connection.
     pub fn reset(&mut self, observations: &mut [f32]) -> Result<(), ClientError> {
-        let Self { servers, shards, observation_size, .. } = self;
+        let Self { servers, parts, observation_size, .. } = self;
         servers.runtime().block_on(async {
-            for shard in shards.iter_mut() {
-                shard.send("a reset", Request::Reset(proto::Reset::default()), servers).await?;
+            for part in parts.iter_mut() {
+                part.send("a reset", Request::Reset(proto::Reset::default()), servers).await?;
             }
-            for shard in shards.iter_mut() {
-                let range = shard.range.start * *observation_size..shard.range.end * *observation_size;
-                match shard.receive("a reset", servers).await? {
+            for part in parts.iter_mut() {
+                let range = part.range.start * *observation_size..part.range.end * *observation_size;
+                match part.receive("a reset", servers).await? {
                     Response::Reset(done) => {
-                        shard.decode("a reset", "observations", &done.observations, &mut observations[range])?;
+                        part.decode("a reset", "observations", &done.observations, &mut observations[range])?;
                     }
-                    other => return Err(shard.unexpected("a reset", &other, "ResetDone")),
+                    other => return Err(part.unexpected("a reset", &other, "ResetDone")),
                 }
             }
             Ok(())
@@ -204,7 +204,7 @@ impl StepReply {
     }
 }
 
-impl Shard {
+impl Part {
     async fn send(&self, what: &'static str, request: Request, servers: &Servers) -> Result<(), ClientError> {
         let message = SessionRequest { request: Some(request) };
         // The channel has room for a request, and is closed only after the stream has ended.
@@ -233,7 +233,7 @@ impl Shard {
         }
     }
 
-    /// Puts this shard's part of a reply in its place.
+    /// Puts one server's reply in its place in the batch's.
     fn store(&self, stepped: proto::Stepped, size: usize, reply: &mut StepReply) -> Result<(), ClientError> {
         let what = "a step";
         let Range { start, end } = self.range;
@@ -311,12 +311,12 @@ impl Shard {
     }
 }
 
-async fn open_shard(
+async fn open_part(
     servers: &Servers,
     link: &Link,
     options: &OpenOptions,
     range: Range<usize>,
-) -> Result<(Shard, proto::Opened), ClientError> {
+) -> Result<(Part, proto::Opened), ClientError> {
     let what = "to open a session";
     let (requests, receiver) = mpsc::channel(4);
     let index = |index: usize| {
@@ -348,10 +348,10 @@ async fn open_shard(
         .map_err(|_| ClientError::TimedOut { address: link.address.clone(), request: what, limit: REPLY_LIMIT })?
         .map_err(|status| servers.lost(&link.address, what, &status))?
         .into_inner();
-    let mut shard = Shard { address: link.address.clone(), range, requests, replies, actions: BytesMut::new() };
-    match shard.receive(what, servers).await? {
-        Response::Opened(opened) => Ok((shard, opened)),
-        other => Err(shard.unexpected(what, &other, "Opened")),
+    let mut part = Part { address: link.address.clone(), range, requests, replies, actions: BytesMut::new() };
+    match part.receive(what, servers).await? {
+        Response::Opened(opened) => Ok((part, opened)),
+        other => Err(part.unexpected(what, &other, "Opened")),
     }
 }
 

@@ -113,7 +113,7 @@ pub fn test(
         session.step(&actions, &mut reply)?;
         reply.ended.iter().for_each(|end| actor.forget(end.slot));
         // Environments that are done go on, unseen: they cost less than a smaller batch would save.
-        counted.extend(reply.ended.drain(..).filter(|end| end.episode_index < quotas[end.slot]));
+        count(reply.ended.drain(..), &quotas, &mut counted);
         report(counted.len() as u64);
     }
     Ok(summarise(&counted))
@@ -134,6 +134,11 @@ fn open_options(environment: &str, version: Version, num_envs: usize, seed: u64)
 fn quotas(episodes: u64) -> Vec<u64> {
     let n = episodes.clamp(1, MOST_ENVS);
     (0..n).map(|i| episodes / n + u64::from(i < episodes % n)).collect()
+}
+
+/// Adds those of the `ended` episodes that were to be counted from the start.
+fn count(ended: impl Iterator<Item = EndedEpisode>, quotas: &[u64], counted: &mut Vec<EndedEpisode>) {
+    counted.extend(ended.filter(|end| end.episode_index < quotas[end.slot]));
 }
 
 fn summarise(episodes: &[EndedEpisode]) -> TestResult {
@@ -201,9 +206,8 @@ mod tests {
         }
     }
 
-    #[test]
-    fn figures_are_means_over_the_episodes() {
-        let episode = |success: bool, episode_return: f64, length: u32| EndedEpisode {
+    fn episode(success: bool, episode_return: f64, length: u32) -> EndedEpisode {
+        EndedEpisode {
             slot: 0,
             environment_index: 0,
             episode_index: 0,
@@ -212,7 +216,34 @@ mod tests {
             success,
             terminated: false,
             parameters: Vec::new(),
+        }
+    }
+
+    /// Environment 0 has short episodes: the first three to end are all its own.
+    #[test]
+    fn the_first_episodes_of_each_environment_count_not_the_first_to_end() {
+        let of = |slot: usize, episode_index: u64| EndedEpisode {
+            slot,
+            environment_index: slot as u32,
+            episode_index,
+            ..episode(true, 1.0, 1)
         };
+        let quotas = quotas(3);
+        let mut counted = Vec::new();
+        for ended in [vec![of(0, 0)], vec![of(0, 1)], vec![of(0, 2), of(2, 0)], vec![of(0, 3), of(1, 0)]] {
+            count(ended.into_iter(), &quotas, &mut counted);
+        }
+        let counted: Vec<_> = counted.iter().map(|episode| (episode.slot, episode.episode_index)).collect();
+        assert_eq!(counted, [(0, 0), (2, 0), (1, 0)]);
+
+        let mut counted = Vec::new();
+        count([of(0, 0), of(0, 1), of(0, 2), of(1, 0), of(1, 1)].into_iter(), &[2, 1], &mut counted);
+        let counted: Vec<_> = counted.iter().map(|episode| (episode.slot, episode.episode_index)).collect();
+        assert_eq!(counted, [(0, 0), (0, 1), (1, 0)]);
+    }
+
+    #[test]
+    fn figures_are_means_over_the_episodes() {
         let result = summarise(&[
             episode(true, 4.0, 10),
             episode(false, -2.0, 20),

@@ -64,6 +64,25 @@ impl RunningMoments {
         Ok(())
     }
 
+    /// Whether these can be moments of vectors of `size` numbers; says what is wrong if they cannot.
+    fn check(&self, size: usize) -> std::result::Result<(), String> {
+        for (name, numbers) in [("mean", &self.mean), ("squares", &self.squares)] {
+            if numbers.len() != size {
+                return Err(format!("{name} has {} numbers, expected {size}", numbers.len()));
+            }
+            if let Some(x) = numbers.iter().find(|x| !x.is_finite()) {
+                return Err(format!("{name} holds {x}"));
+            }
+        }
+        if let Some(x) = self.squares.iter().find(|x| **x < 0.0) {
+            return Err(format!("squares holds {x}, which no sum of squares can be"));
+        }
+        if self.count == 0 && self.mean.iter().chain(&self.squares).any(|&x| x != 0.0) {
+            return Err("count is 0, but there are statistics".into());
+        }
+        Ok(())
+    }
+
     /// Number of vectors seen.
     pub fn count(&self) -> u64 {
         self.count
@@ -96,6 +115,11 @@ impl ObservationNormaliser {
     /// The statistics.
     pub fn moments(&self) -> &RunningMoments {
         &self.moments
+    }
+
+    /// Whether this can normalise observations of `observation_size` numbers; says what is wrong if it cannot.
+    pub(crate) fn check(&self, observation_size: usize) -> std::result::Result<(), String> {
+        self.moments.check(observation_size)
     }
 
     /// Adds `observations` `[N, O]` to the statistics. Infinite numbers and NaN are refused and change nothing.
@@ -146,6 +170,17 @@ impl RewardNormaliser {
     /// The statistics of the discounted returns.
     pub fn moments(&self) -> &RunningMoments {
         &self.moments
+    }
+
+    /// Whether this can normalise rewards; says what is wrong if it cannot.
+    pub(crate) fn check(&self) -> std::result::Result<(), String> {
+        if !(0.0..=1.0).contains(&self.gamma) {
+            return Err(format!("gamma is {}, but must be between 0 and 1", self.gamma));
+        }
+        if let Some(x) = self.returns.iter().find(|x| !x.is_finite()) {
+            return Err(format!("returns holds {x}"));
+        }
+        self.moments.check(1)
     }
 
     /// Adds a step's `rewards` `[N]` to the statistics. Where `done` `[N]`, terminated or truncated, the discounted return
