@@ -6,4 +6,4 @@ mod collector;
 
 pub use advantage::{Estimates, Trajectories, gae, n_step_returns};
 pub use buffer::{Rollout, RolloutStep};
-pub use collector::{CollectError, Collector, Normalisers, Times};
+pub use collector::{CollectError, Collector, CollectorState, Normalisers, Times};
