@@ -17,6 +17,7 @@ pub mod loss;
 pub mod policy;
 pub mod random;
 pub mod rollout;
+mod run_directory;
 pub mod training;
 
 /// The protocol: generated from `proto/perturb/v1/perturb.proto`, whose comments specify every field.
