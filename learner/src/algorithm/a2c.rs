@@ -15,7 +15,7 @@ use crate::policy::Policy;
 use crate::rollout::{Rollout, n_step_returns};
 
 /// Settings of [`A2c`]. The defaults are those of OpenAI Baselines; the paper searches `learning_rate`, `n_steps` and
-/// `ent_coef`.
+/// `ent_coef`, for which `perturb train` has defaults of its own.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct A2cConfig {

@@ -52,7 +52,7 @@ pub struct Common {
     pub episodes: u64,
     /// Fixes all randomness, 0 … 2⁶³-1 (default: `1`).
     pub seed: u64,
-    /// N: environments that are stepped together, 1 … 65536 (default: `16` with A2C, `8` with PPO, `25` with EPOpt).
+    /// N: environments that are stepped together, 1 … 65536 (default: `16`, `8` with PPO FF, `25` with EPOpt).
     /// More makes a step cheaper and updates rarer.
     pub num_envs: usize,
     /// Whether observations are normalised by their running mean and variance (default: `true`).

@@ -34,7 +34,8 @@ fn a_flag_beats_a_set_beats_the_file_beats_the_default() {
 #[test]
 fn an_algorithm_brings_its_own_defaults_and_keys() {
     let config = load(None, &["algorithm=a2c", "rms_alpha=0.9"], "environment = 'Pendulum'").unwrap();
-    let base = BaseSettings::A2c(A2cConfig { rms_alpha: 0.9, ..A2cConfig::default() });
+    let own = A2cConfig { learning_rate: 7e-3, n_steps: 15, ent_coef: 1e-3, ..A2cConfig::default() };
+    let base = BaseSettings::A2c(A2cConfig { rms_alpha: 0.9, ..own });
     assert_eq!(config.settings, Settings { base, wrapper: WrapperSettings::Plain });
     assert!(refusal(None, &["rms_alpha=0.9"]).contains("unknown key `rms_alpha`; ppo's keys are"));
 }

@@ -15,7 +15,7 @@ use crate::error::{Error, Result, check_length};
 /// `max_batch`, except where the caller's outputs grow.
 ///
 /// A recurrent policy's actor keeps the memory of every environment: [`Actor::act`] moves it on, [`Actor::forget`]
-/// empties it at an episode's end, values leave it alone.
+/// empties it at an episode's end (RL²: a trial's), values leave it alone.
 #[derive(Clone, Debug)]
 pub struct Actor {
     spec: PolicySpec,

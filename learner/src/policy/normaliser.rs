@@ -151,7 +151,7 @@ impl ObservationNormaliser {
 /// Normalises rewards: divides them by the standard deviation of the discounted returns R_t = γ R_{t-1} + r_t that every
 /// environment has had so far (Engstrom et al., 2020, arXiv:2005.12729), and clips to ±10. Their mean is kept.
 ///
-/// R starts at 0 in every episode, as in stable-baselines3; the reference lets it run on.
+/// R starts at 0 in every episode, or trial, as in stable-baselines3; the reference lets it run on.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RewardNormaliser {

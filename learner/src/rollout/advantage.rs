@@ -10,6 +10,9 @@
 //! back. If both flags are set, termination wins. The reference treats a truncation as a termination, which is
 //! `bootstrap_truncation = false`; why that biases values: Pardo et al. (2018), arXiv:1712.00378.
 //!
+//! With trials of several episodes (RL²) a trial is the episode that is meant here: its flags are those of the trial's
+//! end.
+//!
 //! Sums are in f64 and rounded once, at the end.
 
 /// T steps of N environments; arrays are row-major.
