@@ -12,9 +12,9 @@ use std::path::{Path, PathBuf};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 
-use crate::config::{AlgorithmName, Architecture, TrainConfig};
+use crate::config::{AlgorithmName, Architecture, TrainConfig, Wrapper};
 use crate::evaluation::Version;
-use crate::policy::{ActionKind, NamedArray, ObservationNormaliser, PolicySpec, RewardNormaliser, Weights};
+use crate::policy::{ActionKind, Inputs, NamedArray, ObservationNormaliser, PolicySpec, RewardNormaliser, Weights};
 use crate::proto;
 
 /// Of the JSON's layout; raised when older programs could misread it.
@@ -50,6 +50,9 @@ pub struct State {
     pub policy: PolicySpec,
     /// Where the parameters came from while training.
     pub train_version: Version,
+    /// Episodes in a trial; 1 without trials.
+    #[serde(default = "one")]
+    pub episodes_per_trial: u32,
     /// The seed of the training.
     pub seed: u64,
     /// The statistics of observations; `None` if they were not normalised.
@@ -60,6 +63,10 @@ pub struct State {
     pub counters: Counters,
     /// The training's configuration, flat, as in `config.toml`.
     pub config: toml::Table,
+}
+
+fn one() -> u32 {
+    1
 }
 
 /// What an environment must still be for a policy to fit it.
@@ -86,10 +93,16 @@ pub struct EnvironmentSummary {
 pub struct Counters {
     /// Rollouts and updates.
     pub iterations: u64,
-    /// Steps of all environments together.
+    /// Steps of all environments together; EPOpt's are those of complete episodes.
     pub timesteps: u64,
-    /// Ended episodes.
+    /// Episodes that the budget counts: those that ended or, with EPOpt, those that it learned from.
     pub episodes: u64,
+    /// Episodes that ended; EPOpt generates more than it learns from.
+    #[serde(default)]
+    pub generated_episodes: u64,
+    /// Steps that were learned from.
+    #[serde(default)]
+    pub learned_timesteps: u64,
 }
 
 /// `checkpoint.json`.
@@ -190,7 +203,7 @@ impl Checkpoint {
         let wrong = |name: &str, reason: String| damaged(&json, format!("{name}: {reason}"));
         if let Some(normaliser) = &state.observation_normaliser {
             normaliser
-                .check(state.policy.observation_size)
+                .check(state.environment_spec.observation.len())
                 .map_err(|reason| wrong("observation_normaliser", reason))?;
         }
         if let Some(normaliser) = &state.reward_normaliser {
@@ -215,6 +228,14 @@ impl Checkpoint {
     /// A configuration that this program does not understand.
     pub fn config(&self) -> std::result::Result<TrainConfig, crate::config::ConfigError> {
         TrainConfig::from_table("the checkpoint's configuration", self.state.config.clone())
+    }
+}
+
+impl State {
+    /// What the policy gets to see of `n_envs` environments at the start of a trial.
+    pub fn inputs(&self, n_envs: usize) -> Inputs {
+        let with_outcomes = self.algorithm.wrapper() == Wrapper::Rl2;
+        Inputs::new(self.environment_spec.observation.len(), self.policy.action, n_envs, with_outcomes)
     }
 }
 

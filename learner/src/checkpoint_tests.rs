@@ -23,10 +23,11 @@ fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
         architecture: if lstm.is_some() { Architecture::Rc } else { Architecture::Ff },
         policy: policy.clone(),
         train_version: Version::R,
+        episodes_per_trial: 2,
         seed,
         observation_normaliser: Some(normaliser),
         reward_normaliser: Some(RewardNormaliser::new(2, 0.99)),
-        counters: Counters { iterations, timesteps: 7, episodes: 3 },
+        counters: Counters { iterations, timesteps: 7, episodes: 3, generated_episodes: 4, learned_timesteps: 5 },
         config: config.table(),
     };
     Checkpoint { state, weights: Policy::new(policy, seed).unwrap().weights() }

@@ -11,13 +11,13 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, Result, bail};
 
-use crate::algorithm::{Algorithm, UpdateStats};
+use crate::algorithm::{Algorithm, Experience, UpdateStats};
 use crate::checkpoint::{Checkpoint, Counters, EnvironmentSummary, State};
 use crate::client::{EndedEpisode, OpenOptions, Servers, Session};
-use crate::config::TrainConfig;
+use crate::config::{TrainConfig, Wrapper};
 use crate::interrupt::StopFlag;
 use crate::logging::{Monitor, Progress, ProgressLog};
-use crate::policy::{ObservationNormaliser, Policy, RewardNormaliser, Weights};
+use crate::policy::{Inputs, ObservationNormaliser, Policy, RewardNormaliser, Weights};
 use crate::rollout::{Collector, Normalisers, Rollout};
 
 /// Means are over so many episodes, as in stable-baselines3.
@@ -194,21 +194,28 @@ impl<'a> Training<'a> {
             version: common.version.to_proto(),
             num_envs: common.num_envs,
             seed: common.seed,
-            episodes_per_trial: 1,
+            episodes_per_trial: config.settings.episodes_per_trial(),
         };
         let mut observations = Vec::new();
         let session = Session::open(servers, &options, &mut observations)?;
         let summary = EnvironmentSummary::of(session.environment())
             .context("the server does not say what actions the environment takes: are both of one version?")?;
-        let spec = common.architecture.spec(session.observation_size(), summary.action);
+        let observation_size = session.observation_size();
+        let with_outcomes = common.algorithm.wrapper() == Wrapper::Rl2;
+        let inputs = Inputs::new(observation_size, summary.action, common.num_envs, with_outcomes);
+        let spec = common.architecture.spec(inputs.size(), summary.action);
         let policy = Policy::new(spec.clone(), common.seed)?;
         let algorithm = config.algorithm(&policy)?;
         let normalisers = Normalisers {
-            observations: common.normalize_observations.then(|| ObservationNormaliser::new(spec.observation_size)),
-            rewards: common.normalize_rewards.then(|| RewardNormaliser::new(common.num_envs, config.gamma())),
+            observations: common.normalize_observations.then(|| ObservationNormaliser::new(observation_size)),
+            rewards: common.normalize_rewards.then(|| RewardNormaliser::new(common.num_envs, config.settings.gamma())),
         };
-        let rollout = Rollout::new(algorithm.n_steps(), common.num_envs, spec.observation_size, spec.action.width());
-        let collector = Collector::new(session, observations, &spec, normalisers, common.seed)?;
+        let (n_envs, input_size, width) = (common.num_envs, inputs.size(), summary.action.width());
+        let rollout = match algorithm.experience() {
+            Experience::Steps(n_steps) => Rollout::new(n_steps, n_envs, input_size, width),
+            Experience::Episodes(_) => Rollout::of_episodes(n_envs, input_size, width),
+        };
+        let collector = Collector::new(session, observations, &spec, inputs, normalisers, common.seed)?;
         let whole = Checkpoint {
             state: State {
                 environment: common.environment.clone(),
@@ -217,6 +224,7 @@ impl<'a> Training<'a> {
                 architecture: common.architecture,
                 policy: spec,
                 train_version: common.version,
+                episodes_per_trial: options.episodes_per_trial,
                 seed: common.seed,
                 observation_normaliser: None,
                 reward_normaliser: None,
@@ -245,18 +253,27 @@ impl<'a> Training<'a> {
     fn iterate(&mut self, log: &mut Logs) -> Result<Progress> {
         let mut counters = self.whole.state.counters;
         let mut written = Ok(());
-        let recent = &mut self.recent;
-        self.collector.collect(&self.whole.weights, &mut self.rollout, |episode| {
-            counters.episodes += 1;
+        let (mut ended, mut steps) = (0, 0);
+        let Self { collector, rollout, recent, whole, algorithm, .. } = self;
+        let on_episode = |episode: &EndedEpisode| {
+            ended += 1;
+            steps += u64::from(episode.length);
             remember(recent, episode);
             if written.is_ok() {
                 written = log.monitor.write(episode);
             }
-        })?;
+        };
+        match algorithm.experience() {
+            Experience::Steps(_) => {
+                collector.collect(&whole.weights, rollout, on_episode)?;
+                steps = (rollout.n_steps() * rollout.n_envs()) as u64;
+            }
+            Experience::Episodes(count) => collector.collect_episodes(&whole.weights, count, rollout, on_episode)?,
+        }
         written.context("cannot write monitor.csv")?;
 
         let updating = Instant::now();
-        let progress_remaining = self.progress_remaining(self.whole.state.counters.timesteps);
+        let progress_remaining = self.progress_remaining(counters.learned_timesteps);
         let Self { algorithm, policy, rollout, .. } = self;
         let mut update = || algorithm.update(policy, rollout, progress_remaining);
         // A thread for it would cost more than the shortest updates; all updates of a training take about as long.
@@ -269,13 +286,20 @@ impl<'a> Training<'a> {
         self.last_update = Some(elapsed);
         self.updating += elapsed;
 
+        let (learned_episodes, learned_steps) = match update.selection {
+            Some(selection) => (selection.kept, selection.kept_steps),
+            None => (ended, steps),
+        };
         counters.iterations += 1;
-        counters.timesteps += (self.rollout.n_steps() * self.rollout.n_envs()) as u64;
+        counters.timesteps += steps;
+        counters.episodes += learned_episodes;
+        counters.generated_episodes += ended;
+        counters.learned_timesteps += learned_steps;
         self.keep(weights, counters);
         Ok(self.progress(update))
     }
 
-    /// 1 at the start, 0 when as many steps were made as the budget's episodes can have at most.
+    /// 1 at the start, 0 when as many steps were learned from as the budget's episodes can have at most.
     fn progress_remaining(&self, timesteps: u64) -> f64 {
         let most = self.config.common.episodes as f64 * f64::from(self.summary.step_limit);
         (1.0 - timesteps as f64 / most).max(0.0)
@@ -291,7 +315,7 @@ impl<'a> Training<'a> {
     }
 
     fn progress(&self, update: UpdateStats) -> Progress {
-        let Counters { iterations, timesteps, episodes } = self.whole.state.counters;
+        let Counters { iterations, timesteps, episodes, generated_episodes, .. } = self.whole.state.counters;
         let times = self.collector.times();
         let mean = |i: usize| self.recent.iter().map(|episode| episode[i]).sum::<f64>() / self.recent.len() as f64;
         Progress {
@@ -300,6 +324,7 @@ impl<'a> Training<'a> {
             elapsed: self.start.elapsed().as_secs_f64(),
             shares: [times.acting, times.waiting, self.updating].map(|time| time.as_secs_f64()),
             episodes,
+            generated_episodes,
             recent: (!self.recent.is_empty()).then(|| [mean(0), mean(1), mean(2)]),
             update,
         }

@@ -9,7 +9,7 @@ use perturb_learner::client::{Address, LocalServer, LocalServerOptions, OpenOpti
 use perturb_learner::config::TrainConfig;
 use perturb_learner::evaluation::{Version, test};
 use perturb_learner::interrupt::StopFlag;
-use perturb_learner::policy::{ActionKind, Policy, PolicySpec, Sequences};
+use perturb_learner::policy::{ActionKind, Inputs, Policy, PolicySpec, Sequences};
 use perturb_learner::proto;
 use perturb_learner::rollout::{Collector, Normalisers, Rollout};
 use perturb_learner::training::{Outcome, RunDirectory, train};
@@ -192,7 +192,8 @@ fn rollouts_keep_what_a_recurrent_policy_remembers() {
     let spec = PolicySpec { observation_size: size, action, hidden: vec![16], lstm: Some(8) };
     let policy = Policy::new(spec.clone(), 1).expect("a policy");
     let none = Normalisers { observations: None, rewards: None };
-    let mut collector = Collector::new(session, observations, &spec, none, 1).expect("a collector");
+    let mut collector = Collector::new(session, observations, &spec, Inputs::new(size, action, n_envs, false), none, 1)
+        .expect("a collector");
     let rollouts = [(); 2].map(|()| {
         let mut rollout = Rollout::new(n_steps, n_envs, size, 1);
         collector.collect(&policy.weights(), &mut rollout, |_| {}).expect("a rollout");
@@ -379,7 +380,13 @@ fn the_program_trains_tests_and_refuses_with_sentences() {
     let output = call(&base);
     assert!(output.status.success(), "{}", stderr(&output));
     refused(&base, 1, "already holds a run");
-    refused(&["train", "--env", "CartPole", "--out", run, "--algorithm", "rl2-ppo"], 2, "possible values: a2c, ppo");
+    refused(
+        &["train", "--env", "CartPole", "--out", run, "--algorithm", "dqn"],
+        2,
+        "possible values: a2c, ppo, epopt-a2c",
+    );
+    let forgetful = ["train", "--env", "CartPole", "--out", run, "--algorithm", "rl2-ppo", "--architecture", "ff"];
+    refused(&forgetful, 2, "rl2-ppo cannot train the architecture ff");
     refused(&["train", "--env", "CartPole", "--out", run, "--architecture", "mlp"], 2, "possible values: ff, rc");
     refused(&["train", "--env", "CartPole", "--out", run, "--set", "foo=1"], 2, "unknown key `foo`");
     refused(&["train", "--out", run], 2, "no environment was named");

@@ -1,12 +1,13 @@
 //! Advantage actor-critic.
 
 use serde::{Deserialize, Serialize};
-use tch::{Kind, Tensor};
+use tch::Kind;
 
+use super::batch::Batch;
 use super::optimiser::{Descent, RmsProp};
 use super::{
-    Algorithm, AlgorithmState, Schedule, UpdateStats, check_count, check_fraction, check_not_negative, check_positive,
-    check_rollout, samples, scalars,
+    Algorithm, AlgorithmState, Experience, Schedule, UpdateStats, check_count, check_fraction, check_not_negative,
+    check_positive, check_rollout, explained_variance, scalars,
 };
 use crate::error::{Result, check};
 use crate::loss;
@@ -98,8 +99,8 @@ impl A2c {
 }
 
 impl Algorithm for A2c {
-    fn n_steps(&self) -> usize {
-        self.config.n_steps
+    fn experience(&self) -> Experience {
+        Experience::Steps(self.config.n_steps)
     }
 
     fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats> {
@@ -107,10 +108,10 @@ impl Algorithm for A2c {
         check_rollout(rollout, policy, self.config.n_steps)?;
         let learning_rate = self.config.learning_rate_schedule.at(self.config.learning_rate, progress_remaining)?;
         let estimates = n_step_returns(&rollout.trajectories()?, gamma, bootstrap_truncation);
-        let (sequences, actions) = samples(rollout, policy)?;
-        let evaluated = policy.evaluate(&sequences, &actions);
-        let policy_loss = loss::policy_gradient(&evaluated.log_probs, &Tensor::f_of_slice(&estimates.advantages)?);
-        let value_loss = loss::value(&evaluated.values, &Tensor::f_of_slice(&estimates.returns)?);
+        let batch = Batch::new(rollout, policy, &estimates)?;
+        let evaluated = policy.evaluate(&batch.sequences, &batch.actions);
+        let policy_loss = loss::policy_gradient(&evaluated.log_probs, &batch.advantages()?);
+        let value_loss = loss::value(&evaluated.values, &batch.returns()?);
         let entropy_loss = -evaluated.entropy.mean(Kind::Float);
         let loss = &policy_loss + &entropy_loss * ent_coef + &value_loss * vf_coef;
         let grad_norm = self.descent.step(policy, &evaluated, &loss, learning_rate)?;
@@ -123,17 +124,20 @@ impl Algorithm for A2c {
             entropy_loss,
             loss,
             approx_kl: None,
+            kl_divergence: None,
             clip_fraction: None,
             clip_range: None,
-            explained_variance: loss::explained_variance(rollout.values(), &estimates.returns),
+            explained_variance: explained_variance(rollout, &estimates),
             grad_norm,
             n_updates: self.descent.n_updates(),
             std: policy.mean_std(),
+            selection: None,
         })
     }
 
     fn state(&self) -> AlgorithmState {
-        AlgorithmState { n_updates: self.descent.n_updates(), optimiser: self.descent.state(), rng: None }
+        let (n_updates, optimiser) = (self.descent.n_updates(), self.descent.state());
+        AlgorithmState { n_updates, iterations: 0, optimiser, rng: None }
     }
 
     fn load_state(&mut self, state: &AlgorithmState) -> Result<()> {

@@ -1,24 +1,39 @@
 //! Algorithms: what turns a rollout into better weights.
 
 mod a2c;
+mod batch;
+mod epopt;
 mod optimiser;
 mod ppo;
+mod rl2;
 
 pub use a2c::{A2c, A2cConfig};
+pub use epopt::{Epopt, EpoptConfig, Selection};
 pub use ppo::{Ppo, PpoConfig};
+pub use rl2::Rl2Config;
 
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use tch::Tensor;
 
 use crate::error::{Error, Result, check, check_length};
-use crate::policy::{NamedArray, Policy, Sequences};
-use crate::rollout::Rollout;
+use crate::loss;
+use crate::policy::{NamedArray, Policy};
+use crate::rollout::{Estimates, Rollout};
+
+/// What an update learns from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Experience {
+    /// T steps of every environment, episodes running on from one rollout to the next.
+    Steps(usize),
+    /// So many complete episodes, each in a freshly drawn environment.
+    Episodes(usize),
+}
 
 /// Learns from rollouts.
 pub trait Algorithm: Send {
-    /// T: steps of each environment between two updates.
-    fn n_steps(&self) -> usize;
+    /// What is collected between two updates.
+    fn experience(&self) -> Experience;
 
     /// Improves `policy` by a finished rollout. `progress_remaining` falls from 1 at the start of training to 0 at its
     /// end. A loss or gradient that is not finite is an error, after which the policy is as it was before that gradient
@@ -37,6 +52,9 @@ pub trait Algorithm: Send {
 pub struct AlgorithmState {
     /// Gradient steps so far.
     pub n_updates: u64,
+    /// Iterations so far, where they count: EPOpt's.
+    #[serde(default)]
+    pub iterations: u64,
     /// The optimiser's running averages.
     pub optimiser: Vec<NamedArray>,
     /// The stream of minibatch orders, where there is one.
@@ -66,7 +84,7 @@ impl Schedule {
 }
 
 /// What happened in an update, by stable-baselines3's names. Averages are over the update's gradient steps.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct UpdateStats {
     /// The optimiser's step size.
     pub learning_rate: f64,
@@ -80,6 +98,8 @@ pub struct UpdateStats {
     pub loss: f64,
     /// Estimate of the KL divergence of the new from the acting policy, in nats; PPO only.
     pub approx_kl: Option<f64>,
+    /// KL divergence of the new from the acting policy, in nats, before `kl_coef`; PPO with `kl_coef` above 0 only.
+    pub kl_divergence: Option<f64>,
     /// Share of samples whose ratio was outside `1 ± clip_range`; PPO only.
     pub clip_fraction: Option<f64>,
     /// `clip_range`; PPO only.
@@ -92,24 +112,29 @@ pub struct UpdateStats {
     pub n_updates: u64,
     /// Mean standard deviation of the actions; continuous actions only.
     pub std: Option<f64>,
+    /// Which episodes were learned from; EPOpt only.
+    pub selection: Option<Selection>,
 }
 
-/// Whether a rollout's axes fit the algorithm and the policy.
+/// Whether a rollout's axes fit the algorithm and the policy. One of complete episodes is as long as these were.
 fn check_rollout(rollout: &Rollout, policy: &Policy, n_steps: usize) -> Result<()> {
-    check_length("the rollout's axis T", rollout.n_steps(), n_steps)?;
+    if rollout.lengths().is_none() {
+        check_length("the rollout's axis T", rollout.n_steps(), n_steps)?;
+    }
     check_length("the rollout's axis O", rollout.observation_size(), policy.spec().observation_size)?;
     check_length("the rollout's axis A", rollout.action_width(), policy.spec().action.width())?;
     check_length("the rollout's memory [N, S]", rollout.memory().len(), rollout.n_envs() * policy.spec().memory_size())
 }
 
-/// The rollout's samples as tensors: what `policy` is evaluated on, and actions `[L, M, A]`.
-fn samples(rollout: &Rollout, policy: &Policy) -> Result<(Sequences, Tensor)> {
-    let spec = policy.spec();
-    let sequences =
-        Sequences::new(spec, rollout.n_steps(), rollout.observations(), rollout.starts(), rollout.memory())?;
-    let shape = (sequences.n_steps(), sequences.count(), spec.action.width() as i64);
-    let actions = Tensor::f_of_slice(rollout.actions())?.f_view(shape)?;
-    Ok((sequences, actions))
+/// The share of the variance of the returns that the rollout's values explain.
+fn explained_variance(rollout: &Rollout, estimates: &Estimates) -> Option<f64> {
+    match rollout.samples() {
+        None => loss::explained_variance(rollout.values(), &estimates.returns),
+        Some(samples) => {
+            let pick = |data: &[f32]| samples.iter().map(|&i| data[i as usize]).collect::<Vec<f32>>();
+            loss::explained_variance(&pick(rollout.values()), &pick(&estimates.returns))
+        }
+    }
 }
 
 /// Copies scalar tensors out, at the cost of one transfer.

@@ -2,16 +2,17 @@
 
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
-use tch::{Kind, Tensor};
+use tch::Kind;
 
+use super::batch::Batch;
 use super::optimiser::{Adam, Descent};
 use super::{
-    Algorithm, AlgorithmState, Schedule, UpdateStats, check_count, check_fraction, check_not_negative, check_positive,
-    check_rollout, samples, scalars,
+    Algorithm, AlgorithmState, Experience, Schedule, UpdateStats, check_count, check_fraction, check_not_negative,
+    check_positive, check_rollout, explained_variance, scalars,
 };
 use crate::error::{Error, Result};
 use crate::loss;
-use crate::policy::{Policy, Sequences};
+use crate::policy::Policy;
 use crate::random::{Purpose, stream, uniform};
 use crate::rollout::{Rollout, gae};
 
@@ -43,6 +44,9 @@ pub struct PpoConfig {
     pub normalize_advantage: bool,
     /// Weight of the entropy in nats, not negative (default: `0`). Larger keeps actions random for longer.
     pub ent_coef: f64,
+    /// Weight of the KL divergence of the new from the acting policy, in nats, not negative (default: `0`). Larger holds
+    /// the policy back where clipping does not. Packer et al. (2018) search it for RL².
+    pub kl_coef: f64,
     /// Weight of the value loss, not negative (default: `0.5`). Feed-forward policy and value networks share no weights, so
     /// it acts through the clipping of the common gradient only; recurrent ones share all but their heads.
     pub vf_coef: f64,
@@ -69,6 +73,7 @@ impl Default for PpoConfig {
             clip_range_vf: 0.2,
             normalize_advantage: true,
             ent_coef: 0.0,
+            kl_coef: 0.0,
             vf_coef: 0.5,
             max_grad_norm: 0.5,
             adam_eps: 1e-5,
@@ -89,6 +94,7 @@ impl PpoConfig {
         check_positive("clip_range", self.clip_range)?;
         check_not_negative("clip_range_vf", self.clip_range_vf)?;
         check_not_negative("ent_coef", self.ent_coef)?;
+        check_not_negative("kl_coef", self.kl_coef)?;
         check_not_negative("vf_coef", self.vf_coef)?;
         check_positive("max_grad_norm", self.max_grad_norm)?;
         check_positive("adam_eps", self.adam_eps)
@@ -99,49 +105,18 @@ impl PpoConfig {
 /// rollout's T·N samples, each in `n_minibatches` random parts with one gradient step (of samples or, for a recurrent
 /// policy, of environments),
 ///
-/// loss = clipped surrogate - ent_coef · mean entropy + vf_coef · clipped value loss,
+/// loss = clipped surrogate - ent_coef · mean entropy + vf_coef · clipped value loss + kl_coef · mean KL(π_old ‖ π),
 ///
-/// with [`gae`]'s advantages and returns, computed once from the rollout's values.
+/// with [`gae`]'s advantages and returns, computed once from the rollout's values, and the acting policy π_old.
 pub struct Ppo {
     config: PpoConfig,
     descent: Descent,
     rng: ChaCha8Rng,
 }
 
-/// A rollout, or a minibatch of it, as tensors: M sequences of L steps.
-struct Batch {
-    /// What the policy is evaluated on.
-    sequences: Sequences,
-    /// `[L, M, A]`.
-    actions: Tensor,
-    /// `[L, M]`.
-    old_log_probs: Tensor,
-    /// `[L, M]`.
-    old_values: Tensor,
-    /// `[L, M]`.
-    advantages: Tensor,
-    /// `[L, M]`.
-    returns: Tensor,
-}
-
-impl Batch {
-    /// The sequences at `indices`.
-    fn select(&self, indices: &[i64]) -> Result<Batch> {
-        let indices = Tensor::f_of_slice(indices)?;
-        let select = |tensor: &Tensor| tensor.f_index_select(1, &indices);
-        Ok(Batch {
-            sequences: self.sequences.select(&indices)?,
-            actions: select(&self.actions)?,
-            old_log_probs: select(&self.old_log_probs)?,
-            old_values: select(&self.old_values)?,
-            advantages: select(&self.advantages)?,
-            returns: select(&self.returns)?,
-        })
-    }
-}
-
-/// What a gradient step reports: policy loss, value loss, entropy loss, loss, KL, clip fraction, gradient norm.
-type Report = [f64; 7];
+/// What a gradient step reports: policy loss, value loss, entropy loss, loss, approximate KL, clip fraction, KL divergence,
+/// gradient norm.
+type Report = [f64; 8];
 
 impl Ppo {
     /// Checks the settings and starts with fresh optimiser state for `policy`; `seed` fixes the order of minibatches.
@@ -154,76 +129,78 @@ impl Ppo {
 
     /// One gradient step on `batch`.
     fn step(&mut self, policy: &mut Policy, batch: &Batch, learning_rate: f64) -> Result<Report> {
-        let PpoConfig { clip_range, clip_range_vf, ent_coef, vf_coef, .. } = self.config;
-        let flat = |tensor: &Tensor| tensor.f_view((-1,));
-        let (old_log_probs, old_values) = (flat(&batch.old_log_probs)?, flat(&batch.old_values)?);
-        let (advantages, returns) = (flat(&batch.advantages)?, flat(&batch.returns)?);
+        let PpoConfig { clip_range, clip_range_vf, ent_coef, kl_coef, vf_coef, .. } = self.config;
+        let (advantages, returns) = (batch.advantages()?, batch.returns()?);
         let normalized = self.config.normalize_advantage.then(|| loss::normalize_advantages(&advantages));
         let advantages = normalized.as_ref().unwrap_or(&advantages);
         let evaluated = policy.evaluate(&batch.sequences, &batch.actions);
-        let surrogate = loss::clipped_surrogate(&evaluated.log_probs, &old_log_probs, advantages, clip_range);
+        let surrogate = loss::clipped_surrogate(&evaluated.log_probs, &batch.old_log_probs()?, advantages, clip_range);
         let value_loss = if clip_range_vf > 0.0 {
-            loss::clipped_value(&evaluated.values, &old_values, &returns, clip_range_vf)
+            loss::clipped_value(&evaluated.values, &batch.old_values()?, &returns, clip_range_vf)
         } else {
             loss::value(&evaluated.values, &returns)
         };
         let entropy_loss = -evaluated.entropy.mean(Kind::Float);
-        let loss = &surrogate.loss + &entropy_loss * ent_coef + &value_loss * vf_coef;
+        let mut loss = &surrogate.loss + &entropy_loss * ent_coef + &value_loss * vf_coef;
+        let kl_divergence = match batch.acting()? {
+            Some(acting) => {
+                let kl_divergence = acting.divergence_to(&evaluated.distributions).mean(Kind::Float);
+                loss += &kl_divergence * kl_coef;
+                kl_divergence
+            }
+            None => surrogate.approx_kl.zeros_like(),
+        };
         let grad_norm = self.descent.step(policy, &evaluated, &loss, learning_rate)?;
-        let [policy, value, entropy, loss, kl, clip] = scalars([
+        let [policy, value, entropy, loss, kl, clip, kl_divergence] = scalars([
             &surrogate.loss,
             &value_loss,
             &entropy_loss,
             &loss,
             &surrogate.approx_kl,
             &surrogate.clip_fraction,
+            &kl_divergence,
         ])?;
-        Ok([policy, value, entropy, loss, kl, clip, grad_norm])
+        Ok([policy, value, entropy, loss, kl, clip, kl_divergence, grad_norm])
     }
 }
 
 impl Algorithm for Ppo {
-    fn n_steps(&self) -> usize {
-        self.config.n_steps
+    fn experience(&self) -> Experience {
+        Experience::Steps(self.config.n_steps)
     }
 
     fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats> {
         let PpoConfig { n_epochs, n_minibatches, .. } = self.config;
         check_rollout(rollout, policy, self.config.n_steps)?;
-        let trajectories = rollout.trajectories()?;
-        let (sequences, actions) = samples(rollout, policy)?;
-        let (n_steps, count) = (sequences.n_steps(), sequences.count());
-        if !(count as usize).is_multiple_of(n_minibatches) {
+        let PpoConfig { gamma, gae_lambda, kl_coef, bootstrap_truncation, .. } = self.config;
+        let estimates = gae(&rollout.trajectories()?, gamma, gae_lambda, bootstrap_truncation);
+        let mut batch = Batch::new(rollout, policy, &estimates)?;
+        if kl_coef > 0.0 {
+            batch.remember_acting(policy);
+        }
+        let count = batch.sequences.count() as usize;
+        if !count.is_multiple_of(n_minibatches) {
             let got = format!("{n_minibatches}, to part {count}");
             let expected = "a divisor of n_steps times num_envs, or of num_envs if the policy is recurrent";
             return Err(Error::Setting { name: "n_minibatches", got, expected });
         }
         let learning_rate = self.config.learning_rate_schedule.at(self.config.learning_rate, progress_remaining)?;
-        let estimates = gae(&trajectories, self.config.gamma, self.config.gae_lambda, self.config.bootstrap_truncation);
-        let shaped = |data: &[f32]| Tensor::f_of_slice(data)?.f_view((n_steps, count));
-        let batch = Batch {
-            sequences,
-            actions,
-            old_log_probs: shaped(rollout.log_probs())?,
-            old_values: shaped(rollout.values())?,
-            advantages: shaped(&estimates.advantages)?,
-            returns: shaped(&estimates.returns)?,
-        };
 
-        let mut sums: Report = [0.0; 7];
+        let mut sums: Report = Report::default();
         let mut add = |report: Report| sums.iter_mut().zip(report).for_each(|(sum, x)| *sum += x);
-        let mut indices: Vec<i64> = (0..count).collect();
+        let mut indices: Vec<i64> = (0..count as i64).collect();
         for _ in 0..n_epochs {
             if n_minibatches == 1 {
-                add(self.step(policy, &batch, learning_rate)?); // the order of a mean's samples does not matter
+                // The order of a mean's samples does not matter.
+                add(self.step(policy, &batch, learning_rate)?);
                 continue;
             }
             shuffle(&mut indices, &mut self.rng);
-            for part in indices.chunks_exact(count as usize / n_minibatches) {
+            for part in indices.chunks_exact(count / n_minibatches) {
                 add(self.step(policy, &batch.select(part)?, learning_rate)?);
             }
         }
-        let [policy_gradient_loss, value_loss, entropy_loss, loss, approx_kl, clip_fraction, grad_norm] =
+        let [policy_gradient_loss, value_loss, entropy_loss, loss, approx_kl, clip_fraction, kl_divergence, grad_norm] =
             sums.map(|sum| sum / (n_epochs * n_minibatches) as f64);
         Ok(UpdateStats {
             learning_rate,
@@ -232,18 +209,20 @@ impl Algorithm for Ppo {
             entropy_loss,
             loss,
             approx_kl: Some(approx_kl),
+            kl_divergence: (kl_coef > 0.0).then_some(kl_divergence),
             clip_fraction: Some(clip_fraction),
             clip_range: Some(self.config.clip_range),
-            explained_variance: loss::explained_variance(rollout.values(), &estimates.returns),
+            explained_variance: explained_variance(rollout, &estimates),
             grad_norm,
             n_updates: self.descent.n_updates(),
             std: policy.mean_std(),
+            selection: None,
         })
     }
 
     fn state(&self) -> AlgorithmState {
         let (n_updates, optimiser) = (self.descent.n_updates(), self.descent.state());
-        AlgorithmState { n_updates, optimiser, rng: Some(self.rng.clone()) }
+        AlgorithmState { n_updates, iterations: 0, optimiser, rng: Some(self.rng.clone()) }
     }
 
     fn load_state(&mut self, state: &AlgorithmState) -> Result<()> {

@@ -71,10 +71,13 @@ pub(super) struct TrainArgs {
     /// What learns [default: ppo].
     #[arg(long)]
     pub(super) algorithm: Option<AlgorithmName>,
-    /// What acts [default: ff].
+    /// What acts [default: ff; with RL², which has no other, rc].
     #[arg(long)]
     pub(super) architecture: Option<Architecture>,
-    /// Episodes to train for [default: 15000].
+    /// RL² only: episodes in a trial [default: 2].
+    #[arg(long, value_name = "N")]
+    pub(super) episodes_per_trial: Option<u64>,
+    /// Episodes to train for; EPOpt counts those that it learns from [default: 15000].
     #[arg(long, value_name = "N")]
     pub(super) episodes: Option<u64>,
     /// Fixes all randomness [default: 1].

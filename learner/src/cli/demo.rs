@@ -13,7 +13,7 @@ use super::train::describe;
 use super::{Ending, servers};
 use crate::checkpoint::Checkpoint;
 use crate::client::Servers;
-use crate::config::{AlgorithmName, TrainConfig};
+use crate::config::{AlgorithmName, Architecture, TrainConfig};
 use crate::evaluation::{Metrics, Rates, Version, paper, test};
 use crate::interrupt::StopFlag;
 use crate::training::{Outcome, RunDirectory, train};
@@ -74,7 +74,7 @@ fn train_on(
     directory: &Path,
     stop: &StopFlag,
 ) -> Result<Outcome> {
-    let mut config = TrainConfig::defaults(AlgorithmName::Ppo);
+    let mut config = TrainConfig::defaults(AlgorithmName::Ppo, Architecture::Ff);
     config.common.environment = ENVIRONMENT.into();
     config.common.version = version;
     config.common.episodes = args.episodes;

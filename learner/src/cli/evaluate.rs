@@ -63,6 +63,7 @@ fn document(state: &State, evaluation_seed: u64, results: &[(Version, TestResult
         "algorithm": state.algorithm,
         "architecture": state.architecture,
         "train_version": state.train_version,
+        "episodes_per_trial": state.episodes_per_trial,
         "seed": state.seed,
         "evaluation_seed": evaluation_seed,
         "training_episodes": state.counters.episodes,

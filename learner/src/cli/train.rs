@@ -79,9 +79,11 @@ fn flags(args: &TrainArgs) -> Result<Table, UsageError> {
     text("version", args.version.map(|version| version.to_string()));
     text("algorithm", args.algorithm.map(|algorithm| algorithm.to_string()));
     text("architecture", args.architecture.map(|architecture| architecture.to_string()));
-    for (key, value) in [("episodes", args.episodes), ("seed", args.seed)] {
+    for (flag, value) in
+        [("episodes", args.episodes), ("seed", args.seed), ("episodes-per-trial", args.episodes_per_trial)]
+    {
         if let Some(value) = value {
-            table.insert(key.to_owned(), number(key, value)?);
+            table.insert(flag.replace('-', "_"), number(flag, value)?);
         }
     }
     Ok(table)

@@ -38,6 +38,10 @@ pub struct EndedEpisode {
     pub environment_index: u32,
     /// Counts the environment's episodes from 0.
     pub episode_index: u64,
+    /// Counts the environment's trials from 0.
+    pub trial_index: u64,
+    /// Counts the trial's episodes from 0.
+    pub episode_in_trial: u32,
     /// The undiscounted sum of its rewards.
     pub episode_return: f64,
     /// Its number of steps.
@@ -76,6 +80,7 @@ pub struct Session<'a> {
     environment: proto::Environment,
     observation_size: usize,
     num_envs: usize,
+    episodes_per_trial: u32,
 }
 
 /// The part of a batch that one server owns.
@@ -124,7 +129,8 @@ impl<'a> Session<'a> {
         }
         let environment = environment.unwrap_or_default();
         let observation_size = environment.observation.len();
-        Ok(Self { servers, parts, environment, observation_size, num_envs: options.num_envs })
+        let OpenOptions { num_envs, episodes_per_trial, .. } = *options;
+        Ok(Self { servers, parts, environment, observation_size, num_envs, episodes_per_trial })
     }
 
     /// What was opened.
@@ -135,6 +141,11 @@ impl<'a> Session<'a> {
     /// N.
     pub fn num_envs(&self) -> usize {
         self.num_envs
+    }
+
+    /// Episodes in a trial.
+    pub fn episodes_per_trial(&self) -> u32 {
+        self.episodes_per_trial
     }
 
     /// O.
@@ -289,6 +300,8 @@ impl Part {
                 slot,
                 environment_index: episode.environment_index,
                 episode_index: episode.episode_index,
+                trial_index: episode.trial_index,
+                episode_in_trial: episode.episode_in_trial,
                 episode_return: end.r#return,
                 length: end.length,
                 success: end.success,

@@ -72,7 +72,8 @@ pub fn environment_seed(seed: u64, version: Version) -> u64 {
 }
 
 /// Tests `checkpoint` on `version`: `episodes` episodes with sampled actions and frozen statistics. Calls `report` with
-/// the number of episodes done.
+/// the number of episodes done. Of a policy that was trained in trials of several episodes the last one of each of
+/// `episodes` trials counts.
 ///
 /// Which episodes count is fixed beforehand: the first ones of each of at most 100 environments, as evenly as possible.
 /// Counting the first to end instead would favour short ones. The result depends on the checkpoint, the version, the
@@ -91,7 +92,10 @@ pub fn test(
 ) -> Result<TestResult, TestError> {
     let state = &checkpoint.state;
     let quotas = quotas(episodes);
-    let options = open_options(&state.environment, version, quotas.len(), seed);
+    let options = OpenOptions {
+        episodes_per_trial: state.episodes_per_trial,
+        ..open_options(&state.environment, version, quotas.len(), seed)
+    };
     let mut reply = StepReply::default();
     let mut session = Session::open(servers, &options, &mut reply.observations)?;
     check_unchanged(checkpoint, EnvironmentSummary::of(session.environment()))?;
@@ -113,10 +117,12 @@ pub(crate) fn play(
     let state = &checkpoint.state;
     let mut reply = StepReply { observations, ..StepReply::default() };
     let mut actor = Actor::new(&state.policy, quotas.len());
+    let mut inputs = state.inputs(quotas.len());
     actor.load(&checkpoint.weights)?;
     let mut rng = stream(seed, Purpose::TestActions);
     let mut acts = Acts::new(state.policy.action, quotas.len());
     let mut actions = Vec::new();
+    let mut done = vec![false; quotas.len()];
     let mut counted: Vec<EndedEpisode> = Vec::new();
     let episodes: u64 = quotas.iter().sum();
     while (counted.len() as u64) < episodes {
@@ -126,10 +132,20 @@ pub(crate) fn play(
         if let Some(normaliser) = &state.observation_normaliser {
             normaliser.normalise(&mut reply.observations)?;
         }
-        actor.act(&reply.observations, &mut rng, &mut acts)?;
+        actor.act(inputs.of(&reply.observations), &mut rng, &mut acts)?;
         acts.write_bytes(&mut actions);
         session.step(&actions, &mut reply)?;
-        reply.ended.iter().for_each(|end| actor.forget(end.slot));
+        if let Some(normaliser) = &state.reward_normaliser {
+            normaliser.normalise(&mut reply.rewards);
+        }
+        done.fill(false);
+        reply.ended.iter().for_each(|end| done[end.slot] = true);
+        inputs.remember(&acts, &reply.rewards, &done)?;
+        reply.ended.retain(|end| end.episode_in_trial + 1 == state.episodes_per_trial);
+        for end in &reply.ended {
+            actor.forget(end.slot);
+            inputs.forget(end.slot);
+        }
         // Environments that are done go on, unseen: they cost less than a smaller batch would save.
         count(reply.ended.drain(..), quotas, &mut counted);
         report(counted.len() as u64);
@@ -137,7 +153,7 @@ pub(crate) fn play(
     Ok(counted)
 }
 
-/// What a test opens.
+/// What a test opens of a policy without trials.
 fn open_options(environment: &str, version: Version, num_envs: usize, seed: u64) -> OpenOptions {
     OpenOptions {
         environment: environment.to_owned(),
@@ -148,15 +164,15 @@ fn open_options(environment: &str, version: Version, num_envs: usize, seed: u64)
     }
 }
 
-/// How many episodes each environment is tested for.
+/// How many trials each environment is tested for.
 fn quotas(episodes: u64) -> Vec<u64> {
     let n = episodes.clamp(1, MOST_ENVS);
     (0..n).map(|i| episodes / n + u64::from(i < episodes % n)).collect()
 }
 
-/// Adds those of the `ended` episodes that were to be counted from the start.
+/// Adds those of the `ended` episodes, each its trial's last, that were to be counted from the start.
 fn count(ended: impl Iterator<Item = EndedEpisode>, quotas: &[u64], counted: &mut Vec<EndedEpisode>) {
-    counted.extend(ended.filter(|end| end.episode_index < quotas[end.slot]));
+    counted.extend(ended.filter(|end| end.trial_index < quotas[end.slot]));
 }
 
 fn summarise(episodes: &[EndedEpisode]) -> TestResult {
@@ -230,6 +246,8 @@ mod tests {
             slot: 0,
             environment_index: 0,
             episode_index: 0,
+            trial_index: 0,
+            episode_in_trial: 0,
             episode_return,
             length,
             success,
@@ -241,10 +259,10 @@ mod tests {
     /// Environment 0 has short episodes: the first three to end are all its own.
     #[test]
     fn the_first_episodes_of_each_environment_count_not_the_first_to_end() {
-        let of = |slot: usize, episode_index: u64| EndedEpisode {
+        let of = |slot: usize, trial_index: u64| EndedEpisode {
             slot,
             environment_index: slot as u32,
-            episode_index,
+            trial_index,
             ..episode(true, 1.0, 1)
         };
         let quotas = quotas(3);
@@ -252,12 +270,12 @@ mod tests {
         for ended in [vec![of(0, 0)], vec![of(0, 1)], vec![of(0, 2), of(2, 0)], vec![of(0, 3), of(1, 0)]] {
             count(ended.into_iter(), &quotas, &mut counted);
         }
-        let counted: Vec<_> = counted.iter().map(|episode| (episode.slot, episode.episode_index)).collect();
+        let counted: Vec<_> = counted.iter().map(|episode| (episode.slot, episode.trial_index)).collect();
         assert_eq!(counted, [(0, 0), (2, 0), (1, 0)]);
 
         let mut counted = Vec::new();
         count([of(0, 0), of(0, 1), of(0, 2), of(1, 0), of(1, 1)].into_iter(), &[2, 1], &mut counted);
-        let counted: Vec<_> = counted.iter().map(|episode| (episode.slot, episode.episode_index)).collect();
+        let counted: Vec<_> = counted.iter().map(|episode| (episode.slot, episode.trial_index)).collect();
         assert_eq!(counted, [(0, 0), (0, 1), (1, 0)]);
     }
 

@@ -72,6 +72,8 @@ mod tests {
             slot: 1,
             environment_index: 3,
             episode_index: 4,
+            trial_index: 4,
+            episode_in_trial: 0,
             episode_return: 17.5,
             length: 18,
             success: false,

@@ -7,8 +7,10 @@ use super::EventWriter;
 use crate::algorithm::UpdateStats;
 
 /// The columns, by stable-baselines3's names; `time/acting`, `time/waiting` and `time/updating` are ours: seconds since
-/// the start spent on choosing actions, on waiting for servers and on updates.
-const COLUMNS: [&str; 23] = [
+/// the start spent on choosing actions, on waiting for servers and on updates; and `epopt/…`: EPOpt's generated episodes
+/// so far, and of the last iteration the share ε that was aimed at, the episodes kept, the mean return of all and that of
+/// the worst (conditional value at risk).
+const COLUMNS: [&str; 29] = [
     "time/iterations",
     "time/total_timesteps",
     "time/time_elapsed",
@@ -32,6 +34,12 @@ const COLUMNS: [&str; 23] = [
     "train/grad_norm",
     "train/n_updates",
     "train/std",
+    "train/kl_divergence",
+    "epopt/episodes_generated",
+    "epopt/epsilon",
+    "epopt/episodes_kept",
+    "epopt/return_mean",
+    "epopt/return_cvar",
 ];
 
 /// A line of `progress.csv`.
@@ -45,8 +53,10 @@ pub struct Progress {
     pub elapsed: f64,
     /// Of these: choosing actions, waiting for servers, updating.
     pub shares: [f64; 3],
-    /// Episodes that have ended.
+    /// Episodes that the budget counts.
     pub episodes: u64,
+    /// Episodes that have ended; EPOpt generates more than it learns from.
+    pub generated_episodes: u64,
     /// Mean return, mean length and share of successes of the last 100 episodes; `None` before the first has ended.
     pub recent: Option<[f64; 3]>,
     /// The last update.
@@ -63,6 +73,7 @@ impl Progress {
     fn values(&self) -> [Option<f64>; COLUMNS.len()] {
         let recent = |i: usize| self.recent.map(|recent| recent[i]);
         let update = &self.update;
+        let selection = update.selection;
         [
             Some(self.iterations as f64),
             Some(self.timesteps as f64),
@@ -87,6 +98,12 @@ impl Progress {
             Some(update.grad_norm),
             Some(update.n_updates as f64),
             update.std,
+            update.kl_divergence,
+            selection.map(|_| self.generated_episodes as f64),
+            selection.map(|selection| selection.epsilon),
+            selection.map(|selection| selection.kept as f64),
+            selection.map(|selection| selection.mean_return),
+            selection.map(|selection| selection.cvar),
         ]
     }
 }
@@ -126,6 +143,7 @@ impl ProgressLog {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::algorithm::Selection;
 
     #[test]
     fn a_line_has_a_value_under_each_name() {
@@ -144,6 +162,8 @@ mod tests {
             grad_norm: 4.0,
             n_updates: 5,
             std: None,
+            kl_divergence: None,
+            selection: Some(Selection { epsilon: 0.1, kept: 10, kept_steps: 50, mean_return: 7.0, cvar: 3.0 }),
         };
         let progress = Progress {
             iterations: 6,
@@ -151,6 +171,7 @@ mod tests {
             elapsed: 2.0,
             shares: [0.25, 0.5, 1.25],
             episodes: 9,
+            generated_episodes: 90,
             recent: Some([10.0, 11.0, 0.12]),
             update,
         };
@@ -166,6 +187,11 @@ mod tests {
             ("rollout/ep_rew_mean", "10"),
             ("rollout/ep_len_mean", "11"),
             ("rollout/success_rate", "0.12"),
+            ("epopt/episodes_generated", "90"),
+            ("epopt/epsilon", "0.1"),
+            ("epopt/episodes_kept", "10"),
+            ("epopt/return_mean", "7"),
+            ("epopt/return_cvar", "3"),
             ("train/approx_kl", "0.125"),
             ("train/clip_fraction", ""),
             ("train/explained_variance", "0.75"),

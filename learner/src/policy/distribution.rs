@@ -7,10 +7,45 @@
 use rand_chacha::ChaCha8Rng;
 use tch::{Kind, Tensor};
 
+use crate::error::Result;
 use crate::random::{normal, uniform};
 
 /// log 2π.
 const LOG_TAU: f64 = 1.837_877_066_409_345_3;
+
+/// Action distributions, one for each of B samples.
+#[derive(Debug)]
+pub struct Distributions {
+    /// `[B, n]` logits, or `[B, A]` means; other axes may stand in place of B.
+    pub(super) outputs: Tensor,
+    /// `[A]` log standard deviations of continuous actions.
+    pub(super) log_std: Option<Tensor>,
+}
+
+impl Distributions {
+    /// The same with other outputs.
+    pub(crate) fn map(&self, change: impl FnOnce(&Tensor) -> Result<Tensor>) -> Result<Self> {
+        Ok(Distributions { outputs: change(&self.outputs)?, log_std: self.log_std.as_ref().map(Tensor::shallow_clone) })
+    }
+
+    /// KL(self ‖ other) `[B]` in nats, with the gradient in both: of categorical distributions Σ_j p_j (log p_j - log q_j), of
+    /// Gaussians Σ_i (log σ_q - log σ_p + (σ_p² + (μ_p - μ_q)²)/(2 σ_q²) - ½).
+    pub fn divergence_to(&self, other: &Distributions) -> Tensor {
+        let sum = |terms: Tensor| terms.sum_dim_intlist(Some([-1i64].as_slice()), false, Kind::Float);
+        match (&self.log_std, &other.log_std) {
+            (Some(own), Some(others)) => {
+                let distances = (&self.outputs - &other.outputs).square();
+                let variances = (own * 2.0).exp();
+                sum((distances + variances) * (others * -2.0).exp() * 0.5 + others - own - 0.5)
+            }
+            _ => {
+                let log_probs = self.outputs.log_softmax(-1, Kind::Float);
+                let others = other.outputs.log_softmax(-1, Kind::Float);
+                sum(log_probs.exp() * (log_probs - others))
+            }
+        }
+    }
+}
 
 /// Log-probabilities `[B]` of `actions` `[B, 1]` and entropies `[B]` of the categorical distributions of `logits` [B, n].
 pub(super) fn categorical(logits: &Tensor, actions: &Tensor) -> (Tensor, Tensor) {

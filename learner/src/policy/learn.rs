@@ -2,7 +2,7 @@
 
 use tch::{Kind, Tensor};
 
-use super::distribution::{categorical, gaussian};
+use super::distribution::{Distributions, categorical, gaussian};
 use super::initial::initial_weights;
 use super::{ActionKind, NamedArray, PolicySpec, Sequences, Weights, ff, rc};
 use crate::error::{Result, check_length};
@@ -34,6 +34,8 @@ pub struct Evaluated {
     pub entropy: Tensor,
     /// `[B]` values.
     pub values: Tensor,
+    /// B action distributions.
+    pub distributions: Distributions,
     /// What the gradient of a recurrence needs.
     tape: Option<rc::Tape>,
 }
@@ -101,18 +103,43 @@ impl Policy {
     ///
     /// If a shape is another, or a discrete action is not in 0 … n-1.
     pub fn evaluate(&self, sequences: &Sequences, actions: &Tensor) -> Evaluated {
-        let (outputs, values, tape) = if self.spec.lstm.is_some() {
-            rc::forward(&self.spec, &self.leaves, sequences, self.plain_autograd)
-        } else {
-            let (outputs, values) = ff::forward(&self.spec, &self.leaves, &sequences.flat_observations());
-            (outputs, values, None)
+        let (outputs, values, tape) = self.forward(sequences);
+        let (outputs, values) = (sequences.without_padding(outputs), sequences.without_padding(values));
+        let actions = sequences.without_padding(actions.view((-1, self.spec.action.width() as i64)));
+        let distributions = self.distributions_of(outputs);
+        let (log_probs, entropy) = match &distributions.log_std {
+            None => categorical(&distributions.outputs, &actions),
+            Some(log_std) => gaussian(&distributions.outputs, log_std, &actions),
         };
-        let actions = actions.view((-1, self.spec.action.width() as i64));
-        let (log_probs, entropy) = match self.spec.action {
-            ActionKind::Discrete { .. } => categorical(&outputs, &actions),
-            ActionKind::Continuous { .. } => gaussian(&outputs, &self.leaves[self.leaves.len() - 1], &actions),
+        Evaluated { log_probs, entropy, values, distributions, tape }
+    }
+
+    /// The action distributions over `sequences`, `[L, M]` of them, padding included; without gradient.
+    pub(crate) fn distributions(&self, sequences: &Sequences) -> Distributions {
+        tch::no_grad(|| {
+            let (outputs, _, _) = self.forward(sequences);
+            let outputs = outputs.view((sequences.n_steps(), sequences.count(), self.spec.action.outputs() as i64));
+            let Distributions { outputs, log_std } = self.distributions_of(outputs);
+            // A copy, for the weights will change.
+            Distributions { outputs, log_std: log_std.map(|log_std| log_std.detach().copy()) }
+        })
+    }
+
+    /// The policy's outputs and values over all L·M steps.
+    fn forward(&self, sequences: &Sequences) -> (Tensor, Tensor, Option<rc::Tape>) {
+        if self.spec.lstm.is_some() {
+            return rc::forward(&self.spec, &self.leaves, sequences, self.plain_autograd);
+        }
+        let (outputs, values) = ff::forward(&self.spec, &self.leaves, &sequences.flat_observations());
+        (outputs, values, None)
+    }
+
+    fn distributions_of(&self, outputs: Tensor) -> Distributions {
+        let log_std = match self.spec.action {
+            ActionKind::Discrete { .. } => None,
+            ActionKind::Continuous { .. } => self.leaves.last().map(Tensor::shallow_clone),
         };
-        Evaluated { log_probs, entropy, values, tape }
+        Distributions { outputs, log_std }
     }
 
     /// Mean standard deviation of the actions; None for discrete ones.

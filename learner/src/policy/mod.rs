@@ -7,6 +7,7 @@ mod dense;
 mod distribution;
 mod ff;
 mod initial;
+mod inputs;
 mod learn;
 mod normaliser;
 mod rc;
@@ -14,6 +15,8 @@ mod sequences;
 mod tanh;
 
 pub use act::{Actor, Acts};
+pub use distribution::Distributions;
+pub use inputs::Inputs;
 pub use learn::{Evaluated, Policy};
 pub use normaliser::{ObservationNormaliser, RewardNormaliser, RunningMoments};
 pub use sequences::Sequences;
@@ -60,7 +63,7 @@ impl ActionKind {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PolicySpec {
-    /// O: numbers in an observation.
+    /// O: numbers that enter: those of an observation, or of the whole input if it holds more, see [`Inputs`].
     pub observation_size: usize,
     /// The actions.
     pub action: ActionKind,

@@ -186,6 +186,11 @@ impl RewardNormaliser {
     /// Adds a step's `rewards` `[N]` to the statistics. Where `done` `[N]`, terminated or truncated, the discounted return
     /// starts again from 0 in the next step. Infinite numbers and NaN are refused and change nothing.
     pub fn update(&mut self, rewards: &[f32], done: &[bool]) -> Result<()> {
+        self.update_active(rewards, done, None)
+    }
+
+    /// The same with the `active` `[N]` environments alone; what the others bring is passed over.
+    pub fn update_active(&mut self, rewards: &[f32], done: &[bool], active: Option<&[bool]>) -> Result<()> {
         check_length("rewards [N]", rewards.len(), self.returns.len())?;
         check_length("done [N]", done.len(), self.returns.len())?;
         check_finite("rewards [N]", rewards)?;
@@ -195,7 +200,17 @@ impl RewardNormaliser {
         for (sum, &reward) in self.returns.iter_mut().zip(rewards) {
             *sum = *sum * self.gamma + f64::from(reward);
         }
-        self.moments.merge(&RunningMoments::of(&self.returns, 1))?;
+        match active.filter(|active| active.contains(&false)) {
+            None => self.moments.merge(&RunningMoments::of(&self.returns, 1))?,
+            Some(active) => {
+                check_length("active [N]", active.len(), self.returns.len())?;
+                let counted = self.returns.iter().zip(active).filter(|(_, active)| **active);
+                let counted: Vec<f64> = counted.map(|(sum, _)| *sum).collect();
+                if !counted.is_empty() {
+                    self.moments.merge(&RunningMoments::of(&counted, 1))?;
+                }
+            }
+        }
         for (sum, _) in self.returns.iter_mut().zip(done).filter(|(_, done)| **done) {
             *sum = 0.0;
         }

@@ -26,11 +26,27 @@ pub struct RolloutStep<'a> {
     pub truncation_values: &'a [f32],
 }
 
+/// A complete episode in a rollout.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Span {
+    /// Which of the N environments.
+    pub environment: usize,
+    /// Its first step, 0 … T-1.
+    pub start: usize,
+    /// Its number of steps.
+    pub length: usize,
+    /// The undiscounted sum of its rewards, before they were normalised.
+    pub episode_return: f64,
+}
+
 /// T steps of N environments. Arrays are row-major [T, N, …], so that a step is pushed as one piece; flattened to
 /// T·N samples, sample t·N + n is step t of environment n.
+///
+/// One of complete episodes takes steps until it is finished, and says where the episodes are.
 #[derive(Clone, Debug)]
 pub struct Rollout {
-    n_steps: usize,
+    /// T, if it is fixed beforehand.
+    wanted: Option<usize>,
     n_envs: usize,
     observation_size: usize,
     action_width: usize,
@@ -47,15 +63,32 @@ pub struct Rollout {
     truncation_values: Vec<f32>,
     last_values: Vec<f32>,
     memory: Vec<f32>,
+    episodes: Vec<Span>,
+    lengths: Option<Vec<usize>>,
 }
 
 impl Rollout {
     /// An empty rollout for T = `n_steps`, N = `n_envs`, O = `observation_size` and A = `action_width` (see
     /// [`ActionKind::width`](crate::policy::ActionKind::width)). Allocates everything that it will need.
     pub fn new(n_steps: usize, n_envs: usize, observation_size: usize, action_width: usize) -> Self {
-        let size = n_steps * n_envs;
+        Self::with_room(Some(n_steps), n_steps, n_envs, observation_size, action_width)
+    }
+
+    /// An empty rollout for complete episodes, as long as these will be.
+    pub fn of_episodes(n_envs: usize, observation_size: usize, action_width: usize) -> Self {
+        Self::with_room(None, 0, n_envs, observation_size, action_width)
+    }
+
+    fn with_room(
+        wanted: Option<usize>,
+        room: usize,
+        n_envs: usize,
+        observation_size: usize,
+        action_width: usize,
+    ) -> Self {
+        let size = room * n_envs;
         Rollout {
-            n_steps,
+            wanted,
             n_envs,
             observation_size,
             action_width,
@@ -72,6 +105,8 @@ impl Rollout {
             truncation_values: Vec::with_capacity(size),
             last_values: Vec::with_capacity(n_envs),
             memory: Vec::new(),
+            episodes: Vec::new(),
+            lengths: None,
         }
     }
 
@@ -97,12 +132,14 @@ impl Rollout {
         self.truncated.clear();
         self.truncation_values.clear();
         self.last_values.clear();
+        self.episodes.clear();
+        self.lengths = None;
     }
 
     /// Appends a step. A wrong length, or a step too many, changes nothing.
     pub fn push(&mut self, step: RolloutStep<'_>) -> Result<()> {
         if self.is_full() {
-            return Err(Error::RolloutLength { got: self.len, expected: self.n_steps, what: "a step was pushed" });
+            return Err(Error::RolloutLength { got: self.len, expected: self.n_steps(), what: "a step was pushed" });
         }
         let n = self.n_envs;
         check_length("observations [N, O]", step.observations.len(), n * self.observation_size)?;
@@ -130,8 +167,8 @@ impl Rollout {
     /// Sets `last_values` `[N]` = V(s_T), where s_T are the observations after the last step. Comes after the last
     /// [`Rollout::push`] and before an update.
     pub fn finish(&mut self, last_values: &[f32]) -> Result<()> {
-        if !self.is_full() {
-            return Err(Error::RolloutLength { got: self.len, expected: self.n_steps, what: "it was finished" });
+        if !self.is_full() && self.wanted.is_some() {
+            return Err(Error::RolloutLength { got: self.len, expected: self.n_steps(), what: "it was finished" });
         }
         check_length("last_values [N]", last_values.len(), self.n_envs)?;
         self.last_values.clear();
@@ -144,7 +181,7 @@ impl Rollout {
     pub fn trajectories(&self) -> Result<Trajectories<'_>> {
         if !self.finished {
             let what = "it was used before it was finished";
-            return Err(Error::RolloutLength { got: self.len, expected: self.n_steps, what });
+            return Err(Error::RolloutLength { got: self.len, expected: self.n_steps(), what });
         }
         Ok(Trajectories {
             n_envs: self.n_envs,
@@ -167,14 +204,107 @@ impl Rollout {
         self.len == 0
     }
 
-    /// Whether T steps were pushed.
+    /// Whether T steps were pushed, if T is fixed beforehand.
     pub fn is_full(&self) -> bool {
-        self.len == self.n_steps
+        self.wanted == Some(self.len)
     }
 
     /// T.
     pub fn n_steps(&self) -> usize {
-        self.n_steps
+        self.wanted.unwrap_or(self.len)
+    }
+
+    /// Notes that the last step that was pushed ended an episode of which the rollout has every step.
+    ///
+    /// # Errors
+    /// One longer than the rollout.
+    pub fn note_episode(&mut self, environment: usize, length: usize, episode_return: f64) -> Result<()> {
+        let what = "an episode of that length was noted";
+        let too_long = Error::RolloutLength { got: length, expected: self.len, what };
+        let start = self.len.checked_sub(length).ok_or(too_long)?;
+        self.episodes.push(Span { environment, start, length, episode_return });
+        Ok(())
+    }
+
+    /// The complete episodes, in the order in which they ended.
+    pub fn episodes(&self) -> &[Span] {
+        &self.episodes
+    }
+
+    /// A rollout of the given episodes of this one alone. T is the longest one's length; shorter ones stand one after the
+    /// other in the same column where they fit, and what fills a column up is no sample. Every episode begins without
+    /// memories.
+    ///
+    /// # Errors
+    /// No episode at all; one that reaches over the rollout's end.
+    pub fn select(&self, episodes: &[Span]) -> Result<Rollout> {
+        let longest = episodes.iter().map(|episode| episode.length).max().unwrap_or(0);
+        if longest == 0 {
+            return Err(Error::RolloutLength { got: 0, expected: 1, what: "its episodes were selected" });
+        }
+        if let Some(episode) = episodes.iter().find(|episode| episode.start + episode.length > self.len) {
+            let (got, what) = (episode.start + episode.length, "one of its episodes ended");
+            return Err(Error::RolloutLength { got, expected: self.len, what });
+        }
+        let columns = pack(episodes, longest);
+        let mut selected = self.padding(longest, columns.len());
+        let (o, a, count) = (self.observation_size, self.action_width, columns.len());
+        let mut lengths = Vec::with_capacity(count);
+        for (column, episodes) in columns.iter().enumerate() {
+            let mut t = 0;
+            for episode in episodes {
+                selected.starts[t * count + column] = true;
+                for step in 0..episode.length {
+                    let (from, to) = ((episode.start + step) * self.n_envs + episode.environment, t * count + column);
+                    selected.observations[to * o..][..o].copy_from_slice(&self.observations[from * o..][..o]);
+                    selected.actions[to * a..][..a].copy_from_slice(&self.actions[from * a..][..a]);
+                    selected.log_probs[to] = self.log_probs[from];
+                    selected.values[to] = self.values[from];
+                    selected.rewards[to] = self.rewards[from];
+                    selected.truncation_values[to] = self.truncation_values[from];
+                    selected.terminated[to] = self.terminated[from];
+                    selected.truncated[to] = self.truncated[from];
+                    t += 1;
+                }
+            }
+            lengths.push(t);
+        }
+        selected.lengths = Some(lengths);
+        Ok(selected)
+    }
+
+    /// A finished rollout of nothing but padding.
+    fn padding(&self, n_steps: usize, n_envs: usize) -> Rollout {
+        let size = n_steps * n_envs;
+        let memory_size = self.memory.len() / self.n_envs;
+        Rollout {
+            len: n_steps,
+            finished: true,
+            observations: vec![0.0; size * self.observation_size],
+            starts: vec![false; size],
+            actions: vec![0.0; size * self.action_width],
+            log_probs: vec![0.0; size],
+            values: vec![0.0; size],
+            rewards: vec![0.0; size],
+            terminated: vec![true; size], // nothing flows from padding into an episode
+            truncated: vec![false; size],
+            truncation_values: vec![0.0; size],
+            last_values: vec![0.0; n_envs],
+            memory: vec![0.0; n_envs * memory_size],
+            ..Rollout::with_room(Some(n_steps), 0, n_envs, self.observation_size, self.action_width)
+        }
+    }
+
+    /// `[N]` how many steps of each environment are samples; None if all are.
+    pub fn lengths(&self) -> Option<&[usize]> {
+        self.lengths.as_deref()
+    }
+
+    /// Places t·N + n of the samples, in order; None if every place is one.
+    pub fn samples(&self) -> Option<Vec<i64>> {
+        let lengths = self.lengths.as_ref()?;
+        let places = (0..self.len).flat_map(|t| (0..self.n_envs).map(move |n| (t, n)));
+        Some(places.filter(|&(t, n)| t < lengths[n]).map(|(t, n)| (t * self.n_envs + n) as i64).collect())
     }
 
     /// N.
@@ -221,4 +351,21 @@ impl Rollout {
     pub fn values(&self) -> &[f32] {
         &self.values
     }
+}
+
+/// Puts episodes into columns of `height` steps, the longest first and each into the first column with room for it.
+fn pack(episodes: &[Span], height: usize) -> Vec<Vec<Span>> {
+    let mut sorted = episodes.to_vec();
+    sorted.sort_by_key(|episode| std::cmp::Reverse(episode.length)); // keeps the order of equally long ones
+    let mut columns: Vec<(usize, Vec<Span>)> = Vec::new();
+    for episode in sorted {
+        match columns.iter_mut().find(|(used, _)| used + episode.length <= height) {
+            Some((used, column)) => {
+                *used += episode.length;
+                column.push(episode);
+            }
+            None => columns.push((episode.length, vec![episode])),
+        }
+    }
+    columns.into_iter().map(|(_, column)| column).collect()
 }

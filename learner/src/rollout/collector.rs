@@ -4,9 +4,9 @@ use std::time::{Duration, Instant};
 
 use rand_chacha::ChaCha8Rng;
 
-use super::{Rollout, RolloutStep};
+use super::{Normalisers, Rollout, RolloutStep};
 use crate::client::{ClientError, EndedEpisode, Session, StepReply};
-use crate::policy::{Actor, Acts, ObservationNormaliser, PolicySpec, RewardNormaliser, Weights};
+use crate::policy::{Actor, Acts, Inputs, PolicySpec, Weights};
 use crate::random::{Purpose, stream};
 
 /// Why a rollout could not be collected.
@@ -21,8 +21,14 @@ pub enum CollectError {
     Numbers(#[from] crate::error::Error),
 }
 
-/// Steps N environments with a policy and fills rollouts; episodes run on from one rollout to the next, and with them
-/// what a recurrent policy remembers, which is emptied where an episode ends.
+/// Steps N environments with a policy and fills rollouts: with T steps of each, where episodes run on from one rollout to
+/// the next, and with them what a recurrent policy remembers ([`Collector::collect`]); or with complete episodes
+/// ([`Collector::collect_episodes`]).
+///
+/// Memories are emptied where a trial ends. In a trial of one episode that is the episode's end. In a trial of several
+/// (RL²) the policy's inputs tell it of the ends in between, and to the rollout, and so to returns and advantages, the
+/// trial is one episode: flags of ends in between are left out, and the discounted returns that rewards are divided by
+/// run on.
 ///
 /// Every training step updates the statistics of observations and rewards, and is normalised with the updated ones, as
 /// stable-baselines3's VecNormalize does. Final observations are normalised with the same statistics.
@@ -30,32 +36,32 @@ pub enum CollectError {
 pub struct Collector<'a> {
     session: Session<'a>,
     actor: Actor,
+    inputs: Inputs,
     rng: ChaCha8Rng,
     normalisers: Normalisers,
     observation_size: usize,
     /// `[N, O]` normalised observations that the next actions are chosen on.
     observations: Vec<f32>,
-    /// `[N]` whether those are the first of an episode.
+    /// `[N]` whether those are the first of a trial.
     starts: Vec<bool>,
+    /// `[N, I]` inputs that the last actions were chosen on.
+    acted_on: Vec<f32>,
     times: Times,
     // Buffers of a step.
     reply: StepReply,
     acts: Acts,
     actions: Vec<u8>,
+    /// `[N]` whether an episode ended.
     done: Vec<bool>,
+    /// `[N]` whether the task, or the time limit, ended a trial's last episode.
+    terminated: Vec<bool>,
+    truncated: Vec<bool>,
+    /// `[N]` whether either did.
+    trial_ended: Vec<bool>,
     finals: Vec<f32>,
-    truncated: Vec<usize>,
+    truncated_slots: Vec<usize>,
     final_values: Vec<f32>,
     truncation_values: Vec<f32>,
-}
-
-/// Statistics of a training; `None` where nothing is normalised.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Normalisers {
-    /// Of observations.
-    pub observations: Option<ObservationNormaliser>,
-    /// Of rewards.
-    pub rewards: Option<RewardNormaliser>,
 }
 
 /// Where the time of collecting went.
@@ -68,7 +74,8 @@ pub struct Times {
 }
 
 impl<'a> Collector<'a> {
-    /// Collects from `session`, whose first observations `[N, O]` are given. `seed` fixes the sampled actions.
+    /// Collects from `session`, whose first observations `[N, O]` are given. `inputs` are those of a policy of `spec`,
+    /// fresh. `seed` fixes the sampled actions.
     ///
     /// # Errors
     /// [`CollectError::Numbers`] if an observation is not finite.
@@ -76,26 +83,32 @@ impl<'a> Collector<'a> {
         session: Session<'a>,
         mut first_observations: Vec<f32>,
         spec: &PolicySpec,
+        inputs: Inputs,
         mut normalisers: Normalisers,
         seed: u64,
     ) -> Result<Self, CollectError> {
         let num_envs = session.num_envs();
-        normalisers.take_observations(&mut first_observations)?;
+        normalisers.take_observations(&mut first_observations, None)?;
         Ok(Self {
             observation_size: session.observation_size(),
             session,
             actor: Actor::new(spec, num_envs),
+            inputs,
             rng: stream(seed, Purpose::Actions),
             normalisers,
             observations: first_observations,
             starts: vec![true; num_envs],
+            acted_on: Vec::new(),
             times: Times::default(),
             reply: StepReply::default(),
             acts: Acts::new(spec.action, num_envs),
             actions: Vec::new(),
             done: vec![false; num_envs],
+            terminated: vec![false; num_envs],
+            truncated: vec![false; num_envs],
+            trial_ended: vec![false; num_envs],
             finals: Vec::new(),
-            truncated: Vec::new(),
+            truncated_slots: Vec::new(),
             final_values: Vec::new(),
             truncation_values: vec![0.0; num_envs],
         })
@@ -121,86 +134,157 @@ impl<'a> Collector<'a> {
         rollout: &mut Rollout,
         mut on_episode: impl FnMut(&EndedEpisode),
     ) -> Result<(), CollectError> {
+        self.timed(|collector| {
+            collector.actor.load(weights)?;
+            rollout.begin(collector.actor.memory());
+            while !rollout.is_full() {
+                collector.step()?;
+                collector.normalise(None)?;
+                collector.store(rollout)?;
+                collector.reply.ended.iter().for_each(&mut on_episode);
+            }
+            let Self { actor, inputs, observations, final_values, .. } = collector;
+            actor.values(inputs.of(observations), final_values)?;
+            Ok(rollout.finish(final_values)?)
+        })
+    }
+
+    /// Breaks off what runs, and fills `rollout` with `count` new complete episodes under the policy of `weights`; gives
+    /// each to `on_episode` as it ends.
+    ///
+    /// How many episodes each environment contributes is fixed beforehand, as evenly as possible: to take the first to
+    /// end instead would favour short ones. An environment that has done its part goes on unseen, neither stored as an
+    /// episode nor part of any statistics.
+    ///
+    /// # Errors
+    /// [`CollectError`]; what was collected of this rollout is lost.
+    pub fn collect_episodes(
+        &mut self,
+        weights: &Weights,
+        count: usize,
+        rollout: &mut Rollout,
+        mut on_episode: impl FnMut(&EndedEpisode),
+    ) -> Result<(), CollectError> {
+        self.timed(|collector| {
+            collector.actor.load(weights)?;
+            collector.reset()?;
+            rollout.begin(collector.actor.memory());
+            let n_envs = collector.starts.len();
+            let mut due: Vec<usize> = (0..n_envs).map(|i| count / n_envs + usize::from(i < count % n_envs)).collect();
+            let mut active: Vec<bool> = due.iter().map(|&due| due > 0).collect();
+            while active.contains(&true) {
+                collector.step()?;
+                collector.normalise(Some(&active))?;
+                collector.store(rollout)?;
+                for end in collector.reply.ended.iter().filter(|end| active[end.slot]) {
+                    rollout.note_episode(end.slot, end.length as usize, end.episode_return)?;
+                    on_episode(end);
+                    due[end.slot] -= 1;
+                }
+                active.iter_mut().zip(&due).for_each(|(active, &due)| *active = due > 0);
+            }
+            collector.final_values.clear();
+            collector.final_values.resize(n_envs, 0.0); // every episode is complete: nothing follows
+            Ok(rollout.finish(&collector.final_values)?)
+        })
+    }
+
+    /// Does `work`; all of its time but that of waiting is that of acting.
+    fn timed(&mut self, work: impl FnOnce(&mut Self) -> Result<(), CollectError>) -> Result<(), CollectError> {
         let start = Instant::now();
         let waited_before = self.times.waiting;
-        self.actor.load(weights)?;
-        rollout.begin(self.actor.memory());
-        while !rollout.is_full() {
-            self.actor.act(&self.observations, &mut self.rng, &mut self.acts)?;
-            self.acts.write_bytes(&mut self.actions);
-            let sent = Instant::now();
-            self.session.step(&self.actions, &mut self.reply)?;
-            self.times.waiting += sent.elapsed();
-            self.store(rollout)?;
-            self.reply.ended.iter().for_each(&mut on_episode);
-        }
-        self.actor.values(&self.observations, &mut self.final_values)?;
-        rollout.finish(&self.final_values)?;
+        work(self)?;
         self.times.acting += start.elapsed().saturating_sub(self.times.waiting - waited_before);
         Ok(())
     }
 
-    /// Normalises what came back and appends the step; the observations become those of the next step.
+    /// A new episode in every environment.
+    fn reset(&mut self) -> Result<(), CollectError> {
+        let sent = Instant::now();
+        self.session.reset(&mut self.observations)?;
+        self.times.waiting += sent.elapsed();
+        self.normalisers.take_observations(&mut self.observations, None)?;
+        if let Some(normaliser) = &mut self.normalisers.rewards {
+            normaliser.reset_returns();
+        }
+        self.starts.fill(true);
+        for slot in 0..self.starts.len() {
+            self.actor.forget(slot);
+            self.inputs.forget(slot);
+        }
+        Ok(())
+    }
+
+    /// Chooses actions and has the environments take them.
+    fn step(&mut self) -> Result<(), CollectError> {
+        let inputs = self.inputs.of(&self.observations);
+        self.actor.act(inputs, &mut self.rng, &mut self.acts)?;
+        self.acted_on.clear();
+        self.acted_on.extend_from_slice(inputs);
+        self.acts.write_bytes(&mut self.actions);
+        let sent = Instant::now();
+        self.session.step(&self.actions, &mut self.reply)?;
+        self.times.waiting += sent.elapsed();
+
+        let Self { session, reply, done, terminated, truncated, trial_ended, .. } = self;
+        terminated.copy_from_slice(&reply.terminated);
+        truncated.copy_from_slice(&reply.truncated);
+        done.fill(false);
+        for end in &reply.ended {
+            done[end.slot] = true;
+            if end.episode_in_trial + 1 < session.episodes_per_trial() {
+                (terminated[end.slot], truncated[end.slot]) = (false, false);
+            }
+        }
+        let flags = terminated.iter().zip(&*truncated);
+        trial_ended.iter_mut().zip(flags).for_each(|(ended, (a, b))| *ended = *a || *b);
+        Ok(())
+    }
+
+    /// Normalises what came back, after the statistics have taken in the `active` environments, or all.
+    fn normalise(&mut self, active: Option<&[bool]>) -> Result<(), CollectError> {
+        let Self { reply, normalisers, trial_ended, .. } = self;
+        normalisers.take_rewards(&mut reply.rewards, trial_ended, active)?;
+        normalisers.take_observations(&mut reply.observations, active)?;
+        Ok(())
+    }
+
+    /// Appends the step; the observations become those of the next step, and memories end with trials.
     fn store(&mut self, rollout: &mut Rollout) -> Result<(), CollectError> {
         let reply = &mut self.reply;
-        for (done, (terminated, truncated)) in self.done.iter_mut().zip(reply.terminated.iter().zip(&reply.truncated)) {
-            *done = *terminated || *truncated;
-        }
-        self.normalisers.take_observations(&mut reply.observations)?;
-        self.normalisers.take_rewards(&mut reply.rewards, &self.done)?;
-
+        self.inputs.remember(&self.acts, &reply.rewards, &self.done)?;
         self.truncation_values.fill(0.0);
         let finals = reply.final_observations.chunks_exact(self.observation_size);
         self.finals.clear();
-        self.truncated.clear();
-        for (end, observation) in reply.ended.iter().zip(finals).filter(|(end, _)| reply.truncated[end.slot]) {
+        self.truncated_slots.clear();
+        for (end, observation) in reply.ended.iter().zip(finals).filter(|(end, _)| self.truncated[end.slot]) {
             self.finals.extend_from_slice(observation);
-            self.truncated.push(end.slot);
+            self.truncated_slots.push(end.slot);
         }
         if !self.finals.is_empty() {
             self.normalisers.normalise(&mut self.finals)?;
-            self.actor.values_in(&self.finals, &self.truncated, &mut self.final_values)?;
-            let values = self.truncated.iter().zip(&self.final_values);
+            let inputs = self.inputs.of_finals(&self.finals, &self.truncated_slots);
+            self.actor.values_in(inputs, &self.truncated_slots, &mut self.final_values)?;
+            let values = self.truncated_slots.iter().zip(&self.final_values);
             values.for_each(|(&slot, value)| self.truncation_values[slot] = *value);
         }
         rollout.push(RolloutStep {
-            observations: &self.observations,
+            observations: &self.acted_on,
             starts: &self.starts,
             actions: &self.acts.actions,
             log_probs: &self.acts.log_probs,
             values: &self.acts.values,
             rewards: &reply.rewards,
-            terminated: &reply.terminated,
-            truncated: &reply.truncated,
+            terminated: &self.terminated,
+            truncated: &self.truncated,
             truncation_values: &self.truncation_values,
         })?;
         std::mem::swap(&mut self.observations, &mut reply.observations);
-        reply.ended.iter().for_each(|end| self.actor.forget(end.slot));
-        self.starts.copy_from_slice(&self.done);
-        Ok(())
-    }
-}
-
-impl Normalisers {
-    /// Adds `observations` `[N, O]` to the statistics and normalises them.
-    fn take_observations(&mut self, observations: &mut [f32]) -> crate::error::Result<()> {
-        match &mut self.observations {
-            Some(normaliser) => normaliser.update(observations).and_then(|()| normaliser.normalise(observations)),
-            None => Ok(()),
+        for (slot, _) in self.trial_ended.iter().enumerate().filter(|(_, ended)| **ended) {
+            self.actor.forget(slot);
+            self.inputs.forget(slot);
         }
-    }
-
-    /// Adds `rewards` `[N]` to the statistics and normalises them.
-    fn take_rewards(&mut self, rewards: &mut [f32], done: &[bool]) -> crate::error::Result<()> {
-        if let Some(normaliser) = &mut self.rewards {
-            normaliser.update(rewards, done)?;
-            normaliser.normalise(rewards);
-        }
+        self.starts.copy_from_slice(&self.trial_ended);
         Ok(())
-    }
-
-    /// Normalises `observations`; the statistics stay.
-    fn normalise(&self, observations: &mut [f32]) -> crate::error::Result<()> {
-        self.observations.as_ref().map_or(Ok(()), |normaliser| normaliser.normalise(observations))
     }
 }

@@ -3,7 +3,9 @@
 mod advantage;
 mod buffer;
 mod collector;
+mod normalisers;
 
 pub use advantage::{Estimates, Trajectories, gae, n_step_returns};
-pub use buffer::{Rollout, RolloutStep};
-pub use collector::{CollectError, Collector, Normalisers, Times};
+pub use buffer::{Rollout, RolloutStep, Span};
+pub use collector::{CollectError, Collector, Times};
+pub use normalisers::Normalisers;

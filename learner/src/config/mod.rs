@@ -3,68 +3,29 @@
 //! Layers, each over the one before: the algorithm's defaults, `--config FILE.toml`, `--set key=value`, flags. The
 //! result is written to `config.toml` of the run; given back with `--config` it repeats the run.
 
-use std::fmt;
+mod defaults;
+mod error;
+mod names;
+mod settings;
+
+pub use error::ConfigError;
+pub use names::{AlgorithmName, Architecture, Base, Wrapper};
+pub use settings::{BaseSettings, Settings, WrapperSettings};
+
 use std::path::Path;
 
 use config::{Config, File, FileFormat};
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use crate::algorithm::{A2c, A2cConfig, Algorithm, Ppo, PpoConfig};
+use crate::algorithm::Algorithm;
 use crate::evaluation::Version;
-use crate::policy::{ActionKind, Policy, PolicySpec};
+use crate::policy::Policy;
 
 /// The most environments of one training.
 const MOST_ENVS: usize = 65_536;
-
-/// Which algorithm learns.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
-#[serde(rename_all = "lowercase")]
-pub enum AlgorithmName {
-    /// Advantage actor-critic.
-    A2c,
-    /// Proximal policy optimisation.
-    Ppo,
-}
-
-impl fmt::Display for AlgorithmName {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            AlgorithmName::A2c => "a2c",
-            AlgorithmName::Ppo => "ppo",
-        })
-    }
-}
-
-/// Which networks the policy has.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
-#[serde(rename_all = "lowercase")]
-pub enum Architecture {
-    /// Feed-forward: two separate multilayer perceptrons, 64-64, tanh.
-    Ff,
-    /// Recurrent: one multilayer perceptron, 256-256, tanh, an LSTM of 256, two linear heads.
-    Rc,
-}
-
-impl Architecture {
-    /// The shape of a policy for observations of `observation_size` numbers.
-    pub fn spec(self, observation_size: usize, action: ActionKind) -> PolicySpec {
-        let (width, lstm) = match self {
-            Architecture::Ff => (64, None),
-            Architecture::Rc => (256, Some(256)),
-        };
-        PolicySpec { observation_size, action, hidden: vec![width, width], lstm }
-    }
-}
-
-impl fmt::Display for Architecture {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            Architecture::Ff => "ff",
-            Architecture::Rc => "rc",
-        })
-    }
-}
+/// As they are typed.
+const ARCHITECTURES: &[&str] = &["ff", "rc"];
 
 /// Everything that decides what a training does. Two trainings with equal configurations give equal bytes.
 #[derive(Clone, Debug, PartialEq)]
@@ -86,87 +47,24 @@ pub struct Common {
     pub algorithm: AlgorithmName,
     /// What acts.
     pub architecture: Architecture,
-    /// Training ends after the iteration in which this many episodes have ended, at least 1 (default: `15000`).
+    /// Training ends after the iteration in which this many episodes have ended, at least 1 (default: `15000`). EPOpt
+    /// counts those that it learned from.
     pub episodes: u64,
     /// Fixes all randomness, 0 … 2⁶³-1 (default: `1`).
     pub seed: u64,
-    /// N: environments that are stepped together, 1 … 65536 (default: `16` with A2C, `8` with PPO). More makes a step
-    /// cheaper and updates rarer.
+    /// N: environments that are stepped together, 1 … 65536 (default: `16` with A2C, `8` with PPO, `25` with EPOpt).
+    /// More makes a step cheaper and updates rarer.
     pub num_envs: usize,
     /// Whether observations are normalised by their running mean and variance (default: `true`).
     pub normalize_observations: bool,
     /// Whether rewards are divided by the running deviation of the discounted return (default: `true`).
     pub normalize_rewards: bool,
-    /// Iterations between two lines of progress.csv, at least 1 (default: `100` with A2C, `1` with PPO). A line has the
+    /// Iterations between two lines of progress.csv, at least 1 (default: `100` with A2C and RL²-A2C, else `1`). A line has the
     /// figures of the last update, and means over the last 100 ended episodes.
     pub log_interval: u64,
     /// Ended episodes between two checkpoints, at least 1 (default: `500`). The first iteration and the last always
     /// write one.
     pub checkpoint_interval: u64,
-}
-
-/// The settings of an algorithm.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Settings {
-    /// Of PPO.
-    Ppo(PpoConfig),
-    /// Of A2C.
-    A2c(A2cConfig),
-}
-
-/// Why a configuration was refused.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum ConfigError {
-    /// A file cannot be read.
-    #[error("cannot read {path}: {source}")]
-    File {
-        /// Its path.
-        path: String,
-        /// The operating system's answer.
-        source: std::io::Error,
-    },
-    /// A file is not TOML, or a `--set` is not `key=value`.
-    #[error("{origin}: {reason}")]
-    Syntax {
-        /// Where it stands.
-        origin: String,
-        /// What is wrong.
-        reason: String,
-    },
-    /// A key does not exist.
-    #[error("{origin}: unknown key `{key}`; {algorithm}'s keys are {keys}")]
-    UnknownKey {
-        /// Where it stands.
-        origin: String,
-        /// The key.
-        key: String,
-        /// Whose keys were looked through.
-        algorithm: AlgorithmName,
-        /// All valid keys.
-        keys: String,
-    },
-    /// A value has the wrong type or lies outside its range.
-    #[error("{key} is {got}, but must be {expected}")]
-    Value {
-        /// The key.
-        key: String,
-        /// What was given.
-        got: String,
-        /// What is accepted.
-        expected: String,
-    },
-    /// No environment was named.
-    #[error(
-        "no environment was named: give --env NAME, or `environment` in the configuration file; `perturb envs` lists them"
-    )]
-    NoEnvironment,
-    /// The layers cannot be merged.
-    #[error("cannot merge the configuration: {0}")]
-    Merge(#[from] config::ConfigError),
-    /// The algorithm refuses its settings.
-    #[error(transparent)]
-    Setting(#[from] crate::error::Error),
 }
 
 /// Where a training's settings come from, weakest first.
@@ -211,12 +109,8 @@ impl TrainConfig {
 
     /// The configuration as a flat table, which [`TrainConfig::from_table`] reads back.
     pub fn table(&self) -> Table {
-        let to_table = |value: Result<Table, toml::ser::Error>| value.unwrap_or_default();
-        let mut table = to_table(Table::try_from(&self.common));
-        table.extend(match &self.settings {
-            Settings::A2c(settings) => to_table(Table::try_from(settings)),
-            Settings::Ppo(settings) => to_table(Table::try_from(settings)),
-        });
+        let mut table = Table::try_from(&self.common).unwrap_or_default();
+        table.extend(self.settings.table());
         table
     }
 
@@ -228,34 +122,10 @@ impl TrainConfig {
         resolve(&[(origin.to_owned(), table)])
     }
 
-    /// The defaults of an algorithm, without an environment.
-    pub fn defaults(algorithm: AlgorithmName) -> Self {
-        let (num_envs, log_interval, settings) = match algorithm {
-            AlgorithmName::A2c => (16, 100, Settings::A2c(A2cConfig::default())),
-            AlgorithmName::Ppo => (8, 1, Settings::Ppo(PpoConfig::default())),
-        };
-        let common = Common {
-            environment: String::new(),
-            version: Version::D,
-            algorithm,
-            architecture: Architecture::Ff,
-            episodes: 15_000,
-            seed: 1,
-            num_envs,
-            normalize_observations: true,
-            normalize_rewards: true,
-            log_interval,
-            checkpoint_interval: 500,
-        };
-        Self { common, settings }
-    }
-
-    /// γ, per step.
-    pub fn gamma(&self) -> f64 {
-        match &self.settings {
-            Settings::A2c(settings) => settings.gamma,
-            Settings::Ppo(settings) => settings.gamma,
-        }
+    /// The defaults of an algorithm with an architecture, without an environment.
+    pub fn defaults(algorithm: AlgorithmName, architecture: Architecture) -> Self {
+        let common = defaults::common(algorithm, architecture);
+        Self { common, settings: defaults::settings(algorithm, architecture) }
     }
 
     /// The algorithm with fresh state for `policy`.
@@ -263,10 +133,7 @@ impl TrainConfig {
     /// # Errors
     /// A setting out of its range.
     pub fn algorithm(&self, policy: &Policy) -> crate::error::Result<Box<dyn Algorithm>> {
-        Ok(match &self.settings {
-            Settings::A2c(settings) => Box::new(A2c::new(settings.clone(), policy)?),
-            Settings::Ppo(settings) => Box::new(Ppo::new(settings.clone(), policy, self.common.seed)?),
-        })
+        self.settings.algorithm(policy, self.common.seed)
     }
 
     fn validate(&self) -> Result<(), ConfigError> {
@@ -285,42 +152,26 @@ impl TrainConfig {
                 return Err(ConfigError::Value { key: key.into(), got: value.to_string(), expected });
             }
         }
-        match &self.settings {
-            Settings::A2c(settings) => settings.validate()?,
-            Settings::Ppo(settings) => {
-                settings.validate()?;
-                self.check_minibatches(settings)?;
-            }
+        let Common { algorithm, architecture, .. } = self.common;
+        if (algorithm.wrapper(), architecture) == (Wrapper::Rl2, Architecture::Ff) {
+            return Err(ConfigError::NeedsMemory { algorithm });
         }
-        Ok(())
-    }
-
-    /// Whether a pass over a rollout can be parted evenly.
-    fn check_minibatches(&self, settings: &PpoConfig) -> Result<(), ConfigError> {
-        let Common { architecture, num_envs, .. } = self.common;
-        let PpoConfig { n_steps, n_minibatches, .. } = *settings;
-        let (whole, count) = match architecture {
-            Architecture::Ff => ("n_steps · num_envs,", n_steps as u128 * num_envs as u128),
-            Architecture::Rc => {
-                ("num_envs, because a recurrent policy learns from whole environments,", num_envs as u128)
-            }
-        };
-        if count.is_multiple_of(n_minibatches as u128) {
-            return Ok(());
-        }
-        let expected = format!("a divisor of {whole} which is {count}");
-        Err(ConfigError::Value { key: "n_minibatches".into(), got: n_minibatches.to_string(), expected })
+        self.settings.validate(architecture, num_envs)
     }
 }
 
 /// Lays `layers` over the defaults of the algorithm that they name.
 fn resolve(layers: &[(String, Table)]) -> Result<TrainConfig, ConfigError> {
-    let named = layers.iter().rev().find_map(|(_, table)| table.get("algorithm"));
-    let algorithm = match named {
+    let named = |key: &str| layers.iter().rev().find_map(|(_, table)| table.get(key));
+    let algorithm = match named("algorithm") {
         None => AlgorithmName::Ppo,
-        Some(value) => choice("algorithm", value, &["a2c", "ppo"])?,
+        Some(value) => choice("algorithm", value, &AlgorithmName::ALL.map(AlgorithmName::as_str))?,
     };
-    let defaults = TrainConfig::defaults(algorithm).table();
+    let architecture = match named("architecture") {
+        None => algorithm.default_architecture(),
+        Some(value) => choice("architecture", value, ARCHITECTURES)?,
+    };
+    let defaults = TrainConfig::defaults(algorithm, architecture).table();
     for (origin, table) in layers {
         for (key, value) in table {
             check(origin, key, value, &defaults, algorithm)?;
@@ -331,20 +182,11 @@ fn resolve(layers: &[(String, Table)]) -> Result<TrainConfig, ConfigError> {
         builder = builder.add_source(source(table));
     }
     let mut merged: Table = builder.build()?.try_deserialize()?;
-    let own = TrainConfig::defaults(algorithm).settings;
-    let keys: Vec<String> = match &own {
-        Settings::A2c(settings) => Table::try_from(settings).unwrap_or_default().keys().cloned().collect(),
-        Settings::Ppo(settings) => Table::try_from(settings).unwrap_or_default().keys().cloned().collect(),
-    };
-    let settings: Table = keys.into_iter().filter_map(|key| merged.remove(&key).map(|value| (key, value))).collect();
     let wrong = |error: toml::de::Error| ConfigError::Syntax {
         origin: "the configuration".into(),
         reason: error.to_string().trim().replace('\n', ", "),
     };
-    let settings = match own {
-        Settings::A2c(_) => Settings::A2c(settings.try_into().map_err(wrong)?),
-        Settings::Ppo(_) => Settings::Ppo(settings.try_into().map_err(wrong)?),
-    };
+    let settings = Settings::take(algorithm, architecture, &mut merged).map_err(wrong)?;
     let config = TrainConfig { common: merged.try_into().map_err(wrong)?, settings };
     config.validate()?;
     Ok(config)
@@ -379,10 +221,11 @@ fn check(
         let keys = defaults.keys().map(String::as_str).collect::<Vec<_>>().join(", ");
         return Err(ConfigError::UnknownKey { origin: origin.to_owned(), key: key.to_owned(), algorithm, keys });
     };
+    let algorithms = AlgorithmName::ALL.map(AlgorithmName::as_str);
     let choices: Option<&[&str]> = match key {
+        "algorithm" => Some(&algorithms),
         "version" => Some(&["D", "R", "E"]),
-        "algorithm" => Some(&["a2c", "ppo"]),
-        "architecture" => Some(&["ff", "rc"]),
+        "architecture" => Some(ARCHITECTURES),
         "learning_rate_schedule" => Some(&["constant", "linear"]),
         _ => None,
     };
@@ -418,5 +261,4 @@ fn show(value: &Value) -> String {
 }
 
 #[cfg(test)]
-#[path = "config_tests.rs"]
 mod tests;

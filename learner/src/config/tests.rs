@@ -1,4 +1,5 @@
 use super::*;
+use crate::algorithm::{A2cConfig, EpoptConfig, PpoConfig};
 
 fn load(file: Option<&str>, sets: &[&str], flags: &str) -> Result<TrainConfig, ConfigError> {
     let directory = tempfile::tempdir().unwrap();
@@ -14,9 +15,9 @@ fn refusal(file: Option<&str>, sets: &[&str]) -> String {
 }
 
 fn ppo(config: &TrainConfig) -> &PpoConfig {
-    match &config.settings {
-        Settings::Ppo(settings) => settings,
-        Settings::A2c(_) => panic!("not PPO"),
+    match &config.settings.base {
+        BaseSettings::Ppo(settings) => settings,
+        BaseSettings::A2c(_) => panic!("not PPO"),
     }
 }
 
@@ -33,25 +34,62 @@ fn a_flag_beats_a_set_beats_the_file_beats_the_default() {
 #[test]
 fn an_algorithm_brings_its_own_defaults_and_keys() {
     let config = load(None, &["algorithm=a2c", "rms_alpha=0.9"], "environment = 'Pendulum'").unwrap();
-    let expected = Settings::A2c(A2cConfig { rms_alpha: 0.9, ..A2cConfig::default() });
-    assert_eq!(config.settings, expected);
+    let base = BaseSettings::A2c(A2cConfig { rms_alpha: 0.9, ..A2cConfig::default() });
+    assert_eq!(config.settings, Settings { base, wrapper: WrapperSettings::Plain });
     assert!(refusal(None, &["rms_alpha=0.9"]).contains("unknown key `rms_alpha`; ppo's keys are"));
 }
 
 #[test]
 fn the_written_configuration_gives_the_same_again() {
-    let sets = [
-        "architecture=rc",
-        "learning_rate=1e-3",
-        "normalize_rewards=false",
-        "learning_rate_schedule=linear",
-        "ent_coef=1",
-    ];
-    for algorithm in ["ppo", "a2c"] {
-        let flags = format!("environment = 'Hopper'\nversion = 'E'\nalgorithm = '{algorithm}'\nepisodes = 7");
+    let sets = ["learning_rate=1e-3", "normalize_rewards=false", "learning_rate_schedule=linear", "ent_coef=1"];
+    for (algorithm, architecture) in pairs() {
+        let flags = format!(
+            "environment = 'Hopper'\nversion = 'E'\nalgorithm = '{algorithm}'\narchitecture = '{architecture}'\n\
+             episodes = 7"
+        );
         let config = load(None, &sets, &flags).unwrap();
+        assert_eq!((config.common.algorithm, config.common.architecture), (algorithm, architecture));
         assert_eq!(load(Some(&config.to_toml()), &[], "").unwrap(), config);
     }
+}
+
+/// The paper's ten pairs.
+fn pairs() -> impl Iterator<Item = (AlgorithmName, Architecture)> {
+    let all = AlgorithmName::ALL.into_iter().flat_map(|name| [(name, Architecture::Ff), (name, Architecture::Rc)]);
+    all.filter(|(name, architecture)| (name.wrapper(), *architecture) != (Wrapper::Rl2, Architecture::Ff))
+}
+
+#[test]
+fn there_are_ten_pairs_of_algorithm_and_architecture_and_no_others() {
+    assert_eq!(pairs().count(), 10);
+    for algorithm in ["rl2-a2c", "rl2-ppo"] {
+        let message = refusal(None, &[&format!("algorithm={algorithm}"), "architecture=ff"]);
+        assert!(message.starts_with(&format!("{algorithm} cannot train the architecture ff")), "{message}");
+        let config = load(None, &[&format!("algorithm={algorithm}")], "environment = 'CartPole'").unwrap();
+        assert_eq!(config.common.architecture, Architecture::Rc, "the only one it has");
+    }
+}
+
+#[test]
+fn names_are_typed_as_they_are_written() {
+    for name in AlgorithmName::ALL {
+        assert_eq!(serde_json::to_value(name).unwrap(), name.as_str());
+        assert_eq!(<AlgorithmName as clap::ValueEnum>::from_str(name.as_str(), false), Ok(name));
+    }
+}
+
+#[test]
+fn a_wrapper_brings_its_keys_and_takes_away_those_that_it_has_no_use_for() {
+    let config = load(None, &["algorithm=epopt-ppo", "epsilon=0.2"], "environment = 'CartPole'").unwrap();
+    let expected = EpoptConfig { epsilon: 0.2, ..EpoptConfig::default() };
+    assert_eq!(config.settings.wrapper, WrapperSettings::Epopt(expected));
+    for key in ["n_steps", "n_minibatches", "episodes_per_trial"] {
+        let message = refusal(None, &["algorithm=epopt-ppo", &format!("{key}=2")]);
+        assert!(message.contains(&format!("unknown key `{key}`; epopt-ppo's keys are")), "{message}");
+    }
+    let config = load(None, &["algorithm=rl2-ppo", "episodes_per_trial=5"], "environment = 'CartPole'").unwrap();
+    assert_eq!(config.settings.episodes_per_trial(), 5);
+    assert!(refusal(None, &["algorithm=ppo", "episodes_per_trial=5"]).contains("unknown key"));
 }
 
 #[test]
@@ -73,7 +111,7 @@ fn a_wrong_type_is_refused_with_the_right_one() {
         ("normalize_rewards=1", "normalize_rewards is 1, but must be true or false"),
         ("environment=3", "environment is 3, but must be a text"),
         ("version=X", "version is \"X\", but must be one of \"D\", \"R\", \"E\""),
-        ("algorithm=rl2-ppo", "algorithm is \"rl2-ppo\", but must be one of \"a2c\", \"ppo\""),
+        ("algorithm=dqn", "algorithm is \"dqn\", but must be one of \"a2c\", \"ppo\", \"epopt-a2c\", "),
         ("architecture=mlp", "architecture is \"mlp\", but must be one of \"ff\", \"rc\""),
         ("learning_rate_schedule=cosine", "must be one of \"constant\", \"linear\""),
         ("num_envs=0", "num_envs is 0, but must be between 1 and 65536"),
@@ -84,6 +122,16 @@ fn a_wrong_type_is_refused_with_the_right_one() {
     ] {
         let message = refusal(None, &[set]);
         assert!(message.contains(part), "{set}: {message}");
+    }
+    for (sets, part) in [
+        (["algorithm=epopt-a2c", "epsilon=0"], "epsilon is 0, but must be above 0 and at most 1"),
+        (["algorithm=epopt-a2c", "episodes_per_iteration=0"], "episodes_per_iteration is 0, but must be at least 1"),
+        (["algorithm=epopt-a2c", "num_envs=101"], "num_envs is 101, but must be at most episodes_per_iteration, 100"),
+        (["algorithm=rl2-a2c", "episodes_per_trial=0"], "episodes_per_trial is 0, but must be at least 1"),
+        (["algorithm=rl2-ppo", "kl_coef=-1"], "kl_coef is -1, but must be a number that is not negative"),
+    ] {
+        let message = refusal(None, &sets);
+        assert!(message.contains(part), "{sets:?}: {message}");
     }
 }
 

@@ -1,0 +1,157 @@
+//! EPOpt: learning from the worst episodes.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Algorithm, AlgorithmState, Experience, UpdateStats, check_count};
+use crate::error::{Result, check};
+use crate::policy::Policy;
+use crate::rollout::{Rollout, Span};
+
+/// Settings of [`Epopt`]. The defaults are the paper's.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct EpoptConfig {
+    /// L: complete episodes in an iteration, at least 1 (default: `100`).
+    pub episodes_per_iteration: usize,
+    /// ε: the share of worst episodes that is learned from, above 0 and at most 1 (default: `0.1`).
+    pub epsilon: f64,
+    /// Iterations at the start that learn from all episodes, ε = 1 (default: `100`).
+    pub full_iterations: u64,
+}
+
+impl Default for EpoptConfig {
+    fn default() -> Self {
+        EpoptConfig { episodes_per_iteration: 100, epsilon: 0.1, full_iterations: 100 }
+    }
+}
+
+impl EpoptConfig {
+    /// Refuses values outside their ranges, NaN included.
+    pub fn validate(&self) -> Result<()> {
+        check_count("episodes_per_iteration", self.episodes_per_iteration)?;
+        check("epsilon", self.epsilon, self.epsilon > 0.0 && self.epsilon <= 1.0, "above 0 and at most 1")
+    }
+}
+
+/// EPOpt-ε, Rajeswaran et al. (2017), arXiv:1610.01283, around another algorithm: an iteration generates L complete
+/// episodes, each in a freshly drawn environment, and the other algorithm learns from those whose undiscounted return is
+/// at most the ε-percentile of all L. That percentile interpolates linearly between order statistics, as numpy's; where
+/// returns are equal to it more than the share ε is kept. After Packer et al. (2018), ε is 1 at first.
+pub struct Epopt {
+    config: EpoptConfig,
+    base: Box<dyn Algorithm>,
+    iterations: u64,
+}
+
+/// What EPOpt did in an iteration.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Selection {
+    /// ε of this iteration.
+    pub epsilon: f64,
+    /// Episodes that were learned from.
+    pub kept: u64,
+    /// Their steps.
+    pub kept_steps: u64,
+    /// Mean return of all L episodes.
+    pub mean_return: f64,
+    /// Conditional value at risk: the mean return of the worst episodes, those of the configured ε, also while the
+    /// iteration's is 1.
+    pub cvar: f64,
+}
+
+impl Epopt {
+    /// Checks the settings; `base` is fresh.
+    pub fn new(config: EpoptConfig, base: Box<dyn Algorithm>) -> Result<Self> {
+        config.validate()?;
+        Ok(Epopt { config, base, iterations: 0 })
+    }
+}
+
+impl Algorithm for Epopt {
+    fn experience(&self) -> Experience {
+        Experience::Episodes(self.config.episodes_per_iteration)
+    }
+
+    /// `rollout` holds L complete episodes, see [`Rollout::episodes`].
+    fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats> {
+        let full = self.iterations < self.config.full_iterations;
+        let epsilon = if full { 1.0 } else { self.config.epsilon };
+        let episodes = rollout.episodes();
+        let kept = worst(episodes, epsilon);
+        let selection = Selection {
+            epsilon,
+            kept: kept.len() as u64,
+            kept_steps: kept.iter().map(|episode| episode.length as u64).sum(),
+            mean_return: mean_return(episodes),
+            cvar: mean_return(&worst(episodes, self.config.epsilon)),
+        };
+        let mut stats = self.base.update(policy, &rollout.select(&kept)?, progress_remaining)?;
+        stats.selection = Some(selection);
+        self.iterations += 1;
+        Ok(stats)
+    }
+
+    fn state(&self) -> AlgorithmState {
+        AlgorithmState { iterations: self.iterations, ..self.base.state() }
+    }
+
+    fn load_state(&mut self, state: &AlgorithmState) -> Result<()> {
+        self.base.load_state(state)?;
+        self.iterations = state.iterations;
+        Ok(())
+    }
+}
+
+/// The episodes whose return is at most the `epsilon`-percentile, in their order.
+fn worst(episodes: &[Span], epsilon: f64) -> Vec<Span> {
+    let mut returns: Vec<f64> = episodes.iter().map(|episode| episode.episode_return).collect();
+    returns.sort_by(f64::total_cmp);
+    let threshold = percentile(&returns, epsilon);
+    episodes.iter().filter(|episode| episode.episode_return <= threshold).copied().collect()
+}
+
+/// The `share`-percentile of `sorted`, linear between order statistics; never below the least.
+fn percentile(sorted: &[f64], share: f64) -> f64 {
+    let Some(last) = sorted.len().checked_sub(1) else { return f64::NAN };
+    let position = share * last as f64;
+    let (low, fraction) = (position.floor() as usize, position.fract());
+    if fraction == 0.0 { sorted[low] } else { sorted[low] + fraction * (sorted[low + 1] - sorted[low]) }
+}
+
+fn mean_return(episodes: &[Span]) -> f64 {
+    episodes.iter().map(|episode| episode.episode_return).sum::<f64>() / episodes.len() as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn episodes(returns: &[f64]) -> Vec<Span> {
+        let span = |(environment, &episode_return)| Span { environment, start: 0, length: 1, episode_return };
+        returns.iter().enumerate().map(span).collect()
+    }
+
+    fn kept(returns: &[f64], epsilon: f64) -> Vec<usize> {
+        worst(&episodes(returns), epsilon).iter().map(|episode| episode.environment).collect()
+    }
+
+    #[test]
+    fn percentiles_are_numpys() {
+        let sorted = [-3.0, 0.0, 1.0, 10.0];
+        for (share, expected) in [(0.0, -3.0), (0.1, -2.1), (0.5, 0.5), (0.9, 7.3), (1.0, 10.0)] {
+            assert!((percentile(&sorted, share) - expected).abs() < 1e-12, "rounding of a few f64 operations: {share}");
+        }
+    }
+
+    #[test]
+    fn the_worst_share_is_kept_in_order_and_equal_returns_all() {
+        let returns: Vec<f64> = (0..100).map(|i| f64::from((i * 37) % 100)).collect();
+        let kept_returns: Vec<f64> = worst(&episodes(&returns), 0.1).iter().map(|e| e.episode_return).collect();
+        assert_eq!(kept_returns.len(), 10);
+        assert!(kept_returns.iter().all(|&r| r < 10.0));
+        assert_eq!(kept(&[5.0, 1.0, 7.0, 0.0], 0.5), [1, 3]);
+        assert_eq!(kept(&[5.0, 1.0, 7.0, 0.0], 1.0), [0, 1, 2, 3]);
+        assert_eq!(kept(&[2.0; 4], 0.1), [0, 1, 2, 3], "none is worse than another");
+        assert_eq!(kept(&[3.0], 0.1), [0]);
+    }
+}
