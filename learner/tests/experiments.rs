@@ -7,7 +7,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use perturb_learner::client::{LocalServer, LocalServerOptions};
-use perturb_learner::experiment::{CellResult, CellState, Folder, Plan};
+use perturb_learner::experiment::{CellResult, CellState, Counts, Folder, Plan};
 use tempfile::TempDir;
 
 /// How long anything may take that must not hang.
@@ -283,11 +283,117 @@ fn shipped(name: &str) -> PathBuf {
 }
 
 #[test]
-fn the_shipped_files_are_valid() {
+fn the_shipped_files_ask_for_what_they_say() {
+    let paper = Plan::load(&shipped("paper.toml")).unwrap_or_else(|error| panic!("{error}")).counts();
+    let expected = Counts { configurations: 183, trainings: 3_294, pairs: 9_882, all_pairs: 49_410, runs: 5 };
+    assert_eq!(paper, expected);
     for (name, configurations, trainings) in
-        [("quick.toml", 3, 18), ("classic.toml", 3, 24), ("locomotion.toml", 2, 12)]
+        [("quick.toml", 3, 18), ("classic.toml", 3, 24), ("locomotion.toml", 2, 12), ("rl2-n.toml", 189, 3402)]
     {
         let counts = Plan::load(&shipped(name)).unwrap_or_else(|error| panic!("{error}")).counts();
         assert_eq!((counts.configurations, counts.trainings), (configurations, trainings), "{name}");
+    }
+}
+
+#[test]
+fn plan_prints_the_papers_counts_and_an_estimate_from_measurements() {
+    let perturb = |arguments: &[&str]| {
+        let output = Command::new(env!("CARGO_BIN_EXE_perturb")).args(arguments).output().expect("ended");
+        succeeded(&output);
+        String::from_utf8(output.stdout).expect("text")
+    };
+    let paper = shipped("paper.toml").display().to_string();
+    let counts = "183 configurations, 3 294 trainings, 9 882 train/test pairs, 49 410 with 5 runs\n";
+    assert_eq!(perturb(&["plan", &paper, "--measure", "0"]), counts);
+
+    let experiment = Experiment::new(PLAN);
+    let file = experiment.out("file.toml").display().to_string();
+    let text = perturb(&["plan", &file, "--cells", "--measure", "1"]);
+    for cell in &experiment.plan.cells {
+        assert!(text.contains(&format!("{:>6} {}\n", cell.index, cell.id)), "{text}");
+    }
+    assert!(text.contains("2 configurations, 8 trainings, 16 train/test pairs, 16 with 1 run"), "{text}");
+    // 40 episodes of 200 steps in each of 8 trainings, 12 in each of 16 tests.
+    assert!(text.contains("6.40e4 steps of training, 3.84e4 of testing"), "{text}");
+    assert!(text.contains("measured: 2 trainings") && text.contains("which takes"), "{text}");
+}
+
+#[test]
+fn a_report_is_the_same_however_often_the_run_was_broken_off() {
+    let experiment = Experiment::new(&PLAN.replace("test_versions = ['D', 'R']", "test_versions = ['D', 'E']"));
+    let report = |name: &str| {
+        let page = experiment.out("page.html");
+        let command =
+            ["report", experiment.out(name).to_str().expect("a path"), "--html", page.to_str().expect("a path")];
+        let output = Command::new(env!("CARGO_BIN_EXE_perturb")).args(command).output().expect("ended");
+        succeeded(&output);
+        let mut files = BTreeMap::from([("text".to_owned(), output.stdout)]);
+        for entry in std::fs::read_dir(experiment.out(name).join("report")).expect("a folder") {
+            let entry = entry.expect("an entry");
+            files.insert(entry.file_name().to_string_lossy().into_owned(), std::fs::read(entry.path()).expect("read"));
+        }
+        files.insert("page".into(), std::fs::read(page).expect("a page"));
+        files
+    };
+    succeeded(&experiment.run("whole", &["--jobs", "1"]));
+    let child = experiment.command("killed", &["--jobs", "2"]).spawn().expect("started");
+    wait_for("a result", || !experiment.results("killed").is_empty());
+    kill_all(child);
+    let partial = report("killed");
+    let text = String::from_utf8_lossy(&partial["text"]).into_owned();
+    assert!(text.contains("are missing.") && text.matches("missing").count() > 5, "{text}");
+    succeeded(&experiment.run("killed", &["--jobs", "2"]));
+    let (whole, killed) = (report("whole"), report("killed"));
+    assert_eq!(whole.keys().collect::<Vec<_>>(), killed.keys().collect::<Vec<_>>());
+    for (name, content) in &whole {
+        assert!(*content == killed[name], "{name} differs");
+    }
+
+    let page = String::from_utf8_lossy(&whole["page"]).into_owned();
+    assert!(page.matches("<svg").count() == 4 && page.matches("<table").count() == 7, "every picture and table");
+    assert!(!page.contains("<script") && !page.contains("src=") && !page.contains("@import"), "it needs nothing else");
+    let links: Vec<&str> = page.split("href=").skip(1).map(|rest| &rest[..8]).collect();
+    assert_eq!(links, ["\"data:,\""], "the empty icon alone");
+    let metrics = String::from_utf8_lossy(&whole["metrics.csv"]).into_owned();
+    // Nothing was trained on R: Interpolation and Extrapolation are empty, not 0.
+    assert!(metrics.lines().any(|line| line == "CartPole,a2c,ff,,Interpolation,0,,,100,0,"), "{metrics}");
+}
+
+#[test]
+fn a_heatmap_is_drawn_of_two_parameters_and_others_are_refused() {
+    let experiment = Experiment::new(PLAN);
+    succeeded(&experiment.run("out", &["--cell", "0"]));
+    let training = Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[0].id).training();
+    let draw = |x: &str, y: &str| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_perturb"));
+        command.args(["heatmap", "--grid", "3", "--episodes", "2", "--x", x, "--y", y, "--checkpoint"]).arg(&training);
+        command.output().expect("ended")
+    };
+    let output = draw("force", "length");
+    succeeded(&output);
+    let read = |ending: &str| std::fs::read(training.join(format!("heatmap-force-length{ending}"))).expect("a file");
+    let table = String::from_utf8(read(".csv")).expect("text");
+    let rows: Vec<Vec<f64>> = table
+        .lines()
+        .skip(1)
+        .map(|line| line.split(',').map(|field| field.parse().expect("a number")).collect())
+        .collect();
+    assert_eq!(table.lines().next(), Some("force,length,mean_return,success_percent"));
+    assert_eq!(rows.len(), 9);
+    // E's force is 1 … 20: three parts, whose middles are 4.17, 10.5 and 16.83.
+    assert!((rows[0][0] - (1.0 + 19.0 / 6.0)).abs() < 1e-12 && rows[1][0] == 10.5 && rows[3][0] == rows[0][0]);
+    assert!(rows.iter().all(|row| row[2] >= 1.0), "a step pays 1");
+    assert!(String::from_utf8(read(".svg")).expect("text").starts_with("<svg") && read(".png").starts_with(b"\x89PNG"));
+    assert_eq!(draw("force", "length").status.code(), Some(0));
+    assert_eq!(String::from_utf8(read(".csv")).expect("text"), table, "the same again");
+
+    for (x, y) in [("force", "force"), ("force", "colour")] {
+        let output = draw(x, y);
+        assert_eq!(output.status.code(), Some(1));
+        let message = stderr(&output);
+        assert!(
+            message.contains(&format!("`{y}` cannot be an axis")) && message.contains("force, length, mass"),
+            "{message}"
+        );
     }
 }

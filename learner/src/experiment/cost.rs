@@ -10,6 +10,7 @@ use anyhow::{Context, Result};
 
 use super::plan::{Cell, Learner, Plan, distinct};
 use crate::client::Servers;
+use crate::config::{TrainConfig, WrapperSettings};
 use crate::interrupt::StopFlag;
 use crate::training::{RunDirectory, train};
 
@@ -110,8 +111,10 @@ pub fn estimate(plan: &Plan, measurements: &[Measurement], step_limit: impl Fn(&
         let speed = *speeds.entry(pair.clone()).or_insert_with(|| speed_of(&pair, measurements));
         let limit = f64::from(step_limit(pair.0));
         let work = Work {
-            training_steps: cell.config.common.episodes as f64 * limit,
-            testing_steps: cell.tests.episodes as f64 * cell.tests.versions.len() as f64 * limit,
+            training_steps: generated_episodes(&cell.config) * limit,
+            testing_steps: (cell.tests.episodes * u64::from(cell.config.settings.episodes_per_trial())) as f64
+                * cell.tests.versions.len() as f64
+                * limit,
         };
         estimate.work.training_steps += work.training_steps;
         estimate.work.testing_steps += work.testing_steps;
@@ -119,6 +122,14 @@ pub fn estimate(plan: &Plan, measurements: &[Measurement], step_limit: impl Fn(&
         estimate.testing_seconds += work.testing_steps * speed.testing;
     }
     estimate
+}
+
+/// How many episodes a training has: more than its budget if it learns from the worst of them only.
+fn generated_episodes(config: &TrainConfig) -> f64 {
+    let budget = config.common.episodes as f64;
+    let WrapperSettings::Epopt(epopt) = &config.settings.wrapper else { return budget };
+    let full = (epopt.full_iterations as f64 * epopt.episodes_per_iteration as f64).min(budget);
+    full + (budget - full) / epopt.epsilon
 }
 
 /// A pair's speed: measured, or the learner's in another environment plus what this environment takes more.
@@ -196,6 +207,22 @@ mod tests {
         let hopper = 3.0 * 100.0 * 1000.0 * (3.0 * 8.0 + 3.0 * 16.0 + 9.0);
         assert!((total.training_seconds - cart_pole - hopper).abs() < 1e-6 * total.training_seconds);
         assert!((total.testing_seconds - total.training_seconds * 0.3 / 4.0).abs() < 1e-6 * total.testing_seconds);
+    }
+
+    #[test]
+    fn episodes_that_are_not_learned_from_and_episodes_of_a_trial_cost_too() {
+        let text = "environments = ['CartPole']\nversions = ['D']\ntest_versions = ['R']\ntest_episodes = 10
+            settings = { episodes = 15000 }
+            [[algorithm]]\nname = 'epopt-ppo'\narchitectures = ['ff']\nsettings = { epsilon = 0.1 }
+            [[algorithm]]\nname = 'rl2-ppo'\narchitectures = ['rc']\nsettings = { episodes_per_trial = 5 }";
+        let plan = Plan::parse("test", text.into()).unwrap();
+        let work = |cell: &Cell| {
+            let alone = Plan { cells: vec![cell.clone()], ..plan.clone() };
+            estimate(&alone, &[], |_| 1).work
+        };
+        // 100 iterations of 100 episodes, and a tenth of each that follows.
+        assert_eq!(work(&plan.cells[0]), Work { training_steps: 10_000.0 + 50_000.0, testing_steps: 10.0 });
+        assert_eq!(work(&plan.cells[1]), Work { training_steps: 15_000.0, testing_steps: 50.0 });
     }
 
     #[test]

@@ -373,7 +373,7 @@ mod tests {
                 configuration: "00000000".into(),
                 run: 2,
                 seed: 8,
-                counters: Counters { iterations: 1, timesteps: 2, episodes: 3 },
+                counters: Counters { iterations: 1, timesteps: 2, episodes: 3, ..Counters::default() },
                 settings: "learning_rate = 3e-4".parse().unwrap(),
             },
             results: BTreeMap::from([(Version::D, test)]),

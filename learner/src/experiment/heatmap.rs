@@ -121,7 +121,7 @@ pub fn heatmap(
         version: Version::D.to_proto(),
         num_envs: grid * grid,
         seed,
-        episodes_per_trial: 1,
+        episodes_per_trial: state.episodes_per_trial,
     };
     let mut observations = Vec::new();
     let mut session = Session::open(servers, &open, &mut observations).map_err(TestError::Client)?;

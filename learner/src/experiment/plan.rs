@@ -10,7 +10,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use crate::config::{ConfigError, TrainConfig};
+use crate::config::{ConfigError, TrainConfig, WrapperSettings};
 use crate::evaluation::Version;
 
 /// Settings that the plan itself decides for each cell.
@@ -251,12 +251,12 @@ impl Plan {
 impl Cell {
     /// What learns.
     pub fn learner(&self) -> Learner {
-        let common = &self.config.common;
-        let trials = self.config.table().get("episodes_per_trial").and_then(Value::as_integer);
+        let TrainConfig { common, settings } = &self.config;
+        let has_trials = matches!(settings.wrapper, WrapperSettings::Rl2(_));
         Learner {
             algorithm: common.algorithm.to_string(),
             architecture: common.architecture.to_string(),
-            episodes_per_trial: trials.and_then(|episodes| u32::try_from(episodes).ok()),
+            episodes_per_trial: has_trials.then(|| settings.episodes_per_trial()),
         }
     }
 }

@@ -139,3 +139,13 @@ fn a_table_may_choose_its_environments_and_versions() {
     assert_eq!((last.environment.as_str(), last.version), ("Acrobot", Version::R));
     assert_eq!(plan.counts().trainings, 49);
 }
+
+#[test]
+fn trials_of_different_lengths_are_different_learners() {
+    let text = "environments = ['CartPole']
+        [[algorithm]]\nname = 'rl2-a2c'\narchitectures = ['rc']\nsettings = { episodes_per_trial = 1 }
+        [[algorithm]]\nname = 'rl2-a2c'\narchitectures = ['rc']
+        [[algorithm]]\nname = 'epopt-a2c'\narchitectures = ['rc']";
+    let learners: Vec<String> = parse(text).unwrap().learners().iter().map(ToString::to_string).collect();
+    assert_eq!(learners, ["rl2-a2c rc N=1", "rl2-a2c rc N=2", "epopt-a2c rc"]);
+}

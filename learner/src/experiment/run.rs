@@ -16,6 +16,8 @@ use crate::interrupt::StopFlag;
 pub const BUSY: u8 = 75;
 /// A worker's exit status if there is no server, or no longer (EX_UNAVAILABLE of sysexits.h).
 pub const NO_SERVER: u8 = 69;
+/// A worker's exit status if its command makes no sense to it.
+const USAGE: i32 = 2;
 /// How often a worker may be killed before its cell counts as failed.
 const MOST_ATTEMPTS: u32 = 3;
 /// How often workers are looked at.
@@ -72,6 +74,9 @@ pub enum RunError {
     /// A worker cannot be started.
     #[error("cannot start a worker process: {0}")]
     Spawn(std::io::Error),
+    /// A worker does not know the plan's cells.
+    #[error("a worker refused its command: {0}; did another run replace the folder's plan.toml meanwhile?")]
+    Refused(String),
     /// The servers are gone.
     #[error("the run cannot go on without a server: {0}; finished cells are kept, call it again to go on")]
     NoServer(String),
@@ -214,6 +219,9 @@ impl<'a> Runner<'a> {
         }
         if status.code() == Some(NO_SERVER.into()) {
             return Err(RunError::NoServer(format!("{id}: {}", self.last_words(cell))));
+        }
+        if status.code() == Some(USAGE) {
+            return Err(RunError::Refused(self.last_words(cell)));
         }
         if let Some(signal) = signal_of(status) {
             let attempts = self.attempts.entry(cell).or_default();

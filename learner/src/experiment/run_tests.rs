@@ -89,12 +89,15 @@ fn a_worker_that_is_killed_is_started_again_but_not_for_ever() {
 }
 
 #[test]
-fn a_lost_server_ends_the_run_and_blames_no_cell() {
+fn a_lost_server_or_plan_ends_the_run_and_blames_no_cell() {
     let directory = tempfile::tempdir().unwrap();
     let folder = Folder::new(directory.path());
     let script = |_: &Cell, _: &Path| "echo gone > log.txt; exit 69".to_owned();
     let error = run_with(&folder, 1, false, &StopFlag::default(), &script).unwrap_err().to_string();
     assert!(error.contains("without a server") && error.contains("gone"), "{error}");
+    let script = |_: &Cell, _: &Path| "echo no such cell > log.txt; exit 2".to_owned();
+    let error = run_with(&folder, 1, false, &StopFlag::default(), &script).unwrap_err().to_string();
+    assert!(error.contains("refused its command: no such cell"), "{error}");
     assert!(plan().cells.iter().all(|cell| !folder.cell(&cell.id).is_settled(true)));
 }
 

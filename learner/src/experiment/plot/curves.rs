@@ -91,6 +91,7 @@ impl CurvesPicture<'_> {
         let (episodes, range) = self.ranges();
         let mut chart = ChartBuilder::on(area)
             .margin(8 * scale)
+            .margin_right(16 * scale)
             .x_label_area_size(34 * scale)
             .y_label_area_size(50 * scale)
             .caption(format!("trained on {version}"), font(13, scale))
@@ -168,7 +169,7 @@ impl CurvesPicture<'_> {
                     area.draw(&DashedPathElement::new(ends, dash * scale, gap * scale, style)).map_err(drawing)?;
                 }
             }
-            area.draw_text(&learner.to_string(), &font(12, scale), (x + 42 * unit, y - 7 * unit)).map_err(drawing)?;
+            area.draw_text(&learner.to_string(), &font(12, scale), (x + 42 * unit, y - 6 * unit)).map_err(drawing)?;
         }
         Ok(())
     }

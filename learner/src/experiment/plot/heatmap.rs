@@ -130,7 +130,7 @@ fn outline<DB: DrawingBackend>(
     scale: u32,
 ) -> Result<(), PlotError> {
     let path = vec![(left, top), (right, top), (right, bottom), (left, bottom), (left, top)];
-    let (wide, narrow) = (BLACK.stroke_width(4 * scale), WHITE.stroke_width(2 * scale));
+    let (wide, narrow) = (BLACK.stroke_width(3 * scale), WHITE.stroke_width(scale));
     area.draw(&PathElement::new(path.clone(), wide)).map_err(drawing)?;
     match set {
         Set::Random => area.draw(&PathElement::new(path, narrow)).map_err(drawing),
