@@ -18,6 +18,7 @@ pub mod loss;
 pub mod policy;
 pub mod random;
 pub mod rollout;
+mod run_directory;
 pub mod training;
 
 /// The version, and the commit that was built, e.g. "0.1.0 (1a2b3c4d5e6f)"; "-dirty" follows a commit whose files were

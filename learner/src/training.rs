@@ -6,19 +6,19 @@
 
 use std::collections::VecDeque;
 use std::fs;
-use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 
 use crate::algorithm::{Algorithm, Experience, UpdateStats};
-use crate::checkpoint::{Checkpoint, Counters, EnvironmentSummary, State};
+use crate::checkpoint::{Checkpoint, Counters, EnvironmentSummary, History, ResumeState, State};
 use crate::client::{EndedEpisode, OpenOptions, Servers, Session};
-use crate::config::{TrainConfig, Wrapper};
+use crate::config::{Common, TrainConfig, Wrapper};
 use crate::interrupt::StopFlag;
-use crate::logging::{Monitor, Progress, ProgressLog};
+use crate::logging::{Clock, Logs, Progress};
 use crate::policy::{Inputs, ObservationNormaliser, Policy, RewardNormaliser, Weights};
 use crate::rollout::{Collector, Normalisers, Rollout};
+pub use crate::run_directory::RunDirectory;
 
 /// Means are over so many episodes, as in stable-baselines3.
 const RECENT: usize = 100;
@@ -36,136 +36,46 @@ pub struct Outcome {
     pub signal: Option<i32>,
 }
 
-/// The directory of a run.
-#[derive(Debug)]
-pub struct RunDirectory {
-    path: PathBuf,
-    overwrite: bool,
-}
-
-impl RunDirectory {
-    /// Chooses `path` for a new run; if it holds an earlier run, `overwrite` allows its deletion. Changes nothing yet:
-    /// [`train`] empties the directory when the environments are open and all settings have proved to work.
-    ///
-    /// # Errors
-    /// If it holds a run and `overwrite` is off; the operating system's.
-    pub fn choose(path: &Path, overwrite: bool) -> Result<Self> {
-        if path.exists() && !path.is_dir() {
-            bail!("--out {} is a file; give a directory", path.display());
-        }
-        let directory = Self { path: path.to_owned(), overwrite };
-        directory.earlier_run()?;
-        Ok(directory)
-    }
-
-    /// The files of an earlier run, which may be deleted.
-    fn earlier_run(&self) -> Result<Vec<PathBuf>> {
-        let files = files_of_a_run(&self.path)?;
-        if let (Some(file), false) = (files.first(), self.overwrite) {
-            bail!(
-                "{} already holds a run ({}): choose another --out, or give --overwrite to delete that run",
-                self.path.display(),
-                file.file_name().unwrap_or_default().to_string_lossy()
-            );
-        }
-        Ok(files)
-    }
-
-    /// Creates it, or empties it of the earlier run.
-    fn prepare(&self) -> Result<()> {
-        let path = &self.path;
-        for file in self.earlier_run()? {
-            let removed = if file.is_dir() { fs::remove_dir_all(&file) } else { fs::remove_file(&file) };
-            removed.with_context(|| format!("cannot delete {}", file.display()))?;
-        }
-        fs::create_dir_all(path).with_context(|| format!("cannot create {}", path.display()))
-    }
-
-    /// Where it is.
-    pub fn path(&self) -> &Path {
-        &self.path
-    }
-
-    /// Where its checkpoint is.
-    pub fn checkpoint(&self) -> PathBuf {
-        self.path.join("checkpoint")
-    }
-}
-
-/// What a run has written in `path`; other files are left alone.
-fn files_of_a_run(path: &Path) -> Result<Vec<PathBuf>> {
-    if !path.exists() {
-        return Ok(Vec::new());
-    }
-    let mut files = Vec::new();
-    for entry in fs::read_dir(path).with_context(|| format!("cannot list {}", path.display()))? {
-        let entry = entry.with_context(|| format!("cannot list {}", path.display()))?;
-        let name = entry.file_name();
-        let name = name.to_string_lossy();
-        let known = ["config.toml", "progress.csv", "monitor.csv", "checkpoint"].contains(&name.as_ref());
-        if known || name.starts_with("events.out.tfevents.") {
-            files.push(entry.path());
-        }
-    }
-    files.sort();
-    Ok(files)
-}
-
 /// Trains as `config` says and writes everything to `directory`; calls `report` after every iteration. When `stop` is
 /// raised, the iteration is finished and the checkpoint written.
 ///
 /// # Errors
-/// A server that is lost, numbers that are not finite, a full disk. The checkpoint of the last whole iteration has then
-/// been written, unless writing itself fails.
+/// A server that is lost, numbers that are not finite, a full disk. The last checkpoint in the directory stays as it is.
 pub fn train(
     servers: &Servers,
     config: &TrainConfig,
     directory: &RunDirectory,
     stop: &StopFlag,
-    mut report: impl FnMut(&Progress),
+    report: impl FnMut(&Progress),
 ) -> Result<Outcome> {
     let mut training = Training::begin(servers, config)?;
     directory.prepare()?; // from here on an earlier run is gone
     tracing::debug!(directory = %directory.path().display(), "training begins");
-    let mut log = Logs::create(config, directory, &training.summary)?;
+    let Common { environment, .. } = &config.common;
+    let mut logs = Logs::create(directory.path(), environment, &training.summary.parameters, training.clock)?;
     fs::write(directory.path().join("config.toml"), config.to_toml()).context("cannot write config.toml")?;
-    let mut saved_at = None;
-    loop {
-        let progress = match training.iterate(&mut log) {
-            Ok(progress) => progress,
-            Err(error) => {
-                log.flush()?;
-                let counters = training.whole.state.counters;
-                let context = if counters.iterations == 0 {
-                    "training failed in its first iteration".to_owned()
-                } else {
-                    training.whole.save(&directory.checkpoint())?;
-                    format!(
-                        "training failed; the policy after {} episodes is kept in {}",
-                        counters.episodes,
-                        directory.checkpoint().display()
-                    )
-                };
-                return Err(error.context(context));
-            }
-        };
-        report(&progress);
-        let signal = stop.signal();
-        let finished = progress.episodes >= config.common.episodes || signal.is_some();
-        let interval = config.common.checkpoint_interval;
-        let due = saved_at.is_none_or(|saved: u64| progress.episodes / interval > saved / interval);
-        if finished || due {
-            log.flush()?;
-            training.whole.save(&directory.checkpoint())?;
-            saved_at = Some(progress.episodes);
-        }
-        if finished || progress.iterations.is_multiple_of(config.common.log_interval) {
-            log.progress.write(&progress).context("cannot write progress.csv")?;
-        }
-        if finished {
-            return Ok(Outcome { checkpoint: training.whole, progress, signal });
-        }
-    }
+    training.run(&mut logs, directory, stop, report)
+}
+
+/// Goes on with the run in `directory` from its last `checkpoint`, whose configuration is `config`, to the same bytes as
+/// without the break, times aside; otherwise as [`train`]. `servers` may be others than before. What the logs hold
+/// beyond the checkpoint is deleted.
+///
+/// # Errors
+/// Those of [`train`]; an environment, a state or a log that does not fit the checkpoint, before anything is changed.
+pub fn resume(
+    servers: &Servers,
+    config: &TrainConfig,
+    directory: &RunDirectory,
+    (checkpoint, state): (Checkpoint, ResumeState),
+    stop: &StopFlag,
+    report: impl FnMut(&Progress),
+) -> Result<Outcome> {
+    let lengths = state.history.logs.clone();
+    let mut training = Training::resume(servers, config, checkpoint, state)?;
+    let mut logs = Logs::resume(directory.path(), &lengths, training.clock)?;
+    tracing::debug!(directory = %directory.path().display(), "training goes on");
+    training.run(&mut logs, directory, stop, report)
 }
 
 /// A training between two iterations.
@@ -180,51 +90,40 @@ struct Training<'a> {
     /// The policy after the last whole iteration.
     whole: Checkpoint,
     recent: VecDeque<[f64; 3]>,
-    start: Instant,
+    clock: Clock,
+    /// Seconds of acting, waiting and updating in earlier processes.
+    shares_before: [f64; 3],
     updating: Duration,
     /// How long the last update took.
     last_update: Option<Duration>,
+    /// Episodes in the last checkpoint on disk.
+    saved: Option<u64>,
 }
 
 impl<'a> Training<'a> {
     fn begin(servers: &'a Servers, config: &'a TrainConfig) -> Result<Self> {
         let common = &config.common;
-        let options = OpenOptions {
-            environment: common.environment.clone(),
-            version: common.version.to_proto(),
-            num_envs: common.num_envs,
-            seed: common.seed,
-            episodes_per_trial: config.settings.episodes_per_trial(),
-        };
         let mut observations = Vec::new();
-        let session = Session::open(servers, &options, &mut observations)?;
-        let summary = EnvironmentSummary::of(session.environment())
-            .context("the server does not say what actions the environment takes: are both of one version?")?;
+        let (session, summary) = open(servers, config, &mut observations)?;
         let observation_size = session.observation_size();
         let with_outcomes = common.algorithm.wrapper() == Wrapper::Rl2;
         let inputs = Inputs::new(observation_size, summary.action, common.num_envs, with_outcomes);
         let spec = common.architecture.spec(inputs.size(), summary.action);
         let policy = Policy::new(spec.clone(), common.seed)?;
-        let algorithm = config.algorithm(&policy)?;
         let normalisers = Normalisers {
             observations: common.normalize_observations.then(|| ObservationNormaliser::new(observation_size)),
             rewards: common.normalize_rewards.then(|| RewardNormaliser::new(common.num_envs, config.settings.gamma())),
-        };
-        let (n_envs, input_size, width) = (common.num_envs, inputs.size(), summary.action.width());
-        let rollout = match algorithm.experience() {
-            Experience::Steps(n_steps) => Rollout::new(n_steps, n_envs, input_size, width),
-            Experience::Episodes(_) => Rollout::of_episodes(n_envs, input_size, width),
         };
         let collector = Collector::new(session, observations, &spec, inputs, normalisers, common.seed)?;
         let whole = Checkpoint {
             state: State {
                 environment: common.environment.clone(),
-                environment_spec: summary.clone(),
+                environment_spec: summary,
                 algorithm: common.algorithm,
                 architecture: common.architecture,
                 policy: spec,
                 train_version: common.version,
-                episodes_per_trial: options.episodes_per_trial,
+                episodes_per_trial: config.settings.episodes_per_trial(),
                 seed: common.seed,
                 observation_normaliser: None,
                 reward_normaliser: None,
@@ -233,24 +132,108 @@ impl<'a> Training<'a> {
             },
             weights: policy.weights(),
         };
+        Self::new(servers, config, policy, collector, whole)
+    }
+
+    fn resume(
+        servers: &'a Servers,
+        config: &'a TrainConfig,
+        checkpoint: Checkpoint,
+        resume: ResumeState,
+    ) -> Result<Self> {
+        let state = &checkpoint.state;
+        let (session, served) = open(servers, config, &mut Vec::new())?;
+        if let Some((what, trained, served)) = state.environment_spec.difference(&served) {
+            bail!(
+                "the run was trained in {} with {what} {trained}, the server's has {served}; resume with the version \
+                 of perturb-server that it began with, or train again",
+                state.environment
+            );
+        }
+        let policy = Policy::from_weights(state.policy.clone(), &checkpoint.weights)?;
+        let normalisers = Normalisers {
+            observations: state.observation_normaliser.clone(),
+            rewards: state.reward_normaliser.clone(),
+        };
+        let inputs = state.inputs(config.common.num_envs);
+        let collector = Collector::resume(session, &state.policy, inputs, normalisers, &resume.collector)
+            .context("cannot bring the environments back")?;
+        let mut training = Self::new(servers, config, policy, collector, checkpoint)?;
+        training.algorithm.load_state(&resume.algorithm).context("cannot bring the optimiser back")?;
+        training.saved = Some(training.whole.state.counters.episodes);
+        training.recent.extend(&resume.history.recent);
+        training.clock = Clock::start(resume.history.elapsed);
+        training.shares_before = resume.history.shares;
+        Ok(training)
+    }
+
+    /// With a fresh algorithm, and no past.
+    fn new(
+        servers: &'a Servers,
+        config: &'a TrainConfig,
+        policy: Policy,
+        collector: Collector<'a>,
+        whole: Checkpoint,
+    ) -> Result<Self> {
+        let algorithm = config.algorithm(&policy)?;
+        let spec = policy.spec();
+        let (n_envs, input_size, width) = (config.common.num_envs, spec.observation_size, spec.action.width());
+        let rollout = match algorithm.experience() {
+            Experience::Steps(n_steps) => Rollout::new(n_steps, n_envs, input_size, width),
+            Experience::Episodes(_) => Rollout::of_episodes(n_envs, input_size, width),
+        };
         Ok(Self {
             servers,
             config,
-            summary,
+            summary: whole.state.environment_spec.clone(),
             collector,
             rollout,
             policy,
             algorithm,
             whole,
             recent: VecDeque::with_capacity(RECENT),
-            start: Instant::now(),
+            clock: Clock::start(0.0),
+            shares_before: [0.0; 3],
             updating: Duration::ZERO,
             last_update: None,
+            saved: None,
         })
     }
 
+    /// Iterations until the budget is used up or `stop` is raised.
+    fn run(
+        &mut self,
+        logs: &mut Logs,
+        directory: &RunDirectory,
+        stop: &StopFlag,
+        mut report: impl FnMut(&Progress),
+    ) -> Result<Outcome> {
+        let Common { episodes, log_interval, checkpoint_interval, .. } = self.config.common;
+        loop {
+            let progress = self.iterate(logs).map_err(|error| self.failed(error, directory))?;
+            report(&progress);
+            let finished = progress.episodes >= episodes;
+            let signal = stop.signal().filter(|_| !finished);
+            let logged = finished || progress.iterations.is_multiple_of(log_interval);
+            if logged {
+                logs.progress(&progress).map_err(|error| self.failed(error.into(), directory))?;
+            }
+            let due =
+                self.saved.is_none_or(|saved| progress.episodes / checkpoint_interval > saved / checkpoint_interval);
+            if finished || due || signal.is_some() {
+                self.save(logs, directory).map_err(|error| self.failed(error, directory))?;
+            }
+            if finished || signal.is_some() {
+                if !logged {
+                    logs.progress(&progress)?; // beyond the checkpoint: a run that is not stopped has no such line
+                }
+                return Ok(Outcome { checkpoint: self.whole.clone(), progress, signal });
+            }
+        }
+    }
+
     /// A rollout and an update.
-    fn iterate(&mut self, log: &mut Logs) -> Result<Progress> {
+    fn iterate(&mut self, logs: &mut Logs) -> Result<Progress> {
         let mut counters = self.whole.state.counters;
         let mut written = Ok(());
         let (mut ended, mut steps) = (0, 0);
@@ -260,7 +243,7 @@ impl<'a> Training<'a> {
             steps += u64::from(episode.length);
             remember(recent, episode);
             if written.is_ok() {
-                written = log.monitor.write(episode);
+                written = logs.episode(episode);
             }
         };
         match algorithm.experience() {
@@ -270,7 +253,7 @@ impl<'a> Training<'a> {
             }
             Experience::Episodes(count) => collector.collect_episodes(&whole.weights, count, rollout, on_episode)?,
         }
-        written.context("cannot write monitor.csv")?;
+        written?;
 
         let updating = Instant::now();
         let progress_remaining = self.progress_remaining(counters.learned_timesteps);
@@ -314,15 +297,52 @@ impl<'a> Training<'a> {
         self.whole.state.counters = counters;
     }
 
+    /// Replaces the checkpoint on disk.
+    fn save(&mut self, logs: &mut Logs, directory: &RunDirectory) -> Result<()> {
+        // What the checkpoint counts on is on the disk before it.
+        let history = History {
+            logs: logs.sync()?,
+            recent: self.recent.iter().copied().collect(),
+            elapsed: self.clock.elapsed(),
+            shares: self.shares(),
+        };
+        let state = ResumeState { collector: self.collector.state()?, algorithm: self.algorithm.state(), history };
+        self.whole.save(&directory.checkpoint(), Some(&state))?;
+        self.saved = Some(self.whole.state.counters.episodes);
+        Ok(())
+    }
+
+    /// Says what is left of a training that `error` ended.
+    fn failed(&self, error: anyhow::Error, directory: &RunDirectory) -> anyhow::Error {
+        let Some(episodes) = self.saved else {
+            return error.context("training failed before its first checkpoint");
+        };
+        let run = directory.path().display();
+        let kept = format!("training failed; the checkpoint after {episodes} episodes is kept in {run}");
+        let numbers = error.is::<crate::error::Error>()
+            || matches!(error.downcast_ref(), Some(crate::rollout::CollectError::Numbers(_)));
+        error.context(if numbers {
+            format!("{kept} (resumed, it would come to the same numbers)")
+        } else {
+            format!("{kept}; go on from there: perturb train --resume {run}")
+        })
+    }
+
+    /// Seconds of acting, waiting and updating.
+    fn shares(&self) -> [f64; 3] {
+        let times = self.collector.times();
+        let now = [times.acting, times.waiting, self.updating];
+        std::array::from_fn(|i| self.shares_before[i] + now[i].as_secs_f64())
+    }
+
     fn progress(&self, update: UpdateStats) -> Progress {
         let Counters { iterations, timesteps, episodes, generated_episodes, .. } = self.whole.state.counters;
-        let times = self.collector.times();
         let mean = |i: usize| self.recent.iter().map(|episode| episode[i]).sum::<f64>() / self.recent.len() as f64;
         Progress {
             iterations,
             timesteps,
-            elapsed: self.start.elapsed().as_secs_f64(),
-            shares: [times.acting, times.waiting, self.updating].map(|time| time.as_secs_f64()),
+            elapsed: self.clock.elapsed(),
+            shares: self.shares(),
             episodes,
             generated_episodes,
             recent: (!self.recent.is_empty()).then(|| [mean(0), mean(1), mean(2)]),
@@ -331,31 +351,29 @@ impl<'a> Training<'a> {
     }
 }
 
+/// Opens the environments of a training.
+fn open<'a>(
+    servers: &'a Servers,
+    config: &TrainConfig,
+    observations: &mut Vec<f32>,
+) -> Result<(Session<'a>, EnvironmentSummary)> {
+    let common = &config.common;
+    let options = OpenOptions {
+        environment: common.environment.clone(),
+        version: common.version.to_proto(),
+        num_envs: common.num_envs,
+        seed: common.seed,
+        episodes_per_trial: config.settings.episodes_per_trial(),
+    };
+    let session = Session::open(servers, &options, observations)?;
+    let summary = EnvironmentSummary::of(session.environment())
+        .context("the server does not say what actions the environment takes: are both of one version?")?;
+    Ok((session, summary))
+}
+
 fn remember(recent: &mut VecDeque<[f64; 3]>, episode: &EndedEpisode) {
     if recent.len() == RECENT {
         recent.pop_front();
     }
     recent.push_back([episode.episode_return, f64::from(episode.length), f64::from(u8::from(episode.success))]);
-}
-
-/// The files that grow.
-struct Logs {
-    monitor: Monitor,
-    progress: ProgressLog,
-}
-
-impl Logs {
-    fn create(config: &TrainConfig, directory: &RunDirectory, summary: &EnvironmentSummary) -> Result<Self> {
-        let t_start = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64();
-        let path = directory.path().join("monitor.csv");
-        let monitor = Monitor::create(&path, &config.common.environment, &summary.parameters, t_start)
-            .with_context(|| format!("cannot create {}", path.display()))?;
-        let progress = ProgressLog::create(directory.path(), t_start)
-            .with_context(|| format!("cannot create the logs in {}", directory.path().display()))?;
-        Ok(Self { monitor, progress })
-    }
-
-    fn flush(&mut self) -> Result<()> {
-        self.monitor.flush().context("cannot write monitor.csv")
-    }
 }

@@ -1,86 +1,22 @@
 //! The learner against real servers. Needs the program `perturb-server`: run `cargo build --release` first.
 
+mod common;
+
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
+use common::{
+    SECONDS, addresses, child_server, config, is_running, kill, perturb, read, run, server, stderr, wait_for,
+};
 use perturb_learner::checkpoint::Checkpoint;
-use perturb_learner::client::{Address, LocalServer, LocalServerOptions, OpenOptions, Servers, Session, StepReply};
-use perturb_learner::config::TrainConfig;
+use perturb_learner::client::{Address, LocalServer, OpenOptions, Servers, Session, StepReply};
 use perturb_learner::evaluation::{Version, test};
 use perturb_learner::interrupt::StopFlag;
 use perturb_learner::policy::{ActionKind, Inputs, Policy, PolicySpec, Sequences};
 use perturb_learner::proto;
 use perturb_learner::rollout::{Collector, Normalisers, Rollout};
-use perturb_learner::training::{Outcome, RunDirectory, train};
 use tch::Tensor;
-use tempfile::TempDir;
-
-/// How long anything may take that must not hang.
-const SECONDS: Duration = Duration::from_secs(20);
-
-fn server(workers: usize) -> LocalServer {
-    LocalServer::start(LocalServerOptions { workers: Some(workers), ..LocalServerOptions::default() })
-        .unwrap_or_else(|error| panic!("{error}"))
-}
-
-fn addresses(servers: &[LocalServer]) -> Vec<Address> {
-    servers.iter().map(|server| server.address().clone()).collect()
-}
-
-fn config(text: &str) -> TrainConfig {
-    TrainConfig::from_table("the test", text.parse().expect("TOML")).unwrap_or_else(|error| panic!("{error}"))
-}
-
-/// Trains in a fresh directory.
-fn run(servers: &Servers, text: &str) -> (TempDir, Outcome) {
-    let out = tempfile::tempdir().expect("a directory");
-    let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
-    let outcome = train(servers, &config(text), &directory, &StopFlag::default(), |_| {});
-    (out, outcome.unwrap_or_else(|error| panic!("{error:#}")))
-}
-
-fn perturb(arguments: &[&str]) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_perturb"));
-    command.args(arguments).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
-    command
-}
-
-fn stderr(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
-}
-
-/// Waits until `condition` holds.
-fn wait_for(what: &str, mut condition: impl FnMut() -> bool) {
-    let start = Instant::now();
-    while !condition() {
-        assert!(start.elapsed() < SECONDS, "{what} did not happen within {SECONDS:?}");
-        std::thread::sleep(Duration::from_millis(20));
-    }
-}
-
-/// The process that `parent` started and that is called perturb-server.
-fn child_server(parent: u32) -> Option<u32> {
-    let children = std::fs::read_to_string(format!("/proc/{parent}/task/{parent}/children")).ok()?;
-    let is_server = |id: &u32| {
-        std::fs::read_to_string(format!("/proc/{id}/comm")).is_ok_and(|name| name.trim().starts_with("perturb-serv"))
-    };
-    children.split_whitespace().filter_map(|id| id.parse().ok()).find(is_server)
-}
-
-/// Whether a process runs; one that has ended and waits for its parent does not.
-fn is_running(id: u32) -> bool {
-    std::fs::read_to_string(format!("/proc/{id}/stat")).is_ok_and(|stat| !stat.contains(") Z "))
-}
-
-fn kill(signal: &str, id: u32) {
-    let status = Command::new("kill").args([signal, &id.to_string()]).status().expect("kill");
-    assert!(status.success());
-}
-
-fn read(directory: &Path, name: &str) -> String {
-    std::fs::read_to_string(directory.join(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
-}
 
 #[test]
 fn a_policy_is_trained_written_and_tested_with_both_algorithms() {
@@ -328,7 +264,8 @@ fn a_server_that_is_killed_ends_the_training_soon_and_leaves_a_checkpoint() {
     let message = stderr(&output);
     assert!(message.contains("lost the server at unix:") && message.contains("signal: 9"), "{message}");
     let episodes = Checkpoint::load(out.path()).expect("a whole checkpoint").state.counters.episodes;
-    assert!(message.contains(&format!("the policy after {episodes} episodes is kept in")), "{message}");
+    let kept = format!("the checkpoint after {episodes} episodes is kept in {path}; go on from there: perturb train");
+    assert!(message.contains(&kept), "{message}");
 }
 
 #[test]
@@ -358,6 +295,7 @@ fn a_signal_ends_a_training_after_the_iteration_with_its_checkpoint() {
         let output = child.wait_with_output().expect("perturb ends");
         assert_eq!(output.status.code(), Some(status), "{}", stderr(&output));
         assert!(stderr(&output).contains("stopped by signal"), "{}", stderr(&output));
+        assert!(stderr(&output).contains(&format!("perturb train --resume {path}")), "{}", stderr(&output));
         assert!(!is_running(server));
         let episodes = Checkpoint::load(out.path()).expect("a whole checkpoint").state.counters.episodes;
         assert_eq!(read(out.path(), "monitor.csv").lines().count() as u64, 2 + episodes);

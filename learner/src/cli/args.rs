@@ -84,8 +84,8 @@ pub(super) struct TrainArgs {
     #[arg(long, value_name = "N")]
     pub(super) seed: Option<u64>,
     /// Directory for the checkpoint and the logs.
-    #[arg(long, value_name = "DIR")]
-    pub(super) out: PathBuf,
+    #[arg(long, value_name = "DIR", required_unless_present = "resume")]
+    pub(super) out: Option<PathBuf>,
     /// Delete the run that is in --out already.
     #[arg(long)]
     pub(super) overwrite: bool,
@@ -95,6 +95,17 @@ pub(super) struct TrainArgs {
     /// A setting, e.g. learning_rate=3e-4; repeatable.
     #[arg(long, value_name = "KEY=VALUE")]
     pub(super) set: Vec<String>,
+    /// Go on with the run in this directory from its last checkpoint, exactly as if it had not been broken off. Its
+    /// settings are those that it began with.
+    #[arg(
+        long,
+        value_name = "DIR",
+        conflicts_with_all = [
+            "env", "version", "algorithm", "architecture", "episodes_per_trial", "episodes", "seed", "out",
+            "overwrite", "config", "set"
+        ]
+    )]
+    pub(super) resume: Option<PathBuf>,
     #[command(flatten)]
     pub(super) server: ServerArgs,
 }
@@ -234,5 +245,25 @@ fn at_least_one(text: &str) -> Result<usize, String> {
     match text.parse() {
         Ok(0) | Err(_) => Err("expected a whole number, at least 1".into()),
         Ok(number) => Ok(number),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    #[test]
+    fn a_run_is_resumed_with_its_own_settings_only() {
+        let cli = Cli::command();
+        let train = cli.find_subcommand("train").unwrap();
+        let of = |name: &str| train.get_arguments().find(|argument| argument.get_id() == name).unwrap();
+        let refused: Vec<&str> =
+            train.get_arg_conflicts_with(of("resume")).iter().map(|argument| argument.get_id().as_str()).collect();
+        for argument in train.get_arguments().map(|argument| argument.get_id().as_str()) {
+            let accepted = ["resume", "server", "workers", "help"].contains(&argument);
+            assert_ne!(refused.contains(&argument), accepted, "--{argument}");
+        }
     }
 }

@@ -1,6 +1,7 @@
 //! `perturb train`.
 
 use std::io::Write;
+use std::path::Path;
 
 use anyhow::{Context, Result};
 use toml::{Table, Value};
@@ -11,36 +12,74 @@ use super::{Ending, UsageError, servers};
 use crate::config::{Sources, TrainConfig};
 use crate::interrupt::StopFlag;
 use crate::logging::Progress;
-use crate::training::{RunDirectory, train};
+use crate::training::{Outcome, RunDirectory, resume, train};
 
 pub(super) fn run(args: &TrainArgs) -> Result<Ending> {
+    match (&args.resume, &args.out) {
+        (Some(path), _) => go_on(args, path),
+        (None, Some(path)) => begin(args, path),
+        (None, None) => Err(UsageError("give --out DIR for a new run, or --resume DIR".into()).into()),
+    }
+}
+
+/// A new run in `out`.
+fn begin(args: &TrainArgs, out: &Path) -> Result<Ending> {
     let flags = flags(args)?;
     let config = TrainConfig::load(&Sources { file: args.config.as_deref(), sets: &args.set, flags })?;
     let stop = StopFlag::on_signals().context("cannot wait for signals")?;
-    let directory = RunDirectory::choose(&args.out, args.overwrite)?;
+    let directory = RunDirectory::choose(out, args.overwrite)?;
     let servers = servers(&args.server, config.common.num_envs)?;
     servers.environment(&config.common.environment)?; // its refusal lists the names
     let mut bar = Bar::new(describe(&config), config.common.episodes);
     let outcome = train(&servers, &config, &directory, &stop, |progress| bar.training(progress))?;
     bar.finish();
+    end(&config, &directory, &outcome)
+}
+
+/// The run in `path`, from its last checkpoint.
+fn go_on(args: &TrainArgs, path: &Path) -> Result<Ending> {
+    let stop = StopFlag::on_signals().context("cannot wait for signals")?;
+    let (directory, checkpoint, state) = RunDirectory::resume(path)?;
+    let config = checkpoint.config()?;
+    let (done, budget) = (checkpoint.state.counters.episodes, config.common.episodes);
+    if done >= budget {
+        eprintln!("the training in {} is finished: it has {done} of {budget} episodes", path.display());
+        print_policy(&directory)?;
+        return Ok(Ending::Done);
+    }
+    eprintln!("{}: going on after {done} of {budget} episodes", describe(&config));
+    let servers = servers(&args.server, config.common.num_envs)?;
+    let mut bar = Bar::new(describe(&config), budget);
+    let report = |progress: &Progress| bar.training(progress);
+    let outcome = resume(&servers, &config, &directory, (checkpoint, state), &stop, report)?;
+    bar.finish();
+    end(&config, &directory, &outcome)
+}
+
+/// Says what a training came to.
+fn end(config: &TrainConfig, directory: &RunDirectory, outcome: &Outcome) -> Result<Ending> {
     summarise(&outcome.progress);
     match outcome.signal {
         Some(number) => {
             eprintln!(
-                "stopped by signal {number} after {} of {} episodes; the checkpoint is in {}",
+                "stopped by signal {number} after {} of {} episodes; go on with: perturb train --resume {}",
                 outcome.progress.episodes,
                 config.common.episodes,
-                directory.checkpoint().display()
+                directory.path().display()
             );
             Ok(Ending::Signal(number))
         }
         None => {
-            let mut out = std::io::stdout();
-            writeln!(out, "trained policy: {}", directory.checkpoint().display())?;
-            writeln!(out, "test it: perturb evaluate --checkpoint {}", directory.path().display())?;
+            print_policy(directory)?;
             Ok(Ending::Done)
         }
     }
+}
+
+fn print_policy(directory: &RunDirectory) -> std::io::Result<()> {
+    let mut out = std::io::stdout();
+    writeln!(out, "trained policy: {}", directory.checkpoint().display())?;
+    writeln!(out, "test it: perturb evaluate --checkpoint {}", directory.path().display())
 }
 
 /// What is trained, in a few words.

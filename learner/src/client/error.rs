@@ -71,6 +71,14 @@ pub enum ClientError {
         /// The environment.
         environment: String,
     },
+    /// There is not one snapshot for each environment.
+    #[error("there are {got} snapshots to restore, expected {expected}: one for each environment")]
+    Snapshots {
+        /// How many were given.
+        got: usize,
+        /// N.
+        expected: usize,
+    },
     /// The program `perturb-server` was not found.
     #[error(
         "the program `perturb-server` was not found ({tried}): run `cargo build --release` first, set PERTURB_SERVER \

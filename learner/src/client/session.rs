@@ -71,6 +71,9 @@ pub struct StepReply {
     pub ended: Vec<EndedEpisode>,
 }
 
+/// So many snapshots are restored by one request: of HalfCheetah some 600 kB, far below what a server accepts.
+const RESTORED_AT_ONCE: usize = 1024;
+
 /// N environments in same-step autoreset mode. Environment i of the batch has index i and gives the same bytes however
 /// many servers share the batch: each server owns a contiguous range.
 #[derive(Debug)]
@@ -212,6 +215,64 @@ impl<'a> Session<'a> {
                 }
                 other => Err(part.unexpected(what, &other, "ResetDone")),
             }
+        })
+    }
+
+    /// Saves every environment whole: N opaque snapshots in order of slots. Changes nothing. All servers work at the same
+    /// time.
+    ///
+    /// # Errors
+    /// The failures of a connection.
+    pub fn snapshot(&mut self) -> Result<Vec<Bytes>, ClientError> {
+        let what = "a snapshot";
+        let Self { servers, parts, num_envs, .. } = self;
+        servers.runtime().block_on(async {
+            for part in parts.iter_mut() {
+                part.send(what, Request::Snapshot(proto::Snapshot::default()), servers).await?;
+            }
+            let mut snapshots = Vec::with_capacity(*num_envs);
+            for part in parts.iter_mut() {
+                match part.receive(what, servers).await? {
+                    Response::Snapshot(saved) if saved.snapshots.len() == part.range.len() => {
+                        snapshots.extend(saved.snapshots);
+                    }
+                    Response::Snapshot(saved) => {
+                        let got = format!("{} snapshots", saved.snapshots.len());
+                        return Err(part.mismatch(what, got, part.range.len().to_string()));
+                    }
+                    other => return Err(part.unexpected(what, &other, "Snapshotted")),
+                }
+            }
+            Ok(snapshots)
+        })
+    }
+
+    /// Brings environments back from N snapshots in order of slots, taken of this environment on any number of servers,
+    /// and writes the observations `[N, O]` at which they were saved. What follows is what followed the snapshots.
+    ///
+    /// # Errors
+    /// [`ClientError::Snapshots`] if there are not N, [`ClientError::Refused`] if one is of something else, and the
+    /// failures of a connection. After the latter two some environments may have been restored.
+    pub fn restore(&mut self, snapshots: &[Bytes], observations: &mut [f32]) -> Result<(), ClientError> {
+        let what = "to restore snapshots";
+        if snapshots.len() != self.num_envs {
+            return Err(ClientError::Snapshots { got: snapshots.len(), expected: self.num_envs });
+        }
+        let Self { servers, parts, observation_size: size, .. } = self;
+        servers.runtime().block_on(async {
+            for part in parts.iter_mut() {
+                for slots in chunks(part.range.clone()) {
+                    let mask = part.range.clone().map(|slot| u8::from(slots.contains(&slot))).collect();
+                    let request = proto::Restore { mask, snapshots: snapshots[slots.clone()].to_vec() };
+                    part.send(what, Request::Restore(request), servers).await?;
+                    let out = &mut observations[slots.start * *size..slots.end * *size];
+                    match part.receive(what, servers).await? {
+                        Response::Restore(done) => part.decode(what, "observations", &done.observations, out)?,
+                        other => return Err(part.unexpected(what, &other, "Restored")),
+                    }
+                }
+            }
+            Ok(())
         })
     }
 
@@ -412,6 +473,12 @@ fn split(num_envs: usize, parts: usize) -> Vec<Range<usize>> {
     (0..parts).map(|part| part * num_envs / parts..(part + 1) * num_envs / parts).collect()
 }
 
+/// Cuts `slots` into ranges that one request restores.
+fn chunks(slots: Range<usize>) -> impl Iterator<Item = Range<usize>> {
+    let end = slots.end;
+    slots.step_by(RESTORED_AT_ONCE).map(move |first| first..end.min(first + RESTORED_AT_ONCE))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -424,6 +491,15 @@ mod tests {
             assert_eq!(all, (0..num_envs).collect::<Vec<_>>());
             let lengths = ranges.iter().map(ExactSizeIterator::len);
             assert!(lengths.clone().max().unwrap() - lengths.min().unwrap() <= 1);
+        }
+    }
+
+    #[test]
+    fn requests_to_restore_cover_a_part_in_order() {
+        for slots in [0..1, 5..RESTORED_AT_ONCE, 7..7 + RESTORED_AT_ONCE, 1..3 * RESTORED_AT_ONCE] {
+            let all: Vec<usize> = chunks(slots.clone()).flatten().collect();
+            assert_eq!(all, slots.clone().collect::<Vec<_>>());
+            assert!(chunks(slots).all(|chunk| (1..=RESTORED_AT_ONCE).contains(&chunk.len())));
         }
     }
 }

@@ -7,14 +7,15 @@ use std::time::Instant;
 
 use anyhow::Result;
 
-use super::folder::{CellFolder, CellResult, CellState, Failure, FolderError, Timing, Training};
+use super::folder::{CellFolder, CellResult, CellState, Failure, FolderError, Timing, Training, io};
 use super::plan::Cell;
 use crate::checkpoint::Checkpoint;
 use crate::client::{ClientError, Servers};
 use crate::evaluation::{TestError, test};
 use crate::interrupt::StopFlag;
+use crate::logging::Progress;
 use crate::rollout::CollectError;
-use crate::training::{RunDirectory, train};
+use crate::training::{RunDirectory, resume, train};
 
 /// What a stop without a signal counts as.
 const SIGTERM: i32 = 15;
@@ -51,7 +52,11 @@ pub fn run_cell(
     match folder.state()? {
         CellState::Done(_) => return Ok(CellEnd::Done),
         CellState::Failed(failure) if !retry => return Ok(CellEnd::Failed(failure)),
-        CellState::Failed(_) => folder.forget_failure()?,
+        CellState::Failed(_) => {
+            // What was trained so far led to the failure.
+            remove(&folder.training())?;
+            folder.forget_failure()?;
+        }
         CellState::Missing => {}
     }
     let start = Instant::now();
@@ -73,6 +78,14 @@ pub fn run_cell(
             folder.write_failure(&failure)?;
             Ok(CellEnd::Failed(failure))
         }
+    }
+}
+
+/// Deletes a folder, if it is there.
+fn remove(path: &Path) -> Result<(), FolderError> {
+    match std::fs::remove_dir_all(path) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(io("delete", path)(error)),
+        _ => Ok(()),
     }
 }
 
@@ -118,10 +131,11 @@ fn train_and_test(
     }))
 }
 
-/// The trained policy of a cell: of an attempt that had finished its training, otherwise of a training from here.
-/// `None` if the stop flag was raised.
+/// The trained policy of a cell; `None` if the stop flag was raised.
 ///
-/// This alone decides what becomes of a training that was broken off: it begins again.
+/// This alone decides what becomes of a training that was broken off: one that had finished is taken as it is, another
+/// goes on from its last checkpoint, to the same bytes as without the break, and one without a usable checkpoint begins
+/// again.
 fn trained(
     servers: &Servers,
     cell: &Cell,
@@ -129,19 +143,19 @@ fn trained(
     stop: &StopFlag,
     report: &mut dyn FnMut(&str, u64),
 ) -> Result<Option<Checkpoint>> {
-    if let Some(checkpoint) = finished(cell, directory) {
-        return Ok(Some(checkpoint));
-    }
-    let directory = RunDirectory::choose(directory, true)?;
-    let outcome = train(servers, &cell.config, &directory, stop, |progress| report("training", progress.episodes))?;
+    let config = &cell.config;
+    let progress = |progress: &Progress| report("training", progress.episodes);
+    let earlier = RunDirectory::resume(directory).ok();
+    let outcome = match earlier.filter(|(_, checkpoint, _)| checkpoint.state.config == config.table()) {
+        Some((_, checkpoint, _)) if checkpoint.state.counters.episodes >= config.common.episodes => {
+            return Ok(Some(checkpoint));
+        }
+        Some((directory, checkpoint, state)) => {
+            resume(servers, config, &directory, (checkpoint, state), stop, progress)?
+        }
+        None => train(servers, config, &RunDirectory::choose(directory, true)?, stop, progress)?,
+    };
     Ok(outcome.signal.is_none().then_some(outcome.checkpoint))
-}
-
-/// The checkpoint of a training that came to its end.
-fn finished(cell: &Cell, directory: &Path) -> Option<Checkpoint> {
-    let checkpoint = Checkpoint::load(directory).ok()?; // a damaged one is trained again
-    let same = checkpoint.state.config == cell.config.table();
-    (same && checkpoint.state.counters.episodes >= cell.config.common.episodes).then_some(checkpoint)
 }
 
 /// Whether an error came from the servers or the way to them, not from what was trained.

@@ -1,10 +1,14 @@
 //! What a training writes while it runs: `monitor.csv`, `progress.csv` and TensorBoard events, all with
 //! stable-baselines3's names, so that the tools that people have read them.
 
+mod clock;
+mod logs;
 mod monitor;
 mod progress;
 mod tensorboard;
 
+pub use clock::Clock;
+pub use logs::{LogError, LogLengths, Logs};
 pub use monitor::Monitor;
 pub use progress::{Progress, ProgressLog};
 pub use tensorboard::EventWriter;

@@ -3,8 +3,9 @@
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::Path;
-use std::time::Instant;
 
+use super::Clock;
+use super::logs::sync;
 use crate::client::EndedEpisode;
 
 /// Writes stable-baselines3's Monitor format: a line of JSON after `#`, a header, and a line an episode with its return
@@ -13,21 +14,26 @@ use crate::client::EndedEpisode;
 #[derive(Debug)]
 pub struct Monitor {
     writer: csv::Writer<BufWriter<File>>,
-    start: Instant,
+    clock: Clock,
 }
 
 impl Monitor {
-    /// Creates the file. `t_start` is the time of day in seconds since 1970.
+    /// Creates the file.
     ///
     /// # Errors
     /// The operating system's.
-    pub fn create(path: &Path, environment: &str, parameters: &[String], t_start: f64) -> std::io::Result<Self> {
+    pub fn create(path: &Path, environment: &str, parameters: &[String], clock: Clock) -> std::io::Result<Self> {
         let mut file = BufWriter::new(File::create(path)?);
-        writeln!(file, "#{}", serde_json::json!({ "t_start": t_start, "env_id": environment }))?;
+        writeln!(file, "#{}", serde_json::json!({ "t_start": clock.t_start(), "env_id": environment }))?;
         let mut writer = csv::Writer::from_writer(file);
         let columns = ["r", "l", "t", "success", "terminated", "episode_index", "environment_index"];
         writer.write_record(columns.into_iter().chain(parameters.iter().map(String::as_str)))?;
-        Ok(Self { writer, start: Instant::now() })
+        Ok(Self { writer, clock })
+    }
+
+    /// Goes on at the end of `file`.
+    pub(super) fn resume(file: File, clock: Clock) -> Self {
+        Self { writer: csv::Writer::from_writer(BufWriter::new(file)), clock }
     }
 
     /// Adds an episode.
@@ -39,7 +45,7 @@ impl Monitor {
         let fixed = [
             format!("{:.6}", episode.episode_return),
             episode.length.to_string(),
-            format!("{:.6}", self.start.elapsed().as_secs_f64()),
+            format!("{:.6}", self.clock.elapsed()),
             flag(episode.success),
             flag(episode.terminated),
             episode.episode_index.to_string(),
@@ -56,6 +62,12 @@ impl Monitor {
     pub fn flush(&mut self) -> std::io::Result<()> {
         self.writer.flush()
     }
+
+    /// Brings what was written to the disk; gives the file's length.
+    pub(super) fn sync(&mut self) -> std::io::Result<u64> {
+        self.flush()?;
+        sync(self.writer.get_ref().get_ref())
+    }
 }
 
 #[cfg(test)]
@@ -67,7 +79,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("monitor.csv");
         let parameters = ["mass".to_owned(), "length".to_owned()];
-        let mut monitor = Monitor::create(&path, "CartPole", &parameters, 12.5).unwrap();
+        let mut monitor = Monitor::create(&path, "CartPole", &parameters, Clock::new(12.5, 3.0)).unwrap();
         let episode = EndedEpisode {
             slot: 1,
             environment_index: 3,
@@ -89,7 +101,7 @@ mod tests {
         assert_eq!(lines[1], "r,l,t,success,terminated,episode_index,environment_index,mass,length");
         let fields: Vec<&str> = lines[2].split(',').collect();
         assert_eq!(fields[..2], ["17.500000", "18"]);
-        assert!(fields[2].parse::<f64>().unwrap() >= 0.0);
+        assert!(fields[2].parse::<f64>().unwrap() >= 3.0);
         assert_eq!(fields[3..], ["0", "1", "4", "3", "0.1", "0.25"]);
         assert_eq!(lines.len(), 3);
     }

@@ -4,6 +4,7 @@ use std::fs::File;
 use std::path::Path;
 
 use super::EventWriter;
+use super::logs::sync;
 use crate::algorithm::UpdateStats;
 
 /// The columns, by stable-baselines3's names; `time/acting`, `time/waiting` and `time/updating` are ours: seconds since
@@ -125,6 +126,22 @@ impl ProgressLog {
         csv.write_record(COLUMNS)?;
         csv.flush()?;
         Ok(Self { csv, events: EventWriter::create(directory, t_start)? })
+    }
+
+    /// Goes on at the ends of `csv` and of `events`, which is called `events_file`.
+    pub(super) fn resume(csv: File, events: File, events_file: String, t_start: f64) -> Self {
+        Self { csv: csv::Writer::from_writer(csv), events: EventWriter::resume(events, events_file, t_start) }
+    }
+
+    /// The name of the events file.
+    pub(super) fn events_file(&self) -> &str {
+        self.events.file_name()
+    }
+
+    /// Brings what was written to the disk; gives the lengths of `progress.csv` and of the events.
+    pub(super) fn sync(&mut self) -> std::io::Result<[u64; 2]> {
+        self.csv.flush()?;
+        Ok([sync(self.csv.get_ref())?, self.events.sync()?])
     }
 
     /// Adds a line and an event, and hands them to the operating system. A value that there is not is an empty cell.

@@ -9,6 +9,8 @@ use std::path::Path;
 
 use prost::Message;
 
+use super::logs::sync;
+
 /// The parts of tensorflow/core/util/event.proto that scalars need.
 #[derive(Clone, PartialEq, Message)]
 struct Event {
@@ -44,6 +46,7 @@ struct Value {
 #[derive(Debug)]
 pub struct EventWriter {
     file: BufWriter<File>,
+    file_name: String,
     t_start: f64,
 }
 
@@ -53,11 +56,28 @@ impl EventWriter {
     /// # Errors
     /// The operating system's.
     pub fn create(directory: &Path, t_start: f64) -> std::io::Result<Self> {
-        let name = format!("events.out.tfevents.{}.perturb", t_start as u64);
-        let mut writer = Self { file: BufWriter::new(File::create(directory.join(name))?), t_start };
+        let file_name = format!("events.out.tfevents.{}.perturb", t_start as u64);
+        let file = File::create(directory.join(&file_name))?;
+        let mut writer = Self { file: BufWriter::new(file), file_name, t_start };
         let first = Event { wall_time: t_start, file_version: Some("brain.Event:2".into()), ..Event::default() };
         writer.record(&first)?;
         Ok(writer)
+    }
+
+    /// Goes on at the end of `file`, which is called `file_name`.
+    pub(super) fn resume(file: File, file_name: String, t_start: f64) -> Self {
+        Self { file: BufWriter::new(file), file_name, t_start }
+    }
+
+    /// What the file is called.
+    pub(super) fn file_name(&self) -> &str {
+        &self.file_name
+    }
+
+    /// Brings what was written to the disk; gives the file's length.
+    pub(super) fn sync(&mut self) -> std::io::Result<u64> {
+        self.file.flush()?;
+        sync(self.file.get_ref())
     }
 
     /// Adds scalars at `step`, `elapsed` seconds after the start, and hands them to the operating system.

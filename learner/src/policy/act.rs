@@ -156,6 +156,18 @@ impl Actor {
         }
     }
 
+    /// Puts back what [`Actor::memory`] gave.
+    ///
+    /// # Errors
+    /// [`Error::Length`] if it is not [`max_batch`, S]; nothing was changed then.
+    pub fn set_memory(&mut self, memory: &[f32]) -> Result<()> {
+        check_length("memory [N, S]", memory.len(), self.memory().len())?;
+        if let Networks::Recurrent(network) = &mut self.networks {
+            network.memory_mut().copy_from_slice(memory);
+        }
+        Ok(())
+    }
+
     /// The number of observations.
     fn count(&self, observations: &[f32]) -> Result<usize> {
         let n_envs = observations.len() / self.spec.observation_size;

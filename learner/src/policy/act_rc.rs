@@ -102,6 +102,11 @@ impl Recurrent {
         &self.memory
     }
 
+    /// The same, to be overwritten.
+    pub(super) fn memory_mut(&mut self) -> &mut [f32] {
+        &mut self.memory
+    }
+
     /// Computes `next` from `observations` and the memories of `environments`.
     fn step(&mut self, observations: &[f32], environments: impl ExactSizeIterator<Item = usize>) {
         let (n, width) = (environments.len(), self.width);

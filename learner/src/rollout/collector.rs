@@ -2,10 +2,12 @@
 
 use std::time::{Duration, Instant};
 
+use bytes::Bytes;
 use rand_chacha::ChaCha8Rng;
 
 use super::{Normalisers, Rollout, RolloutStep};
 use crate::client::{ClientError, EndedEpisode, Session, StepReply};
+use crate::error::check_length;
 use crate::policy::{Actor, Acts, Inputs, PolicySpec, Weights};
 use crate::random::{Purpose, stream};
 
@@ -64,6 +66,23 @@ pub struct Collector<'a> {
     truncation_values: Vec<f32>,
 }
 
+/// Everything beside its statistics that a collector's future depends on, for exact resumption.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CollectorState {
+    /// `[N]` the environments.
+    pub snapshots: Vec<Bytes>,
+    /// `[N, O]` normalised observations that the next actions are chosen on.
+    pub observations: Vec<f32>,
+    /// `[N]` whether those are the first of a trial.
+    pub starts: Vec<bool>,
+    /// `[N, E]` what stands beside the observations, see [`Inputs`].
+    pub outcomes: Vec<f32>,
+    /// `[N, S]` what the policy remembers; empty for a feed-forward policy.
+    pub memory: Vec<f32>,
+    /// The stream of sampled actions.
+    pub actions: ChaCha8Rng,
+}
+
 /// Where the time of collecting went.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Times {
@@ -112,6 +131,50 @@ impl<'a> Collector<'a> {
             final_values: Vec::new(),
             truncation_values: vec![0.0; num_envs],
         })
+    }
+
+    /// The state between two rollouts.
+    ///
+    /// # Errors
+    /// [`CollectError::Client`].
+    pub fn state(&mut self) -> Result<CollectorState, CollectError> {
+        Ok(CollectorState {
+            snapshots: self.session.snapshot()?,
+            observations: self.observations.clone(),
+            starts: self.starts.clone(),
+            outcomes: self.inputs.outcomes().to_vec(),
+            memory: self.actor.memory().to_vec(),
+            actions: self.rng.clone(),
+        })
+    }
+
+    /// Goes on from a saved state, whose `normalisers` are given: later rollouts are those that followed it. `session` is
+    /// one of the same environment with as many of them, on any number of servers.
+    ///
+    /// # Errors
+    /// [`CollectError::Numbers`] if an array does not fit, [`CollectError::Client`] if a snapshot does not.
+    pub fn resume(
+        session: Session<'a>,
+        spec: &PolicySpec,
+        inputs: Inputs,
+        normalisers: Normalisers,
+        state: &CollectorState,
+    ) -> Result<Self, CollectError> {
+        let CollectorState { snapshots, observations, starts, outcomes, memory, actions } = state;
+        let (num_envs, size) = (session.num_envs(), session.observation_size());
+        check_length("observations [N, O]", observations.len(), num_envs * size)?;
+        check_length("starts [N]", starts.len(), num_envs)?;
+        let none = Normalisers { observations: None, rewards: None };
+        let mut collector = Self::new(session, vec![0.0; num_envs * size], spec, inputs, none, 0)?;
+        // The observations that come back are those of `observations` before normalisation.
+        collector.session.restore(snapshots, &mut collector.observations)?;
+        collector.observations.copy_from_slice(observations);
+        collector.starts.copy_from_slice(starts);
+        collector.inputs.restore(outcomes)?;
+        collector.actor.set_memory(memory)?;
+        collector.rng = actions.clone();
+        collector.normalisers = normalisers;
+        Ok(collector)
     }
 
     /// The statistics so far.

@@ -7,5 +7,5 @@ mod normalisers;
 
 pub use advantage::{Estimates, Trajectories, gae, n_step_returns};
 pub use buffer::{Rollout, RolloutStep, Span};
-pub use collector::{CollectError, Collector, Times};
+pub use collector::{CollectError, Collector, CollectorState, Times};
 pub use normalisers::Normalisers;

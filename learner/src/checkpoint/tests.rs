@@ -1,5 +1,12 @@
+use bytes::Bytes;
+use rand::Rng;
+
 use super::*;
-use crate::policy::Policy;
+use crate::algorithm::AlgorithmState;
+use crate::logging::LogLengths;
+use crate::policy::{NamedArray, Policy};
+use crate::random::{Purpose, stream};
+use crate::rollout::CollectorState;
 
 fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
     // Odd seeds feed-forward, even ones recurrent.
@@ -33,6 +40,38 @@ fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
     Checkpoint { state, weights: Policy::new(policy, seed).unwrap().weights() }
 }
 
+/// Of two environments; snapshots differ in length, floats are none that text would round well.
+fn resume_state(seed: u64) -> ResumeState {
+    let mut rng = stream(seed, Purpose::Actions);
+    for _ in 0..seed {
+        rng.next_u32(); // within a block
+    }
+    let array = |name: &str| NamedArray { name: name.into(), shape: vec![3], data: vec![0.1, -1e-38, 1.0 / 3.0] };
+    let recurrent = seed.is_multiple_of(2);
+    ResumeState {
+        collector: CollectorState {
+            snapshots: vec![Bytes::from_static(b"\0one"), Bytes::from(vec![255; seed as usize])],
+            observations: vec![0.1, f32::MIN_POSITIVE, -3.0, 1e-7, 10.0, seed as f32],
+            starts: vec![true, false],
+            outcomes: vec![0.5; 6],
+            memory: if recurrent { vec![0.25; 12] } else { vec![] },
+            actions: rng.clone(),
+        },
+        algorithm: AlgorithmState {
+            n_updates: 1 << 40,
+            iterations: 12,
+            optimiser: vec![array("mean"), array("mean_square")],
+            rng: recurrent.then_some(rng),
+        },
+        history: History {
+            recent: vec![[0.1 + 0.2, 200.0, 1.0], [-1e-300, 1.0, 0.0]],
+            elapsed: 1.0 / 3.0,
+            shares: [0.1, 0.2, 0.3],
+            logs: LogLengths { monitor: 1, progress: 2, events: 3, events_file: "events.out.tfevents.7".into() },
+        },
+    }
+}
+
 fn names(directory: &Path) -> Vec<String> {
     let mut names: Vec<String> =
         fs::read_dir(directory).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
@@ -45,7 +84,7 @@ fn what_is_saved_is_loaded_bit_for_bit_from_the_run_or_its_folder() {
     let run = tempfile::tempdir().unwrap();
     for seed in [1, 2] {
         let saved = checkpoint(seed, seed);
-        saved.save(&run.path().join("checkpoint")).unwrap();
+        saved.save(&run.path().join("checkpoint"), None).unwrap();
         assert_eq!(Checkpoint::load(run.path()).unwrap(), saved);
         assert_eq!(Checkpoint::load(&run.path().join("checkpoint")).unwrap(), saved);
         assert_eq!(saved.config().unwrap().table(), saved.state.config);
@@ -53,46 +92,79 @@ fn what_is_saved_is_loaded_bit_for_bit_from_the_run_or_its_folder() {
 }
 
 #[test]
-fn only_the_current_weights_are_kept() {
+fn what_resuming_needs_is_saved_and_loaded_bit_for_bit() {
     let directory = tempfile::tempdir().unwrap();
-    checkpoint(1, 1).save(directory.path()).unwrap();
+    for seed in [1, 2, 3] {
+        let (saved, state) = (checkpoint(seed, seed), resume_state(seed));
+        saved.save(directory.path(), Some(&state)).unwrap();
+        let (loaded, mut loaded_state) = Checkpoint::load_with_resume(directory.path()).unwrap();
+        assert_eq!((&loaded, &loaded_state), (&saved, &state));
+        assert_eq!(loaded_state.collector.actions.next_u64(), state.collector.actions.clone().next_u64());
+    }
+}
+
+#[test]
+fn a_checkpoint_without_the_state_of_its_training_can_be_tested_but_not_resumed() {
+    let directory = tempfile::tempdir().unwrap();
+    checkpoint(1, 1).save(directory.path(), Some(&resume_state(1))).unwrap();
+    checkpoint(1, 2).save(directory.path(), None).unwrap();
+    assert_eq!(names(directory.path()).len(), 2, "the earlier state is gone");
+    assert_eq!(Checkpoint::load(directory.path()).unwrap(), checkpoint(1, 2));
+    let error = Checkpoint::load_with_resume(directory.path()).unwrap_err();
+    assert!(matches!(error, CheckpointError::NotResumable { .. }), "{error}");
+    assert!(error.to_string().contains("can be tested but not resumed"), "{error}");
+}
+
+#[test]
+fn only_the_current_arrays_are_kept() {
+    let directory = tempfile::tempdir().unwrap();
+    checkpoint(1, 1).save(directory.path(), Some(&resume_state(1))).unwrap();
     fs::write(directory.path().join(".tmp-checkpoint.json"), "left by a crash").unwrap();
-    checkpoint(2, 2).save(directory.path()).unwrap();
+    checkpoint(2, 2).save(directory.path(), Some(&resume_state(2))).unwrap();
     let names = names(directory.path());
-    assert_eq!(names.len(), 2, "{names:?}");
+    assert_eq!(names.len(), 3, "{names:?}");
     assert_eq!(names[0], "checkpoint.json");
-    assert!(names[1].starts_with("weights-00000002-"));
+    assert!(names[1].starts_with("resume-00000002-"));
+    assert!(names[2].starts_with("weights-00000002-"));
     assert_eq!(Checkpoint::load(directory.path()).unwrap(), checkpoint(2, 2));
 }
 
 /// Every state of the directory that a crash during a save can leave.
 #[test]
 fn a_crash_at_any_moment_leaves_a_whole_checkpoint() {
-    let (old, new) = (checkpoint(1, 1), checkpoint(2, 2));
+    let (old, new) = ((checkpoint(1, 1), resume_state(1)), (checkpoint(2, 2), resume_state(2)));
     let after = tempfile::tempdir().unwrap();
-    new.save(after.path()).unwrap();
+    new.0.save(after.path(), Some(&new.1)).unwrap();
     let after_names = names(after.path());
-    let new_weights = fs::read(after.path().join(&after_names[1])).unwrap();
-    let new_json = fs::read(after.path().join(JSON)).unwrap();
+    let [new_json, new_resume, new_weights] =
+        std::array::from_fn(|i| fs::read(after.path().join(&after_names[i])).unwrap());
 
     let load_with = |files: &[(&str, &[u8])]| {
         let directory = tempfile::tempdir().unwrap();
-        old.save(directory.path()).unwrap();
+        old.0.save(directory.path(), Some(&old.1)).unwrap();
         for (name, content) in files {
             fs::write(directory.path().join(name), content).unwrap();
         }
-        let loaded = Checkpoint::load(directory.path()).unwrap();
+        let loaded = Checkpoint::load_with_resume(directory.path()).unwrap();
         // A later save finds its way out of any of them.
-        new.save(directory.path()).unwrap();
+        new.0.save(directory.path(), Some(&new.1)).unwrap();
         assert_eq!(names(directory.path()), after_names);
         loaded
     };
-    let temporary = format!(".tmp-{}", after_names[1]);
-    assert_eq!(load_with(&[(&temporary, &new_weights[..10])]), old);
-    assert_eq!(load_with(&[(&temporary, &new_weights)]), old);
-    assert_eq!(load_with(&[(&after_names[1], &new_weights)]), old);
-    assert_eq!(load_with(&[(&after_names[1], &new_weights), (".tmp-checkpoint.json", &new_json[..50])]), old);
-    assert_eq!(load_with(&[(&after_names[1], &new_weights), (JSON, &new_json)]), new);
+    let [resume, weights] = [after_names[1].as_str(), after_names[2].as_str()];
+    let (temporary_resume, temporary_weights) = (format!(".tmp-{resume}"), format!(".tmp-{weights}"));
+    let mut files: Vec<(&str, &[u8])> = Vec::new();
+    assert_eq!(load_with(&[(&temporary_resume, &new_resume[..10])]), old);
+    assert_eq!(load_with(&[(&temporary_resume, &new_resume)]), old);
+    files.push((resume, &new_resume));
+    assert_eq!(load_with(&files), old);
+    assert_eq!(load_with(&[&files[..], &[(&temporary_weights, &new_weights[..10])]].concat()), old);
+    assert_eq!(load_with(&[&files[..], &[(&temporary_weights, &new_weights)]].concat()), old);
+    files.push((weights, &new_weights));
+    assert_eq!(load_with(&files), old);
+    assert_eq!(load_with(&[&files[..], &[(".tmp-checkpoint.json", &new_json[..50])]].concat()), old);
+    files.push((JSON, &new_json));
+    assert_eq!(load_with(&files), new);
 }
 
 #[test]
@@ -102,11 +174,12 @@ fn damage_is_named() {
 
     let spoil = |name: &str, change: &dyn Fn(Vec<u8>) -> Vec<u8>| {
         let directory = tempfile::tempdir().unwrap();
-        checkpoint(1, 1).save(directory.path()).unwrap();
+        checkpoint(1, 1).save(directory.path(), Some(&resume_state(1))).unwrap();
         let path = names(directory.path()).into_iter().find(|known| known.starts_with(name)).unwrap();
         let path = directory.path().join(path);
         fs::write(&path, change(fs::read(&path).unwrap())).unwrap();
-        Checkpoint::load(directory.path()).unwrap_err().to_string()
+        assert_eq!(Checkpoint::load(directory.path()).is_ok(), name == "resume", "testing looks at what it needs");
+        Checkpoint::load_with_resume(directory.path()).unwrap_err().to_string()
     };
     let cut = |bytes: Vec<u8>| bytes[..bytes.len() / 2].to_vec();
     assert!(spoil("weights", &cut).contains("expected"));
@@ -115,6 +188,8 @@ fn damage_is_named() {
         bytes
     };
     assert!(spoil("weights", &flip).contains("another checksum"));
+    assert!(spoil("resume", &cut).contains("expected"));
+    assert!(spoil("resume", &flip).contains("another checksum"));
     assert!(spoil("checkpoint.json", &cut).contains("not understood"));
     let later = |bytes: Vec<u8>| {
         String::from_utf8(bytes).unwrap().replace("\"format_version\": 1", "\"format_version\": 9").into_bytes()
@@ -126,7 +201,7 @@ fn damage_is_named() {
 fn statistics_that_cannot_be_are_refused() {
     let refusal = |pointer: &str, value: serde_json::Value| {
         let directory = tempfile::tempdir().unwrap();
-        checkpoint(1, 1).save(directory.path()).unwrap();
+        checkpoint(1, 1).save(directory.path(), None).unwrap();
         let path = directory.path().join(JSON);
         let mut document: serde_json::Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
         *document.pointer_mut(pointer).unwrap() = value;
@@ -157,4 +232,17 @@ fn statistics_that_cannot_be_are_refused() {
         let message = refusal(&pointer, value);
         assert!(message.contains(part), "{pointer}: {message}");
     }
+}
+
+#[test]
+fn a_changed_environment_is_told_from_the_one_that_was_trained_in() {
+    let trained = checkpoint(1, 1).state.environment_spec;
+    assert_eq!(trained.difference(&trained), None);
+    let mut served = trained.clone();
+    served.step_limit = 11;
+    assert_eq!(trained.difference(&served), Some(("step limit", "10".into(), "11".into())));
+    served.model_hash = "abc".into();
+    assert_eq!(trained.difference(&served), Some(("model", "\"\"".into(), "\"abc\"".into())));
+    served.revision = 2;
+    assert_eq!(trained.difference(&served), Some(("revision", "1".into(), "2".into())));
 }

@@ -1,31 +1,34 @@
-//! Checkpoints: a directory with `checkpoint.json` and the weights file that it names.
+//! Checkpoints: a directory with `checkpoint.json` and the files of arrays that it names, the policy's weights and what
+//! the training needs to go on.
 //!
-//! Writing is atomic: the weights get a new name first, then `checkpoint.json`, which names them with their size and
-//! checksum, is renamed into place, and only then the old weights are deleted. Whatever moment the program or the
+//! Writing is atomic: the arrays get new names first, then `checkpoint.json`, which names them with their sizes and
+//! checksums, is renamed into place, and only then the old arrays are deleted. Whatever moment the program or the
 //! machine dies at, the directory holds a complete checkpoint, the old one or the new one.
 
-use std::collections::HashMap;
-use std::fs::{self, File};
-use std::io::Write;
+mod arrays;
+mod files;
+mod resume;
+
+use std::fmt;
+use std::fs;
 use std::path::{Path, PathBuf};
 
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 
+use self::arrays::{decode_weights, encode_weights};
+use self::files::{ArraysFile, damaged, io, remove_others, write_atomically};
+pub use self::resume::{History, ResumeState};
 use crate::config::{AlgorithmName, Architecture, TrainConfig, Wrapper};
 use crate::evaluation::Version;
-use crate::policy::{ActionKind, Inputs, NamedArray, ObservationNormaliser, PolicySpec, RewardNormaliser, Weights};
+use crate::policy::{ActionKind, Inputs, ObservationNormaliser, PolicySpec, RewardNormaliser, Weights};
 use crate::proto;
 
 /// Of the JSON's layout; raised when older programs could misread it.
 const FORMAT_VERSION: u32 = 1;
 const JSON: &str = "checkpoint.json";
 const WEIGHTS_PREFIX: &str = "weights-";
-const WEIGHTS_SUFFIX: &str = ".safetensors";
-/// Files that a write has not finished.
-const TEMPORARY_PREFIX: &str = ".tmp-";
 
-/// A trained policy with everything that testing needs.
+/// A trained policy with everything that testing needs; what resuming needs beside it is [`ResumeState`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Checkpoint {
     /// Everything but the weights.
@@ -109,17 +112,12 @@ pub struct Counters {
 #[derive(Serialize, Deserialize)]
 struct Document {
     format_version: u32,
-    weights: WeightsFile,
+    weights: ArraysFile,
+    /// Not looked into for testing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    resume: Option<serde_json::Value>,
     #[serde(flatten)]
     rest: serde_json::Value,
-}
-
-/// Names the weights file and says how to tell whether it is whole.
-#[derive(Serialize, Deserialize)]
-struct WeightsFile {
-    file: String,
-    bytes: u64,
-    crc32c: u32,
 }
 
 /// Why a checkpoint cannot be written or read.
@@ -154,31 +152,45 @@ pub enum CheckpointError {
         /// What is wrong with it.
         reason: String,
     },
+    /// There is a policy, but not the state of its training.
+    #[error(
+        "the checkpoint in {} can be tested but not resumed: it holds the policy without the state of its training, as \
+         those of earlier versions of perturb; train again with --overwrite",
+        path.display()
+    )]
+    NotResumable {
+        /// The directory.
+        path: PathBuf,
+    },
 }
 
 type Result<T> = std::result::Result<T, CheckpointError>;
 
 impl Checkpoint {
-    /// Replaces the checkpoint in `directory`, which is created if it is not there.
+    /// Replaces the checkpoint in `directory`, which is created if it is not there. Without `resume` it can be tested,
+    /// but its training cannot be resumed.
     ///
     /// # Errors
     /// [`CheckpointError::Io`]; the earlier checkpoint, if any, is then still there.
-    pub fn save(&self, directory: &Path) -> Result<()> {
+    pub fn save(&self, directory: &Path, resume: Option<&ResumeState>) -> Result<()> {
         fs::create_dir_all(directory).map_err(io("create", directory))?;
+        let iterations = self.state.counters.iterations;
+        let resume = resume.map(|resume| resume.write(directory, iterations)).transpose()?;
+        let (resume_file, resume) = resume.unzip();
         let weights = encode_weights(&self.weights).map_err(|reason| damaged(directory, reason))?;
-        let crc = crc32c::crc32c(&weights);
-        // The checksum is part of the name: a file that is in use is never written over by another content.
-        let name = format!("{WEIGHTS_PREFIX}{:08}-{crc:08x}{WEIGHTS_SUFFIX}", self.state.counters.iterations);
-        write_atomically(directory, &name, &weights)?;
+        let weights = ArraysFile::write(directory, WEIGHTS_PREFIX, iterations, &weights)?;
+        let weights_file = weights.file.clone();
 
         let document = Document {
             format_version: FORMAT_VERSION,
-            weights: WeightsFile { file: name.clone(), bytes: weights.len() as u64, crc32c: crc },
+            weights,
+            resume,
             rest: serde_json::to_value(&self.state).map_err(|error| damaged(directory, error.to_string()))?,
         };
         let json = serde_json::to_vec_pretty(&document).map_err(|error| damaged(directory, error.to_string()))?;
         write_atomically(directory, JSON, &json)?;
-        remove_others(directory, &name)
+        let current = [weights_file.as_str(), resume_file.as_deref().unwrap_or_default()];
+        remove_others(directory, &[WEIGHTS_PREFIX, resume::PREFIX], &current)
     }
 
     /// Reads the checkpoint in `path`, or in its folder `checkpoint`.
@@ -186,18 +198,25 @@ impl Checkpoint {
     /// # Errors
     /// [`CheckpointError`], which names the file.
     pub fn load(path: &Path) -> Result<Self> {
-        let directory = [path.to_owned(), path.join("checkpoint")]
-            .into_iter()
-            .find(|directory| directory.join(JSON).is_file())
-            .ok_or_else(|| CheckpointError::Missing { path: path.to_owned() })?;
+        let (directory, document) = Document::read(path)?;
+        Self::of(&directory, document)
+    }
+
+    /// Reads the checkpoint in `path`, or in its folder `checkpoint`, with the state of its training.
+    ///
+    /// # Errors
+    /// [`CheckpointError`], which names the file.
+    pub fn load_with_resume(path: &Path) -> Result<(Self, ResumeState)> {
+        let (directory, mut document) = Document::read(path)?;
+        let resume = document.resume.take();
+        let checkpoint = Self::of(&directory, document)?;
+        let resume = resume.ok_or_else(|| CheckpointError::NotResumable { path: directory.clone() })?;
+        Ok((checkpoint, ResumeState::read(&directory, resume)?))
+    }
+
+    /// What `document` in `directory` describes.
+    fn of(directory: &Path, document: Document) -> Result<Self> {
         let json = directory.join(JSON);
-        let text = fs::read(&json).map_err(io("read", &json))?;
-        let document: Document =
-            serde_json::from_slice(&text).map_err(|error| damaged(&json, format!("it is not understood: {error}")))?;
-        if document.format_version != FORMAT_VERSION {
-            let reason = format!("it has format {}, this program reads {FORMAT_VERSION}", document.format_version);
-            return Err(damaged(&json, reason));
-        }
         let state: State = serde_json::from_value(document.rest)
             .map_err(|error| damaged(&json, format!("it is not understood: {error}")))?;
         let wrong = |name: &str, reason: String| damaged(&json, format!("{name}: {reason}"));
@@ -210,14 +229,8 @@ impl Checkpoint {
             normaliser.check().map_err(|reason| wrong("reward_normaliser", reason))?;
         }
 
-        let file = Path::new(&document.weights.file).file_name().unwrap_or_default();
-        let file = directory.join(file);
-        let bytes = fs::read(&file).map_err(io("read", &file))?;
-        if bytes.len() as u64 != document.weights.bytes || crc32c::crc32c(&bytes) != document.weights.crc32c {
-            let expected = document.weights.bytes;
-            let reason = format!("it has {} bytes, expected {expected} with another checksum", bytes.len());
-            return Err(damaged(&file, reason));
-        }
+        let bytes = document.weights.read(directory)?;
+        let file = document.weights.path(directory);
         let weights = decode_weights(&bytes, &state.policy).map_err(|reason| damaged(&file, reason))?;
         Ok(Self { state, weights })
     }
@@ -239,6 +252,25 @@ impl State {
     }
 }
 
+impl Document {
+    /// Reads `checkpoint.json` in `path`, or in its folder `checkpoint`; gives the folder, too.
+    fn read(path: &Path) -> Result<(PathBuf, Self)> {
+        let directory = [path.to_owned(), path.join("checkpoint")]
+            .into_iter()
+            .find(|directory| directory.join(JSON).is_file())
+            .ok_or_else(|| CheckpointError::Missing { path: path.to_owned() })?;
+        let json = directory.join(JSON);
+        let text = fs::read(&json).map_err(io("read", &json))?;
+        let document: Document =
+            serde_json::from_slice(&text).map_err(|error| damaged(&json, format!("it is not understood: {error}")))?;
+        if document.format_version != FORMAT_VERSION {
+            let reason = format!("it has format {}, this program reads {FORMAT_VERSION}", document.format_version);
+            return Err(damaged(&json, reason));
+        }
+        Ok((directory, document))
+    }
+}
+
 impl EnvironmentSummary {
     /// What a checkpoint keeps of an environment; `None` if its action space is not given.
     pub fn of(environment: &proto::Environment) -> Option<Self> {
@@ -256,74 +288,23 @@ impl EnvironmentSummary {
             model_hash: environment.model_hash.clone(),
         })
     }
-}
 
-fn encode_weights(weights: &Weights) -> std::result::Result<Vec<u8>, String> {
-    let bytes: Vec<Vec<u8>> =
-        weights.iter().map(|array| array.data.iter().flat_map(|x| x.to_le_bytes()).collect()).collect();
-    let views: Vec<(&str, TensorView<'_>)> = weights
-        .iter()
-        .zip(&bytes)
-        .map(|(array, bytes)| Ok((array.name.as_str(), TensorView::new(Dtype::F32, array.shape.clone(), bytes)?)))
-        .collect::<std::result::Result<_, safetensors::SafeTensorError>>()
-        .map_err(|error| error.to_string())?;
-    let metadata = HashMap::from([("format".to_owned(), "perturb".to_owned())]);
-    safetensors::serialize(views, Some(metadata)).map_err(|error| error.to_string())
-}
-
-fn decode_weights(bytes: &[u8], spec: &PolicySpec) -> std::result::Result<Weights, String> {
-    spec.validate().map_err(|error| error.to_string())?;
-    let tensors = SafeTensors::deserialize(bytes).map_err(|error| error.to_string())?;
-    let layout = spec.layout();
-    if tensors.len() != layout.len() {
-        return Err(format!("it has {} arrays, expected {}", tensors.len(), layout.len()));
-    }
-    let mut weights = Weights::new();
-    for (name, _) in layout {
-        let tensor = tensors.tensor(&name).map_err(|error| error.to_string())?;
-        if tensor.dtype() != Dtype::F32 {
-            return Err(format!("{name} has the type {:?}, expected F32", tensor.dtype()));
-        }
-        let data = tensor.data().as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
-        weights.push(NamedArray { name, shape: tensor.shape().to_vec(), data });
-    }
-    spec.check(&weights).map_err(|error| error.to_string())?;
-    Ok(weights)
-}
-
-/// Writes `name` in one piece: it appears complete, and on the disk, or not at all.
-fn write_atomically(directory: &Path, name: &str, content: &[u8]) -> Result<()> {
-    let temporary = directory.join(format!("{TEMPORARY_PREFIX}{name}"));
-    let mut file = File::create(&temporary).map_err(io("create", &temporary))?;
-    file.write_all(content).and_then(|()| file.sync_all()).map_err(io("write", &temporary))?;
-    let path = directory.join(name);
-    fs::rename(&temporary, &path).map_err(io("rename a file to", &path))?;
-    File::open(directory).and_then(|directory| directory.sync_all()).map_err(io("sync", directory))
-}
-
-/// Deletes weights that no checkpoint names, and what broken-off writes left.
-fn remove_others(directory: &Path, current: &str) -> Result<()> {
-    for entry in fs::read_dir(directory).map_err(io("list", directory))? {
-        let name = entry.map_err(io("list", directory))?.file_name();
-        let name = name.to_string_lossy();
-        let weights = name.starts_with(WEIGHTS_PREFIX) && name.ends_with(WEIGHTS_SUFFIX) && name != current;
-        if weights || name.starts_with(TEMPORARY_PREFIX) {
-            let path = directory.join(name.as_ref());
-            fs::remove_file(&path).map_err(io("delete", &path))?;
+    /// The first part in which `served` is not what this says, with both values; `None` if they are equal.
+    pub fn difference(&self, served: &Self) -> Option<(&'static str, String, String)> {
+        let both = |what, trained: &dyn fmt::Debug, served: &dyn fmt::Debug| {
+            Some((what, format!("{trained:?}"), format!("{served:?}")))
+        };
+        match (self, served) {
+            (a, b) if a.revision != b.revision => both("revision", &a.revision, &b.revision),
+            (a, b) if a.model_hash != b.model_hash => both("model", &a.model_hash, &b.model_hash),
+            (a, b) if a.observation != b.observation => both("observations", &a.observation, &b.observation),
+            (a, b) if a.action != b.action => both("actions", &a.action, &b.action),
+            (a, b) if a.parameters != b.parameters => both("parameters", &a.parameters, &b.parameters),
+            (a, b) if a.step_limit != b.step_limit => both("step limit", &a.step_limit, &b.step_limit),
+            _ => None,
         }
     }
-    Ok(())
-}
-
-fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> CheckpointError {
-    let path = path.to_owned();
-    move |source| CheckpointError::Io { action, path, source }
-}
-
-fn damaged(path: &Path, reason: String) -> CheckpointError {
-    CheckpointError::Damaged { path: path.to_owned(), reason }
 }
 
 #[cfg(test)]
-#[path = "checkpoint_tests.rs"]
 mod tests;

@@ -1,0 +1,134 @@
+//! What a training needs beside its policy to go on exactly where it was.
+//!
+//! Large arrays are in a file of their own, which testing does not read; the rest is `resume` in `checkpoint.json`.
+
+use std::path::Path;
+
+use bytes::Bytes;
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use super::arrays::{Array, Arrays, encode};
+use super::files::{ArraysFile, damaged};
+use super::{JSON, Result};
+use crate::algorithm::AlgorithmState;
+use crate::logging::LogLengths;
+use crate::rollout::CollectorState;
+
+pub(super) const PREFIX: &str = "resume-";
+
+/// The state of a training between two iterations, beside what a [`Checkpoint`](super::Checkpoint) holds.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ResumeState {
+    /// Environments, observations, memories, the stream of actions.
+    pub collector: CollectorState,
+    /// The optimiser, the stream of minibatches.
+    pub algorithm: AlgorithmState,
+    /// The figures of the run so far.
+    pub history: History,
+}
+
+/// Figures of a run that are not those of its last iteration.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct History {
+    /// Return, length and success (0 or 1) of the last episodes, oldest first.
+    pub recent: Vec<[f64; 3]>,
+    /// Seconds of training.
+    pub elapsed: f64,
+    /// Of these: choosing actions, waiting for servers, updating.
+    pub shares: [f64; 3],
+    /// How long the logs were.
+    pub logs: LogLengths,
+}
+
+/// `resume` in `checkpoint.json`.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Document {
+    arrays: ArraysFile,
+    /// Its arrays are without their data.
+    algorithm: AlgorithmState,
+    /// The stream of actions.
+    actions: ChaCha8Rng,
+    history: History,
+}
+
+impl ResumeState {
+    /// Writes the arrays; gives the name of their file, and what stands in `checkpoint.json`.
+    pub(super) fn write(&self, directory: &Path, iterations: u64) -> Result<(String, serde_json::Value)> {
+        let content = self.encode().map_err(|reason| damaged(directory, reason))?;
+        let arrays = ArraysFile::write(directory, PREFIX, iterations, &content)?;
+        let file = arrays.file.clone();
+        let mut algorithm = self.algorithm.clone();
+        algorithm.optimiser.iter_mut().for_each(|array| array.data.clear());
+        let (actions, history) = (self.collector.actions.clone(), self.history.clone());
+        let value = serde_json::to_value(Document { arrays, algorithm, actions, history });
+        Ok((file, value.map_err(|error| damaged(directory, error.to_string()))?))
+    }
+
+    /// Reads what [`ResumeState::write`] wrote.
+    pub(super) fn read(directory: &Path, value: serde_json::Value) -> Result<Self> {
+        let not_understood =
+            |error: serde_json::Error| damaged(&directory.join(JSON), format!("resume is not understood: {error}"));
+        let document: Document = serde_json::from_value(value).map_err(not_understood)?;
+        let content = document.arrays.read(directory)?;
+        let path = document.arrays.path(directory);
+        document.complete(&content).map_err(|reason| damaged(&path, reason))
+    }
+
+    fn encode(&self) -> std::result::Result<Vec<u8>, String> {
+        let CollectorState { snapshots, observations, starts, outcomes, memory, actions: _ } = &self.collector;
+        let num_envs = starts.len();
+        let rows = |data: &[f32]| vec![num_envs, data.len() / num_envs.max(1)];
+        let mut arrays = vec![
+            Array::u8("snapshots", snapshots.concat()),
+            Array::u64("snapshot_lengths", snapshots.iter().map(|snapshot| snapshot.len() as u64)),
+            Array::f32("observations", rows(observations), observations),
+            Array::u8("starts", starts.iter().map(|&start| u8::from(start)).collect()),
+            Array::f32("outcomes", rows(outcomes), outcomes),
+            Array::f32("memory", rows(memory), memory),
+        ];
+        for array in &self.algorithm.optimiser {
+            arrays.push(Array::f32(optimiser(&array.name), array.shape.clone(), &array.data));
+        }
+        encode(&arrays)
+    }
+}
+
+impl Document {
+    /// Puts the arrays in.
+    fn complete(mut self, content: &[u8]) -> std::result::Result<ResumeState, String> {
+        let arrays = Arrays::decode(content)?;
+        for array in &mut self.algorithm.optimiser {
+            array.data = arrays.f32(&optimiser(&array.name))?.data;
+        }
+        let collector = CollectorState {
+            snapshots: cut(arrays.u8("snapshots")?, &arrays.u64("snapshot_lengths")?)?,
+            observations: arrays.f32("observations")?.data,
+            starts: arrays.u8("starts")?.iter().map(|&start| start != 0).collect(),
+            outcomes: arrays.f32("outcomes")?.data,
+            memory: arrays.f32("memory")?.data,
+            actions: self.actions,
+        };
+        Ok(ResumeState { collector, algorithm: self.algorithm, history: self.history })
+    }
+}
+
+/// The name of an optimiser's array in the file.
+fn optimiser(name: &str) -> String {
+    format!("optimiser.{name}")
+}
+
+/// Cuts `bytes` into pieces of these `lengths`.
+fn cut(bytes: &[u8], lengths: &[u64]) -> std::result::Result<Vec<Bytes>, String> {
+    let mut rest = Bytes::copy_from_slice(bytes);
+    let mut pieces = Vec::with_capacity(lengths.len());
+    for &length in lengths {
+        match usize::try_from(length).ok().filter(|&length| length <= rest.len()) {
+            Some(length) => pieces.push(rest.split_to(length)),
+            None => return Err(format!("its snapshots have {} bytes, too few for snapshot_lengths", bytes.len())),
+        }
+    }
+    if rest.is_empty() { Ok(pieces) } else { Err(format!("its snapshots have {} bytes too many", rest.len())) }
+}

@@ -1,0 +1,241 @@
+//! The logs of a run together: created, or cut back to a checkpoint and gone on with.
+
+use std::fs::{File, OpenOptions};
+use std::io::ErrorKind;
+use std::os::unix::fs::FileExt;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use super::{Clock, Monitor, Progress, ProgressLog};
+use crate::client::EndedEpisode;
+
+const MONITOR: &str = "monitor.csv";
+const PROGRESS: &str = "progress.csv";
+
+/// The files of a run that grow.
+#[derive(Debug)]
+pub struct Logs {
+    directory: PathBuf,
+    monitor: Monitor,
+    progress: ProgressLog,
+}
+
+/// How long the logs were at a moment, in bytes.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LogLengths {
+    /// Of `monitor.csv`.
+    pub monitor: u64,
+    /// Of `progress.csv`.
+    pub progress: u64,
+    /// Of the TensorBoard events.
+    pub events: u64,
+    /// Their file's name.
+    pub events_file: String,
+}
+
+/// Why a log cannot be written or gone on with.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum LogError {
+    /// The operating system refused a file.
+    #[error("cannot {action} {}: {source}", path.display())]
+    Io {
+        /// What was tried.
+        action: &'static str,
+        /// On what.
+        path: PathBuf,
+        /// Its answer.
+        source: std::io::Error,
+    },
+    /// A log does not hold what it held when the checkpoint was written.
+    #[error(
+        "{} has changed since the checkpoint was written: {reason}; put the file back as perturb wrote it, or train \
+         again with --overwrite",
+        path.display()
+    )]
+    Changed {
+        /// The log.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+type Result<T> = std::result::Result<T, LogError>;
+
+impl Logs {
+    /// Creates the files in `directory`.
+    ///
+    /// # Errors
+    /// [`LogError::Io`].
+    pub fn create(directory: &Path, environment: &str, parameters: &[String], clock: Clock) -> Result<Self> {
+        let path = directory.join(MONITOR);
+        let monitor = Monitor::create(&path, environment, parameters, clock).map_err(io("create", &path))?;
+        let progress = ProgressLog::create(directory, clock.t_start()).map_err(io("create the logs in", directory))?;
+        // Their names must be on the disk before a checkpoint counts on them.
+        File::open(directory).and_then(|directory| directory.sync_all()).map_err(io("sync", directory))?;
+        Ok(Self { directory: directory.to_owned(), monitor, progress })
+    }
+
+    /// Goes on with the files in `directory` where they had these `lengths`: what was written later is deleted.
+    ///
+    /// # Errors
+    /// [`LogError::Changed`] if one is shorter, or does not end a line there; then none was changed. [`LogError::Io`].
+    pub fn resume(directory: &Path, lengths: &LogLengths, clock: Clock) -> Result<Self> {
+        let events = Path::new(&lengths.events_file).file_name().unwrap_or_default();
+        let paths = [directory.join(MONITOR), directory.join(PROGRESS), directory.join(events)];
+        let monitor = open(&paths[0], lengths.monitor, true)?;
+        let progress = open(&paths[1], lengths.progress, true)?;
+        let events = open(&paths[2], lengths.events, false)?;
+        let logs = [(&monitor, lengths.monitor), (&progress, lengths.progress), (&events, lengths.events)];
+        for ((file, length), path) in logs.into_iter().zip(&paths) {
+            file.set_len(length).map_err(io("shorten", path))?;
+        }
+        let progress = ProgressLog::resume(progress, events, lengths.events_file.clone(), clock.t_start());
+        Ok(Self { directory: directory.to_owned(), monitor: Monitor::resume(monitor, clock), progress })
+    }
+
+    /// Adds an episode to `monitor.csv`.
+    ///
+    /// # Errors
+    /// [`LogError::Io`].
+    pub fn episode(&mut self, episode: &EndedEpisode) -> Result<()> {
+        self.monitor.write(episode).map_err(io("write", &self.directory.join(MONITOR)))
+    }
+
+    /// Adds a line to `progress.csv`, and an event.
+    ///
+    /// # Errors
+    /// [`LogError::Io`].
+    pub fn progress(&mut self, progress: &Progress) -> Result<()> {
+        self.progress.write(progress).map_err(io("write", &self.directory.join(PROGRESS)))
+    }
+
+    /// Brings all that was written to the disk, and says how much it is.
+    ///
+    /// # Errors
+    /// [`LogError::Io`].
+    pub fn sync(&mut self) -> Result<LogLengths> {
+        let monitor = self.monitor.sync().map_err(io("write", &self.directory.join(MONITOR)))?;
+        let [progress, events] = self.progress.sync().map_err(io("write", &self.directory.join(PROGRESS)))?;
+        Ok(LogLengths { monitor, progress, events, events_file: self.progress.events_file().to_owned() })
+    }
+}
+
+/// Brings `file` to the disk and gives its length.
+pub(super) fn sync(file: &File) -> std::io::Result<u64> {
+    file.sync_data()?;
+    Ok(file.metadata()?.len())
+}
+
+/// Opens a log for appending that has at least `length` bytes, with the end of a line there if it consists of `lines`.
+fn open(path: &Path, length: u64, lines: bool) -> Result<File> {
+    let changed = |reason| Err(LogError::Changed { path: path.to_owned(), reason });
+    let file = match OpenOptions::new().read(true).append(true).open(path) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return changed("it is gone".into()),
+        opened => opened.map_err(io("open", path))?,
+    };
+    let got = file.metadata().map_err(io("look at", path))?.len();
+    if got < length {
+        return changed(format!("it has {got} bytes, but had {length}"));
+    }
+    let mut last = [b'\n'];
+    if lines && length > 0 {
+        file.read_exact_at(&mut last, length - 1).map_err(io("read", path))?;
+    }
+    if last != *b"\n" {
+        return changed(format!("its first {length} bytes no longer end with a line"));
+    }
+    Ok(file)
+}
+
+/// Names the file in the operating system's error.
+fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> LogError {
+    let path = path.to_owned();
+    move |source| LogError::Io { action, path, source }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    fn episode(length: u32) -> EndedEpisode {
+        EndedEpisode {
+            slot: 0,
+            environment_index: 0,
+            episode_index: 0,
+            trial_index: 0,
+            episode_in_trial: 0,
+            episode_return: 1.5,
+            length,
+            success: true,
+            terminated: true,
+            parameters: vec![],
+        }
+    }
+
+    fn start(directory: &Path) -> Logs {
+        Logs::create(directory, "CartPole", &[], Clock::new(100.0, 0.0)).unwrap()
+    }
+
+    fn read(directory: &Path, name: &str) -> String {
+        fs::read_to_string(directory.join(name)).unwrap()
+    }
+
+    #[test]
+    fn logs_go_on_where_they_were_synced() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut logs = start(directory.path());
+        logs.episode(&episode(1)).unwrap();
+        let lengths = logs.sync().unwrap();
+        assert_eq!(lengths.monitor, read(directory.path(), MONITOR).len() as u64, "all that was written");
+        let kept = read(directory.path(), MONITOR);
+        logs.episode(&episode(2)).unwrap();
+        drop(logs);
+        assert!(read(directory.path(), MONITOR).len() > kept.len());
+
+        let mut logs = Logs::resume(directory.path(), &lengths, Clock::start(7.0)).unwrap();
+        assert_eq!(logs.sync().unwrap(), lengths, "what was later is gone");
+        logs.episode(&episode(3)).unwrap();
+        logs.sync().unwrap();
+        let text = read(directory.path(), MONITOR);
+        let fields: Vec<&str> = text.strip_prefix(&kept).unwrap().trim_end().split(',').collect();
+        assert_eq!(fields[..2], ["1.500000", "3"]);
+        assert!((7.0..100.0).contains(&fields[2].parse::<f64>().unwrap()), "seconds go on: {}", fields[2]);
+    }
+
+    #[test]
+    fn logs_that_were_edited_are_refused_and_left_alone() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut logs = start(directory.path());
+        logs.episode(&episode(1)).unwrap();
+        let lengths = logs.sync().unwrap();
+        drop(logs);
+        let refusal = |name: &str, change: &dyn Fn(&[u8]) -> Vec<u8>| {
+            let path = directory.path().join(name);
+            let before = fs::read(&path).unwrap();
+            let changed = change(&before);
+            fs::write(&path, &changed).unwrap();
+            let error = Logs::resume(directory.path(), &lengths, Clock::start(0.0)).unwrap_err().to_string();
+            assert_eq!(fs::read(&path).unwrap(), changed);
+            fs::write(&path, before).unwrap();
+            assert!(error.contains(&path.display().to_string()), "{error}");
+            error
+        };
+        let shorter = |bytes: &[u8]| bytes[..bytes.len() - 1].to_vec();
+        let longer = |bytes: &[u8]| String::from_utf8_lossy(bytes).replace('\n', "\r\n").into_bytes();
+        for name in [MONITOR, PROGRESS, "events.out.tfevents.100.perturb"] {
+            let expected = |error: &str| error.contains("has changed since") && error.contains("bytes, but had");
+            let error = refusal(name, &shorter);
+            assert!(expected(&error), "{error}");
+        }
+        assert!(refusal(MONITOR, &longer).contains("no longer end with a line"));
+        fs::remove_file(directory.path().join(PROGRESS)).unwrap();
+        let error = Logs::resume(directory.path(), &lengths, Clock::start(0.0)).unwrap_err().to_string();
+        assert!(error.contains("it is gone") && error.contains(PROGRESS), "{error}");
+    }
+}
