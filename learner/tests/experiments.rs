@@ -215,12 +215,11 @@ fn a_failed_cell_is_recorded_with_its_reason_and_the_others_are_done() {
 #[test]
 fn a_signal_stops_the_workers_and_the_same_command_goes_on() {
     let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 400"));
-    let mut begun = 0;
     for (name, code) in [("-INT", 130), ("-TERM", 143)] {
+        let begun: usize = experiment.attempts("out").iter().sum();
         let child = experiment.command("out", &["--jobs", "2"]).spawn().expect("started");
         let id = child.id();
         wait_for("trainings", || experiment.attempts("out").iter().sum::<usize>() > begun);
-        begun = experiment.attempts("out").iter().sum();
         let started = children(id);
         signal(name, id);
         let output = child.wait_with_output().expect("ended");
@@ -323,9 +322,9 @@ fn a_report_is_the_same_however_often_the_run_was_broken_off() {
     let experiment = Experiment::new(&PLAN.replace("test_versions = ['D', 'R']", "test_versions = ['D', 'E']"));
     let report = |name: &str| {
         let page = experiment.out("page.html");
-        let command =
-            ["report", experiment.out(name).to_str().expect("a path"), "--html", page.to_str().expect("a path")];
-        let output = Command::new(env!("CARGO_BIN_EXE_perturb")).args(command).output().expect("ended");
+        let mut command = Command::new(env!("CARGO_BIN_EXE_perturb"));
+        command.arg("report").arg(experiment.out(name)).arg("--html").arg(&page);
+        let output = command.output().expect("ended");
         succeeded(&output);
         let mut files = BTreeMap::from([("text".to_owned(), output.stdout)]);
         for entry in std::fs::read_dir(experiment.out(name).join("report")).expect("a folder") {

@@ -20,7 +20,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<Ending> {
         }
     }
     let counts = plan.counts();
-    let runs = if counts.runs == 1 { "run".to_owned() } else { format!("{} runs", counts.runs) };
+    let runs = if counts.runs == 1 { "1 run".to_owned() } else { format!("{} runs", counts.runs) };
     writeln!(
         out,
         "{} configurations, {} trainings, {} train/test pairs, {} with {runs}",

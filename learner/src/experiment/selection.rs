@@ -2,8 +2,9 @@
 //!
 //! Per environment, learner, training version and run, one configuration is selected: the one with the highest success
 //! rate when tested on the version that it was trained on. Of equal ones the one with the higher mean return in the same
-//! test is taken, of still equal ones the one that the plan lists first; so is it where that version was not tested. Like in the paper, the test that selects is the
-//! test that is reported; with a large grid that makes Default and Interpolation look a little better than they are.
+//! test is taken, of still equal ones the one that the plan lists first; so is it where that version was not tested. Like
+//! in the paper, the test that selects is the test that is reported; with a large grid that makes Default and
+//! Interpolation look a little better than they are.
 
 use std::collections::BTreeMap;
 

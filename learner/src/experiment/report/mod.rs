@@ -8,7 +8,7 @@ mod csv;
 mod html;
 mod render;
 
-use super::plan::Learner;
+use super::plan::{Cell, Learner};
 use super::selection::{Group, Metric, Results, average, interquartile};
 use super::statistics::Summary;
 use crate::evaluation::{Scenario, Version, paper};
@@ -19,6 +19,9 @@ pub use render::{markdown, text};
 
 /// Resamples of each bootstrap, as many as rliable takes.
 const RESAMPLES: usize = 50_000;
+/// The paper's budgets.
+const PAPER_EPISODES: u64 = 15_000;
+const PAPER_TEST_EPISODES: u64 = 1000;
 /// What stands for a number that there is not.
 pub const MISSING: &str = "missing";
 /// What stands for a number that the paper does not have.
@@ -116,6 +119,7 @@ fn overview(results: &Results<'_>, groups: &[Group]) -> Vec<String> {
     let (cells, done, failed) = (results.plan.cells.len(), results.done(), results.failures().count());
     let mut lines =
         vec![format!("{done} of {cells} cells are done, {failed} failed, {} are missing.", cells - done - failed)];
+    lines.extend(budgets(results));
     let incomplete = groups.iter().filter(|group| group.done < group.cells).count();
     if incomplete > 0 {
         lines.push(format!(
@@ -136,6 +140,24 @@ fn overview(results: &Results<'_>, groups: &[Group]) -> Vec<String> {
             .into(),
     );
     lines
+}
+
+/// Budgets that are not the paper's.
+fn budgets(results: &Results<'_>) -> Option<String> {
+    let range = |of: &dyn Fn(&Cell) -> u64| {
+        let (least, most) = results.plan.cells.iter().map(of).fold((u64::MAX, 0), |(l, m), n| (l.min(n), m.max(n)));
+        (least, most, if least == most { least.to_string() } else { format!("{least} to {most}") })
+    };
+    let (trained, tested) = (range(&|cell| cell.config.common.episodes), range(&|cell| cell.tests.episodes));
+    let same = |range: &(u64, u64, String), paper: u64| (range.0, range.1) == (paper, paper);
+    if same(&trained, PAPER_EPISODES) && same(&tested, PAPER_TEST_EPISODES) {
+        return None;
+    }
+    Some(format!(
+        "Other budgets than the paper's: {} episodes in a training, where the paper has {PAPER_EPISODES}, and {} in a \
+         test, where it has {PAPER_TEST_EPISODES}.",
+        trained.2, tested.2
+    ))
 }
 
 fn metrics_of(environment: &str, groups: &[&Group], runs: u32) -> Table {
@@ -314,5 +336,48 @@ impl std::fmt::Display for PaperCell {
             Some(std) => f.pad(&format!("{:.1} ± {std:.1}", self.mean)),
             None => f.pad(&format!("{:.1}", self.mean)),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::experiment::Plan;
+
+    fn overview_of(budgets: &str) -> String {
+        let text =
+            format!("environments = ['CartPole']\n{budgets}\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']");
+        let plan = Plan::parse("test", text).unwrap();
+        let states = vec![super::super::folder::CellState::Missing; plan.cells.len()];
+        let results = Results { plan: &plan, states };
+        let report = Report::new(&results, &results.select());
+        assert_eq!(report.metrics[0].rows[0][1].text, MISSING, "nothing is done");
+        assert!(report.scenarios[0].rows.iter().all(|row| row[2..].iter().all(|entry| entry.heat.is_none())));
+        text_of(&report)
+    }
+
+    fn text_of(report: &Report) -> String {
+        report.overview.join("\n")
+    }
+
+    #[test]
+    fn other_budgets_than_the_papers_are_told() {
+        assert!(!overview_of("").contains("budgets"));
+        let told =
+            "Other budgets than the paper's: 300 episodes in a training, where the paper has 15000, and 50 in a test";
+        let text = overview_of("settings = { episodes = 300 }\ntest_episodes = 50");
+        assert!(text.contains(told), "{text}");
+        assert!(overview_of("test_episodes = 999").contains("999 in a test"));
+    }
+
+    #[test]
+    fn the_papers_average_is_over_the_same_environments() {
+        let learner = Learner { algorithm: "a2c".into(), architecture: "ff".into(), episodes_per_trial: None };
+        let two = paper_average(&["CartPole", "MountainCar"], &learner, Metric::Default).unwrap();
+        assert!((two.mean - (100.0 + 79.78) / 2.0).abs() < 1e-9 && two.std.is_none());
+        let six = ["Acrobot", "CartPole", "MountainCar", "Pendulum", "HalfCheetah", "Hopper"];
+        let all = paper_average(&six, &learner, Metric::Default).unwrap();
+        assert_eq!((all.mean, all.std), (78.14, Some(6.07)));
+        assert_eq!(paper_average(&["CartPole", "Ant"], &learner, Metric::Default), None);
     }
 }
