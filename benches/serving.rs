@@ -2,7 +2,8 @@
 //!
 //! - CartPole, batch 256, over a Unix socket, against a bare tonic echo of the same payload;
 //! - Hopper and HalfCheetah, batch 64, two workers, against twice the bare loop of the same model on one thread, and
-//!   against two such threads at once, which is what the machine can give;
+//!   against two such threads at once, which is what the machine can give: in a closed loop, where each request waits for
+//!   the reply to the last and the workers wait with it, and with two requests in flight, where they do not;
 //! - the round trip of one environment, and the memory of one Hopper.
 //!
 //! Servers are processes of their own: `perturb-server`, and this program with the argument `echo` and a socket.
@@ -95,27 +96,42 @@ async fn locomotion(name: &'static str) -> Result<(), Failure> {
     const TRIPS: usize = 60;
     let server = Process::server(2)?;
     let mut served = Client::open(&server.socket, name, BATCH).await?;
-    let (mut bare, mut steps) = (Vec::new(), Vec::new());
-    let (mut of_twice, mut of_both, mut ceilings) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut bare, mut ceilings) = (Vec::new(), Vec::new());
+    let mut loops = [("closed loop", 1), ("two requests in flight", 2)]
+        .map(|(kind, in_flight)| (kind, in_flight, Figures::default()));
     for _ in 0..ROUNDS {
         let one = bare_loop(name, TRIPS * BATCH / 4).await?;
         let (a, b) = tokio::try_join!(bare_loop(name, TRIPS * BATCH / 4), bare_loop(name, TRIPS * BATCH / 4))?;
-        let rate = (TRIPS * BATCH) as f64 / served.run(TRIPS).await?;
-        of_twice.push(rate / (2.0 * one));
-        of_both.push(rate / (a + b));
+        for (_, in_flight, figures) in &mut loops {
+            let rate = (TRIPS * BATCH) as f64 / served.run_ahead(TRIPS, *in_flight).await?;
+            figures.rates.push(rate);
+            figures.of_twice.push(rate / (2.0 * one));
+            figures.of_both.push(rate / (a + b));
+        }
         ceilings.push((a + b) / (2.0 * one));
         bare.push(one);
-        steps.push(rate);
     }
     let id = format!("step/{name}/64");
-    println!("{id:<23} {:>12.0} env steps/s, two workers; bare loop {:.0}", median(&mut steps), median(&mut bare));
-    println!("{id:<23} {:>12.2} of twice the bare loop (at least 0.8)", median(&mut of_twice));
+    for (kind, _, mut figures) in loops {
+        println!("{id:<22} {:>12.0} env steps/s, two workers, {kind}", median(&mut figures.rates));
+        println!("{id:<22} {:>12.2} of twice the bare loop, {kind} (at least 0.8)", median(&mut figures.of_twice));
+        println!("{id:<22} {:>12.2} of two bare loops at once, {kind}", median(&mut figures.of_both));
+    }
     println!(
-        "{id:<23} {:>12.2} of two bare loops at once, which reach {:.2} of twice one",
-        median(&mut of_both),
+        "{id:<22} {:>12.0} steps/s of the bare loop; two at once reach {:.2} of twice one",
+        median(&mut bare),
         median(&mut ceilings)
     );
     Ok(())
+}
+
+/// One kind of served loop, round by round.
+#[derive(Default)]
+struct Figures {
+    /// Environment steps/s.
+    rates: Vec<f64>,
+    of_twice: Vec<f64>,
+    of_both: Vec<f64>,
 }
 
 /// (c) One environment.
@@ -235,19 +251,38 @@ impl Client {
 
     /// Takes `trips` steps, each after the reply to the last. Returns the seconds.
     async fn run(&mut self, trips: usize) -> Result<f64, Failure> {
+        self.run_ahead(trips, 1).await
+    }
+
+    /// Takes `trips` steps with up to `in_flight` requests on their way. Returns the seconds until the last reply.
+    async fn run_ahead(&mut self, trips: usize, in_flight: usize) -> Result<f64, Failure> {
         let start = Instant::now();
-        for _ in 0..trips {
-            let actions = self.actions();
-            self.requests.send(SessionRequest { request: Some(Ask::Step(proto::Step { actions })) }).await?;
-            match self.responses.message().await?.and_then(|r| r.response) {
-                Some(Answer::Stepped(stepped)) => {
-                    assert_eq!(stepped.observations.len(), 4 * self.batch * self.spec.observation.len());
-                    assert_eq!(stepped.rewards.len(), 4 * self.batch);
-                }
-                other => return Err(format!("{other:?}").into()),
+        for _ in 1..in_flight.min(trips) {
+            self.send().await?;
+        }
+        for trip in 0..trips {
+            if trip + in_flight <= trips {
+                self.send().await?;
             }
+            self.receive().await?;
         }
         Ok(start.elapsed().as_secs_f64())
+    }
+
+    async fn send(&mut self) -> Result<(), Failure> {
+        let actions = self.actions();
+        Ok(self.requests.send(SessionRequest { request: Some(Ask::Step(proto::Step { actions })) }).await?)
+    }
+
+    async fn receive(&mut self) -> Result<(), Failure> {
+        match self.responses.message().await?.and_then(|r| r.response) {
+            Some(Answer::Stepped(stepped)) => {
+                assert_eq!(stepped.observations.len(), 4 * self.batch * self.spec.observation.len());
+                assert_eq!(stepped.rewards.len(), 4 * self.batch);
+                Ok(())
+            }
+            other => Err(format!("{other:?}").into()),
+        }
     }
 
     fn actions(&mut self) -> Bytes {

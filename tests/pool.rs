@@ -364,9 +364,11 @@ async fn small_batches_finish_before_a_large_one_that_came_first() {
     const ATTEMPTS: usize = 50;
     let spec = env::find("Acrobot").unwrap();
     let size = 40_000; // over 200 shards
-    let pool = Pool::new(1, size + 10).unwrap();
+    // Still too long for their sessions to wait awake, which would ring the bells before the end.
+    let small = 1000;
+    let pool = Pool::new(1, size + 10 * small).unwrap();
     let mut batches = Vec::new();
-    for size in std::iter::once(size).chain([1; 10]) {
+    for size in std::iter::once(size).chain([small; 10]) {
         batches.push(Batch::open(&pool, batch_settings(spec, size, Autoreset::SameStep)).await.unwrap().0);
     }
     let actions = vec![0; 4 * size];
@@ -408,6 +410,25 @@ async fn wait_until(condition: impl Fn() -> bool) {
         assert!(Instant::now() < deadline, "not within 30 s");
         tokio::time::sleep(Duration::from_millis(1)).await;
     }
+}
+
+#[tokio::test]
+async fn workers_that_fell_asleep_are_woken_for_every_job() {
+    let pool = Pool::new(2, 1000).unwrap();
+    let open = |name, size| Batch::open(&pool, batch_settings(env::find(name).unwrap(), size, Autoreset::SameStep));
+    let work = async {
+        let (mut small, ..) = open("CartPole", 1).await.unwrap();
+        let (mut other, ..) = open("CartPole", 1).await.unwrap();
+        let (mut large, ..) = open("Acrobot", 900).await.unwrap(); // several shards
+        for _ in 0..3 {
+            tokio::time::sleep(Duration::from_millis(50)).await; // idle workers sleep much sooner
+            let (a, b) = tokio::join!(small.step(&[0; 4]), other.step(&[0; 4]));
+            assert!(a.is_ok() && b.is_ok());
+            tokio::time::sleep(Duration::from_millis(50)).await;
+            assert!(large.step(&[0; 3600]).await.is_ok());
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(30), work).await.expect("within 30 s");
 }
 
 #[tokio::test]

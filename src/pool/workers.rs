@@ -36,7 +36,7 @@ impl Pool {
     /// If the operating system starts no thread.
     pub fn new(workers: usize, max_environments: usize) -> io::Result<Self> {
         let shared = Arc::new(Shared {
-            queue: Mutex::new(Queue { jobs: VecDeque::with_capacity(1024), closed: false }),
+            queue: Mutex::new(Queue { jobs: VecDeque::with_capacity(1024), sleeping: 0, closed: false }),
             waiting: AtomicUsize::new(0),
             ready: Condvar::new(),
             used: AtomicUsize::new(0),
@@ -93,7 +93,10 @@ pub(super) struct Shared {
 }
 
 struct Queue {
-    jobs: VecDeque<Arc<Job>>,
+    /// Jobs with the number of their shards that nobody has taken, which is never 0.
+    jobs: VecDeque<(Arc<Job>, usize)>,
+    /// Workers that wait for `ready`.
+    sleeping: usize,
     closed: bool,
 }
 
@@ -111,10 +114,7 @@ impl Shared {
     /// Runs every shard of the job on the workers and waits for the last.
     pub(super) async fn run(&self, job: &Arc<Job>) -> Result<(), Error> {
         job.prepare();
-        self.push(Arc::clone(job)); // its lock publishes the job's counters
-        if job.shards.len() > 1 {
-            self.ready.notify_all();
-        }
+        self.push(job); // its lock publishes the job's counters
         // A job that is nearly done is worth more polls than a sleep: being woken costs more than many steps.
         for _ in 0..job.patience {
             if job.left.load(Ordering::Acquire) == 0 {
@@ -126,14 +126,23 @@ impl Shared {
         if job.failed.load(Ordering::Relaxed) { Err(Error::Defect) } else { Ok(()) }
     }
 
-    fn push(&self, job: Arc<Job>) {
+    fn push(&self, job: &Arc<Job>) {
+        let shards = job.shards.len();
         let mut queue = lock(&self.queue);
-        queue.jobs.push_back(job);
+        queue.jobs.push_back((Arc::clone(job), shards));
         self.waiting.store(queue.jobs.len(), Ordering::Release);
+        let sleeping = queue.sleeping;
         drop(queue);
-        self.ready.notify_one();
+        // A wake-up is a system call, also when nobody sleeps.
+        match sleeping.min(shards) {
+            0 => {}
+            1 => self.ready.notify_one(),
+            _ => self.ready.notify_all(),
+        }
     }
 
+    /// The job at the queue's head, one shard of which is now the caller's. If shards remain the job goes to the tail,
+    /// where others find it.
     fn pop(&self) -> Option<Arc<Job>> {
         for _ in 0..YIELDS_BEFORE_SLEEP {
             if self.waiting.load(Ordering::Acquire) > 0 {
@@ -143,22 +152,24 @@ impl Shared {
         }
         let mut queue = lock(&self.queue);
         loop {
-            if let Some(job) = queue.jobs.pop_front() {
+            if let Some((job, shards)) = queue.jobs.pop_front() {
+                if shards > 1 {
+                    queue.jobs.push_back((Arc::clone(&job), shards - 1));
+                }
                 self.waiting.store(queue.jobs.len(), Ordering::Release);
                 return Some(job);
             }
             if queue.closed {
                 return None;
             }
+            queue.sleeping += 1;
             queue = self.ready.wait(queue).unwrap_or_else(PoisonError::into_inner);
+            queue.sleeping -= 1;
         }
     }
 
     fn work(&self, worker: usize) {
         while let Some(job) = self.pop() {
-            if job.unclaimed.fetch_sub(1, Ordering::Relaxed) > 1 {
-                self.push(Arc::clone(&job));
-            }
             job.run(job.claim(worker));
         }
     }
@@ -170,8 +181,6 @@ pub(super) struct Job {
     /// For each worker the shards that it takes first, and the next of them. A worker that meets the same environments
     /// again finds them in its core's cache; one that is done helps the others.
     ranges: Vec<(Range<usize>, AtomicUsize)>,
-    /// Shards that no worker has promised to take.
-    unclaimed: AtomicUsize,
     /// Shards that have not finished.
     left: AtomicUsize,
     done: Notify,
@@ -190,7 +199,6 @@ impl Job {
         let range = |worker: usize| (bound(worker)..bound(worker + 1), AtomicUsize::new(0));
         Self {
             ranges: (0..workers).map(range).collect(),
-            unclaimed: AtomicUsize::new(0),
             shards,
             left: AtomicUsize::new(0),
             done: Notify::new(),
@@ -206,11 +214,10 @@ impl Job {
         for (range, next) in &self.ranges {
             next.store(range.start, Ordering::Relaxed);
         }
-        self.unclaimed.store(self.shards.len(), Ordering::Relaxed);
         self.left.store(self.shards.len(), Ordering::Relaxed);
     }
 
-    /// A shard that nobody has taken: the worker's own first. The caller has taken one off `unclaimed`, so there is one.
+    /// A shard that nobody has taken: the worker's own first. The caller has it from the queue, so there is one.
     fn claim(&self, worker: usize) -> usize {
         loop {
             for i in 0..self.ranges.len() {
