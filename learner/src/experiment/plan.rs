@@ -127,7 +127,7 @@ pub enum PlanError {
         /// Which table of the file the refused key stands in, and for what.
         table: String,
         /// The refusal, which names the key.
-        source: ConfigError,
+        source: Box<ConfigError>,
     },
     /// Two tables ask for the same cell.
     #[error("{path}: {first} and {second} both ask for {id}: take it out of one of them")]
@@ -424,7 +424,7 @@ impl Expansion<'_> {
         let config = TrainConfig::from_table("the cell", table).map_err(|source| PlanError::Cell {
             path: self.path.to_owned(),
             table: place_of(&source, name, block, &self.file.settings),
-            source,
+            source: Box::new(source),
         })?;
         let tests = Tests { episodes: self.file.test_episodes, versions: self.file.test_versions.clone() };
         let configuration = fingerprint(&config, &tests);

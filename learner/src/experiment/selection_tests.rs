@@ -48,8 +48,11 @@ fn done(cell: &Cell, rates: [f64; 3], mean_return: f64) -> CellState {
     }))
 }
 
-/// Results by environment, training version, configuration ("A" or "B") and run; what `rates` does not know is missing.
-fn results<'a>(plan: &'a Plan, rates: &dyn Fn(&str, Version, &str, u32) -> Option<([f64; 3], f64)>) -> Results<'a> {
+/// Success rates on D, R and E and a mean return, by environment, training version, configuration ("A" or "B") and run.
+type Known<'f> = &'f dyn Fn(&str, Version, &str, u32) -> Option<([f64; 3], f64)>;
+
+/// What `rates` does not know is missing.
+fn results<'a>(plan: &'a Plan, rates: Known<'_>) -> Results<'a> {
     let state = |cell: &Cell| {
         let common = &cell.config.common;
         let name = if cell.config.table()["learning_rate"].as_float() == Some(7e-3) { "A" } else { "B" };
