@@ -259,7 +259,8 @@ impl<'a> Training<'a> {
         let progress_remaining = self.progress_remaining(counters.learned_timesteps);
         let Self { algorithm, policy, rollout, .. } = self;
         let mut update = || algorithm.update(policy, rollout, progress_remaining);
-        // A thread for it would cost more than the shortest updates; all updates of a training take about as long.
+        // A thread for it would cost more than the shortest updates. The next update takes about as long as the last, with
+        // EPOpt up to some ten times: still less than servers wait for.
         let update = match self.last_update {
             Some(last) if last < LONG_UPDATE => update()?,
             _ => self.servers.keep_alive_during(update)?,
@@ -372,7 +373,7 @@ fn open<'a>(
 }
 
 fn remember(recent: &mut VecDeque<[f64; 3]>, episode: &EndedEpisode) {
-    if recent.len() == RECENT {
+    while recent.len() >= RECENT {
         recent.pop_front();
     }
     recent.push_back([episode.episode_return, f64::from(episode.length), f64::from(u8::from(episode.success))]);

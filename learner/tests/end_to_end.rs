@@ -39,11 +39,13 @@ fn a_policy_is_trained_written_and_tested_with_both_algorithms() {
         assert_eq!(lines.len() as u64, outcome.progress.episodes);
         assert_eq!(
             monitor.lines().nth(1),
-            Some("r,l,t,success,terminated,episode_index,environment_index,force,length,mass")
+            Some(
+                "r,l,t,success,terminated,episode_index,environment_index,trial_index,episode_in_trial,force,length,mass"
+            )
         );
         for line in &lines {
             assert_eq!(line[0], line[1], "CartPole pays 1 a step");
-            assert!((5.0..=15.0).contains(&line[7]) && (0.25..=0.75).contains(&line[8]), "R's intervals");
+            assert!((5.0..=15.0).contains(&line[9]) && (0.25..=0.75).contains(&line[10]), "R's intervals");
         }
         let progress = read(out.path(), "progress.csv");
         assert_eq!(progress.lines().count() as u64, 1 + outcome.progress.iterations);

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Algorithm, AlgorithmState, Experience, UpdateStats, check_count};
+use super::{Algorithm, AlgorithmState, Experience, UpdateStats, check_episodes};
 use crate::error::{Result, check};
 use crate::policy::Policy;
 use crate::rollout::{Rollout, Span};
@@ -11,7 +11,7 @@ use crate::rollout::{Rollout, Span};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct EpoptConfig {
-    /// L: complete episodes in an iteration, at least 1 (default: `100`).
+    /// L: complete episodes in an iteration, 1 … 10⁶ (default: `100`).
     pub episodes_per_iteration: usize,
     /// ε: the share of worst episodes that is learned from, above 0 and at most 1 (default: `0.1`).
     pub epsilon: f64,
@@ -28,7 +28,7 @@ impl Default for EpoptConfig {
 impl EpoptConfig {
     /// Refuses values outside their ranges, NaN included.
     pub fn validate(&self) -> Result<()> {
-        check_count("episodes_per_iteration", self.episodes_per_iteration)?;
+        check_episodes("episodes_per_iteration", self.episodes_per_iteration)?;
         check("epsilon", self.epsilon, self.epsilon > 0.0 && self.epsilon <= 1.0, "above 0 and at most 1")
     }
 }
@@ -54,7 +54,7 @@ pub struct Selection {
     pub kept_steps: u64,
     /// Mean return of all L episodes.
     pub mean_return: f64,
-    /// Conditional value at risk: the mean return of the worst episodes, those of the configured ε, also while the
+    /// Conditional value at risk: the mean return of the ⌈εL⌉ worst episodes, of the configured ε also while the
     /// iteration's is 1.
     pub cvar: f64,
 }
@@ -83,7 +83,7 @@ impl Algorithm for Epopt {
             kept: kept.len() as u64,
             kept_steps: kept.iter().map(|episode| episode.length as u64).sum(),
             mean_return: mean_return(episodes),
-            cvar: mean_return(&worst(episodes, self.config.epsilon)),
+            cvar: conditional_value_at_risk(episodes, self.config.epsilon),
         };
         let mut stats = self.base.update(policy, &rollout.select(&kept)?, progress_remaining)?;
         stats.selection = Some(selection);
@@ -116,6 +116,14 @@ fn percentile(sorted: &[f64], share: f64) -> f64 {
     let position = share * last as f64;
     let (low, fraction) = (position.floor() as usize, position.fract());
     if fraction == 0.0 { sorted[low] } else { sorted[low] + fraction * (sorted[low + 1] - sorted[low]) }
+}
+
+/// The mean return of the ⌈share · L⌉ worst of L episodes; of equally bad ones no more than that.
+fn conditional_value_at_risk(episodes: &[Span], share: f64) -> f64 {
+    let mut returns: Vec<f64> = episodes.iter().map(|episode| episode.episode_return).collect();
+    returns.sort_by(f64::total_cmp);
+    returns.truncate((share * returns.len() as f64).ceil() as usize);
+    returns.iter().sum::<f64>() / returns.len() as f64
 }
 
 fn mean_return(episodes: &[Span]) -> f64 {
@@ -153,5 +161,13 @@ mod tests {
         assert_eq!(kept(&[5.0, 1.0, 7.0, 0.0], 1.0), [0, 1, 2, 3]);
         assert_eq!(kept(&[2.0; 4], 0.1), [0, 1, 2, 3], "none is worse than another");
         assert_eq!(kept(&[3.0], 0.1), [0]);
+    }
+
+    #[test]
+    fn the_value_at_risk_is_that_of_the_worst_share_alone_also_among_equals() {
+        let returns: Vec<f64> = (0..100).map(|i| if i < 95 { 200.0 } else { 0.0 }).collect();
+        assert_eq!(conditional_value_at_risk(&episodes(&returns), 0.1), 100.0);
+        assert_eq!(conditional_value_at_risk(&episodes(&[3.0, 1.0, 2.0]), 0.5), 1.5);
+        assert_eq!(conditional_value_at_risk(&episodes(&[3.0, 1.0, 2.0]), 1.0), 2.0);
     }
 }

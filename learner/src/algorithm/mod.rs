@@ -149,6 +149,14 @@ fn check_count(name: &'static str, value: usize) -> Result<()> {
     if value > 0 { Ok(()) } else { Err(Error::Setting { name, got: value.to_string(), expected: "at least 1" }) }
 }
 
+/// `Ok` if `value` is a number of episodes that can be waited for.
+fn check_episodes(name: &'static str, value: usize) -> Result<()> {
+    if (1..=1_000_000).contains(&value) {
+        return Ok(());
+    }
+    Err(Error::Setting { name, got: value.to_string(), expected: "between 1 and 1000000" })
+}
+
 /// `Ok` if `value` is a positive number.
 fn check_positive(name: &'static str, value: f64) -> Result<()> {
     check(name, value, value > 0.0, "a positive number")

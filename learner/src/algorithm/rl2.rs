@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::check_count;
+use super::check_episodes;
 use crate::error::Result;
 
 /// Settings of RL², Duan et al. (2016), arXiv:1611.02779, beside those of A2C or PPO, which it is wrapped around.
@@ -16,7 +16,7 @@ use crate::error::Result;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Rl2Config {
-    /// N: episodes in a trial, at least 1 (default: `2`; the paper also tries 1 and 5). Testing counts a trial's last.
+    /// N: episodes in a trial, 1 … 10⁶ (default: `2`; the paper also tries 1 and 5). Testing counts a trial's last.
     pub episodes_per_trial: u32,
 }
 
@@ -29,6 +29,6 @@ impl Default for Rl2Config {
 impl Rl2Config {
     /// Refuses values outside their ranges.
     pub fn validate(&self) -> Result<()> {
-        check_count("episodes_per_trial", self.episodes_per_trial as usize)
+        check_episodes("episodes_per_trial", self.episodes_per_trial as usize)
     }
 }

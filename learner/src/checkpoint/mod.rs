@@ -210,6 +210,7 @@ impl Checkpoint {
         let (directory, mut document) = Document::read(path)?;
         let resume = document.resume.take();
         let checkpoint = Self::of(&directory, document)?;
+        checkpoint.check_config().map_err(|reason| damaged(&directory.join(JSON), format!("config: {reason}")))?;
         let resume = resume.ok_or_else(|| CheckpointError::NotResumable { path: directory.clone() })?;
         Ok((checkpoint, ResumeState::read(&directory, resume)?))
     }
@@ -220,6 +221,7 @@ impl Checkpoint {
         let state: State = serde_json::from_value(document.rest)
             .map_err(|error| damaged(&json, format!("it is not understood: {error}")))?;
         let wrong = |name: &str, reason: String| damaged(&json, format!("{name}: {reason}"));
+        state.check().map_err(|reason| damaged(&json, reason))?;
         if let Some(normaliser) = &state.observation_normaliser {
             normaliser
                 .check(state.environment_spec.observation.len())
@@ -235,6 +237,39 @@ impl Checkpoint {
         Ok(Self { state, weights })
     }
 
+    /// Whether the configuration is the one that everything else came from; says what is wrong if it is not.
+    fn check_config(&self) -> std::result::Result<(), String> {
+        let config = self.config().map_err(|error| error.to_string())?;
+        let (state, common) = (&self.state, &config.common);
+        let own = [
+            ("environment", state.environment.clone(), common.environment.clone()),
+            ("algorithm", state.algorithm.to_string(), common.algorithm.to_string()),
+            ("architecture", state.architecture.to_string(), common.architecture.to_string()),
+            ("version", state.train_version.to_string(), common.version.to_string()),
+            ("seed", state.seed.to_string(), common.seed.to_string()),
+            (
+                "episodes_per_trial",
+                state.episodes_per_trial.to_string(),
+                config.settings.episodes_per_trial().to_string(),
+            ),
+            (
+                "normalize_observations",
+                state.observation_normaliser.is_some().to_string(),
+                common.normalize_observations.to_string(),
+            ),
+            ("normalize_rewards", state.reward_normaliser.is_some().to_string(), common.normalize_rewards.to_string()),
+        ];
+        if let Some((key, trained, got)) = own.into_iter().find(|(_, trained, got)| trained != got) {
+            return Err(format!("{key} is {got}, but the training began with {trained}"));
+        }
+        match &state.reward_normaliser {
+            Some(normaliser) => normaliser
+                .fits(common.num_envs, config.settings.gamma())
+                .map_err(|reason| format!("reward_normaliser: {reason}")),
+            None => Ok(()),
+        }
+    }
+
     /// The configuration of the training.
     ///
     /// # Errors
@@ -245,6 +280,19 @@ impl Checkpoint {
 }
 
 impl State {
+    /// Whether the parts go together; says what is wrong if they do not.
+    fn check(&self) -> std::result::Result<(), String> {
+        let episodes = self.episodes_per_trial;
+        if episodes == 0 || (episodes > 1 && self.algorithm.wrapper() != Wrapper::Rl2) {
+            return Err(format!("episodes_per_trial is {episodes}, which {} cannot have", self.algorithm));
+        }
+        let (got, expected) = (self.policy.observation_size, self.inputs(1).size());
+        if got != expected {
+            return Err(format!("policy: observation_size is {got}, expected {expected} with {}", self.algorithm));
+        }
+        Ok(())
+    }
+
     /// What the policy gets to see of `n_envs` environments at the start of a trial.
     pub fn inputs(&self, n_envs: usize) -> Inputs {
         let with_outcomes = self.algorithm.wrapper() == Wrapper::Rl2;

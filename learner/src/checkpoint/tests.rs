@@ -15,7 +15,10 @@ fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
     let policy = PolicySpec { observation_size: 3, action, hidden: vec![4, 5], lstm };
     let mut normaliser = ObservationNormaliser::new(3);
     normaliser.update(&[0.1, 1e-7, -3.0, 0.3, 2e-7, 5.0]).unwrap();
-    let config = TrainConfig::from_table("test", "environment = 'Toy'".parse().unwrap()).unwrap();
+    let architecture = if lstm.is_some() { Architecture::Rc } else { Architecture::Ff };
+    let config =
+        format!("environment = 'Toy'\nversion = 'R'\nseed = {seed}\narchitecture = '{architecture}'\nnum_envs = 2");
+    let config = TrainConfig::from_table("test", config.parse().unwrap()).unwrap();
     let state = State {
         environment: "Toy".into(),
         environment_spec: EnvironmentSummary {
@@ -27,10 +30,10 @@ fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
             model_hash: String::new(),
         },
         algorithm: AlgorithmName::Ppo,
-        architecture: if lstm.is_some() { Architecture::Rc } else { Architecture::Ff },
+        architecture,
         policy: policy.clone(),
         train_version: Version::R,
-        episodes_per_trial: 2,
+        episodes_per_trial: 1,
         seed,
         observation_normaliser: Some(normaliser),
         reward_normaliser: Some(RewardNormaliser::new(2, 0.99)),

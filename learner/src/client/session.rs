@@ -165,21 +165,15 @@ impl<'a> Session<'a> {
     pub fn step(&mut self, actions: &[u8], reply: &mut StepReply) -> Result<(), ClientError> {
         let width = actions.len() / self.num_envs.max(1);
         reply.resize(self.num_envs, self.observation_size);
-        let Self { servers, parts, observation_size, .. } = self;
-        servers.runtime().block_on(async {
-            for part in parts.iter_mut() {
-                part.actions.clear();
-                part.actions.extend_from_slice(&actions[part.range.start * width..part.range.end * width]);
-                let actions = part.actions.split().freeze();
-                part.send("a step", Request::Step(proto::Step { actions }), servers).await?;
-            }
-            for part in parts.iter_mut() {
-                match part.receive("a step", servers).await? {
-                    Response::Stepped(stepped) => part.store(stepped, *observation_size, reply)?,
-                    other => return Err(part.unexpected("a step", &other, "Stepped")),
-                }
-            }
-            Ok(())
+        let size = self.observation_size;
+        let request = |part: &mut Part| {
+            part.actions.clear();
+            part.actions.extend_from_slice(&actions[part.range.start * width..part.range.end * width]);
+            Request::Step(proto::Step { actions: part.actions.split().freeze() })
+        };
+        self.exchange("a step", request, |part, response| match response {
+            Response::Stepped(stepped) => part.store(stepped, size, reply),
+            other => Err(part.unexpected("a step", &other, "Stepped")),
         })
     }
 
@@ -225,26 +219,20 @@ impl<'a> Session<'a> {
     /// The failures of a connection.
     pub fn snapshot(&mut self) -> Result<Vec<Bytes>, ClientError> {
         let what = "a snapshot";
-        let Self { servers, parts, num_envs, .. } = self;
-        servers.runtime().block_on(async {
-            for part in parts.iter_mut() {
-                part.send(what, Request::Snapshot(proto::Snapshot::default()), servers).await?;
+        let mut snapshots = Vec::with_capacity(self.num_envs);
+        let request = |_: &mut Part| Request::Snapshot(proto::Snapshot::default());
+        self.exchange(what, request, |part, response| match response {
+            Response::Snapshot(saved) if saved.snapshots.len() == part.range.len() => {
+                snapshots.extend(saved.snapshots);
+                Ok(())
             }
-            let mut snapshots = Vec::with_capacity(*num_envs);
-            for part in parts.iter_mut() {
-                match part.receive(what, servers).await? {
-                    Response::Snapshot(saved) if saved.snapshots.len() == part.range.len() => {
-                        snapshots.extend(saved.snapshots);
-                    }
-                    Response::Snapshot(saved) => {
-                        let got = format!("{} snapshots", saved.snapshots.len());
-                        return Err(part.mismatch(what, got, part.range.len().to_string()));
-                    }
-                    other => return Err(part.unexpected(what, &other, "Snapshotted")),
-                }
+            Response::Snapshot(saved) => {
+                let got = format!("{} snapshots", saved.snapshots.len());
+                Err(part.mismatch(what, got, part.range.len().to_string()))
             }
-            Ok(snapshots)
-        })
+            other => Err(part.unexpected(what, &other, "Snapshotted")),
+        })?;
+        Ok(snapshots)
     }
 
     /// Brings environments back from N snapshots in order of slots, taken of this environment on any number of servers,
@@ -281,21 +269,37 @@ impl<'a> Session<'a> {
     /// # Errors
     /// The failures of a connection.
     pub fn reset(&mut self, observations: &mut [f32]) -> Result<(), ClientError> {
-        let Self { servers, parts, observation_size, .. } = self;
+        let size = self.observation_size;
+        let request = |_: &mut Part| Request::Reset(proto::Reset::default());
+        self.exchange("a reset", request, |part, response| match response {
+            Response::Reset(done) => {
+                let range = part.range.start * size..part.range.end * size;
+                part.decode("a reset", "observations", &done.observations, &mut observations[range])
+            }
+            other => Err(part.unexpected("a reset", &other, "ResetDone")),
+        })
+    }
+
+    /// Sends every server its request and takes its response. All are heard before the first failure is returned, so
+    /// that no response is left for a later request.
+    fn exchange(
+        &mut self,
+        what: &'static str,
+        mut request: impl FnMut(&mut Part) -> Request,
+        mut take: impl FnMut(&Part, Response) -> Result<(), ClientError>,
+    ) -> Result<(), ClientError> {
+        let Self { servers, parts, .. } = self;
         servers.runtime().block_on(async {
             for part in parts.iter_mut() {
-                part.send("a reset", Request::Reset(proto::Reset::default()), servers).await?;
+                let request = request(part);
+                part.send(what, request, servers).await?;
             }
+            let mut outcome = Ok(());
             for part in parts.iter_mut() {
-                let range = part.range.start * *observation_size..part.range.end * *observation_size;
-                match part.receive("a reset", servers).await? {
-                    Response::Reset(done) => {
-                        part.decode("a reset", "observations", &done.observations, &mut observations[range])?;
-                    }
-                    other => return Err(part.unexpected("a reset", &other, "ResetDone")),
-                }
+                let taken = part.receive(what, servers).await.and_then(|response| take(part, response));
+                outcome = outcome.and(taken);
             }
-            Ok(())
+            outcome
         })
     }
 }

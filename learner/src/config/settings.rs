@@ -9,6 +9,9 @@ use crate::policy::Policy;
 /// What EPOpt's base has no use for: an iteration is complete episodes, and one batch.
 const NOT_WITH_EPISODES: [&str; 2] = ["n_steps", "n_minibatches"];
 
+/// The most samples of a rollout: some gigabytes.
+const MOST_SAMPLES: u128 = 1 << 26;
+
 /// The settings of an algorithm.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
@@ -115,9 +118,13 @@ impl Settings {
     /// Refuses values outside their ranges, and those that do not go together.
     pub(super) fn validate(&self, architecture: Architecture, num_envs: usize) -> Result<(), ConfigError> {
         match &self.base {
-            BaseSettings::A2c(settings) => settings.validate()?,
+            BaseSettings::A2c(settings) => {
+                settings.validate()?;
+                check_size(settings.n_steps, num_envs)?;
+            }
             BaseSettings::Ppo(settings) => {
                 settings.validate()?;
+                check_size(settings.n_steps, num_envs)?;
                 check_minibatches(settings, architecture, num_envs)?;
             }
         }
@@ -135,6 +142,15 @@ impl Settings {
             }
         }
     }
+}
+
+/// Whether a rollout is one that a machine can hold.
+fn check_size(n_steps: usize, num_envs: usize) -> Result<(), ConfigError> {
+    if n_steps as u128 * num_envs as u128 <= MOST_SAMPLES {
+        return Ok(());
+    }
+    let expected = format!("at most {} with {num_envs} environments", MOST_SAMPLES / num_envs as u128);
+    Err(ConfigError::Value { key: "n_steps".into(), got: n_steps.to_string(), expected })
 }
 
 /// Whether a pass over a rollout can be parted evenly.

@@ -125,9 +125,15 @@ fn a_wrong_type_is_refused_with_the_right_one() {
     }
     for (sets, part) in [
         (["algorithm=epopt-a2c", "epsilon=0"], "epsilon is 0, but must be above 0 and at most 1"),
-        (["algorithm=epopt-a2c", "episodes_per_iteration=0"], "episodes_per_iteration is 0, but must be at least 1"),
+        (
+            ["algorithm=epopt-a2c", "episodes_per_iteration=0"],
+            "episodes_per_iteration is 0, but must be between 1 and 1000000",
+        ),
         (["algorithm=epopt-a2c", "num_envs=101"], "num_envs is 101, but must be at most episodes_per_iteration, 100"),
-        (["algorithm=rl2-a2c", "episodes_per_trial=0"], "episodes_per_trial is 0, but must be at least 1"),
+        (["algorithm=epopt-ppo", "episodes_per_iteration=10000000"], "must be between 1 and 1000000"),
+        (["algorithm=rl2-a2c", "episodes_per_trial=0"], "episodes_per_trial is 0, but must be between 1 and 1000000"),
+        (["algorithm=rl2-a2c", "episodes_per_trial=4000000000"], "must be between 1 and 1000000"),
+        (["algorithm=ppo", "n_steps=1000000000000000000"], "but must be at most 8388608 with 8 environments"),
         (["algorithm=rl2-ppo", "kl_coef=-1"], "kl_coef is -1, but must be a number that is not negative"),
     ] {
         let message = refusal(None, &sets);

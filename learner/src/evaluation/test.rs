@@ -190,28 +190,16 @@ fn summarise(episodes: &[EndedEpisode]) -> TestResult {
 
 /// Whether the served environment is the one that the policy was trained in.
 pub(crate) fn check_unchanged(checkpoint: &Checkpoint, served: Option<EnvironmentSummary>) -> Result<(), TestError> {
-    let (trained, environment) = (&checkpoint.state.environment_spec, &checkpoint.state.environment);
-    let changed = |what, trained: String, served: String| {
-        let advice = "test with the version of perturb that trained it, or train again";
-        Err(TestError::Changed { environment: environment.clone(), what, trained, served, advice })
+    let (trained, environment) = (&checkpoint.state.environment_spec, checkpoint.state.environment.clone());
+    let advice = "test with the version of perturb that trained it, or train again";
+    let (what, trained, served) = match served {
+        None => ("actions", format!("{:?}", trained.action), "none".into()),
+        Some(served) => match trained.difference(&served) {
+            None => return Ok(()),
+            Some(difference) => difference,
+        },
     };
-    let Some(served) = served else {
-        return changed("actions", format!("{:?}", trained.action), "none".into());
-    };
-    if served.revision != trained.revision {
-        return changed("revision", trained.revision.to_string(), served.revision.to_string());
-    }
-    if served.observation != trained.observation || served.action != trained.action {
-        return changed("spaces", show_spaces(trained), show_spaces(&served));
-    }
-    if served.model_hash != trained.model_hash {
-        return changed("model", trained.model_hash.clone(), served.model_hash);
-    }
-    Ok(())
-}
-
-fn show_spaces(summary: &EnvironmentSummary) -> String {
-    format!("observations of {} numbers and {:?} actions", summary.observation.len(), summary.action)
+    Err(TestError::Changed { environment, what, trained, served, advice })
 }
 
 #[cfg(test)]

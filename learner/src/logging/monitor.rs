@@ -10,7 +10,7 @@ use crate::client::EndedEpisode;
 
 /// Writes stable-baselines3's Monitor format: a line of JSON after `#`, a header, and a line an episode with its return
 /// `r`, its length `l` and the seconds `t` since the start; then `success`, `terminated` (0 or 1), `episode_index`,
-/// `environment_index`, and a column for each parameter.
+/// `environment_index`, `trial_index`, `episode_in_trial`, and a column for each parameter.
 #[derive(Debug)]
 pub struct Monitor {
     writer: csv::Writer<BufWriter<File>>,
@@ -26,7 +26,17 @@ impl Monitor {
         let mut file = BufWriter::new(File::create(path)?);
         writeln!(file, "#{}", serde_json::json!({ "t_start": clock.t_start(), "env_id": environment }))?;
         let mut writer = csv::Writer::from_writer(file);
-        let columns = ["r", "l", "t", "success", "terminated", "episode_index", "environment_index"];
+        let columns = [
+            "r",
+            "l",
+            "t",
+            "success",
+            "terminated",
+            "episode_index",
+            "environment_index",
+            "trial_index",
+            "episode_in_trial",
+        ];
         writer.write_record(columns.into_iter().chain(parameters.iter().map(String::as_str)))?;
         Ok(Self { writer, clock })
     }
@@ -50,6 +60,8 @@ impl Monitor {
             flag(episode.terminated),
             episode.episode_index.to_string(),
             episode.environment_index.to_string(),
+            episode.trial_index.to_string(),
+            episode.episode_in_trial.to_string(),
         ];
         let parameters = episode.parameters.iter().map(f64::to_string);
         Ok(self.writer.write_record(fixed.into_iter().chain(parameters))?)
@@ -98,11 +110,14 @@ mod tests {
         let lines: Vec<&str> = text.lines().collect();
         let first: serde_json::Value = serde_json::from_str(lines[0].strip_prefix('#').unwrap()).unwrap();
         assert_eq!(first, serde_json::json!({ "t_start": 12.5, "env_id": "CartPole" }));
-        assert_eq!(lines[1], "r,l,t,success,terminated,episode_index,environment_index,mass,length");
+        assert_eq!(
+            lines[1],
+            "r,l,t,success,terminated,episode_index,environment_index,trial_index,episode_in_trial,mass,length"
+        );
         let fields: Vec<&str> = lines[2].split(',').collect();
         assert_eq!(fields[..2], ["17.500000", "18"]);
         assert!(fields[2].parse::<f64>().unwrap() >= 3.0);
-        assert_eq!(fields[3..], ["0", "1", "4", "3", "0.1", "0.25"]);
+        assert_eq!(fields[3..], ["0", "1", "4", "3", "4", "0", "0.1", "0.25"]);
         assert_eq!(lines.len(), 3);
     }
 }

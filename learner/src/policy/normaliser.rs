@@ -172,6 +172,17 @@ impl RewardNormaliser {
         &self.moments
     }
 
+    /// Whether this is that of a training of `n_envs` environments with `gamma`; says what is wrong if it is not.
+    pub(crate) fn fits(&self, n_envs: usize, gamma: f64) -> std::result::Result<(), String> {
+        if self.returns.len() != n_envs {
+            return Err(format!("returns has {} numbers, expected {n_envs}", self.returns.len()));
+        }
+        if self.gamma.to_bits() != gamma.to_bits() {
+            return Err(format!("gamma is {}, but {gamma} in the configuration", self.gamma));
+        }
+        Ok(())
+    }
+
     /// Whether this can normalise rewards; says what is wrong if it cannot.
     pub(crate) fn check(&self) -> std::result::Result<(), String> {
         if !(0.0..=1.0).contains(&self.gamma) {
@@ -183,8 +194,8 @@ impl RewardNormaliser {
         self.moments.check(1)
     }
 
-    /// Adds a step's `rewards` `[N]` to the statistics. Where `done` `[N]`, terminated or truncated, the discounted return
-    /// starts again from 0 in the next step. Infinite numbers and NaN are refused and change nothing.
+    /// Adds a step's `rewards` `[N]` to the statistics. Where `done` `[N]`, at the end of an episode or, with trials, of a
+    /// trial, the discounted return starts again from 0 in the next step. Infinite numbers and NaN are refused and change nothing.
     pub fn update(&mut self, rewards: &[f32], done: &[bool]) -> Result<()> {
         self.update_active(rewards, done, None)
     }
@@ -193,6 +204,7 @@ impl RewardNormaliser {
     pub fn update_active(&mut self, rewards: &[f32], done: &[bool], active: Option<&[bool]>) -> Result<()> {
         check_length("rewards [N]", rewards.len(), self.returns.len())?;
         check_length("done [N]", done.len(), self.returns.len())?;
+        check_length("active [N]", active.map_or(rewards.len(), <[bool]>::len), self.returns.len())?;
         check_finite("rewards [N]", rewards)?;
         if rewards.is_empty() {
             return Ok(());
@@ -203,7 +215,6 @@ impl RewardNormaliser {
         match active.filter(|active| active.contains(&false)) {
             None => self.moments.merge(&RunningMoments::of(&self.returns, 1))?,
             Some(active) => {
-                check_length("active [N]", active.len(), self.returns.len())?;
                 let counted = self.returns.iter().zip(active).filter(|(_, active)| **active);
                 let counted: Vec<f64> = counted.map(|(sum, _)| *sum).collect();
                 if !counted.is_empty() {
