@@ -214,7 +214,7 @@ fn a_failed_cell_is_recorded_with_its_reason_and_the_others_are_done() {
 
 #[test]
 fn a_signal_stops_the_workers_and_the_same_command_goes_on() {
-    let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 400"));
+    let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 100"));
     for (name, code) in [("-INT", 130), ("-TERM", 143)] {
         let begun: usize = experiment.attempts("out").iter().sum();
         let child = experiment.command("out", &["--jobs", "2"]).spawn().expect("started");
