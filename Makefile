@@ -5,8 +5,10 @@ PACKAGES := build-essential pkg-config libclang-dev libmujoco-dev libtorch-dev l
 CARGO_DENY_VERSION := 0.20.2
 PROGRAMS := $(or $(CARGO_TARGET_DIR),target)/release
 
-# Arguments of `make demo` and `make bench`, e.g. make demo DEMO_ARGS="--episodes 200 --test-episodes 50".
+# Arguments of `make demo`, `make bench` and `make all-pairs`, e.g. make demo DEMO_ARGS="--episodes 200 --test-episodes 50",
+# make all-pairs ALL_PAIRS_ARGS="20 /tmp/runs": episodes, directory.
 DEMO_ARGS ?=
+ALL_PAIRS_ARGS ?=
 BENCH_ARGS ?=
 
 # The learner's threads are its own; more inside libtorch's matrix products only get in their way.
@@ -18,7 +20,7 @@ ALL := --workspace --release --locked
 WITHOUT_MUJOCO := --package perturb --no-default-features --release --locked
 
 .DEFAULT_GOAL := help
-.PHONY: help deps toolchain build demo test lint bench audit cargo-deny
+.PHONY: help deps toolchain build demo all-pairs test lint bench audit cargo-deny
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -48,6 +50,9 @@ build: deps ## compile the programs perturb-server and perturb
 
 demo: build ## train and test PPO on CartPole over gRPC; the paper's row beside it
 	$(PROGRAMS)/perturb demo $(DEMO_ARGS)
+
+all-pairs: build ## train and test every algorithm and architecture on every environment, shortly
+	PROGRAMS=$(PROGRAMS) learner/tests/all_pairs.sh $(ALL_PAIRS_ARGS)
 
 test: deps ## run all tests, then those of the server without MuJoCo
 	cargo test $(ALL)

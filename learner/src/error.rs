@@ -70,6 +70,23 @@ pub enum Error {
         /// What was attempted.
         what: &'static str,
     },
+    /// An episode is not in a rollout.
+    #[error(
+        "an episode of {length} steps that ends before step {end} of environment {environment} is not in a rollout of \
+         {n_steps} steps of {n_envs} environments; one has at least one step"
+    )]
+    Episode {
+        /// Its environment, from 0.
+        environment: usize,
+        /// The step after its last.
+        end: usize,
+        /// Its number of steps.
+        length: usize,
+        /// N.
+        n_envs: usize,
+        /// Steps that the rollout holds.
+        n_steps: usize,
+    },
     /// libtorch refused an operation.
     #[error("libtorch: {0}")]
     Torch(#[from] tch::TchError),

@@ -2,10 +2,11 @@
 
 use perturb_learner::algorithm::{A2c, A2cConfig, Algorithm, AlgorithmState, Ppo, PpoConfig, Schedule};
 use perturb_learner::error::Error;
-use perturb_learner::policy::{ActionKind, Actor, Acts, Policy, PolicySpec};
+use perturb_learner::policy::{ActionKind, Actor, Acts, Policy, PolicySpec, Sequences};
 use perturb_learner::random::{Purpose, normal, stream, uniform};
 use perturb_learner::rollout::{Rollout, RolloutStep};
 use rand_chacha::ChaCha8Rng;
+use tch::{Kind, Tensor};
 
 const N_ENVS: usize = 16;
 const DISCRETE: ActionKind = ActionKind::Discrete { n: 4 };
@@ -158,14 +159,22 @@ fn ppo_begins_with_ratio_1_and_clips_nothing() {
         let mut training = Training::new(action, 32);
         training.collect();
         // A learning rate that moves no weight by a rounding, so that each of four minibatches is a first one.
-        let config =
-            PpoConfig { n_steps: 32, n_epochs: 1, n_minibatches, learning_rate: 1e-12, ..PpoConfig::default() };
+        let config = PpoConfig {
+            n_steps: 32,
+            n_epochs: 1,
+            n_minibatches,
+            learning_rate: 1e-12,
+            kl_coef: 0.5,
+            ..PpoConfig::default()
+        };
         let mut first = Ppo::new(config.clone(), &training.policy, 1).expect("valid settings");
         let stats = first.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
         assert_eq!(stats.clip_fraction, Some(0.0));
         // The actor's log-probabilities are off by 1e-6 at most, the divergence by half the square of that; but its
         // f32 terms are rounded to 2⁻²⁴ each.
         assert!(stats.approx_kl.expect("PPO's").abs() < 2e-7, "{stats:?}");
+        // The policy diverges from itself by nothing; a minibatch's outputs may differ from all's by a rounding.
+        assert!(stats.kl_divergence.expect("a penalty").abs() < 2e-7, "{stats:?}");
         // With ratio 1, the surrogate is minus the mean of the normalised advantages, 0 but for the ratios' error.
         assert!(stats.policy_gradient_loss.abs() < 1e-5, "{stats:?}");
         // The rollout's own values lie inside any clipping interval.
@@ -185,19 +194,59 @@ fn the_loss_is_the_weighted_sum_of_its_parts() {
     for action in [DISCRETE, CONTINUOUS] {
         let mut training = Training::new(action, 8);
         training.collect();
-        let (ent_coef, vf_coef) = (0.3, 0.7);
+        let (ent_coef, vf_coef, kl_coef) = (0.3, 0.7, 0.9);
         let a2c = A2cConfig { n_steps: 8, ent_coef, vf_coef, ..A2cConfig::default() };
-        let ppo = PpoConfig { n_steps: 8, ent_coef, vf_coef, n_epochs: 3, ..PpoConfig::default() };
-        let algorithms: [Box<dyn Algorithm>; 2] = [
-            Box::new(A2c::new(a2c, &training.policy).expect("valid settings")),
-            Box::new(Ppo::new(ppo, &training.policy, 1).expect("valid settings")),
-        ];
-        for mut algorithm in algorithms {
-            let stats = algorithm.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
-            let sum = stats.policy_gradient_loss + ent_coef * stats.entropy_loss + vf_coef * stats.value_loss;
+        let ppo = PpoConfig {
+            n_steps: 8,
+            ent_coef,
+            vf_coef,
+            n_epochs: 3,
+            learning_rate: 1e-2, // so far that the divergence matters
+            ..PpoConfig::default()
+        };
+        let penalised = |n_minibatches| PpoConfig { kl_coef, n_minibatches, ..ppo.clone() };
+        let ppos = [penalised(1), penalised(4), ppo.clone()];
+        let mut algorithms: Vec<Box<dyn Algorithm>> =
+            vec![Box::new(A2c::new(a2c, &training.policy).expect("valid settings"))];
+        for config in ppos {
+            algorithms.push(Box::new(Ppo::new(config, &training.policy, 1).expect("valid settings")));
+        }
+        let penalties = algorithms.into_iter().map(|mut algorithm| {
+            let (spec, weights) = (training.policy.spec().clone(), training.policy.weights());
+            let mut policy = Policy::from_weights(spec, &weights).expect("a policy");
+            let stats = algorithm.update(&mut policy, &training.rollout, 1.0).expect("an update");
+            let penalty = kl_coef * stats.kl_divergence.unwrap_or(0.0);
+            let sum = stats.policy_gradient_loss + ent_coef * stats.entropy_loss + vf_coef * stats.value_loss + penalty;
             assert!((stats.loss - sum).abs() < 1e-6, "f32 rounding of numbers of order 1: {stats:?}");
             assert!(stats.entropy_loss < 0.0 && stats.value_loss > 0.0, "{stats:?}");
-        }
+            stats.kl_divergence.map(|divergence| divergence > 1e-4)
+        });
+        assert_eq!(penalties.collect::<Vec<_>>(), [None, Some(true), Some(true), None]);
+    }
+}
+
+#[test]
+fn a_penalty_on_the_divergence_keeps_the_policy_near() {
+    for (action, n_minibatches) in [(DISCRETE, 1), (DISCRETE, 4), (CONTINUOUS, 1), (CONTINUOUS, 4)] {
+        let mut training = Training::new(action, 8);
+        training.collect();
+        let copy = || Policy::from_weights(training.policy.spec().clone(), &training.policy.weights()).expect("a copy");
+        let rollout = &training.rollout;
+        let moved_by = |kl_coef| {
+            let (before, mut after) = (copy(), copy());
+            let config = PpoConfig { n_steps: 8, n_minibatches, learning_rate: 1e-2, kl_coef, ..PpoConfig::default() };
+            let mut ppo = Ppo::new(config, &after, 1).expect("valid settings");
+            ppo.update(&mut after, rollout, 1.0).expect("an update");
+            let distributions = |policy: &Policy| {
+                let sequences = Sequences::new(policy.spec(), 8, rollout.observations(), rollout.starts(), &[]);
+                policy
+                    .evaluate(&sequences.expect("shapes that fit"), &Tensor::of_slice(rollout.actions()))
+                    .distributions
+            };
+            distributions(&before).divergence_to(&distributions(&after)).mean(Kind::Float).double_value(&[])
+        };
+        let (free, held) = (moved_by(0.0), moved_by(30.0));
+        assert!(0.0 < held && held < 0.5 * free, "{action:?}, {n_minibatches} minibatches: {held} {free}");
     }
 }
 
@@ -321,6 +370,7 @@ fn settings_outside_their_ranges_are_refused_by_name() {
         refused(PpoConfig { clip_range: bad, ..PpoConfig::default() }.validate(), "clip_range");
         refused(PpoConfig { clip_range_vf: bad, ..PpoConfig::default() }.validate(), "clip_range_vf");
         refused(PpoConfig { ent_coef: bad, ..PpoConfig::default() }.validate(), "ent_coef");
+        refused(PpoConfig { kl_coef: bad, ..PpoConfig::default() }.validate(), "kl_coef");
         refused(PpoConfig { vf_coef: bad, ..PpoConfig::default() }.validate(), "vf_coef");
         refused(PpoConfig { max_grad_norm: bad, ..PpoConfig::default() }.validate(), "max_grad_norm");
         refused(PpoConfig { adam_eps: bad, ..PpoConfig::default() }.validate(), "adam_eps");

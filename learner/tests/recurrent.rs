@@ -358,19 +358,31 @@ fn ppo_begins_with_ratio_1_and_clips_nothing() {
         let mut algorithm = ppo(&training, n_minibatches);
         training.train(&mut algorithm, 20); // ends with a rollout of a policy that uses its memory
         assert!(training.rollout.memory().iter().any(|&x| x != 0.0));
-        let config =
-            PpoConfig { n_steps: 30, n_epochs: 1, n_minibatches, learning_rate: 1e-12, ..PpoConfig::default() };
+        let config = PpoConfig {
+            n_steps: 30,
+            n_epochs: 1,
+            n_minibatches,
+            learning_rate: 1e-12,
+            kl_coef: 0.5,
+            ..PpoConfig::default()
+        };
         let mut first = Ppo::new(config.clone(), &training.policy, 1).expect("valid settings");
         let stats = first.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
         assert_eq!(stats.clip_fraction, Some(0.0));
         // The divergence is half the square of the log-probabilities' errors of 1e-6; its f32 terms are rounded to 2⁻²⁴.
         assert!(stats.approx_kl.expect("PPO's").abs() < 2e-7, "{stats:?}");
+        // The policy diverges from itself by nothing; a minibatch's outputs may differ from all's by a rounding.
+        assert!(stats.kl_divergence.expect("a penalty").abs() < 2e-7, "{stats:?}");
         // With ratio 1, the surrogate is minus the mean of the normalised advantages, 0 but for the ratios' error.
         assert!(stats.policy_gradient_loss.abs() < 1e-5, "{stats:?}");
         let config = PpoConfig { n_epochs: 10, learning_rate: 1e-2, ..config };
         let mut later = Ppo::new(config, &training.policy, 1).expect("valid settings");
         let stats = later.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
         assert!(stats.approx_kl > Some(1e-4), "a moved policy: {stats:?}");
+        let divergence = stats.kl_divergence.expect("a penalty");
+        assert!(divergence > 1e-4, "{stats:?}");
+        let sum = stats.policy_gradient_loss + 0.5 * stats.value_loss + 0.5 * divergence;
+        assert!((stats.loss - sum).abs() < 1e-6, "f32 rounding of numbers of order 1: {stats:?}");
     }
 }
 

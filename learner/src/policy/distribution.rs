@@ -124,6 +124,26 @@ mod tests {
     }
 
     #[test]
+    fn divergences_agree_with_numpy_and_are_0_between_equals() {
+        let categorical = |name| {
+            let outputs = tensor("divergence_categorical", name).view((11, 4));
+            Distributions { outputs, log_std: None }
+        };
+        let gaussian = |means, log_std| {
+            let outputs = tensor("divergence_gaussian", means).view((11, 3));
+            Distributions { outputs, log_std: Some(tensor("divergence_gaussian", log_std)) }
+        };
+        for (case, own, other) in [
+            ("divergence_categorical", categorical("logits"), categorical("others")),
+            ("divergence_gaussian", gaussian("means", "log_std"), gaussian("other_means", "other_log_std")),
+        ] {
+            assert_close(&own.divergence_to(&other), &fixture(case, "divergence"), TOLERANCE);
+            // Of Gaussians σ² · σ⁻² is 1 but for two roundings of 2⁻²⁴ in each of three elements.
+            assert_close(&own.divergence_to(&own), &[0.0; 11], 5e-7);
+        }
+    }
+
+    #[test]
     fn choices_are_as_frequent_as_their_probabilities() {
         let logits = [0.3f32, -1.2, 1.1];
         let total: f64 = logits.iter().map(|&l| f64::from(l).exp()).sum();

@@ -217,13 +217,20 @@ impl Rollout {
     /// Notes that the last step that was pushed ended an episode of which the rollout has every step.
     ///
     /// # Errors
-    /// One longer than the rollout.
+    /// One that the rollout does not hold: without steps, longer than the rollout, of an environment that is not there.
     pub fn note_episode(&mut self, environment: usize, length: usize, episode_return: f64) -> Result<()> {
-        let what = "an episode of that length was noted";
-        let too_long = Error::RolloutLength { got: length, expected: self.len, what };
-        let start = self.len.checked_sub(length).ok_or(too_long)?;
-        self.episodes.push(Span { environment, start, length, episode_return });
+        self.check_episode(environment, self.len, length)?;
+        self.episodes.push(Span { environment, start: self.len - length, length, episode_return });
         Ok(())
+    }
+
+    /// Whether the `length` steps before step `end` of `environment` are in the rollout, and at least one.
+    fn check_episode(&self, environment: usize, end: usize, length: usize) -> Result<()> {
+        let (n_envs, n_steps) = (self.n_envs, self.len);
+        if environment < n_envs && (1..=end).contains(&length) && end <= n_steps {
+            return Ok(());
+        }
+        Err(Error::Episode { environment, end, length, n_envs, n_steps })
     }
 
     /// The complete episodes, in the order in which they ended.
@@ -236,15 +243,14 @@ impl Rollout {
     /// memories.
     ///
     /// # Errors
-    /// No episode at all; one that reaches over the rollout's end.
+    /// No episode at all; one that the rollout does not hold.
     pub fn select(&self, episodes: &[Span]) -> Result<Rollout> {
         let longest = episodes.iter().map(|episode| episode.length).max().unwrap_or(0);
         if longest == 0 {
             return Err(Error::RolloutLength { got: 0, expected: 1, what: "its episodes were selected" });
         }
-        if let Some(episode) = episodes.iter().find(|episode| episode.start + episode.length > self.len) {
-            let (got, what) = (episode.start + episode.length, "one of its episodes ended");
-            return Err(Error::RolloutLength { got, expected: self.len, what });
+        for &Span { environment, start, length, .. } in episodes {
+            self.check_episode(environment, start.saturating_add(length), length)?;
         }
         let columns = pack(episodes, longest);
         let mut selected = self.padding(longest, columns.len());

@@ -202,7 +202,7 @@ impl<'a> Collector<'a> {
             rollout.begin(collector.actor.memory());
             while !rollout.is_full() {
                 collector.step()?;
-                collector.normalise(None)?;
+                collector.normalise(None, None)?;
                 collector.store(rollout)?;
                 collector.reply.ended.iter().for_each(&mut on_episode);
             }
@@ -229,22 +229,27 @@ impl<'a> Collector<'a> {
         mut on_episode: impl FnMut(&EndedEpisode),
     ) -> Result<(), CollectError> {
         self.timed(|collector| {
-            collector.actor.load(weights)?;
-            collector.reset()?;
-            rollout.begin(collector.actor.memory());
             let n_envs = collector.starts.len();
             let mut due: Vec<usize> = (0..n_envs).map(|i| count / n_envs + usize::from(i < count % n_envs)).collect();
             let mut active: Vec<bool> = due.iter().map(|&due| due > 0).collect();
+            let mut stepped = active.clone();
+            collector.actor.load(weights)?;
+            collector.reset(&active)?;
+            rollout.begin(collector.actor.memory());
             while active.contains(&true) {
                 collector.step()?;
-                collector.normalise(Some(&active))?;
+                stepped.copy_from_slice(&active);
+                for end in collector.reply.ended.iter().filter(|end| stepped[end.slot]) {
+                    due[end.slot] -= 1;
+                    active[end.slot] = due[end.slot] > 0;
+                }
+                // What was observed after an environment's last episode begins one that is not seen.
+                collector.normalise(Some(&stepped), Some(&active))?;
                 collector.store(rollout)?;
-                for end in collector.reply.ended.iter().filter(|end| active[end.slot]) {
+                for end in collector.reply.ended.iter().filter(|end| stepped[end.slot]) {
                     rollout.note_episode(end.slot, end.length as usize, end.episode_return)?;
                     on_episode(end);
-                    due[end.slot] -= 1;
                 }
-                active.iter_mut().zip(&due).for_each(|(active, &due)| *active = due > 0);
             }
             collector.final_values.clear();
             collector.final_values.resize(n_envs, 0.0); // every episode is complete: nothing follows
@@ -261,12 +266,12 @@ impl<'a> Collector<'a> {
         Ok(())
     }
 
-    /// A new episode in every environment.
-    fn reset(&mut self) -> Result<(), CollectError> {
+    /// A new episode in every environment; the statistics take in those of the `active` ones.
+    fn reset(&mut self, active: &[bool]) -> Result<(), CollectError> {
         let sent = Instant::now();
         self.session.reset(&mut self.observations)?;
         self.times.waiting += sent.elapsed();
-        self.normalisers.take_observations(&mut self.observations, None)?;
+        self.normalisers.take_observations(&mut self.observations, Some(active))?;
         if let Some(normaliser) = &mut self.normalisers.rewards {
             normaliser.reset_returns();
         }
@@ -304,10 +309,11 @@ impl<'a> Collector<'a> {
         Ok(())
     }
 
-    /// Normalises what came back, after the statistics have taken in the `active` environments, or all.
-    fn normalise(&mut self, active: Option<&[bool]>) -> Result<(), CollectError> {
+    /// Normalises what came back, after the statistics have taken in the rewards of the environments that `stepped`, and
+    /// the observations of those that will be `active` in the next step; or all.
+    fn normalise(&mut self, stepped: Option<&[bool]>, active: Option<&[bool]>) -> Result<(), CollectError> {
         let Self { reply, normalisers, trial_ended, .. } = self;
-        normalisers.take_rewards(&mut reply.rewards, trial_ended, active)?;
+        normalisers.take_rewards(&mut reply.rewards, trial_ended, stepped)?;
         normalisers.take_observations(&mut reply.observations, active)?;
         Ok(())
     }

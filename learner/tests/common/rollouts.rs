@@ -1,0 +1,69 @@
+//! What the tests of EPOpt and of RL² share.
+
+use perturb_learner::algorithm::{A2c, A2cConfig, Algorithm, Ppo, PpoConfig};
+use perturb_learner::client::{Address, LocalServer, LocalServerOptions, OpenOptions, Servers};
+use perturb_learner::policy::{Policy, PolicySpec};
+use perturb_learner::proto;
+use perturb_learner::random::{Purpose, normal, stream};
+use perturb_learner::rollout::Rollout;
+
+/// A server with one physics thread.
+pub fn server() -> LocalServer {
+    LocalServer::start(LocalServerOptions { workers: Some(1), ..LocalServerOptions::default() })
+        .unwrap_or_else(|error| panic!("{error}"))
+}
+
+/// Connections to all of `servers`.
+pub fn connect(servers: &[LocalServer]) -> Servers {
+    let addresses: Vec<Address> = servers.iter().map(|server| server.address().clone()).collect();
+    Servers::connect(&addresses).expect("connections")
+}
+
+/// Environments of version R.
+pub fn options(environment: &str, num_envs: usize, episodes_per_trial: u32) -> OpenOptions {
+    OpenOptions {
+        environment: environment.into(),
+        version: proto::Version::Random,
+        num_envs,
+        seed: 3,
+        episodes_per_trial,
+    }
+}
+
+/// A policy whose every number, biases and log_std too, differs from its initial one by about 0.1.
+pub fn moved(spec: &PolicySpec) -> Policy {
+    let mut rng = stream(9, Purpose::Weights);
+    let mut weights = Policy::new(spec.clone(), 1).expect("a policy").weights();
+    weights.iter_mut().flat_map(|array| &mut array.data).for_each(|x| *x += 0.1 * normal(&mut rng) as f32);
+    Policy::from_weights(spec.clone(), &weights).expect("a policy")
+}
+
+/// A2C and PPO.
+pub fn bases(n_steps: usize, n_minibatches: usize, policy: &Policy) -> [Box<dyn Algorithm>; 2] {
+    let a2c = A2cConfig { n_steps, learning_rate: 7e-3, ..A2cConfig::default() };
+    let ppo =
+        PpoConfig { n_steps, n_minibatches, n_epochs: 3, learning_rate: 3e-3, kl_coef: 0.1, ..Default::default() };
+    [
+        Box::new(A2c::new(a2c, policy).expect("valid settings")),
+        Box::new(Ppo::new(ppo, policy, 5).expect("valid settings")),
+    ]
+}
+
+/// All that a finished rollout holds; flags are 0 and 1.
+pub fn contents(rollout: &Rollout) -> Vec<Vec<f32>> {
+    let flags = |flags: &[bool]| flags.iter().map(|&flag| f32::from(u8::from(flag))).collect::<Vec<_>>();
+    let trajectories = rollout.trajectories().expect("a finished rollout");
+    vec![
+        rollout.observations().to_vec(),
+        flags(rollout.starts()),
+        rollout.actions().to_vec(),
+        rollout.log_probs().to_vec(),
+        rollout.values().to_vec(),
+        trajectories.rewards.to_vec(),
+        flags(trajectories.terminated),
+        flags(trajectories.truncated),
+        trajectories.truncation_values.to_vec(),
+        trajectories.last_values.to_vec(),
+        rollout.memory().to_vec(),
+    ]
+}

@@ -1,0 +1,645 @@
+//! EPOpt: complete episodes are collected without bias, packed without loss, and the worst of them are learned from.
+//! Needs the program `perturb-server`: run `cargo build --release` first.
+
+#[path = "common/rollouts.rs"]
+mod common;
+
+use std::collections::{BTreeMap, HashSet};
+
+use common::{bases, connect, contents, moved, options, server};
+use perturb_learner::algorithm::{
+    A2c, A2cConfig, Algorithm, AlgorithmState, Epopt, EpoptConfig, Ppo, PpoConfig, Selection, UpdateStats,
+};
+use perturb_learner::client::{EndedEpisode, LocalServer, Session};
+use perturb_learner::error::Error;
+use perturb_learner::policy::{
+    ActionKind, Actor, Acts, Inputs, ObservationNormaliser, Policy, PolicySpec, RewardNormaliser, Sequences,
+};
+use perturb_learner::random::{Purpose, normal, stream, uniform};
+use perturb_learner::rollout::{
+    Collector, Estimates, Normalisers, Rollout, RolloutStep, Span, Trajectories, gae, n_step_returns,
+};
+use proptest::prelude::*;
+use rand_chacha::ChaCha8Rng;
+use tch::{Kind, Tensor};
+
+const O: usize = 3;
+const DISCRETE: ActionKind = ActionKind::Discrete { n: 3 };
+const CONTINUOUS: ActionKind = ActionKind::Continuous { size: 2 };
+
+fn spec(action: ActionKind, lstm: Option<usize>) -> PolicySpec {
+    PolicySpec { observation_size: O, action, hidden: vec![8], lstm }
+}
+
+fn noise(count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
+    (0..count).map(|_| normal(rng) as f32).collect()
+}
+
+/// Fills `rollout` with episodes of noise. Those of environment n have `lengths[n]` steps and the returns `returns[n]`, one
+/// after the other; an environment that has no more goes on unseen until the last has ended. The task ends about half of
+/// them, the time limit the others.
+fn play(policy: &Policy, lengths: &[Vec<usize>], returns: &[Vec<f64>], mut rollout: Rollout) -> Rollout {
+    let (action, n_envs) = (policy.spec().action, lengths.len());
+    let mut rng = stream(7, Purpose::Actions);
+    let mut actor = Actor::new(policy.spec(), n_envs);
+    actor.load(&policy.weights()).expect("weights that fit");
+    let mut acts = Acts::new(action, n_envs);
+    rollout.begin(actor.memory());
+    let mut episodes = vec![0; n_envs];
+    let mut ages = vec![0; n_envs];
+    let n_steps = lengths.iter().map(|lengths| lengths.iter().sum::<usize>()).max().unwrap_or(0);
+    for _ in 0..n_steps {
+        let observations = noise(n_envs * O, &mut rng);
+        actor.act(&observations, &mut rng, &mut acts).expect("actions");
+        let starts: Vec<bool> = ages.iter().map(|&age| age == 0).collect();
+        ages.iter_mut().for_each(|age| *age += 1);
+        let ended: Vec<bool> = (0..n_envs).map(|n| lengths[n].get(episodes[n]) == Some(&ages[n])).collect();
+        let truncated: Vec<bool> = ended.iter().map(|&ended| ended && uniform(&mut rng) < 0.5).collect();
+        let terminated: Vec<bool> = ended.iter().zip(&truncated).map(|(&ended, &limit)| ended && !limit).collect();
+        let step = RolloutStep {
+            observations: &observations,
+            starts: &starts,
+            actions: &acts.actions,
+            log_probs: &acts.log_probs,
+            values: &acts.values,
+            rewards: &noise(n_envs, &mut rng),
+            terminated: &terminated,
+            truncated: &truncated,
+            truncation_values: &noise(n_envs, &mut rng),
+        };
+        rollout.push(step).expect("a step that fits");
+        for n in (0..n_envs).filter(|&n| ended[n]) {
+            rollout.note_episode(n, ages[n], returns[n][episodes[n]]).expect("an episode of the rollout");
+            (episodes[n], ages[n]) = (episodes[n] + 1, 0);
+            actor.forget(n);
+        }
+    }
+    rollout.finish(&vec![9.0; n_envs]).expect("values that fit"); // nothing may ask for them
+    rollout
+}
+
+/// Returns that do not matter.
+fn zeros(lengths: &[Vec<usize>]) -> Vec<Vec<f64>> {
+    lengths.iter().map(|lengths| vec![0.0; lengths.len()]).collect()
+}
+
+fn of_episodes(spec: &PolicySpec, n_envs: usize) -> Rollout {
+    Rollout::of_episodes(n_envs, O, spec.action.width())
+}
+
+fn epopt(base: Box<dyn Algorithm>, epsilon: f64, full_iterations: u64) -> Epopt {
+    let config = EpoptConfig { episodes_per_iteration: 8, epsilon, full_iterations };
+    Epopt::new(config, base).expect("valid settings")
+}
+
+#[test]
+fn with_epsilon_1_it_is_its_base_to_the_byte() {
+    let lengths = vec![vec![9]; 6]; // a rollout without padding
+    for (lstm, action) in [(None, DISCRETE), (None, CONTINUOUS), (Some(8), DISCRETE), (Some(8), CONTINUOUS)] {
+        let spec = spec(action, lstm);
+        for which in 0..2 {
+            let (mut plain, mut wrapped) = (moved(&spec), moved(&spec));
+            let [a2c, ppo] = bases(9, 2, &plain);
+            let mut base = if which == 0 { a2c } else { ppo };
+            let [a2c, ppo] = bases(9, 2, &wrapped);
+            let mut epopt = epopt(if which == 0 { a2c } else { ppo }, 1.0, 0);
+            for _ in 0..3 {
+                let fixed = Rollout::new(9, 6, O, action.width());
+                let fixed = play(&plain, &lengths, &zeros(&lengths), fixed);
+                let complete = play(&wrapped, &lengths, &zeros(&lengths), of_episodes(&spec, 6));
+                let expected = base.update(&mut plain, &fixed, 1.0).expect("an update");
+                let got = epopt.update(&mut wrapped, &complete, 1.0).expect("an update");
+                assert_eq!(got.selection.map(|selection| (selection.kept, selection.kept_steps)), Some((6, 54)));
+                assert_eq!(UpdateStats { selection: None, ..got }, expected, "{lstm:?} {action:?}");
+                assert_eq!(wrapped.weights(), plain.weights(), "{lstm:?} {action:?}");
+            }
+        }
+    }
+}
+
+/// Eight episodes of unequal lengths; the worse half has the returns -1, 0, 1 and 2.
+fn eight() -> (Vec<Vec<usize>>, Vec<Vec<f64>>) {
+    let lengths = vec![vec![3, 7], vec![9, 2], vec![4, 4], vec![1, 6]];
+    let returns = vec![vec![5.0, -1.0], vec![0.0, 3.0], vec![8.0, 2.0], vec![1.0, 7.0]];
+    (lengths, returns)
+}
+
+#[test]
+fn it_learns_from_the_worst_episodes_alone() {
+    let (lengths, returns) = eight();
+    let span = |environment, start, length, episode_return| Span { environment, start, length, episode_return };
+    // In the order in which they ended.
+    let worst = [span(3, 0, 1, 1.0), span(2, 4, 4, 2.0), span(1, 0, 9, 0.0), span(0, 3, 7, -1.0)];
+    for lstm in [None, Some(8)] {
+        let spec = spec(DISCRETE, lstm);
+        for which in 0..2 {
+            let start = || {
+                let policy = moved(&spec);
+                let [a2c, ppo] = bases(1, 1, &policy);
+                let rollout = play(&policy, &lengths, &returns, of_episodes(&spec, 4));
+                (if which == 0 { a2c } else { ppo }, policy, rollout)
+            };
+            let of_chosen = |chosen: Option<&[Span]>| {
+                let (mut base, mut policy, rollout) = start();
+                let packed = rollout.select(chosen.unwrap_or(rollout.episodes())).expect("its own episodes");
+                (base.update(&mut policy, &packed, 1.0).expect("an update"), policy.weights())
+            };
+            let (expected, expected_weights) = of_chosen(Some(&worst));
+            let (_, weights_of_all) = of_chosen(None);
+            let (base, mut policy, rollout) = start();
+            let stats = epopt(base, 0.5, 0).update(&mut policy, &rollout, 1.0).expect("an update");
+            assert_eq!(UpdateStats { selection: None, ..stats }, expected, "{lstm:?}");
+            assert_eq!(policy.weights(), expected_weights, "{lstm:?}");
+            assert_ne!(policy.weights(), weights_of_all, "the better half would matter");
+            let expected = Selection { epsilon: 0.5, kept: 4, kept_steps: 21, mean_return: 25.0 / 8.0, cvar: 0.5 };
+            assert_eq!(stats.selection, Some(expected));
+        }
+    }
+}
+
+#[test]
+fn the_share_falls_after_the_full_iterations_and_a_resumed_training_knows_when() {
+    let (lengths, returns) = eight();
+    let spec = spec(DISCRETE, Some(8));
+    for which in 0..2 {
+        let fresh = |policy: &Policy| {
+            let [a2c, ppo] = bases(1, 1, policy);
+            epopt(if which == 0 { a2c } else { ppo }, 0.5, 2)
+        };
+        let run = |resumed_after: Option<usize>| {
+            let mut policy = moved(&spec);
+            let mut algorithm = fresh(&policy);
+            let mut selections = Vec::new();
+            for iteration in 0..4 {
+                if resumed_after == Some(iteration) {
+                    let json = serde_json::to_string(&algorithm.state()).expect("JSON");
+                    let state: AlgorithmState = serde_json::from_str(&json).expect("a state");
+                    policy = Policy::from_weights(spec.clone(), &policy.weights()).expect("a policy");
+                    algorithm = fresh(&policy);
+                    algorithm.load_state(&state).expect("a state that fits");
+                }
+                let rollout = play(&policy, &lengths, &returns, of_episodes(&spec, 4));
+                let stats = algorithm.update(&mut policy, &rollout, 1.0).expect("an update");
+                selections.push(stats.selection.expect("EPOpt's"));
+            }
+            (selections, policy.weights())
+        };
+        let whole = run(None);
+        let figures: Vec<_> =
+            whole.0.iter().map(|s| (s.epsilon, s.kept, s.kept_steps, s.mean_return, s.cvar)).collect();
+        let (full, half) = ((1.0, 8, 36, 3.125, 0.5), (0.5, 4, 21, 3.125, 0.5));
+        assert_eq!(figures, [full, full, half, half], "the value at risk is always that of the configured share");
+        for iteration in 1..4 {
+            assert_eq!(run(Some(iteration)), whole, "resumed after {iteration}");
+        }
+    }
+}
+
+/// A rollout whose every number says where it comes from: place p = t·N + n holds the observation (p, -p), and numbers that
+/// are functions of p.
+fn coded(lengths: &[Vec<usize>]) -> Rollout {
+    let n_envs = lengths.len();
+    let mut rollout = Rollout::of_episodes(n_envs, 2, 1);
+    rollout.begin(&vec![1.0; 2 * n_envs]);
+    let ends: Vec<Vec<usize>> = lengths
+        .iter()
+        .map(|lengths| (1..=lengths.len()).map(|count| lengths[..count].iter().sum()).collect())
+        .collect();
+    let n_steps = ends.iter().filter_map(|ends| ends.last()).max().copied().unwrap_or(0);
+    for t in 0..n_steps {
+        let number = |k: usize| (0..n_envs).map(move |n| (((t * n_envs + n) * k) % 101) as f32 / 10.0 - 5.0);
+        let place = |n: usize| t * n_envs + n;
+        let ended = |n: usize| ends[n].contains(&(t + 1));
+        let step = RolloutStep {
+            observations: &(0..n_envs).flat_map(|n| [place(n) as f32, -(place(n) as f32)]).collect::<Vec<_>>(),
+            starts: &(0..n_envs).map(|n| t == 0 || ends[n].contains(&t)).collect::<Vec<_>>(),
+            actions: &number(7).collect::<Vec<_>>(),
+            log_probs: &number(11).collect::<Vec<_>>(),
+            values: &number(13).collect::<Vec<_>>(),
+            rewards: &number(17).collect::<Vec<_>>(),
+            terminated: &(0..n_envs).map(|n| ended(n) && !place(n).is_multiple_of(3)).collect::<Vec<_>>(),
+            truncated: &(0..n_envs).map(|n| ended(n) && place(n) % 3 != 1).collect::<Vec<_>>(),
+            truncation_values: &number(19).collect::<Vec<_>>(),
+        };
+        rollout.push(step).expect("a step that fits");
+        for n in (0..n_envs).filter(|&n| ended(n)) {
+            let k = ends[n].iter().position(|&end| end == t + 1).expect("its number");
+            rollout.note_episode(n, lengths[n][k], 0.0).expect("an episode of the rollout");
+        }
+    }
+    rollout.finish(&vec![99.0; n_envs]).expect("values that fit");
+    rollout
+}
+
+/// The numbers of place `p` of a rollout of [`coded`], or of one selected from it.
+fn at(rollout: &Rollout, p: usize) -> (Vec<f32>, [bool; 2]) {
+    let trajectories = rollout.trajectories().expect("a finished rollout");
+    let numbers = [
+        rollout.observations()[2 * p],
+        rollout.observations()[2 * p + 1],
+        rollout.actions()[p],
+        rollout.log_probs()[p],
+        rollout.values()[p],
+        trajectories.rewards[p],
+        trajectories.truncation_values[p],
+    ];
+    (numbers.to_vec(), [trajectories.terminated[p], trajectories.truncated[p]])
+}
+
+proptest! {
+    #[test]
+    fn every_step_of_the_chosen_episodes_is_a_sample_once(
+        lengths in prop::collection::vec(prop::collection::vec(1usize..12, 1..6), 1..7),
+        choice in prop::collection::vec(any::<bool>(), 36),
+    ) {
+        let rollout = coded(&lengths);
+        let n_envs = rollout.n_envs();
+        let episodes = rollout.episodes();
+        prop_assert_eq!(episodes.len(), lengths.iter().map(Vec::len).sum::<usize>());
+        let mut chosen: Vec<Span> = episodes.iter().zip(&choice).filter(|(_, chosen)| **chosen).map(|(e, _)| *e).collect();
+        if chosen.is_empty() {
+            chosen.push(episodes[0]);
+        }
+        let packed = rollout.select(&chosen).expect("its own episodes");
+        let samples: Vec<usize> = packed.samples().expect("not all are").into_iter().map(|i| i as usize).collect();
+        let columns = packed.n_envs();
+        prop_assert_eq!(packed.n_steps(), chosen.iter().map(|e| e.length).max().expect("one"));
+        prop_assert_eq!(packed.memory(), vec![0.0; 2 * columns]);
+
+        // Where each step of the chosen episodes came from, and whether it is a first one.
+        let mut expected = BTreeMap::new();
+        for episode in &chosen {
+            for step in 0..episode.length {
+                expected.insert((episode.start + step) * n_envs + episode.environment, step == 0);
+            }
+        }
+        let steps = packed.lengths().expect("packed").iter().sum::<usize>();
+        prop_assert_eq!((samples.len(), steps), (expected.len(), expected.len()));
+        let is_sample: HashSet<usize> = samples.iter().copied().collect();
+        prop_assert_eq!(is_sample.len(), samples.len());
+        let mut seen = HashSet::new();
+        for place in 0..packed.n_steps() * columns {
+            let (t, column) = (place / columns, place % columns);
+            let sample = t < packed.lengths().expect("packed")[column];
+            prop_assert_eq!(sample, is_sample.contains(&place));
+            if !sample {
+                prop_assert!(!packed.starts()[place], "padding starts nothing");
+                continue;
+            }
+            let source = packed.observations()[2 * place] as usize;
+            prop_assert!(seen.insert(source), "step {} twice", source);
+            prop_assert_eq!(Some(&packed.starts()[place]), expected.get(&source));
+            prop_assert_eq!(at(&packed, place), at(&rollout, source));
+            if !packed.starts()[place] {
+                let before = packed.observations()[2 * (place - columns)] as usize;
+                prop_assert_eq!(before + n_envs, source, "steps are in order");
+            }
+        }
+
+        // Advantages are those of each episode alone: the same sums in the same order.
+        let (gamma, lambda) = (0.9, 0.8);
+        for bootstrap in [true, false] {
+            let estimators: [&dyn Fn(&Trajectories<'_>) -> Estimates; 2] = [
+                &|trajectories| gae(trajectories, gamma, lambda, bootstrap),
+                &|trajectories| n_step_returns(trajectories, gamma, bootstrap),
+            ];
+            for estimate in estimators {
+                let together = estimate(&packed.trajectories().expect("finished"));
+                for episode in &chosen {
+                    let places = || (0..episode.length).map(|t| (episode.start + t) * n_envs + episode.environment);
+                    let whole = rollout.trajectories().expect("finished");
+                    let numbers = |data: &[f32]| places().map(|p| data[p]).collect::<Vec<_>>();
+                    let flags = |data: &[bool]| places().map(|p| data[p]).collect::<Vec<_>>();
+                    let alone = estimate(&Trajectories {
+                        n_envs: 1,
+                        rewards: &numbers(whole.rewards),
+                        values: &numbers(whole.values),
+                        terminated: &flags(whole.terminated),
+                        truncated: &flags(whole.truncated),
+                        truncation_values: &numbers(whole.truncation_values),
+                        last_values: &[99.0],
+                    });
+                    let first = places().next().expect("a step");
+                    let is_first = |&&place: &&usize| packed.observations()[2 * place] as usize == first;
+                    let start = *samples.iter().find(is_first).expect("it is there");
+                    for t in 0..episode.length {
+                        prop_assert_eq!(together.advantages[start + t * columns], alone.advantages[t]);
+                        prop_assert_eq!(together.returns[start + t * columns], alone.returns[t]);
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn episodes_that_a_rollout_does_not_hold_are_refused() {
+    let mut rollout = coded(&[vec![4, 2], vec![3]]);
+    let own = rollout.episodes()[0];
+    assert!(matches!(rollout.select(&[]), Err(Error::RolloutLength { .. })));
+    for wrong in [
+        Span { environment: 2, ..own },
+        Span { start: 5, ..own },
+        Span { start: usize::MAX, ..own },
+        Span { length: 0, ..own },
+    ] {
+        let result = rollout.select(&[own, wrong]);
+        assert!(matches!(result, Err(Error::Episode { n_envs: 2, n_steps: 6, .. })), "{wrong:?}: {result:?}");
+    }
+    for (environment, length) in [(2, 1), (0, 7), (0, 0)] {
+        let result = rollout.note_episode(environment, length, 0.0);
+        assert!(matches!(result, Err(Error::Episode { .. })), "{environment} {length}: {result:?}");
+    }
+    let policy = moved(&spec(DISCRETE, None));
+    let [base, _] = bases(1, 1, &policy);
+    let unfinished = Rollout::of_episodes(2, O, 1);
+    let result = epopt(base, 0.5, 0).update(&mut moved(&spec(DISCRETE, None)), &unfinished, 1.0);
+    assert!(matches!(result, Err(Error::RolloutLength { .. })), "{result:?}");
+}
+
+/// The mean over the samples of a packed `rollout` of a loss in which every output of the policy counts, with its gradient.
+fn loss_of(policy: &Policy, rollout: &Rollout) -> (f64, Vec<f32>) {
+    let sequences =
+        Sequences::new(policy.spec(), rollout.n_steps(), rollout.observations(), rollout.starts(), rollout.memory())
+            .and_then(|sequences| sequences.with_lengths(rollout.lengths().expect("packed")))
+            .expect("shapes that fit");
+    let evaluated = policy.evaluate(&sequences, &Tensor::of_slice(rollout.actions()));
+    let samples = rollout.samples().expect("packed");
+    let weights: Vec<f32> = samples.iter().map(|&i| rollout.observations()[O * i as usize]).collect();
+    let terms =
+        &evaluated.log_probs * Tensor::of_slice(&weights) + evaluated.values.square() + &evaluated.entropy * 0.3;
+    let loss = terms.mean(Kind::Float);
+    let mut gradient = vec![0.0; policy.n_weights()];
+    policy.gradient(&evaluated, &loss, &mut gradient).expect("a gradient");
+    (loss.double_value(&[]), gradient)
+}
+
+/// Thirty steps.
+fn unequal() -> Vec<Vec<usize>> {
+    vec![vec![6, 2], vec![9], vec![1, 3, 5], vec![4]]
+}
+
+#[test]
+fn padding_is_no_sample_of_a_recurrent_policys_loss_and_gradient() {
+    for action in [DISCRETE, CONTINUOUS] {
+        for plain_autograd in [false, true] {
+            let mut policy = moved(&spec(action, Some(8)));
+            if plain_autograd {
+                policy = policy.with_plain_autograd();
+            }
+            let rollout = play(&policy, &unequal(), &zeros(&unequal()), of_episodes(policy.spec(), 4));
+            let select = |episodes: &[Span]| rollout.select(episodes).expect("its own episodes");
+            let packed = select(rollout.episodes());
+            let (places, steps) = (packed.n_steps() * packed.n_envs(), 30);
+            assert!(packed.samples().is_some_and(|samples| samples.len() == steps) && places > steps, "{places}");
+            let (loss, gradient) = loss_of(&policy, &packed);
+
+            let (mut mean, mut mean_gradient) = (0.0, vec![0.0f64; gradient.len()]);
+            for episode in rollout.episodes() {
+                let share = episode.length as f64 / steps as f64;
+                let (loss, gradient) = loss_of(&policy, &select(&[*episode]));
+                mean += share * loss;
+                mean_gradient.iter_mut().zip(gradient).for_each(|(sum, g)| *sum += share * f64::from(g));
+            }
+            assert!((loss - mean).abs() < 1e-6, "f32 rounding of a mean of order 1: {loss} {mean}");
+            let mut start = 0;
+            for array in policy.weights() {
+                let range = start..start + array.data.len();
+                start = range.end;
+                let norm = |numbers: &mut dyn Iterator<Item = f64>| numbers.map(|x| x * x).sum::<f64>().sqrt();
+                let size = norm(&mut mean_gradient[range.clone()].iter().copied());
+                let difference = norm(&mut range.map(|i| f64::from(gradient[i]) - mean_gradient[i]));
+                // Sums of 30 products in another order, each rounded to 2⁻²⁴.
+                assert!(size > 0.0 && difference < 1e-5 * size, "{}: {difference} of {size}", array.name);
+            }
+        }
+    }
+}
+
+#[test]
+fn padding_is_no_sample_of_an_update() {
+    for lstm in [None, Some(8)] {
+        for action in [DISCRETE, CONTINUOUS] {
+            let spec = spec(action, lstm);
+            let rollout = play(&moved(&spec), &unequal(), &zeros(&unequal()), of_episodes(&spec, 4));
+            let update = |mut algorithm: Box<dyn Algorithm>, episodes: &[Span]| {
+                let packed = rollout.select(episodes).expect("its own episodes");
+                algorithm.update(&mut moved(&spec), &packed, 1.0).expect("an update")
+            };
+            let a2c = || Box::new(A2c::new(A2cConfig::default(), &moved(&spec)).expect("valid settings"));
+            let parts =
+                |stats: UpdateStats| [stats.policy_gradient_loss, stats.value_loss, stats.entropy_loss, stats.loss];
+            let got = parts(update(a2c(), rollout.episodes()));
+            let mut expected = [0.0; 4];
+            for episode in rollout.episodes() {
+                let alone = parts(update(a2c(), &[*episode]));
+                expected.iter_mut().zip(alone).for_each(|(sum, x)| *sum += x * episode.length as f64 / 30.0);
+            }
+            for (got, expected) in got.iter().zip(expected) {
+                assert!((got - expected).abs() < 2e-6, "f32 rounding of means below 10: {got} {expected}");
+            }
+
+            let config = PpoConfig { n_epochs: 1, learning_rate: 1e-12, kl_coef: 0.2, ..PpoConfig::default() };
+            let ppo = Ppo::new(config, &moved(&spec), 1).expect("valid settings");
+            let stats = update(Box::new(ppo), rollout.episodes());
+            assert_eq!(stats.clip_fraction, Some(0.0));
+            // As in the tests of PPO: half the square of errors of 1e-6, its terms rounded to 2⁻²⁴; and the errors.
+            assert!(stats.approx_kl.is_some_and(|kl| kl.abs() < 2e-7), "{stats:?}");
+            assert!(stats.policy_gradient_loss.abs() < 1e-5, "{stats:?}");
+            assert!(stats.kl_divergence.is_some_and(|kl| kl.abs() < 5e-7), "{stats:?}");
+        }
+    }
+}
+
+const CARTPOLES: usize = 4;
+/// Not divisible by their number: 3, 3, 2 and 2.
+const COUNT: usize = 10;
+
+/// A recurrent policy that pushes to either side as often, whatever it sees.
+fn blind(input_size: usize) -> Policy {
+    let spec = PolicySpec {
+        observation_size: input_size,
+        action: ActionKind::Discrete { n: 2 },
+        hidden: vec![],
+        lstm: Some(4),
+    };
+    let mut weights = moved(&spec).weights();
+    weights.iter_mut().filter(|array| array.name.starts_with("policy")).for_each(|array| array.data.fill(0.0));
+    Policy::from_weights(spec, &weights).expect("a policy")
+}
+
+/// Two rollouts of complete episodes with those that ended, and the statistics after them.
+fn collect(servers: &[LocalServer], normalised: bool) -> (Vec<(Rollout, Vec<EndedEpisode>)>, Normalisers) {
+    let servers = connect(servers);
+    let mut observations = Vec::new();
+    let session = Session::open(&servers, &options("CartPole", CARTPOLES, 1), &mut observations).expect("a session");
+    let size = session.observation_size();
+    let policy = blind(size);
+    let inputs = Inputs::new(size, policy.spec().action, CARTPOLES, false);
+    let normalisers = Normalisers {
+        observations: normalised.then(|| ObservationNormaliser::new(size)),
+        rewards: normalised.then(|| RewardNormaliser::new(CARTPOLES, 0.9)),
+    };
+    let mut collector =
+        Collector::new(session, observations, policy.spec(), inputs, normalisers, 1).expect("a collector");
+    let mut collected = Vec::new();
+    for _ in 0..2 {
+        let (mut rollout, mut ended) = (Rollout::of_episodes(CARTPOLES, size, 1), Vec::new());
+        let on_episode = |episode: &EndedEpisode| ended.push(episode.clone());
+        collector.collect_episodes(&policy.weights(), COUNT, &mut rollout, on_episode).expect("a rollout");
+        collected.push((rollout, ended));
+    }
+    (collected, collector.normalisers().clone())
+}
+
+#[test]
+fn which_episodes_are_collected_is_fixed_beforehand() {
+    let (collected, _) = collect(&[server()], false);
+    let mut parameters = HashSet::new();
+    for (iteration, (rollout, ended)) in collected.iter().enumerate() {
+        assert_eq!(ended.len(), COUNT);
+        let spans: Vec<_> = rollout.episodes().iter().map(|e| (e.environment, e.length, e.episode_return)).collect();
+        let said: Vec<_> = ended.iter().map(|e| (e.slot, e.length as usize, e.episode_return)).collect();
+        assert_eq!(spans, said, "the server's word on every episode");
+        let trajectories = rollout.trajectories().expect("a finished rollout");
+        for slot in 0..CARTPOLES {
+            let own: Vec<&EndedEpisode> = ended.iter().filter(|episode| episode.slot == slot).collect();
+            assert_eq!(own.len(), [3, 3, 2, 2][slot], "however short they are");
+            let first = own[0].episode_index;
+            assert!(own.iter().zip(first..).all(|(episode, index)| episode.episode_index == index), "its first ones");
+            assert!(iteration > 0 || first == 1, "what was opened is broken off");
+            // One after the other from the rollout's first step on, with an end after the last step and nowhere else.
+            let mut t = 0;
+            for span in rollout.episodes().iter().filter(|span| span.environment == slot) {
+                assert_eq!(span.start, t);
+                for step in 0..span.length {
+                    let place = t * CARTPOLES + slot;
+                    assert_eq!(rollout.starts()[place], step == 0);
+                    let ended = trajectories.terminated[place] || trajectories.truncated[place];
+                    assert_eq!(ended, step + 1 == span.length);
+                    t += 1;
+                }
+            }
+        }
+        assert_eq!(rollout.memory(), vec![0.0; CARTPOLES * 8], "nothing of the rollout before");
+        let last = rollout.episodes().iter().map(|span| span.start + span.length).max();
+        assert_eq!(last, Some(rollout.n_steps()), "it ends with the last episode");
+        assert!(ended.iter().any(|e| e.length != ended[0].length), "lengths differ");
+        parameters.extend(ended.iter().map(|episode| format!("{:?}", episode.parameters)));
+    }
+    assert_eq!(parameters.len(), 2 * COUNT, "every episode is in an environment of its own");
+}
+
+#[test]
+fn unseen_steps_are_no_part_of_the_statistics() {
+    let server = [server()];
+    let (raw, _) = collect(&server, false);
+    let (normalised, normalisers) = collect(&server, true);
+    let mut rows = Vec::new(); // those that the session opens with, then all that was acted on
+    Session::open(&connect(&server), &options("CartPole", CARTPOLES, 1), &mut rows).expect("a session");
+    let size = rows.len() / CARTPOLES;
+    let mut seen = 0;
+    let mut unseen = 0;
+    for ((rollout, _), (normalised, _)) in raw.iter().zip(&normalised) {
+        assert_eq!(rollout.actions(), normalised.actions(), "the same episodes");
+        for span in rollout.episodes() {
+            for t in span.start..span.start + span.length {
+                rows.extend(&rollout.observations()[(t * CARTPOLES + span.environment) * size..][..size]);
+            }
+            seen += span.length;
+        }
+        unseen += rollout.n_steps() * CARTPOLES;
+    }
+    unseen -= seen;
+    assert!(unseen > 10, "{unseen}");
+
+    let moments = normalisers.observations.as_ref().expect("statistics").moments();
+    assert_eq!(moments.count(), (CARTPOLES + seen) as u64);
+    for i in 0..size {
+        let column = || rows.iter().skip(i).step_by(size).map(|&x| f64::from(x));
+        let count = (rows.len() / size) as f64;
+        let mean = column().sum::<f64>() / count;
+        let variance = column().map(|x| (x - mean).powi(2)).sum::<f64>() / count;
+        // Sums of some hundred numbers in f64 in another order.
+        assert!((moments.mean()[i] - mean).abs() < 1e-12, "{} {mean}", moments.mean()[i]);
+        assert!((moments.variance(i) - variance).abs() < 1e-12, "{} {variance}", moments.variance(i));
+    }
+    assert_eq!(normalisers.rewards.as_ref().expect("statistics").moments().count(), seen as u64);
+}
+
+#[test]
+fn complete_episodes_are_the_same_on_one_server_and_on_two() {
+    let both = [server(), server()];
+    let (one, one_after) = collect(&both[..1], true);
+    let (two, two_after) = collect(&both, true);
+    for ((one, one_ended), (two, two_ended)) in one.iter().zip(&two) {
+        assert_eq!(contents(one), contents(two));
+        assert_eq!((one.episodes(), one_ended), (two.episodes(), two_ended));
+    }
+    assert_eq!(one_after, two_after);
+}
+
+const SAFE: f32 = 0.0;
+const ENVS: usize = 16;
+
+/// Episodes of one step with two arms. The safe one pays 0, the risky one 1, but -2.5 in a fifth of the drawn environments,
+/// so that it is better by 0.3 in the mean.
+fn pull(policy: &Policy, rng: &mut ChaCha8Rng, episodes: usize) -> Rollout {
+    let mut rollout = Rollout::of_episodes(ENVS, 1, 1);
+    let mut actor = Actor::new(policy.spec(), ENVS);
+    actor.load(&policy.weights()).expect("weights that fit");
+    let mut acts = Acts::new(policy.spec().action, ENVS);
+    rollout.begin(&[]);
+    for _ in 0..episodes / ENVS {
+        actor.act(&[1.0; ENVS], rng, &mut acts).expect("actions");
+        let rewards: [f32; ENVS] = std::array::from_fn(|n| match (acts.actions[n] == SAFE, uniform(rng) < 0.2) {
+            (true, _) => 0.0,
+            (false, false) => 1.0,
+            (false, true) => -2.5,
+        });
+        let step = RolloutStep {
+            observations: &[1.0; ENVS],
+            starts: &[true; ENVS],
+            actions: &acts.actions,
+            log_probs: &acts.log_probs,
+            values: &acts.values,
+            rewards: &rewards,
+            terminated: &[true; ENVS],
+            truncated: &[false; ENVS],
+            truncation_values: &[0.0; ENVS],
+        };
+        rollout.push(step).expect("a step that fits");
+        for (n, reward) in rewards.into_iter().enumerate() {
+            rollout.note_episode(n, 1, f64::from(reward)).expect("an episode");
+        }
+    }
+    rollout.finish(&[0.0; ENVS]).expect("a finished rollout");
+    rollout
+}
+
+#[test]
+fn it_avoids_what_is_catastrophic_in_some_environments_and_its_base_does_not() {
+    let spec = PolicySpec { observation_size: 1, action: ActionKind::Discrete { n: 2 }, hidden: vec![8], lstm: None };
+    // Of the episodes of a policy that takes either arm, a tenth is catastrophic; the worst fifth holds those and safe ones.
+    for (epsilon, which) in [(0.2, 0), (0.2, 1), (1.0, 0), (1.0, 1)] {
+        let mut policy = Policy::new(spec.clone(), 5).expect("a policy");
+        let mut rng = stream(5, Purpose::Actions);
+        let a2c = A2cConfig { learning_rate: 7e-3, ..A2cConfig::default() };
+        let ppo = PpoConfig { learning_rate: 3e-3, ..PpoConfig::default() };
+        let base: Box<dyn Algorithm> = if which == 0 {
+            Box::new(A2c::new(a2c, &policy).expect("valid settings"))
+        } else {
+            Box::new(Ppo::new(ppo, &policy, 5).expect("valid settings"))
+        };
+        let mut algorithm = epopt(base, epsilon, 0);
+        for _ in 0..[1500, 100][which] {
+            let rollout = pull(&policy, &mut rng, 128);
+            algorithm.update(&mut policy, &rollout, 1.0).expect("an update");
+        }
+        let last = pull(&policy, &mut rng, 1024);
+        let safe = last.actions().iter().filter(|&&action| action == SAFE).count() as f64 / 1024.0;
+        // Both are nearly sure in the end; at first it is ½.
+        let expected = if epsilon < 1.0 { 0.9..=1.0 } else { 0.0..=0.1 };
+        assert!(expected.contains(&safe), "ε = {epsilon}, {}: {safe}", ["A2C", "PPO"][which]);
+    }
+}
