@@ -9,6 +9,7 @@ pub mod client;
 pub mod config;
 pub mod error;
 pub mod evaluation;
+pub mod experiment;
 #[cfg(test)]
 mod fixture;
 pub mod interrupt;
@@ -19,6 +20,10 @@ pub mod random;
 pub mod rollout;
 mod run_directory;
 pub mod training;
+
+/// The version, and the commit that was built, e.g. "0.1.0 (1a2b3c4d5e6f)"; "-dirty" follows a commit whose files were
+/// changed.
+pub const VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), " (", env!("PERTURB_COMMIT"), ")");
 
 /// The protocol: generated from `proto/perturb/v1/perturb.proto`, whose comments specify every field.
 #[allow(missing_docs, clippy::all)]

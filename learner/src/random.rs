@@ -20,6 +20,8 @@ pub enum Purpose {
     TestActions = 4,
     /// Seeds of test environments.
     TestEnvironments = 5,
+    /// Resamples of a bootstrap.
+    Bootstrap = 16,
 }
 
 /// The stream of `seed` for `purpose`.

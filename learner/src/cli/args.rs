@@ -26,6 +26,16 @@ pub(super) enum Command {
     Evaluate(EvaluateArgs),
     /// Train and test on CartPole in a few minutes, and print the result beside the paper's.
     Demo(DemoArgs),
+    /// Say what an experiment file asks for, and what it costs.
+    Plan(PlanArgs),
+    /// Do all trainings and tests of an experiment file; called again, it goes on.
+    Run(RunArgs),
+    /// Make tables of an experiment's results, beside the paper's.
+    Report(ReportArgs),
+    /// Draw the training curves of an experiment.
+    Curves(CurvesArgs),
+    /// Draw how a trained policy does over two parameters.
+    Heatmap(HeatmapArgs),
 }
 
 /// Where environments run.
@@ -138,6 +148,97 @@ pub(super) struct DemoArgs {
     pub(super) out: Option<PathBuf>,
     #[command(flatten)]
     pub(super) server: ServerArgs,
+}
+
+#[derive(Args, Debug)]
+pub(super) struct PlanArgs {
+    /// An experiment file, e.g. experiments/paper.toml.
+    #[arg(value_name = "FILE")]
+    pub(super) file: PathBuf,
+    /// List the cells with their indices and ids.
+    #[arg(long)]
+    pub(super) cells: bool,
+    /// Seconds that each measured training takes; 0 measures nothing and gives no estimate.
+    #[arg(long, value_name = "SECONDS", default_value_t = 3)]
+    pub(super) measure: u64,
+    #[command(flatten)]
+    pub(super) server: ServerArgs,
+}
+
+#[derive(Args, Debug)]
+pub(super) struct RunArgs {
+    /// An experiment file, e.g. experiments/quick.toml.
+    #[arg(value_name = "PLAN")]
+    pub(super) plan: PathBuf,
+    /// Directory of the results; what is done there already is kept.
+    #[arg(long, value_name = "DIR")]
+    pub(super) out: PathBuf,
+    /// Trainings at a time [default: one a core].
+    #[arg(long, value_name = "N", value_parser = at_least_one)]
+    pub(super) jobs: Option<usize>,
+    /// Try cells again that have failed.
+    #[arg(long)]
+    pub(super) retry_failed: bool,
+    /// Do this cell only, by its index or id, in this process.
+    #[arg(long, value_name = "K", conflicts_with = "jobs")]
+    pub(super) cell: Option<String>,
+    /// With --cell: stop when standard input is closed, and show no progress.
+    #[arg(long)]
+    pub(super) exit_with_stdin: bool,
+    #[command(flatten)]
+    pub(super) server: ServerArgs,
+}
+
+#[derive(Args, Debug)]
+pub(super) struct ReportArgs {
+    /// The --out of `perturb run`; tables go to its folder report/.
+    #[arg(value_name = "DIR")]
+    pub(super) dir: PathBuf,
+    /// Also write everything, with training curves, as one HTML page that needs nothing else.
+    #[arg(long, value_name = "FILE")]
+    pub(super) html: Option<PathBuf>,
+}
+
+#[derive(Args, Debug)]
+pub(super) struct CurvesArgs {
+    /// The --out of `perturb run`.
+    #[arg(value_name = "DIR")]
+    pub(super) dir: PathBuf,
+    /// Where the pictures go [default: DIR/report].
+    #[arg(long, value_name = "DIR")]
+    pub(super) out: Option<PathBuf>,
+}
+
+#[derive(Args, Debug)]
+pub(super) struct HeatmapArgs {
+    /// The --out of a training, or the checkpoint folder in it.
+    #[arg(long, value_name = "DIR")]
+    pub(super) checkpoint: PathBuf,
+    /// The parameter along x, e.g. force; `perturb envs` lists them.
+    #[arg(long, value_name = "PARAMETER")]
+    pub(super) x: String,
+    /// The parameter along y, e.g. mass.
+    #[arg(long, value_name = "PARAMETER")]
+    pub(super) y: String,
+    /// Points along each axis, at most 100.
+    #[arg(long, value_name = "N", default_value_t = 40, value_parser = points)]
+    pub(super) grid: usize,
+    /// Episodes at each point.
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..))]
+    pub(super) episodes: u64,
+    /// Fixes the tests' randomness [default: the training's seed].
+    #[arg(long, value_name = "N")]
+    pub(super) seed: Option<u64>,
+    /// The files without their endings .csv, .svg, .png [default: heatmap-X-Y in --checkpoint].
+    #[arg(long, value_name = "PATH")]
+    pub(super) out: Option<PathBuf>,
+    #[command(flatten)]
+    pub(super) server: ServerArgs,
+}
+
+fn points(text: &str) -> Result<usize, String> {
+    let most = crate::experiment::MOST_POINTS;
+    text.parse().ok().filter(|number| (1..=most).contains(number)).ok_or_else(|| format!("expected 1 to {most}"))
 }
 
 fn at_least_one(text: &str) -> Result<usize, String> {

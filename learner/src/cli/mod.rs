@@ -1,13 +1,19 @@
-//! The command line: `perturb envs | train | evaluate | demo`.
+//! The command line: `perturb envs | train | evaluate | demo | plan | run | report | curves |
+//! heatmap`.
 //!
 //! Results go to standard output, everything else to standard error. Exit status: 0 done, 1 failed, 2 wrong usage, 128 +
-//! the signal's number if Ctrl-C or SIGTERM ended it.
+//! the signal's number if Ctrl-C or SIGTERM ended it. `run --cell` has two more: 69 without a server, 75 if another
+//! process works on the cell.
 
 mod args;
 mod bar;
 mod demo;
 mod envs;
 mod evaluate;
+mod heatmap;
+mod plan;
+mod report;
+mod run;
 mod single_thread;
 mod train;
 
@@ -19,6 +25,7 @@ use clap::Parser;
 use crate::client::{LocalServerOptions, Servers};
 use crate::config::ConfigError;
 use crate::evaluation::TestError;
+use crate::experiment::{HeatmapError, PlanError};
 use args::{Cli, Command, ServerArgs};
 
 /// How a command ended that did not fail.
@@ -27,6 +34,8 @@ enum Ending {
     Done,
     /// It was asked to end by this signal.
     Signal(i32),
+    /// It could not do its work now, for the reason that this exit status stands for.
+    Status(u8),
 }
 
 /// A mistake of the person who typed the command.
@@ -40,7 +49,7 @@ pub fn main() -> ExitCode {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn"));
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
-    if matches!(cli.command, Command::Train(_) | Command::Demo(_)) {
+    if matches!(cli.command, Command::Train(_) | Command::Demo(_) | Command::Plan(_) | Command::Run(_)) {
         single_thread::ensure();
     }
     let result = match cli.command {
@@ -48,16 +57,26 @@ pub fn main() -> ExitCode {
         Command::Train(args) => train::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Demo(args) => demo::run(&args),
+        Command::Plan(args) => plan::run(&args),
+        Command::Run(args) => run::run(&args),
+        Command::Report(args) => report::run(&args),
+        Command::Curves(args) => report::curves(&args),
+        Command::Heatmap(args) => heatmap::run(&args),
     };
     match result {
         Ok(Ending::Done) => ExitCode::SUCCESS,
         Ok(Ending::Signal(number)) => signal_code(number),
+        Ok(Ending::Status(status)) => ExitCode::from(status),
         Err(error) => fail(&error),
     }
 }
 
 fn fail(error: &anyhow::Error) -> ExitCode {
-    if let Some(TestError::Stopped { signal }) = error.downcast_ref() {
+    let stopped = match error.downcast_ref() {
+        Some(HeatmapError::Test(error)) => Some(error),
+        _ => error.downcast_ref(),
+    };
+    if let Some(TestError::Stopped { signal }) = stopped {
         eprintln!("perturb: {error}");
         return signal_code(*signal);
     }
@@ -69,7 +88,7 @@ fn fail(error: &anyhow::Error) -> ExitCode {
         return ExitCode::SUCCESS;
     }
     eprintln!("perturb: {error:#}");
-    let usage = error.downcast_ref::<ConfigError>().is_some() || error.downcast_ref::<UsageError>().is_some();
+    let usage = error.is::<ConfigError>() || error.is::<UsageError>() || error.is::<PlanError>();
     ExitCode::from(if usage { 2 } else { 1 })
 }
 
@@ -83,9 +102,15 @@ fn servers(args: &ServerArgs, num_envs: usize) -> Result<Servers> {
         let options = LocalServerOptions { workers: args.workers, num_envs };
         return Servers::local(options).context("cannot start a server for this run");
     }
+    refuse_workers(args)?;
+    Ok(Servers::connect(&args.server)?)
+}
+
+/// Servers that were named have their threads already.
+fn refuse_workers(args: &ServerArgs) -> Result<(), UsageError> {
     if args.workers.is_some() {
         let message = "--workers is for the server that perturb starts itself; give it to perturb-server instead";
-        return Err(UsageError(message.into()).into());
+        return Err(UsageError(message.into()));
     }
-    Ok(Servers::connect(&args.server)?)
+    Ok(())
 }

@@ -20,3 +20,10 @@ pub(super) fn ensure() {
     let error = Command::new(program).arg0(name).args(arguments).env(VARIABLE, "1").exec();
     tracing::warn!(%error, "cannot start again with {VARIABLE}=1");
 }
+
+/// Makes a program that is started compute on one thread, unless the variable has a value already.
+pub(super) fn set(command: &mut Command) {
+    if std::env::var_os(VARIABLE).is_none() {
+        command.env(VARIABLE, "1");
+    }
+}

@@ -177,6 +177,41 @@ impl<'a> Session<'a> {
         })
     }
 
+    /// Begins a new trial in the environment of `slot`, whose named parameters have the given values from now on; the
+    /// others keep the version's distributions. `seed` replaces its seed, and its episodes count from 0 again. Writes the
+    /// first observation `[O]` to its place in `observations` `[N, O]`.
+    ///
+    /// # Errors
+    /// [`ClientError::Refused`] if there is no such parameter, or if a value is out of its bounds; the failures of a
+    /// connection.
+    pub fn reset_with(
+        &mut self,
+        slot: usize,
+        parameters: &[(&str, f64)],
+        seed: u64,
+        observations: &mut [f32],
+    ) -> Result<(), ClientError> {
+        let what = "a reset with parameters";
+        let fixed = |value: f64| proto::Distribution { intervals: vec![proto::Interval { low: value, high: value }] };
+        let Self { servers, parts, observation_size: size, .. } = self;
+        let Some(part) = parts.iter_mut().find(|part| part.range.contains(&slot)) else { return Ok(()) };
+        let request = proto::Reset {
+            mask: part.range.clone().map(|other| u8::from(other == slot)).collect(),
+            seeds: vec![seed],
+            parameters: parameters.iter().map(|(name, value)| ((*name).to_owned(), fixed(*value))).collect(),
+            ..proto::Reset::default()
+        };
+        servers.runtime().block_on(async {
+            part.send(what, Request::Reset(request), servers).await?;
+            match part.receive(what, servers).await? {
+                Response::Reset(done) => {
+                    part.decode(what, "observations", &done.observations, &mut observations[slot * *size..][..*size])
+                }
+                other => Err(part.unexpected(what, &other, "ResetDone")),
+            }
+        })
+    }
+
     /// Saves every environment whole: N opaque snapshots in order of slots. Changes nothing. All servers work at the same
     /// time.
     ///

@@ -47,14 +47,22 @@ struct Record {
 /// The row of `environment` (e.g. "CartPole"), `algorithm` and `architecture` (e.g. "ppo", "ff"; upper or lower case);
 /// `None` if the paper has none. Only algorithms without trials are looked up.
 pub fn row(environment: &str, algorithm: &str, architecture: &str) -> Option<Row> {
-    let records: Vec<Record> = csv::Reader::from_reader(TABLE.as_bytes())
-        .deserialize::<Record>()
-        .filter_map(Result::ok) // the test reads every line
+    row_with_trials(environment, algorithm, architecture, None)
+}
+
+/// The same for algorithms whose trials have so many episodes. The environment "Average" is the mean of all six.
+pub fn row_with_trials(
+    environment: &str,
+    algorithm: &str,
+    architecture: &str,
+    episodes_per_trial: Option<u32>,
+) -> Option<Row> {
+    let records: Vec<Record> = records()
         .filter(|record| {
             record.environment == environment
                 && record.algorithm.eq_ignore_ascii_case(algorithm)
                 && record.architecture.eq_ignore_ascii_case(architecture)
-                && record.episodes_per_trial.is_none()
+                && record.episodes_per_trial == episodes_per_trial
         })
         .collect();
     let cell = |metric: &str| {
@@ -66,6 +74,20 @@ pub fn row(environment: &str, algorithm: &str, architecture: &str) -> Option<Row
         interpolation: cell("interpolation")?,
         extrapolation: cell("extrapolation")?,
     })
+}
+
+/// Algorithm, architecture and episodes in a trial of each row of `environment`.
+pub fn rows_of(environment: &str) -> Vec<(String, String, Option<u32>)> {
+    let mut rows: Vec<_> = records()
+        .filter(|record| record.environment == environment)
+        .map(|record| (record.algorithm, record.architecture, record.episodes_per_trial))
+        .collect();
+    rows.dedup(); // a row's metrics stand together
+    rows
+}
+
+fn records() -> impl Iterator<Item = Record> {
+    csv::Reader::from_reader(TABLE.as_bytes()).into_deserialize().filter_map(Result::ok) // the test reads every line
 }
 
 #[cfg(test)]
@@ -84,5 +106,9 @@ mod tests {
         assert_eq!(row.default, Cell { mean: 100.0, std: 0.0 });
         assert_eq!(row.extrapolation.to_string(), "86.2 ± 12.6");
         assert_eq!(super::row("CartPole", "ppo", "transformer"), None);
+        assert_eq!(super::row("Pendulum", "rl2-a2c", "rc"), None, "it has trials");
+        let with = |trials| row_with_trials("Average", "rl2-a2c", "rc", Some(trials)).unwrap().default.mean;
+        assert_eq!([1, 2, 5].map(with), [66.83, 45.79, 41.08]);
+        assert_eq!(rows_of("Hopper").len(), 14);
     }
 }

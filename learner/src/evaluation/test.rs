@@ -1,7 +1,7 @@
 //! Testing a checkpoint on a version of its environment.
 
 use rand::Rng;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::protocol::Version;
 use super::statistics::{mean, wilson};
@@ -15,7 +15,7 @@ use crate::random::{Purpose, stream};
 const MOST_ENVS: u64 = 100;
 
 /// Figures over test episodes.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TestResult {
     /// Episodes tested.
     pub episodes: u64,
@@ -99,6 +99,23 @@ pub fn test(
     let mut reply = StepReply::default();
     let mut session = Session::open(servers, &options, &mut reply.observations)?;
     check_unchanged(checkpoint, EnvironmentSummary::of(session.environment()))?;
+    let episodes = play(&mut session, reply.observations, checkpoint, &quotas, seed, stop, &mut report)?;
+    Ok(summarise(&episodes))
+}
+
+/// Lets the policy act in the environments of `session`, which are at their first `observations` `[N, O]`, until each has
+/// ended as many episodes as `quotas` `[N]` says, and returns these. Calls `report` with their number.
+pub(crate) fn play(
+    session: &mut Session<'_>,
+    observations: Vec<f32>,
+    checkpoint: &Checkpoint,
+    quotas: &[u64],
+    seed: u64,
+    stop: &StopFlag,
+    report: &mut dyn FnMut(u64),
+) -> Result<Vec<EndedEpisode>, TestError> {
+    let state = &checkpoint.state;
+    let mut reply = StepReply { observations, ..StepReply::default() };
     let mut actor = Actor::new(&state.policy, quotas.len());
     let mut inputs = state.inputs(quotas.len());
     actor.load(&checkpoint.weights)?;
@@ -107,6 +124,7 @@ pub fn test(
     let mut actions = Vec::new();
     let mut done = vec![false; quotas.len()];
     let mut counted: Vec<EndedEpisode> = Vec::new();
+    let episodes: u64 = quotas.iter().sum();
     while (counted.len() as u64) < episodes {
         if let Some(signal) = stop.signal() {
             return Err(TestError::Stopped { signal });
@@ -129,10 +147,10 @@ pub fn test(
             inputs.forget(end.slot);
         }
         // Environments that are done go on, unseen: they cost less than a smaller batch would save.
-        count(reply.ended.drain(..), &quotas, &mut counted);
+        count(reply.ended.drain(..), quotas, &mut counted);
         report(counted.len() as u64);
     }
-    Ok(summarise(&counted))
+    Ok(counted)
 }
 
 /// What a test opens of a policy without trials.
@@ -170,7 +188,8 @@ fn summarise(episodes: &[EndedEpisode]) -> TestResult {
     }
 }
 
-fn check_unchanged(checkpoint: &Checkpoint, served: Option<EnvironmentSummary>) -> Result<(), TestError> {
+/// Whether the served environment is the one that the policy was trained in.
+pub(crate) fn check_unchanged(checkpoint: &Checkpoint, served: Option<EnvironmentSummary>) -> Result<(), TestError> {
     let (trained, environment) = (&checkpoint.state.environment_spec, checkpoint.state.environment.clone());
     let advice = "test with the version of perturb that trained it, or train again";
     let (what, trained, served) = match served {

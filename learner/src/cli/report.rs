@@ -1,0 +1,74 @@
+//! `perturb report` and `perturb curves`.
+
+use std::io::Write;
+use std::path::Path;
+
+use anyhow::{Context, Result};
+
+use super::Ending;
+use super::args::{CurvesArgs, ReportArgs};
+use crate::experiment::plot::{Quantity, draw_curves, save, svg};
+use crate::experiment::report::{Report, csv_files, html, markdown, text};
+use crate::experiment::{EnvironmentCurves, Folder, Plan, Results, curves_csv, read_curves};
+
+pub(super) fn run(args: &ReportArgs) -> Result<Ending> {
+    let folder = Folder::new(&args.dir);
+    let plan = Plan::load(&folder.require_plan()?)?;
+    let results = Results::read(&plan, &folder)?;
+    let groups = results.select();
+    let report = Report::new(&results, &groups);
+    write!(std::io::stdout(), "{}", text(&report))?;
+
+    let out = args.dir.join("report");
+    write_file(&out.join("report.md"), markdown(&report).as_bytes())?;
+    for (name, content) in csv_files(&results, &groups)? {
+        write_file(&out.join(name), &content)?;
+    }
+    if let Some(path) = &args.html {
+        let mut figures = Vec::new();
+        for curves in read_curves(&results, &groups, &folder)?.iter().filter(|curves| !curves.curves.is_empty()) {
+            for quantity in Quantity::ALL {
+                let caption = format!(
+                    "{}: {quantity} while training, of the selected configurations, as means over runs with their \
+                     standard deviation as a band",
+                    curves.environment
+                );
+                figures.push((caption, svg(&draw_curves(curves, quantity))?));
+            }
+        }
+        write_file(path, html(&report, &figures).as_bytes())?;
+    }
+    eprintln!("\nthe tables are also in {}", out.display());
+    Ok(Ending::Done)
+}
+
+pub(super) fn curves(args: &CurvesArgs) -> Result<Ending> {
+    let folder = Folder::new(&args.dir);
+    let plan = Plan::load(&folder.require_plan()?)?;
+    let results = Results::read(&plan, &folder)?;
+    let all: Vec<EnvironmentCurves> = read_curves(&results, &results.select(), &folder)?;
+    let out = args.out.clone().unwrap_or_else(|| args.dir.join("report"));
+    write_file(&out.join("curves.csv"), &curves_csv(&all)?)?;
+    let mut stdout = std::io::stdout();
+    for curves in &all {
+        if curves.curves.is_empty() {
+            eprintln!("{}: no finished training with a monitor.csv", curves.environment);
+            continue;
+        }
+        for quantity in Quantity::ALL {
+            let path = out.join(format!("{}-{quantity}.svg", curves.environment));
+            save(&draw_curves(curves, quantity), &path)?;
+            writeln!(stdout, "{} and .png", path.display())?;
+        }
+    }
+    writeln!(stdout, "{}", out.join("curves.csv").display())?;
+    Ok(Ending::Done)
+}
+
+/// Writes a file, and the folders above it if they are not there.
+pub(super) fn write_file(path: &Path, content: &[u8]) -> Result<()> {
+    if let Some(parent) = path.parent().filter(|parent| !parent.as_os_str().is_empty()) {
+        std::fs::create_dir_all(parent).with_context(|| format!("cannot create {}", parent.display()))?;
+    }
+    std::fs::write(path, content).with_context(|| format!("cannot write {}", path.display()))
+}

@@ -1,0 +1,151 @@
+use super::*;
+
+const SMALL: &str = "
+environments = ['CartPole', 'Pendulum']
+versions = ['D', 'E']
+runs = 2
+seed = 7
+test_episodes = 30
+settings = { episodes = 50 }
+
+[[algorithm]]
+name = 'a2c'
+architectures = ['ff', 'rc']
+settings = { num_envs = 4 }
+grid = { n_steps = [5, 10], learning_rate = [7e-3, 7e-4, 7e-5] }
+
+[[algorithm]]
+name = 'ppo'
+architectures = ['ff']
+";
+
+fn parse(text: &str) -> Result<Plan, PlanError> {
+    Plan::parse("small.toml", text.to_owned())
+}
+
+fn refusal(from: &str, to: &str) -> String {
+    assert!(SMALL.contains(from), "{from}");
+    parse(&SMALL.replacen(from, to, 1)).unwrap_err().to_string()
+}
+
+#[test]
+fn a_file_expands_to_the_product_of_its_lists() {
+    let plan = parse(SMALL).unwrap();
+    // (2 architectures × 6 grid points + 1) configurations × 2 environments × 2 versions.
+    let expected = Counts { configurations: 13, trainings: 52, pairs: 156, all_pairs: 312, runs: 2 };
+    assert_eq!(plan.counts(), expected);
+    assert!(plan.cells.iter().enumerate().all(|(index, cell)| cell.index == index));
+    assert_eq!(plan.environments(), ["CartPole", "Pendulum"]);
+    let learners: Vec<String> = plan.learners().iter().map(ToString::to_string).collect();
+    assert_eq!(learners, ["a2c ff", "a2c rc", "ppo ff"]);
+}
+
+#[test]
+fn a_cell_has_all_settings_and_the_seed_of_its_run() {
+    let plan = parse(SMALL).unwrap();
+    let expected = |run: u32, version: &str| {
+        let seed = 6 + run;
+        let text = format!(
+            "environment = 'CartPole'\nversion = '{version}'\nalgorithm = 'a2c'\narchitecture = 'ff'\nepisodes = 50\n\
+             num_envs = 4\nlearning_rate = 7e-3\nn_steps = 5\nseed = {seed}"
+        );
+        TrainConfig::from_table("", text.parse().unwrap()).unwrap()
+    };
+    for (index, run, version) in [(0, 1, "D"), (1, 2, "D"), (2, 1, "E"), (3, 2, "E")] {
+        let cell = &plan.cells[index];
+        assert_eq!((&cell.config, cell.run), (&expected(run, version), run));
+        assert_eq!(cell.tests, Tests { episodes: 30, versions: Version::ALL.to_vec() });
+    }
+    assert_eq!(plan.cells[0].configuration, plan.cells[3].configuration);
+    assert_ne!(plan.cells[0].configuration, plan.cells[4].configuration, "the next point of the grid");
+}
+
+#[test]
+fn an_id_names_a_cell_whatever_else_the_plan_has() {
+    let plan = parse(SMALL).unwrap();
+    let ids: BTreeSet<&str> = plan.cells.iter().map(|cell| cell.id.as_str()).collect();
+    assert_eq!(ids.len(), plan.cells.len());
+    let larger = SMALL.replace("runs = 2", "runs = 3").replace("['CartPole'", "['Hopper', 'CartPole'");
+    let larger = parse(&larger.replace("[5, 10]", "[1, 5, 10]")).unwrap();
+    for cell in &plan.cells {
+        let same = larger.find(&cell.id).unwrap_or_else(|| panic!("{} is gone", cell.id));
+        assert_eq!((&same.config, same.run), (&cell.config, cell.run));
+    }
+    for (from, to) in [("test_episodes = 30", "test_episodes = 31"), ("episodes = 50", "episodes = 51")] {
+        let other = parse(&SMALL.replacen(from, to, 1)).unwrap();
+        assert!(other.cells.iter().all(|cell| !ids.contains(cell.id.as_str())), "{to}");
+    }
+    assert_eq!(plan.find("3"), Some(&plan.cells[3]));
+    assert_eq!(plan.find(&plan.cells[5].id), Some(&plan.cells[5]));
+    assert_eq!(plan.find("104"), None);
+}
+
+#[test]
+fn an_invalid_cell_is_refused_with_its_table_and_key() {
+    for (from, to, parts) in [
+        ("7e-3,", "-1,", &["small.toml: [[algorithm]] 1 (a2c): [algorithm.grid]: learning_rate is -1"][..]),
+        ("num_envs = 4", "num_envs = 0", &["[[algorithm]] 1 (a2c): [algorithm.settings]: num_envs is 0"]),
+        ("episodes = 50 }", "gama = 0.9 }", &["(a2c): [settings]:", "unknown key `gama`"]),
+        ("n_steps = [5, 10]", "n_epochs = [1]", &["[algorithm.grid]:", "unknown key `n_epochs`; a2c's keys are"]),
+        ("'a2c'", "'a3c'", &["[[algorithm]] 1 (a3c): algorithm is \"a3c\""]),
+        ("'ff', 'rc'", "'ff', 'cnn'", &["(a2c): architecture is \"cnn\""]),
+    ] {
+        let message = refusal(from, to);
+        for part in parts {
+            assert!(message.contains(part), "{to}: {message}");
+        }
+    }
+}
+
+#[test]
+fn an_invalid_plan_is_refused_with_its_key() {
+    for (from, to, part) in [
+        ("runs = 2", "runs = 0", "runs is 0, but must be at least 1"),
+        ("runs = 2", "run = 2", "unknown field `run`"),
+        ("seed = 7", "seed = -7", "seed"),
+        ("seed = 7", "seed = 9223372036854775807", "seed is 9223372036854775807, but must be at most"),
+        ("test_episodes = 30", "test_episodes = 0", "test_episodes is 0"),
+        ("['CartPole', 'Pendulum']", "[]", "environments is empty"),
+        ("['CartPole', 'Pendulum']", "['CartPole', 'CartPole']", "a list without repetitions"),
+        ("['CartPole', 'Pendulum']", "['../CartPole']", "environments is `../CartPole`, but must be names of letters"),
+        ("versions = ['D', 'E']", "versions = ['X']", "unknown variant `X`"),
+        ("n_steps = [5, 10]", "n_steps = 5", "[algorithm.grid] n_steps is 5, but must be a list"),
+        ("n_steps = [5, 10]", "n_steps = []", "[algorithm.grid] n_steps is empty"),
+        ("n_steps = [5, 10]", "num_envs = [5, 10]", "num_envs is in both"),
+        ("num_envs = 4", "seed = 4", "[algorithm.settings] seed is 4, but must be left out"),
+        ("name = 'ppo'\narchitectures = ['ff']", "name = 'ppo'\narchitectures = []", "(ppo): architectures is empty"),
+    ] {
+        let message = refusal(from, to);
+        assert!(message.contains("small.toml") && message.contains(part), "{to}: {message}");
+    }
+}
+
+#[test]
+fn a_cell_asked_for_twice_is_refused() {
+    let message = parse(&format!("{SMALL}\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\nversions = ['E']"))
+        .unwrap_err()
+        .to_string();
+    assert!(
+        message.contains("[[algorithm]] 2 (ppo) and [[algorithm]] 3 (ppo) both ask for CartPole-ppo-ff-E-"),
+        "{message}"
+    );
+}
+
+#[test]
+fn a_table_may_choose_its_environments_and_versions() {
+    let text = format!("{SMALL}environments = ['Acrobot']\nversions = ['R']");
+    let plan = parse(&text).unwrap();
+    let last = &plan.cells[plan.cells.len() - 1].config.common;
+    assert_eq!((last.environment.as_str(), last.version), ("Acrobot", Version::R));
+    assert_eq!(plan.counts().trainings, 49);
+}
+
+#[test]
+fn trials_of_different_lengths_are_different_learners() {
+    let text = "environments = ['CartPole']
+        [[algorithm]]\nname = 'rl2-a2c'\narchitectures = ['rc']\nsettings = { episodes_per_trial = 1 }
+        [[algorithm]]\nname = 'rl2-a2c'\narchitectures = ['rc']
+        [[algorithm]]\nname = 'epopt-a2c'\narchitectures = ['rc']";
+    let learners: Vec<String> = parse(text).unwrap().learners().iter().map(ToString::to_string).collect();
+    assert_eq!(learners, ["rl2-a2c rc N=1", "rl2-a2c rc N=2", "epopt-a2c rc"]);
+}
