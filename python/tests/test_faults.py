@@ -128,13 +128,17 @@ def test_a_reset_finds_a_server_that_runs_again(start_server: Callable[..., Any]
         env.close()
 
 
-def test_parameters_of_some_environments_are_not_forgotten_silently(start_server: Callable[..., Any]) -> None:
+@pytest.mark.parametrize("by", ["mask", "snapshot"])
+def test_parameters_of_some_environments_are_not_forgotten_silently(by: str, start_server: Callable[..., Any]) -> None:
     with tempfile.TemporaryDirectory() as directory:
         listen = f"unix:{directory}/server.sock"
         running = start_server(listen=listen)
         envs = perturb.PerturbVectorEnv("CartPole", 2, server=listen)
         envs.reset(seed=1)
-        envs.reset(options={"parameters": {"mass": 0.3}, "reset_mask": np.array([True, False])})
+        if by == "mask":
+            envs.reset(options={"parameters": {"mass": 0.3}, "reset_mask": np.array([True, False])})
+        else:
+            envs.restore(envs.snapshot())
         running.process.kill()
         running.process.wait()
         start_server(listen=listen)
@@ -226,6 +230,7 @@ def test_the_private_server_is_shared_and_ends_with_its_last_environment() -> No
     one.reset(seed=1)
     shared = private()
     assert shared is not None
+    assert os.getpgid(shared.process.pid) != os.getpgid(0), "Ctrl-C would end it"
     other.reset(seed=1)
     assert private() is shared
     one.close()
@@ -249,8 +254,9 @@ def test_a_forgotten_environment_gives_its_server_back() -> None:
 
 
 def test_a_private_server_that_is_killed_is_told_and_replaced() -> None:
-    env = perturb.PerturbEnv("CartPole")
+    env, other = perturb.PerturbEnv("CartPole"), perturb.PerturbEnv("CartPole")
     env.reset(seed=1)
+    other.reset(seed=1)
     shared = private()
     assert shared is not None
     shared.process.kill()
@@ -259,6 +265,9 @@ def test_a_private_server_that_is_killed_is_told_and_replaced() -> None:
     env.reset(seed=1)
     env.step(0)
     assert private() is not shared
+    with within(SECONDS), pytest.raises(perturb.ServerConnectionError, match="ended with status -9"):
+        other.step(0)
+    env.step(0)  # the other's share was of the server that is gone
     env.close()
     assert private() is None
 
@@ -268,10 +277,10 @@ import perturb, sys, os, time
 from perturb import local_server
 env = perturb.PerturbEnv("CartPole")
 env.reset(seed=1)
-print(local_server._shared.process.pid, flush=True)
 if {fork}:
     if os.fork() == 0:
         time.sleep(60)
+print(local_server._shared.process.pid, flush=True)
 sys.stdin.readline() if {wait} else None
 """
 
@@ -318,7 +327,7 @@ def test_a_program_that_is_no_server_is_said(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_settings_of_other_servers_do_not_reach_the_private_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PERTURB_SERVER_MAX_ENVS", "1")
+    monkeypatch.setenv("PERTURB_SERVER_WORKERS", "0")  # with which no server starts
     envs = perturb.PerturbVectorEnv("CartPole", 20_000)  # more than the default, too
     envs.reset()
     envs.close()
@@ -365,6 +374,25 @@ def test_an_environment_opens_its_session_in_the_process_that_uses_it(own: bool,
     assert in_fork(both) == [expected, expected]
     assert used.step(1)[0].tobytes() == expected, "the parent's session goes on"
     used.close()
+
+
+FORKING = """
+import os, perturb
+env = perturb.PerturbEnv("CartPole", server={address!r})
+env.reset(seed=1)
+child = os.fork()
+env.reset(seed=1)
+env.step(0)
+if child:
+    assert os.waitpid(child, 0)[1] == 0
+    print("both went on")
+"""
+
+
+def test_grpc_prepares_for_forks(server: str) -> None:
+    """Otherwise it says that it does not, and whether the child hangs is a matter of luck."""
+    output, errors = python(FORKING.format(address=server)).communicate(timeout=60)
+    assert (output, errors) == ("both went on\n", "")
 
 
 @pytest.mark.parametrize("own", [False, True])

@@ -67,6 +67,7 @@ def test_a_batch_gives_what_gymnasium_makes_of_single_environments(
     """Observations, rewards, flags and infos, with their structure, types and masks."""
     identifier, n, steps = f"perturb/{name}-v0", 5, 150
     settings: dict[str, Any] = {"version": "E", "server": server, "receipts": receipts, "reward_terms": True}
+    settings["episodes_per_trial"] = 2
     ours = gymnasium.make_vec(identifier, num_envs=n, autoreset_mode=mode, **settings)
 
     def single(i: int) -> gymnasium.Env[Any, Any]:

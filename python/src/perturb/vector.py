@@ -177,7 +177,9 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
 
     def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002
         """Free the environments on the server."""
-        self._client.close()
+        # An environment whose settings were refused has no client. Older Gymnasiums close it all the same.
+        if hasattr(self, "_client"):
+            self._client.close()
 
     def _seeds(self, seed: int | Sequence[int] | None) -> list[int]:
         if seed is None:
