@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 import perturb
-from perturb import local_server
+from perturb import local_server, session
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -160,6 +160,20 @@ def test_a_server_that_hangs_is_given_up(start_server: Callable[..., Any]) -> No
         env.reset()
     running.process.send_signal(signal.SIGCONT)
     env.reset()
+
+
+def test_a_server_that_answers_no_pings_is_given_up(
+    start_server: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With other limits, since the real ones are half a minute; the limit of replies, a minute, has no part in it."""
+    monkeypatch.setattr(session, "KEEPALIVE_INTERVAL", 1)
+    monkeypatch.setattr(session, "KEEPALIVE_LIMIT", 1)
+    running = start_server(listen="tcp://127.0.0.1:0")
+    env = perturb.PerturbEnv("CartPole", server=running.address)
+    env.reset(seed=1)
+    running.process.send_signal(signal.SIGSTOP)
+    with within(2 * SECONDS), pytest.raises(perturb.ServerConnectionError, match="lost the server"):
+        env.step(0)
 
 
 def test_what_is_no_perturb_server_is_said() -> None:

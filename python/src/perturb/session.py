@@ -45,8 +45,9 @@ SERVICE = pb.DESCRIPTOR.services_by_name["Perturb"].full_name
 REPLIES = {"open": "opened", "step": "stepped", "reset": "reset", "snapshot": "snapshot", "restore": "restore"}
 # How long a connection may take to be made, s.
 CONNECT_LIMIT = 10
-# How often a silent server is asked whether its host lives, and how long it may take to answer, s.
-KEEPALIVE_INTERVAL, KEEPALIVE_LIMIT = 10, 5
+# How often a silent server is asked whether it lives, and how long it may take to answer, s. A very busy machine is no
+# reason to lose environments; the sockets of a server that ended are closed by its system at once.
+KEEPALIVE_INTERVAL, KEEPALIVE_LIMIT = 10, 20
 # How often the watchdog looks for requests that are overdue, s.
 WATCH_INTERVAL = 0.25
 
@@ -223,6 +224,8 @@ def _channel_options(address: Address) -> list[tuple[str, int | str]]:
         ("grpc.min_reconnect_backoff_ms", CONNECT_LIMIT * 1000),  # this is also the limit of the first attempt
         ("grpc.keepalive_time_ms", KEEPALIVE_INTERVAL * 1000),
         ("grpc.keepalive_timeout_ms", KEEPALIVE_LIMIT * 1000),
+        # Pings of other purposes, which hold back those of keepalive, would be waited for for a minute.
+        ("grpc.http2.ping_timeout_ms", (KEEPALIVE_INTERVAL + KEEPALIVE_LIMIT) * 1000),
         ("grpc.http2.max_pings_without_data", 0),
     ]
     if address.local:
