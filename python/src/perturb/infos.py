@@ -72,20 +72,17 @@ class BatchInfos:
         self._num_envs = num_envs
         self.infos: dict[str, Any] = {}
 
-    def started(self, starts: Sequence[pb.EpisodeStart]) -> None:
-        """Add new episodes, which came with receipts."""
-        if starts:
-            self._receipts(starts, [start.slot for start in starts])
-
-    def ended(self, ends: Sequence[pb.EpisodeEnd]) -> None:
-        """Add ended episodes."""
-        if not ends:
-            return
-        slots = [end.slot for end in ends]
-        self._put(self.infos, "is_success", slots, np.array([end.success for end in ends]))
-        self._put(self.infos, "diverged", slots, np.array([end.diverged for end in ends]))
-        if ends[0].HasField("receipt"):
-            self._receipts(ends, slots)
+    def episodes(self, ends: Sequence[pb.EpisodeEnd], starts: Sequence[pb.EpisodeStart]) -> None:
+        """Add episodes that ended, and others that began, which come only with receipts. Called once."""
+        if ends:
+            slots = [end.slot for end in ends]
+            self._put(self.infos, "is_success", slots, np.array([end.success for end in ends]))
+            self._put(self.infos, "diverged", slots, np.array([end.diverged for end in ends]))
+        begun_or_ended: list[pb.EpisodeStart | pb.EpisodeEnd] = [*starts]
+        if ends and ends[0].HasField("receipt"):
+            begun_or_ended += ends
+        if begun_or_ended:
+            self._receipts(begun_or_ended, [message.slot for message in begun_or_ended])
 
     def terms(self, terms: NDArray[np.float32], slots: NDArray[np.intp]) -> None:
         """Add the reward terms [N, terms] of the environments that took a step."""
@@ -104,13 +101,14 @@ class BatchInfos:
         self.infos["final_info"] = ended.infos
         self._mark(self.infos, "final_info", slots)
 
-    def _receipts(self, messages: Sequence[pb.EpisodeStart] | Sequence[pb.EpisodeEnd], slots: Sequence[int]) -> None:
+    def _receipts(self, messages: Sequence[pb.EpisodeStart | pb.EpisodeEnd], slots: Sequence[int]) -> None:
         names = self._names
         episodes = [message.episode for message in messages]
         receipts = [message.receipt for message in messages]
         trials = np.array([episode.trial_index for episode in episodes])
-        requested = np.array([receipt.requested for receipt in receipts], dtype=np.float64)
-        applied = np.array([receipt.applied for receipt in receipts], dtype=np.float64)
+        # A slice is a list, which NumPy reads thirty times as fast as protobuf's own container.
+        requested = np.array([receipt.requested[:] for receipt in receipts])
+        applied = np.array([receipt.applied[:] for receipt in receipts])
         self._put(self.infos, "context_id", slots, trials)
         self._put_named(self.infos, "parameters", slots, names.parameters, requested)
         receipt = self._nested(self.infos, "receipt", slots)
@@ -130,8 +128,11 @@ class BatchInfos:
         values: NDArray[np.float64],
     ) -> None:
         nested = self._nested(infos, key, slots)
-        for name, column in zip(names, values.T, strict=True):
-            self._put(nested, name, slots, column)
+        mask = infos[f"_{key}"]
+        rows = np.zeros((len(names), self._num_envs))
+        rows[:, slots] = values.T
+        for name, row in zip(names, rows, strict=True):
+            nested[name], nested[f"_{name}"] = row, mask.copy()
 
     def _nested(self, infos: dict[str, Any], key: str, slots: Sequence[int] | NDArray[np.intp]) -> dict[str, Any]:
         nested: dict[str, Any] = infos.setdefault(key, {})

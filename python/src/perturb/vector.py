@@ -129,7 +129,7 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         if opened is None or seeds or parameters or states:
             done = self._client.reset(mask, [seeds[i] for i in selected] if seeds else [], parameters, states)
         collected = BatchInfos(self._client.names, self.num_envs)
-        collected.started(done.started)
+        collected.episodes([], done.started)
         return self._merge(done.observations, mask), collected.infos
 
     def step(
@@ -222,11 +222,14 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
             infos.final_observations(finals.copy(), slots)
             infos.final_infos(ended, slots)
             moved[slots] = False
-        ended.ended(stepped.ended)
+        if ended is infos:
+            infos.episodes(stepped.ended, stepped.started)
+        else:
+            ended.episodes(stepped.ended, [])
+            infos.episodes([], stepped.started)
         if self._reward_terms:
             terms = self._client.floats(stepped.reward_terms, self.num_envs, len(names.reward_terms))
             infos.terms(terms, np.flatnonzero(moved))
             if ended is not infos:
                 ended.terms(terms, np.array(slots, dtype=np.intp))
-        infos.started(stepped.started)
         return infos.infos
