@@ -3,7 +3,10 @@
 # Debian 12's packages: a compiler, libclang for bindgen, MuJoCo, libtorch, and a BLAS that is not the slow reference one.
 PACKAGES := build-essential pkg-config libclang-dev libmujoco-dev libtorch-dev libopenblas0-pthread
 CARGO_DENY_VERSION := 0.20.2
-PROGRAMS := $(or $(CARGO_TARGET_DIR),target)/release
+TARGET := $(or $(CARGO_TARGET_DIR),target)
+PROGRAMS := $(TARGET)/release
+# The Python package's tools are in an environment of their own.
+VENV := $(TARGET)/python
 
 # Arguments of `make demo`, `make bench` and `make all-pairs`, e.g. make demo DEMO_ARGS="--episodes 200 --test-episodes 50",
 # make all-pairs ALL_PAIRS_ARGS="20 /tmp/runs": episodes, directory.
@@ -19,15 +22,10 @@ export OPENBLAS_NUM_THREADS := 1
 ALL := --workspace --release --locked
 WITHOUT_MUJOCO := --package perturb --no-default-features --release --locked
 
-.DEFAULT_GOAL := help
-.PHONY: help deps toolchain build demo all-pairs test lint bench audit cargo-deny
-
-help: ## this list
-	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
-
-deps: toolchain ## install the missing Debian packages, with sudo if need be
-	@missing=; \
-	for package in $(PACKAGES); do \
+# Installs those of the Debian packages $(1) that are missing.
+define install
+missing=; \
+	for package in $(1); do \
 		dpkg-query --show --showformat='$${Status}' $$package 2>/dev/null | grep -q 'ok installed' || missing="$$missing $$package"; \
 	done; \
 	[ -n "$$missing" ] || exit 0; \
@@ -41,6 +39,17 @@ deps: toolchain ## install the missing Debian packages, with sudo if need be
 	fi; \
 	echo "Installing with apt-get:$$missing"; \
 	$$as_root apt-get -q update && $$as_root env DEBIAN_FRONTEND=noninteractive apt-get -qy install --no-install-recommends $$missing
+endef
+
+.DEFAULT_GOAL := help
+.PHONY: help deps toolchain build demo all-pairs test lint bench audit cargo-deny python-test python-wheel python-acceptance \
+	python-server python-venv
+
+help: ## this list
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 20
+
+deps: toolchain ## install the missing Debian packages, with sudo if need be
+	@$(call install,$(PACKAGES))
 
 toolchain:
 	@command -v cargo >/dev/null || { echo "cargo is missing; install Rust 1.95 or later, see https://rustup.rs" >&2; exit 1; }
@@ -76,3 +85,34 @@ cargo-deny: toolchain
 		echo "Installing cargo-deny $(CARGO_DENY_VERSION), which takes some minutes"; \
 		cargo install --locked --version $(CARGO_DENY_VERSION) cargo-deny; \
 	}
+
+python-test: $(VENV)/installed python-server ## lint, type-check and test the Python package
+	cd python && $(abspath $(VENV))/bin/ruff check . && $(abspath $(VENV))/bin/ruff format --check .
+	cd python && $(abspath $(VENV))/bin/mypy
+	cd python && PERTURB_SERVER=$(abspath $(PROGRAMS))/perturb-server $(abspath $(VENV))/bin/pytest -q
+
+python-wheel: $(VENV)/installed python-server ## build the Python package, install it in an empty environment, run its loop
+	rm -rf python/dist $(VENV)-empty
+	$(VENV)/bin/python -m build --outdir python/dist python
+	python3 -m venv $(VENV)-empty
+	$(VENV)-empty/bin/pip install -q --disable-pip-version-check python/dist/*.whl
+	PERTURB_SERVER=$(abspath $(PROGRAMS))/perturb-server $(VENV)-empty/bin/python python/examples/ten_lines.py
+
+python-acceptance: $(VENV)/installed python-server ## train with stable-baselines3, measure beside EnvPool; gigabytes, minutes
+	$(VENV)/bin/pip install -q --disable-pip-version-check -r python/requirements-acceptance.txt
+	cd python && PERTURB_SERVER=$(abspath $(PROGRAMS))/perturb-server $(abspath $(VENV))/bin/pytest -q -m slow
+	PERTURB_SERVER=$(abspath $(PROGRAMS))/perturb-server $(VENV)/bin/python python/benchmarks/throughput.py
+
+python-server: deps
+	cargo build --package perturb --release --locked
+
+# The protocol's messages are generated when the package is installed.
+$(VENV)/installed: python/requirements-dev.txt python/pyproject.toml python/hatch_build.py proto/perturb/v1/perturb.proto | python-venv
+	python3 -m venv $(VENV)
+	$(VENV)/bin/pip install -q --disable-pip-version-check -r python/requirements-dev.txt
+	$(VENV)/bin/pip install -q --disable-pip-version-check --no-deps --editable python
+	touch $@
+
+# Debian keeps what fills a new environment in a package of its own.
+python-venv:
+	@command -v python3 >/dev/null && python3 -c 'import ensurepip' 2>/dev/null || { $(call install,python3 python3-venv); }

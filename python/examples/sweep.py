@@ -1,0 +1,49 @@
+"""What if the pole were longer? One batch, each environment with another pole, one simple policy. Needs nothing more.
+
+Every environment of a batch may have parameters of its own: reset it by a mask. All begin in the same state.
+Run: python sweep.py [--server unix:/path]
+"""
+
+import argparse
+
+import gymnasium
+import numpy as np
+
+import perturb  # noqa: F401  (registers the environments)
+
+
+def main() -> None:
+    """Print how long each pole stays up."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--server", help="unix:/path or host:port; at first a server of its own")
+    lengths = np.array([0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0, 5.0])
+    n = len(lengths)
+
+    server = parser.parse_args().server
+    envs = gymnasium.make_vec("perturb/CartPole-v0", num_envs=n, autoreset_mode="Disabled", server=server)
+    envs.reset(seed=1)
+    for i, length in enumerate(lengths):
+        options = {
+            "reset_mask": np.arange(n) == i,
+            "parameters": {"length": length},
+            "state": [[0, 0, 0.03, 0]],
+        }
+        observations, _ = envs.reset(options=options)
+
+    steps = np.zeros(n, dtype=int)
+    up = np.ones(n, dtype=bool)
+    while up.any():
+        actions = (observations[:, 2] + 0.3 * observations[:, 3] > 0).astype(np.int64)
+        observations, _, terminated, truncated, _ = envs.step(actions)
+        steps += up
+        ended = terminated | truncated
+        up &= ~ended
+        if ended.any():  # the others go on, these begin again and are no longer counted
+            observations, _ = envs.reset(options={"reset_mask": ended})
+    envs.close()
+    for length, count in zip(lengths, steps, strict=True):
+        print(f"half length {length:4.2f} m: {count:3} steps {'#' * (count // 5)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,47 @@
+"""Gymnasium environments whose physics can be changed, served by perturb-server.
+
+Importing this package registers its environments:
+
+    import gymnasium
+    import perturb
+
+    env = gymnasium.make("perturb/Hopper-v0", version="R", server="unix:/tmp/perturb.sock")
+    envs = gymnasium.make_vec("perturb/CartPole-v0", num_envs=64, version="E")
+"""
+
+from importlib.metadata import version as _version
+
+from .env import PerturbEnv
+from .errors import (
+    InvalidArgumentError,
+    OutOfOrderError,
+    PerturbError,
+    ProtocolError,
+    ServerConnectionError,
+    ServerDefectError,
+    ServerFullError,
+    ServerStartError,
+    ServerTimeoutError,
+    UnknownNameError,
+)
+from .registration import register_all as _register_all
+from .vector import PerturbVectorEnv
+
+__version__ = _version("perturb-client")
+
+__all__ = [
+    "InvalidArgumentError",
+    "OutOfOrderError",
+    "PerturbEnv",
+    "PerturbError",
+    "PerturbVectorEnv",
+    "ProtocolError",
+    "ServerConnectionError",
+    "ServerDefectError",
+    "ServerFullError",
+    "ServerStartError",
+    "ServerTimeoutError",
+    "UnknownNameError",
+]
+
+_register_all()

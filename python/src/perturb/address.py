@@ -1,0 +1,73 @@
+"""Addresses of servers."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from dataclasses import dataclass
+
+from .errors import InvalidArgumentError
+
+# The longest path that a Unix socket can have on Linux, in bytes.
+LONGEST_SOCKET_PATH = 107
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where a server listens, as gRPC wants it: `unix:/path` or `host:port`."""
+
+    target: str
+    # Whether the server is on this machine, where no proxy stands between.
+    local: bool
+
+    def __str__(self) -> str:
+        return self.target
+
+
+def parse_address(text: str) -> Address:
+    """Understand `unix:/path`, `host:port`, `http://host:port` and `tcp://host:port`, as the learner does.
+
+    Raises:
+        InvalidArgumentError: with what is wrong with it.
+    """
+
+    def refuse(reason: str) -> InvalidArgumentError:
+        forms = "write unix:/path, host:port, http://host:port or tcp://host:port"
+        return InvalidArgumentError(f"server={text!r} is not a server's address: {reason}; {forms}")
+
+    if not isinstance(text, str):
+        raise refuse("it is no text")
+    if text.startswith("unix:"):
+        path = text.removeprefix("unix:")
+        path = path.removeprefix("//")
+        if not path.startswith("/"):
+            raise refuse("the path of the socket must be absolute")
+        if len(path.encode()) > LONGEST_SOCKET_PATH:
+            raise refuse(f"the path of the socket is longer than the {LONGEST_SOCKET_PATH} bytes that Linux allows")
+        return Address(f"unix:{path}", local=True)
+    if text.startswith("https://"):
+        raise refuse("encrypted connections are not supported, tunnel them instead")
+    rest = text.removeprefix("http://") if text.startswith("http://") else text.removeprefix("tcp://")
+    rest = rest.removesuffix("/")
+    host, separator, port = rest.rpartition(":")
+    if not separator:
+        raise refuse("the port is missing")
+    if not re.fullmatch(r"[0-9]{1,5}", port) or not 1 <= int(port) <= 65535:
+        raise refuse(f"{port!r} is not a port (1 to 65535)")
+    if host.startswith("[") and host.endswith("]"):
+        try:
+            ipaddress.IPv6Address(host[1:-1])
+        except ValueError as error:
+            raise refuse(f"{host[1:-1]!r} is not an IPv6 address") from error
+    elif not re.fullmatch(r"[A-Za-z0-9._-]+", host):
+        raise refuse(f"{host!r} is not a host name; an IPv6 address must stand in brackets")
+    return Address(f"{host}:{port}", local=_is_loopback(host.strip("[]")))
+
+
+def _is_loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

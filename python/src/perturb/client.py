@@ -1,0 +1,173 @@
+"""What a single environment and a batch have in common: settings, and the session that they are sent to."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from . import catalogue, local_server, requests
+from ._proto import perturb_pb2 as pb
+from .address import parse_address
+from .errors import InvalidArgumentError, OutOfOrderError, ProtocolError
+from .infos import Names
+from .session import Session
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from gymnasium.vector import AutoresetMode
+    from numpy.typing import NDArray
+
+# How long a reply may take unless told otherwise, s.
+TIMEOUT = 60.0
+
+
+class Client:
+    """N environments of a server. The session is opened by the first reset, in the process that calls it."""
+
+    def __init__(
+        self,
+        *,
+        environment: str,
+        version: str,
+        num_envs: int,
+        server: str | None,
+        parameters: requests.Parameters | None,
+        first_environment_index: int,
+        episodes_per_trial: int,
+        autoreset_mode: AutoresetMode,
+        receipts: bool,
+        reward_terms: bool,
+        timeout: float,
+        render_mode: str | None,
+    ) -> None:
+        if render_mode is not None:
+            raise InvalidArgumentError(f"render_mode={render_mode!r} is not supported: servers send no pictures")
+        if not timeout > 0:
+            raise InvalidArgumentError(f"timeout={timeout!r}; expected seconds, more than 0")
+        self.description = catalogue.find(environment)
+        self.num_envs = requests.count(num_envs, "num_envs", 1)
+        self._server = None if server is None else parse_address(server)
+        if server is None:
+            local_server.find_program()  # better now than at the first reset
+        self._timeout = timeout
+        self._request = pb.Open(
+            environment=environment,
+            version=requests.version(version),
+            parameters=requests.distributions(parameters),
+            batch_size=self.num_envs,
+            first_environment_index=requests.count(first_environment_index, "first_environment_index", 0),
+            episodes_per_trial=requests.count(episodes_per_trial, "episodes_per_trial", 1),
+            autoreset_mode=requests.autoreset(autoreset_mode),
+            receipts=receipts,
+            reward_terms=reward_terms,
+        )
+        self._partly_changed = False
+        self._session: Session | None = None
+        self._names: Names | None = None
+        self._closed = False
+
+    @property
+    def session(self) -> Session:
+        """The open session.
+
+        Raises:
+            OutOfOrderError: if there is none, or it is gone.
+        """
+        self._require_not_closed()
+        if self._session is None:
+            raise OutOfOrderError("call reset() first: no episode has begun")
+        return self._session
+
+    @property
+    def names(self) -> Names:
+        """The names of what the session's replies hold."""
+        if self._names is None:
+            raise OutOfOrderError("call reset() first: no episode has begun")
+        return self._names
+
+    def open(self, seeds: Sequence[int], generator: np.random.Generator) -> pb.Opened | None:
+        """Open a session, unless one is open. Without seeds, which a reset is to give, the generator draws one.
+
+        Raises:
+            OutOfOrderError: if a session is gone whose environments did not all have the same parameters.
+        """
+        self._require_not_closed()
+        if self._session is not None:
+            if self._session.usable():
+                return None
+            if self._partly_changed:
+                raise OutOfOrderError(
+                    "the session is gone, and earlier resets gave parameters to some of its environments: "
+                    "make the environments anew, and give them again"
+                )
+            self._session.close()
+            self._session = None
+        session = Session(self._server, self._timeout)
+        try:
+            self._request.seed = seeds[0] if seeds else int(generator.integers(2**63))
+            opened = session.open(self._request)
+            self.description.require_equal(opened.environment)
+        except BaseException:
+            session.close()
+            raise
+        self._session, self._names = session, Names(opened.environment)
+        return opened
+
+    def reset(
+        self,
+        mask: NDArray[np.bool_] | None,
+        seeds: Sequence[int],
+        parameters: dict[str, pb.Distribution],
+        states: bytes,
+    ) -> pb.ResetDone:
+        """Begin new episodes. Parameters stay, also if the session has to be opened again."""
+        request = pb.Reset(mask=_bytes(mask), seeds=seeds, parameters=parameters, states=states)
+        done = self.session.reset(request)
+        if parameters and mask is not None and not mask.all():
+            self._partly_changed = True
+        elif parameters:
+            for name, distribution in parameters.items():
+                self._request.parameters[name].CopyFrom(distribution)
+        return done
+
+    def snapshot(self, mask: NDArray[np.bool_] | None) -> list[bytes]:
+        """Save the selected environments."""
+        return list(self.session.snapshot(pb.Snapshot(mask=_bytes(mask))).snapshots)
+
+    def restore(self, snapshots: Sequence[bytes], mask: NDArray[np.bool_] | None) -> pb.Restored:
+        """Bring saved environments back."""
+        if not all(isinstance(snapshot, bytes) for snapshot in snapshots):
+            raise InvalidArgumentError("a snapshot is not of the type bytes; expected what snapshot() returned")
+        # From here on nobody but the server knows the parameters.
+        self._partly_changed = True
+        return self.session.restore(pb.Restore(mask=_bytes(mask), snapshots=snapshots))
+
+    def floats(self, data: bytes, *shape: int) -> NDArray[np.float32]:
+        """Look at a reply's numbers as a read-only array, without a copy."""
+        size = int(np.prod(shape)) * 4
+        if len(data) != size:
+            raise ProtocolError(f"the server sent {len(data)} bytes for float32 {list(shape)}; expected {size}")
+        return np.frombuffer(data, "<f4").reshape(shape)
+
+    def flags(self, data: bytes) -> NDArray[np.bool_]:
+        """Copy flags [N]."""
+        if len(data) != self.num_envs:
+            raise ProtocolError(f"the server sent {len(data)} flags; expected {self.num_envs}")
+        return np.frombuffer(data, np.bool_).copy()
+
+    def close(self) -> None:
+        """Close the session; this process's own server ends with its last session."""
+        self._closed = True
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    def _require_not_closed(self) -> None:
+        if self._closed:
+            raise OutOfOrderError("the environment was closed; make it anew")
+
+
+def _bytes(mask: NDArray[np.bool_] | None) -> bytes:
+    return b"" if mask is None else mask.tobytes()

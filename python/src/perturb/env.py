@@ -1,0 +1,149 @@
+"""A single environment, as `gymnasium.Env`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from . import requests
+from .client import TIMEOUT, Client
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from gymnasium import spaces
+
+OPTIONS = ("parameters", "state")
+
+
+class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
+    """One environment of a perturb-server.
+
+    Args:
+        environment: `CartPole`, `MountainCar`, `Acrobot`, `Pendulum`, `HalfCheetah` or `Hopper`.
+        version: where parameters come from: `D` their defaults, `R` random, `E` extreme.
+        server: `unix:/path` or `host:port`; None starts a server of this process's own.
+        parameters: replaces the version's set of the named parameters: a value, an interval `(low, high)`, or several
+            `[(low, high), …]`.
+        environment_index: fixes all randomness, together with the seed. Environment i of a vector with the same
+            first index and seed gives the same bytes as this one with the index and the seed i higher.
+        episodes_per_trial: parameters are drawn anew after so many episodes.
+        receipts: whether infos have parameters and receipt.
+        reward_terms: whether every step's info has the terms of the reward.
+        timeout: how long a reply may take, s.
+        render_mode: None; servers send no pictures.
+
+    The connection is made by the first `reset`. Observations are float32 [O], the caller's own to keep and to change.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}  # type: ignore[misc]
+    action_space: spaces.Discrete | spaces.Box
+
+    def __init__(
+        self,
+        environment: str,
+        *,
+        version: str = "D",
+        server: str | None = None,
+        parameters: requests.Parameters | None = None,
+        environment_index: int = 0,
+        episodes_per_trial: int = 1,
+        receipts: bool = True,
+        reward_terms: bool = False,
+        timeout: float = TIMEOUT,
+        render_mode: str | None = None,
+    ) -> None:
+        self._client = Client(
+            environment=environment,
+            version=version,
+            num_envs=1,
+            server=server,
+            parameters=parameters,
+            first_environment_index=environment_index,
+            episodes_per_trial=episodes_per_trial,
+            autoreset_mode=AutoresetMode.DISABLED,
+            receipts=receipts,
+            reward_terms=reward_terms,
+            timeout=timeout,
+            render_mode=render_mode,
+        )
+        self._reward_terms = reward_terms
+        self.observation_space = cast("spaces.Space[NDArray[np.float32]]", self._client.description.observation_space())
+        self.action_space = self._client.description.action_space()
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin the next episode.
+
+        Args:
+            seed: begins the seed's first episode; without it, the next episode of the seed before (at first a random
+                one).
+            options: `parameters`, as at `make`, from now on; `state`, an exact initial state [S] for this episode.
+
+        Raises:
+            InvalidArgumentError: and nothing has changed.
+            ServerConnectionError, ServerTimeoutError, ServerStartError: and the environment is gone; a later reset
+                opens another session.
+        """
+        seeds = [] if seed is None else [requests.seed(seed)]
+        given = requests.options(options, OPTIONS)
+        parameters = requests.distributions(given.get("parameters"))
+        state = given.get("state")
+        states = b"" if state is None else requests.states(state, 1, batched=False)
+        super().reset(seed=seed)
+
+        opened = self._client.open(seeds, self.np_random)
+        done: Any = opened
+        if opened is None or seeds or parameters or states:
+            done = self._client.reset(None, seeds, parameters, states)
+        info = self._client.names.started(done.started[0]) if done.started else {}
+        return self._observation(done.observations), info
+
+    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Advance by one step. Actions beyond the range of a Box are clipped by the environment.
+
+        Raises:
+            InvalidArgumentError: and the environment has not moved.
+            OutOfOrderError: before the first reset, and after the end of an episode.
+            ServerConnectionError, ServerTimeoutError: and the environment is gone.
+        """
+        client = self._client
+        session = client.session
+        actions = requests.actions(action, client.description, self.action_space.shape or ())
+        stepped = session.step(actions)
+        info: dict[str, Any] = {}
+        if self._reward_terms:
+            info |= client.names.terms(client.floats(stepped.reward_terms, len(client.names.reward_terms)))
+        if stepped.ended:
+            info |= client.names.ended(stepped.ended[0])
+        observation = self._observation(stepped.observations)
+        reward = float(client.floats(stepped.rewards, 1)[0])
+        return observation, reward, bool(stepped.terminated[0]), bool(stepped.truncated[0]), info
+
+    def snapshot(self) -> bytes:
+        """Save the environment whole: physics, parameters, counters, random streams."""
+        return self._client.snapshot(None)[0]
+
+    def restore(self, snapshot: bytes) -> NDArray[np.float32]:
+        """Bring a saved environment back, also one of another process; returns the observation at which it was saved.
+
+        What follows is what followed the snapshot, byte for byte.
+        """
+        self._client.open([], self.np_random)
+        return self._observation(self._client.restore([snapshot], None).observations)
+
+    def render(self) -> None:
+        """Raise NotImplementedError: servers send no pictures."""
+        raise NotImplementedError("servers send no pictures; only render_mode=None is supported")
+
+    def close(self) -> None:
+        """Free the environment on the server."""
+        self._client.close()
+
+    def _observation(self, data: bytes) -> NDArray[np.float32]:
+        return self._client.floats(data, len(self._client.description.observation)).copy()

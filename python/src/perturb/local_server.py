@@ -1,0 +1,186 @@
+"""A perturb-server of this process's own, on a private Unix socket.
+
+All environments that were made without `server=` share it. It starts with the first and ends with the last. It also
+ends with this process, however that ends, for this process holds the other end of the server's standard input.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import shutil
+import subprocess
+import tempfile
+import threading
+import time
+import weakref
+from pathlib import Path
+from typing import IO
+
+from .address import Address, parse_address
+from .errors import PerturbError, ServerStartError
+
+PROGRAM = "perturb-server"
+# Overrides where the program is looked for.
+VARIABLE = "PERTURB_SERVER"
+# How long a start may take, s.
+START_LIMIT = 20.0
+# How long a server may take to end before it is killed, s.
+END_LIMIT = 5.0
+# The limits guard shared servers. This one's only client is this process, whose memory is its own affair.
+LIMITS = ["--max-envs", "16777216", "--max-sessions", "65536", "--max-message-bytes", str(1 << 30)]
+
+
+def find_program() -> Path:
+    """Find the program perturb-server.
+
+    Raises:
+        ServerStartError: with how to get it.
+    """
+    how = (
+        "build it with `make build` in a clone of perturb and set PERTURB_SERVER to target/release/perturb-server, "
+        "or name a running server: server='unix:/path' or server='host:port'"
+    )
+    named = os.environ.get(VARIABLE)
+    if named:
+        found = shutil.which(named)
+        if found is None:
+            raise ServerStartError(f"{VARIABLE}={named} is not a program that can be run; {how}")
+        return Path(found)
+    found = shutil.which(PROGRAM)
+    if found is None:
+        raise ServerStartError(f"the program {PROGRAM} is not on PATH, and {VARIABLE} is not set; {how}")
+    return Path(found)
+
+
+class LocalServer:
+    """A running server. It lives no longer than this object, and no longer than this process."""
+
+    def __init__(self) -> None:
+        program = find_program()
+        self._owner = os.getpid()
+        directory = tempfile.mkdtemp(prefix="perturb-")  # only its owner may enter
+        try:
+            self.address: Address = parse_address(f"unix:{directory}/server.sock")
+            self.process = _spawn(program, self.address)
+        except (PerturbError, OSError) as error:
+            shutil.rmtree(directory, ignore_errors=True)
+            raise ServerStartError(f"the private server {program} did not start: {error}") from error
+        self._end = weakref.finalize(self, _end, self.process, directory, self._owner)
+        _running.add(self)
+        self._wait_until_ready(program)
+
+    def end(self) -> None:
+        """End the server and wait until it has ended. Its sessions should be closed."""
+        self._end()
+
+    def exit_status(self) -> int | None:
+        """Tell how it ended, as `subprocess` does; None while it runs."""
+        return self.process.poll()
+
+    def forget_in_child(self) -> None:
+        """In a forked process: let go of the pipe, so that the server ends with the parent alone."""
+        if self.process.stdin is not None:
+            self.process.stdin.close()
+
+    def _wait_until_ready(self, program: Path) -> None:
+        lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        # Reads to the end of the output, so that the server never waits for a reader.
+        threading.Thread(target=_read, args=(self.process.stdout, lines), daemon=True).start()
+        deadline = time.monotonic() + START_LIMIT
+        while True:
+            try:
+                line = lines.get(timeout=max(0.0, deadline - time.monotonic()))
+            except queue.Empty:
+                reason = f"it did not listen within {START_LIMIT:.0f} s"
+            else:
+                if line is not None and line.startswith("listening on "):
+                    return
+                if line is not None:
+                    continue
+                reason = f"it ended with status {self.process.wait()} before it listened; its words are above"
+            self.end()
+            raise ServerStartError(f"the private server {program} did not start: {reason}")
+
+
+def _spawn(program: Path, address: Address) -> subprocess.Popen[bytes]:
+    # Settings for servers that people run themselves do not reach this one.
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PERTURB_SERVER_")}
+    # Between two steps a learner may compute for long; its death closes the socket and the pipe anyway.
+    flags = ["--exit-with-stdin", "--log", "error", "--grace-seconds", "1", "--keepalive-seconds", "3600", *LIMITS]
+    return subprocess.Popen(
+        [program, "--listen", str(address), *flags],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        bufsize=0,
+        env=environment,
+        start_new_session=True,  # Ctrl-C is for the learner, which may still want its environments
+    )
+
+
+def _read(output: IO[bytes], lines: queue.SimpleQueue[str | None]) -> None:
+    with output:
+        for line in output:
+            lines.put(line.decode(errors="replace"))
+    lines.put(None)
+
+
+def _end(process: subprocess.Popen[bytes], directory: str, owner: int) -> None:
+    if os.getpid() != owner:
+        return  # the parent's server is not a forked process's to end
+    if process.stdin is not None:
+        with contextlib.suppress(OSError):
+            process.stdin.close()
+    try:
+        process.wait(END_LIMIT)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    shutil.rmtree(directory, ignore_errors=True)
+
+
+# Every server whose pipe this process holds.
+_running: weakref.WeakSet[LocalServer] = weakref.WeakSet()
+_lock = threading.Lock()
+_shared: LocalServer | None = None
+_users = 0
+
+
+def acquire() -> LocalServer:
+    """Share this process's server; start it if it does not run.
+
+    Raises:
+        ServerStartError: if there is no program, or it does not start.
+    """
+    global _shared, _users
+    with _lock:
+        if _shared is None or _shared.exit_status() is not None:
+            _shared, _users = LocalServer(), 0
+        _users += 1
+        return _shared
+
+
+def release(server: LocalServer) -> None:
+    """Give a share back; the last ends the server."""
+    global _shared, _users
+    with _lock:
+        if server is not _shared:
+            return  # it died and was replaced
+        _users -= 1
+        if _users > 0:
+            return
+        _shared = None
+    server.end()
+
+
+def _after_fork_in_child() -> None:
+    global _lock, _shared, _users
+    _lock = threading.Lock()
+    _shared, _users = None, 0
+    for server in list(_running):
+        server.forget_in_child()
+    _running.clear()
+
+
+os.register_at_fork(after_in_child=_after_fork_in_child)

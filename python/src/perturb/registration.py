@@ -1,0 +1,31 @@
+"""The ids by which `gymnasium.make` and `make_vec` find the environments."""
+
+from __future__ import annotations
+
+import gymnasium
+
+from .catalogue import CATALOGUE
+
+# The paper's names of the versions.
+_OLD_SUFFIXES = {"D": "", "R": "RandomNormal", "E": "RandomExtreme"}
+
+
+def register_all() -> None:
+    """Register `perturb/CartPole-v0` and so on, and the paper's ids, such as `SunblazeCartPoleRandomNormal-v0`.
+
+    Step limits are the server's: a limit here would go wrong when a snapshot is restored.
+    """
+    for name, description in CATALOGUE.items():
+        _register(f"perturb/{name}-v{description.revision}", environment=name)
+        for version, suffix in _OLD_SUFFIXES.items():
+            _register(f"Sunblaze{name}{suffix}-v0", environment=name, version=version)
+
+
+def _register(identifier: str, **settings: str) -> None:
+    if identifier not in gymnasium.registry:
+        gymnasium.register(
+            identifier,
+            entry_point="perturb.env:PerturbEnv",
+            vector_entry_point="perturb.vector:PerturbVectorEnv",
+            kwargs=settings,
+        )

@@ -1,0 +1,235 @@
+"""A batch of environments, as `gymnasium.vector.VectorEnv`: one round trip a step, whatever their number."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from . import requests
+from .client import TIMEOUT, Client
+from .errors import InvalidArgumentError
+from .infos import BatchInfos
+
+if TYPE_CHECKING:
+    from ._proto import perturb_pb2 as pb
+
+OPTIONS = ("parameters", "state", "reset_mask")
+
+
+class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
+    """N environments of a perturb-server.
+
+    Args:
+        environment: `CartPole`, `MountainCar`, `Acrobot`, `Pendulum`, `HalfCheetah` or `Hopper`.
+        num_envs: N.
+        version: where parameters come from: `D` their defaults, `R` random, `E` extreme.
+        server: `unix:/path` or `host:port`; None starts a server of this process's own.
+        parameters: replaces the version's set of the named parameters: a value, an interval `(low, high)`, or several
+            `[(low, high), …]`.
+        autoreset_mode: Gymnasium's; what happens to environments whose episode has ended.
+        first_environment_index: the index of the first environment. A batch that is split gives the same bytes as a
+            whole one if each part has its place here, and seeds to match.
+        episodes_per_trial: parameters are drawn anew after so many episodes.
+        receipts: whether infos have parameters and receipt.
+        reward_terms: whether every step's infos have the terms of the reward.
+        copy: False returns observations as they came, read-only arrays without a copy; True returns copies, which can
+            be changed and which PyTorch takes without a warning. Either way the next step leaves them as they are.
+        timeout: how long a reply may take, s.
+        render_mode: None; servers send no pictures.
+
+    The connection is made by the first `reset`. Rewards are float32 [N], flags bool [N].
+    """
+
+    def __init__(
+        self,
+        environment: str,
+        num_envs: int = 1,
+        *,
+        version: str = "D",
+        server: str | None = None,
+        parameters: requests.Parameters | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        first_environment_index: int = 0,
+        episodes_per_trial: int = 1,
+        receipts: bool = True,
+        reward_terms: bool = False,
+        copy: bool = False,
+        timeout: float = TIMEOUT,
+        render_mode: str | None = None,
+    ) -> None:
+        self._mode = requests.autoreset_mode(autoreset_mode)
+        self._client = Client(
+            environment=environment,
+            version=version,
+            num_envs=num_envs,
+            server=server,
+            parameters=parameters,
+            first_environment_index=first_environment_index,
+            episodes_per_trial=episodes_per_trial,
+            autoreset_mode=self._mode,
+            receipts=receipts,
+            reward_terms=reward_terms,
+            timeout=timeout,
+            render_mode=render_mode,
+        )
+        description = self._client.description
+        self.num_envs = self._client.num_envs
+        self.metadata = {"render_modes": [], "autoreset_mode": self._mode}
+        self.single_observation_space = description.observation_space()
+        self.single_action_space = description.action_space()
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._action_shape = self.action_space.shape or ()
+        self._observation_size = len(description.observation)
+        self._reward_terms = reward_terms
+        self._copy = copy
+        # What was last returned: a masked reset or restore leaves the other environments as they are.
+        self._observations: NDArray[np.float32] | None = None
+        # Whose next step is an autoreset, in next-step mode.
+        self._resetting = np.zeros(self.num_envs, dtype=np.bool_)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int] | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin the next episodes.
+
+        Args:
+            seed: environment i begins the first episode of the seed s + i, or of the i-th of N seeds; without it, the
+                next episode of its seed before (at first a random one).
+            options: `parameters`, as at `make`, from now on; `state`, exact initial states [M, S] for this episode;
+                `reset_mask`, bool [N], which environments are reset, at first all.
+
+        Raises:
+            InvalidArgumentError: and nothing has changed.
+            ServerConnectionError, ServerTimeoutError, ServerStartError: and the environments are gone; a later reset
+                opens another session.
+        """
+        given = requests.options(options, OPTIONS)
+        mask = None
+        if given.get("reset_mask") is not None:
+            mask = requests.mask(given["reset_mask"], self.num_envs, "options['reset_mask']")
+            self._client.session.require_usable()  # a new one would hold other episodes than the mask leaves alone
+        selected = range(self.num_envs) if mask is None else np.flatnonzero(mask).tolist()
+        seeds = self._seeds(seed)
+        parameters = requests.distributions(given.get("parameters"))
+        state = given.get("state")
+        states = b"" if state is None else requests.states(state, len(selected), batched=True)
+        super().reset(seed=seeds[0] if seeds and isinstance(seed, Sequence) else seed)  # type: ignore[arg-type]
+
+        opened = self._client.open(seeds, self.np_random)
+        done: Any = opened
+        if opened is None or seeds or parameters or states:
+            done = self._client.reset(mask, [seeds[i] for i in selected] if seeds else [], parameters, states)
+        collected = BatchInfos(self._client.names, self.num_envs)
+        collected.episodes([], done.started)
+        return self._merge(done.observations, mask), collected.infos
+
+    def step(
+        self, actions: Any
+    ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """Advance every environment by one step. Actions beyond the range of a Box are clipped by the environment.
+
+        Raises:
+            InvalidArgumentError: and no environment has moved.
+            OutOfOrderError: before the first reset; with autoreset disabled, if an episode has ended and was not reset.
+            ServerConnectionError, ServerTimeoutError: and the environments are gone.
+        """
+        client = self._client
+        session = client.session
+        stepped = session.step(requests.actions(actions, client.description, self._action_shape))
+        observations = self._store(client.floats(stepped.observations, self.num_envs, self._observation_size))
+        rewards = client.floats(stepped.rewards, self.num_envs).copy()  # Gymnasium's wrappers write into it
+        terminated, truncated = client.flags(stepped.terminated), client.flags(stepped.truncated)
+        infos = self._infos(stepped) if stepped.ended or stepped.started or self._reward_terms else {}
+        if self._mode is AutoresetMode.NEXT_STEP:
+            self._resetting = terminated | truncated
+        return observations, rewards, terminated, truncated, infos
+
+    def snapshot(self, mask: NDArray[np.bool_] | None = None) -> list[bytes]:
+        """Save the environments that the mask [N] selects, at first all: M pieces of bytes, in order."""
+        return self._client.snapshot(None if mask is None else requests.mask(mask, self.num_envs, "mask"))
+
+    def restore(self, snapshots: Sequence[bytes], mask: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
+        """Bring saved environments back into the M slots that the mask [N] selects, at first all.
+
+        Returns the observations [N, O]: of restored environments those at which they were saved, of others the last.
+        What follows is what followed the snapshot, byte for byte. All are restored, or none.
+        """
+        selected = None
+        if mask is not None:
+            selected = requests.mask(mask, self.num_envs, "mask")
+            self._client.session.require_usable()
+        self._client.open([], self.np_random)
+        restored = self._client.restore(snapshots, selected)
+        return self._merge(restored.observations, selected)
+
+    def render(self) -> None:
+        """Raise NotImplementedError: servers send no pictures."""
+        raise NotImplementedError("servers send no pictures; only render_mode=None is supported")
+
+    def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002
+        """Free the environments on the server."""
+        # An environment whose settings were refused has no client. Older Gymnasiums close it all the same.
+        if hasattr(self, "_client"):
+            self._client.close()
+
+    def _seeds(self, seed: int | Sequence[int] | None) -> list[int]:
+        if seed is None:
+            return []
+        if not isinstance(seed, Sequence | np.ndarray):
+            first = requests.seed(seed)
+            return [requests.seed(first + i) for i in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise InvalidArgumentError(f"seed has {len(seed)} numbers; expected one, or {self.num_envs}")
+        return [requests.seed(value) for value in seed]
+
+    def _store(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
+        self._observations = observations
+        return observations.copy() if self._copy else observations
+
+    def _merge(self, data: bytes, mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
+        """The observations [N, O] after M rows have changed."""
+        if mask is None:
+            self._resetting[:] = False
+            return self._store(self._client.floats(data, self.num_envs, self._observation_size))
+        self._resetting &= ~mask
+        rows = self._client.floats(data, int(mask.sum()), self._observation_size)
+        if self._observations is None:
+            return self._store(rows)
+        merged = self._observations.copy()
+        merged[mask] = rows
+        merged.flags.writeable = False
+        return self._store(merged)
+
+    def _infos(self, stepped: pb.Stepped) -> dict[str, Any]:
+        names = self._client.names
+        infos = BatchInfos(names, self.num_envs)
+        slots = [end.slot for end in stepped.ended]
+        moved = np.ones(self.num_envs, dtype=np.bool_) & ~self._resetting
+        ended = infos
+        if self._mode is AutoresetMode.SAME_STEP and slots:
+            # The infos of ended episodes and those of the next ones come in one step.
+            ended = BatchInfos(names, self.num_envs)
+            finals = self._client.floats(stepped.final_observations, len(slots), self._observation_size)
+            infos.final_observations(finals.copy(), slots)
+            infos.final_infos(ended, slots)
+            moved[slots] = False
+        if ended is infos:
+            infos.episodes(stepped.ended, stepped.started)
+        else:
+            ended.episodes(stepped.ended, [])
+            infos.episodes([], stepped.started)
+        if self._reward_terms:
+            terms = self._client.floats(stepped.reward_terms, self.num_envs, len(names.reward_terms))
+            infos.terms(terms, np.flatnonzero(moved))
+            if ended is not infos:
+                ended.terms(terms, np.array(slots, dtype=np.intp))
+        return infos.infos

@@ -1,0 +1,63 @@
+"""A server for the tests."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from perturb import local_server
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+ROOT = Path(__file__).parents[2]
+
+
+class Server:
+    """A perturb-server as people run it, on a Unix socket or a free TCP port."""
+
+    def __init__(self, *flags: str, listen: str | None = None) -> None:
+        self._directory = tempfile.TemporaryDirectory(prefix="perturb-test-")
+        listen = listen or f"unix:{self._directory.name}/server.sock"
+        command = [str(local_server.find_program()), "--listen", listen, "--log", "error", "--exit-with-stdin", *flags]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        self.address = self.process.stdout.readline().strip().removeprefix("listening on ")
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.communicate()
+        self._directory.cleanup()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _program() -> None:
+    """Let the tests find the server that cargo built, unless another is named."""
+    os.environ.setdefault(local_server.VARIABLE, str(ROOT / "target/release/perturb-server"))
+
+
+@pytest.fixture(scope="session")
+def server(_program: None) -> Iterator[str]:
+    """Give the address of a server that all tests share."""
+    running = Server()
+    yield running.address
+    running.end()
+
+
+@pytest.fixture
+def start_server(_program: None) -> Iterator[Callable[..., Server]]:
+    """Start servers of the test's own."""
+    running: list[Server] = []
+
+    def start(*flags: str, listen: str | None = None) -> Server:
+        running.append(Server(*flags, listen=listen))
+        return running[-1]
+
+    yield start
+    for one in running:
+        one.end()

@@ -1,0 +1,34 @@
+"""The examples that need nothing but the package."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+
+from .conftest import ROOT
+
+EXAMPLES = ROOT / "python/examples"
+
+
+def run(*command: str) -> str:
+    ended = subprocess.run([sys.executable, *command], capture_output=True, text=True, cwd=EXAMPLES, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stderr == ""
+    return ended.stdout
+
+
+def test_the_loop_of_ten_lines_runs_and_is_that_of_the_readme() -> None:
+    output = run("ten_lines.py")
+    assert output.startswith("frictions: [")
+    assert "ended:" in output
+    example = (EXAMPLES / "ten_lines.py").read_text()
+    loop = example[example.index("envs = ") :]
+    assert loop in (ROOT / "python/README.md").read_text()
+
+
+def test_the_sweep_shows_which_poles_stay_up(server: str) -> None:
+    steps = [int(value) for value in re.findall(r": +(\d+) steps", run("sweep.py", "--server", server))]
+    assert len(steps) == 9
+    assert steps[0] < 100
+    assert steps[4] == 200

@@ -1,0 +1,426 @@
+"""Clients and servers that die, hang, fork or are interrupted: errors within seconds, and nothing is left behind."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import perturb
+from perturb import local_server, session
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+# What "within seconds" means here: the rest is for a machine that is busy.
+SECONDS = 10.0
+
+
+@contextlib.contextmanager
+def within(seconds: float) -> Iterator[None]:
+    start = time.monotonic()
+    yield
+    assert time.monotonic() - start < seconds
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + SECONDS
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def runs(pid: int) -> bool:
+    """Whether there is such a process that has not ended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except FileNotFoundError:
+        return False
+
+
+def python(code: str) -> subprocess.Popen[str]:
+    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def step_forever(envs: perturb.PerturbVectorEnv, actions: Any) -> None:
+    while True:
+        envs.step(actions)
+
+
+STEPPING = """
+import perturb, numpy as np
+envs = perturb.PerturbVectorEnv("Hopper", 64, server={address!r}, autoreset_mode="SameStep")
+envs.reset(seed=1)
+actions = np.zeros((64, 3), dtype=np.float32)
+print("stepping", flush=True)
+while True:
+    envs.step(actions)
+"""
+
+
+def test_a_client_killed_in_mid_step_leaves_its_room(start_server: Callable[..., Any]) -> None:
+    address = start_server("--max-envs", "64").address
+    client = python(STEPPING.format(address=address))
+    assert client.stdout is not None
+    assert client.stdout.readline() == "stepping\n"
+    envs = perturb.PerturbVectorEnv("Hopper", 64, server=address)
+    with pytest.raises(perturb.ServerFullError):
+        envs.reset()
+    client.kill()
+    client.communicate()
+
+    def free() -> bool:
+        try:
+            envs.reset()
+        except perturb.ServerFullError:
+            return False
+        return True
+
+    wait_until(free)
+
+
+@pytest.mark.parametrize("listen", [None, "tcp://127.0.0.1:0"])
+def test_a_server_killed_under_a_client_is_told_at_once(listen: str | None, start_server: Callable[..., Any]) -> None:
+    running = start_server(listen=listen)
+    envs = perturb.PerturbVectorEnv("Hopper", 256, server=running.address)
+    envs.reset(seed=1)
+    actions = np.zeros((256, 3), dtype=np.float32)
+    threading.Timer(0.3, running.process.kill).start()
+    with within(SECONDS), pytest.raises(perturb.ServerConnectionError, match=r"lost the server at .* during step"):
+        step_forever(envs, actions)
+    with within(1), pytest.raises(perturb.OutOfOrderError, match=r"reset\(\) .* lost the server"):
+        envs.step(actions)
+    with (
+        within(SECONDS),
+        pytest.raises(perturb.ServerConnectionError, match=r"no server answers at .*perturb-server --l"),
+    ):
+        envs.reset()
+
+
+def test_a_reset_finds_a_server_that_runs_again(start_server: Callable[..., Any]) -> None:
+    with tempfile.TemporaryDirectory() as directory:
+        listen = f"unix:{directory}/server.sock"
+        running = start_server(listen=listen)
+        env = perturb.PerturbEnv("CartPole", version="R", server=listen)
+        first, info = env.reset(seed=1, options={"parameters": {"mass": 0.3}})
+        running.process.kill()
+        running.process.wait()
+        with pytest.raises(perturb.ServerConnectionError):
+            env.step(0)
+        start_server(listen=listen)
+        again, same = env.reset(seed=1)
+        assert again.tobytes() == first.tobytes()
+        assert same == info
+        assert info["parameters"]["mass"] == 0.3
+        env.close()
+
+
+@pytest.mark.parametrize("by", ["mask", "snapshot"])
+def test_parameters_of_some_environments_are_not_forgotten_silently(by: str, start_server: Callable[..., Any]) -> None:
+    with tempfile.TemporaryDirectory() as directory:
+        listen = f"unix:{directory}/server.sock"
+        running = start_server(listen=listen)
+        envs = perturb.PerturbVectorEnv("CartPole", 2, server=listen)
+        envs.reset(seed=1)
+        if by == "mask":
+            envs.reset(options={"parameters": {"mass": 0.3}, "reset_mask": np.array([True, False])})
+        else:
+            envs.restore(envs.snapshot())
+        running.process.kill()
+        running.process.wait()
+        start_server(listen=listen)
+        with pytest.raises(perturb.ServerConnectionError):
+            envs.step(np.zeros(2, dtype=np.int64))
+        with pytest.raises(perturb.OutOfOrderError, match="make the environments anew"):
+            envs.reset(seed=1)
+
+
+def test_a_server_that_hangs_is_given_up(start_server: Callable[..., Any]) -> None:
+    running = start_server()
+    env = perturb.PerturbEnv("CartPole", server=running.address, timeout=1.0)
+    env.reset(seed=1)
+    running.process.send_signal(signal.SIGSTOP)
+    with within(SECONDS), pytest.raises(perturb.ServerTimeoutError, match="did not answer step within 1 s") as caught:
+        env.step(0)
+    assert isinstance(caught.value, TimeoutError)
+    with within(SECONDS), pytest.raises(perturb.ServerTimeoutError, match="open"):
+        env.reset()
+    running.process.send_signal(signal.SIGCONT)
+    env.reset()
+
+
+def test_a_server_that_answers_no_pings_is_given_up(
+    start_server: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With other limits, since the real ones are half a minute; the limit of replies, a minute, has no part in it."""
+    monkeypatch.setattr(session, "KEEPALIVE_INTERVAL", 1)
+    monkeypatch.setattr(session, "KEEPALIVE_LIMIT", 1)
+    running = start_server(listen="tcp://127.0.0.1:0")
+    env = perturb.PerturbEnv("CartPole", server=running.address)
+    env.reset(seed=1)
+    running.process.send_signal(signal.SIGSTOP)
+    with within(2 * SECONDS), pytest.raises(perturb.ServerConnectionError, match="lost the server"):
+        env.step(0)
+
+
+def test_what_is_no_perturb_server_is_said() -> None:
+    with within(SECONDS), pytest.raises(perturb.ServerConnectionError, match="no server answers at unix:/nowhere"):
+        perturb.PerturbEnv("CartPole", server="unix:/nowhere").reset()
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+        silent = perturb.PerturbEnv("CartPole", server=f"127.0.0.1:{port}", timeout=2.0)
+        with within(SECONDS), pytest.raises(perturb.ServerTimeoutError):
+            silent.reset()
+
+
+def test_a_server_that_shuts_down_ends_sessions_with_its_sentence(start_server: Callable[..., Any]) -> None:
+    running = start_server("--grace-seconds", "0")
+    env = perturb.PerturbEnv("CartPole", server=running.address)
+    env.reset()
+    running.process.terminate()
+    running.process.wait()
+    with within(SECONDS), pytest.raises(perturb.ServerConnectionError, match="lost the server"):
+        env.step(0)
+
+
+def test_an_interrupt_leaves_no_reply_behind(server: str) -> None:
+    envs = perturb.PerturbVectorEnv("Hopper", 4096, server=server)
+    envs.reset(seed=1)
+    expected = perturb.PerturbVectorEnv("Hopper", 4096, server=server).reset(seed=2)[0].tobytes()
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.05)
+        with within(SECONDS), pytest.raises(KeyboardInterrupt):
+            step_forever(envs, np.zeros((4096, 3), dtype=np.float32))
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    with pytest.raises(perturb.OutOfOrderError, match="interrupted"):
+        envs.step(np.zeros((4096, 3), dtype=np.float32))
+    assert envs.reset(seed=2)[0].tobytes() == expected
+    envs.close()
+
+
+def test_proxy_variables_do_not_reach_loopback_and_sockets(
+    start_server: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("http_proxy", "HTTP_PROXY", "https_proxy", "grpc_proxy", "all_proxy"):
+        monkeypatch.setenv(name, "http://127.0.0.1:9")  # nobody listens there
+    for name in ("no_proxy", "NO_PROXY", "no_grpc_proxy"):
+        monkeypatch.delenv(name, raising=False)
+    for listen in (None, "tcp://127.0.0.1:0"):
+        env = perturb.PerturbEnv("CartPole", server=start_server(listen=listen).address)
+        env.reset()
+        env.close()
+
+
+# The private server.
+
+
+def private() -> local_server.LocalServer | None:
+    return local_server._shared
+
+
+def test_the_private_server_is_shared_and_ends_with_its_last_environment() -> None:
+    one, other = perturb.PerturbEnv("CartPole"), perturb.PerturbVectorEnv("Pendulum", 3)
+    assert private() is None, "nothing is started before a reset"
+    one.reset(seed=1)
+    shared = private()
+    assert shared is not None
+    assert os.getpgid(shared.process.pid) != os.getpgid(0), "Ctrl-C would end it"
+    other.reset(seed=1)
+    assert private() is shared
+    one.close()
+    assert runs(shared.process.pid)
+    other.step(np.zeros((3, 1), dtype=np.float32))
+    directory = Path(str(shared.address).removeprefix("unix:")).parent
+    assert directory.stat().st_mode & 0o777 == 0o700
+    with within(SECONDS):
+        other.close()
+    assert not runs(shared.process.pid)
+    assert not directory.exists()
+
+
+def test_a_forgotten_environment_gives_its_server_back() -> None:
+    env = perturb.PerturbEnv("CartPole")
+    env.reset()
+    shared = private()
+    assert shared is not None
+    del env
+    wait_until(lambda: not runs(shared.process.pid))
+
+
+def test_a_private_server_that_is_killed_is_told_and_replaced() -> None:
+    env, other = perturb.PerturbEnv("CartPole"), perturb.PerturbEnv("CartPole")
+    env.reset(seed=1)
+    other.reset(seed=1)
+    shared = private()
+    assert shared is not None
+    shared.process.kill()
+    with within(SECONDS), pytest.raises(perturb.ServerConnectionError, match="ended with status -9"):
+        env.step(0)
+    env.reset(seed=1)
+    env.step(0)
+    assert private() is not shared
+    with within(SECONDS), pytest.raises(perturb.ServerConnectionError, match="ended with status -9"):
+        other.step(0)
+    env.step(0)  # the other's share was of the server that is gone
+    env.close()
+    assert private() is None
+
+
+OWNING = """
+import perturb, sys, os, time
+from perturb import local_server
+env = perturb.PerturbEnv("CartPole")
+env.reset(seed=1)
+if {fork}:
+    if os.fork() == 0:
+        time.sleep(60)
+print(local_server._shared.process.pid, flush=True)
+sys.stdin.readline() if {wait} else None
+"""
+
+
+@pytest.mark.parametrize("fork", [False, True])
+@pytest.mark.parametrize("ending", ["exit", signal.SIGTERM, signal.SIGKILL])
+def test_the_private_server_ends_with_its_process_however_that_ends(ending: Any, fork: bool) -> None:
+    """Also if a process that was forked from it lives on."""
+    client = subprocess.Popen(
+        [sys.executable, "-c", OWNING.format(wait=ending != "exit", fork=fork)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert client.stdout is not None
+    try:
+        server = int(client.stdout.readline())
+        if ending != "exit":
+            assert runs(server)
+            client.send_signal(ending)
+        assert client.wait(SECONDS) == (0 if ending == "exit" else -ending)
+        wait_until(lambda: not runs(server))
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(client.pid, signal.SIGKILL)
+        client.communicate()
+
+
+def test_without_the_program_the_error_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(local_server.VARIABLE, "/nowhere/perturb-server")
+    with pytest.raises(perturb.ServerStartError, match=r"/nowhere/perturb-server.*make build"):
+        perturb.PerturbEnv("CartPole")
+    monkeypatch.delenv(local_server.VARIABLE)
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(perturb.ServerStartError, match=r"not on PATH.*server='unix:"):
+        gymnasium.make("perturb/CartPole-v0")
+
+
+def test_a_program_that_is_no_server_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(local_server.VARIABLE, "/bin/false")
+    with within(SECONDS), pytest.raises(perturb.ServerStartError, match="ended with status 1 before it listened"):
+        perturb.PerturbEnv("CartPole").reset()
+
+
+def test_settings_of_other_servers_do_not_reach_the_private_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PERTURB_SERVER_WORKERS", "0")  # with which no server starts
+    envs = perturb.PerturbVectorEnv("CartPole", 20_000)  # more than the default, too
+    envs.reset()
+    envs.close()
+
+
+# Forks.
+
+
+def in_fork(function: Callable[[], Any]) -> Any:
+    """Call the function in a forked process and give back what it returns, or the text of its error."""
+    receiver, sender = multiprocessing.Pipe(duplex=False)
+
+    def child() -> None:
+        try:
+            sender.send(function())
+        except BaseException as error:  # noqa: BLE001
+            sender.send(f"{type(error).__name__}: {error}")
+
+    process = multiprocessing.get_context("fork").Process(target=child)
+    process.start()
+    assert receiver.poll(SECONDS), "the forked process hangs"
+    result = receiver.recv()
+    process.join()
+    return result
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_an_environment_opens_its_session_in_the_process_that_uses_it(own: bool, server: str) -> None:
+    address = None if own else server
+    used, unused = (perturb.PerturbEnv("CartPole", server=address) for _ in range(2))
+    used.reset(seed=1)
+    expected = used.step(1)[0].tobytes()
+
+    def both() -> list[bytes]:
+        results = []
+        for env in (unused, used):
+            env.reset(seed=1)
+            results.append(env.step(1)[0].tobytes())
+            env.close()
+        return results
+
+    used.reset(seed=1)
+    assert in_fork(lambda: used.step(1)).startswith("OutOfOrderError: process")
+    assert in_fork(both) == [expected, expected]
+    assert used.step(1)[0].tobytes() == expected, "the parent's session goes on"
+    used.close()
+
+
+FORKING = """
+import os, perturb
+env = perturb.PerturbEnv("CartPole", server={address!r})
+env.reset(seed=1)
+child = os.fork()
+env.reset(seed=1)
+env.step(0)
+if child:
+    assert os.waitpid(child, 0)[1] == 0
+    print("both went on")
+"""
+
+
+def test_grpc_prepares_for_forks(server: str) -> None:
+    """Otherwise it says that it does not, and whether the child hangs is a matter of luck."""
+    output, errors = python(FORKING.format(address=server)).communicate(timeout=60)
+    assert (output, errors) == ("both went on\n", "")
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_gymnasiums_asynchronous_batches_work(own: bool, server: str) -> None:
+    """They make an environment in the parent for its spaces, and fork."""
+    settings: dict[str, Any] = {} if own else {"server": server}
+    parent = perturb.PerturbEnv("Pendulum", **settings)
+    parent.reset()
+    envs: Any = gymnasium.make_vec("perturb/Pendulum-v0", num_envs=2, vectorization_mode="async", **settings)
+    with within(3 * SECONDS):
+        observations, infos = envs.reset(seed=5)
+        envs.step(np.zeros((2, 1), dtype=np.float32))
+    assert observations.shape == (2, 3)
+    assert infos["parameters"]["mass"].tolist() == [1, 1]
+    envs.close()
+    parent.step(np.zeros(1, dtype=np.float32))
+    parent.close()

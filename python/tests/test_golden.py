@@ -1,0 +1,65 @@
+"""The classic tasks give through this package what Gymnasium 1.4 computed: tests/data/classic_control.jsonl."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from .conftest import ROOT
+
+CASES = [json.loads(line) for line in (ROOT / "tests/data/classic_control.jsonl").read_text().splitlines()]
+
+# Rounding to float32, half an ulp by each side, relative, or absolute below 1. Pendulum's torque is rounded too, by
+# 2^-24 of at most 2 N m; light rods of E turn this into 3 / (m l²) · 0.05 s ≤ 1.2 times as much speed.
+SINGLE_STEP = {"CartPole": 1.2e-7, "MountainCar": 1.2e-7, "Acrobot": 1.2e-7, "Pendulum": 4e-7}
+
+
+def deviation(got: Any, expected: Any) -> float:
+    expected = np.asarray(expected)
+    return float(np.max(np.abs(got - expected) / np.maximum(np.abs(expected), 1.0)))
+
+
+@pytest.mark.parametrize("case", CASES, ids=[f"{i}-{case['env']}-{case['version']}" for i, case in enumerate(CASES)])
+def test_every_step_of_a_golden_trajectory_agrees(case: dict[str, Any], server: str) -> None:
+    """Each environment of a batch begins at one of the trajectory's states, and takes one step."""
+    states = [case["state0"], *case["states"]]
+    # Beyond an ending there are states that a reset does not accept.
+    n = next((t + 1 for t, ended in enumerate(case["terminated"]) if ended), len(case["actions"]))
+    envs = gymnasium.make_vec(f"perturb/{case['env']}-v0", num_envs=n, autoreset_mode="Disabled", server=server)
+    options = {"parameters": case["params"], "state": states[:n]}
+    tolerance = SINGLE_STEP[case["env"]]
+
+    observations, infos = envs.reset(seed=0, options=options)
+    for name, value in case["params"].items():
+        assert (infos["receipt"]["applied"][name] == value).all()
+    assert deviation(observations, case["observations"][:n]) <= 1.2e-7
+
+    shape = (n,) if isinstance(envs.single_action_space, gymnasium.spaces.Discrete) else (n, 1)
+    kind = np.int64 if len(shape) == 1 else np.float64
+    actions = np.array(case["actions"][:n], dtype=kind).reshape(shape)
+    observations, rewards, terminated, _, _ = envs.step(actions)
+    assert deviation(observations, case["observations"][1 : n + 1]) <= tolerance
+    assert deviation(rewards, case["rewards"][:n]) <= tolerance
+    assert terminated.tolist() == case["terminated"][:n]
+    envs.close()
+
+
+@pytest.mark.parametrize("case", CASES, ids=[f"{i}-{case['env']}-{case['version']}" for i, case in enumerate(CASES)])
+def test_trajectories_from_the_initial_state_agree(case: dict[str, Any], server: str) -> None:
+    """Nothing is rounded on the way but Pendulum's torque: float64 errors of 1e-9 over 50 steps vanish in float32."""
+    tolerance = {"Pendulum": 1e-4}.get(case["env"], 1.3e-7)  # its rounded torques pile up, and it is unstable upright
+    env = gymnasium.make(f"perturb/{case['env']}-v0", parameters=case["params"], server=server)
+    discrete = isinstance(env.action_space, gymnasium.spaces.Discrete)
+    env.reset(options={"state": case["state0"]})
+    for t, action in enumerate(case["actions"][:50]):
+        observation, reward, terminated, _, _ = env.step(action if discrete else np.array([action]))
+        assert deviation(observation, case["observations"][t + 1]) <= tolerance, t
+        assert deviation(reward, case["rewards"][t]) <= tolerance, t
+        assert terminated == case["terminated"][t], t
+        if terminated:
+            break
+    env.close()

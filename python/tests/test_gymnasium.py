@@ -1,0 +1,191 @@
+"""What Gymnasium expects of environments, and users of Gymnasium."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env, data_equivalence
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import vector as wrappers
+
+import perturb
+from perturb.catalogue import CATALOGUE
+
+NAMES = list(CATALOGUE)
+MODES = list(AutoresetMode)
+
+
+def equal(a: object, b: object) -> bool:
+    return data_equivalence(a, b, exact=True)
+
+
+@pytest.mark.filterwarnings("ignore")  # CartPole's unbounded observations, Pendulum's torque of ±2
+@pytest.mark.parametrize("version", ["D", "R", "E"])
+@pytest.mark.parametrize("name", NAMES)
+def test_gymnasiums_checker_accepts_every_environment_and_version(name: str, version: str, server: str) -> None:
+    env = gymnasium.make(f"perturb/{name}-v0", version=version, server=server)
+    check_env(env.unwrapped)
+    env.close()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_papers_ids_are_the_versions(name: str, server: str) -> None:
+    for version, suffix in {"D": "", "R": "RandomNormal", "E": "RandomExtreme"}.items():
+        old = gymnasium.make(f"Sunblaze{name}{suffix}-v0", server=server)
+        new = gymnasium.make(f"perturb/{name}-v0", version=version, server=server)
+        (a, a_info), (b, b_info) = old.reset(seed=3), new.reset(seed=3)
+        assert equal(a, b)
+        assert a_info["parameters"] == b_info["parameters"]
+        assert (a_info["parameters"] == gymnasium.make(f"perturb/{name}-v0").reset()[1]["parameters"]) == (
+            version == "D"
+        )
+        old.close()
+        new.close()
+
+
+def run(envs: gymnasium.vector.VectorEnv[Any, Any, Any], steps: int) -> list[Any]:
+    """Reset, act, and reset what has ended where nobody else does."""
+    envs.action_space.seed(1)
+    results: list[Any] = [envs.reset(seed=100)]
+    for _ in range(steps):
+        results.append(envs.step(envs.action_space.sample()))
+        ended = results[-1][2] | results[-1][3]
+        if envs.metadata["autoreset_mode"] is AutoresetMode.DISABLED and ended.any():
+            results.append(envs.reset(options={"reset_mask": ended}))
+    return results
+
+
+@pytest.mark.parametrize("receipts", [True, False])
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("name", ["CartPole", "Hopper"])
+def test_a_batch_gives_what_gymnasium_makes_of_single_environments(
+    name: str, mode: AutoresetMode, receipts: bool, server: str
+) -> None:
+    """Observations, rewards, flags and infos, with their structure, types and masks."""
+    identifier, n, steps = f"perturb/{name}-v0", 5, 150
+    settings: dict[str, Any] = {"version": "E", "server": server, "receipts": receipts, "reward_terms": True}
+    settings["episodes_per_trial"] = 2
+    ours = gymnasium.make_vec(identifier, num_envs=n, autoreset_mode=mode, **settings)
+
+    def single(i: int) -> gymnasium.Env[Any, Any]:
+        return gymnasium.make(identifier, environment_index=i, **settings)
+
+    theirs = SyncVectorEnv([lambda i=i: single(i) for i in range(n)], autoreset_mode=mode)  # type: ignore[misc]
+    assert ours.metadata["autoreset_mode"] is mode
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+
+    ended = 0
+    for step, (a, b) in enumerate(zip(run(ours, steps), run(theirs, steps), strict=True)):
+        assert equal(a[0], b[0]), step
+        assert equal(a[-1], b[-1]), (step, a[-1], b[-1])
+        if len(a) == 5:
+            assert equal(a[1].astype(np.float64), b[1]), step
+            assert equal(a[2], b[2]), step
+            assert equal(a[3], b[3]), step
+            ended += int((a[2] | a[3]).sum())
+    assert ended > 3, "the test saw no endings"
+    ours.close()
+    theirs.close()
+
+
+def test_final_observations_and_infos_are_where_gymnasium_puts_them(server: str) -> None:
+    envs = gymnasium.make_vec("perturb/CartPole-v0", num_envs=3, autoreset_mode="SameStep", server=server)
+    envs.reset(seed=1)
+    for _ in range(200):
+        observations, _, terminated, _, infos = envs.step(np.ones(3, dtype=np.int64))
+        if terminated.any():
+            break
+    i = int(np.flatnonzero(terminated)[0])
+    assert equal(infos["_final_obs"], terminated)
+    assert equal(infos["_final_info"], terminated)
+    assert abs(infos["final_obs"][i][2]) > np.deg2rad(12)
+    assert abs(observations[i][2]) <= 0.05  # the next episode's
+    assert equal(infos["final_info"]["is_success"], np.zeros(3, dtype=np.bool_))
+    assert infos["parameters"]["force"][i] == 10.0
+    assert "is_success" not in infos
+    envs.close()
+
+
+def test_success_is_told_at_the_end_and_only_there(server: str) -> None:
+    env = gymnasium.make("perturb/CartPole-v0", server=server)
+    observation, info = env.reset(seed=1)
+    assert "is_success" not in info
+    truncated = False
+    while not truncated:
+        action = int(observation[2] + observation[3] > 0)
+        observation, _, terminated, truncated, info = env.step(action)
+        assert not terminated
+        assert ("is_success" in info) == truncated
+    assert info["is_success"] is True
+    env.close()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_gymnasiums_wrappers_work_on_batches(mode: AutoresetMode, server: str) -> None:
+    envs = gymnasium.make_vec("perturb/CartPole-v0", num_envs=4, autoreset_mode=mode, server=server)
+    wrapped: Any = wrappers.RecordEpisodeStatistics(envs)
+    wrapped = wrappers.ClipReward(wrapped, min_reward=0.0, max_reward=0.5)
+    wrapped.reset(seed=1)
+    lengths = []
+    for _ in range(60):
+        _, rewards, terminated, truncated, infos = wrapped.step(np.ones(4, dtype=np.int64))
+        assert (rewards <= 0.5).all()
+        ended = terminated | truncated
+        lengths += list(infos["episode"]["l"][ended]) if ended.any() else []
+        if mode is AutoresetMode.DISABLED and ended.any():
+            wrapped.reset(options={"reset_mask": ended})
+    assert len(lengths) >= 16
+    assert all(8 <= length <= 11 for length in lengths)  # pushed to one side only
+    wrapped.close()
+
+
+def test_two_environments_of_one_seed_match(server: str) -> None:
+    from gymnasium.utils.env_match import check_environments_match
+
+    a = gymnasium.make("perturb/Hopper-v0", version="E", server=server)
+    b = gymnasium.make("SunblazeHopperRandomExtreme-v0", server=server)
+    check_environments_match(a, b, num_steps=300, seed=5, info_comparison="equivalence")
+    a.close()
+    b.close()
+
+
+def test_random_numbers_are_those_of_the_documents(server: str) -> None:
+    """docs/environments.md, "Random streams": seed 7, environment 3, trial 2 of CartPole E."""
+    env = gymnasium.make("perturb/CartPole-v0", version="E", environment_index=3, server=server)
+    env.reset(seed=7)
+    env.reset()
+    observation, info = env.reset()
+    stream = np.random.Philox(key=np.array([7, 3], np.uint64), counter=np.array([0, 2, 1, 0], np.uint64))
+    state = -0.05 + 0.1 * np.random.Generator(stream).random(4)
+    assert info["parameters"]["force"] == 18.11554580481264
+    assert info["context_id"] == 2
+    assert info["receipt"]["environment_index"] == 3
+    assert equal(observation, state.astype(np.float32))
+    env.close()
+
+
+def test_what_gymnasium_asks_of_batches_holds_for_seeds(server: str) -> None:
+    envs = gymnasium.make_vec("perturb/Pendulum-v0", num_envs=3, version="R", server=server)
+    by_number, _ = envs.reset(seed=10)
+    by_list, _ = envs.reset(seed=[10, 11, 12])  # type: ignore[arg-type]
+    others, _ = envs.reset(seed=11)
+    assert equal(by_number, by_list)
+    assert not np.any(by_number == others, axis=1).any()
+    envs.close()
+
+
+def test_without_a_seed_episodes_differ(server: str) -> None:
+    first = [gymnasium.make("perturb/Pendulum-v0", server=server).reset()[0].tobytes() for _ in range(3)]
+    assert len(set(first)) == 3
+
+
+def test_pictures_are_refused_and_not_pretended(server: str) -> None:
+    with pytest.warns(UserWarning, match="render_mode"), pytest.raises(perturb.InvalidArgumentError, match="pictures"):
+        gymnasium.make("perturb/CartPole-v0", render_mode="rgb_array", server=server)
+    env = gymnasium.make("perturb/CartPole-v0", server=server).unwrapped
+    with pytest.raises(NotImplementedError, match="pictures"):
+        env.render()

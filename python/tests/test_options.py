@@ -1,0 +1,189 @@
+"""Parameters, states, masks, receipts, snapshots, ownership of arrays."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import grpc
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+import perturb
+from perturb import session
+from perturb._proto import perturb_pb2 as pb
+from perturb.catalogue import CATALOGUE
+
+from .conftest import ROOT
+
+
+def make(name: str = "CartPole", **settings: Any) -> perturb.PerturbEnv:
+    env = gymnasium.make(f"perturb/{name}-v0", **settings).unwrapped
+    assert isinstance(env, perturb.PerturbEnv)
+    return env
+
+
+def make_vec(name: str = "CartPole", **settings: Any) -> perturb.PerturbVectorEnv:
+    envs = gymnasium.make_vec(f"perturb/{name}-v0", **settings)
+    assert isinstance(envs, perturb.PerturbVectorEnv)
+    return envs
+
+
+def test_the_package_has_the_version_of_the_server() -> None:
+    version = re.search(r'\[workspace\.package\]\nversion = "(.*)"', (ROOT / "Cargo.toml").read_text())
+    assert version is not None
+    assert perturb.__version__ == version[1]
+
+
+def test_the_catalogue_is_the_servers(server: str) -> None:
+    with grpc.insecure_channel(server, options=[("grpc.default_authority", "localhost")]) as channel:
+        served = channel.unary_unary(
+            f"/{session.SERVICE}/ListEnvironments",
+            pb.ListEnvironmentsRequest.SerializeToString,
+            pb.ListEnvironmentsResponse.FromString,
+        )(pb.ListEnvironmentsRequest())
+    assert [environment.name for environment in served.environments] == list(CATALOGUE)
+    for environment in served.environments:
+        CATALOGUE[environment.name].require_equal(environment)
+        environment.revision += 1
+        with pytest.raises(perturb.ProtocolError, match="revision 1"):
+            CATALOGUE[environment.name].require_equal(environment)
+        environment.revision -= 1
+        environment.observation[0].low = -7
+        with pytest.raises(perturb.ProtocolError, match=r"-7\.0"):
+            CATALOGUE[environment.name].require_equal(environment)
+
+
+@pytest.mark.parametrize(
+    ("given", "intervals"),
+    [
+        (12, [(12, 12)]),
+        (np.float32(0.5), [(0.5, 0.5)]),
+        ((1, 2), [(1, 2)]),
+        ([3.0, 4.0], [(3, 4)]),
+        ([(1, 2), (3, 4)], [(1, 2), (3, 4)]),
+        (np.array([[5.0, 6.0], [8.0, 9.0]]), [(5, 6), (8, 9)]),
+    ],
+)
+def test_a_parameter_is_a_value_an_interval_or_several(
+    given: Any, intervals: list[tuple[float, float]], server: str
+) -> None:
+    at_make = make(parameters={"force": given}, server=server)
+    at_reset = make(server=server)
+    seen = []
+    for i in range(30):
+        _, info = at_make.reset(seed=i)
+        _, same = at_reset.reset(seed=i, options={"parameters": {"force": given}})
+        assert info == same
+        seen.append(info["parameters"]["force"])
+        assert info["receipt"]["applied"]["force"] == seen[-1]
+        assert info["parameters"]["length"] == 0.5
+    for low, high in intervals:
+        assert any(low <= force <= high for force in seen)
+    assert all(any(low <= force <= high for low, high in intervals) for force in seen)
+
+
+def test_parameters_of_a_reset_stay(server: str) -> None:
+    env = make(version="R", server=server)
+    env.reset(options={"parameters": {"mass": 0.25}})
+    _, first = env.reset()
+    _, second = env.reset(seed=9)
+    assert first["parameters"]["mass"] == second["parameters"]["mass"] == 0.25
+    assert first["parameters"]["force"] != second["parameters"]["force"]
+
+
+def test_trials_keep_parameters(server: str) -> None:
+    env = make(version="R", episodes_per_trial=2, server=server)
+    infos = [env.reset(seed=4)[1], env.reset()[1], env.reset()[1]]
+    assert [info["context_id"] for info in infos] == [0, 0, 1]
+    assert [info["receipt"]["episode_index"] for info in infos] == [0, 1, 2]
+    assert infos[0]["parameters"] == infos[1]["parameters"] != infos[2]["parameters"]
+
+
+def test_an_exact_state_is_where_the_episode_begins(server: str) -> None:
+    state = [1.25, -0.5, 0.125, 0.75]
+    observation, _ = make(server=server).reset(options={"state": state})
+    assert observation.tolist() == state
+    envs = make_vec(num_envs=2, server=server)
+    states = np.array([state, [0, 0, 0, 0]])
+    assert envs.reset(options={"state": states})[0].tolist() == states.tolist()
+
+
+def test_a_mask_resets_some(server: str) -> None:
+    envs = make_vec(num_envs=3, autoreset_mode=AutoresetMode.DISABLED, version="R", server=server)
+    before, _ = envs.reset(seed=1)
+    mask = np.array([False, True, False])
+    options = {"reset_mask": mask, "parameters": {"force": 7}, "state": [[0.5, 0, 0, 0]]}
+    after, infos = envs.reset(seed=50, options=options)
+    assert "reset_mask" in options
+    assert after[[0, 2]].tolist() == before[[0, 2]].tolist()
+    assert after[1].tolist() == [0.5, 0, 0, 0]
+    assert infos["_parameters"].tolist() == mask.tolist()
+    assert infos["parameters"]["force"].tolist() == [0, 7, 0]
+    # It has the seed 51 and is environment 1.
+    same = make(version="R", parameters={"force": 7}, environment_index=1, server=server)
+    assert same.reset(seed=51)[1]["parameters"]["mass"] == infos["parameters"]["mass"][1]
+
+
+def test_receipts_and_terms_come_on_request(server: str) -> None:
+    env = make("Hopper", receipts=False, reward_terms=True, server=server)
+    assert env.reset(seed=1)[1] == {}
+    _, reward, _, _, info = env.step(np.full(3, 0.5, dtype=np.float32))
+    assert list(info) == ["reward_terms"]
+    assert list(info["reward_terms"]) == ["alive", "progress", "electricity", "stall_torque", "joint_limits"]
+    assert reward == pytest.approx(sum(info["reward_terms"].values()), abs=1e-6)  # float32, a few units
+    env = make(server=server)
+    env.reset(seed=1)
+    assert env.step(0)[4] == {}
+
+
+def test_a_snapshot_is_followed_by_the_same_bytes(server: str) -> None:
+    env, other = make("Hopper", version="E", server=server), make("Hopper", server=server)
+    env.reset(seed=3)
+    actions = np.random.default_rng(0).uniform(-0.2, 0.2, (20, 3)).astype(np.float32)
+    for action in actions[:10]:
+        observation = env.step(action)[0]
+    saved = env.snapshot()
+    expected = [env.step(action)[0].tobytes() for action in actions[10:20]]
+    for somewhere in (env, other):
+        assert somewhere.restore(saved).tobytes() == observation.tobytes()
+        assert [somewhere.step(action)[0].tobytes() for action in actions[10:20]] == expected
+
+
+def test_snapshots_of_a_batch_move_between_slots(server: str) -> None:
+    envs = make_vec("Pendulum", num_envs=3, server=server)
+    observations, _ = envs.reset(seed=3)
+    saved = envs.snapshot(np.array([False, False, True]))
+    assert len(saved) == 1
+    moved = envs.restore(saved * 2, np.array([True, True, False]))
+    assert moved.tolist() == observations[[2, 2, 2]].tolist()
+    stepped = envs.step(np.full((3, 1), 0.5, dtype=np.float32))[0]
+    assert stepped[0].tolist() == stepped[1].tolist() == stepped[2].tolist()
+    assert len(envs.snapshot()) == 3
+
+
+def test_observations_stay_as_they_are(server: str) -> None:
+    for copy in (False, True):
+        envs = make_vec(num_envs=4, copy=copy, server=server)
+        kept = [envs.reset(seed=1)[0]]
+        copies = [kept[0].copy()]
+        for _ in range(20):
+            kept.append(envs.step(np.ones(4, dtype=np.int64))[0])
+            copies.append(kept[-1].copy())
+        assert all((a == b).all() for a, b in zip(kept, copies, strict=True))
+        assert not any(np.shares_memory(a, b) for a in kept for b in kept if a is not b)
+        assert all(array.flags.writeable is copy for array in kept)
+        assert all(isinstance(array.base, np.ndarray) is not copy for array in kept)  # a view, unless it is a copy
+    env = make(server=server)
+    assert env.reset()[0].flags.writeable
+    assert env.step(0)[0].flags.writeable
+
+
+def test_changing_a_copy_does_not_change_what_a_mask_leaves_alone(server: str) -> None:
+    envs = make_vec(num_envs=2, copy=True, autoreset_mode=AutoresetMode.DISABLED, server=server)
+    observations, _ = envs.reset(seed=1)
+    expected = observations[1].tolist()
+    observations[:] = 99
+    assert envs.reset(options={"reset_mask": np.array([True, False])})[0][1].tolist() == expected

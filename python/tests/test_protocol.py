@@ -1,0 +1,160 @@
+"""Servers that do not keep to the protocol, or are of another version: nothing of theirs is taken for a reply."""
+
+from __future__ import annotations
+
+import tempfile
+from concurrent import futures
+from typing import TYPE_CHECKING
+
+import grpc
+import pytest
+
+import perturb
+from perturb._proto import perturb_pb2 as pb
+from perturb.session import SERVICE
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+Answer = pb.SessionResponse
+
+
+class FakeServer:
+    """Answers requests by `answers`, from a session's first on."""
+
+    def __init__(self, method: str = "Session") -> None:
+        self._directory = tempfile.TemporaryDirectory(prefix="perturb-test-")
+        self.address = f"unix:{self._directory.name}/fake.sock"
+        self.answers: list[Answer] = []
+        self.sessions = 0
+        handler = grpc.stream_stream_rpc_method_handler(
+            self._session, pb.SessionRequest.FromString, pb.SessionResponse.SerializeToString
+        )
+        self._server = grpc.server(futures.ThreadPoolExecutor(4))
+        self._server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, {method: handler}),))
+        self._server.add_insecure_port(self.address)
+        self._server.start()
+
+    def _session(self, requests: Iterator[pb.SessionRequest], _: grpc.ServicerContext) -> Iterator[Answer]:
+        self.sessions += 1
+        for answer, _request in zip(self.answers, requests, strict=False):
+            yield answer
+
+    def end(self) -> None:
+        self._server.stop(None).wait()
+        self._directory.cleanup()
+
+
+def opened() -> pb.Opened:
+    channels = [pb.Channel(name=str(i), low=-float("inf"), high=float("inf")) for i in range(4)]
+    action = pb.ActionSpace(discrete=pb.Discrete(names=["left", "right"]))
+    environment = pb.Environment(name="CartPole", observation=channels, action=action)
+    return pb.Opened(environment=environment, observations=bytes(16))
+
+
+def reset_done() -> pb.ResetDone:
+    return pb.ResetDone(observations=bytes(16))
+
+
+def stepped() -> pb.Stepped:
+    return pb.Stepped(observations=bytes(16), rewards=bytes(4), terminated=bytes(1), truncated=bytes(1))
+
+
+@pytest.fixture
+def fake() -> Iterator[FakeServer]:
+    server = FakeServer()
+    yield server
+    server.end()
+
+
+def test_a_server_that_keeps_to_the_protocol_is_understood(fake: FakeServer) -> None:
+    """So that the tests below fail for their own reason."""
+    fake.answers = [Answer(opened=opened()), Answer(stepped=stepped())]
+    env = perturb.PerturbEnv("CartPole", server=fake.address)
+    env.reset()
+    assert env.step(0)[1:] == (0.0, False, False, {})
+    env.close()
+
+
+def test_another_revision_is_refused(fake: FakeServer) -> None:
+    other = opened()
+    other.environment.revision = 3
+    fake.answers = [Answer(opened=other)]
+    with pytest.raises(perturb.ProtocolError, match="revision 3 of CartPole, this package has 0: install"):
+        perturb.PerturbEnv("CartPole", server=fake.address).reset()
+
+
+def test_a_reply_of_another_kind_is_refused(fake: FakeServer) -> None:
+    fake.answers = [Answer(opened=opened()), Answer(reset=reset_done())]
+    env = perturb.PerturbEnv("CartPole", server=fake.address)
+    env.reset()
+    with pytest.raises(perturb.ProtocolError, match="answered step with reset"):
+        env.step(0)
+    with pytest.raises(perturb.OutOfOrderError, match="gone"):
+        env.step(0)
+
+
+def test_an_empty_reply_is_refused(fake: FakeServer) -> None:
+    fake.answers = [Answer()]
+    with pytest.raises(perturb.ProtocolError, match="answered open with None"):
+        perturb.PerturbEnv("CartPole", server=fake.address).reset()
+
+
+@pytest.mark.parametrize("field", ["observations", "rewards"])
+def test_arrays_of_a_wrong_length_are_refused(field: str, fake: FakeServer) -> None:
+    short = stepped()
+    setattr(short, field, bytes(3))
+    fake.answers = [Answer(opened=opened()), Answer(stepped=short)]
+    env = perturb.PerturbEnv("CartPole", server=fake.address)
+    env.reset()
+    with pytest.raises(perturb.ProtocolError, match="3 bytes"):
+        env.step(0)
+
+
+def test_a_defect_of_the_server_costs_the_session(fake: FakeServer) -> None:
+    fake.answers = [Answer(opened=opened()), Answer(error=pb.Error(code=13, message="a worker died"))]
+    env = perturb.PerturbEnv("CartPole", server=fake.address)
+    env.reset()
+    with pytest.raises(perturb.ServerDefectError, match="a worker died"):
+        env.step(0)
+    with pytest.raises(perturb.OutOfOrderError, match="a worker died"):
+        env.step(0)
+    env.reset()
+    assert fake.sessions == 2
+
+
+@pytest.mark.parametrize(
+    ("code", "error"),
+    [
+        (3, perturb.InvalidArgumentError),
+        (5, perturb.UnknownNameError),
+        (8, perturb.ServerFullError),
+        (9, perturb.OutOfOrderError),
+        (2, perturb.ProtocolError),
+    ],
+)
+def test_a_refusal_costs_nothing(code: int, error: type[Exception], fake: FakeServer) -> None:
+    refused = Answer(error=pb.Error(code=code, message="the reason"))
+    fake.answers = [Answer(opened=opened()), refused, Answer(stepped=stepped())]
+    env = perturb.PerturbEnv("CartPole", server=fake.address)
+    env.reset()
+    with pytest.raises(error, match="the reason"):
+        env.step(0)
+    env.step(0)
+    assert fake.sessions == 1
+
+
+def test_a_stream_that_ends_is_told(fake: FakeServer) -> None:
+    fake.answers = [Answer(opened=opened())]
+    env = perturb.PerturbEnv("CartPole", server=fake.address, timeout=5)
+    env.reset()
+    fake.end()
+    with pytest.raises(perturb.ServerConnectionError, match="lost the server"):
+        env.step(0)
+
+
+def test_another_service_is_no_perturb_server() -> None:
+    other = FakeServer("SomethingElse")
+    with pytest.raises(perturb.ProtocolError, match="no perturb-server"):
+        perturb.PerturbEnv("CartPole", server=other.address).reset()
+    other.end()
