@@ -304,6 +304,57 @@ def test_a_forgotten_environment_gives_its_server_back() -> None:
     wait_until(lambda: not runs(shared.process.pid))
 
 
+FORGETTING = """
+import gc, perturb
+from perturb import local_server
+
+gc.disable()
+cycle = [perturb.PerturbEnv("CartPole")]
+cycle[0].reset(seed=1)
+cycle.append(cycle)
+del cycle
+ask = local_server.LocalServer.exit_status
+collected = []
+
+def collect_and_ask(server):
+    assert local_server._lock.locked()
+    collected.append(gc.collect())
+    return ask(server)
+
+local_server.LocalServer.exit_status = collect_and_ask
+env = perturb.PerturbEnv("CartPole")
+env.reset(seed=1)
+assert collected[0] > 0
+env.close()
+assert local_server._shared is None, "the forgotten environment's share is kept"
+print("went on")
+"""
+
+
+def test_an_environment_may_be_collected_while_another_asks_for_the_private_server() -> None:
+    assert output_of(FORGETTING) == ("went on\n", "")
+
+
+def test_a_process_that_ends_closes_its_sessions_before_its_server() -> None:
+    """Otherwise the server would wait for them for its second of grace."""
+    ending = """
+from pathlib import Path
+import perturb
+from perturb import local_server
+env = perturb.PerturbEnv("CartPole")
+env.reset(seed=1)
+end = local_server.LocalServer.end
+
+def say_and_end(server):
+    print(env._client._session._lost, server.exit_status())
+    end(server)
+    print(server.exit_status(), Path(server._directory).exists())
+
+local_server.LocalServer.end = say_and_end
+"""
+    assert output_of(ending) == ("it was closed None\n0 False\n" + "it was closed 0\n0 False\n", "")
+
+
 def test_a_private_server_that_is_killed_is_told_and_replaced() -> None:
     env, other = perturb.PerturbEnv("CartPole"), perturb.PerturbEnv("CartPole")
     env.reset(seed=1)

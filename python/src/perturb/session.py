@@ -6,6 +6,8 @@ needed, not when an environment is made: a process that is forked in between ope
 
 from __future__ import annotations
 
+import atexit
+import collections
 import contextlib
 import os
 import queue
@@ -14,7 +16,7 @@ import sys
 import threading
 import time
 import weakref
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 # gRPC reads this once, when it is first imported. Without it a process that is forked from one with open channels hangs
 # in its first call.
@@ -59,6 +61,7 @@ class Session:
     """
 
     def __init__(self, server: Address | None, timeout: float) -> None:
+        _close_forgotten()
         self._local: local_server.LocalServer | None = None
         if server is None:
             self._local = local_server.acquire()
@@ -78,9 +81,10 @@ class Session:
             request_serializer=pb.SessionRequest.SerializeToString,
             response_deserializer=pb.SessionResponse.FromString,
         )(iter(self._requests.get, None))
-        self._close = weakref.finalize(
-            self, _close, self._requests, self._responses, self._channel, self._local, self._owner
-        )
+        self._parts: _Parts = (self._requests, self._responses, self._channel, self._local, self._owner)
+        # Wherever Python happens to collect a forgotten session, also where a lock is held: so nothing but this.
+        self._forget = weakref.finalize(self, _forgotten.append, self._parts)
+        self._forget.atexit = False  # _at_exit closes what is left
         _watchdog.watch(self)
 
     def usable(self) -> bool:
@@ -130,10 +134,12 @@ class Session:
     def close(self) -> None:
         """End the session; the server frees its environments."""
         self._lost = self._lost or "it was closed"
-        if os.getpid() == self._owner:
-            self._close()
-        else:
-            _abandoned.append(self)
+        self._close()
+        _close_forgotten()
+
+    def _close(self) -> None:
+        if self._forget.detach() is not None:
+            _close(*self._parts)
 
     def expire(self) -> None:
         """Give up waiting for the reply; called by the watchdog."""
@@ -236,6 +242,20 @@ def _channel_options(address: Address) -> list[tuple[str, int | str]]:
     return options
 
 
+# What of a session has to be closed: requests, responses, channel, the private server, the process that opened it.
+_Parts: TypeAlias = tuple[
+    "queue.SimpleQueue[pb.SessionRequest | None]", Any, grpc.Channel, "local_server.LocalServer | None", int
+]
+# Of sessions that nobody closed. The next session that is opened or closed closes them, or the watchdog.
+_forgotten: collections.deque[_Parts] = collections.deque()
+
+
+def _close_forgotten() -> None:
+    with contextlib.suppress(IndexError):  # another thread may be at it, too
+        while True:
+            _close(*_forgotten.popleft())
+
+
 def _close(
     requests: queue.SimpleQueue[pb.SessionRequest | None],
     responses: Any,
@@ -276,12 +296,16 @@ class _Watchdog:
         while True:
             time.sleep(WATCH_INTERVAL)
             self._look()  # in a frame of its own: a sleeping watchdog keeps no session alive
+            _close_forgotten()
+
+    def sessions(self) -> list[Session]:
+        """All that somebody holds."""
+        with self._lock:
+            return list(self._sessions)
 
     def _look(self) -> None:
-        with self._lock:
-            sessions = list(self._sessions)
         now = time.monotonic()
-        for session in sessions:
+        for session in self.sessions():
             deadline = session.deadline
             if deadline is not None and now > deadline:
                 session.deadline = None
@@ -296,4 +320,11 @@ def _after_fork_in_child() -> None:
     _watchdog = _Watchdog()
 
 
+def _at_exit() -> None:
+    for session in _watchdog.sessions():
+        session.close()
+    _close_forgotten()
+
+
 os.register_at_fork(after_in_child=_after_fork_in_child)
+atexit.register(_at_exit)  # runs before the private server is ended, which was registered before
