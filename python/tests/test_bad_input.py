@@ -127,6 +127,9 @@ def test_wrong_settings_of_a_batch_are_refused(settings: dict[str, Any], says: s
         (1.5, None, "1.5"),
         (2**64 - 2, None, "2\\^64"),  # the third environment's does not fit
         ([1, 2], None, "2 numbers"),
+        (np.array([1, 2]), None, "2 numbers"),
+        (np.array([1.0, 2.0, 3.0]), None, "1.0"),
+        (np.array([[1], [2], [3]]), None, "integer"),
         ([1, 2, None], None, "None"),
         (None, ["state"], "expected a dict"),
         (None, {"states": [[0] * 4] * 3}, "unknown keys"),
