@@ -87,6 +87,11 @@ def test_wrong_actions_of_a_batch_move_nothing(actions: Any, says: str, server: 
         ({"episodes_per_trial": 0}, perturb.InvalidArgumentError, "episodes_per_trial=0"),
         ({"timeout": 0}, perturb.InvalidArgumentError, "timeout=0"),
         ({"timeout": NAN}, perturb.InvalidArgumentError, "timeout=nan"),
+        ({"timeout": None}, perturb.InvalidArgumentError, "timeout=None; expected a number of seconds"),
+        ({"timeout": "5"}, perturb.InvalidArgumentError, "timeout='5'"),
+        ({"timeout": True}, perturb.InvalidArgumentError, "timeout=True"),
+        ({"timeout": [5.0]}, perturb.InvalidArgumentError, r"timeout=\[5\.0\]"),
+        ({"timeout": 10**400}, perturb.InvalidArgumentError, "timeout=1000"),
         ({"render_mode": "rgb_array"}, perturb.InvalidArgumentError, "pictures"),
     ],
 )

@@ -175,6 +175,29 @@ def test_parameters_of_some_environments_are_not_forgotten_silently(by: str, sta
             envs.reset(seed=1)
 
 
+@pytest.mark.parametrize("how", ["refused", "lost"])
+def test_a_restore_that_is_refused_changes_nothing(how: str, start_server: Callable[..., Any]) -> None:
+    """If the server is lost in the middle, nobody knows."""
+    with tempfile.TemporaryDirectory() as directory:
+        listen = f"unix:{directory}/server.sock"
+        running = start_server(listen=listen)
+        env = perturb.PerturbEnv("CartPole", server=listen)
+        expected, _ = env.reset(seed=1)
+        if how == "refused":
+            with pytest.raises(perturb.InvalidArgumentError):
+                env.restore(b"no snapshot")
+        running.process.kill()
+        running.process.wait()
+        with pytest.raises(perturb.ServerConnectionError):
+            env.step(0) if how == "refused" else env.restore(b"no snapshot")
+        start_server(listen=listen)
+        if how == "refused":
+            assert env.reset(seed=1)[0].tobytes() == expected.tobytes()
+        else:
+            with pytest.raises(perturb.OutOfOrderError, match="make the environments anew"):
+                env.reset(seed=1)
+
+
 def test_a_server_that_hangs_is_given_up(start_server: Callable[..., Any]) -> None:
     running = start_server()
     env = perturb.PerturbEnv("CartPole", server=running.address)
