@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import multiprocessing
 import os
 import signal
@@ -212,6 +213,44 @@ def test_a_server_that_hangs_is_given_up(start_server: Callable[..., Any]) -> No
     running.process.send_signal(signal.SIGCONT)
     env._client._timeout = usual
     env.reset()
+
+
+class Watched:
+    """A session's replies, and a watchdog that looks just when one has come."""
+
+    def __init__(self, watched: session.Session, now: float) -> None:
+        self._replies, self._session, self._now = watched._responses, watched, now
+
+    def __next__(self) -> Any:
+        reply = next(self._replies)
+        self._session.expire(self._now)
+        return reply
+
+    def cancel(self) -> None:
+        self._replies.cancel()
+
+
+def test_a_wait_that_ends_as_its_reply_comes_is_not_blamed_on_the_next_call(server: str) -> None:
+    env = perturb.PerturbEnv("CartPole", server=server)
+    expected, _ = env.reset(seed=1)
+    watched = env._client.session
+    watched._responses = Watched(watched, now=math.inf)
+    with pytest.raises(perturb.ServerTimeoutError, match="did not answer step within 60 s"):
+        env.step(0)
+    with pytest.raises(perturb.OutOfOrderError, match="did not answer step"):
+        env.step(0)
+    assert env.reset(seed=1)[0].tobytes() == expected.tobytes()
+
+
+def test_a_watchdog_that_is_late_finds_nothing_overdue(server: str) -> None:
+    env = perturb.PerturbEnv("CartPole", server=server)
+    env.reset(seed=1)
+    watched = env._client.session
+    watched.expire(math.inf)  # the call that it looked for has its reply
+    env.step(0)
+    watched._responses = Watched(watched, now=time.monotonic())  # or the next one waits already
+    env.step(0)
+    env.close()
 
 
 def test_a_server_that_answers_no_pings_is_given_up(

@@ -71,9 +71,11 @@ class Session:
         self._timeout = timeout
         self._lost: str | None = None
         self._opened = False
-        # When the reply that is waited for is overdue; the watchdog reads it.
+        # When the reply that is waited for is overdue. Under the lock the watchdog sees that of the present call, or
+        # none: it cannot blame the next one.
         self.deadline: float | None = None
         self._overdue = False
+        self._watched = threading.Lock()
         self._requests: queue.SimpleQueue[pb.SessionRequest | None] = queue.SimpleQueue()
         self._channel = grpc.insecure_channel(str(self.address), options=_channel_options(self.address))
         self._responses: Any = self._channel.stream_stream(
@@ -141,16 +143,20 @@ class Session:
         if self._forget.detach() is not None:
             _close(*self._parts)
 
-    def expire(self) -> None:
-        """Give up waiting for the reply; called by the watchdog."""
-        self._overdue = True
-        self._responses.cancel()
+    def expire(self, now: float) -> None:
+        """Give up waiting for the reply, if it is overdue; called by the watchdog."""
+        with self._watched:
+            if self.deadline is not None and now > self.deadline:
+                self.deadline = None
+                self._overdue = True
+                self._responses.cancel()
 
     def _call(self, kind: str, request: pb.SessionRequest) -> Any:
         self.require_usable()
         self._lost = f"the wait for the reply to {kind} was interrupted"  # unless it comes, or fails otherwise
-        self.deadline = time.monotonic() + self._timeout
         try:
+            with self._watched:
+                self.deadline = time.monotonic() + self._timeout
             self._requests.put(request)
             response = next(self._responses)
         except grpc.RpcError as error:
@@ -161,7 +167,10 @@ class Session:
             self._close()
             raise
         finally:
-            self.deadline = None
+            with self._watched:
+                self.deadline = None
+        if self._overdue:  # the reply and the end of the wait for it crossed: the stream is cancelled
+            raise self._fail(self._timed_out(kind))
         self._lost = None
         answered = response.WhichOneof("response")
         if answered == "error":
@@ -181,18 +190,21 @@ class Session:
     def _lost_during(self, kind: str) -> str:
         return f"lost the server at {self.address} during {kind}"
 
+    def _timed_out(self, kind: str) -> ServerTimeoutError:
+        forked = (
+            " (gRPC was imported before perturb, and cannot be used in forked processes then: import perturb first)"
+        )
+        hint = forked if GRPC_WAS_IMPORTED and not self._opened else ""
+        return ServerTimeoutError(
+            f"the server at {self.address} did not answer {kind} within {self._timeout:g} s{hint}; "
+            "look at its log, or give slow environments more time with timeout="
+        )
+
     def _explain(self, kind: str, error: grpc.RpcError) -> PerturbError:
         """Turn the status that ended the stream into what happened and what to do."""
         status, details = error.code(), error.details()
         if self._overdue:
-            forked = (
-                " (gRPC was imported before perturb, and cannot be used in forked processes then: import perturb first)"
-            )
-            hint = forked if GRPC_WAS_IMPORTED and not self._opened else ""
-            return ServerTimeoutError(
-                f"the server at {self.address} did not answer {kind} within {self._timeout:g} s{hint}; "
-                "look at its log, or give slow environments more time with timeout="
-            )
+            return self._timed_out(kind)
         if status is grpc.StatusCode.RESOURCE_EXHAUSTED:
             return ServerFullError(f"the server at {self.address} refused {kind}: {details}")
         if status is grpc.StatusCode.OUT_OF_RANGE:
@@ -306,10 +318,7 @@ class _Watchdog:
     def _look(self) -> None:
         now = time.monotonic()
         for session in self.sessions():
-            deadline = session.deadline
-            if deadline is not None and now > deadline:
-                session.deadline = None
-                session.expire()
+            session.expire(now)
 
 
 _watchdog = _Watchdog()
