@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import re
 import subprocess
 import sys
@@ -18,8 +19,16 @@ EXAMPLES = ROOT / "python/examples"
 pytestmark = pytest.mark.slow
 
 
+@pytest.fixture(autouse=True)
+def _takes_longer() -> None:
+    """Lift the limit of other tests."""
+    faulthandler.cancel_dump_traceback_later()
+
+
 def run(*command: str) -> str:
-    ended = subprocess.run([sys.executable, *command], capture_output=True, text=True, cwd=EXAMPLES, check=False)
+    ended = subprocess.run(
+        [sys.executable, *command], capture_output=True, text=True, cwd=EXAMPLES, check=False, timeout=3600
+    )
     assert ended.returncode == 0, ended.stderr
     return ended.stdout
 

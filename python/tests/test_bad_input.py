@@ -87,6 +87,11 @@ def test_wrong_actions_of_a_batch_move_nothing(actions: Any, says: str, server: 
         ({"episodes_per_trial": 0}, perturb.InvalidArgumentError, "episodes_per_trial=0"),
         ({"timeout": 0}, perturb.InvalidArgumentError, "timeout=0"),
         ({"timeout": NAN}, perturb.InvalidArgumentError, "timeout=nan"),
+        ({"timeout": None}, perturb.InvalidArgumentError, "timeout=None; expected a number of seconds"),
+        ({"timeout": "5"}, perturb.InvalidArgumentError, "timeout='5'"),
+        ({"timeout": True}, perturb.InvalidArgumentError, "timeout=True"),
+        ({"timeout": [5.0]}, perturb.InvalidArgumentError, r"timeout=\[5\.0\]"),
+        ({"timeout": 10**400}, perturb.InvalidArgumentError, "timeout=1000"),
         ({"render_mode": "rgb_array"}, perturb.InvalidArgumentError, "pictures"),
     ],
 )
@@ -127,6 +132,9 @@ def test_wrong_settings_of_a_batch_are_refused(settings: dict[str, Any], says: s
         (1.5, None, "1.5"),
         (2**64 - 2, None, "2\\^64"),  # the third environment's does not fit
         ([1, 2], None, "2 numbers"),
+        (np.array([1, 2]), None, "2 numbers"),
+        (np.array([1.0, 2.0, 3.0]), None, "1.0"),
+        (np.array([[1], [2], [3]]), None, "integer"),
         ([1, 2, None], None, "None"),
         (None, ["state"], "expected a dict"),
         (None, {"states": [[0] * 4] * 3}, "unknown keys"),

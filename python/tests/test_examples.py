@@ -12,7 +12,9 @@ EXAMPLES = ROOT / "python/examples"
 
 
 def run(*command: str) -> str:
-    ended = subprocess.run([sys.executable, *command], capture_output=True, text=True, cwd=EXAMPLES, check=False)
+    ended = subprocess.run(
+        [sys.executable, *command], capture_output=True, text=True, cwd=EXAMPLES, check=False, timeout=100
+    )
     assert ended.returncode == 0, ended.stderr
     assert ended.stderr == ""
     return ended.stdout

@@ -56,6 +56,20 @@ def test_the_catalogue_is_the_servers(server: str) -> None:
             CATALOGUE[environment.name].require_equal(environment)
 
 
+@pytest.mark.parametrize("kind", [np.int64, np.uint8, np.array])
+def test_seeds_may_be_numpys(kind: Any, server: str) -> None:
+    env, envs = make(server=server), make_vec(num_envs=3, server=server)
+    expected, _ = env.reset(seed=11)
+    assert env.reset(seed=kind(11))[0].tobytes() == expected.tobytes()
+    assert env.np_random_seed == 11
+    batch, _ = envs.reset(seed=11)
+    assert batch[0].tobytes() == expected.tobytes()
+    assert envs.reset(seed=kind(11))[0].tobytes() == batch.tobytes()
+    assert envs.reset(seed=np.array([11, 12, 13], dtype=np.int32))[0].tobytes() == batch.tobytes()  # type: ignore[arg-type]
+    assert envs.reset(seed=[kind(11), kind(12), kind(13)])[0].tobytes() == batch.tobytes()
+    assert envs.np_random_seed == 11
+
+
 @pytest.mark.parametrize(
     ("given", "intervals"),
     [

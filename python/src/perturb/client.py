@@ -44,14 +44,12 @@ class Client:
     ) -> None:
         if render_mode is not None:
             raise InvalidArgumentError(f"render_mode={render_mode!r} is not supported: servers send no pictures")
-        if not timeout > 0:
-            raise InvalidArgumentError(f"timeout={timeout!r}; expected seconds, more than 0")
         self.description = catalogue.find(environment)
         self.num_envs = requests.count(num_envs, "num_envs", 1)
         self._server = None if server is None else parse_address(server)
         if server is None:
             local_server.find_program()  # better now than at the first reset
-        self._timeout = timeout
+        self._timeout = requests.seconds(timeout, "timeout")
         self._request = pb.Open(
             environment=environment,
             version=requests.version(version),
@@ -140,9 +138,15 @@ class Client:
         """Bring saved environments back."""
         if not all(isinstance(snapshot, bytes) for snapshot in snapshots):
             raise InvalidArgumentError("a snapshot is not of the type bytes; expected what snapshot() returned")
-        # From here on nobody but the server knows the parameters.
-        self._partly_changed = True
-        return self.session.restore(pb.Restore(mask=_bytes(mask), snapshots=snapshots))
+        session = self.session
+        try:
+            restored = session.restore(pb.Restore(mask=_bytes(mask), snapshots=snapshots))
+        except BaseException:
+            # A refusal, after which the session is usable, has changed nothing.
+            self._partly_changed = self._partly_changed or not session.usable()
+            raise
+        self._partly_changed = True  # from here on nobody but the server knows the parameters
+        return restored
 
     def floats(self, data: bytes, *shape: int) -> NDArray[np.float32]:
         """Look at a reply's numbers as a read-only array, without a copy."""

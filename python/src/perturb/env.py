@@ -95,7 +95,7 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
         parameters = requests.distributions(given.get("parameters"))
         state = given.get("state")
         states = b"" if state is None else requests.states(state, 1, batched=False)
-        super().reset(seed=seed)
+        super().reset(seed=seeds[0] if seeds else None)
 
         opened = self._client.open(seeds, self.np_random)
         done: Any = opened

@@ -6,6 +6,7 @@ ends with this process, however that ends, for this process holds the other end 
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import queue
@@ -67,13 +68,17 @@ class LocalServer:
         except (PerturbError, OSError) as error:
             shutil.rmtree(directory, ignore_errors=True)
             raise ServerStartError(f"the private server {program} did not start: {error}") from error
-        self._end = weakref.finalize(self, _end, self.process, directory, self._owner)
+        self._directory = directory
+        self._unended = weakref.finalize(self, _end, self.process, directory, self._owner)
+        self._unended.atexit = False  # _at_exit ends what is left, after the sessions
         _running.add(self)
         self._wait_until_ready(program)
 
     def end(self) -> None:
         """End the server and wait until it has ended. Its sessions should be closed."""
-        self._end()
+        # Not by a call of the finalizer: finalizers do nothing any more when _at_exit runs.
+        if self._unended.detach() is not None:
+            _end(self.process, self._directory, self._owner)
 
     def exit_status(self) -> int | None:
         """Tell how it ended, as `subprocess` does; None while it runs."""
@@ -183,4 +188,10 @@ def _after_fork_in_child() -> None:
     _running.clear()
 
 
+def _at_exit() -> None:
+    for server in list(_running):
+        server.end()
+
+
 os.register_at_fork(after_in_child=_after_fork_in_child)
+atexit.register(_at_exit)

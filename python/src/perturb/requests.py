@@ -6,6 +6,7 @@ judge, whose sentences are better.
 
 from __future__ import annotations
 
+import numbers
 import operator
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -117,6 +118,17 @@ def count(value: Any, name: str, least: int) -> int:
         number = -1
     if not least <= number < 2**32:
         raise InvalidArgumentError(f"{name}={value!r}; expected an integer from {least} to 2^32 - 1")
+    return number
+
+
+def seconds(value: Any, name: str) -> float:
+    """A span of time, more than nothing; infinity is one."""
+    try:
+        number = float(value) if isinstance(value, numbers.Real) and not isinstance(value, bool) else 0.0
+    except OverflowError:
+        number = 0.0
+    if not number > 0:
+        raise InvalidArgumentError(f"{name}={value!r}; expected a number of seconds, more than 0")
     return number
 
 

@@ -6,6 +6,8 @@ needed, not when an environment is made: a process that is forked in between ope
 
 from __future__ import annotations
 
+import atexit
+import collections
 import contextlib
 import os
 import queue
@@ -14,7 +16,7 @@ import sys
 import threading
 import time
 import weakref
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 # gRPC reads this once, when it is first imported. Without it a process that is forked from one with open channels hangs
 # in its first call.
@@ -59,6 +61,7 @@ class Session:
     """
 
     def __init__(self, server: Address | None, timeout: float) -> None:
+        _close_forgotten()
         self._local: local_server.LocalServer | None = None
         if server is None:
             self._local = local_server.acquire()
@@ -68,9 +71,11 @@ class Session:
         self._timeout = timeout
         self._lost: str | None = None
         self._opened = False
-        # When the reply that is waited for is overdue; the watchdog reads it.
+        # When the reply that is waited for is overdue. Under the lock the watchdog sees that of the present call, or
+        # none: it cannot blame the next one.
         self.deadline: float | None = None
         self._overdue = False
+        self._watched = threading.Lock()
         self._requests: queue.SimpleQueue[pb.SessionRequest | None] = queue.SimpleQueue()
         self._channel = grpc.insecure_channel(str(self.address), options=_channel_options(self.address))
         self._responses: Any = self._channel.stream_stream(
@@ -78,9 +83,10 @@ class Session:
             request_serializer=pb.SessionRequest.SerializeToString,
             response_deserializer=pb.SessionResponse.FromString,
         )(iter(self._requests.get, None))
-        self._close = weakref.finalize(
-            self, _close, self._requests, self._responses, self._channel, self._local, self._owner
-        )
+        self._parts: _Parts = (self._requests, self._responses, self._channel, self._local, self._owner)
+        # Wherever Python happens to collect a forgotten session, also where a lock is held: so nothing but this.
+        self._forget = weakref.finalize(self, _forgotten.append, self._parts)
+        self._forget.atexit = False  # _at_exit closes what is left
         _watchdog.watch(self)
 
     def usable(self) -> bool:
@@ -130,21 +136,27 @@ class Session:
     def close(self) -> None:
         """End the session; the server frees its environments."""
         self._lost = self._lost or "it was closed"
-        if os.getpid() == self._owner:
-            self._close()
-        else:
-            _abandoned.append(self)
+        self._close()
+        _close_forgotten()
 
-    def expire(self) -> None:
-        """Give up waiting for the reply; called by the watchdog."""
-        self._overdue = True
-        self._responses.cancel()
+    def _close(self) -> None:
+        if self._forget.detach() is not None:
+            _close(*self._parts)
+
+    def expire(self, now: float) -> None:
+        """Give up waiting for the reply, if it is overdue; called by the watchdog."""
+        with self._watched:
+            if self.deadline is not None and now > self.deadline:
+                self.deadline = None
+                self._overdue = True
+                self._responses.cancel()
 
     def _call(self, kind: str, request: pb.SessionRequest) -> Any:
         self.require_usable()
         self._lost = f"the wait for the reply to {kind} was interrupted"  # unless it comes, or fails otherwise
-        self.deadline = time.monotonic() + self._timeout
         try:
+            with self._watched:
+                self.deadline = time.monotonic() + self._timeout
             self._requests.put(request)
             response = next(self._responses)
         except grpc.RpcError as error:
@@ -155,7 +167,10 @@ class Session:
             self._close()
             raise
         finally:
-            self.deadline = None
+            with self._watched:
+                self.deadline = None
+        if self._overdue:  # the reply and the end of the wait for it crossed: the stream is cancelled
+            raise self._fail(self._timed_out(kind))
         self._lost = None
         answered = response.WhichOneof("response")
         if answered == "error":
@@ -175,18 +190,21 @@ class Session:
     def _lost_during(self, kind: str) -> str:
         return f"lost the server at {self.address} during {kind}"
 
+    def _timed_out(self, kind: str) -> ServerTimeoutError:
+        forked = (
+            " (gRPC was imported before perturb, and cannot be used in forked processes then: import perturb first)"
+        )
+        hint = forked if GRPC_WAS_IMPORTED and not self._opened else ""
+        return ServerTimeoutError(
+            f"the server at {self.address} did not answer {kind} within {self._timeout:g} s{hint}; "
+            "look at its log, or give slow environments more time with timeout="
+        )
+
     def _explain(self, kind: str, error: grpc.RpcError) -> PerturbError:
         """Turn the status that ended the stream into what happened and what to do."""
         status, details = error.code(), error.details()
         if self._overdue:
-            forked = (
-                " (gRPC was imported before perturb, and cannot be used in forked processes then: import perturb first)"
-            )
-            hint = forked if GRPC_WAS_IMPORTED and not self._opened else ""
-            return ServerTimeoutError(
-                f"the server at {self.address} did not answer {kind} within {self._timeout:g} s{hint}; "
-                "look at its log, or give slow environments more time with timeout="
-            )
+            return self._timed_out(kind)
         if status is grpc.StatusCode.RESOURCE_EXHAUSTED:
             return ServerFullError(f"the server at {self.address} refused {kind}: {details}")
         if status is grpc.StatusCode.OUT_OF_RANGE:
@@ -236,6 +254,20 @@ def _channel_options(address: Address) -> list[tuple[str, int | str]]:
     return options
 
 
+# What of a session has to be closed: requests, responses, channel, the private server, the process that opened it.
+_Parts: TypeAlias = tuple[
+    "queue.SimpleQueue[pb.SessionRequest | None]", Any, grpc.Channel, "local_server.LocalServer | None", int
+]
+# Of sessions that nobody closed. The next session that is opened or closed closes them, or the watchdog.
+_forgotten: collections.deque[_Parts] = collections.deque()
+
+
+def _close_forgotten() -> None:
+    with contextlib.suppress(IndexError):  # another thread may be at it, too
+        while True:
+            _close(*_forgotten.popleft())
+
+
 def _close(
     requests: queue.SimpleQueue[pb.SessionRequest | None],
     responses: Any,
@@ -276,16 +308,17 @@ class _Watchdog:
         while True:
             time.sleep(WATCH_INTERVAL)
             self._look()  # in a frame of its own: a sleeping watchdog keeps no session alive
+            _close_forgotten()
+
+    def sessions(self) -> list[Session]:
+        """All that somebody holds."""
+        with self._lock:
+            return list(self._sessions)
 
     def _look(self) -> None:
-        with self._lock:
-            sessions = list(self._sessions)
         now = time.monotonic()
-        for session in sessions:
-            deadline = session.deadline
-            if deadline is not None and now > deadline:
-                session.deadline = None
-                session.expire()
+        for session in self.sessions():
+            session.expire(now)
 
 
 _watchdog = _Watchdog()
@@ -296,4 +329,11 @@ def _after_fork_in_child() -> None:
     _watchdog = _Watchdog()
 
 
+def _at_exit() -> None:
+    for session in _watchdog.sessions():
+        session.close()
+    _close_forgotten()
+
+
 os.register_at_fork(after_in_child=_after_fork_in_child)
+atexit.register(_at_exit)  # runs before the private server is ended, which was registered before

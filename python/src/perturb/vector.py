@@ -122,7 +122,7 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         parameters = requests.distributions(given.get("parameters"))
         state = given.get("state")
         states = b"" if state is None else requests.states(state, len(selected), batched=True)
-        super().reset(seed=seeds[0] if seeds and isinstance(seed, Sequence) else seed)  # type: ignore[arg-type]
+        super().reset(seed=seeds[0] if seeds else None)
 
         opened = self._client.open(seeds, self.np_random)
         done: Any = opened
@@ -184,7 +184,7 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
     def _seeds(self, seed: int | Sequence[int] | None) -> list[int]:
         if seed is None:
             return []
-        if not isinstance(seed, Sequence | np.ndarray):
+        if not isinstance(seed, Sequence | np.ndarray) or getattr(seed, "ndim", 1) == 0:
             first = requests.seed(seed)
             return [requests.seed(first + i) for i in range(self.num_envs)]
         if len(seed) != self.num_envs:
