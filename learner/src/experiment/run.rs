@@ -20,6 +20,8 @@ pub const NO_SERVER: u8 = 69;
 const USAGE: i32 = 2;
 /// How often a worker may be killed before its cell counts as failed, or be without a server before the run ends.
 const MOST_ATTEMPTS: u32 = 3;
+/// How often it is said how far the run is, which looks at every cell that is left.
+const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 /// How often workers are looked at.
 const TICK: Duration = Duration::from_millis(50);
 /// How long no worker is started after one had no server.
@@ -152,6 +154,7 @@ impl<'a> Runner<'a> {
     }
 
     fn run(&mut self, stop: &StopFlag, report: &mut dyn FnMut(&RunStatus)) -> Result<RunEnd, RunError> {
+        let mut reported: Option<Instant> = None;
         loop {
             self.reap()?;
             if let Some(signal) = stop.signal() {
@@ -162,7 +165,10 @@ impl<'a> Runner<'a> {
             }
             self.look_elsewhere()?;
             self.start_workers()?;
-            report(&self.status());
+            if reported.is_none_or(|time| time.elapsed() >= STATUS_INTERVAL) {
+                reported = Some(Instant::now());
+                report(&self.status());
+            }
             if self.running.is_empty() && self.queue.is_empty() && self.elsewhere.is_empty() {
                 let failed = self.failed.iter().map(|&cell| self.plan.cells[cell].id.clone()).collect();
                 return Ok(RunEnd::Finished { failed });
