@@ -18,14 +18,18 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
+/// What the program is made of.
+const SOURCES: [&str; 5] = ["src", "data", "Cargo.toml", "../Cargo.lock", "../proto"];
+
 /// The commit that is checked out, with "-dirty" if the learner's files differ from it.
 fn described() -> Option<String> {
     let log = git(&["rev-parse", "--git-path", "logs/HEAD"])?; // grows with every commit and checkout
-    for path in [log.as_str(), "src", "data", "Cargo.toml"] {
+    for path in [log.as_str()].iter().chain(&SOURCES) {
         println!("cargo:rerun-if-changed={path}");
     }
     let commit = git(&["rev-parse", "--short=12", "HEAD"])?;
-    let changed = git(&["status", "--porcelain", "--untracked-files=no", "--", "src", "data", "Cargo.toml"])?;
+    let status = ["status", "--porcelain", "--untracked-files=no", "--"];
+    let changed = git(&[&status[..], &SOURCES].concat())?;
     Some(if changed.is_empty() { commit } else { format!("{commit}-dirty") })
 }
 

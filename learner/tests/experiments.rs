@@ -128,7 +128,7 @@ fn results_depend_neither_on_jobs_nor_on_kills() {
     assert_eq!(whole.len(), cells);
     assert_eq!(experiment.attempts("whole"), vec![1; cells]);
 
-    for done in [1, 3, 6] {
+    for done in [1, 2, 4] {
         let child = experiment.command("killed", &["--jobs", "2"]).spawn().expect("started");
         wait_for("a few results", || experiment.results("killed").len() >= done);
         kill_all(child);
@@ -395,4 +395,29 @@ fn a_heatmap_is_drawn_of_two_parameters_and_others_are_refused() {
             "{message}"
         );
     }
+}
+
+#[test]
+fn curves_of_two_learners_are_drawn_and_written() {
+    let plan = "environments = ['CartPole']\nversions = ['D']\ntest_versions = ['D']\ntest_episodes = 4
+        settings = { episodes = 40, num_envs = 4 }
+        [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+    let experiment = Experiment::new(plan);
+    succeeded(&experiment.run("out", &["--jobs", "2"]));
+    let mut command = Command::new(env!("CARGO_BIN_EXE_perturb"));
+    let output = command.arg("curves").arg(experiment.out("out")).output().expect("ended");
+    succeeded(&output);
+    let report = experiment.out("out").join("report");
+    for quantity in ["return", "success"] {
+        let read = |ending: &str| {
+            let name = format!("CartPole-{quantity}.{ending}");
+            std::fs::read(report.join(&name)).unwrap_or_else(|error| panic!("{name}: {error}"))
+        };
+        let picture = String::from_utf8(read("svg")).expect("text");
+        assert!(picture.starts_with("<svg") && picture.contains("a2c") && picture.contains("ppo"));
+        assert!(read("png").starts_with(b"\x89PNG"));
+    }
+    let table = std::fs::read_to_string(report.join("curves.csv")).expect("a table");
+    let lines_of = |name: &str| table.lines().filter(|line| line.contains(name)).count();
+    assert!(lines_of("a2c") >= 2 && lines_of("a2c") == lines_of("ppo"), "{table}");
 }

@@ -49,8 +49,9 @@ fn one_cell(args: &RunArgs, plan: &Plan, folder: &Folder, name: &str, stop: &Sto
     if args.exit_with_stdin {
         stop_with_input(stop)?;
     }
-    if !folder.plan_path().exists() {
-        folder.keep_plan(&plan.text)?;
+    // A worker has its plan from there.
+    if !args.exit_with_stdin {
+        keep_plan(plan, folder)?;
     }
     let servers = match servers(&args.server, cell.config.common.num_envs.max(TEST_ENVS)) {
         Ok(servers) => servers,
@@ -107,12 +108,7 @@ fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> R
     let (local, addresses) = shared_servers(args, plan, jobs)?;
     let local = local.map(Mutex::new);
     step_limits(&Servers::connect(&addresses)?, plan)?; // refuses environments that there are not
-    if folder.keep_plan(&plan.text)? {
-        eprintln!(
-            "{} was another plan; it is replaced, and cells that both have are kept",
-            folder.plan_path().display()
-        );
-    }
+    keep_plan(plan, folder)?;
     let addresses: Vec<String> = addresses.iter().map(Address::to_string).collect();
     let worker = |cell: &Cell| worker(args, folder, cell, &addresses);
     let server_trouble = || {
@@ -144,6 +140,17 @@ fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> R
             )
         }
     }
+}
+
+/// Copies the plan into its folder, and says so if another one was there.
+fn keep_plan(plan: &Plan, folder: &Folder) -> Result<()> {
+    if folder.keep_plan(&plan.text)? {
+        eprintln!(
+            "{} was another plan; it is replaced, and cells that both have are kept",
+            folder.plan_path().display()
+        );
+    }
+    Ok(())
 }
 
 /// The servers that all workers share.

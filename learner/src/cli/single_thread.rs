@@ -8,10 +8,10 @@ const VARIABLE: &str = "OPENBLAS_NUM_THREADS";
 
 /// Makes sure that OpenBLAS computes on one thread: its threads cost more than they bring with networks this small, and
 /// sums depend on their number. OpenBLAS reads the variable when it is loaded, before `main`, so that the program has to
-/// start again with the same process number. Returns if the variable has a value already, or if the start fails: then
-/// all works, but slower.
-pub(super) fn ensure() {
-    if std::env::var_os(VARIABLE).is_some() {
+/// start again with the same process number. Returns if the variable has a value already, which must be 1 if `always`,
+/// or if the start fails: then all works, but slower.
+pub(super) fn ensure(always: bool) {
+    if std::env::var_os(VARIABLE).is_some_and(|value| !always || value == "1") {
         return;
     }
     let Ok(program) = std::env::current_exe() else { return };
@@ -21,9 +21,7 @@ pub(super) fn ensure() {
     tracing::warn!(%error, "cannot start again with {VARIABLE}=1");
 }
 
-/// Makes a program that is started compute on one thread, unless the variable has a value already.
+/// Makes a program that is started compute on one thread, whatever the variable is here.
 pub(super) fn set(command: &mut Command) {
-    if std::env::var_os(VARIABLE).is_none() {
-        command.env(VARIABLE, "1");
-    }
+    command.env(VARIABLE, "1");
 }

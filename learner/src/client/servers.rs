@@ -1,5 +1,6 @@
 //! Connections to one or several servers.
 
+use std::io::ErrorKind;
 use std::sync::Mutex;
 use std::time::Duration;
 
@@ -97,7 +98,12 @@ impl Servers {
     /// # Errors
     /// [`ClientError::Lost`] or [`ClientError::TimedOut`].
     pub fn catalogue(&self) -> Result<proto::ListEnvironmentsResponse, ClientError> {
-        let Some(link) = self.links.first() else { return Ok(proto::ListEnvironmentsResponse::default()) };
+        self.links
+            .first()
+            .map_or_else(|| Ok(proto::ListEnvironmentsResponse::default()), |link| self.catalogue_of(link))
+    }
+
+    fn catalogue_of(&self, link: &Link) -> Result<proto::ListEnvironmentsResponse, ClientError> {
         let request = "the catalogue";
         let mut client = link.client.clone();
         self.runtime
@@ -110,16 +116,34 @@ impl Servers {
             .map_err(|status| self.lost(&link.address, request, &status))
     }
 
-    /// The catalogue's entry `name`.
+    /// The entry `name` of the catalogues, which must be the same in all of them.
     ///
     /// # Errors
-    /// [`ClientError::Refused`] with the names that there are, and those of [`Servers::catalogue`].
+    /// [`ClientError::Refused`] with the names that there are, [`ClientError::Disagreement`], and those of
+    /// [`Servers::catalogue`].
     pub fn environment(&self, name: &str) -> Result<proto::Environment, ClientError> {
-        let catalogue = self.catalogue()?.environments;
+        let Some((first, others)) = self.links.split_first() else {
+            return Err(ClientError::System {
+                action: "ask for an environment",
+                source: ErrorKind::NotConnected.into(),
+            });
+        };
+        let environment = self.environment_of(first, name)?;
+        for other in others {
+            if self.environment_of(other, name)? != environment {
+                let (first, other) = (first.address.clone(), other.address.clone());
+                return Err(ClientError::Disagreement { first, other, environment: name.into() });
+            }
+        }
+        Ok(environment)
+    }
+
+    fn environment_of(&self, link: &Link, name: &str) -> Result<proto::Environment, ClientError> {
+        let catalogue = self.catalogue_of(link)?.environments;
         let names: Vec<&str> = catalogue.iter().map(|environment| environment.name.as_str()).collect();
         let message = format!("there is no environment `{name}`; there are {}", names.join(", "));
         catalogue.iter().find(|environment| environment.name == name).cloned().ok_or_else(|| ClientError::Refused {
-            address: self.links[0].address.clone(),
+            address: link.address.clone(),
             request: "the environment",
             code: tonic::Code::NotFound as i32,
             message,

@@ -9,7 +9,7 @@ use anyhow::Result;
 
 use super::folder::{CellFolder, CellResult, CellState, Failure, FolderError, Timing, Training, io};
 use super::plan::Cell;
-use crate::checkpoint::Checkpoint;
+use crate::checkpoint::{Checkpoint, CheckpointError, ResumeState};
 use crate::client::{ClientError, Servers};
 use crate::evaluation::{TestError, test};
 use crate::interrupt::StopFlag;
@@ -145,7 +145,7 @@ fn trained(
 ) -> Result<Option<Checkpoint>> {
     let config = &cell.config;
     let progress = |progress: &Progress| report("training", progress.episodes);
-    let earlier = RunDirectory::resume(directory).ok();
+    let earlier = earlier(directory)?;
     let outcome = match earlier.filter(|(_, checkpoint, _)| checkpoint.state.config == config.table()) {
         Some((_, checkpoint, _)) if checkpoint.state.counters.episodes >= config.common.episodes => {
             return Ok(Some(checkpoint));
@@ -156,6 +156,30 @@ fn trained(
         None => train(servers, config, &RunDirectory::choose(directory, true)?, stop, progress)?,
     };
     Ok(outcome.signal.is_none().then_some(outcome.checkpoint))
+}
+
+/// What is left of a training that was broken off; `None` if there is nothing that could go on.
+///
+/// # Errors
+/// Whatever else keeps it from being read, a lock for instance: then it may still go on later, and is left as it is.
+fn earlier(directory: &Path) -> Result<Option<(RunDirectory, Checkpoint, ResumeState)>> {
+    if !directory.try_exists()? {
+        return Ok(None);
+    }
+    let error = match RunDirectory::resume(directory) {
+        Ok(earlier) => return Ok(Some(earlier)),
+        Err(error) => error,
+    };
+    let useless = match error.downcast_ref() {
+        Some(CheckpointError::Damaged { .. } | CheckpointError::NotResumable { .. }) => true,
+        Some(_) => false,
+        None => !directory.join("checkpoint").join("checkpoint.json").try_exists()?,
+    };
+    if !useless {
+        return Err(error);
+    }
+    tracing::warn!("the training begins again: {error:#}");
+    Ok(None)
 }
 
 /// Whether an error came from the servers or the way to them, not from what was trained.
@@ -172,9 +196,10 @@ fn lost_server(error: &anyhow::Error) -> bool {
         });
         direct.or(collecting).or(testing)
     });
-    use ClientError::{Connect, Lost, NoServerProgram, Refused, Start, System, TimedOut};
+    use ClientError::{Connect, Disagreement, Lost, NoServerProgram, Protocol, Refused, Start, System, TimedOut};
     client.is_some_and(|error| match error {
         Connect { .. } | Lost { .. } | TimedOut { .. } | NoServerProgram { .. } | Start { .. } | System { .. } => true,
+        Disagreement { .. } | Protocol { .. } => true, // servers of another version
         Refused { code, .. } => *code == tonic::Code::ResourceExhausted as i32, // full; others' sessions will end
         _ => false,
     })
@@ -234,6 +259,22 @@ mod tests {
     }
 
     #[test]
+    fn a_training_that_cannot_be_read_now_is_not_begun_again() {
+        let directory = tempfile::tempdir().unwrap();
+        let training = directory.path().join("training");
+        assert!(earlier(&training).unwrap().is_none(), "nothing there");
+        let checkpoint = training.join("checkpoint");
+        std::fs::create_dir_all(&checkpoint).unwrap();
+        assert!(earlier(&training).unwrap().is_none(), "broken off before the first checkpoint");
+        std::fs::write(checkpoint.join("checkpoint.json"), "{").unwrap();
+        assert!(earlier(&training).unwrap().is_none(), "damaged");
+        let lock = std::fs::File::open(&training).unwrap();
+        lock.try_lock().unwrap();
+        let Err(error) = earlier(&training) else { panic!("it is locked") };
+        assert!(error.to_string().contains("another process trains in"), "{error:#}");
+    }
+
+    #[test]
     fn a_lost_server_is_told_from_a_failure() {
         let address: crate::client::Address = "unix:/x".parse().unwrap();
         let lost = || ClientError::Lost { address: address.clone(), request: "a step", reason: "gone".into() };
@@ -244,6 +285,9 @@ mod tests {
         assert!(lost_server(&anyhow::Error::new(lost())));
         assert!(lost_server(&anyhow::Error::new(CollectError::Client(lost())).context("training failed")));
         assert!(lost_server(&anyhow::Error::new(TestError::Client(lost())).context("testing")));
+        let environment = "Hopper".to_owned();
+        let disagreement = ClientError::Disagreement { first: address.clone(), other: address.clone(), environment };
+        assert!(lost_server(&anyhow::Error::new(disagreement)), "servers of two versions");
         assert!(!lost_server(&anyhow::Error::new(refused())));
         assert!(!lost_server(&anyhow::Error::new(CollectError::Client(refused())).context("training")));
         assert!(!lost_server(&anyhow::anyhow!("NaN")));

@@ -334,12 +334,12 @@ fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
 pub(super) fn write_atomically(path: &Path, content: &[u8]) -> Result<()> {
     let directory = path.parent().unwrap_or(Path::new("."));
     fs::create_dir_all(directory).map_err(io("create", directory))?;
+    // As readable as any other file that is created here; temporary files are otherwise their owner's alone.
+    let mode = <fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666);
+    let mut builder = tempfile::Builder::new();
     let mut file =
-        tempfile::Builder::new().prefix(".tmp-").tempfile_in(directory).map_err(io("write in", directory))?;
+        builder.prefix(".tmp-").permissions(mode).tempfile_in(directory).map_err(io("write in", directory))?;
     file.write_all(content).and_then(|()| file.as_file().sync_all()).map_err(io("write", path))?;
-    // Temporary files are their owner's alone; results are as readable as any other file that is created here.
-    let readable = <fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o644);
-    file.as_file().set_permissions(readable).map_err(io("write", path))?;
     file.persist(path).map_err(|error| io("rename a file to", path)(error.error))?;
     File::open(directory).and_then(|directory| directory.sync_all()).map_err(io("sync", directory))
 }
@@ -421,6 +421,17 @@ mod tests {
         }
         cell.write_result(&CellResult { format_version: 9, ..result() }).unwrap();
         assert!(cell.state().unwrap_err().to_string().contains("it has format 9, this program reads 1"));
+    }
+
+    #[test]
+    fn a_result_is_as_readable_as_other_files() {
+        use std::os::unix::fs::PermissionsExt;
+        let directory = tempfile::tempdir().unwrap();
+        let [plain, whole] = ["plain", "whole"].map(|name| directory.path().join(name));
+        fs::write(&plain, "x").unwrap();
+        write_atomically(&whole, b"x").unwrap();
+        let [plain, whole] = [plain, whole].map(|path| fs::metadata(path).unwrap().permissions().mode());
+        assert_eq!(plain, whole);
     }
 
     #[test]

@@ -101,8 +101,9 @@ impl Axis {
     }
 }
 
-/// Tests `checkpoint` at every point of a grid over two parameters, whose range is that of R and E together. All points
-/// have the same seed, so that they differ by their parameters alone. Calls `report` with the number of episodes.
+/// Tests `checkpoint` at every point of a grid over two parameters, whose range is that of R and E together. Each
+/// point is an environment with random numbers of its own, so that points differ by their parameters and by chance.
+/// Calls `report` with the number of episodes.
 ///
 /// # Errors
 /// [`HeatmapError`].

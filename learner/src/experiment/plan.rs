@@ -87,6 +87,9 @@ pub struct Counts {
     pub runs: u32,
 }
 
+/// The most cells of a plan.
+const MOST_CELLS: usize = 1_000_000;
+
 /// Why an experiment file was refused.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -328,6 +331,22 @@ impl Expansion<'_> {
         Ok(())
     }
 
+    /// Refuses more cells than anybody can do, before they fill the memory.
+    fn check_size(&self, name: &str, block: &Block, places: usize) -> Result<(), PlanError> {
+        let values = block.grid.values().map(|values| values.as_array().map_or(1, Vec::len));
+        let cells = [places, block.architectures.len(), self.file.runs as usize]
+            .into_iter()
+            .chain(values)
+            .fold(1, usize::saturating_mul)
+            .saturating_add(self.cells.len());
+        if cells > MOST_CELLS {
+            let key =
+                format!("{name}: the number of cells up to here, every combination of [algorithm.grid] in each run,");
+            return Err(self.value(key, cells, format!("at most {MOST_CELLS}")));
+        }
+        Ok(())
+    }
+
     fn add_block(&mut self, number: usize, block: &Block) -> Result<(), PlanError> {
         let name = format!("[[algorithm]] {} ({})", number + 1, block.name);
         let environments = block.environments.as_ref().unwrap_or(&self.file.environments);
@@ -344,6 +363,7 @@ impl Expansion<'_> {
         self.check_list(&format!("{name}: versions"), versions)?;
         self.check_list(&format!("{name}: architectures"), &block.architectures)?;
         self.check_keys(&name, block)?;
+        self.check_size(&name, block, environments.len() * versions.len())?;
         let points = self.grid_points(&name, &block.grid)?;
         for environment in environments {
             for architecture in &block.architectures {

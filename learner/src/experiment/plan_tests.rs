@@ -149,3 +149,15 @@ fn trials_of_different_lengths_are_different_learners() {
     let learners: Vec<String> = parse(text).unwrap().learners().iter().map(ToString::to_string).collect();
     assert_eq!(learners, ["rl2-a2c rc N=1", "rl2-a2c rc N=2", "epopt-a2c rc"]);
 }
+
+#[test]
+fn a_plan_that_nobody_can_do_is_refused_before_it_is_expanded() {
+    let values: Vec<String> = (1..=100).map(|number| format!("{number}e-6")).collect();
+    let values = values.join(", ");
+    let text = format!(
+        "environments = ['CartPole']\nruns = 4294967295\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff']
+        [algorithm.grid]\nlearning_rate = [{values}]\nent_coef = [{values}]\nvf_coef = [{values}]\ngamma = [{values}]"
+    );
+    let message = Plan::parse("test", text).unwrap_err().to_string();
+    assert!(message.contains("[[algorithm]] 1 (a2c)") && message.contains("at most 1000000"), "{message}");
+}

@@ -18,10 +18,14 @@ pub const BUSY: u8 = 75;
 pub const NO_SERVER: u8 = 69;
 /// A worker's exit status if its command makes no sense to it.
 const USAGE: i32 = 2;
-/// How often a worker may be killed before its cell counts as failed.
+/// How often a worker may be killed before its cell counts as failed, or be without a server before the run ends.
 const MOST_ATTEMPTS: u32 = 3;
+/// How often it is said how far the run is, which looks at every cell that is left.
+const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 /// How often workers are looked at.
 const TICK: Duration = Duration::from_millis(50);
+/// How long no worker is started after one had no server.
+const SERVER_PAUSE: Duration = Duration::from_secs(1);
 /// How often cells are looked at that others work on.
 const BUSY_INTERVAL: Duration = Duration::from_secs(1);
 
@@ -100,6 +104,9 @@ struct Runner<'a> {
     done: usize,
     failed: Vec<usize>,
     attempts: HashMap<usize, u32>,
+    /// How often a cell's worker had no server.
+    lost: HashMap<usize, u32>,
+    paused_until: Option<Instant>,
     times: Times<'a>,
 }
 
@@ -134,6 +141,8 @@ impl<'a> Runner<'a> {
             done: 0,
             failed: Vec::new(),
             attempts: HashMap::new(),
+            lost: HashMap::new(),
+            paused_until: None,
             times: Times::default(),
         };
         for cell in 0..plan.cells.len() {
@@ -145,6 +154,7 @@ impl<'a> Runner<'a> {
     }
 
     fn run(&mut self, stop: &StopFlag, report: &mut dyn FnMut(&RunStatus)) -> Result<RunEnd, RunError> {
+        let mut reported: Option<Instant> = None;
         loop {
             self.reap()?;
             if let Some(signal) = stop.signal() {
@@ -155,7 +165,10 @@ impl<'a> Runner<'a> {
             }
             self.look_elsewhere()?;
             self.start_workers()?;
-            report(&self.status());
+            if reported.is_none_or(|time| time.elapsed() >= STATUS_INTERVAL) {
+                reported = Some(Instant::now());
+                report(&self.status());
+            }
             if self.running.is_empty() && self.queue.is_empty() && self.elsewhere.is_empty() {
                 let failed = self.failed.iter().map(|&cell| self.plan.cells[cell].id.clone()).collect();
                 return Ok(RunEnd::Finished { failed });
@@ -182,6 +195,9 @@ impl<'a> Runner<'a> {
     }
 
     fn start_workers(&mut self) -> Result<(), RunError> {
+        if self.paused_until.is_some_and(|end| Instant::now() < end) {
+            return Ok(());
+        }
         while self.running.len() < self.options.jobs {
             let Some(cell) = self.queue.pop_front() else { break };
             // Another run may have done it meanwhile.
@@ -209,16 +225,25 @@ impl<'a> Runner<'a> {
     }
 
     fn conclude(&mut self, cell: usize, status: ExitStatus) -> Result<(), RunError> {
-        if self.settled(cell, true) {
+        // A failure counts after the statuses below: until a worker forgets it, there may be one of an earlier run.
+        if self.settled(cell, false) {
             return Ok(());
         }
-        let id = &self.plan.cells[cell].id;
         if status.code() == Some(BUSY.into()) {
             self.elsewhere.push(cell);
             return Ok(());
         }
         if status.code() == Some(NO_SERVER.into()) {
-            return Err(RunError::NoServer(format!("{id}: {}", self.last_words(cell))));
+            let lost = self.lost.entry(cell).or_default();
+            *lost += 1;
+            if *lost >= MOST_ATTEMPTS {
+                let id = &self.plan.cells[cell].id;
+                return Err(RunError::NoServer(format!("{id}: {}", self.last_words(cell))));
+            }
+            // At the front: if the servers are gone, the run ends soon, however many cells it has.
+            self.queue.push_front(cell);
+            self.paused_until = Some(Instant::now() + SERVER_PAUSE);
+            return Ok(());
         }
         if status.code() == Some(USAGE) {
             return Err(RunError::Refused(self.last_words(cell)));
@@ -232,6 +257,9 @@ impl<'a> Runner<'a> {
                 return Ok(());
             }
             return self.record_failure(cell, format!("its process was ended by signal {signal}, {attempts} times"));
+        }
+        if self.settled(cell, true) {
+            return Ok(());
         }
         let reason = format!("its process ended with {status}: {}", self.last_words(cell));
         self.record_failure(cell, reason)

@@ -102,6 +102,34 @@ fn a_lost_server_or_plan_ends_the_run_and_blames_no_cell() {
 }
 
 #[test]
+fn a_server_that_was_lost_for_a_moment_does_not_end_the_run() {
+    let directory = tempfile::tempdir().unwrap();
+    let folder = Folder::new(directory.path());
+    let script = |cell: &Cell, _: &Path| match cell.index {
+        0 => "echo x >> count; test $(wc -l < count) = 3 || exit 69; echo x > result.json".to_owned(),
+        _ => "echo x > result.json".to_owned(),
+    };
+    let end = run_with(&folder, 1, false, &StopFlag::default(), &script).unwrap();
+    assert_eq!(end, RunEnd::Finished { failed: Vec::new() });
+    assert_eq!(lines(&folder.cell(&plan().cells[0].id).path().join("count")), 3);
+}
+
+#[test]
+fn an_earlier_failure_does_not_count_while_others_try_again() {
+    let directory = tempfile::tempdir().unwrap();
+    let folder = Folder::new(directory.path());
+    let id = plan().cells[0].id.clone();
+    let failure = Failure { id: id.clone(), reason: "earlier".into(), commit: "x".into() };
+    folder.cell(&id).write_failure(&failure).unwrap();
+    let script = |cell: &Cell, _: &Path| match cell.index {
+        0 => format!("echo x >> count; test $(wc -l < count) = 2 || exit {NO_SERVER}; echo x > result.json"),
+        _ => "echo x > result.json".to_owned(),
+    };
+    let end = run_with(&folder, 1, true, &StopFlag::default(), &script).unwrap();
+    assert_eq!(end, RunEnd::Finished { failed: Vec::new() });
+}
+
+#[test]
 fn a_cell_that_another_run_works_on_is_waited_for_and_taken_over() {
     let directory = tempfile::tempdir().unwrap();
     let folder = Folder::new(directory.path());
@@ -120,6 +148,11 @@ fn a_cell_that_another_run_works_on_is_waited_for_and_taken_over() {
     };
     let end = std::thread::scope(|scope| {
         scope.spawn(|| {
+            let start = Instant::now();
+            while tries.load(Ordering::SeqCst) == 0 {
+                assert!(start.elapsed() < Duration::from_secs(60));
+                std::thread::sleep(TICK);
+            }
             std::thread::sleep(Duration::from_millis(1500));
             assert_eq!(tries.load(Ordering::SeqCst), 1, "it is not started while it is locked");
             drop(lock.lock().unwrap().take());

@@ -194,19 +194,23 @@ impl Group {
 /// A metric averaged over the environments of `groups`, in each run that all of them have; mean and deviation over
 /// these runs.
 pub fn average(groups: &[&Group], metric: Metric) -> Option<Summary> {
-    let by_environment: Vec<BTreeMap<u32, f64>> = groups.iter().map(|group| group.metric(metric)).collect();
-    let first = by_environment.first()?;
-    let of_run = |run: &u32| {
-        let numbers: Vec<f64> = by_environment.iter().map(|runs| runs.get(run).copied()).collect::<Option<_>>()?;
-        Some(mean(numbers.into_iter()))
-    };
-    Summary::of(&first.keys().filter_map(of_run).collect::<Vec<_>>())
+    let runs = common_runs(groups, metric);
+    Summary::of(&runs.into_iter().map(|numbers| mean(numbers.into_iter())).collect::<Vec<_>>())
 }
 
-/// The interquartile mean of a metric over all runs of all environments of `groups`, with its bootstrap interval.
-pub fn interquartile(groups: &[&Group], metric: Metric, resamples: usize) -> Option<Iqm> {
-    let strata: Vec<Vec<f64>> = groups.iter().map(|group| group.metric(metric).into_values().collect()).collect();
-    Iqm::of(&strata, resamples, 1)
+/// The interquartile mean of a metric over the environments of `groups` and the runs that all of them have, with its
+/// bootstrap interval and the number of these runs.
+pub fn interquartile(groups: &[&Group], metric: Metric, resamples: usize) -> Option<(Iqm, usize)> {
+    let runs = common_runs(groups, metric);
+    let strata: Vec<Vec<f64>> = (0..groups.len()).map(|i| runs.iter().map(|numbers| numbers[i]).collect()).collect();
+    Some((Iqm::of(&strata, resamples, 1)?, runs.len()))
+}
+
+/// For each run that all `groups` have, the metric in each of them.
+fn common_runs(groups: &[&Group], metric: Metric) -> Vec<Vec<f64>> {
+    let by_environment: Vec<BTreeMap<u32, f64>> = groups.iter().map(|group| group.metric(metric)).collect();
+    let of_run = |run: &u32| by_environment.iter().map(|runs| runs.get(run).copied()).collect();
+    by_environment.first().map_or_else(Vec::new, |first| first.keys().filter_map(of_run).collect())
 }
 
 #[cfg(test)]

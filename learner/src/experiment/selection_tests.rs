@@ -143,7 +143,9 @@ fn metrics_are_those_computed_by_hand() {
     let [first, second] = [20.0 / 2.0, (40.0 + second) / 2.0];
     assert_summary(average(&both, Metric::Extrapolation), (first + second) / 2.0, (second - first) / 2.0, 2);
     // Of 90, 80, 50, 60 the lowest and the highest go.
-    close(interquartile(&both, Metric::Default, 100).unwrap().iqm, 70.0);
+    let (iqm, runs) = interquartile(&both, Metric::Default, 100).unwrap();
+    close(iqm.iqm, 70.0);
+    assert_eq!(runs, average(&both, Metric::Default).unwrap().runs);
 }
 
 #[test]

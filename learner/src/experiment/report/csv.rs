@@ -48,14 +48,15 @@ fn metrics(results: &Results<'_>, groups: &[Group]) -> Lines {
 }
 
 fn iqm(results: &Results<'_>, groups: &[Group]) -> Lines {
-    let mut file = File::new(&["metric", "iqm", "low_95", "high_95"], false)?;
+    let mut file = File::new(&["metric", "runs", "iqm", "low_95", "high_95"], false)?;
     let environments = results.plan.environments();
     for learner in results.plan.learners() {
         for metric in Metric::ALL {
             let groups = by_environment(groups, &learner, &environments);
             let iqm = groups.and_then(|groups| interquartile(&groups, metric, RESAMPLES));
-            let [low, high] = [0, 1].map(|end| number(iqm.map(|iqm| iqm.interval_95[end])));
-            file.add("", &learner, [metric.to_string(), number(iqm.map(|iqm| iqm.iqm)), low, high])?;
+            let runs = iqm.map_or(0, |(_, runs)| runs).to_string();
+            let [low, high] = [0, 1].map(|end| number(iqm.map(|(iqm, _)| iqm.interval_95[end])));
+            file.add("", &learner, [metric.to_string(), runs, number(iqm.map(|(iqm, _)| iqm.iqm)), low, high])?;
         }
     }
     file.finish()

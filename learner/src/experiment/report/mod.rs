@@ -10,7 +10,7 @@ mod render;
 
 use super::plan::{Cell, Learner};
 use super::selection::{Group, Metric, Results, average, interquartile};
-use super::statistics::Summary;
+use super::statistics::{Iqm, Summary};
 use crate::evaluation::{Scenario, Version, paper};
 
 pub use csv::csv_files;
@@ -234,15 +234,25 @@ fn iqm(results: &Results<'_>, groups: &[Group]) -> Table {
     let environments = results.plan.environments();
     let row = |learner: &Learner| {
         let of_learner = by_environment(groups, learner, &environments);
-        let entry = |metric| {
-            let iqm = of_learner.as_ref().and_then(|groups| interquartile(groups, metric, RESAMPLES));
-            Entry::from(iqm.map_or_else(|| MISSING.to_owned(), |iqm| iqm.to_string()))
+        let numbers =
+            Metric::ALL.map(|metric| of_learner.as_ref().and_then(|groups| interquartile(groups, metric, RESAMPLES)));
+        let entry = |number: &Option<(Iqm, usize)>| -> Entry {
+            number.map_or_else(|| MISSING.to_owned(), |(iqm, _)| iqm.to_string()).into()
         };
-        std::iter::once(learner.to_string().into()).chain(Metric::ALL.map(entry)).collect()
+        let runs = results.plan.runs;
+        let least = numbers.iter().map(|number| number.map_or(0, |(_, runs)| runs)).min().unwrap_or_default();
+        let least = if least == runs as usize { runs.to_string() } else { format!("{least} of {runs}") };
+        let name = std::iter::once(learner.to_string().into());
+        name.chain(numbers.iter().map(entry)).chain(std::iter::once(least.into())).collect()
     };
     Table {
-        title: "Interquartile mean over all runs and environments, with its 95 % stratified bootstrap interval".into(),
-        header: std::iter::once("learner".to_owned()).chain(Metric::ALL.map(|metric| metric.to_string())).collect(),
+        title: "Interquartile mean over all environments and the runs that all of them have, with its 95 % stratified \
+                bootstrap interval"
+            .into(),
+        header: std::iter::once("learner".to_owned())
+            .chain(Metric::ALL.map(|metric| metric.to_string()))
+            .chain(std::iter::once("runs".to_owned()))
+            .collect(),
         texts: 1,
         rows: results.plan.learners().iter().map(row).collect(),
     }
