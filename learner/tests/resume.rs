@@ -367,7 +367,15 @@ fn a_run_that_cannot_be_resumed_says_why() {
         &|run| edit(run, "/environment_spec/model_hash", "abc".into()),
         &["trained in CartPole with model \"abc\", the server's has \"\""],
     );
-    refused(&|run| edit(run, "/config/num_envs", 6.into()), &["cannot bring the environments back", "expected 24"]);
+    refused(
+        &|run| edit(run, "/config/num_envs", 6.into()),
+        &["checkpoint.json", "config: reward_normaliser: returns has 4 numbers, expected 6"],
+    );
+    refused(&|run| edit(run, "/config/seed", 9.into()), &["config: seed is 9, but the training began with 1"]);
+    refused(&|run| edit(run, "/config/gamma", 0.5.into()), &["reward_normaliser: gamma is 0.99, but 0.5 in the"]);
+    refused(&|run| edit(run, "/config/num_envs", 0.into()), &["checkpoint.json", "config: num_envs is 0, but must be"]);
+    refused(&|run| edit(run, "/episodes_per_trial", 0.into()), &["episodes_per_trial is 0, which"]);
+    refused(&|run| edit(run, "/algorithm", "rl2-ppo".into()), &["policy: observation_size is 4, expected 8"]);
     refused(&|run| edit(run, "/resume/algorithm/rng", serde_json::Value::Null), &["cannot bring the optimiser back"]);
     refused(&|run| edit(run, "/resume/history", 5.into()), &["checkpoint.json", "resume is not understood"]);
     let without_state = |run: &Path| {
