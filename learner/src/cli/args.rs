@@ -118,7 +118,7 @@ pub(super) struct EvaluateArgs {
     /// Versions to test on, separated by commas.
     #[arg(long, value_delimiter = ',', default_value = "D,R,E", ignore_case = true)]
     pub(super) versions: Vec<Version>,
-    /// Episodes to test on each version.
+    /// Episodes to test on each version; of a policy trained with RL² trials, of each of which the last episode counts.
     #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u64).range(1..))]
     pub(super) episodes: u64,
     /// Fixes the tests' randomness; its environments differ from those of any training, also with the same number
