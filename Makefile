@@ -42,7 +42,7 @@ missing=; \
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help deps toolchain build demo all-pairs test lint bench audit cargo-deny python-test python-wheel python-acceptance \
+.PHONY: help deps toolchain build demo all-pairs report-check test lint bench audit cargo-deny python-test python-wheel python-acceptance \
 	python-server python-venv
 
 help: ## this list
@@ -62,6 +62,10 @@ demo: build ## train and test PPO on CartPole over gRPC; the paper's row beside 
 
 all-pairs: build ## train and test every algorithm and architecture on every environment, shortly
 	PROGRAMS=$(PROGRAMS) learner/tests/all_pairs.sh $(ALL_PAIRS_ARGS)
+
+report-check: build ## make the report of a small experiment and look at it in Chromium, which it installs; minutes
+	@$(call install,chromium python3)
+	PROGRAMS=$(PROGRAMS) learner/tests/report_check.sh $(TARGET)/report-check
 
 test: deps ## run all tests, then those of the server without MuJoCo
 	cargo test $(ALL)

@@ -129,6 +129,7 @@ impl<'a> Training<'a> {
                 reward_normaliser: None,
                 counters: Counters::default(),
                 config: config.table(),
+                commits: Vec::new(),
             },
             weights: policy.weights(),
         };
@@ -173,9 +174,12 @@ impl<'a> Training<'a> {
         config: &'a TrainConfig,
         policy: Policy,
         collector: Collector<'a>,
-        whole: Checkpoint,
+        mut whole: Checkpoint,
     ) -> Result<Self> {
         let algorithm = config.algorithm(&policy)?;
+        if !whole.state.commits.iter().any(|commit| commit == crate::VERSION) {
+            whole.state.commits.push(crate::VERSION.into());
+        }
         let spec = policy.spec();
         let (n_envs, input_size, width) = (config.common.num_envs, spec.observation_size, spec.action.width());
         let rollout = match algorithm.experience() {

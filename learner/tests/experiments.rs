@@ -1,13 +1,13 @@
 //! Experiments with real worker processes and servers. Needs the program `perturb-server`: run `cargo build --release`
 //! first.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use perturb_learner::client::{LocalServer, LocalServerOptions};
-use perturb_learner::experiment::{CellResult, CellState, Counts, Folder, Plan};
+use perturb_learner::experiment::{CellResult, CellState, Counts, Folder, Plan, default_axes};
 use tempfile::TempDir;
 
 /// How long anything may take that must not hang.
@@ -212,6 +212,57 @@ fn a_failed_cell_is_recorded_with_its_reason_and_the_others_are_done() {
     assert_eq!(experiment.attempts("out")[failed.index], 2 * attempts[failed.index]);
 }
 
+/// What two runs that try again at once find failed: each failing cell is tried again once, by one of them.
+#[test]
+fn two_runs_that_try_again_at_once_try_each_cell_once() {
+    let experiment = Experiment::new(&PLAN.replace("7e-3, 7e-4", "1e38, 2e38"));
+    let cells = experiment.plan.cells.len();
+    assert_eq!(experiment.run("out", &["--jobs", "2"]).status.code(), Some(1));
+    assert_eq!(experiment.attempts("out"), vec![1; cells]);
+    let folder = Folder::new(&experiment.out("out"));
+    let held: Vec<_> = experiment.plan.cells.iter().map(|cell| folder.cell(&cell.id).try_lock()).collect();
+    let runs: Vec<Child> = (0..2)
+        .map(|_| experiment.command("out", &["--jobs", "2", "--retry-failed"]).spawn().expect("started"))
+        .collect();
+    // Both have seen the failures: each has started a worker for the first cell, which found it locked.
+    let log = folder.cell(&experiment.plan.cells[0].id).log();
+    let busy = || std::fs::read_to_string(&log).map_or(0, |text| text.matches("another process works on").count());
+    wait_for("two runs", || busy() >= 2);
+    drop(held);
+    for run in runs {
+        let output = run.wait_with_output().expect("ended");
+        assert!(output.status.code() == Some(1) && stderr(&output).contains("8 of 8 cells failed"), "{output:?}");
+    }
+    assert_eq!(experiment.attempts("out"), vec![2; cells]);
+}
+
+#[test]
+fn a_result_names_the_program_that_began_its_training_if_it_is_another() {
+    let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 2000, checkpoint_interval = 10"));
+    let id = &experiment.plan.cells[0].id;
+    let document =
+        |name: &str| Folder::new(&experiment.out(name)).cell(id).training().join("checkpoint/checkpoint.json");
+    let child = experiment.command("same", &["--cell", "0"]).spawn().expect("started");
+    wait_for("a checkpoint", || document("same").exists());
+    kill_all(child);
+    assert!(experiment.results("same").is_empty(), "killed before the end");
+    let copied = Command::new("cp").arg("-a").args([experiment.out("same"), experiment.out("other")]).status();
+    assert!(copied.expect("cp").success());
+    let text = std::fs::read_to_string(document("other")).expect("a checkpoint");
+    assert_eq!(text.matches(perturb_learner::VERSION).count(), 1, "{text}");
+    std::fs::write(document("other"), text.replace(perturb_learner::VERSION, "0.0.9 (abc)")).expect("written");
+
+    for name in ["same", "other", "whole"] {
+        succeeded(&experiment.run(name, &["--cell", "0"]));
+    }
+    assert_eq!(experiment.results("same"), experiment.results("whole"), "as if it had not been broken off");
+    assert!(!String::from_utf8_lossy(&experiment.results("whole")[id]).contains("earlier_commits"));
+    let other = experiment.cell_result("other", 0);
+    assert_eq!(other.earlier_commits, ["0.0.9 (abc)"]);
+    let whole = experiment.cell_result("whole", 0);
+    assert_eq!(CellResult { earlier_commits: Vec::new(), ..*other }, *whole);
+}
+
 #[test]
 fn a_signal_stops_the_workers_and_the_same_command_goes_on() {
     let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 100"));
@@ -351,8 +402,9 @@ fn a_report_is_the_same_however_often_the_run_was_broken_off() {
     let page = String::from_utf8_lossy(&whole["page"]).into_owned();
     assert!(page.matches("<svg").count() == 4 && page.matches("<table").count() == 7, "every picture and table");
     assert!(!page.contains("<script") && !page.contains("src=") && !page.contains("@import"), "it needs nothing else");
-    let links: Vec<&str> = page.split("href=").skip(1).map(|rest| &rest[..8]).collect();
-    assert_eq!(links, ["\"data:,\""], "the empty icon alone");
+    let links: Vec<&str> = page.split("href=\"").skip(1).filter_map(|rest| rest.split('"').next()).collect();
+    let inside = |link: &&str| link.strip_prefix('#').is_some_and(|id| page.contains(&format!(" id=\"{id}\"")));
+    assert!(links.len() > 10 && links[0] == "data:," && links[1..].iter().all(|link| inside(&link)), "{links:?}");
     let metrics = String::from_utf8_lossy(&whole["metrics.csv"]).into_owned();
     // Nothing was trained on R: Interpolation and Extrapolation are empty, not 0.
     assert!(metrics.lines().any(|line| line == "CartPole,a2c,ff,,Interpolation,0,,,100,0,"), "{metrics}");
@@ -363,14 +415,25 @@ fn a_heatmap_is_drawn_of_two_parameters_and_others_are_refused() {
     let experiment = Experiment::new(PLAN);
     succeeded(&experiment.run("out", &["--cell", "0"]));
     let training = Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[0].id).training();
-    let draw = |x: &str, y: &str| {
+    let elsewhere = tempfile::tempdir().expect("a directory");
+    let draw = |arguments: &[&str]| {
         let mut command = Command::new(env!("CARGO_BIN_EXE_perturb"));
-        command.args(["heatmap", "--grid", "3", "--episodes", "2", "--x", x, "--y", y, "--checkpoint"]).arg(&training);
-        command.output().expect("ended")
+        command.args(["heatmap", "--grid", "3", "--episodes", "2", "--checkpoint"]).arg(&training).args(arguments);
+        command.current_dir(elsewhere.path()).output().expect("ended")
     };
-    let output = draw("force", "length");
+    let names = |directory: &Path| -> BTreeSet<String> {
+        let entries = std::fs::read_dir(directory).expect("a folder");
+        entries.map(|entry| entry.expect("an entry").file_name().to_string_lossy().into_owned()).collect()
+    };
+    let before = names(&training);
+    let output = draw(&["--x", "force", "--y", "length"]);
     succeeded(&output);
-    let read = |ending: &str| std::fs::read(training.join(format!("heatmap-force-length{ending}"))).expect("a file");
+    let files = ["csv", "png", "svg"].map(|ending| format!("CartPole-a2c-ff-D-s1-force-length.{ending}"));
+    assert_eq!(names(elsewhere.path()), BTreeSet::from(files), "in the working directory");
+    assert_eq!(names(&training), before, "and nothing in the training's folder");
+    let read = |ending: &str| {
+        std::fs::read(elsewhere.path().join(format!("CartPole-a2c-ff-D-s1-force-length{ending}"))).expect("a file")
+    };
     let table = String::from_utf8(read(".csv")).expect("text");
     let rows: Vec<Vec<f64>> = table
         .lines()
@@ -383,11 +446,11 @@ fn a_heatmap_is_drawn_of_two_parameters_and_others_are_refused() {
     assert!((rows[0][0] - (1.0 + 19.0 / 6.0)).abs() < 1e-12 && rows[1][0] == 10.5 && rows[3][0] == rows[0][0]);
     assert!(rows.iter().all(|row| row[2] >= 1.0), "a step pays 1");
     assert!(String::from_utf8(read(".svg")).expect("text").starts_with("<svg") && read(".png").starts_with(b"\x89PNG"));
-    assert_eq!(draw("force", "length").status.code(), Some(0));
+    assert_eq!(draw(&["--x", "force", "--y", "length"]).status.code(), Some(0));
     assert_eq!(String::from_utf8(read(".csv")).expect("text"), table, "the same again");
 
     for (x, y) in [("force", "force"), ("force", "colour")] {
-        let output = draw(x, y);
+        let output = draw(&["--x", x, "--y", y]);
         assert_eq!(output.status.code(), Some(1));
         let message = stderr(&output);
         assert!(
@@ -395,6 +458,99 @@ fn a_heatmap_is_drawn_of_two_parameters_and_others_are_refused() {
             "{message}"
         );
     }
+    succeeded(&draw(&["--out", "usual"]));
+    let table = std::fs::read_to_string(elsewhere.path().join("usual.csv")).expect("a table");
+    assert!(table.starts_with("length,mass,"), "CartPole's usual parameters: {table}");
+    assert_eq!(draw(&["--x", "force"]).status.code(), Some(2), "one parameter is not enough");
+}
+
+#[test]
+fn every_environment_has_two_parameters_for_its_heatmaps() {
+    let output = Command::new(env!("CARGO_BIN_EXE_perturb")).args(["envs", "--json"]).output().expect("ended");
+    succeeded(&output);
+    let catalogue: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    let environments = catalogue["environments"].as_array().expect("a list");
+    assert_eq!(environments.len(), 6);
+    for environment in environments {
+        let name = environment["name"].as_str().expect("a name");
+        let known: Vec<&str> = environment["parameters"]
+            .as_array()
+            .expect("a list")
+            .iter()
+            .filter_map(|parameter| parameter["name"].as_str())
+            .collect();
+        let [x, y] = default_axes(name).unwrap_or_else(|| panic!("{name} has none"));
+        assert!(x != y && known.contains(&x) && known.contains(&y), "{name}: {x}, {y} of {known:?}");
+    }
+}
+
+#[test]
+fn heatmaps_of_an_experiment_are_made_once_and_are_in_its_report() {
+    let experiment = Experiment::new(&PLAN.replace("['D', 'R']", "['D', 'E']"));
+    succeeded(&experiment.run("out", &["--jobs", "2"]));
+    let out = experiment.out("out");
+    let heatmaps = |arguments: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_perturb"));
+        command.arg("heatmap").arg(&out).args(["--grid", "2", "--episodes", "1"]).args(arguments);
+        let output = command.output().expect("ended");
+        succeeded(&output);
+        (String::from_utf8_lossy(&output.stdout).lines().count(), stderr(&output).matches("is there already").count())
+    };
+    let page = |name: &str| {
+        let path = experiment.out(name);
+        let mut command = Command::new(env!("CARGO_BIN_EXE_perturb"));
+        succeeded(&command.arg("report").arg(&out).arg("--html").arg(&path).output().expect("ended"));
+        std::fs::read_to_string(path).expect("a page")
+    };
+    let embedded = |page: &str| page.matches("<img ").count();
+    let without = page("without.html");
+    assert_eq!(embedded(&without), 0);
+    assert!(without.contains("4 of 4 heatmaps are not there: `perturb heatmap DIR` makes them"));
+
+    // Two environments, trained on D and on E; the better of two configurations.
+    assert_eq!(heatmaps(&[]), (4, 0));
+    assert_eq!(heatmaps(&[]), (0, 4), "made once");
+    let with = page("with.html");
+    assert_eq!(embedded(&with), 4);
+    assert!(!with.contains("heatmaps are not there") && !with.contains("src=\"http") && !with.contains("<script"));
+    assert_eq!(with, page("again.html"), "the same folder, the same bytes");
+    let files = || -> BTreeMap<PathBuf, Vec<u8>> {
+        let entries = std::fs::read_dir(out.join("heatmaps")).expect("a folder");
+        let paths = entries.map(|entry| entry.expect("an entry").path());
+        paths.map(|path| (path.clone(), std::fs::read(path).expect("read"))).collect()
+    };
+    let first = files();
+    assert_eq!(first.len(), 16, "three files and a record of each");
+
+    // Half a picture does not count, nor one of a result that has been replaced.
+    let (damaged, _) =
+        first.iter().find(|(path, _)| path.extension().is_some_and(|ending| ending == "png")).expect("one");
+    std::fs::write(damaged, b"\x89PNG").expect("written");
+    assert_eq!(embedded(&page("damaged.html")), 3);
+    assert_eq!(heatmaps(&[]), (1, 3));
+    assert_eq!(files(), first, "the same bytes again");
+    let id = damaged.file_stem().expect("a name").to_string_lossy().into_owned();
+    let result = Folder::new(&out).cell(&id).path().join("result.json");
+    let text = std::fs::read_to_string(&result).expect("a result");
+    std::fs::write(&result, text.replace("\"command\": \"perturb", "\"command\": \"/bin/perturb")).expect("written");
+    let outdated = page("outdated.html");
+    assert!(embedded(&outdated) == 3 && outdated.contains("the heatmap is of an earlier result"));
+    assert_eq!(heatmaps(&["--seed", "2"]), (4, 0), "other settings, other heatmaps");
+
+    // Without the checkpoint that a result came from there is none, and the others are made.
+    std::fs::remove_dir_all(Folder::new(&out).cell(&id).training()).expect("deleted");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_perturb"));
+    let output = command.arg("heatmap").arg(&out).args(["--grid", "2", "--episodes", "1"]).output().expect("ended");
+    assert_eq!(output.status.code(), Some(1));
+    assert!(
+        stderr(&output).contains("holds no checkpoint") && stderr(&output).contains("1 of 4 heatmaps"),
+        "{output:?}"
+    );
+    assert_eq!(String::from_utf8_lossy(&output.stdout).lines().count(), 3);
+
+    let mut command = Command::new(env!("CARGO_BIN_EXE_perturb"));
+    let both = command.arg("heatmap").arg(&out).args(["--x", "force", "--y", "mass"]).output().expect("ended");
+    assert_eq!(both.status.code(), Some(2), "an experiment has its environments' usual parameters");
 }
 
 #[test]

@@ -66,6 +66,10 @@ pub struct State {
     pub counters: Counters,
     /// The training's configuration, flat, as in `config.toml`.
     pub config: toml::Table,
+    /// The programs that trained, each with its commit, in order and without repetitions; empty in checkpoints of
+    /// earlier programs, which did not say.
+    #[serde(default)]
+    pub commits: Vec<String>,
 }
 
 fn one() -> u32 {
@@ -268,6 +272,16 @@ impl Checkpoint {
                 .map_err(|reason| format!("reward_normaliser: {reason}")),
             None => Ok(()),
         }
+    }
+
+    /// Names the policy: the iterations of its training, and a checksum of its weights. Weights of equal trainings have
+    /// the same name.
+    ///
+    /// # Errors
+    /// What is wrong with the weights.
+    pub fn id(&self) -> std::result::Result<String, String> {
+        let weights = encode_weights(&self.weights)?;
+        Ok(format!("{:08}-{:08x}", self.state.counters.iterations, crc32c::crc32c(&weights)))
     }
 
     /// The configuration of the training.

@@ -39,6 +39,7 @@ fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
         reward_normaliser: Some(RewardNormaliser::new(2, 0.99)),
         counters: Counters { iterations, timesteps: 7, episodes: 3, generated_episodes: 4, learned_timesteps: 5 },
         config: config.table(),
+        commits: vec!["0.1.0 (a)".into()],
     };
     Checkpoint { state, weights: Policy::new(policy, seed).unwrap().weights() }
 }

@@ -7,6 +7,7 @@ use clap::{Args, Parser, Subcommand};
 use crate::client::Address;
 use crate::config::{AlgorithmName, Architecture};
 use crate::evaluation::Version;
+use crate::experiment::FailureMark;
 
 /// Trains policies over environment servers and tests whether they still work when the physics changes.
 #[derive(Debug, Parser)]
@@ -34,7 +35,7 @@ pub(super) enum Command {
     Report(ReportArgs),
     /// Draw the training curves of an experiment.
     Curves(CurvesArgs),
-    /// Draw how a trained policy does over two parameters.
+    /// Draw how trained policies do over two parameters: one policy, or those that an experiment selected.
     Heatmap(HeatmapArgs),
 }
 
@@ -185,6 +186,9 @@ pub(super) struct RunArgs {
     /// With --cell: stop when standard input is closed, and show no progress.
     #[arg(long)]
     pub(super) exit_with_stdin: bool,
+    /// Of a worker: try again if this is how the cell has failed, and not if it has failed once more since.
+    #[arg(long, value_name = "MARK", hide = true, requires = "exit_with_stdin")]
+    pub(super) retry_failure: Option<FailureMark>,
     #[command(flatten)]
     pub(super) server: ServerArgs,
 }
@@ -194,7 +198,8 @@ pub(super) struct ReportArgs {
     /// The --out of `perturb run`; tables go to its folder report/.
     #[arg(value_name = "DIR")]
     pub(super) dir: PathBuf,
-    /// Also write everything, with training curves, as one HTML page that needs nothing else.
+    /// Also write everything, with training curves and the heatmaps of `perturb heatmap`, as one HTML page that needs
+    /// nothing else.
     #[arg(long, value_name = "FILE")]
     pub(super) html: Option<PathBuf>,
 }
@@ -211,15 +216,23 @@ pub(super) struct CurvesArgs {
 
 #[derive(Args, Debug)]
 pub(super) struct HeatmapArgs {
-    /// The --out of a training, or the checkpoint folder in it.
+    /// The --out of `perturb run`: every training that was selected in its first run, over the environment's usual two
+    /// parameters. Heatmaps go to its folder heatmaps/; those that are there are kept.
+    #[arg(
+        value_name = "DIR",
+        required_unless_present = "checkpoint",
+        conflicts_with_all = ["checkpoint", "x", "y", "out"]
+    )]
+    pub(super) dir: Option<PathBuf>,
+    /// One policy instead: the --out of a training, or the checkpoint folder in it.
     #[arg(long, value_name = "DIR")]
-    pub(super) checkpoint: PathBuf,
-    /// The parameter along x, e.g. force; `perturb envs` lists them.
-    #[arg(long, value_name = "PARAMETER")]
-    pub(super) x: String,
+    pub(super) checkpoint: Option<PathBuf>,
+    /// The parameter along x, e.g. force; `perturb envs` lists them [default: the environment's usual two].
+    #[arg(long, value_name = "PARAMETER", requires = "y")]
+    pub(super) x: Option<String>,
     /// The parameter along y, e.g. mass.
-    #[arg(long, value_name = "PARAMETER")]
-    pub(super) y: String,
+    #[arg(long, value_name = "PARAMETER", requires = "x")]
+    pub(super) y: Option<String>,
     /// Points along each axis, at most 100.
     #[arg(long, value_name = "N", default_value_t = 40, value_parser = points)]
     pub(super) grid: usize,
@@ -229,7 +242,8 @@ pub(super) struct HeatmapArgs {
     /// Fixes the tests' randomness [default: the training's seed].
     #[arg(long, value_name = "N")]
     pub(super) seed: Option<u64>,
-    /// The files without their endings .csv, .svg, .png [default: heatmap-X-Y in --checkpoint].
+    /// The files without their endings .csv, .svg, .png [default: in the working directory, named after environment,
+    /// algorithm, architecture, version, seed and parameters].
     #[arg(long, value_name = "PATH")]
     pub(super) out: Option<PathBuf>,
     #[command(flatten)]

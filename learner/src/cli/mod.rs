@@ -78,7 +78,7 @@ fn fail(error: &anyhow::Error) -> ExitCode {
         _ => error.downcast_ref(),
     };
     if let Some(TestError::Stopped { signal }) = stopped {
-        eprintln!("perturb: {error}");
+        eprintln!("perturb: {error:#}");
         return signal_code(*signal);
     }
     // A closed pipe is how `perturb envs | head` ends.

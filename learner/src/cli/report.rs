@@ -7,8 +7,8 @@ use anyhow::{Context, Result};
 
 use super::Ending;
 use super::args::{CurvesArgs, ReportArgs};
-use crate::experiment::plot::{Quantity, draw_curves, save, svg};
-use crate::experiment::report::{Report, csv_files, html, markdown, text};
+use crate::experiment::plot::{Quantity, draw_curves, save};
+use crate::experiment::report::{Figures, Report, csv_files, html, markdown, text};
 use crate::experiment::{EnvironmentCurves, Folder, Plan, Results, curves_csv, read_curves};
 
 pub(super) fn run(args: &ReportArgs) -> Result<Ending> {
@@ -25,17 +25,7 @@ pub(super) fn run(args: &ReportArgs) -> Result<Ending> {
         write_file(&out.join(name), &content)?;
     }
     if let Some(path) = &args.html {
-        let mut figures = Vec::new();
-        for curves in read_curves(&results, &groups, &folder)?.iter().filter(|curves| !curves.curves.is_empty()) {
-            for quantity in Quantity::ALL {
-                let caption = format!(
-                    "{}: {quantity} while training, of the selected configurations, as means over runs with their \
-                     standard deviation as a band",
-                    curves.environment
-                );
-                figures.push((caption, svg(&draw_curves(curves, quantity))?));
-            }
-        }
+        let figures = Figures::read(&results, &groups, &folder)?;
         write_file(path, html(&report, &figures).as_bytes())?;
     }
     eprintln!("\nthe tables are also in {}", out.display());

@@ -17,7 +17,8 @@ use super::plan::{duration, step_limits};
 use super::{Ending, UsageError, servers, single_thread};
 use crate::client::{Address, ClientError, LocalServer, LocalServerOptions, Servers};
 use crate::experiment::{
-    BUSY, Cell, CellEnd, Folder, NO_SERVER, Plan, RunEnd, RunOptions, RunStatus, run as run_cells, run_cell,
+    BUSY, Cell, CellEnd, FailureMark, Folder, NO_SERVER, Plan, RunEnd, RunOptions, RunStatus, run as run_cells,
+    run_cell,
 };
 use crate::interrupt::StopFlag;
 
@@ -49,6 +50,8 @@ fn one_cell(args: &RunArgs, plan: &Plan, folder: &Folder, name: &str, stop: &Sto
     if args.exit_with_stdin {
         stop_with_input(stop)?;
     }
+    let place = folder.cell(&cell.id);
+    let retry = args.retry_failure.or_else(|| place.failure_mark().filter(|_| args.retry_failed));
     // A worker has its plan from there.
     if !args.exit_with_stdin {
         keep_plan(plan, folder)?;
@@ -68,8 +71,7 @@ fn one_cell(args: &RunArgs, plan: &Plan, folder: &Folder, name: &str, stop: &Sto
         }
         None => {}
     };
-    let place = folder.cell(&cell.id);
-    match run_cell(&servers, cell, &place, args.retry_failed, stop, &mut report)? {
+    match run_cell(&servers, cell, &place, retry, stop, &mut report)? {
         CellEnd::Done => Ok(Ending::Done),
         CellEnd::Failed(failure) => bail!("{} failed: {}", cell.id, failure.reason),
         CellEnd::Stopped(signal) => Ok(Ending::Signal(signal)),
@@ -110,7 +112,7 @@ fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> R
     step_limits(&Servers::connect(&addresses)?, plan)?; // refuses environments that there are not
     keep_plan(plan, folder)?;
     let addresses: Vec<String> = addresses.iter().map(Address::to_string).collect();
-    let worker = |cell: &Cell| worker(args, folder, cell, &addresses);
+    let worker = |cell: &Cell, retry| worker(folder, cell, retry, &addresses);
     let server_trouble = || {
         let status = local.as_ref()?.lock().ok()?.exit_status()?;
         Some(format!("the private server ended with {status}"))
@@ -168,7 +170,7 @@ fn shared_servers(args: &RunArgs, plan: &Plan, jobs: usize) -> Result<(Option<Lo
 }
 
 /// The command that does one cell.
-fn worker(args: &RunArgs, folder: &Folder, cell: &Cell, addresses: &[String]) -> std::io::Result<Command> {
+fn worker(folder: &Folder, cell: &Cell, retry: Option<FailureMark>, addresses: &[String]) -> std::io::Result<Command> {
     let place = folder.cell(&cell.id);
     std::fs::create_dir_all(place.path())?;
     let log = File::options().create(true).append(true).open(place.log())?;
@@ -177,8 +179,8 @@ fn worker(args: &RunArgs, folder: &Folder, cell: &Cell, addresses: &[String]) ->
     let mut command = Command::new(program);
     command.arg0("perturb").arg("run").arg(folder.plan_path()).arg("--out").arg(folder.path());
     command.args(["--cell", &cell.id, "--exit-with-stdin", "--server", &addresses.join(",")]);
-    if args.retry_failed {
-        command.arg("--retry-failed");
+    if let Some(failure) = retry {
+        command.args(["--retry-failure", &failure.to_string()]);
     }
     single_thread::set(&mut command);
     command.stdout(Stdio::null()).stderr(log);

@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use anyhow::Result;
 
-use super::folder::{CellFolder, CellResult, CellState, Failure, FolderError, Timing, Training, io};
+use super::folder::{CellFolder, CellResult, CellState, Failure, FailureMark, FolderError, Timing, Training, io};
 use super::plan::Cell;
 use crate::checkpoint::{Checkpoint, CheckpointError, ResumeState};
 use crate::client::{ClientError, Servers};
@@ -17,6 +17,8 @@ use crate::logging::Progress;
 use crate::rollout::CollectError;
 use crate::training::{RunDirectory, resume, train};
 
+/// Stands for the program that began a training whose checkpoint does not say.
+const UNKNOWN: &str = "unknown";
 /// What a stop without a signal counts as.
 const SIGTERM: i32 = 15;
 
@@ -35,8 +37,8 @@ pub enum CellEnd {
     NoServer(anyhow::Error),
 }
 
-/// Trains and tests `cell` in `folder`, unless that is done, or failed and `retry` is off. Calls `report` with what is
-/// being done and the number of episodes.
+/// Trains and tests `cell` in `folder`, unless that is done, or has failed otherwise than `retry` says. Calls `report`
+/// with what is being done and the number of episodes.
 ///
 /// # Errors
 /// [`FolderError`]: the folder cannot be read or written. Whatever else goes wrong is recorded in it.
@@ -44,14 +46,14 @@ pub fn run_cell(
     servers: &Servers,
     cell: &Cell,
     folder: &CellFolder,
-    retry: bool,
+    retry: Option<FailureMark>,
     stop: &StopFlag,
     report: &mut dyn FnMut(&str, u64),
 ) -> Result<CellEnd, FolderError> {
     let Some(_lock) = folder.try_lock()? else { return Ok(CellEnd::Busy) };
     match folder.state()? {
         CellState::Done(_) => return Ok(CellEnd::Done),
-        CellState::Failed(failure) if !retry => return Ok(CellEnd::Failed(failure)),
+        CellState::Failed(failure) if folder.failure_mark() != retry => return Ok(CellEnd::Failed(failure)),
         CellState::Failed(_) => {
             // What was trained so far led to the failure.
             remove(&folder.training())?;
@@ -127,8 +129,18 @@ fn train_and_test(
         },
         results,
         commit: crate::VERSION.into(),
+        earlier_commits: earlier_commits(state.commits),
         command: command(cell),
     }))
+}
+
+/// Of the programs that trained, those that are not this one.
+fn earlier_commits(mut commits: Vec<String>) -> Vec<String> {
+    if commits.is_empty() {
+        return vec![UNKNOWN.into()];
+    }
+    commits.retain(|commit| commit != crate::VERSION);
+    commits
 }
 
 /// The trained policy of a cell; `None` if the stop flag was raised.
@@ -233,7 +245,7 @@ mod tests {
     use crate::experiment::Plan;
 
     fn cell() -> Cell {
-        let text = "environments = ['Pendulum']\nversions = ['E']\ntest_versions = ['E', 'D']\ntest_episodes = 9
+        let text = "environments = ['Pendulum']\nversions = ['E']\ntest_versions = ['D', 'E']\ntest_episodes = 9
             [[algorithm]]\nname = 'a2c'\narchitectures = ['rc']\nsettings = { ent_coef = 1e-4, episodes = 3 }";
         Plan::parse("test", text.into()).unwrap().cells.remove(0)
     }
@@ -245,7 +257,7 @@ mod tests {
         let expected = "perturb train --out RUN --env Pendulum --version E --algorithm a2c --architecture rc --episodes 3 \
                         --seed 1 --set ";
         assert!(command.starts_with(expected), "{command}");
-        assert!(command.ends_with(" && perturb evaluate --checkpoint RUN --versions E,D --episodes 9"), "{command}");
+        assert!(command.ends_with(" && perturb evaluate --checkpoint RUN --versions D,E --episodes 9"), "{command}");
         let mut table: toml::Table =
             "environment = 'Pendulum'\nversion = 'E'\narchitecture = 'rc'\nepisodes = 3\nseed = 1".parse().unwrap();
         let sets: Vec<&str> = command.split(" --set ").skip(1).map(|part| part.split(' ').next().unwrap()).collect();
@@ -256,6 +268,14 @@ mod tests {
         }
         table.insert("algorithm".into(), "a2c".into());
         assert_eq!(table, cell.config.table());
+    }
+
+    #[test]
+    fn only_programs_that_differ_are_named_beside_the_one_that_finished() {
+        let of = |commits: &[&str]| earlier_commits(commits.iter().map(|&commit| commit.to_owned()).collect());
+        assert!(of(&[crate::VERSION]).is_empty(), "as if it had not been broken off");
+        assert_eq!(of(&["a", crate::VERSION, "b"]), ["a", "b"]);
+        assert_eq!(of(&[]), [UNKNOWN], "a checkpoint of a program that did not say");
     }
 
     #[test]

@@ -8,6 +8,7 @@
 //! DIR/cells/ID/training/     what `perturb train --out` writes
 //! DIR/cells/ID/log.txt       what a worker process said
 //! DIR/cells/ID/lock          locked while someone works on the cell
+//! DIR/heatmaps/              what `perturb heatmap DIR` writes
 //! DIR/report/                what `perturb report` writes
 //! ```
 //!
@@ -16,6 +17,7 @@
 use std::collections::BTreeMap;
 use std::fs::{self, File, TryLockError};
 use std::io::{ErrorKind, Write};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
@@ -46,6 +48,15 @@ pub struct CellLock {
     _file: File,
 }
 
+/// Tells one record of a failure from the next, even if both say the same.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FailureMark {
+    /// The file's number, which another file may get when this one is deleted …
+    inode: u64,
+    /// … and when it was written, s and ns.
+    written: (i64, i64),
+}
+
 /// How far a cell is.
 #[derive(Clone, Debug, PartialEq)]
 pub enum CellState {
@@ -71,6 +82,9 @@ pub struct CellResult {
     pub results: BTreeMap<Version, TestResult>,
     /// The program's version and the commit that it was built from.
     pub commit: String,
+    /// Other programs that did a part of the training before it was broken off, in order.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub earlier_commits: Vec<String>,
     /// What gives the same numbers again without the plan.
     pub command: String,
 }
@@ -246,6 +260,12 @@ impl CellFolder {
         self.path.join("result.json").exists() || (failed_too && self.path.join("failure.json").exists())
     }
 
+    /// Which record of a failure there is; `None` if there is none.
+    pub fn failure_mark(&self) -> Option<FailureMark> {
+        let file = fs::metadata(self.path.join("failure.json")).ok()?;
+        Some(FailureMark { inode: file.ino(), written: (file.mtime(), file.mtime_nsec()) })
+    }
+
     /// Tries to become the one who works on the cell; `None` while somebody else does.
     ///
     /// # Errors
@@ -311,18 +331,49 @@ impl CellFolder {
     }
 }
 
+impl std::fmt::Display for FailureMark {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { inode, written: (seconds, nanoseconds) } = self;
+        write!(f, "{inode}.{seconds}.{nanoseconds}")
+    }
+}
+
+impl std::str::FromStr for FailureMark {
+    type Err = String;
+
+    /// What `Display` writes.
+    fn from_str(text: &str) -> std::result::Result<Self, String> {
+        let wrong = || format!("expected three whole numbers with points between them, got `{text}`");
+        let mut parts = text.split('.');
+        let mut next = || parts.next().ok_or_else(wrong);
+        let (inode, seconds, nanoseconds) = (next()?, next()?, next()?);
+        let number = |text: &str| text.parse().map_err(|_| wrong());
+        Ok(Self { inode: inode.parse().map_err(|_| wrong())?, written: (number(seconds)?, number(nanoseconds)?) })
+    }
+}
+
 impl CellResult {
     /// The layout that this program writes.
     pub const FORMAT_VERSION: u32 = FORMAT_VERSION;
+
+    /// All programs that it comes from, in order.
+    pub fn commits(&self) -> impl Iterator<Item = &str> {
+        self.earlier_commits.iter().chain([&self.commit]).map(String::as_str)
+    }
+}
+
+/// A file's content; `None` if it is not there.
+pub(super) fn read_bytes(path: &Path) -> Result<Option<Vec<u8>>> {
+    match fs::read(path) {
+        Ok(content) => Ok(Some(content)),
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(io("read", path)(error)),
+    }
 }
 
 /// A JSON file; `None` if it is not there.
 fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
-    let text = match fs::read(path) {
-        Ok(text) => text,
-        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
-        Err(error) => return Err(io("read", path)(error)),
-    };
+    let Some(text) = read_bytes(path)? else { return Ok(None) };
     let damaged = |error: serde_json::Error| FolderError::Damaged { path: path.to_owned(), reason: error.to_string() };
     serde_json::from_slice(&text).map(Some).map_err(damaged)
 }
@@ -331,7 +382,7 @@ fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
 ///
 /// # Errors
 /// [`FolderError::Io`].
-pub(super) fn write_atomically(path: &Path, content: &[u8]) -> Result<()> {
+pub(crate) fn write_atomically(path: &Path, content: &[u8]) -> Result<()> {
     let directory = path.parent().unwrap_or(Path::new("."));
     fs::create_dir_all(directory).map_err(io("create", directory))?;
     // As readable as any other file that is created here; temporary files are otherwise their owner's alone.
@@ -378,6 +429,7 @@ mod tests {
             },
             results: BTreeMap::from([(Version::D, test)]),
             commit: "x".into(),
+            earlier_commits: Vec::new(),
             command: "y".into(),
         }
     }
@@ -397,6 +449,23 @@ mod tests {
         cell.forget_failure().unwrap();
         let names: Vec<_> = fs::read_dir(cell.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
         assert_eq!(names, ["result.json"], "nothing temporary stays");
+    }
+
+    #[test]
+    fn a_failure_recorded_again_is_another_one() {
+        let directory = tempfile::tempdir().unwrap();
+        let cell = Folder::new(directory.path()).cell("a");
+        let failure = Failure { id: "a".into(), reason: "NaN".into(), commit: "x".into() };
+        assert_eq!(cell.failure_mark(), None);
+        cell.write_failure(&failure).unwrap();
+        let first = cell.failure_mark().unwrap();
+        assert_eq!(cell.failure_mark(), Some(first));
+        assert_eq!(first.to_string().parse(), Ok(first));
+        cell.write_failure(&failure).unwrap();
+        assert_ne!(cell.failure_mark(), Some(first));
+        for wrong in ["", "1.2", "1.2.x", "-1.2.3"] {
+            assert!(wrong.parse::<FailureMark>().unwrap_err().contains(wrong));
+        }
     }
 
     #[test]

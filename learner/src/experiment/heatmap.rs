@@ -1,7 +1,10 @@
 //! How a policy does over two parameters.
 
-use crate::checkpoint::{Checkpoint, EnvironmentSummary};
+use serde::{Deserialize, Serialize};
+
+use crate::checkpoint::{Checkpoint, EnvironmentSummary, State};
 use crate::client::{OpenOptions, Servers, Session};
+use crate::config::Wrapper;
 use crate::evaluation::{TestError, Version, check_unchanged, environment_seed, mean, play};
 use crate::interrupt::StopFlag;
 use crate::proto::{self, Interval};
@@ -10,7 +13,7 @@ use crate::proto::{self, Interval};
 pub const MOST_POINTS: usize = 100;
 
 /// What to test.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct HeatmapOptions {
     /// Names of the two parameters, along x and along y.
     pub parameters: [String; 2],
@@ -77,6 +80,21 @@ pub enum HeatmapError {
     Test(#[from] TestError),
 }
 
+/// The two parameters, along x and along y, over which an environment's heatmaps are unless others are asked for; `None`
+/// for an environment that is not known here.
+///
+/// Those of MountainCar and Pendulum are the paper's; of CartPole it says that a light and long pole would be the
+/// difficult one. Those of the robots are a heavier torso on a more slippery floor.
+pub fn default_axes(environment: &str) -> Option<[&'static str; 2]> {
+    Some(match environment {
+        "CartPole" | "Acrobot" => ["length", "mass"],
+        "MountainCar" => ["force", "mass"],
+        "Pendulum" => ["mass", "length"],
+        "HalfCheetah" | "Hopper" => ["density", "friction"],
+        _ => return None,
+    })
+}
+
 impl Axis {
     /// The value of the `index`th of `grid` points, which stand in the middle of equal parts.
     pub fn value(&self, index: usize, grid: usize) -> f64 {
@@ -141,16 +159,23 @@ pub fn heatmap(
     let means = |column: usize| by_slot.iter().map(|ends| mean(ends.iter().map(|end| end[column]))).collect();
     Ok(Heatmap {
         environment: state.environment.clone(),
-        policy: format!(
-            "{} {}, trained on {} with seed {}",
-            state.algorithm, state.architecture, state.train_version, state.seed
-        ),
+        policy: policy(state),
         axes,
         grid,
         episodes: options.episodes,
         returns: means(0),
         success: means(1),
     })
+}
+
+/// Who is tested.
+fn policy(state: &State) -> String {
+    let State { algorithm, architecture, train_version, seed, .. } = state;
+    let trials = match algorithm.wrapper() {
+        Wrapper::Rl2 => format!(" N={}", state.episodes_per_trial),
+        _ => String::new(),
+    };
+    format!("{algorithm} {architecture}{trials}, trained on {train_version} with seed {seed}")
 }
 
 fn axes(environment: &proto::Environment, names: &[String; 2]) -> Result<[Axis; 2], HeatmapError> {

@@ -9,6 +9,7 @@ mod cost;
 mod curves;
 mod folder;
 mod heatmap;
+mod heatmaps;
 mod plan;
 pub mod plot;
 pub mod report;
@@ -19,8 +20,13 @@ mod statistics;
 pub use cell::{CellEnd, run_cell};
 pub use cost::{Estimate, Measurement, Speed, Work, estimate, measure, representatives};
 pub use curves::{Curve, EnvironmentCurves, Point, curves_csv, read_curves};
-pub use folder::{CellFolder, CellLock, CellResult, CellState, Failure, Folder, FolderError, Timing, Training};
-pub use heatmap::{Axis, Heatmap, HeatmapError, HeatmapOptions, MOST_POINTS, heatmap, heatmap_csv};
+pub use folder::{
+    CellFolder, CellLock, CellResult, CellState, Failure, FailureMark, Folder, FolderError, Timing, Training,
+};
+pub use heatmap::{Axis, Heatmap, HeatmapError, HeatmapOptions, MOST_POINTS, default_axes, heatmap, heatmap_csv};
+pub use heatmaps::{
+    HeatmapPlace, HeatmapRecord, NoHeatmap, StoredHeatmap, heatmap_files, heatmap_places, store_heatmap,
+};
 pub use plan::{Cell, Counts, Learner, Plan, PlanError, Tests};
 pub use run::{BUSY, NO_SERVER, RunEnd, RunError, RunOptions, RunStatus, run};
 pub use selection::{Group, Metric, Results, Selected, average, interquartile};

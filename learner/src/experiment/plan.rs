@@ -50,7 +50,7 @@ pub struct Cell {
 pub struct Tests {
     /// Episodes of each test.
     pub episodes: u64,
-    /// On which versions.
+    /// On which versions, in the order D, R, E.
     pub versions: Vec<Version>,
 }
 
@@ -446,7 +446,9 @@ impl Expansion<'_> {
             table: place_of(&source, name, block, &self.file.settings),
             source: Box::new(source),
         })?;
-        let tests = Tests { episodes: self.file.test_episodes, versions: self.file.test_versions.clone() };
+        let mut versions = self.file.test_versions.clone();
+        versions.sort_unstable();
+        let tests = Tests { episodes: self.file.test_episodes, versions };
         let configuration = fingerprint(&config, &tests);
         for run in 1..=self.file.runs {
             let mut config = config.clone();

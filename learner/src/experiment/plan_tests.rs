@@ -80,6 +80,33 @@ fn an_id_names_a_cell_whatever_else_the_plan_has() {
     assert_eq!(plan.find("104"), None);
 }
 
+/// What is tested is the same whichever version the file names first.
+#[test]
+fn the_order_of_a_list_without_order_changes_no_id() {
+    let with = |versions: &str| parse(&SMALL.replacen("runs = 2", &format!("runs = 2\ntest_versions = {versions}"), 1));
+    let ids = |versions: &str| -> BTreeSet<String> {
+        with(versions).unwrap().cells.into_iter().map(|cell| cell.id).collect()
+    };
+    let expected = ids("['D', 'R', 'E']");
+    assert_eq!(expected, parse(SMALL).unwrap().cells.into_iter().map(|cell| cell.id).collect());
+    assert_eq!(ids("['E', 'D', 'R']"), expected);
+    assert!(ids("['E', 'D']").is_disjoint(&expected));
+    for (from, to) in [
+        ("['CartPole', 'Pendulum']", "['Pendulum', 'CartPole']"),
+        ("versions = ['D', 'E']", "versions = ['E', 'D']"),
+        ("['ff', 'rc']", "['rc', 'ff']"),
+        ("[7e-3, 7e-4, 7e-5]", "[0.0007, 7e-5, 7e-3]"),
+        (
+            "n_steps = [5, 10], learning_rate = [7e-3, 7e-4, 7e-5]",
+            "learning_rate = [7e-3, 7e-4, 7e-5], n_steps = [10, 5]",
+        ),
+    ] {
+        assert!(SMALL.contains(from), "{from}");
+        let other = parse(&SMALL.replacen(from, to, 1)).unwrap();
+        assert_eq!(other.cells.into_iter().map(|cell| cell.id).collect::<BTreeSet<_>>(), expected, "{to}");
+    }
+}
+
 #[test]
 fn an_invalid_cell_is_refused_with_its_table_and_key() {
     for (from, to, parts) in [

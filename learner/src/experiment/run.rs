@@ -8,7 +8,7 @@ use std::os::unix::process::ExitStatusExt;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
-use super::folder::{Failure, Folder, FolderError};
+use super::folder::{Failure, FailureMark, Folder, FolderError};
 use super::plan::{Cell, Learner, Plan};
 use crate::interrupt::StopFlag;
 
@@ -33,10 +33,11 @@ const BUSY_INTERVAL: Duration = Duration::from_secs(1);
 pub struct RunOptions<'a> {
     /// Worker processes at a time, at least 1.
     pub jobs: usize,
-    /// Whether cells that failed are tried again.
+    /// Whether cells that have failed before are tried again.
     pub retry_failed: bool,
-    /// Makes the command of a worker for a cell; its standard input is set here.
-    pub worker: &'a dyn Fn(&Cell) -> std::io::Result<Command>,
+    /// Makes the command of a worker for a cell, which may forget this failure and no other; its standard input is set
+    /// here.
+    pub worker: &'a dyn Fn(&Cell, Option<FailureMark>) -> std::io::Result<Command>,
     /// Says what is wrong with the servers; `None` while nothing is known to be.
     pub server_trouble: &'a dyn Fn() -> Option<String>,
 }
@@ -97,6 +98,8 @@ struct Runner<'a> {
     folder: &'a Folder,
     options: &'a RunOptions<'a>,
     queue: VecDeque<usize>,
+    /// Failures that were there before this run and that do not count. One that is recorded later does, whoever tried.
+    forgiven: HashMap<usize, FailureMark>,
     /// Cells that others work on.
     elsewhere: Vec<usize>,
     looked_elsewhere: Instant,
@@ -135,6 +138,7 @@ impl<'a> Runner<'a> {
             folder,
             options,
             queue: VecDeque::new(),
+            forgiven: HashMap::new(),
             elsewhere: Vec::new(),
             looked_elsewhere: Instant::now(),
             running: Vec::new(),
@@ -146,7 +150,10 @@ impl<'a> Runner<'a> {
             times: Times::default(),
         };
         for cell in 0..plan.cells.len() {
-            if !runner.settled(cell, !options.retry_failed) {
+            if let Some(failure) = folder.cell(&plan.cells[cell].id).failure_mark().filter(|_| options.retry_failed) {
+                runner.forgiven.insert(cell, failure);
+            }
+            if !runner.settled(cell) {
                 runner.queue.push_back(cell);
             }
         }
@@ -178,7 +185,7 @@ impl<'a> Runner<'a> {
     }
 
     /// Whether a cell has a result, or has failed and that counts; if so, it is counted.
-    fn settled(&mut self, cell: usize, failed_too: bool) -> bool {
+    fn settled(&mut self, cell: usize) -> bool {
         let place = self.folder.cell(&self.plan.cells[cell].id);
         if place.is_settled(false) {
             self.done += 1;
@@ -187,11 +194,12 @@ impl<'a> Runner<'a> {
             }
             return true;
         }
-        if failed_too && place.is_settled(true) {
+        let failure = place.failure_mark();
+        let failed = failure.is_some() && failure.as_ref() != self.forgiven.get(&cell);
+        if failed {
             self.failed.push(cell);
-            return true;
         }
-        false
+        failed
     }
 
     fn start_workers(&mut self) -> Result<(), RunError> {
@@ -201,10 +209,11 @@ impl<'a> Runner<'a> {
         while self.running.len() < self.options.jobs {
             let Some(cell) = self.queue.pop_front() else { break };
             // Another run may have done it meanwhile.
-            if self.settled(cell, !self.options.retry_failed) {
+            if self.settled(cell) {
                 continue;
             }
-            let mut command = (self.options.worker)(&self.plan.cells[cell]).map_err(RunError::Spawn)?;
+            let forgiven = self.forgiven.get(&cell).copied();
+            let mut command = (self.options.worker)(&self.plan.cells[cell], forgiven).map_err(RunError::Spawn)?;
             let child = command.stdin(Stdio::piped()).spawn().map_err(RunError::Spawn)?;
             self.running.push(Job { cell, child, start: Instant::now() });
         }
@@ -225,8 +234,7 @@ impl<'a> Runner<'a> {
     }
 
     fn conclude(&mut self, cell: usize, status: ExitStatus) -> Result<(), RunError> {
-        // A failure counts after the statuses below: until a worker forgets it, there may be one of an earlier run.
-        if self.settled(cell, false) {
+        if self.settled(cell) {
             return Ok(());
         }
         if status.code() == Some(BUSY.into()) {
@@ -258,9 +266,6 @@ impl<'a> Runner<'a> {
             }
             return self.record_failure(cell, format!("its process was ended by signal {signal}, {attempts} times"));
         }
-        if self.settled(cell, true) {
-            return Ok(());
-        }
         let reason = format!("its process ended with {status}: {}", self.last_words(cell));
         self.record_failure(cell, reason)
     }
@@ -273,10 +278,10 @@ impl<'a> Runner<'a> {
             self.elsewhere.push(cell);
             return Ok(());
         };
-        if !place.is_settled(true) {
+        if !self.settled(cell) {
             place.write_failure(&Failure { id, reason, commit: crate::VERSION.into() })?;
+            self.settled(cell);
         }
-        self.settled(cell, true);
         Ok(())
     }
 
@@ -295,7 +300,7 @@ impl<'a> Runner<'a> {
         }
         self.looked_elsewhere = Instant::now();
         for cell in std::mem::take(&mut self.elsewhere) {
-            if self.settled(cell, true) {
+            if self.settled(cell) {
                 continue;
             }
             match self.folder.cell(&self.plan.cells[cell].id).try_lock()? {

@@ -18,7 +18,7 @@ fn run_with(
     stop: &StopFlag,
     script: &dyn Fn(&Cell, &Path) -> String,
 ) -> Result<RunEnd, RunError> {
-    let worker = |cell: &Cell| {
+    let worker = |cell: &Cell, _: Option<FailureMark>| {
         let place = folder.cell(&cell.id);
         std::fs::create_dir_all(place.path())?;
         let mut command = Command::new("sh");
@@ -127,6 +127,44 @@ fn an_earlier_failure_does_not_count_while_others_try_again() {
     };
     let end = run_with(&folder, 1, true, &StopFlag::default(), &script).unwrap();
     assert_eq!(end, RunEnd::Finished { failed: Vec::new() });
+}
+
+#[test]
+fn a_failure_that_another_run_records_meanwhile_counts() {
+    let directory = tempfile::tempdir().unwrap();
+    let folder = Folder::new(directory.path());
+    let id = plan().cells[2].id.clone();
+    let failure = Failure { id: id.clone(), reason: "the same again".into(), commit: "x".into() };
+    folder.cell(&id).write_failure(&failure).unwrap();
+    // While cell 0 is done, another run tries cell 2 again, in vain.
+    let script = |cell: &Cell, _: &Path| match cell.index {
+        0 => {
+            folder.cell(&id).forget_failure().unwrap();
+            folder.cell(&id).write_failure(&failure).unwrap();
+            "echo x > result.json".to_owned()
+        }
+        _ => "echo x >> count; rm -f failure.json; echo x > result.json".to_owned(),
+    };
+    let end = run_with(&folder, 1, true, &StopFlag::default(), &script).unwrap();
+    assert_eq!(end, RunEnd::Finished { failed: vec![id.clone()] });
+    assert_eq!(lines(&folder.cell(&id).path().join("count")), 0, "it is not tried once more");
+}
+
+#[test]
+fn a_worker_that_fails_without_a_word_replaces_the_earlier_failure() {
+    let directory = tempfile::tempdir().unwrap();
+    let folder = Folder::new(directory.path());
+    let id = plan().cells[0].id.clone();
+    let failure = Failure { id: id.clone(), reason: "earlier".into(), commit: "x".into() };
+    folder.cell(&id).write_failure(&failure).unwrap();
+    let script = |cell: &Cell, _: &Path| match cell.index {
+        0 => "echo no folder > log.txt; exit 1".to_owned(),
+        _ => "echo x > result.json".to_owned(),
+    };
+    let end = run_with(&folder, 1, true, &StopFlag::default(), &script).unwrap();
+    assert_eq!(end, RunEnd::Finished { failed: vec![id.clone()] });
+    let text = std::fs::read_to_string(folder.cell(&id).path().join("failure.json")).unwrap();
+    assert!(text.contains("exit status: 1: no folder"), "{text}");
 }
 
 #[test]

@@ -44,6 +44,7 @@ fn done(cell: &Cell, rates: [f64; 3], mean_return: f64) -> CellState {
         },
         results: Version::ALL.into_iter().zip(rates.map(test)).collect(),
         commit: String::new(),
+        earlier_commits: Vec::new(),
         command: String::new(),
     }))
 }

@@ -1,4 +1,5 @@
-//! Heatmaps: mean return and success over two parameters, with the sets of R and E.
+//! Heatmaps: mean return and, below it, success over two parameters, with the sets of R and E. Pictures are narrow, so that
+//! those of policies trained on D, R and E fit side by side.
 
 use plotters::coord::Shift;
 use plotters::element::DashedPathElement;
@@ -8,8 +9,8 @@ use super::super::heatmap::{Axis, Heatmap};
 use super::curves::tick;
 use super::{Picture, PlotError, drawing, font, viridis};
 
-const PANEL: (u32, u32) = (430, 380);
-const TITLE: u32 = 52;
+const PANEL: (u32, u32) = (400, 316);
+const TITLE: u32 = 48;
 const KEY: u32 = 34;
 /// The part of a panel that the colour bar takes.
 const BAR: u32 = 74;
@@ -23,21 +24,21 @@ struct HeatmapPicture<'a>(&'a Heatmap);
 
 impl Picture for HeatmapPicture<'_> {
     fn size(&self) -> (u32, u32) {
-        (2 * PANEL.0, TITLE + PANEL.1 + KEY)
+        (PANEL.0, TITLE + 2 * PANEL.1 + KEY)
     }
 
     fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError> {
         area.fill(&WHITE).map_err(drawing)?;
         let unit = scale as i32;
         let (title, rest) = area.split_vertically(TITLE * scale);
-        let (panels, key) = rest.split_vertically(PANEL.1 * scale);
+        let (panels, key) = rest.split_vertically(2 * PANEL.1 * scale);
         let Heatmap { environment, policy, episodes, .. } = self.0;
         title
-            .draw_text(&format!("{environment}: {policy}"), &font(15, scale), (12 * unit, 8 * unit))
+            .draw_text(&format!("{environment}: {policy}"), &font(13, scale), (10 * unit, 8 * unit))
             .map_err(drawing)?;
         let text = format!("{episodes} episodes at each point, other parameters at their defaults");
-        title.draw_text(&text, &font(12, scale), (12 * unit, 30 * unit)).map_err(drawing)?;
-        let panels = panels.split_evenly((1, 2));
+        title.draw_text(&text, &font(11, scale), (10 * unit, 28 * unit)).map_err(drawing)?;
+        let panels = panels.split_evenly((2, 1));
         let (low, high) = range(&self.0.returns);
         self.panel(&panels[0], "mean return", &self.0.returns, low..high, scale)?;
         self.panel(&panels[1], "success rate, %", &self.0.success, 0.0..100.0, scale)?;

@@ -13,6 +13,7 @@ use plotters::coord::Shift;
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
 
+use super::folder::write_atomically;
 pub use curves::{Quantity, draw_curves};
 pub use heatmap::draw_heatmap;
 
@@ -21,7 +22,7 @@ const FONT: &[u8] = include_bytes!("../../../data/fonts/DejaVuSans-subset.ttf");
 /// What the font is called in an SVG.
 const FAMILY: &str = "sans-serif";
 /// PNG has so many pixels for one unit of the SVG, so that it can be printed.
-const PNG_SCALE: u32 = 2;
+pub const PNG_SCALE: u32 = 2;
 
 /// Why a picture could not be made.
 #[derive(Debug, thiserror::Error)]
@@ -38,6 +39,13 @@ pub enum PlotError {
         /// What the library or the system said.
         reason: String,
     },
+}
+
+impl PlotError {
+    /// Of a file at `path`.
+    pub(super) fn file(path: &Path, reason: &dyn std::fmt::Display) -> Self {
+        Self::File { path: path.display().to_string(), reason: reason.to_string() }
+    }
 }
 
 /// A picture that can be drawn with any backend. Everything is in units of the SVG times `scale`.
@@ -67,19 +75,32 @@ pub fn svg(picture: &impl Picture) -> Result<String, PlotError> {
     Ok(text)
 }
 
-/// Writes the picture as SVG and as PNG: `path` with these endings. The folder must exist.
+/// The picture as PNG, with [`PNG_SCALE`] pixels for each unit.
+///
+/// # Errors
+/// [`PlotError`].
+pub fn png(picture: &impl Picture) -> Result<Vec<u8>, PlotError> {
+    load_font()?;
+    // The library encodes to files only.
+    let scratch = tempfile::tempdir().map_err(|error| PlotError::file(&std::env::temp_dir(), &error))?;
+    let path = scratch.path().join("picture.png");
+    let (width, height) = picture.size();
+    let area = BitMapBackend::new(&path, (width * PNG_SCALE, height * PNG_SCALE)).into_drawing_area();
+    picture.draw(&area, PNG_SCALE)?;
+    area.present().map_err(|error| PlotError::file(&path, &error))?;
+    std::fs::read(&path).map_err(|error| PlotError::file(&path, &error))
+}
+
+/// Writes the picture as SVG and as PNG, each in one piece: `path` with these endings.
 ///
 /// # Errors
 /// [`PlotError`].
 pub fn save(picture: &impl Picture, path: &Path) -> Result<(), PlotError> {
-    let failed = |path: &Path, reason: String| PlotError::File { path: path.display().to_string(), reason };
-    let vector = path.with_extension("svg");
-    std::fs::write(&vector, svg(picture)?).map_err(|error| failed(&vector, error.to_string()))?;
-    let bitmap = path.with_extension("png");
-    let (width, height) = picture.size();
-    let area = BitMapBackend::new(&bitmap, (width * PNG_SCALE, height * PNG_SCALE)).into_drawing_area();
-    picture.draw(&area, PNG_SCALE)?;
-    area.present().map_err(|error| failed(&bitmap, error.to_string()))
+    for (ending, content) in [("svg", svg(picture)?.into_bytes()), ("png", png(picture)?)] {
+        let path = path.with_extension(ending);
+        write_atomically(&path, &content).map_err(|error| PlotError::file(&path, &error))?;
+    }
+    Ok(())
 }
 
 /// Makes the font known to the library, once.

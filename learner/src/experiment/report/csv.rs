@@ -84,7 +84,8 @@ fn selected(results: &Results<'_>, groups: &[Group]) -> Lines {
                 let rates = selected.rates[version as usize].map(number);
                 let seed = result.training.seed.to_string();
                 let names = [version.to_string(), run.to_string(), seed, result.id.clone()];
-                let origin = [result.commit.clone(), result.command.clone()];
+                let commits = result.commits().collect::<Vec<_>>().join("; ");
+                let origin = [commits, result.command.clone()];
                 file.add(&group.environment, &group.learner, names.into_iter().chain(rates).chain(origin))?;
             }
         }

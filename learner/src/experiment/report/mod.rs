@@ -5,6 +5,7 @@
 //! done.
 
 mod csv;
+mod figures;
 mod html;
 mod render;
 
@@ -14,6 +15,7 @@ use super::statistics::{Iqm, Summary};
 use crate::evaluation::{Scenario, Version, paper};
 
 pub use csv::csv_files;
+pub use figures::{Figure, FigureData, FigureError, Figures};
 pub use html::html;
 pub use render::{markdown, text};
 
@@ -51,6 +53,8 @@ pub struct Table {
     pub title: String,
     /// Names of the columns.
     pub header: Vec<String>,
+    /// Names of neighbouring columns together, with their number, where one name is not enough; empty otherwise.
+    pub spans: Vec<(String, usize)>,
     /// How many of the first columns are texts; the others are numbers.
     pub texts: usize,
     /// The rows, each as long as the header.
@@ -129,7 +133,7 @@ fn overview(results: &Results<'_>, groups: &[Group]) -> Vec<String> {
         ));
     }
     let results = (0..cells).filter_map(|index| results.result(index));
-    let commits: std::collections::BTreeSet<&str> = results.map(|result| result.commit.as_str()).collect();
+    let commits: std::collections::BTreeSet<&str> = results.flat_map(|result| result.commits()).collect();
     if !commits.is_empty() {
         lines.push(format!("Done by perturb {}.", commits.into_iter().collect::<Vec<_>>().join(", ")));
     }
@@ -178,7 +182,9 @@ fn metrics_table(title: String, rows: Vec<Vec<Entry>>) -> Table {
     let mut header = vec!["learner".to_owned()];
     header.extend(Metric::ALL.iter().flat_map(|metric| [metric.to_string(), "paper".into(), "difference".into()]));
     header.extend(["runs".into(), "cells".into()]);
-    Table { title, header, texts: 1, rows }
+    let ours_and_papers = Metric::ALL.map(|metric| (metric.to_string(), 3));
+    let spans = [(String::new(), 1)].into_iter().chain(ours_and_papers).chain([(String::new(), 2)]).collect();
+    Table { title, header, spans, texts: 1, rows }
 }
 
 fn metrics_row(
@@ -253,6 +259,7 @@ fn iqm(results: &Results<'_>, groups: &[Group]) -> Table {
             .chain(Metric::ALL.map(|metric| metric.to_string()))
             .chain(std::iter::once("runs".to_owned()))
             .collect(),
+        spans: Vec::new(),
         texts: 1,
         rows: results.plan.learners().iter().map(row).collect(),
     }
@@ -266,6 +273,7 @@ fn scenarios_of(environment: &str, groups: &[&Group]) -> Table {
     Table {
         title: format!("{environment}: the nine scenarios"),
         header: ["learner", "trained on", "tested on D", "on R", "on E"].map(str::to_owned).into(),
+        spans: Vec::new(),
         texts: 2,
         rows: groups.iter().flat_map(|group| Version::ALL.map(|train| row(group, train))).collect(),
     }
@@ -296,6 +304,7 @@ fn selected(results: &Results<'_>, groups: &[Group]) -> Table {
         header: ["environment", "learner", "trained on", "run", "seed", "cell", "success on it"]
             .map(str::to_owned)
             .into(),
+        spans: Vec::new(),
         texts: 6,
         rows,
     }
@@ -306,6 +315,7 @@ fn failures(results: &Results<'_>) -> Table {
     Table {
         title: "Failed cells".into(),
         header: ["cell", "reason"].map(str::to_owned).into(),
+        spans: Vec::new(),
         texts: 2,
         rows: results.failures().map(row).collect(),
     }
