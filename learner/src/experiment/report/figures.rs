@@ -134,16 +134,16 @@ fn advice(missing: [usize; 4], all: usize) -> Vec<String> {
     let mut advice = Vec::new();
     if makeable > 0 {
         advice.push(format!(
-            "{makeable} of {all} heatmaps are not there: `perturb heatmap DIR` makes them, where DIR is the folder of \
-             these results."
+            "Heatmaps that are not there: {makeable} of {all}. `perturb heatmap DIR` makes them, where DIR is the folder \
+             of these results."
         ));
     }
     if waiting > 0 {
-        advice.push(format!("{waiting} of {all} heatmaps wait for the results of their trainings."));
+        advice.push(format!("Heatmaps that wait for the results of their trainings: {waiting} of {all}."));
     }
     if unknown > 0 {
         advice.push(format!(
-            "{unknown} of {all} heatmaps have no usual parameters: `perturb heatmap --checkpoint` takes any two."
+            "Heatmaps without usual parameters: {unknown} of {all}. `perturb heatmap --checkpoint` takes any two."
         ));
     }
     advice

@@ -69,7 +69,7 @@ impl Page {
         }
         let _ = writeln!(self.body, "<section id=\"{id}\">\n<h2>{title}</h2>");
         for note in notes {
-            let _ = writeln!(self.body, "<p>{}</p>", escaped(note));
+            let _ = writeln!(self.body, "<p>{}</p>", prose(note));
         }
         self.sections.push(Section { id, title, parts: Vec::new() });
     }
@@ -111,7 +111,7 @@ impl Page {
         }
         self.body.push_str("<ul class=\"missing\">\n");
         for note in notes {
-            let _ = writeln!(self.body, "<li>{}</li>", escaped(note));
+            let _ = writeln!(self.body, "<li>{}</li>", prose(note));
         }
         self.body.push_str("</ul>\n");
     }
@@ -185,7 +185,7 @@ impl Page {
              <link rel=\"icon\" href=\"data:,\">\n<style>\n{STYLE}</style>\n</head>\n<body>\n<header>\n<h1>Results</h1>\n"
         );
         for line in overview {
-            let _ = writeln!(out, "<p>{}</p>", escaped(line));
+            let _ = writeln!(out, "<p>{}</p>", prose(line));
         }
         out.push_str("</header>\n<nav aria-label=\"Contents\">\n<ol>\n");
         for Section { id, title, parts } in &self.sections {
@@ -236,6 +236,12 @@ fn class(names: &[(bool, &str)]) -> String {
 fn png_size(png: &[u8]) -> Option<(u32, u32)> {
     let number = |from: usize| Some(u32::from_be_bytes(png.get(from..from + 4)?.try_into().ok()?));
     Some((number(16)?, number(20)?))
+}
+
+/// A sentence, in which `names` stand between backticks.
+fn prose(text: &str) -> String {
+    let part = |(i, part)| if i % 2 == 1 { format!("<code>{part}</code>") } else { str::to_owned(part) };
+    escaped(text).split('`').enumerate().map(part).collect()
 }
 
 fn escaped(text: &str) -> String {
