@@ -79,7 +79,7 @@ pub enum Refusal {
         request: &'static str,
     },
     /// dm_env_rpc: a property does not allow this.
-    #[error("property {key:?} cannot be {access}; its spec, which a list of properties tells, says what it allows")]
+    #[error("property {key:?} cannot be {access}; list_property tells what each property allows")]
     Forbidden {
         /// The property.
         key: String,

@@ -66,7 +66,7 @@ pub(super) fn answer(joined: Option<&Joined>, request: &Any) -> Result<Any, Refu
     let response = match request.payload {
         Some(Request::ReadProperty(read)) => {
             let property = find(&properties, &read.key)?;
-            let value = property.value.as_ref().ok_or_else(|| property.forbidden("read; list it"))?;
+            let value = property.value.as_ref().ok_or_else(|| property.forbidden("read, only listed"))?;
             Response::ReadProperty(ReadPropertyResponse { value: Some(value.tensor()) })
         }
         Some(Request::WriteProperty(write)) => {

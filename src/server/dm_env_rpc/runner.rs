@@ -132,12 +132,7 @@ impl Runner {
         let Stepped { observations, rewards, terminated, truncated, ended, .. } = self.batch.step(actions).await?;
         let is_set = |flags: &Bytes| flags.first().is_some_and(|flag| *flag == 1);
         let truncated = is_set(&truncated);
-        // Gymnasium's rule: a state that the task ended has no value, whether or not the time was up too.
-        let state = match is_set(&terminated) {
-            true => State::Terminated,
-            false if truncated || interrupted => State::Interrupted,
-            false => State::Running,
-        };
+        let state = state(is_set(&terminated), truncated || interrupted);
         if state != State::Running {
             self.phase = Phase::Over;
         }
@@ -153,7 +148,29 @@ impl Runner {
     }
 }
 
+/// An end by the task comes before one from outside: the state that it leaves has no value, as in Gymnasium.
+fn state(terminated: bool, interrupted: bool) -> State {
+    match (terminated, interrupted) {
+        (true, _) => State::Terminated,
+        (false, true) => State::Interrupted,
+        (false, false) => State::Running,
+    }
+}
+
 /// The only environment's.
 fn only(started: Vec<(u32, EpisodeStart)>) -> Option<EpisodeStart> {
     started.into_iter().next().map(|(_, start)| start)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_end_by_the_task_and_by_the_step_limit_at_once_is_terminated() {
+        assert_eq!(state(true, true), State::Terminated);
+        assert_eq!(state(true, false), State::Terminated);
+        assert_eq!(state(false, true), State::Interrupted);
+        assert_eq!(state(false, false), State::Running);
+    }
 }
