@@ -104,7 +104,7 @@ fn elements<T: Copy + PartialOrd + Display>(
         _ => return Err(refuse()),
     };
     // NaN is within no bounds.
-    match all.iter().zip(bounds).position(|(x, (low, high))| !(low <= x && x <= high)) {
+    match all.iter().zip(bounds).position(|(x, (low, high))| !(low..=high).contains(&x)) {
         Some(i) => {
             let (got, (low, high)) = (format!("{} in element {i}", all[i]), bounds[i]);
             Err(Refusal::value(field.to_owned(), got, format!("a number within [{low}, {high}]")))
