@@ -7,6 +7,8 @@ TARGET := $(or $(CARGO_TARGET_DIR),target)
 PROGRAMS := $(TARGET)/release
 # The Python package's tools are in an environment of their own.
 VENV := $(TARGET)/python
+# The Python package whose compliance cases `make test` runs.
+DM_ENV_RPC := $(TARGET)/dm_env_rpc
 
 # Arguments of `make demo`, `make bench` and `make all-pairs`, e.g. make demo DEMO_ARGS="--episodes 200 --test-episodes 50",
 # make all-pairs ALL_PAIRS_ARGS="20 /tmp/runs": episodes, directory.
@@ -67,7 +69,8 @@ report-check: build ## make the report of a small experiment and look at it in C
 	@$(call install,chromium python3)
 	PROGRAMS=$(PROGRAMS) learner/tests/report_check.sh $(TARGET)/report-check
 
-test: deps ## run all tests, then those of the server without MuJoCo
+test: export PERTURB_TEST_DM_ENV_RPC_PYTHON := $(abspath $(DM_ENV_RPC))/bin/python
+test: deps $(DM_ENV_RPC)/installed ## run all tests, then those of the server without MuJoCo
 	cargo test $(ALL)
 	cargo test $(WITHOUT_MUJOCO)
 
@@ -115,6 +118,11 @@ $(VENV)/installed: python/requirements-dev.txt python/pyproject.toml python/hatc
 	python3 -m venv $(VENV)
 	$(VENV)/bin/pip install -q --disable-pip-version-check -r python/requirements-dev.txt
 	$(VENV)/bin/pip install -q --disable-pip-version-check --no-deps --editable python
+	touch $@
+
+$(DM_ENV_RPC)/installed: tests/dm_env_rpc/requirements.txt | python-venv
+	python3 -m venv $(DM_ENV_RPC)
+	$(DM_ENV_RPC)/bin/pip install -q --disable-pip-version-check -r $<
 	touch $@
 
 # Debian keeps what fills a new environment in a package of its own.

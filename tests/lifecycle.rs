@@ -358,7 +358,7 @@ macro_rules! reflect {
             MessageResponse::ListServicesResponse(list) => list.service.into_iter().map(|s| s.name).collect(),
             other => panic!("{other:?}"),
         };
-        for name in [SERVICE, "grpc.health.v1.Health"] {
+        for name in [SERVICE, "dm_env_rpc.v1.Environment", "grpc.health.v1.Health"] {
             assert!(names.iter().any(|listed| listed == name), "{name} is not in {names:?}");
         }
         for _ in 0..2 {

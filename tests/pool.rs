@@ -477,6 +477,26 @@ async fn a_batch_dropped_in_mid_step_gives_its_environments_back() {
 }
 
 #[tokio::test]
+async fn a_batch_whose_step_nobody_waits_for_settles_and_goes_on_after_it() {
+    const N: usize = 2000;
+    let pool = Pool::new(2, N * 2).unwrap();
+    let spec = env::find("Acrobot").unwrap();
+    let settings = batch_settings(spec, N, Autoreset::SameStep);
+    let (mut batch, ..) = Batch::open(&pool, settings.clone()).await.unwrap();
+    let (mut twin, ..) = Batch::open(&pool, settings).await.unwrap();
+    let mut in_mid_step = 0;
+    for t in 0..20 {
+        let (forgotten, next) = (actions(spec, 0, N, 2 * t), actions(spec, 0, N, 2 * t + 1));
+        in_mid_step += u32::from(poll_once(pin!(batch.step(&forgotten))).await.is_pending());
+        batch.settle().await;
+        batch.settle().await;
+        twin.step(&forgotten).await.unwrap();
+        assert!(batch.step(&next).await.unwrap() == twin.step(&next).await.unwrap(), "step {t}");
+    }
+    assert!(in_mid_step > 0, "no step was forgotten");
+}
+
+#[tokio::test]
 async fn a_batch_outlives_others_and_a_pool_ends_with_batches_alive() {
     let spec = env::find("Pendulum").unwrap();
     let pool = Pool::new(2, 20).unwrap();

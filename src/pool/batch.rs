@@ -76,6 +76,8 @@ pub struct Batch {
     job: Arc<Job>,
     workers: Arc<Shared>,
     buffer: BytesMut,
+    /// A request has been handed to the workers and its end not been waited for.
+    under_way: bool,
 }
 
 impl Batch {
@@ -95,7 +97,7 @@ impl Batch {
         };
         let shards = (0..settings.size).step_by(shard_size).map(shard).collect();
         let job = Arc::new(Job::new(shards, pool.workers(), permit, settings.spec.step_cost * settings.size as f64));
-        let mut batch = Self { settings, shard_size, job, workers, buffer: BytesMut::new() };
+        let mut batch = Self { settings, shard_size, job, workers, buffer: BytesMut::new(), under_way: false };
         batch.run().await?;
         batch.check_failures()?;
         let observations = batch.all_observations();
@@ -180,8 +182,21 @@ impl Batch {
         lock(&self.job.shards[slot / self.shard_size]).distributions(slot).to_vec()
     }
 
+    /// Waits for the end of a request whose future was dropped before it was ready. To be called before the next one,
+    /// then; the workers still run it, and another would mix with it.
+    pub async fn settle(&mut self) {
+        if self.under_way {
+            // Whether it failed the next request will tell.
+            let _ = self.workers.wait(&self.job).await;
+            self.under_way = false;
+        }
+    }
+
     async fn run(&mut self) -> Result<(), Error> {
-        self.workers.run(&self.job).await
+        self.under_way = true;
+        let result = self.workers.run(&self.job).await;
+        self.under_way = false;
+        result
     }
 
     fn check_failures(&self) -> Result<(), Error> {

@@ -115,6 +115,11 @@ impl Shared {
     pub(super) async fn run(&self, job: &Arc<Job>) -> Result<(), Error> {
         job.prepare();
         self.push(job); // its lock publishes the job's counters
+        self.wait(job).await
+    }
+
+    /// Waits for the last shard of a job that was pushed.
+    pub(super) async fn wait(&self, job: &Arc<Job>) -> Result<(), Error> {
         // A job that is nearly done is worth more polls than a sleep: being woken costs more than many steps.
         for _ in 0..job.patience {
             if job.left.load(Ordering::Acquire) == 0 {

@@ -56,7 +56,8 @@ pub fn open(request: proto::Open) -> Result<BatchSettings, Refusal> {
     })
 }
 
-fn override_parameters(
+/// Replaces the distributions of the parameters that are named.
+pub fn override_parameters(
     spec: &'static EnvironmentSpec,
     base: &mut [Distribution],
     parameters: &HashMap<String, proto::Distribution>,

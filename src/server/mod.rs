@@ -1,12 +1,16 @@
 //! The server: gRPC in, gRPC out.
 //!
-//! - [`service`]: one short method for each call, and the transport of a session.
+//! - [`service`]: one short method for each call.
+//! - [`conversation`]: the transport of a session.
 //! - [`session`]: the legal order of a session's requests.
 //! - [`convert`]: the protocol to the domain and back, with all validation.
 //! - [`status`]: every refusal, and its gRPC code.
+//! - [`dm_env_rpc`]: the same environments by DeepMind's protocol.
 //! - [`listen`] and [`drain`]: how it begins and how it ends.
 
+pub mod conversation;
 pub mod convert;
+pub mod dm_env_rpc;
 pub mod drain;
 pub mod listen;
 pub mod service;
@@ -17,8 +21,9 @@ use crate::{
     config::Config,
     env,
     pool::Pool,
-    proto::{self, perturb_server::PerturbServer},
+    proto::{self, dm_env_rpc::v1::environment_server::EnvironmentServer, perturb_server::PerturbServer},
 };
+use conversation::Sessions;
 use drain::{Controller, Phase};
 use listen::Listener;
 use service::Service;
@@ -61,12 +66,18 @@ pub async fn run(listeners: Vec<Listener>, config: &Config, shutdown: impl Futur
     let pool = Arc::new(Pool::new(config.workers, config.max_envs)?);
     let (controller, drain) = Controller::new();
     let idle = (config.idle_seconds > 0).then(|| Duration::from_secs(config.idle_seconds));
-    let service = Service::new(pool, catalogue, config.max_sessions, idle, drain.clone());
+    let sessions = Sessions::new(config.max_sessions, idle, drain.clone());
+    let worlds = dm_env_rpc::service::Service::new(Arc::clone(&pool), sessions.clone());
+    let worlds = EnvironmentServer::new(worlds)
+        .max_decoding_message_size(config.max_message_bytes)
+        .max_encoding_message_size(usize::MAX);
+    let service = Service::new(pool, catalogue, sessions);
     let service = PerturbServer::new(service)
         .max_decoding_message_size(config.max_message_bytes)
         .max_encoding_message_size(usize::MAX);
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<PerturbServer<Service>>().await;
+    health.set_serving::<EnvironmentServer<dm_env_rpc::service::Service>>().await;
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(proto::DESCRIPTORS)
@@ -79,6 +90,7 @@ pub async fn run(listeners: Vec<Listener>, config: &Config, shutdown: impl Futur
         .initial_stream_window_size(STREAM_WINDOW)
         .initial_connection_window_size(CONNECTION_WINDOW)
         .add_service(service)
+        .add_service(worlds)
         .add_service(health_service)
         .add_service(reflection().build_v1()?)
         .add_service(reflection().build_v1alpha()?);
@@ -107,6 +119,7 @@ pub async fn run(listeners: Vec<Listener>, config: &Config, shutdown: impl Futur
     tracing::info!(grace_seconds = config.grace_seconds, "shutting down: no new sessions");
     controller.set(Phase::Draining);
     health.set_not_serving::<PerturbServer<Service>>().await;
+    health.set_not_serving::<EnvironmentServer<dm_env_rpc::service::Service>>().await;
     health.set_service_status("", ServingStatus::NotServing).await;
     if tokio::time::timeout(config.grace(), controller.idle()).await.is_err() {
         tracing::warn!("the grace period is over: ending the sessions that still run");

@@ -1,6 +1,7 @@
 //! Every refusal, and the only place that turns one into a gRPC code.
 
 use crate::{env, pool, proto};
+use std::borrow::Cow;
 use tonic::{Code, Status};
 
 /// Why a request was refused. It changed nothing.
@@ -16,8 +17,8 @@ pub enum Refusal {
     /// A field has a value that it cannot have.
     #[error("{field} is {got}; expected {expected}")]
     Value {
-        /// The field, by its path in the protocol.
-        field: &'static str,
+        /// The field, by its path in the protocol; of dm_env_rpc the setting, action or property.
+        field: Cow<'static, str>,
         /// What came.
         got: String,
         /// What would be right, and what to do.
@@ -47,12 +48,58 @@ pub enum Refusal {
     /// The server takes no new work.
     #[error("this server is shutting down; use another, or try again later")]
     Draining,
+    /// dm_env_rpc: nothing has this name.
+    #[error("{what} {name} is unknown; {known}")]
+    Unknown {
+        /// What was looked for: a world, a setting, an action, …
+        what: &'static str,
+        /// Its name or number, as it came.
+        name: String,
+        /// What there is.
+        known: String,
+    },
+    /// dm_env_rpc: a request of agents on a stream that is none.
+    #[error("{request} came from a stream that has joined no world; send join_world first")]
+    NotJoined {
+        /// The request.
+        request: &'static str,
+    },
+    /// dm_env_rpc: a second `join_world`.
+    #[error("join_world came from a stream that has joined {world:?}; leave that world first, or use another stream")]
+    AlreadyJoined {
+        /// The world that it has joined.
+        world: String,
+    },
+    /// dm_env_rpc: a world has an agent and must not.
+    #[error("world {world:?} has an agent; {request} can be done when the agent has left it")]
+    Occupied {
+        /// The world.
+        world: String,
+        /// What was asked for.
+        request: &'static str,
+    },
+    /// dm_env_rpc: a property does not allow this.
+    #[error("property {key:?} cannot be {access}; list_property tells what each property allows")]
+    Forbidden {
+        /// The property.
+        key: String,
+        /// What was asked for, as a participle.
+        access: &'static str,
+    },
+    /// dm_env_rpc: an extension that this server does not have.
+    #[error("extension {name:?} is unknown; this server has {known}")]
+    UnknownExtension {
+        /// The type of the message.
+        name: String,
+        /// The one that there is.
+        known: &'static str,
+    },
 }
 
 impl Refusal {
     /// A [`Refusal::Value`].
-    pub fn value(field: &'static str, got: impl ToString, expected: impl ToString) -> Self {
-        Self::Value { field, got: got.to_string(), expected: expected.to_string() }
+    pub fn value(field: impl Into<Cow<'static, str>>, got: impl ToString, expected: impl ToString) -> Self {
+        Self::Value { field: field.into(), got: got.to_string(), expected: expected.to_string() }
     }
 
     /// The gRPC code of this refusal.
@@ -67,10 +114,14 @@ impl Refusal {
             Self::Pool(pool::Error::Ended { .. }) | Self::NotOpen { .. } | Self::AlreadyOpen => {
                 Code::FailedPrecondition
             }
+            Self::NotJoined { .. } | Self::AlreadyJoined { .. } | Self::Occupied { .. } => Code::FailedPrecondition,
             Self::Pool(pool::Error::Defect) => Code::Internal,
             Self::Value { .. } => Code::InvalidArgument,
             Self::Idle { .. } => Code::DeadlineExceeded,
             Self::Draining => Code::Unavailable,
+            Self::Unknown { .. } => Code::NotFound,
+            Self::Forbidden { .. } => Code::PermissionDenied,
+            Self::UnknownExtension { .. } => Code::Unimplemented,
         }
     }
 }
@@ -79,6 +130,13 @@ impl Refusal {
 impl From<Refusal> for proto::Error {
     fn from(refusal: Refusal) -> Self {
         Self { code: refusal.code() as i32, message: refusal.to_string() }
+    }
+}
+
+/// The same of dm_env_rpc.
+impl From<Refusal> for proto::google::rpc::Status {
+    fn from(refusal: Refusal) -> Self {
+        Self { code: refusal.code() as i32, message: refusal.to_string(), details: Vec::new() }
     }
 }
 

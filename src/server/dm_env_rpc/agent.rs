@@ -1,0 +1,142 @@
+//! One stream: the legal order of its requests, each answered once.
+
+use super::{
+    properties,
+    runner::Runner,
+    settings, specs,
+    world::World,
+    worlds::{StreamId, Worlds},
+};
+use crate::{
+    proto::dm_env_rpc::v1::{
+        self as rpc, environment_request::Payload as Request, environment_response::Payload as Response,
+    },
+    server::{conversation::Sessions, drain::Phase, status::Refusal},
+};
+use std::sync::Arc;
+
+/// A client's stream. When it is dropped it leaves its world, and the worlds that it made go unless an agent is in them.
+pub(super) struct Agent {
+    worlds: Arc<Worlds>,
+    sessions: Sessions,
+    id: StreamId,
+    joined: Option<Joined>,
+}
+
+/// The world whose agent this is.
+pub(super) struct Joined {
+    pub(super) world: Arc<World>,
+    pub(super) runner: Runner,
+}
+
+impl Agent {
+    /// A stream that has joined no world.
+    pub(super) fn new(worlds: Arc<Worlds>, sessions: Sessions) -> Self {
+        let id = worlds.stream();
+        Self { worlds, sessions, id, joined: None }
+    }
+
+    /// Whether it keeps a world alive.
+    pub(super) fn is_open(&self) -> bool {
+        self.joined.is_some() || self.worlds.are_made_by(self.id)
+    }
+
+    /// Answers a request.
+    pub(super) async fn answer(&mut self, request: rpc::EnvironmentRequest) -> rpc::EnvironmentResponse {
+        let response = match request.payload {
+            Some(Request::CreateWorld(create)) => self.create_world(create).await.map(Response::CreateWorld),
+            Some(Request::JoinWorld(join)) => self.join_world(join).await.map(Response::JoinWorld),
+            Some(Request::Step(step)) => self.step(step).await.map(Response::Step),
+            Some(Request::Reset(reset)) => self.reset(reset).map(Response::Reset),
+            Some(Request::ResetWorld(reset)) => self.reset_world(reset).map(Response::ResetWorld),
+            Some(Request::LeaveWorld(_)) => {
+                self.leave();
+                Ok(Response::LeaveWorld(rpc::LeaveWorldResponse {}))
+            }
+            Some(Request::DestroyWorld(destroy)) => self.destroy_world(&destroy).map(Response::DestroyWorld),
+            Some(Request::Extension(any)) => properties::answer(self.joined.as_ref(), &any).map(Response::Extension),
+            None => {
+                let expected = "create_world, join_world, step, …";
+                Err(Refusal::value("request", "empty or of a kind this server does not know", expected))
+            }
+        };
+        let response = response.unwrap_or_else(|refusal| {
+            tracing::debug!(%refusal, "refused a request of dm_env_rpc");
+            Response::Error(refusal.into())
+        });
+        rpc::EnvironmentResponse { payload: Some(response) }
+    }
+
+    async fn create_world(&mut self, request: rpc::CreateWorldRequest) -> Result<rpc::CreateWorldResponse, Refusal> {
+        if self.sessions.phase() != Phase::Running {
+            return Err(Refusal::Draining);
+        }
+        let (settings, version) = settings::create(&request.settings)?;
+        let runner = Runner::open(self.worlds.pool(), settings, version).await?;
+        Ok(rpc::CreateWorldResponse { world_name: self.worlds.add(self.id, runner) })
+    }
+
+    async fn join_world(&mut self, request: rpc::JoinWorldRequest) -> Result<rpc::JoinWorldResponse, Refusal> {
+        if let Some(joined) = &self.joined {
+            return Err(Refusal::AlreadyJoined { world: joined.world.name().into() });
+        }
+        settings::none("join_world", &request.settings)?;
+        let (world, runner) = self.worlds.join(&request.world_name)?;
+        // Before anything is awaited: if the client goes now, the world is left and not lost.
+        let joined = self.joined.insert(Joined { world, runner });
+        joined.runner.settle().await;
+        Ok(rpc::JoinWorldResponse { specs: Some(specs::of(joined.world.spec())) })
+    }
+
+    async fn step(&mut self, request: rpc::StepRequest) -> Result<rpc::StepResponse, Refusal> {
+        let Joined { world, runner } = self.joined("step")?;
+        specs::check_requested(&request.requested_observations)?;
+        let outcome = if runner.is_running() {
+            let actions = specs::actions(world.spec(), &request.actions)?;
+            runner.step(&actions, world.take_interruption()).await?
+        } else {
+            runner.begin(world.take_changes()).await?
+        };
+        Ok(specs::response(&outcome, &request.requested_observations))
+    }
+
+    fn reset(&mut self, request: rpc::ResetRequest) -> Result<rpc::ResetResponse, Refusal> {
+        let Joined { world, runner } = self.joined("reset")?;
+        world.change(settings::change(world.spec(), "reset", &request.settings)?)?;
+        runner.stop();
+        Ok(rpc::ResetResponse { specs: Some(specs::of(world.spec())) })
+    }
+
+    fn reset_world(&mut self, request: rpc::ResetWorldRequest) -> Result<rpc::ResetWorldResponse, Refusal> {
+        let world = self.worlds.find(&request.world_name)?;
+        world.change(settings::change(world.spec(), "reset_world", &request.settings)?)?;
+        match &mut self.joined {
+            Some(joined) if joined.world.name() == world.name() => joined.runner.stop(),
+            _ => world.interrupt(),
+        }
+        Ok(rpc::ResetWorldResponse {})
+    }
+
+    fn destroy_world(&mut self, request: &rpc::DestroyWorldRequest) -> Result<rpc::DestroyWorldResponse, Refusal> {
+        self.worlds.destroy(&request.world_name)?;
+        Ok(rpc::DestroyWorldResponse {})
+    }
+
+    fn leave(&mut self) {
+        if let Some(Joined { world, mut runner }) = self.joined.take() {
+            runner.stop();
+            self.worlds.leave(&world, runner);
+        }
+    }
+
+    fn joined(&mut self, request: &'static str) -> Result<&mut Joined, Refusal> {
+        self.joined.as_mut().ok_or(Refusal::NotJoined { request })
+    }
+}
+
+impl Drop for Agent {
+    fn drop(&mut self) {
+        self.leave();
+        self.worlds.stream_ended(self.id);
+    }
+}

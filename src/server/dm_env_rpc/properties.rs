@@ -1,0 +1,246 @@
+//! Properties: values beside actions and observations, by name. They are those of the episode that was begun last; what
+//! is written takes effect when the next begins.
+
+use super::{
+    agent::Joined,
+    settings::{self, Change},
+    tensors,
+};
+use crate::{
+    env::{self, EpisodeId, Receipt, shorten},
+    proto::dm_env_rpc::v1::{
+        DataType, Tensor, TensorSpec,
+        extensions::properties::{
+            ListPropertyResponse, PropertyRequest, PropertyResponse, PropertySpec, ReadPropertyResponse,
+            WritePropertyRequest, WritePropertyResponse, property_request::Payload as Request,
+            property_response::Payload as Response,
+        },
+        tensor::{DoubleArray, Payload, StringArray, Uint32Array, Uint64Array},
+        tensor_spec,
+    },
+    server::status::Refusal,
+};
+use prost::Message;
+use prost_types::Any;
+
+const REQUEST: &str = "dm_env_rpc.v1.extensions.properties.PropertyRequest";
+const RESPONSE_URL: &str = "type.googleapis.com/dm_env_rpc.v1.extensions.properties.PropertyResponse";
+
+const PARAMETERS: &str = "parameters";
+const APPLIED: &str = "applied";
+const VERSION: &str = "version";
+const SEED: &str = "seed";
+
+/// A property and its value.
+struct Property {
+    key: String,
+    description: String,
+    /// None if it only holds others.
+    value: Option<Value>,
+    /// What may be written.
+    range: Option<(f64, f64)>,
+    is_writable: bool,
+}
+
+enum Value {
+    Text(String),
+    Texts(Vec<String>),
+    Small(u32),
+    Large(u64),
+    Real(f64),
+}
+
+/// Answers an extension's message.
+///
+/// # Errors
+/// If it is of another extension or cannot be decoded, or for what the request is refused for.
+pub(super) fn answer(joined: Option<&Joined>, request: &Any) -> Result<Any, Refusal> {
+    let name = request.type_url.rsplit('/').next().unwrap_or_default();
+    if name != REQUEST {
+        return Err(Refusal::UnknownExtension { name: shorten(name), known: REQUEST });
+    }
+    let expected = "read_property, write_property or list_property";
+    let request = PropertyRequest::decode(request.value.as_slice())
+        .map_err(|error| Refusal::value("extension", format!("no {REQUEST}: {error}"), expected))?;
+    let properties = properties(joined);
+    let response = match request.payload {
+        Some(Request::ReadProperty(read)) => {
+            let property = find(&properties, &read.key)?;
+            let value = property.value.as_ref().ok_or_else(|| property.forbidden("read, only listed"))?;
+            Response::ReadProperty(ReadPropertyResponse { value: Some(value.tensor()) })
+        }
+        Some(Request::WriteProperty(write)) => {
+            self::write(joined, find(&properties, &write.key)?, &write)?;
+            Response::WriteProperty(WritePropertyResponse {})
+        }
+        Some(Request::ListProperty(list)) => {
+            let values = self::list(&properties, &list.key)?.map(Property::spec).collect();
+            Response::ListProperty(ListPropertyResponse { values })
+        }
+        None => return Err(Refusal::value("extension", "an empty PropertyRequest", expected)),
+    };
+    let value = PropertyResponse { payload: Some(response) }.encode_to_vec();
+    Ok(Any { type_url: RESPONSE_URL.into(), value })
+}
+
+/// All properties, in a fixed order: the server's, then those of the joined world.
+fn properties(joined: Option<&Joined>) -> Vec<Property> {
+    let names = env::names().map(String::from).collect();
+    let mut all = vec![
+        Property::new("server_version", "the server's version", Value::Text(env!("CARGO_PKG_VERSION").into())),
+        Property::new("environments", "what env_id may be in create_world", Value::Texts(names)),
+    ];
+    // A world's batch is opened with receipts, so that there is always an episode's start.
+    if let Some((joined, start)) = joined.and_then(|joined| Some((joined, joined.runner.start()?))) {
+        all.extend(of_world(joined, start.id, start.receipt.as_ref()));
+    }
+    all
+}
+
+fn of_world(joined: &Joined, episode: EpisodeId, receipt: Option<&Receipt>) -> Vec<Property> {
+    let (spec, runner) = (joined.world.spec(), &joined.runner);
+    let new = Property::new;
+    let hash = receipt.map(|receipt| receipt.model_hash.clone()).unwrap_or_default();
+    let mut all = vec![
+        new("env_id", spec.description, Value::Text(spec.name.into())),
+        new("revision", "raised by every change of the environment", Value::Small(spec.revision)),
+        new("model_hash", "SHA-256 of the model's MJCF; empty without a model", Value::Text(hash)),
+        new(
+            VERSION,
+            "D, R or E; writing it gives all parameters its sets",
+            Value::Text(settings::letter(runner.version()).into()),
+        )
+        .writable(),
+        new(SEED, "fixes all randomness; writing it restarts the counts", Value::Large(runner.seed())).writable(),
+        new("environment_index", "fixes randomness together with the seed", Value::Small(episode.environment_index)),
+        new("trial_index", "counts trials from 0", Value::Large(episode.trial_index)),
+        new("episode_index", "counts episodes from 0", Value::Large(episode.episode_index)),
+        new(
+            "episodes_per_trial",
+            "episodes with the same parameters",
+            Value::Small(runner.settings().episodes.episodes_per_trial),
+        ),
+        new("step_limit", "an episode is INTERRUPTED after so many steps", Value::Small(spec.step_limit)),
+        new("control_timestep", "simulated seconds in a step", Value::Real(spec.control_timestep)),
+        Property::folder(PARAMETERS, "what was drawn or given for the episode; writing a parameter fixes it"),
+    ];
+    let requested = receipt.map_or(&[][..], |receipt| &receipt.requested);
+    for (parameter, value) in spec.parameters.iter().zip(requested) {
+        let description = format!("{}, {}", parameter.description, parameter.unit);
+        let mut property = new(&format!("{PARAMETERS}.{}", parameter.name), &description, Value::Real(*value));
+        property.range = Some((parameter.bounds.low, parameter.bounds.high));
+        all.push(property.writable());
+    }
+    all.push(Property::folder(APPLIED, "what was read back from the physics of the episode"));
+    let applied = receipt.map_or(&[][..], |receipt| &receipt.applied);
+    for (quantity, value) in spec.applied.iter().zip(applied) {
+        all.push(new(&format!("{APPLIED}.{}", quantity.name), quantity.unit, Value::Real(*value)));
+    }
+    all
+}
+
+fn find<'a>(properties: &'a [Property], key: &str) -> Result<&'a Property, Refusal> {
+    properties.iter().find(|property| property.key == key).ok_or_else(|| Refusal::Unknown {
+        what: "property",
+        name: format!("{:?}", shorten(key)),
+        known: "list properties to see which there are; most are a world's, which must be joined".into(),
+    })
+}
+
+/// The properties that a key holds, or those at the root.
+fn list<'a>(properties: &'a [Property], key: &'a str) -> Result<impl Iterator<Item = &'a Property>, Refusal> {
+    if !key.is_empty() {
+        let property = find(properties, key)?;
+        if property.value.is_some() {
+            return Err(property.forbidden("listed"));
+        }
+    }
+    Ok(properties.iter().filter(move |property| property.parent() == key))
+}
+
+fn write(joined: Option<&Joined>, property: &Property, request: &WritePropertyRequest) -> Result<(), Refusal> {
+    // Only a joined world's can be written.
+    let (Some(joined), true) = (joined, property.is_writable) else {
+        return Err(property.forbidden("written"));
+    };
+    let field = format!("property {:?}", property.key);
+    let no_value = || Refusal::value(field.clone(), "written without a value", "a tensor");
+    let value = request.value.as_ref().ok_or_else(no_value)?;
+    let mut change = Change::default();
+    match property.key.as_str() {
+        VERSION => change.version = Some(settings::version_of(field.clone(), tensors::text(&field, value)?)?),
+        SEED => change.seed = Some(tensors::integer(&field, value, 0, u64::MAX)?),
+        key => {
+            let name = key.rsplit('.').next().unwrap_or_default();
+            change.parameters.insert(name.into(), settings::fixed(tensors::number(&field, value)?));
+        }
+    }
+    joined.world.change(change)
+}
+
+impl Property {
+    fn new(key: &str, description: &str, value: Value) -> Self {
+        Self { key: key.into(), description: description.into(), value: Some(value), range: None, is_writable: false }
+    }
+
+    fn folder(key: &str, description: &str) -> Self {
+        Self { value: None, ..Self::new(key, description, Value::Small(0)) }
+    }
+
+    fn writable(self) -> Self {
+        Self { is_writable: true, ..self }
+    }
+
+    /// The key of what holds it; empty at the root.
+    fn parent(&self) -> &str {
+        self.key.rsplit_once('.').map_or("", |(parent, _)| parent)
+    }
+
+    fn spec(&self) -> PropertySpec {
+        let bound = |x| tensor_spec::Value {
+            payload: Some(tensor_spec::value::Payload::Doubles(DoubleArray { array: vec![x] })),
+        };
+        let (dtype, shape) = self.value.as_ref().map_or((DataType::InvalidDataType, Vec::new()), Value::type_and_shape);
+        let spec = TensorSpec {
+            name: self.key.clone(),
+            shape,
+            dtype: dtype.into(),
+            min: self.range.map(|(low, _)| bound(low)),
+            max: self.range.map(|(_, high)| bound(high)),
+        };
+        PropertySpec {
+            spec: Some(spec),
+            is_readable: self.value.is_some(),
+            is_writable: self.is_writable,
+            is_listable: self.value.is_none(),
+            description: self.description.clone(),
+        }
+    }
+
+    fn forbidden(&self, access: &'static str) -> Refusal {
+        Refusal::Forbidden { key: self.key.clone(), access }
+    }
+}
+
+impl Value {
+    fn type_and_shape(&self) -> (DataType, Vec<i32>) {
+        match self {
+            Self::Text(_) => (DataType::String, Vec::new()),
+            Self::Texts(texts) => (DataType::String, vec![texts.len() as i32]),
+            Self::Small(_) => (DataType::Uint32, Vec::new()),
+            Self::Large(_) => (DataType::Uint64, Vec::new()),
+            Self::Real(_) => (DataType::Double, Vec::new()),
+        }
+    }
+
+    fn tensor(&self) -> Tensor {
+        let payload = match self {
+            Self::Text(text) => Payload::Strings(StringArray { array: vec![text.clone()] }),
+            Self::Texts(texts) => Payload::Strings(StringArray { array: texts.clone() }),
+            Self::Small(n) => Payload::Uint32s(Uint32Array { array: vec![*n] }),
+            Self::Large(n) => Payload::Uint64s(Uint64Array { array: vec![*n] }),
+            Self::Real(x) => Payload::Doubles(DoubleArray { array: vec![*x] }),
+        };
+        Tensor { payload: Some(payload), shape: self.type_and_shape().1 }
+    }
+}

@@ -1,0 +1,170 @@
+//! Settings to the domain. Names and types are checked here, values by the checks that `perturb.v1` has.
+
+use super::tensors;
+use crate::{
+    env::{self, EnvironmentSpec, shorten},
+    physics::Version,
+    pool::BatchSettings,
+    proto::{self, dm_env_rpc::v1::Tensor},
+    server::{convert, status::Refusal},
+};
+use std::collections::{BTreeMap, HashMap};
+
+const ENV_ID: &str = "env_id";
+const VERSION: &str = "version";
+const SEED: &str = "seed";
+const ENVIRONMENT_INDEX: &str = "environment_index";
+const EPISODES_PER_TRIAL: &str = "episodes_per_trial";
+
+type Settings = BTreeMap<String, Tensor>;
+
+/// What a reset, or a written property, changes from the next episode on.
+#[derive(Default)]
+pub(super) struct Change {
+    /// All parameters get this version's distributions, then those named below theirs.
+    pub(super) version: Option<Version>,
+    /// Restarts the counts of episodes and trials.
+    pub(super) seed: Option<u64>,
+    /// Fixed values, as distributions.
+    pub(super) parameters: HashMap<String, proto::Distribution>,
+}
+
+/// Checks the settings of `create_world`. Returns the version beside what the batch needs to know.
+///
+/// # Errors
+/// For settings that are missing, unknown, of a wrong type or out of range.
+pub(super) fn create(settings: &Settings) -> Result<(BatchSettings, Version), Refusal> {
+    let id = settings.get(ENV_ID).ok_or_else(|| {
+        let expected = format!("a STRING scalar, one of {}", env::names().collect::<Vec<_>>().join(", "));
+        Refusal::value(field(ENV_ID), "missing", expected)
+    })?;
+    let spec = environment(tensors::text(&field(ENV_ID), id)?)?;
+    let own = [ENV_ID, VERSION, SEED, ENVIRONMENT_INDEX, EPISODES_PER_TRIAL];
+    check_names(spec, "create_world", &own, settings)?;
+    let integer = |name, default, low, high| match settings.get(name) {
+        Some(tensor) => tensors::integer(&field(name), tensor, low, high),
+        None => Ok(default),
+    };
+    let small =
+        |name, default, low| integer(name, default, low, u32::MAX.into()).map(|n| u32::try_from(n).unwrap_or(u32::MAX));
+    let version = version(settings)?.unwrap_or(Version::Default);
+    let batch = convert::open(proto::Open {
+        environment: spec.name.into(),
+        version: match version {
+            Version::Default => proto::Version::Default,
+            Version::Random => proto::Version::Random,
+            Version::Extreme => proto::Version::Extreme,
+        }
+        .into(),
+        parameters: parameters(spec, settings)?,
+        batch_size: 1,
+        seed: integer(SEED, 0, 0, u64::MAX)?,
+        first_environment_index: small(ENVIRONMENT_INDEX, 0, 0)?,
+        episodes_per_trial: small(EPISODES_PER_TRIAL, 1, 1)?,
+        // An agent's step after the end begins the next episode by a reset.
+        autoreset_mode: proto::AutoresetMode::Disabled.into(),
+        receipts: true,
+        reward_terms: false,
+    })?;
+    Ok((batch, version))
+}
+
+/// Checks the settings of a reset.
+///
+/// # Errors
+/// For settings that are unknown, of a wrong type or not finite. Bounds of parameters are checked by who applies it.
+pub(super) fn change(
+    spec: &'static EnvironmentSpec,
+    request: &'static str,
+    settings: &Settings,
+) -> Result<Change, Refusal> {
+    check_names(spec, request, &[VERSION, SEED], settings)?;
+    Ok(Change {
+        version: version(settings)?,
+        seed: settings.get(SEED).map(|tensor| tensors::integer(&field(SEED), tensor, 0, u64::MAX)).transpose()?,
+        parameters: parameters(spec, settings)?,
+    })
+}
+
+/// Checks that there are no settings.
+///
+/// # Errors
+/// If there are.
+pub(super) fn none(request: &'static str, settings: &Settings) -> Result<(), Refusal> {
+    match settings.keys().next() {
+        Some(name) => Err(unknown(name, format!("{request} takes no settings; give them to create_world or reset"))),
+        None => Ok(()),
+    }
+}
+
+/// A version by its letter.
+///
+/// # Errors
+/// If it is another letter.
+pub(super) fn version_of(field: String, letter: &str) -> Result<Version, Refusal> {
+    match letter {
+        "D" => Ok(Version::Default),
+        "R" => Ok(Version::Random),
+        "E" => Ok(Version::Extreme),
+        _ => Err(Refusal::value(field, format!("{:?}", shorten(letter)), "\"D\", \"R\" or \"E\"")),
+    }
+}
+
+/// A version's letter.
+pub(super) fn letter(version: Version) -> &'static str {
+    match version {
+        Version::Default => "D",
+        Version::Random => "R",
+        Version::Extreme => "E",
+    }
+}
+
+/// Always this value.
+pub(super) fn fixed(value: f64) -> proto::Distribution {
+    proto::Distribution { intervals: vec![proto::Interval { low: value, high: value }] }
+}
+
+/// By the catalogue's name, or the id that Gymnasium knows it by.
+fn environment(id: &str) -> Result<&'static EnvironmentSpec, Refusal> {
+    let gymnasium = |spec: &&EnvironmentSpec| id == format!("perturb/{}-v{}", spec.name, spec.revision);
+    Ok(env::specs().find(gymnasium).map_or_else(|| env::find(id), Ok)?)
+}
+
+fn version(settings: &Settings) -> Result<Option<Version>, Refusal> {
+    let read = |tensor| version_of(field(VERSION), tensors::text(&field(VERSION), tensor)?);
+    settings.get(VERSION).map(read).transpose()
+}
+
+/// Those of the settings that are the environment's parameters.
+fn parameters(
+    spec: &'static EnvironmentSpec,
+    settings: &Settings,
+) -> Result<HashMap<String, proto::Distribution>, Refusal> {
+    let given = spec.parameters.iter().filter_map(|p| Some((p.name, settings.get(p.name)?)));
+    given.map(|(name, tensor)| Ok((name.into(), fixed(tensors::number(&field(name), tensor)?)))).collect()
+}
+
+fn check_names(
+    spec: &'static EnvironmentSpec,
+    request: &'static str,
+    own: &[&str],
+    settings: &Settings,
+) -> Result<(), Refusal> {
+    let is_known = |name: &&String| own.contains(&name.as_str()) || spec.parameters.iter().any(|p| p.name == *name);
+    match settings.keys().find(|name| !is_known(name)) {
+        Some(name) => {
+            let parameters: Vec<_> = spec.parameters.iter().map(|p| p.name).collect();
+            let known = format!("{request} takes {} and {}'s {}", own.join(", "), spec.name, parameters.join(", "));
+            Err(unknown(name, known))
+        }
+        None => Ok(()),
+    }
+}
+
+fn field(name: &str) -> String {
+    format!("setting {name:?}")
+}
+
+fn unknown(name: &str, known: String) -> Refusal {
+    Refusal::Unknown { what: "setting", name: format!("{:?}", shorten(name)), known }
+}

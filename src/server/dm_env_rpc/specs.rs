@@ -1,0 +1,144 @@
+//! Actions and observations: uids, names, types and bounds.
+
+use super::{runner::Outcome, tensors};
+use crate::{
+    env::{ActionSpace, Channel, EnvironmentSpec},
+    proto::dm_env_rpc::v1::{
+        ActionObservationSpecs, DataType, StepResponse, Tensor, TensorSpec,
+        tensor::{BoolArray, FloatArray, Int32Array, Payload},
+        tensor_spec::{Value, value},
+    },
+    server::status::Refusal,
+};
+use std::collections::BTreeMap;
+
+/// The only action.
+const ACTION: u64 = 1;
+
+/// The observations, from 1: 0 is none's uid.
+const OBSERVATION: u64 = 1;
+const REWARD: u64 = 2;
+const TRUNCATED: u64 = 3;
+const SUCCESS: u64 = 4;
+const DIVERGED: u64 = 5;
+
+/// What an agent of this environment can do and see.
+///
+/// There is no `discount`: clients make it of the state, as they should, and must not get one with a first step.
+pub(super) fn of(spec: &EnvironmentSpec) -> ActionObservationSpecs {
+    let scalar = |name: &str, dtype: DataType| TensorSpec {
+        name: name.into(),
+        shape: Vec::new(),
+        dtype: dtype.into(),
+        min: None,
+        max: None,
+    };
+    let (min, max) = bounds(spec.observation);
+    let observation =
+        TensorSpec { shape: length(spec.observation), min, max, ..scalar("observation", DataType::Float) };
+    let action = match spec.action {
+        ActionSpace::Discrete(names) => {
+            let bound =
+                |choice| Some(Value { payload: Some(value::Payload::Int32s(Int32Array { array: vec![choice] })) });
+            TensorSpec { min: bound(0), max: bound(last(names)), ..scalar("action", DataType::Int32) }
+        }
+        ActionSpace::Continuous(channels) => {
+            let (min, max) = bounds(channels);
+            TensorSpec { shape: length(channels), min, max, ..scalar("action", DataType::Float) }
+        }
+    };
+    ActionObservationSpecs {
+        actions: BTreeMap::from([(ACTION, action)]),
+        observations: BTreeMap::from([
+            (OBSERVATION, observation),
+            (REWARD, scalar("reward", DataType::Float)),
+            (TRUNCATED, scalar("truncated", DataType::Bool)),
+            (SUCCESS, scalar("success", DataType::Bool)),
+            (DIVERGED, scalar("diverged", DataType::Bool)),
+        ]),
+    }
+}
+
+/// Checks that there are observations of these uids.
+///
+/// # Errors
+/// [`Refusal::Unknown`].
+pub(super) fn check_requested(uids: &[u64]) -> Result<(), Refusal> {
+    match uids.iter().find(|uid| !(OBSERVATION..=DIVERGED).contains(uid)) {
+        Some(uid) => Err(unknown("observation", *uid, format!("observations are {OBSERVATION} … {DIVERGED}"))),
+        None => Ok(()),
+    }
+}
+
+/// Checks a step's actions. Returns them as the pool takes them: i32, or f32 `[A]`, little-endian.
+///
+/// # Errors
+/// If there is an unknown one, or none, or one that is not as its spec says.
+pub(super) fn actions(spec: &EnvironmentSpec, actions: &BTreeMap<u64, Tensor>) -> Result<Vec<u8>, Refusal> {
+    if let Some(uid) = actions.keys().find(|uid| **uid != ACTION) {
+        return Err(unknown("action", *uid, format!("the only action is {ACTION}")));
+    }
+    let field = format!("action {ACTION}");
+    let tensor = actions.get(&ACTION).ok_or_else(|| {
+        Refusal::value(field.clone(), "missing", "a tensor: every step while an episode runs takes an action")
+    })?;
+    Ok(match spec.action {
+        ActionSpace::Discrete(names) => {
+            let choice = tensors::int32s(&field, tensor, &[], &[(0, last(names))])?;
+            choice.iter().flat_map(|x| x.to_le_bytes()).collect()
+        }
+        ActionSpace::Continuous(channels) => {
+            let bounds: Vec<_> = channels.iter().map(|c| (c.low as f32, c.high as f32)).collect();
+            let vector = tensors::floats(&field, tensor, &[channels.len()], &bounds)?;
+            vector.iter().flat_map(|x| x.to_le_bytes()).collect()
+        }
+    })
+}
+
+/// The response to a step, with the observations that were requested.
+pub(super) fn response(outcome: &Outcome, requested: &[u64]) -> StepResponse {
+    let bool = |x| tensors::tensor(Payload::Bools(BoolArray { array: vec![x] }), &[]);
+    let floats = |array, shape: &[usize]| tensors::tensor(Payload::Floats(FloatArray { array }), shape);
+    let observation = |uid| match uid {
+        OBSERVATION => {
+            let words = outcome.observation.as_chunks::<4>().0;
+            floats(words.iter().map(|word| f32::from_le_bytes(*word)).collect(), &[words.len()])
+        }
+        REWARD => floats(vec![outcome.reward], &[]),
+        TRUNCATED => bool(outcome.truncated),
+        SUCCESS => bool(outcome.success),
+        // The caller has checked that there are no others.
+        _ => bool(outcome.diverged),
+    };
+    StepResponse {
+        state: outcome.state.into(),
+        observations: requested.iter().map(|&uid| (uid, observation(uid))).collect(),
+    }
+}
+
+/// The last of the choices.
+fn last(names: &[&str]) -> i32 {
+    names.len() as i32 - 1
+}
+
+fn length(channels: &[Channel]) -> Vec<i32> {
+    vec![channels.len() as i32]
+}
+
+/// Least and greatest values, if every channel has some: one pair for all if they are alike, else one for each.
+fn bounds(channels: &[Channel]) -> (Option<Value>, Option<Value>) {
+    if !channels.iter().all(|c| c.low.is_finite() && c.high.is_finite()) {
+        return (None, None);
+    }
+    let alike = channels.windows(2).all(|w| (w[0].low, w[0].high) == (w[1].low, w[1].high));
+    let shown = if alike { &channels[..channels.len().min(1)] } else { channels };
+    let value = |bound: fn(&Channel) -> f64| {
+        let array = shown.iter().map(|c| bound(c) as f32).collect();
+        Some(Value { payload: Some(value::Payload::Floats(FloatArray { array })) })
+    };
+    (value(|c| c.low), value(|c| c.high))
+}
+
+fn unknown(what: &'static str, uid: u64, known: String) -> Refusal {
+    Refusal::Unknown { what, name: uid.to_string(), known }
+}

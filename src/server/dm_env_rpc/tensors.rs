@@ -1,0 +1,160 @@
+//! What a tensor must be: type, shape, number of elements, bounds. Nothing is converted.
+
+use crate::{
+    proto::dm_env_rpc::v1::{DataType, Tensor, tensor::Payload},
+    server::status::Refusal,
+};
+use std::fmt::Display;
+
+/// The most dimensions that a refusal repeats.
+const SHOWN_DIMENSIONS: usize = 8;
+
+/// A STRING scalar.
+///
+/// # Errors
+/// If it is something else.
+pub(super) fn text<'a>(field: &str, tensor: &'a Tensor) -> Result<&'a str, Refusal> {
+    match (&tensor.payload, tensor.shape.as_slice()) {
+        (Some(Payload::Strings(strings)), []) if strings.array.len() == 1 => Ok(&strings.array[0]),
+        _ => Err(refuse(field, tensor, "a scalar: STRING, shape [], elements: 1")),
+    }
+}
+
+/// A DOUBLE scalar.
+///
+/// # Errors
+/// If it is something else, or not finite.
+pub(super) fn number(field: &str, tensor: &Tensor) -> Result<f64, Refusal> {
+    match (&tensor.payload, tensor.shape.as_slice()) {
+        (Some(Payload::Doubles(doubles)), []) if doubles.array.len() == 1 => match doubles.array[0] {
+            x if x.is_finite() => Ok(x),
+            x => Err(Refusal::value(field.to_owned(), x, "a finite number")),
+        },
+        _ => Err(refuse(field, tensor, "a scalar: DOUBLE, shape [], elements: 1")),
+    }
+}
+
+/// An integer scalar of any type with 32 or 64 bits, from `low` to `high`.
+///
+/// # Errors
+/// If it is something else, or not in this range.
+pub(super) fn integer(field: &str, tensor: &Tensor, low: u64, high: u64) -> Result<u64, Refusal> {
+    let one = match (&tensor.payload, tensor.shape.as_slice()) {
+        (Some(Payload::Int32s(i)), []) if i.array.len() == 1 => i128::from(i.array[0]),
+        (Some(Payload::Int64s(i)), []) if i.array.len() == 1 => i128::from(i.array[0]),
+        (Some(Payload::Uint32s(i)), []) if i.array.len() == 1 => i128::from(i.array[0]),
+        (Some(Payload::Uint64s(i)), []) if i.array.len() == 1 => i128::from(i.array[0]),
+        _ => return Err(refuse(field, tensor, "a scalar: INT64, INT32, UINT64 or UINT32, shape [], elements: 1")),
+    };
+    let within = u64::try_from(one).ok().filter(|n| (low..=high).contains(n));
+    within.ok_or_else(|| Refusal::value(field.to_owned(), one, format!("an integer from {low} to {high}")))
+}
+
+/// INT32 elements of exactly this shape, each within its bounds.
+///
+/// # Errors
+/// If it is something else.
+pub(super) fn int32s(
+    field: &str,
+    tensor: &Tensor,
+    shape: &[usize],
+    bounds: &[(i32, i32)],
+) -> Result<Vec<i32>, Refusal> {
+    match &tensor.payload {
+        Some(Payload::Int32s(given)) => elements(field, tensor, &given.array, shape, DataType::Int32, bounds),
+        _ => Err(refuse(field, tensor, &of(DataType::Int32, shape))),
+    }
+}
+
+/// FLOAT elements of exactly this shape, each within its bounds.
+///
+/// # Errors
+/// If it is something else.
+pub(super) fn floats(
+    field: &str,
+    tensor: &Tensor,
+    shape: &[usize],
+    bounds: &[(f32, f32)],
+) -> Result<Vec<f32>, Refusal> {
+    match &tensor.payload {
+        Some(Payload::Floats(given)) => elements(field, tensor, &given.array, shape, DataType::Float, bounds),
+        _ => Err(refuse(field, tensor, &of(DataType::Float, shape))),
+    }
+}
+
+/// The elements, if they have this shape; there are as many bounds. A single element stands for all. One dimension may
+/// be negative: then it is what the number of elements makes of it, and a single element stands for itself.
+fn elements<T: Copy + PartialOrd + Display>(
+    field: &str,
+    tensor: &Tensor,
+    given: &[T],
+    shape: &[usize],
+    dtype: DataType,
+    bounds: &[(T, T)],
+) -> Result<Vec<T>, Refusal> {
+    let refuse = || refuse(field, tensor, &of(dtype, shape));
+    let inferred = tensor.shape.iter().filter(|&&length| length < 0).count();
+    let fits = |(&given, &wanted): (&i32, &usize)| given < 0 || usize::try_from(given).is_ok_and(|n| n == wanted);
+    if tensor.shape.len() != shape.len() || inferred > 1 || !tensor.shape.iter().zip(shape).all(fits) {
+        return Err(refuse());
+    }
+    let all = match given {
+        [one] if inferred == 0 => vec![*one; bounds.len()],
+        many if many.len() == bounds.len() => many.to_vec(),
+        _ => return Err(refuse()),
+    };
+    // NaN is within no bounds.
+    match all.iter().zip(bounds).position(|(x, (low, high))| !(low..=high).contains(&x)) {
+        Some(i) => {
+            let (got, (low, high)) = (format!("{} in element {i}", all[i]), bounds[i]);
+            Err(Refusal::value(field.to_owned(), got, format!("a number within [{low}, {high}]")))
+        }
+        None => Ok(all),
+    }
+}
+
+fn refuse(field: &str, tensor: &Tensor, expected: &str) -> Refusal {
+    let got = match dtype_and_count(tensor) {
+        Some((dtype, count)) => format!("{}, {}, elements: {count}", dtype.as_str_name(), shape_of(&tensor.shape)),
+        None => "a tensor without a payload".into(),
+    };
+    Refusal::value(field.to_owned(), got, expected)
+}
+
+fn of(dtype: DataType, shape: &[usize]) -> String {
+    let count = match shape.iter().product() {
+        1 => "1".into(),
+        n => format!("{n}, or 1 for all"),
+    };
+    format!("{}, shape {shape:?}, elements: {count}", dtype.as_str_name())
+}
+
+fn shape_of(shape: &[i32]) -> String {
+    match shape.len() {
+        0..=SHOWN_DIMENSIONS => format!("shape {shape:?}"),
+        n => format!("a shape of {n} dimensions"),
+    }
+}
+
+fn dtype_and_count(tensor: &Tensor) -> Option<(DataType, usize)> {
+    Some(match tensor.payload.as_ref()? {
+        Payload::Floats(x) => (DataType::Float, x.array.len()),
+        Payload::Doubles(x) => (DataType::Double, x.array.len()),
+        Payload::Int8s(x) => (DataType::Int8, x.array.len()),
+        Payload::Int32s(x) => (DataType::Int32, x.array.len()),
+        Payload::Int64s(x) => (DataType::Int64, x.array.len()),
+        Payload::Uint8s(x) => (DataType::Uint8, x.array.len()),
+        Payload::Uint32s(x) => (DataType::Uint32, x.array.len()),
+        Payload::Uint64s(x) => (DataType::Uint64, x.array.len()),
+        Payload::Bools(x) => (DataType::Bool, x.array.len()),
+        Payload::Strings(x) => (DataType::String, x.array.len()),
+        Payload::Protos(x) => (DataType::Proto, x.array.len()),
+    })
+}
+
+/// A tensor of this shape; none for a scalar.
+pub(super) fn tensor(payload: Payload, shape: &[usize]) -> Tensor {
+    // Shapes are those of specs, a few dozen elements.
+    let shape = shape.iter().map(|&length| i32::try_from(length).unwrap_or(i32::MAX)).collect();
+    Tensor { payload: Some(payload), shape }
+}

@@ -1,0 +1,427 @@
+//! The server of dm_env_rpc, seen from outside: the package's own compliance cases, and what they do not ask.
+#![allow(clippy::unwrap_used)]
+
+#[path = "dm_env_rpc/client.rs"]
+mod client;
+#[path = "common/server.rs"]
+mod server;
+
+use client::{
+    ACTION, ALL, Agent, PROPERTIES, Seen, choice, create, destroy, double, floats, int64, join, leave, property, read,
+    settings, step, text, uint64, vector,
+};
+use perturb::proto::{
+    self, Environment, Open, Version,
+    action_space::Kind,
+    dm_env_rpc::v1::{
+        self as rpc, DataType, EnvironmentStateType as State, Tensor, environment_request::Payload as Request,
+        environment_response::Payload as Response, tensor, tensor_spec::value,
+    },
+};
+use prost_types::Any;
+use server::{Server, Session, action, environment, open};
+use std::{collections::BTreeMap, path::Path, process::Command};
+use tonic::Code;
+
+/// A Python with the package of tests/dm_env_rpc/requirements.txt.
+const PYTHON: &str = "PERTURB_TEST_DM_ENV_RPC_PYTHON";
+
+/// Runs a program of tests/dm_env_rpc with that Python, if there is one. Returns what it printed.
+fn python(program: &str, arguments: &[&str]) -> Option<String> {
+    let Ok(python) = std::env::var(PYTHON) else {
+        eprintln!(
+            "{program} was not run: it needs the Python package dm-env-rpc. `make test` installs it and sets {PYTHON}."
+        );
+        return None;
+    };
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/dm_env_rpc").join(program);
+    let mut command = Command::new(&python);
+    command.arg(path).args(arguments).env("PYTHONDONTWRITEBYTECODE", "1").env("no_proxy", "*");
+    let output = command.output().unwrap_or_else(|error| panic!("{PYTHON} is {python}, which cannot be run: {error}"));
+    let (stdout, stderr) = (String::from_utf8(output.stdout).unwrap(), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{program}: {}\n{stdout}\n{stderr}", output.status);
+    Some(stdout)
+}
+
+#[tokio::test]
+async fn the_packages_44_compliance_cases_pass_on_discrete_and_continuous_environments() {
+    let server = Server::start(&[]);
+    let catalogue = server::catalogue(server.tcp()).await;
+    let has = |name: &&str| catalogue.iter().any(|e| e.name == **name);
+    let names: Vec<&str> = ["CartPole", "Pendulum", "Hopper"].into_iter().filter(|name| has(name)).collect();
+    if let Some(output) = python("compliance.py", &[&[server.port()], &names[..]].concat()) {
+        let expected: String = names.iter().map(|name| format!("{name}: 44 cases, 0 not passed\n")).collect();
+        assert_eq!(output, expected);
+    }
+}
+
+#[tokio::test]
+async fn the_packages_adaptor_and_properties_work_and_the_documents_examples_run() {
+    let server = Server::start(&[]);
+    let document = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/dm_env_rpc.md");
+    python("adaptor.py", &[server.port(), document.to_str().unwrap()]);
+}
+
+#[test]
+fn the_definitions_are_the_packages() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("descriptors.bin");
+    std::fs::write(&file, proto::DESCRIPTORS).unwrap();
+    if let Some(output) = python("descriptors.py", &[file.to_str().unwrap()]) {
+        assert_eq!(output, "3 files are equal\n");
+    }
+}
+
+/// The action of a time, within its bounds, for both protocols.
+fn actions(e: &Environment, t: u64) -> (Vec<u8>, Tensor) {
+    let bytes = action(e, 0, t);
+    match e.action.as_ref().unwrap().kind.as_ref().unwrap() {
+        Kind::Discrete(_) => {
+            let tensor = choice(i32::from_le_bytes(bytes.as_slice().try_into().unwrap()));
+            (bytes, tensor)
+        }
+        Kind::Continuous(space) => {
+            let clamped = server::floats(&bytes).into_iter().zip(&space.channels);
+            let clamped: Vec<f32> = clamped.map(|(x, c)| x.clamp(c.low as f32, c.high as f32)).collect();
+            (clamped.iter().flat_map(|x| x.to_le_bytes()).collect(), vector(&clamped))
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_world_plays_the_same_bytes_as_a_session_and_its_states_are_the_sessions_flags() {
+    let server = Server::start(&["--workers", "2"]);
+    let mut ends = BTreeMap::new();
+    for e in &server::catalogue(server.tcp()).await {
+        let (p, x) = (&e.parameters[0], e.parameters[0].default_value * 1.1);
+        let request = Open {
+            first_environment_index: 7,
+            episodes_per_trial: 2,
+            version: Version::Extreme.into(),
+            parameters: server::parameters(&[(&p.name, &[(x, x)])]),
+            ..open(&e.name, 1, u64::MAX)
+        };
+        let (mut session, opened) = Session::open(server.tcp(), request).await;
+        let given = settings(
+            &e.name,
+            [
+                ("version", text("E")),
+                ("seed", uint64(u64::MAX)),
+                ("environment_index", int64(7)),
+                ("episodes_per_trial", choice(2)),
+                (p.name.as_str(), double(x)),
+            ],
+        );
+        let (mut agent, _) = Agent::in_world(server.unix(), given).await;
+        let first = agent.step(actions(e, 0).1).await;
+        assert_eq!(first.observation, server::floats(&opened.observations), "{}", e.name);
+        for t in 0..3 * u64::from(e.step_limit) / 2 {
+            let (bytes, tensor) = actions(e, t);
+            let (theirs, ours) = (session.step(bytes.into()).await, agent.step(tensor).await);
+            let end = theirs.ended.first();
+            let expected = Seen {
+                state: match (theirs.terminated[0], theirs.truncated[0]) {
+                    (0, 0) => State::Running,
+                    (0, 1) => State::Interrupted,
+                    _ => State::Terminated,
+                },
+                observation: server::floats(&theirs.observations),
+                reward: server::floats(&theirs.rewards)[0],
+                truncated: theirs.truncated[0] == 1,
+                success: end.is_some_and(|end| end.success),
+                diverged: end.is_some_and(|end| end.diverged),
+            };
+            assert_eq!(ours, expected, "{}, step {t}", e.name);
+            *ends.entry(ours.state).or_insert(0) += 1;
+        }
+    }
+    assert!(ends[&State::Terminated] > 2 && ends[&State::Interrupted] >= 2, "both kinds of ends were seen: {ends:?}");
+}
+
+#[tokio::test]
+async fn specs_tell_types_shapes_and_bounds_and_every_observation_is_within() {
+    let server = Server::start(&[]);
+    for e in &server::catalogue(server.tcp()).await {
+        let (mut agent, _) = Agent::in_world(server.tcp(), settings(&e.name, [("version", text("R"))])).await;
+        let specs = agent.reset(client::Settings::new()).await;
+        assert_eq!(specs.actions.keys().copied().collect::<Vec<_>>(), [ACTION]);
+        assert_eq!(specs.observations.keys().copied().collect::<Vec<_>>(), ALL);
+        let names: Vec<_> = specs.observations.values().map(|spec| spec.name.as_str()).collect();
+        assert_eq!(names, ["observation", "reward", "truncated", "success", "diverged"]);
+        let observation = &specs.observations[&1];
+        assert_eq!((observation.dtype(), &observation.shape[..]), (DataType::Float, &[e.observation.len() as i32][..]));
+        let bounds = |bound: &Option<rpc::tensor_spec::Value>, n: usize| {
+            bound.as_ref().map(|bound| match bound.payload.as_ref().unwrap() {
+                value::Payload::Floats(floats) if floats.array.len() == 1 => vec![floats.array[0]; n],
+                value::Payload::Floats(floats) => floats.array.clone(),
+                other => panic!("{other:?}"),
+            })
+        };
+        let n = e.observation.len();
+        let bounded = e.observation.iter().all(|c| c.low.is_finite() && c.high.is_finite());
+        let (low, high) = (bounds(&observation.min, n), bounds(&observation.max, n));
+        assert_eq!((low.is_some(), high.is_some()), (bounded, bounded), "{}", e.name);
+        assert_eq!(bounded, e.name != "CartPole", "CartPole alone has none");
+        if let Kind::Continuous(space) = e.action.as_ref().unwrap().kind.as_ref().unwrap() {
+            let spec = &specs.actions[&ACTION];
+            assert_eq!((spec.dtype(), &spec.shape[..]), (DataType::Float, &[space.channels.len() as i32][..]));
+            let ends: Vec<f32> = space.channels.iter().map(|c| c.high as f32).collect();
+            assert_eq!(bounds(&spec.max, ends.len()), Some(ends));
+        }
+        for t in 0..300 {
+            let seen = agent.step(actions(e, t).1).await;
+            for (i, x) in seen.observation.iter().enumerate() {
+                let within = |bounds: &Option<Vec<f32>>, ok: fn(f32, f32) -> bool| {
+                    bounds.as_ref().is_none_or(|bounds| ok(*x, bounds[i]))
+                };
+                assert!(within(&low, |x, low| x >= low) && within(&high, |x, high| x <= high), "{}: {seen:?}", e.name);
+            }
+        }
+    }
+}
+
+#[tokio::test]
+async fn wrong_actions_are_refused_by_name_and_change_nothing() {
+    let server = Server::start(&[]);
+    let (nan, inf) = (f32::NAN, f32::INFINITY);
+    let one = |tensor| BTreeMap::from([(ACTION, tensor)]);
+    let doubles = tensor::Payload::Doubles(tensor::DoubleArray { array: vec![0.5] });
+    let wrong: Vec<(&str, BTreeMap<u64, Tensor>, Code, &str)> = vec![
+        (
+            "Pendulum",
+            one(vector(&[nan])),
+            Code::InvalidArgument,
+            "action 1 is NaN in element 0; expected a number within [-2, 2]",
+        ),
+        ("Pendulum", one(vector(&[inf])), Code::InvalidArgument, "is inf in element 0"),
+        ("Pendulum", one(vector(&[2.0000002])), Code::InvalidArgument, "is 2.0000002 in element 0"),
+        ("Pendulum", one(vector(&[-2.5])), Code::InvalidArgument, "is -2.5 in element 0"),
+        (
+            "Pendulum",
+            one(floats(&[0.5], &[])),
+            Code::InvalidArgument,
+            "is FLOAT, shape [], elements: 1; expected FLOAT, shape [1], elements: 1",
+        ),
+        ("Pendulum", one(floats(&[0.5], &[1, 1])), Code::InvalidArgument, "shape [1, 1]"),
+        ("Pendulum", one(floats(&[0.5], &[-1, -1])), Code::InvalidArgument, "shape [-1, -1]"),
+        ("Pendulum", one(floats(&[0.5], &[i32::MAX])), Code::InvalidArgument, "shape [2147483647]"),
+        ("Pendulum", one(floats(&[0.5], &[0])), Code::InvalidArgument, "shape [0]"),
+        (
+            "Pendulum",
+            one(floats(&[0.5], &vec![i32::MAX; 100_000])),
+            Code::InvalidArgument,
+            "a shape of 100000 dimensions",
+        ),
+        ("Pendulum", one(floats(&[0.5; 100_000], &[1])), Code::InvalidArgument, "elements: 100000"),
+        ("Pendulum", one(floats(&[], &[-1])), Code::InvalidArgument, "elements: 0"),
+        ("Pendulum", one(Tensor { payload: Some(doubles), shape: vec![1] }), Code::InvalidArgument, "DOUBLE"),
+        (
+            "Pendulum",
+            one(Tensor { payload: None, shape: vec![1] }),
+            Code::InvalidArgument,
+            "a tensor without a payload",
+        ),
+        ("Pendulum", one(choice(0)), Code::InvalidArgument, "INT32"),
+        ("Pendulum", BTreeMap::new(), Code::InvalidArgument, "action 1 is missing"),
+        (
+            "Pendulum",
+            BTreeMap::from([(ACTION, vector(&[0.5])), (u64::MAX, choice(0))]),
+            Code::NotFound,
+            "action 18446744073709551615 is unknown",
+        ),
+        (
+            "CartPole",
+            one(choice(2)),
+            Code::InvalidArgument,
+            "action 1 is 2 in element 0; expected a number within [0, 1]",
+        ),
+        ("CartPole", one(choice(-1)), Code::InvalidArgument, "is -1 in element 0"),
+        ("CartPole", one(int64(1)), Code::InvalidArgument, "is INT64, shape [], elements: 1; expected INT32, shape []"),
+        ("CartPole", one(Tensor { shape: vec![1], ..choice(1) }), Code::InvalidArgument, "INT32, shape [1]"),
+        ("CartPole", one(vector(&[1.0])), Code::InvalidArgument, "FLOAT"),
+        ("CartPole", BTreeMap::new(), Code::InvalidArgument, "action 1 is missing"),
+    ];
+    for name in ["Pendulum", "CartPole"] {
+        let e = environment(server.tcp(), name).await;
+        let (mut agent, _) = Agent::in_world(server.tcp(), settings(name, [])).await;
+        let (mut twin, _) = Agent::in_world(server.tcp(), settings(name, [])).await;
+        assert_eq!(agent.step(actions(&e, 0).1).await, twin.step(actions(&e, 0).1).await);
+        for (t, (_, actions, code, words)) in (1..).zip(wrong.iter().filter(|case| case.0 == name)) {
+            // The last step may have ended the episode, when actions are not looked at.
+            agent.reset(client::Settings::new()).await;
+            twin.reset(client::Settings::new()).await;
+            let good = self::actions(&e, t).1;
+            assert_eq!(agent.step(good.clone()).await, twin.step(good.clone()).await, "{actions:?}");
+            let request = Request::Step(rpc::StepRequest { actions: actions.clone(), requested_observations: vec![1] });
+            let (got, message) = agent.refused(request).await;
+            assert!(got == *code && message.contains(words), "{actions:?}: {got:?}: {message}");
+            assert_eq!(agent.step(good.clone()).await, twin.step(good).await, "{actions:?} changed something");
+        }
+        // An unknown observation is refused too, before anything is done: running or not.
+        for _ in 0..2 {
+            let actions = one(actions(&e, 0).1);
+            let requested_observations = vec![1, 6, 2];
+            let (code, message) =
+                agent.refused(Request::Step(rpc::StepRequest { actions, requested_observations })).await;
+            assert!(code == Code::NotFound && message.contains("observation 6 is unknown"), "{message}");
+            agent.reset(client::Settings::new()).await;
+            twin.reset(client::Settings::new()).await;
+        }
+        assert_eq!(agent.step(actions(&e, 1).1).await, twin.step(actions(&e, 1).1).await);
+    }
+}
+
+#[tokio::test]
+async fn one_element_stands_for_all_and_one_dimension_may_be_inferred() {
+    let server = Server::start(&[]);
+    for e in &server::catalogue(server.tcp()).await {
+        let Kind::Continuous(space) = e.action.as_ref().unwrap().kind.as_ref().unwrap() else { continue };
+        let n = space.channels.len() as i32;
+        let mut seen = Vec::new();
+        for tensor in [vector(&vec![0.25; n as usize]), floats(&[0.25], &[n]), floats(&vec![0.25; n as usize], &[-1])] {
+            let (mut agent, _) = Agent::in_world(server.tcp(), settings(&e.name, [])).await;
+            agent.step(tensor.clone()).await;
+            seen.push(agent.step(tensor).await);
+        }
+        assert!(seen[0] == seen[1] && seen[0] == seen[2], "{}: {seen:?}", e.name);
+        if n > 1 {
+            // As many as there are elements: one, which is not n.
+            let (mut agent, _) = Agent::in_world(server.tcp(), settings(&e.name, [])).await;
+            agent.step(vector(&[])).await;
+            let (code, message) = agent.refused(step(floats(&[0.25], &[-1]))).await;
+            assert!(code == Code::InvalidArgument && message.contains("shape [-1], elements: 1"), "{message}");
+        }
+    }
+}
+
+#[tokio::test]
+async fn wrong_settings_are_refused_by_name_and_nothing_is_created() {
+    let server = Server::start(&["--max-envs", "1"]);
+    let mut agent = Agent::connect(server.tcp()).await;
+    let cart = |name, tensor| settings("CartPole", [(name, tensor)]);
+    use Code::{InvalidArgument as Bad, NotFound};
+    let missing = client::Settings::from([("seed".into(), int64(1))]);
+    let number = client::Settings::from([("env_id".into(), int64(1))]);
+    let two = tensor::Payload::Strings(tensor::StringArray { array: vec!["CartPole".into(), "Pendulum".into()] });
+    let two = client::Settings::from([("env_id".into(), Tensor { payload: Some(two), shape: vec![2] })]);
+    let cases = [
+        (missing, Bad, "setting \"env_id\" is missing; expected a STRING scalar, one of CartPole, "),
+        (number, Bad, "setting \"env_id\" is INT64, shape [], elements: 1; expected a scalar: STRING"),
+        (two, Bad, "setting \"env_id\" is STRING, shape [2], elements: 2"),
+        (settings("cartpole", []), NotFound, "\"cartpole\" is unknown; this server has CartPole, "),
+        (settings("perturb/CartPole-v9", []), NotFound, "\"perturb/CartPole-v9\" is unknown"),
+        (cart("colour", text("blue")), NotFound, "setting \"colour\" is unknown; create_world takes env_id, version"),
+        (cart("torque", double(1.0)), NotFound, "setting \"torque\" is unknown"),
+        (cart("version", text("d")), Bad, "setting \"version\" is \"d\"; expected \"D\", \"R\" or \"E\""),
+        (cart("version", int64(1)), Bad, "setting \"version\" is INT64"),
+        (cart("seed", int64(-1)), Bad, "setting \"seed\" is -1; expected an integer from 0 to 18446744073709551615"),
+        (cart("seed", double(1.0)), Bad, "setting \"seed\" is DOUBLE"),
+        (cart("seed", Tensor { shape: vec![1], ..int64(1) }), Bad, "setting \"seed\" is INT64, shape [1]"),
+        (
+            cart("environment_index", int64(1 << 32)),
+            Bad,
+            "\"environment_index\" is 4294967296; expected an integer from 0 to 4294967295",
+        ),
+        (cart("episodes_per_trial", choice(0)), Bad, "\"episodes_per_trial\" is 0; expected an integer from 1"),
+        (cart("mass", double(f64::NAN)), Bad, "setting \"mass\" is NaN; expected a finite number"),
+        (cart("mass", double(f64::NEG_INFINITY)), Bad, "setting \"mass\" is -inf"),
+        (
+            cart("mass", double(0.0)),
+            Bad,
+            "parameter \"mass\" of CartPole may reach 0 kg; give values within [0.0001, 1000]",
+        ),
+        (cart("mass", int64(1)), Bad, "setting \"mass\" is INT64, shape [], elements: 1; expected a scalar: DOUBLE"),
+        (cart("mass", floats(&[1.0], &[])), Bad, "setting \"mass\" is FLOAT"),
+    ];
+    for (settings, code, words) in cases {
+        let (got, message) = agent.refused(create(settings.clone())).await;
+        assert!(got == code && message.contains(words), "{settings:?}: {got:?}: {message}");
+    }
+    let right = |n| settings("CartPole", [("seed", n), ("mass", double(0.5))]);
+    let world = agent.create(right(Tensor { shape: vec![], ..int64(i64::MAX) })).await;
+    let (code, message) = agent.refused(create(right(int64(0)))).await;
+    assert!(code == Code::ResourceExhausted && message.contains("1 of this server's 1 are in use"), "{message}");
+    let mut with_settings = join(&world);
+    if let Request::JoinWorld(join) = &mut with_settings {
+        join.settings = client::Settings::from([("seed".into(), int64(1))]);
+    }
+    let (code, message) = agent.refused(with_settings).await;
+    assert!(
+        code == Code::NotFound && message.contains("setting \"seed\" is unknown; join_world takes no"),
+        "{message}"
+    );
+    agent.join(&world).await;
+    for (name, tensor, words) in [
+        ("env_id", text("CartPole"), "setting \"env_id\" is unknown; reset takes version, seed and CartPole's force, "),
+        ("seed", text("1"), "setting \"seed\" is STRING"),
+        ("version", text("X"), "setting \"version\" is \"X\""),
+        ("length", double(1e9), "parameter \"length\" of CartPole may reach 1000000000 m"),
+    ] {
+        let settings = client::Settings::from([("mass".into(), double(0.1)), (name.into(), tensor)]);
+        let (_, message) = agent.refused(Request::Reset(rpc::ResetRequest { settings: settings.clone() })).await;
+        assert!(message.contains(words), "{message}");
+        let (_, message) = agent.refused(client::reset_world(&world, settings)).await;
+        assert!(message.contains(&words.replace("reset takes", "reset_world takes")), "{message}");
+    }
+    agent.step(choice(0)).await;
+    assert_eq!(agent.read("parameters.mass").await, double(0.5), "what was refused changed nothing");
+}
+
+#[tokio::test]
+async fn every_request_is_answered_once_in_order_by_its_variant_or_an_error() {
+    let server = Server::start(&[]);
+    let mut agent = Agent::connect(server.tcp()).await;
+    let world = "CartPole-1"; // the server's first
+    let reset = || Some(Request::Reset(rpc::ResetRequest::default()));
+    let step = || Some(step(choice(1)));
+    let wrong_type = Any { type_url: "type.googleapis.com/google.protobuf.Empty".into(), value: vec![] };
+    let garbage = Any { type_url: PROPERTIES.into(), value: vec![0xFF; 9] };
+    let empty = Any { type_url: PROPERTIES.into(), value: vec![] };
+    let extension = |any: &Any| Some(Request::Extension(any.clone()));
+    let expected: Vec<(Option<Request>, Result<&str, Code>)> = vec![
+        (None, Err(Code::InvalidArgument)),
+        (step(), Err(Code::FailedPrecondition)),
+        (reset(), Err(Code::FailedPrecondition)),
+        (Some(leave()), Ok("LeaveWorld")),
+        (Some(join(world)), Err(Code::NotFound)),
+        (Some(destroy(world)), Err(Code::NotFound)),
+        (Some(client::reset_world(world, client::Settings::new())), Err(Code::NotFound)),
+        (Some(create(settings("CartPole", []))), Ok("CreateWorld")),
+        (Some(client::reset_world(world, client::Settings::new())), Ok("ResetWorld")),
+        (Some(join(world)), Ok("JoinWorld")),
+        (Some(join(world)), Err(Code::FailedPrecondition)),
+        (step(), Ok("Step")),
+        (step(), Ok("Step")),
+        (Some(destroy(world)), Err(Code::FailedPrecondition)),
+        (reset(), Ok("Reset")),
+        (reset(), Ok("Reset")),
+        (extension(&wrong_type), Err(Code::Unimplemented)),
+        (extension(&garbage), Err(Code::InvalidArgument)),
+        (extension(&empty), Err(Code::InvalidArgument)),
+        (Some(property(read("seed"))), Ok("Extension")),
+        (step(), Ok("Step")),
+        (Some(client::reset_world(world, client::Settings::new())), Ok("ResetWorld")),
+        (Some(leave()), Ok("LeaveWorld")),
+        (Some(leave()), Ok("LeaveWorld")),
+        (step(), Err(Code::FailedPrecondition)),
+        (Some(destroy(world)), Ok("DestroyWorld")),
+        (Some(join(world)), Err(Code::NotFound)),
+    ];
+    for (request, _) in &expected {
+        agent.send(request.clone()).await;
+    }
+    agent.close();
+    for (request, expected) in expected {
+        let response = agent.receive().await.unwrap().unwrap().payload.unwrap();
+        match (&response, expected) {
+            (Response::Error(status), Err(code)) => {
+                assert_eq!(Code::from_i32(status.code), code, "{request:?}: {status:?}");
+            }
+            (response, Ok(variant)) => {
+                assert!(format!("{response:?}").starts_with(variant), "{request:?}: {response:?}")
+            }
+            (response, Err(code)) => panic!("{request:?} was answered by {response:?}, not refused as {code:?}"),
+        }
+    }
+    assert_eq!(agent.receive().await.unwrap(), None, "nothing follows the last response");
+}
