@@ -33,6 +33,7 @@ impl Session {
             Some(Request::Reset(reset)) => self.reset(reset).await.map(Response::Reset),
             Some(Request::Snapshot(snapshot)) => self.snapshot(snapshot).await.map(Response::Snapshot),
             Some(Request::Restore(restore)) => self.restore(restore).await.map(Response::Restore),
+            Some(Request::Render(_)) => Err(Refusal::value("request", "render", "open, step, …")),
             None => Err(Refusal::value("request", "empty or of a kind this server does not know", "open, step, …")),
         };
         let response = response.unwrap_or_else(|refusal| {
