@@ -8,6 +8,7 @@ use super::{
 use crate::{
     pool::Pool,
     proto::{self, perturb_server::Perturb},
+    render::Renderer,
 };
 use futures_util::{Stream, stream};
 use std::{
@@ -25,6 +26,7 @@ use tonic::{Request, Response, Status, Streaming};
 pub struct Service {
     pool: Arc<Pool>,
     catalogue: Arc<[proto::Environment]>,
+    renderer: Arc<Renderer>,
     sessions: Arc<AtomicUsize>,
     max_sessions: usize,
     idle: Option<Duration>,
@@ -40,7 +42,7 @@ impl Service {
         idle: Option<Duration>,
         drain: Drain,
     ) -> Self {
-        Self { pool, catalogue, sessions: Arc::default(), max_sessions, idle, drain }
+        Self { pool, catalogue, renderer: Arc::default(), sessions: Arc::default(), max_sessions, idle, drain }
     }
 }
 
@@ -73,7 +75,7 @@ impl Perturb for Service {
         };
         let conversation = Conversation {
             requests: requests.into_inner(),
-            session: Session::new(Arc::clone(&self.pool), Arc::clone(&self.catalogue)),
+            session: Session::new(Arc::clone(&self.pool), Arc::clone(&self.catalogue), Arc::clone(&self.renderer)),
             idle: self.idle,
             drain: self.drain.enter(),
             _ticket: ticket,

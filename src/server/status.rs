@@ -1,6 +1,6 @@
 //! Every refusal, and the only place that turns one into a gRPC code.
 
-use crate::{env, pool, proto};
+use crate::{env, pool, proto, render};
 use tonic::{Code, Status};
 
 /// Why a request was refused. It changed nothing.
@@ -13,6 +13,15 @@ pub enum Refusal {
     /// The pool refuses it.
     #[error(transparent)]
     Pool(#[from] pool::Error),
+    /// There is no picture.
+    #[error(transparent)]
+    Render(#[from] render::Error),
+    /// The environment to be drawn has no state.
+    #[error("the physics of slot {slot} diverged and left no state to draw; reset it first")]
+    NothingToDraw {
+        /// The environment's place in the batch.
+        slot: usize,
+    },
     /// A field has a value that it cannot have.
     #[error("{field} is {got}; expected {expected}")]
     Value {
@@ -63,11 +72,17 @@ impl Refusal {
                 env::Error::Model { .. } => Code::Internal,
                 _ => Code::InvalidArgument,
             },
-            Self::Pool(pool::Error::Full { .. }) | Self::TooManySessions { .. } => Code::ResourceExhausted,
-            Self::Pool(pool::Error::Ended { .. }) | Self::NotOpen { .. } | Self::AlreadyOpen => {
-                Code::FailedPrecondition
+            Self::Pool(pool::Error::Full { .. })
+            | Self::TooManySessions { .. }
+            | Self::Render(render::Error::NoThread { .. }) => Code::ResourceExhausted,
+            Self::Pool(pool::Error::Ended { .. })
+            | Self::NotOpen { .. }
+            | Self::AlreadyOpen
+            | Self::Render(render::Error::Missing { .. })
+            | Self::NothingToDraw { .. } => Code::FailedPrecondition,
+            Self::Pool(pool::Error::Defect) | Self::Render(render::Error::Failed { .. } | render::Error::Defect) => {
+                Code::Internal
             }
-            Self::Pool(pool::Error::Defect) => Code::Internal,
             Self::Value { .. } => Code::InvalidArgument,
             Self::Idle { .. } => Code::DeadlineExceeded,
             Self::Draining => Code::Unavailable,

@@ -2,6 +2,7 @@
 //!
 //! - [`Model`]: a compiled model; loaded from MJCF text, copied, read.
 //! - [`Simulation`]: a model of its own and the data that MuJoCo computes on it; stepped, edited, read.
+//! - [`Gl`], [`Renderer`]: an OpenGL context without a display, and pictures of a model drawn in it.
 //! - [`Error`], [`Warning`]: what can go wrong. No failure of MuJoCo ends the process or is passed over.
 //!
 //! ```
@@ -31,10 +32,14 @@
 
 mod data;
 mod error;
+mod gl;
 mod model;
+mod render;
 #[allow(unreachable_pub)]
 mod sys;
 
 pub use data::Simulation;
 pub use error::{Error, Warning};
+pub use gl::Gl;
 pub use model::{FloatArray, Kind, Model};
+pub use render::{Camera, Renderer};
