@@ -1,45 +1,41 @@
-//! Draws each environment after some steps and writes it as PNG, for the documents:
+//! Draws each environment and writes it as PNG, for the documents:
 //! `cargo run --release --example pictures -- docs/pictures`.
 
 use perturb::{
-    env::{self, Action, ActionSpace, Episodes, Settings},
+    env::{self, Action, Episodes, Settings},
     physics::Version,
     render::{Renderer, Size},
 };
 use std::{env as process, error::Error, fs::File, io::BufWriter, path::Path};
 
-/// Steps before the picture, short enough that nothing has fallen, and the action: left or right, or a control.
-const SCENES: &[(&str, usize, f32)] = &[
-    ("CartPole", 8, 1.0),
-    ("MountainCar", 30, 0.0),
-    ("Acrobot", 12, 1.0),
-    ("Pendulum", 30, 1.2),
-    ("HalfCheetah", 8, 0.6),
-    ("Hopper", 20, -0.4),
+/// Exact states that show what a task is about.
+const SCENES: &[(&str, &[f64])] = &[
+    ("CartPole", &[0.7, 0.0, 0.12, 0.0]),
+    ("MountainCar", &[0.15, 0.0]),
+    ("Acrobot", &[1.9, 0.9, 0.0, 0.0]),
+    ("Pendulum", &[0.9, 0.0]),
+    ("HalfCheetah", &[3.3, 0.02, -0.05, 0.5, -0.3, 0.2, -0.7, 0.5, -0.6, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+    ("Hopper", &[4.3, -0.1, 0.1, -0.3, -0.7, 0.7, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
 ];
-const SIZE: Size = Size { width: 320, height: 320 };
+const SIZE: Size = Size { width: 280, height: 280 };
 
 #[tokio::main(flavor = "current_thread")]
 async fn main() -> Result<(), Box<dyn Error>> {
     let folder = process::args().nth(1).ok_or("give a folder to write the pictures to")?;
     let renderer = Renderer::new();
-    for &(name, steps, action) in SCENES {
-        let Ok(spec) = env::find(name) else { continue };
+    for &(name, state) in SCENES {
+        let Ok(spec) = env::find(name) else { continue }; // built without MuJoCo
         let distributions = spec.parameters.iter().map(|p| p.distribution(Version::Default)).collect();
         let settings = Settings { seed: 1, environment_index: 0, distributions, episodes_per_trial: 1 };
         let mut episodes = Episodes::new(env::make(name)?, settings);
-        let mut terms = vec![0.0; spec.reward_terms.len()];
-        for _ in 0..steps {
-            match spec.action {
-                ActionSpace::Discrete(_) => episodes.step(Action::Discrete(action as u32), &mut terms),
-                ActionSpace::Continuous(a) => episodes.step(Action::Continuous(&vec![action; a.len()]), &mut terms),
-            };
+        episodes.begin(Some(state));
+        if name == "Pendulum" {
+            episodes.step(Action::Continuous(&[-1.6]), &mut [0.0; 3]); // its torque is shown
         }
-        let pose = episodes.pose().ok_or("its physics diverged")?;
-        let pixels = renderer.draw(pose, SIZE).await?;
+        let pixels = renderer.draw(episodes.pose().ok_or("its physics diverged")?, SIZE).await?;
         let path = Path::new(&folder).join(format!("{name}.png"));
-        let mut encoder =
-            png::Encoder::new(BufWriter::new(File::create(&path)?), SIZE.width.into(), SIZE.height.into());
+        let file = BufWriter::new(File::create(&path)?);
+        let mut encoder = png::Encoder::new(file, SIZE.width.into(), SIZE.height.into());
         encoder.set_color(png::ColorType::Rgb);
         encoder.set_compression(png::Compression::High);
         encoder.write_header()?.write_image_data(&pixels)?;

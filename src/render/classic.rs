@@ -76,8 +76,8 @@ pub(super) fn cart_pole(
 
 /// A car on the road between two hills, and the flag it has to reach.
 pub(super) fn mountain_car(size: Size, position: f64, (low, high): (f64, f64), goal: f64) -> Result<Vec<u8>, Error> {
-    const CAR: Point = [0.07, 0.055]; // half length, height
-    const WHEEL: f64 = 0.026;
+    const CAR: Point = [0.09, 0.075]; // half length, height
+    const WHEEL: f64 = 0.03;
     let road = |x: f64| 0.45 * (3.0 * x).sin() + 0.55;
     let slope = |x: f64| 1.35 * (3.0 * x).cos();
     let mut canvas = canvas("MountainCar", size, [low - 0.06, -0.08], [high + 0.06, 1.32])?;

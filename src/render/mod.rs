@@ -22,6 +22,8 @@ use tokio::sync::{mpsc, oneshot};
 
 /// Requests that wait for the thread. More wait in their sessions.
 const QUEUE: usize = 64;
+/// What the thread's niceness is raised by. Its driver's threads inherit it: physics comes first.
+const NICENESS: i32 = 10;
 
 /// A picture's size in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -139,6 +141,9 @@ impl Drop for Renderer {
 
 /// The thread: draws what is asked for until nobody can ask any more.
 fn work(mut jobs: mpsc::Receiver<Job>) {
+    if let Err(error) = rustix::process::nice(NICENESS) {
+        tracing::debug!(%error, "pictures are drawn at the priority of physics");
+    }
     let mut easel = Easel::default();
     while let Some(Job { pose, size, reply }) = jobs.blocking_recv() {
         if reply.is_closed() {

@@ -5,8 +5,7 @@
 //! parameters (power, density, friction) cannot be seen.
 
 use super::{Error, Size};
-use perturb_mujoco::{self as mujoco, Camera, Gl, Kind, Model};
-use std::rc::Rc;
+use perturb_mujoco::{self as mujoco, Camera, Kind, Model};
 
 /// Follows the robot's own elements in its MJCF. The floor of the physics ends 40 m from the start, as a picture; the
 /// ground here does not. The line is where the task is done.
@@ -33,13 +32,13 @@ const VERMILLION: [f32; 3] = [0.835, 0.369, 0.0];
 const LOOKS: [Look; 2] = [
     Look {
         name: "Hopper",
-        distance: 3.2,
+        distance: 3.0,
         height: 0.75,
         colours: &[("torso", BLUE), ("thigh", SKY_BLUE), ("leg", ORANGE), ("foot", VERMILLION)],
     },
     Look {
         name: "HalfCheetah",
-        distance: 3.2,
+        distance: 3.0,
         height: 0.55,
         colours: &[
             ("torso", GREY),
@@ -57,12 +56,9 @@ const LOOKS: [Look; 2] = [
 /// The robot may rise or sink by so many m before the camera follows, so that a hop looks like one.
 const FREE_RISE: f64 = 0.6;
 
-/// The OpenGL context and the robots that were drawn so far.
+/// The robots that were drawn so far.
 #[derive(Default)]
-pub(super) struct Robots {
-    gl: Option<Rc<Gl>>,
-    robots: Vec<Robot>,
-}
+pub(super) struct Robots(Vec<Robot>);
 
 struct Robot {
     look: &'static Look,
@@ -82,23 +78,19 @@ impl Robots {
     }
 
     fn try_draw(&mut self, name: &str, mjcf: &str, qpos: &[f64], size: Size) -> Result<Vec<u8>, mujoco::Error> {
-        let index = match self.robots.iter().position(|robot| robot.look.name == name) {
+        let index = match self.0.iter().position(|robot| robot.look.name == name) {
             Some(index) => index,
             None => {
-                let gl = match &self.gl {
-                    Some(gl) => Rc::clone(gl),
-                    None => Rc::clone(self.gl.insert(Rc::new(Gl::new()?))),
-                };
-                self.robots.push(Robot::new(gl, name, mjcf, size)?);
-                self.robots.len() - 1
+                self.0.push(Robot::new(name, mjcf, size)?);
+                self.0.len() - 1
             }
         };
-        self.robots[index].draw(qpos, size)
+        self.0[index].draw(qpos, size)
     }
 }
 
 impl Robot {
-    fn new(gl: Rc<Gl>, name: &str, mjcf: &str, size: Size) -> Result<Self, mujoco::Error> {
+    fn new(name: &str, mjcf: &str, size: Size) -> Result<Self, mujoco::Error> {
         let compile = |reason: String| mujoco::Error::Compile { reason };
         let look = LOOKS.iter().find(|look| look.name == name);
         let look = look.ok_or_else(|| compile(format!("nothing says how to show {name}")))?;
@@ -107,7 +99,7 @@ impl Robot {
         let (torso, floor) = (model.id(Kind::Body, "torso")?, model.id(Kind::Geom, "floor")?);
         let colours = look.colours.iter().map(|(geom, rgb)| Ok((model.id(Kind::Geom, geom)?, rgb)));
         let colours = colours.collect::<Result<Vec<_>, mujoco::Error>>()?;
-        let mut renderer = mujoco::Renderer::new(gl, model, (size.width, size.height))?;
+        let mut renderer = mujoco::Renderer::new(model, (size.width, size.height))?;
         let simulation = renderer.simulation();
         let initial_height = simulation.xpos(torso)[2];
         let rgba = simulation.geom_rgba_mut();

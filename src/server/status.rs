@@ -103,3 +103,21 @@ impl From<Refusal> for Status {
         Status::new(refusal.code(), refusal.to_string())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn refused_pictures_say_whose_fault_it_is() {
+        let nothing = Refusal::NothingToDraw { slot: 7 };
+        assert_eq!(nothing.code(), Code::FailedPrecondition);
+        assert!(nothing.to_string().contains("slot 7"), "{nothing}");
+        let code = |error: render::Error| Refusal::from(error).code();
+        let (environment, reason) = ("Hopper", String::new());
+        assert_eq!(code(render::Error::Missing { environment, reason: reason.clone() }), Code::FailedPrecondition);
+        assert_eq!(code(render::Error::NoThread { reason: reason.clone() }), Code::ResourceExhausted);
+        assert_eq!(code(render::Error::Failed { environment, reason }), Code::Internal);
+        assert_eq!(code(render::Error::Defect), Code::Internal);
+    }
+}

@@ -126,7 +126,7 @@ impl Egl {
 }
 
 /// An OpenGL context without a display. It belongs to the thread that made it.
-pub struct Gl {
+pub(crate) struct Gl {
     egl: &'static Egl,
     // Of `egl`, valid as long as this lives; the display for ever. Raw pointers keep it on its thread.
     display: Handle,
@@ -139,7 +139,7 @@ impl Gl {
     ///
     /// # Errors
     /// [`Error::NoOpenGl`].
-    pub fn new() -> Result<Self, Error> {
+    pub(crate) fn new() -> Result<Self, Error> {
         let egl = Egl::get()?;
         let mut reason = "EGL has no display".to_owned();
         for display in egl.displays() {

@@ -2,7 +2,7 @@
 //!
 //! - [`Model`]: a compiled model; loaded from MJCF text, copied, read.
 //! - [`Simulation`]: a model of its own and the data that MuJoCo computes on it; stepped, edited, read.
-//! - [`Gl`], [`Renderer`]: an OpenGL context without a display, and pictures of a model drawn in it.
+//! - [`Renderer`]: pictures of a model, drawn without a display.
 //! - [`Error`], [`Warning`]: what can go wrong. No failure of MuJoCo ends the process or is passed over.
 //!
 //! ```
@@ -40,6 +40,5 @@ mod sys;
 
 pub use data::Simulation;
 pub use error::{Error, Warning};
-pub use gl::Gl;
 pub use model::{FloatArray, Kind, Model};
 pub use render::{Camera, Renderer};

@@ -1,10 +1,9 @@
 //! Pictures of a model.
 
-use crate::{Error, Gl, Model, Simulation, model::last_error, sys};
+use crate::{Error, Model, Simulation, gl::Gl, model::last_error, sys};
 use std::{
     ffi::c_int,
     mem::{self, MaybeUninit},
-    rc::Rc,
     sync::{Mutex, MutexGuard, PoisonError},
 };
 
@@ -26,7 +25,7 @@ pub struct Camera {
 
 /// Draws one model into memory. It belongs to its thread, as its OpenGL context does.
 pub struct Renderer {
-    gl: Rc<Gl>,
+    gl: Gl,
     simulation: Simulation,
     option: Box<sys::mjvOption>,
     /// Made by mjv_makeScene for the model, freed in drop.
@@ -48,8 +47,9 @@ impl Renderer {
     /// Gets ready to draw `model`, at its initial positions, in pictures of about this size in pixels.
     ///
     /// # Errors
-    /// [`Error::Fatal`] if OpenGL cannot do what MuJoCo needs.
-    pub fn new(gl: Rc<Gl>, model: Model, size: (u16, u16)) -> Result<Self, Error> {
+    /// [`Error::NoOpenGl`], and [`Error::Fatal`] if OpenGL cannot do what MuJoCo needs.
+    pub fn new(model: Model, size: (u16, u16)) -> Result<Self, Error> {
+        let gl = Gl::new()?;
         let mut option = Box::new(MaybeUninit::zeroed());
         let mut scene = Box::new(MaybeUninit::zeroed());
         let mut context = Box::new(MaybeUninit::zeroed());

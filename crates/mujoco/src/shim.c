@@ -118,7 +118,9 @@ int perturb_mjv_make_scene(const mjModel* model, mjvScene* scene, int most_geoms
 
 int perturb_mjv_update_scene(const mjModel* model, mjData* data, const mjvOption* option, mjvCamera* camera,
                              mjvScene* scene) {
-  GUARDED(mjv_updateScene(model, data, option, NULL, camera, mjCAT_ALL, scene))
+  // The headlight is put where the scene's camera is before mjv_updateScene moves it: a picture would depend on the last.
+  GUARDED(mjv_updateCamera(model, data, camera, scene);
+          mjv_updateScene(model, data, option, NULL, camera, mjCAT_ALL, scene))
   return failed;
 }
 
