@@ -4,7 +4,7 @@
 use futures_util::future::join_all;
 use perturb::{
     env::Pose,
-    render::{Error, Renderer, Size},
+    render::{Renderer, Size},
 };
 
 /// More requests than wait for the thread.
@@ -72,6 +72,8 @@ fn absurd_numbers_are_drawn_somehow() {
 #[cfg(feature = "mujoco")]
 #[test]
 fn a_failed_drawing_fails_alone() {
+    use perturb::render::Error;
+
     let renderer = Renderer::new();
     let mjcf = include_str!("../models/hopper.xml");
     let hopper = |mjcf, n| renderer.draw(Pose::Robot { name: "Hopper", mjcf, qpos: vec![0.1; n] }, SIZE);
