@@ -13,7 +13,12 @@ use perturb::{
     },
 };
 use server::{Actor, Server, Session, catalogue, doubles, open, parameters};
-use std::{collections::HashSet, process::Command, sync::Arc};
+use std::{
+    collections::HashSet,
+    f64::consts::{FRAC_PI_2, PI},
+    process::Command,
+    sync::Arc,
+};
 use tonic::Code;
 
 const SMALL: (u32, u32) = (120, 120);
@@ -162,14 +167,14 @@ async fn up_is_up_and_right_is_right() {
     assert!(right_y > centre(&valley, SMALL, blue).1 + 0.2);
 
     // Hanging, upright, and both links to the right: the angle is from hanging, anticlockwise.
-    for (angle, x, y) in [(0.0, 0.0, -1.0), (3.14, 0.0, 1.0), (1.57, 1.0, 0.0)] {
+    for (angle, x, y) in [(0.0, 0.0, -1.0), (PI, 0.0, 1.0), (FRAC_PI_2, 1.0, 0.0)] {
         let pixels = at(&server, "Acrobot", &[angle, 0.0, 0.0, 0.0], SMALL).await;
         let (tip_x, tip_y, _) = centre(&pixels, SMALL, orange);
         let (is_x, is_y) = (tip_x - 0.5, tip_y - 0.5);
         assert!((is_x - 0.227 * x).abs() < 0.02 && (is_y - 0.227 * y).abs() < 0.02, "{angle}: {is_x} {is_y}");
     }
     // The angle is from upright, anticlockwise.
-    for (angle, x, y) in [(0.0, 0.0, 1.0), (3.14, 0.0, -1.0), (1.57, -1.0, 0.0)] {
+    for (angle, x, y) in [(0.0, 0.0, 1.0), (PI, 0.0, -1.0), (FRAC_PI_2, -1.0, 0.0)] {
         let pixels = at(&server, "Pendulum", &[angle, 0.0], SMALL).await;
         let (rod_x, rod_y, _) = centre(&pixels, SMALL, vermillion);
         let (is_x, is_y) = (rod_x - 0.5, rod_y - 0.5);
