@@ -2,6 +2,8 @@
 
 # Debian 12's packages: a compiler, libclang for bindgen, MuJoCo, libtorch, and a BLAS that is not the slow reference one.
 PACKAGES := build-essential pkg-config libclang-dev libmujoco-dev libtorch-dev libopenblas0-pthread
+# What draws Hopper and HalfCheetah: OpenGL without a display, in software. The server runs without it.
+OPENGL := libegl1 libgl1-mesa-dri
 CARGO_DENY_VERSION := 0.20.2
 TARGET := $(or $(CARGO_TARGET_DIR),target)
 PROGRAMS := $(TARGET)/release
@@ -44,7 +46,7 @@ missing=; \
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help deps toolchain build demo all-pairs report-check test lint bench audit cargo-deny python-test python-wheel python-acceptance \
+.PHONY: help deps opengl toolchain build demo all-pairs report-check test lint bench audit cargo-deny python-test python-wheel python-acceptance \
 	python-server python-venv
 
 help: ## this list
@@ -52,6 +54,9 @@ help: ## this list
 
 deps: toolchain ## install the missing Debian packages, with sudo if need be
 	@$(call install,$(PACKAGES))
+
+opengl:
+	@$(call install,$(OPENGL))
 
 toolchain:
 	@command -v cargo >/dev/null || { echo "cargo is missing; install Rust 1.95 or later, see https://rustup.rs" >&2; exit 1; }
@@ -70,7 +75,7 @@ report-check: build ## make the report of a small experiment and look at it in C
 	PROGRAMS=$(PROGRAMS) learner/tests/report_check.sh $(TARGET)/report-check
 
 test: export PERTURB_TEST_DM_ENV_RPC_PYTHON := $(abspath $(DM_ENV_RPC))/bin/python
-test: deps $(DM_ENV_RPC)/installed ## run all tests, then those of the server without MuJoCo
+test: deps opengl $(DM_ENV_RPC)/installed ## run all tests, then those of the server without MuJoCo
 	cargo test $(ALL)
 	cargo test $(WITHOUT_MUJOCO)
 
@@ -81,7 +86,7 @@ lint: deps cargo-deny ## check formatting, clippy, documentation and dependencie
 	RUSTDOCFLAGS="-D warnings" cargo doc $(ALL) --no-deps --lib
 	cargo deny --locked check bans licenses sources
 
-bench: build ## measure throughput, latency and memory
+bench: build opengl ## measure throughput, latency and memory
 	cargo bench --workspace --locked --bench '*' -- $(BENCH_ARGS)
 
 audit: toolchain cargo-deny ## look the dependencies up in the RustSec database, which is downloaded from GitHub

@@ -4,7 +4,8 @@
 //! - Hopper and HalfCheetah, batch 64, two workers, against twice the bare loop of the same model on one thread, and
 //!   against two such threads at once, which is what the machine can give: in a closed loop, where each request waits for
 //!   the reply to the last and the workers wait with it, and with two requests in flight, where they do not;
-//! - the round trip of one environment, and the memory of one Hopper.
+//! - the round trip of one environment, and the memory of one Hopper;
+//! - pictures of each environment, 480 × 480 pixels, and what the server's memory grows by with them.
 //!
 //! Servers are processes of their own: `perturb-server`, and this program with the argument `echo` and a socket.
 
@@ -66,6 +67,11 @@ fn main() -> Result<(), Failure> {
         }
         if wanted("memory/Hopper") {
             memory().await?;
+        }
+        for name in env::names() {
+            if wanted(&format!("render/{name}/480")) {
+                pictures(name).await?;
+            }
         }
         Ok(())
     })
@@ -163,6 +169,28 @@ async fn memory() -> Result<(), Failure> {
     client.run(50).await?;
     let each = (server.resident()? - before) / BATCH as f64;
     println!("memory/Hopper           {:>12.1} kB for each environment (at most 150)", each / 1e3);
+    Ok(())
+}
+
+/// (e) Pictures of one environment, each asked for after the last came.
+async fn pictures(name: &'static str) -> Result<(), Failure> {
+    const PICTURES: usize = 10;
+    let server = Process::server(1)?;
+    let mut client = Client::open(&server.socket, name, 1).await?;
+    client.run(10).await?;
+    let before = server.resident()?;
+    client.draw().await?; // the first one loads the driver
+    let mut rates = Vec::new();
+    for _ in 0..ROUNDS {
+        let start = Instant::now();
+        for _ in 0..PICTURES {
+            client.draw().await?;
+        }
+        rates.push(PICTURES as f64 / start.elapsed().as_secs_f64());
+    }
+    let id = format!("render/{name}/480");
+    let grown = (server.resident()? - before) / 1e6;
+    println!("{id:<22} {:>12.0} pictures/s over a Unix socket; {grown:.0} MB more memory", median(&mut rates));
     Ok(())
 }
 
@@ -267,6 +295,18 @@ impl Client {
             self.receive().await?;
         }
         Ok(start.elapsed().as_secs_f64())
+    }
+
+    /// Asks for a picture and waits for it.
+    async fn draw(&mut self) -> Result<(), Failure> {
+        self.requests.send(SessionRequest { request: Some(Ask::Render(proto::Render::default())) }).await?;
+        match self.responses.message().await?.and_then(|r| r.response) {
+            Some(Answer::Render(picture)) => {
+                assert_eq!((picture.width, picture.height, picture.pixels.len()), (480, 480, 480 * 480 * 3));
+                Ok(())
+            }
+            other => Err(format!("{other:?}").into()),
+        }
     }
 
     async fn send(&mut self) -> Result<(), Failure> {

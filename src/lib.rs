@@ -5,6 +5,7 @@
 //! - [`server`]: gRPC in, gRPC out; the legal order of a session's calls; all validation.
 //! - [`pool`]: batches of environments, stepped by worker threads.
 //! - [`env`](mod@env): the trait of an environment, episodes, trials, receipts, random streams.
+//! - [`render`]: pictures of environments, drawn by a thread of their own.
 //! - [`physics`]: parameters, their bounds, and the distributions of the versions D, R and E.
 //! - [`classic`]: CartPole, MountainCar, Acrobot, Pendulum.
 //! - [`locomotion`]: Hopper and HalfCheetah on MuJoCo (feature `mujoco`).
@@ -20,6 +21,7 @@ pub mod env;
 pub mod locomotion;
 pub mod physics;
 pub mod pool;
+pub mod render;
 pub mod server;
 
 /// The protocols: generated from `proto`, whose comments specify every field. `perturb.v1` is here at the top.

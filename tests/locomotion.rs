@@ -432,6 +432,7 @@ fn divergence_ends_the_episode_with_finite_numbers() {
             assert!(transition.terminated && transition.diverged && !transition.goal);
             assert_eq!(terms, [-1.0, 0.0, 0.0, 0.0, 0.0]);
             assert_eq!(observation(walker), seen);
+            assert_eq!(walker.pose(), None, "what MuJoCo put in the state's place is not shown");
             let state = saved(walker);
             walker.load(&state).unwrap();
             assert_eq!(saved(walker), state);
@@ -451,5 +452,6 @@ fn divergence_ends_the_episode_with_finite_numbers() {
         walker.set_parameters(&[1.0, 1000.0, 0.8]);
         walker.reset(&mut stream(0));
         assert!(!walker.step(Action::Continuous(&action), &mut [0.0; 5]).diverged);
+        assert!(walker.pose().is_some());
     }
 }

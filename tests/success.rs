@@ -6,7 +6,7 @@ mod common;
 use common::{episodes, observe, settings, step};
 use perturb::{
     env::{
-        self, Action, ActionSpace, Channel, Environment, EnvironmentSpec, EpisodeEnd, Episodes, Error, Outcome,
+        self, Action, ActionSpace, Channel, Environment, EnvironmentSpec, EpisodeEnd, Episodes, Error, Outcome, Pose,
         Purpose, RewardTerm, Stream, SuccessRule, Transition,
     },
     physics::Version,
@@ -64,6 +64,10 @@ impl Environment for Scripted {
 
     fn observe(&self, out: &mut [f32]) {
         out[0] = self.time as f32;
+    }
+
+    fn pose(&self) -> Option<Pose> {
+        None
     }
 
     fn step(&mut self, _: Action<'_>, reward_terms: &mut [f64]) -> Transition {

@@ -61,8 +61,11 @@ fn generate_bindings(include: &Path) {
         bindgen::Builder::default()
             .header("src/shim.h")
             .clang_arg(format!("-I{}", include.display()))
-            .allowlist_function("perturb_mj_.*|mj_version|mj_deleteModel|mj_deleteData|mj_name2id|mj_objectVelocity")
-            .allowlist_type("mjtWarning|mjtObj")
+            .allowlist_function(
+                "perturb_mj[rv]?_.*|mj_version|mj_deleteModel|mj_deleteData|mj_name2id|mj_objectVelocity",
+            )
+            .allowlist_function("mjv_defaultOption|mjv_defaultScene|mjv_freeScene|mjr_defaultContext")
+            .allowlist_type("mjtWarning|mjtObj|mjtCamera")
             .allowlist_var("mjVERSION_HEADER")
             .generate_comments(false)
             .generate()

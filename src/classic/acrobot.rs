@@ -5,8 +5,8 @@
 
 use crate::{
     env::{
-        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Quantity, RewardTerm, Stream, SuccessRule,
-        Transition,
+        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Pose, Quantity, RewardTerm, Stream,
+        SuccessRule, Transition,
     },
     physics,
 };
@@ -147,6 +147,13 @@ impl Environment for Acrobot {
         let [theta1, theta2, dtheta1, dtheta2] = self.state;
         let values = [theta1.cos(), theta1.sin(), theta2.cos(), theta2.sin(), dtheta1, dtheta2];
         out.copy_from_slice(&values.map(|x| x as f32));
+    }
+
+    fn pose(&self) -> Option<Pose> {
+        let [theta1, theta2, _, _] = self.state;
+        // The task's height is in lengths of a link: it adds cosines.
+        let goal_height = HEIGHT * self.link_length;
+        Some(Pose::Acrobot { angles: [theta1, theta2], link_length: self.link_length, goal_height })
     }
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {

@@ -4,8 +4,8 @@
 
 use crate::{
     env::{
-        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Quantity, RewardTerm, Stream, SuccessRule,
-        Transition,
+        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Pose, Quantity, RewardTerm, Stream,
+        SuccessRule, Transition,
     },
     physics,
 };
@@ -115,6 +115,17 @@ impl Environment for CartPole {
 
     fn observe(&self, out: &mut [f32]) {
         out.copy_from_slice(&self.state.map(|x| x as f32));
+    }
+
+    fn pose(&self) -> Option<Pose> {
+        let [position, _, angle, _] = self.state;
+        Some(Pose::CartPole {
+            position,
+            angle,
+            half_pole_length: self.half_pole_length,
+            position_limit: POSITION_LIMIT,
+            angle_limit: ANGLE_LIMIT,
+        })
     }
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {

@@ -4,8 +4,8 @@
 
 use crate::{
     env::{
-        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Quantity, RewardTerm, Stream, SuccessRule,
-        Transition,
+        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Pose, Quantity, RewardTerm, Stream,
+        SuccessRule, Transition,
     },
     physics,
 };
@@ -86,6 +86,11 @@ impl Environment for MountainCar {
 
     fn observe(&self, out: &mut [f32]) {
         out.copy_from_slice(&self.state.map(|x| x as f32));
+    }
+
+    fn pose(&self) -> Option<Pose> {
+        let [position, _] = self.state;
+        Some(Pose::MountainCar { position, low: MIN_POSITION, high: MAX_POSITION, goal: GOAL_POSITION })
     }
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {

@@ -5,8 +5,8 @@
 
 use crate::{
     env::{
-        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Quantity, RewardTerm, Stream, SuccessRule,
-        Transition,
+        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Pose, Quantity, RewardTerm, Stream,
+        SuccessRule, Transition,
     },
     physics,
 };
@@ -54,13 +54,15 @@ pub struct Pendulum {
     mass: f64,
     /// Angle from upright, not wrapped, and its velocity.
     state: [f64; 2],
+    /// The torque that led to this state, if a step did. Only pictures show it.
+    torque: Option<f64>,
 }
 
 impl Pendulum {
     /// With default parameters, upright.
     pub fn new() -> Self {
         let [length, mass] = [0, 1].map(|i: usize| physics::PENDULUM[i].default);
-        Self { length, mass, state: [0.0; 2] }
+        Self { length, mass, state: [0.0; 2], torque: None }
     }
 
     /// Advances by one step under a torque in N m, clipped to ±2, in full precision: actions arrive as f32, but the
@@ -69,6 +71,7 @@ impl Pendulum {
         let [theta, velocity] = self.state;
         let (m, l) = (self.mass, self.length);
         let u = torque.clamp(-MAX_TORQUE, MAX_TORQUE);
+        self.torque = Some(u);
         let angle = normalise(theta);
         reward_terms.copy_from_slice(&[-(angle * angle), -(0.1 * (velocity * velocity)), -(0.001 * (u * u))]);
 
@@ -105,15 +108,23 @@ impl Environment for Pendulum {
 
     fn reset(&mut self, stream: &mut Stream) {
         self.state = [stream.uniform(-PI, PI), stream.uniform(-1.0, 1.0)];
+        self.torque = None;
     }
 
     fn reset_to(&mut self, state: &[f64]) {
         self.state.copy_from_slice(state);
+        self.torque = None;
     }
 
     fn observe(&self, out: &mut [f32]) {
         let [theta, velocity] = self.state;
         out.copy_from_slice(&[theta.cos() as f32, theta.sin() as f32, velocity as f32]);
+    }
+
+    fn pose(&self) -> Option<Pose> {
+        let [angle, _] = self.state;
+        let torque = self.torque.map(|torque| torque / MAX_TORQUE);
+        Some(Pose::Pendulum { angle, length: self.length, upright: UPRIGHT, torque })
     }
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
@@ -129,6 +140,7 @@ impl Environment for Pendulum {
 
     fn load(&mut self, state: &[f64]) -> Result<(), Error> {
         self.state = super::load(state)?;
+        self.torque = None;
         Ok(())
     }
 }

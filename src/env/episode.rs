@@ -1,6 +1,6 @@
 //! One environment and its episodes: trials, step limit, success, receipts, snapshots.
 
-use super::{Action, Environment, EnvironmentSpec, Purpose, Stream, SuccessRule};
+use super::{Action, Environment, EnvironmentSpec, Pose, Purpose, Stream, SuccessRule};
 use crate::physics::Distribution;
 
 /// What fixes an environment's episodes.
@@ -195,6 +195,11 @@ impl Episodes {
     /// Writes the current observation, `[O]`.
     pub fn observe(&self, out: &mut [f32]) {
         self.environment.observe(out);
+    }
+
+    /// What a picture of the current state shows; none where the physics diverged.
+    pub fn pose(&self) -> Option<Pose> {
+        self.environment.pose()
     }
 
     /// Whether the current episode has ended.

@@ -3,6 +3,7 @@
 mod catalogue;
 mod episode;
 mod error;
+mod pose;
 mod seeding;
 mod snapshot;
 mod spaces;
@@ -11,6 +12,7 @@ pub use catalogue::{find, make, names, specs};
 pub use episode::{EpisodeEnd, EpisodeId, EpisodeStart, Episodes, Outcome, Receipt, Settings};
 pub use error::Error;
 pub(crate) use error::shorten;
+pub use pose::Pose;
 pub use seeding::{Purpose, Stream};
 pub use spaces::{Action, ActionSpace, Channel, EnvironmentSpec, Quantity, RewardTerm, SuccessRule};
 
@@ -53,6 +55,9 @@ pub trait Environment: Send {
 
     /// Writes the current observation, `[O]`.
     fn observe(&self, out: &mut [f32]);
+
+    /// What a picture of the current state shows; none where the physics diverged and no state is left to be shown.
+    fn pose(&self) -> Option<Pose>;
 
     /// Advances by one control step and writes the reward's terms, in the spec's order.
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition;

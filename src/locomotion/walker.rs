@@ -4,7 +4,7 @@ use super::{
     channels::{CLIP, CONTROL_TIMESTEP},
     model_edit::Targets,
 };
-use crate::env::{Action, Environment, EnvironmentSpec, Error, Stream, Transition};
+use crate::env::{Action, Environment, EnvironmentSpec, Error, Pose, Stream, Transition};
 use perturb_mujoco::{Error as SimulationError, Kind, Model, Simulation};
 use sha2::{Digest, Sha256};
 use std::{fmt::Write, sync::OnceLock};
@@ -330,6 +330,13 @@ impl Environment for Walker {
 
     fn observe(&self, out: &mut [f32]) {
         out.copy_from_slice(&self.observation[..self.task.spec.observation.len()]);
+    }
+
+    fn pose(&self) -> Option<Pose> {
+        let qpos = self.simulation.qpos();
+        // After divergence MuJoCo may have put the initial state in its place.
+        let known = !self.diverged && qpos.iter().all(|q| q.is_finite());
+        known.then(|| Pose::Robot { name: self.task.spec.name, mjcf: self.task.mjcf, qpos: qpos.to_vec() })
     }
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {

@@ -6,7 +6,7 @@ use super::{
     workers::{Job, Shared, lock},
 };
 use crate::{
-    env::{ActionSpace, EnvironmentSpec, EpisodeEnd, EpisodeStart, Settings},
+    env::{ActionSpace, EnvironmentSpec, EpisodeEnd, EpisodeStart, Pose, Settings},
     physics::Distribution,
 };
 use bytes::{Bytes, BytesMut};
@@ -190,6 +190,18 @@ impl Batch {
             let _ = self.workers.wait(&self.job).await;
             self.under_way = false;
         }
+    }
+
+    /// What a picture of a slot shows; none where its physics diverged. A few numbers, read between two requests: no
+    /// worker is asked.
+    ///
+    /// # Errors
+    /// [`Error::Defect`].
+    pub fn pose(&self, slot: usize) -> Result<Option<Pose>, Error> {
+        if self.job.failed() {
+            return Err(Error::Defect);
+        }
+        Ok(lock(&self.job.shards[slot / self.shard_size]).pose(slot))
     }
 
     async fn run(&mut self) -> Result<(), Error> {

@@ -1,7 +1,7 @@
 //! A part of a batch: what one worker runs at a time.
 
 use crate::{
-    env::{self, Action, ActionSpace, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings},
+    env::{self, Action, ActionSpace, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Pose, Settings},
     physics::Distribution,
 };
 use bytes::Bytes;
@@ -122,6 +122,11 @@ impl Shard {
     /// The distributions in force in a slot of the batch.
     pub(super) fn distributions(&self, slot: usize) -> &[Distribution] {
         &self.slots[slot - self.first_slot].settings().distributions
+    }
+
+    /// What a picture of a slot of the batch shows.
+    pub(super) fn pose(&self, slot: usize) -> Option<Pose> {
+        self.slots[slot - self.first_slot].pose()
     }
 
     /// Carries out the command.

@@ -128,7 +128,7 @@ impl Shared {
             tokio::task::yield_now().await;
         }
         job.done.notified().await;
-        if job.failed.load(Ordering::Relaxed) { Err(Error::Defect) } else { Ok(()) }
+        if job.failed() { Err(Error::Defect) } else { Ok(()) }
     }
 
     fn push(&self, job: &Arc<Job>) {
@@ -212,6 +212,11 @@ impl Job {
             patience: if cost <= SHORT { POLLS } else { 0 },
             _permit: permit,
         }
+    }
+
+    /// Whether a worker panicked on it, now or earlier.
+    pub(super) fn failed(&self) -> bool {
+        self.failed.load(Ordering::Relaxed)
     }
 
     /// Makes every shard ready to be taken.

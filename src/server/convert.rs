@@ -6,6 +6,7 @@ use crate::{
     physics::{Distribution, Interval, Parameter, Version, resolve},
     pool::{Autoreset, BatchSettings, ResetEntry, Stepped},
     proto,
+    render::Size,
 };
 use bytes::Bytes;
 use std::{collections::HashMap, sync::Arc};
@@ -180,6 +181,24 @@ pub fn restore(size: usize, request: proto::Restore) -> Result<Vec<(usize, Bytes
         return Err(Refusal::value("restore.snapshots", got, expected));
     }
     Ok(slots.into_iter().zip(request.snapshots).collect())
+}
+
+/// The slot of a batch of `n` that a `render` asks for, and the picture's size.
+pub fn render(n: usize, request: proto::Render) -> Result<(usize, Size), Refusal> {
+    let slot = request.slot as usize;
+    if slot >= n {
+        return Err(Refusal::value("render.slot", request.slot, format!("a slot of the batch, 0 … {}", n - 1)));
+    }
+    let pixels = |field, value| match u16::try_from(value) {
+        Ok(0) => Ok(Size::USUAL),
+        Ok(pixels @ Size::LEAST..=Size::MOST) => Ok(pixels),
+        _ => {
+            let expected = format!("{} … {} pixels, or 0 for {}", Size::LEAST, Size::MOST, Size::USUAL);
+            Err(Refusal::value(field, value, expected))
+        }
+    };
+    let (width, height) = (pixels("render.width", request.width)?, pixels("render.height", request.height)?);
+    Ok((slot, Size { width, height }))
 }
 
 /// An environment's entry in the catalogue.

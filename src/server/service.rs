@@ -7,6 +7,7 @@ use super::{
 use crate::{
     pool::Pool,
     proto::{self, perturb_server::Perturb},
+    render::Renderer,
 };
 use std::sync::Arc;
 use tonic::{Request, Response, Status, Streaming};
@@ -16,13 +17,14 @@ use tonic::{Request, Response, Status, Streaming};
 pub struct Service {
     pool: Arc<Pool>,
     catalogue: Arc<[proto::Environment]>,
+    renderer: Arc<Renderer>,
     sessions: Sessions,
 }
 
 impl Service {
     /// A service over a pool.
     pub fn new(pool: Arc<Pool>, catalogue: Arc<[proto::Environment]>, sessions: Sessions) -> Self {
-        Self { pool, catalogue, sessions }
+        Self { pool, catalogue, renderer: Arc::default(), sessions }
     }
 }
 
@@ -45,7 +47,7 @@ impl Perturb for Service {
         &self,
         requests: Request<Streaming<proto::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        let session = Session::new(Arc::clone(&self.pool), Arc::clone(&self.catalogue));
+        let session = Session::new(Arc::clone(&self.pool), Arc::clone(&self.catalogue), Arc::clone(&self.renderer));
         Ok(Response::new(self.sessions.begin(requests.into_inner(), session)?))
     }
 }

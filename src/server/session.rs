@@ -4,6 +4,7 @@ use super::{convert, status::Refusal};
 use crate::{
     pool::{Batch, Pool},
     proto::{self, session_request::Request, session_response::Response},
+    render::Renderer,
 };
 use std::sync::Arc;
 
@@ -11,13 +12,14 @@ use std::sync::Arc;
 pub struct Session {
     pool: Arc<Pool>,
     catalogue: Arc<[proto::Environment]>,
+    renderer: Arc<Renderer>,
     batch: Option<Batch>,
 }
 
 impl Session {
     /// A session that is not open yet.
-    pub fn new(pool: Arc<Pool>, catalogue: Arc<[proto::Environment]>) -> Self {
-        Self { pool, catalogue, batch: None }
+    pub fn new(pool: Arc<Pool>, catalogue: Arc<[proto::Environment]>, renderer: Arc<Renderer>) -> Self {
+        Self { pool, catalogue, renderer, batch: None }
     }
 
     /// Whether it owns environments.
@@ -33,6 +35,7 @@ impl Session {
             Some(Request::Reset(reset)) => self.reset(reset).await.map(Response::Reset),
             Some(Request::Snapshot(snapshot)) => self.snapshot(snapshot).await.map(Response::Snapshot),
             Some(Request::Restore(restore)) => self.restore(restore).await.map(Response::Restore),
+            Some(Request::Render(render)) => self.render(render).await.map(Response::Render),
             None => Err(Refusal::value("request", "empty or of a kind this server does not know", "open, step, …")),
         };
         let response = response.unwrap_or_else(|refusal| {
@@ -77,6 +80,14 @@ impl Session {
         let batch = self.opened("restore")?;
         let entries = convert::restore(batch.settings().size, request)?;
         Ok(proto::Restored { observations: batch.restore(entries).await? })
+    }
+
+    async fn render(&mut self, request: proto::Render) -> Result<proto::Rendered, Refusal> {
+        let batch = self.opened("render")?;
+        let (slot, size) = convert::render(batch.settings().size, request)?;
+        let pose = batch.pose(slot)?.ok_or(Refusal::NothingToDraw { slot })?;
+        let pixels = self.renderer.draw(pose, size).await?;
+        Ok(proto::Rendered { pixels, width: size.width.into(), height: size.height.into() })
     }
 
     fn opened(&mut self, request: &'static str) -> Result<&mut Batch, Refusal> {

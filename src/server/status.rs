@@ -1,6 +1,6 @@
 //! Every refusal, and the only place that turns one into a gRPC code.
 
-use crate::{env, pool, proto};
+use crate::{env, pool, proto, render};
 use std::borrow::Cow;
 use tonic::{Code, Status};
 
@@ -14,6 +14,15 @@ pub enum Refusal {
     /// The pool refuses it.
     #[error(transparent)]
     Pool(#[from] pool::Error),
+    /// There is no picture.
+    #[error(transparent)]
+    Render(#[from] render::Error),
+    /// The environment to be drawn has no state.
+    #[error("the physics of slot {slot} diverged and left no state to draw; reset it first")]
+    NothingToDraw {
+        /// The environment's place in the batch.
+        slot: usize,
+    },
     /// A field has a value that it cannot have.
     #[error("{field} is {got}; expected {expected}")]
     Value {
@@ -110,12 +119,18 @@ impl Refusal {
                 env::Error::Model { .. } => Code::Internal,
                 _ => Code::InvalidArgument,
             },
-            Self::Pool(pool::Error::Full { .. }) | Self::TooManySessions { .. } => Code::ResourceExhausted,
-            Self::Pool(pool::Error::Ended { .. }) | Self::NotOpen { .. } | Self::AlreadyOpen => {
-                Code::FailedPrecondition
+            Self::Pool(pool::Error::Full { .. })
+            | Self::TooManySessions { .. }
+            | Self::Render(render::Error::NoThread { .. }) => Code::ResourceExhausted,
+            Self::Pool(pool::Error::Ended { .. })
+            | Self::NotOpen { .. }
+            | Self::AlreadyOpen
+            | Self::Render(render::Error::Missing { .. })
+            | Self::NothingToDraw { .. } => Code::FailedPrecondition,
+            Self::Pool(pool::Error::Defect) | Self::Render(render::Error::Failed { .. } | render::Error::Defect) => {
+                Code::Internal
             }
             Self::NotJoined { .. } | Self::AlreadyJoined { .. } | Self::Occupied { .. } => Code::FailedPrecondition,
-            Self::Pool(pool::Error::Defect) => Code::Internal,
             Self::Value { .. } => Code::InvalidArgument,
             Self::Idle { .. } => Code::DeadlineExceeded,
             Self::Draining => Code::Unavailable,
@@ -144,5 +159,23 @@ impl From<Refusal> for proto::google::rpc::Status {
 impl From<Refusal> for Status {
     fn from(refusal: Refusal) -> Self {
         Status::new(refusal.code(), refusal.to_string())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn refused_pictures_say_whose_fault_it_is() {
+        let nothing = Refusal::NothingToDraw { slot: 7 };
+        assert_eq!(nothing.code(), Code::FailedPrecondition);
+        assert!(nothing.to_string().contains("slot 7"), "{nothing}");
+        let code = |error: render::Error| Refusal::from(error).code();
+        let (environment, reason) = ("Hopper", String::new());
+        assert_eq!(code(render::Error::Missing { environment, reason: reason.clone() }), Code::FailedPrecondition);
+        assert_eq!(code(render::Error::NoThread { reason: reason.clone() }), Code::ResourceExhausted);
+        assert_eq!(code(render::Error::Failed { environment, reason }), Code::Internal);
+        assert_eq!(code(render::Error::Defect), Code::Internal);
     }
 }

@@ -3,8 +3,9 @@
 
 use bytes::Bytes;
 use perturb::proto::{
-    self, AutoresetMode, Environment, Open, Reset, Restore, SessionRequest, SessionResponse, Snapshot, Step, Stepped,
-    Version, action_space::Kind, perturb_client::PerturbClient, session_request::Request, session_response::Response,
+    self, AutoresetMode, Environment, Open, Render, Reset, Restore, SessionRequest, SessionResponse, Snapshot, Step,
+    Stepped, Version, action_space::Kind, perturb_client::PerturbClient, session_request::Request,
+    session_response::Response,
 };
 use std::{
     future::Future,
@@ -280,6 +281,14 @@ impl Session {
         match self.ask(Request::Restore(Restore { mask: Bytes::copy_from_slice(mask), snapshots })).await {
             Response::Restore(done) => done.observations,
             other => panic!("restore was answered by {other:?}"),
+        }
+    }
+
+    /// A picture: its pixels, `[height, width, 3]`.
+    pub async fn render(&mut self, slot: u32, (width, height): (u32, u32)) -> Bytes {
+        match self.ask(Request::Render(Render { slot, width, height })).await {
+            Response::Render(picture) => picture.pixels,
+            other => panic!("render was answered by {other:?}"),
         }
     }
 

@@ -92,6 +92,12 @@ impl Simulation {
         self.array_mut(start, length)
     }
 
+    /// Colours: red, green, blue and opacity in 0 … 1, `[G, 4]`.
+    pub fn geom_rgba_mut(&mut self) -> &mut [f32] {
+        let (start, length) = (self.model.raw().geom_rgba, 4 * self.model.n_geom());
+        self.array_mut(start, length)
+    }
+
     /// Recomputes what follows from the edited arrays. It overwrites the positions: reset afterwards.
     ///
     /// # Errors
@@ -158,6 +164,14 @@ impl Simulation {
         };
         self.status = Status::Diverged(warning);
         Err(Error::Diverged { warning })
+    }
+
+    /// Computes the poses of bodies, geoms and lights at the current positions, and nothing else.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
+    pub fn kinematics(&mut self) -> Result<(), Error> {
+        self.run(sys::perturb_mj_kinematics)
     }
 
     /// How often MuJoCo raised a warning since the last reset.
@@ -276,6 +290,15 @@ impl Simulation {
         [all[3 * body], all[3 * body + 1], all[3 * body + 2]]
     }
 
+    /// The origin of a body's frame in m, world frame.
+    ///
+    /// # Panics
+    /// If `body` is not below the number of bodies.
+    pub fn xpos(&self, body: usize) -> [f64; 3] {
+        let all = self.array(self.raw().xpos, 3 * self.model.n_body());
+        [all[3 * body], all[3 * body + 1], all[3 * body + 2]]
+    }
+
     /// The rotation matrix of a body's frame, row-major.
     ///
     /// # Panics
@@ -311,6 +334,10 @@ impl Simulation {
         self.array(self.raw().contact, self.raw().ncon as usize)
             .iter()
             .map(|contact| (contact.geom1 as usize, contact.geom2 as usize))
+    }
+
+    pub(crate) fn as_ptr(&self) -> *mut sys::mjData {
+        self.data.as_ptr()
     }
 
     fn raw(&self) -> &sys::mjData {

@@ -40,6 +40,12 @@ pub enum Error {
     /// An earlier fatal error left the data in an undefined state.
     #[error("the simulation is unusable after a fatal error; renew it")]
     Poisoned,
+    /// There is no OpenGL to draw with.
+    #[error("OpenGL without a display is missing: {reason}; install the Debian packages libegl1 and libgl1-mesa-dri")]
+    NoOpenGl {
+        /// What failed.
+        reason: String,
+    },
     /// The state cannot be trusted any more. MuJoCo may have put the initial state in its place.
     #[error("the simulation diverged: {warning}; reset it")]
     Diverged {

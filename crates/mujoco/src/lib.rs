@@ -2,6 +2,7 @@
 //!
 //! - [`Model`]: a compiled model; loaded from MJCF text, copied, read.
 //! - [`Simulation`]: a model of its own and the data that MuJoCo computes on it; stepped, edited, read.
+//! - [`Renderer`]: pictures of a model, drawn without a display.
 //! - [`Error`], [`Warning`]: what can go wrong. No failure of MuJoCo ends the process or is passed over.
 //!
 //! ```
@@ -20,8 +21,8 @@
 //! # Threads
 //!
 //! MuJoCo's engine keeps no state outside `mjModel` and `mjData`, except its error handlers, which the shim installs per
-//! thread and per call, and its callbacks, which nothing here sets. Only the compiler of MJCF is not thread-safe; loads
-//! are serialised.
+//! thread and per call, its callbacks, which nothing here sets, and the addresses of OpenGL's functions. Only the compiler
+//! of MJCF and drawing are not thread-safe; both are serialised.
 //!
 //! # Fatal errors
 //!
@@ -31,10 +32,13 @@
 
 mod data;
 mod error;
+mod gl;
 mod model;
+mod render;
 #[allow(unreachable_pub)]
 mod sys;
 
 pub use data::Simulation;
 pub use error::{Error, Warning};
 pub use model::{FloatArray, Kind, Model};
+pub use render::{Camera, Renderer};

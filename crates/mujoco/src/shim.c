@@ -106,6 +106,53 @@ int perturb_mj_forward(const mjModel* model, mjData* data) {
   return failed;
 }
 
+int perturb_mj_kinematics(const mjModel* model, mjData* data) {
+  GUARDED(mj_kinematics(model, data); mj_comPos(model, data); mj_camlight(model, data))
+  return failed;
+}
+
+int perturb_mjv_make_scene(const mjModel* model, mjvScene* scene, int most_geoms) {
+  GUARDED(mjv_makeScene(model, scene, most_geoms))
+  return failed;
+}
+
+int perturb_mjv_update_scene(const mjModel* model, mjData* data, const mjvOption* option, mjvCamera* camera,
+                             mjvScene* scene) {
+  // The headlight is put where the scene's camera is before mjv_updateScene moves it: a picture would depend on the last.
+  GUARDED(mjv_updateCamera(model, data, camera, scene);
+          mjv_updateScene(model, data, option, NULL, camera, mjCAT_ALL, scene))
+  return failed;
+}
+
+int perturb_mjr_make_context(mjModel* model, mjrContext* context, int width, int height) {
+  model->vis.global.offwidth = width;
+  model->vis.global.offheight = height;
+  // MuJoCo's loader of OpenGL, which this calls, is C++. It raises an error only where no library of OpenGL is loaded;
+  // the current context is of one.
+  GUARDED(mjr_makeContext(model, context, mjFONTSCALE_50); mjr_setBuffer(mjFB_OFFSCREEN, context))
+  if (!failed && context->currentBuffer != mjFB_OFFSCREEN) {
+    snprintf(last_error, sizeof last_error, "OpenGL has no off-screen framebuffer");
+    return 1;
+  }
+  return failed;
+}
+
+int perturb_mjr_free_context(mjrContext* context) {
+  GUARDED(mjr_freeContext(context))
+  return failed;
+}
+
+int perturb_mjr_draw(mjvScene* scene, const mjrContext* context, int width, int height, unsigned char* pixels) {
+  mjrRect viewport = {0, 0, width, height};
+  GUARDED(mjr_render(viewport, scene, context); mjr_readPixels(pixels, NULL, viewport, context))
+  int error = failed ? 0 : mjr_getError();
+  if (error) {
+    snprintf(last_error, sizeof last_error, "OpenGL error 0x%x", error);
+    return 1;
+  }
+  return failed;
+}
+
 int perturb_mj_same_sizes(const mjModel* a, const mjModel* b) {
   // The sizes are the leading ints of mjModel, up to the options.
   return memcmp(a, b, offsetof(mjModel, opt)) == 0;

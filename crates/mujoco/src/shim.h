@@ -25,6 +25,19 @@ int perturb_mj_step1(const mjModel* model, mjData* data);
 int perturb_mj_step2(const mjModel* model, mjData* data);
 int perturb_mj_forward(const mjModel* model, mjData* data);
 
+// Poses of bodies, geoms, cameras and lights, and nothing else. Nonzero on failure.
+int perturb_mj_kinematics(const mjModel* model, mjData* data);
+
+// Drawing. Nonzero on failure. Those of mjr need a current OpenGL context, and are not to be raced.
+int perturb_mjv_make_scene(const mjModel* model, mjvScene* scene, int most_geoms);
+int perturb_mjv_update_scene(const mjModel* model, mjData* data, const mjvOption* option, mjvCamera* camera,
+                             mjvScene* scene);
+// Makes the context draw into a buffer of this size in pixels; the context is a default or a freed one.
+int perturb_mjr_make_context(mjModel* model, mjrContext* context, int width, int height);
+int perturb_mjr_free_context(mjrContext* context);
+// Draws the scene and reads the picture: 3 * width * height bytes, the lowest row first.
+int perturb_mjr_draw(mjvScene* scene, const mjrContext* context, int width, int height, unsigned char* pixels);
+
 // Whether two models have the same sizes, so that one may be assigned to the other or used with its data.
 int perturb_mj_same_sizes(const mjModel* a, const mjModel* b);
 

@@ -1,0 +1,187 @@
+//! Pictures of environments.
+//!
+//! One thread for a server draws them all, so that neither the physics' workers nor the transport's thread ever draws
+//! or waits for OpenGL: a session hands over a [`Pose`], a few numbers, and gets pixels back.
+//!
+//! - `classic` draws the analytic tasks, on `canvas`: paths in metres, anti-aliased, by a library in Rust.
+//! - `robot` draws Hopper and HalfCheetah with MuJoCo, on a model of its own with colours, floor, light and sky.
+
+mod canvas;
+mod classic;
+#[cfg(feature = "mujoco")]
+mod robot;
+
+use crate::env::Pose;
+use bytes::Bytes;
+use std::{
+    panic::{AssertUnwindSafe, catch_unwind},
+    sync::{Mutex, PoisonError},
+    thread::{self, JoinHandle},
+};
+use tokio::sync::{mpsc, oneshot};
+
+/// Requests that wait for the thread. More wait in their sessions.
+const QUEUE: usize = 64;
+/// What the thread's niceness is raised by. Its driver's threads inherit it: physics comes first.
+const NICENESS: i32 = 5;
+
+/// A picture's size in pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Size {
+    /// From left to right, in [`Size::LEAST`] … [`Size::MOST`].
+    pub width: u16,
+    /// From top to bottom, in [`Size::LEAST`] … [`Size::MOST`].
+    pub height: u16,
+}
+
+impl Size {
+    /// The least width or height.
+    pub const LEAST: u16 = 16;
+    /// The largest width or height.
+    pub const MOST: u16 = 2048;
+    /// The width or height of those who do not care.
+    pub const USUAL: u16 = 480;
+}
+
+/// Why there is no picture.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// The machine lacks something to draw this environment with.
+    #[error("this server cannot draw {environment}: {reason}")]
+    Missing {
+        /// The environment.
+        environment: &'static str,
+        /// What is missing, and how to get it.
+        reason: String,
+    },
+    /// The drawing failed.
+    #[error("{environment} could not be drawn: {reason}")]
+    Failed {
+        /// The environment.
+        environment: &'static str,
+        /// Why.
+        reason: String,
+    },
+    /// The operating system gives no thread to draw with.
+    #[error("no thread could be started to draw with ({reason}); try again when the machine is less busy")]
+    NoThread {
+        /// What it says.
+        reason: String,
+    },
+    /// The drawing thread panicked: a defect of the server.
+    #[error("the drawing failed from a defect of the server; report what its log says")]
+    Defect,
+}
+
+/// Draws pictures on a thread of its own, which starts with the first. Dropping it ends the thread after the picture
+/// under way.
+#[derive(Default)]
+pub struct Renderer {
+    studio: Mutex<Option<Studio>>,
+}
+
+/// The thread, and the way to it.
+struct Studio {
+    jobs: mpsc::Sender<Job>,
+    thread: JoinHandle<()>,
+}
+
+struct Job {
+    pose: Pose,
+    size: Size,
+    reply: oneshot::Sender<Result<Vec<u8>, Error>>,
+}
+
+impl Renderer {
+    /// A renderer whose thread has not started.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// A picture, `[height, width, 3]`: red, green, blue, the uppermost row first. Pictures are drawn one after the
+    /// other, in the order of their requests; where too many wait, this one waits for its place. The same pose and size
+    /// give the same bytes.
+    ///
+    /// # Errors
+    /// [`Error`].
+    pub async fn draw(&self, pose: Pose, size: Size) -> Result<Bytes, Error> {
+        let (reply, picture) = oneshot::channel();
+        let jobs = self.jobs()?;
+        // The thread ends only when this is dropped.
+        jobs.send(Job { pose, size, reply }).await.map_err(|_| Error::Defect)?;
+        picture.await.map_err(|_| Error::Defect)?.map(Bytes::from)
+    }
+
+    fn jobs(&self) -> Result<mpsc::Sender<Job>, Error> {
+        let mut studio = self.studio.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(studio) = &*studio {
+            return Ok(studio.jobs.clone());
+        }
+        let (jobs, receiver) = mpsc::channel(QUEUE);
+        let thread = thread::Builder::new()
+            .name("render".into())
+            .spawn(move || work(receiver))
+            .map_err(|error| Error::NoThread { reason: error.to_string() })?;
+        *studio = Some(Studio { jobs: jobs.clone(), thread });
+        Ok(jobs)
+    }
+}
+
+impl Drop for Renderer {
+    fn drop(&mut self) {
+        let studio = self.studio.get_mut().unwrap_or_else(PoisonError::into_inner);
+        if let Some(Studio { jobs, thread }) = studio.take() {
+            drop(jobs);
+            // A driver must not be drawing while the process ends. The thread does not panic: drawings are caught.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// The thread: draws what is asked for until nobody can ask any more.
+fn work(mut jobs: mpsc::Receiver<Job>) {
+    if let Err(error) = rustix::process::nice(NICENESS) {
+        tracing::debug!(%error, "pictures are drawn at the priority of physics");
+    }
+    let mut easel = Easel::default();
+    while let Some(Job { pose, size, reply }) = jobs.blocking_recv() {
+        if reply.is_closed() {
+            continue; // its session is gone
+        }
+        let drawn = catch_unwind(AssertUnwindSafe(|| easel.draw(&pose, size))).unwrap_or_else(|_| {
+            tracing::error!(?pose, "a drawing panicked");
+            Err(Error::Defect)
+        });
+        if drawn.is_err() {
+            easel = Easel::default(); // what a failed drawing leaves behind is not to be trusted
+        }
+        let _ = reply.send(drawn); // the session may be gone by now
+    }
+}
+
+/// What the thread keeps from one picture to the next.
+#[derive(Default)]
+struct Easel {
+    #[cfg(feature = "mujoco")]
+    robots: robot::Robots,
+}
+
+impl Easel {
+    fn draw(&mut self, pose: &Pose, size: Size) -> Result<Vec<u8>, Error> {
+        match *pose {
+            Pose::CartPole { position, angle, half_pole_length, position_limit, angle_limit } => {
+                classic::cart_pole(size, position, angle, half_pole_length, (position_limit, angle_limit))
+            }
+            Pose::MountainCar { position, low, high, goal } => classic::mountain_car(size, position, (low, high), goal),
+            Pose::Acrobot { angles, link_length, goal_height } => {
+                classic::acrobot(size, angles, link_length, goal_height)
+            }
+            Pose::Pendulum { angle, length, upright, torque } => {
+                classic::pendulum(size, angle, length, upright, torque)
+            }
+            #[cfg(feature = "mujoco")]
+            Pose::Robot { name, mjcf, ref qpos } => self.robots.draw(name, mjcf, qpos, size),
+        }
+    }
+}
