@@ -5,10 +5,12 @@
 //! - [`convert`]: the protocol to the domain and back, with all validation.
 //! - [`status`]: every refusal, and its gRPC code.
 //! - [`listen`] and [`drain`]: how it begins and how it ends.
+//! - [`probe`]: asking another process's server for its health.
 
 pub mod convert;
 pub mod drain;
 pub mod listen;
+pub mod probe;
 pub mod service;
 pub mod session;
 pub mod status;

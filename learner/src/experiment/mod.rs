@@ -19,7 +19,9 @@ mod statistics;
 pub use cell::{CellEnd, run_cell};
 pub use cost::{Estimate, Measurement, Speed, Work, estimate, measure, representatives};
 pub use curves::{Curve, EnvironmentCurves, Point, curves_csv, read_curves};
-pub use folder::{CellFolder, CellLock, CellResult, CellState, Failure, Folder, FolderError, Timing, Training};
+pub use folder::{
+    CellFolder, CellLock, CellResult, CellState, Failure, Folder, FolderError, Timing, Training, write_atomically,
+};
 pub use heatmap::{Axis, Heatmap, HeatmapError, HeatmapOptions, MOST_POINTS, heatmap, heatmap_csv};
 pub use plan::{Cell, Counts, Learner, Plan, PlanError, Tests};
 pub use run::{BUSY, NO_SERVER, RunEnd, RunError, RunOptions, RunStatus, run};
