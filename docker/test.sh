@@ -17,7 +17,7 @@ compose() { "${program[@]}" --file compose.yaml --project-name "perturb-test-$$"
 
 work=$(mktemp -d)
 mkdir "$work/runs"
-# Not even if this script runs as root does anything else.
+# Learners run as whoever calls this script, but never as root.
 user=$(id -u):$(id -g)
 [ "$(id -u)" != 0 ] || { user=1000:1000; chown "$user" "$work/runs"; chmod 755 "$work"; }
 export PERTURB_RUNS=$work/runs PERTURB_USER=$user PERTURB_PLAN=/runs/plan.toml PERTURB_LOG=info,perturb=debug
