@@ -1,5 +1,6 @@
 # The program perturb with libtorch and OpenBLAS, and the experiments. From the repository's root:
-#   docker build --file docker/learner.Dockerfile --tag perturb-learner --build-arg PERTURB_COMMIT=$(git rev-parse --short=12 HEAD) .
+#   docker build --file docker/learner.Dockerfile --tag perturb-learner \
+#     --build-arg PERTURB_COMMIT=$(git rev-parse --short=12 HEAD) .
 
 FROM rust:1.95-bookworm AS skeleton
 WORKDIR /perturb
