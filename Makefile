@@ -17,6 +17,10 @@ DM_ENV_RPC := $(TARGET)/dm_env_rpc
 DEMO_ARGS ?=
 ALL_PAIRS_ARGS ?=
 BENCH_ARGS ?=
+# More arguments for `docker build`, e.g. make docker DOCKER_ARGS="--build-arg RENDERING=1".
+DOCKER_ARGS ?=
+# What the images are made from.
+BASE_IMAGES := debian:bookworm-slim rust:1.95-bookworm
 
 # The learner's threads are its own; more inside libtorch's matrix products only get in their way.
 export OPENBLAS_NUM_THREADS := 1
@@ -47,7 +51,7 @@ endef
 
 .DEFAULT_GOAL := help
 .PHONY: help deps opengl toolchain build demo all-pairs report-check test lint bench audit cargo-deny python-test python-wheel python-acceptance \
-	python-server python-venv
+	python-server python-venv docker docker-base docker-test
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -133,3 +137,23 @@ $(DM_ENV_RPC)/installed: tests/dm_env_rpc/requirements.txt | python-venv
 # Debian keeps what fills a new environment in a package of its own.
 python-venv:
 	@command -v python3 >/dev/null && python3 -c 'import ensurepip' 2>/dev/null || { $(call install,python3 python3-venv); }
+
+# The commit as the learner's build script writes it: the repository is no part of the images' context.
+docker: docker-base ## build the container images perturb-server and perturb-learner
+	docker build $(DOCKER_ARGS) --file docker/server.Dockerfile --tag perturb-server .
+	docker build $(DOCKER_ARGS) --file docker/learner.Dockerfile --tag perturb-learner \
+		--build-arg PERTURB_COMMIT="$$(git describe --always --abbrev=12 --dirty --exclude='*' 2>/dev/null || echo unknown commit)" .
+
+docker-base:
+	@command -v docker >/dev/null || { echo "docker is missing; install Docker 20.10 or later, on Debian the package docker.io" >&2; exit 1; }
+	@docker info >/dev/null 2>&1 || { \
+		echo "Docker does not answer: start its service, or have yourself added to the group docker" >&2; exit 1; \
+	}
+	@for image in $(BASE_IMAGES); do \
+		docker image inspect $$image >/dev/null 2>&1 || docker pull --quiet $$image || { \
+			echo "The base image $$image is missing and cannot be pulled; docker/README.md says how else to come by it" >&2; exit 1; \
+		}; \
+	done
+
+docker-test: docker ## run an experiment on servers and learners in containers, and stop a server in mid-run
+	docker/test.sh

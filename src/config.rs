@@ -64,6 +64,11 @@ pub struct Arguments {
     #[arg(long)]
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub exit_with_stdin: bool,
+    /// Start no server, but ask the one that runs with these settings, at its first address, whether it takes sessions:
+    /// exit status 0 if so, else 1. For the health checks of containers.
+    #[arg(long)]
+    #[serde(skip)]
+    pub health: bool,
 }
 
 /// The configuration in force, validated.

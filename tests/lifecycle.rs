@@ -150,6 +150,35 @@ async fn a_server_without_sessions_ends_at_once_whatever_its_grace_period() {
 }
 
 #[tokio::test]
+async fn the_program_tells_whether_a_server_takes_sessions() {
+    let ask = |address: &str| {
+        let mut command = command();
+        let Output { status, stderr, .. } = finished(command.args(["--health", "--listen", address]));
+        (status.code(), String::from_utf8(stderr).unwrap())
+    };
+    let mut server = Server::start(&["--grace-seconds", "100000"]);
+    let (tcp, unix) = (format!("tcp://{}", server.port()), server.unix().to_owned());
+    for address in [&tcp, &unix] {
+        assert_eq!(ask(address), (Some(0), String::new()), "{address}");
+    }
+    let (session, _) = Session::open(server.tcp(), open("CartPole", 4, 1)).await;
+    server.signal("TERM");
+    until("the server drains", async || health(server.tcp(), SERVICE).await.unwrap() == ServingStatus::NotServing)
+        .await;
+    let (code, words) = ask(&tcp);
+    assert!(code == Some(1) && words.contains("answers NOT_SERVING"), "{code:?}: {words}");
+    drop(session);
+    server.ended().await;
+    for address in [&tcp, &unix] {
+        let (code, words) = ask(address);
+        assert!(code == Some(1) && words.contains("no server answers at"), "{code:?}: {words}");
+    }
+    let silent = TcpListener::bind("127.0.0.1:0").unwrap();
+    let (code, words) = ask(&format!("tcp://{}", silent.local_addr().unwrap()));
+    assert!(code == Some(1) && words.contains("it took more than 3 s"), "{code:?}: {words}");
+}
+
+#[tokio::test]
 async fn sigterm_right_after_the_address_is_printed_is_an_orderly_end() {
     for _ in 0..10 {
         let mut server = Server::start(&[]);

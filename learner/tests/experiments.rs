@@ -411,6 +411,23 @@ fn a_report_is_the_same_however_often_the_run_was_broken_off() {
 }
 
 #[test]
+fn a_run_writes_its_report_when_nothing_is_left_to_do() {
+    let experiment = Experiment::new(&PLAN.replace("7e-3, 7e-4", "1e38, 7e-4"));
+    let (page, again) = (experiment.out("pages/page.html"), experiment.out("again.html"));
+    let output = experiment.run("out", &["--html", page.to_str().expect("a path")]);
+    assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
+    assert!(stderr(&output).contains("4 of 8 cells failed") && stderr(&output).contains("the report is in"));
+    let table = experiment.out("out/report/metrics.csv");
+    let written = [&page, &table].map(|path| std::fs::read(path).expect("a file"));
+    assert!(String::from_utf8_lossy(&written[0]).contains("</html>"));
+    let mut command = Command::new(env!("CARGO_BIN_EXE_perturb"));
+    succeeded(&command.arg("report").arg(experiment.out("out")).arg("--html").arg(&again).output().expect("ended"));
+    assert!([&again, &table].map(|path| std::fs::read(path).expect("a file")) == written, "the same report");
+    let names = std::fs::read_dir(experiment.out("pages")).expect("a folder").count();
+    assert_eq!(names, 1, "nothing temporary stays");
+}
+
+#[test]
 fn a_heatmap_is_drawn_of_two_parameters_and_others_are_refused() {
     let experiment = Experiment::new(PLAN);
     succeeded(&experiment.run("out", &["--cell", "0"]));

@@ -4,7 +4,7 @@
 use clap::Parser;
 use perturb::{
     config::{Arguments, Config},
-    server::{self, listen::Listener},
+    server::{self, listen::Listener, probe::probe},
 };
 use std::{
     error::Error,
@@ -30,7 +30,8 @@ fn main() -> ExitCode {
         .with_ansi(io::stderr().is_terminal())
         .with_env_filter(tracing_subscriber::EnvFilter::new(&config.log))
         .init();
-    match run(&config) {
+    let done = if arguments.health { health(&config) } else { run(&config) };
+    match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("perturb-server: {error}");
@@ -58,6 +59,13 @@ fn run(config: &Config) -> Result<(), Box<dyn Error>> {
     // Connections that did not close by themselves must not keep the program.
     runtime.shutdown_background();
     result
+}
+
+/// Asks the server that runs with the same settings.
+fn health(config: &Config) -> Result<(), Box<dyn Error>> {
+    let listen = config.listen.first().ok_or("no address is given")?;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    Ok(runtime.block_on(probe(listen))?)
 }
 
 /// Resolves at SIGTERM, SIGINT, or, if asked for, when standard input closes. A second signal exits at once.

@@ -7,12 +7,14 @@
 //! - [`status`]: every refusal, and its gRPC code.
 //! - [`dm_env_rpc`]: the same environments by DeepMind's protocol.
 //! - [`listen`] and [`drain`]: how it begins and how it ends.
+//! - [`probe`]: asking another process's server for its health.
 
 pub mod conversation;
 pub mod convert;
 pub mod dm_env_rpc;
 pub mod drain;
 pub mod listen;
+pub mod probe;
 pub mod service;
 pub mod session;
 pub mod status;

@@ -51,6 +51,7 @@ impl Session {
         }
         let autoreset_mode = request.autoreset_mode;
         let settings = convert::open(request)?;
+        tracing::debug!(environment = settings.spec.name, batch_size = settings.size, "opening a session");
         let environment = self.catalogue.iter().find(|entry| entry.name == settings.spec.name).cloned();
         let (batch, observations, started) = Batch::open(&self.pool, settings).await?;
         self.batch = Some(batch);

@@ -183,6 +183,12 @@ pub(super) struct RunArgs {
     /// Do this cell only, by its index or id, in this process.
     #[arg(long, value_name = "K", conflicts_with = "jobs")]
     pub(super) cell: Option<String>,
+    /// When nothing is left to do, also write the report, as `perturb report DIR --html FILE` does.
+    #[arg(long, value_name = "FILE", conflicts_with = "cell")]
+    pub(super) html: Option<PathBuf>,
+    /// With --cell and several servers: how many of them earlier tries have lost, so that the next one's turn comes.
+    #[arg(long, value_name = "N", default_value_t = 0, requires = "cell", hide = true)]
+    pub(super) losses: u32,
     /// With --cell: stop when standard input is closed, and show no progress.
     #[arg(long)]
     pub(super) exit_with_stdin: bool,

@@ -17,6 +17,7 @@ mod run;
 mod single_thread;
 mod train;
 
+use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use anyhow::{Context, Result};
@@ -48,7 +49,8 @@ pub fn main() -> ExitCode {
     let cli = Cli::parse();
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    let colours = std::io::stderr().is_terminal(); // a worker's is a file
+    tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours).with_writer(std::io::stderr).init();
     if matches!(cli.command, Command::Train(_) | Command::Demo(_) | Command::Plan(_) | Command::Run(_)) {
         // An experiment's results must not depend on what a cluster's profile exports.
         single_thread::ensure(matches!(cli.command, Command::Run(_)));

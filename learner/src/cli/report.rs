@@ -9,27 +9,33 @@ use super::Ending;
 use super::args::{CurvesArgs, ReportArgs};
 use crate::experiment::plot::{Quantity, draw_curves, save};
 use crate::experiment::report::{Figures, Report, csv_files, html, markdown, text};
-use crate::experiment::{EnvironmentCurves, Folder, Plan, Results, curves_csv, read_curves};
+use crate::experiment::{EnvironmentCurves, Folder, Plan, Results, curves_csv, read_curves, write_atomically};
 
 pub(super) fn run(args: &ReportArgs) -> Result<Ending> {
     let folder = Folder::new(&args.dir);
+    let text = write(&folder, args.html.as_deref())?;
+    write!(std::io::stdout(), "{text}")?;
+    eprintln!("\nthe tables are also in {}", args.dir.join("report").display());
+    Ok(Ending::Done)
+}
+
+/// Writes the tables of an experiment and, with `page`, everything as HTML; returns the tables as text.
+pub(super) fn write(folder: &Folder, page: Option<&Path>) -> Result<String> {
     let plan = Plan::load(&folder.require_plan()?)?;
-    let results = Results::read(&plan, &folder)?;
+    let results = Results::read(&plan, folder)?;
     let groups = results.select();
     let report = Report::new(&results, &groups);
-    write!(std::io::stdout(), "{}", text(&report))?;
 
-    let out = args.dir.join("report");
+    let out = folder.path().join("report");
     write_file(&out.join("report.md"), markdown(&report).as_bytes())?;
     for (name, content) in csv_files(&results, &groups)? {
         write_file(&out.join(name), &content)?;
     }
-    if let Some(path) = &args.html {
-        let figures = Figures::read(&results, &groups, &folder)?;
+    if let Some(path) = page {
+        let figures = Figures::read(&results, &groups, folder)?;
         write_file(path, html(&report, &figures).as_bytes())?;
     }
-    eprintln!("\nthe tables are also in {}", out.display());
-    Ok(Ending::Done)
+    Ok(text(&report))
 }
 
 pub(super) fn curves(args: &CurvesArgs) -> Result<Ending> {
@@ -55,10 +61,11 @@ pub(super) fn curves(args: &CurvesArgs) -> Result<Ending> {
     Ok(Ending::Done)
 }
 
-/// Writes a file, and the folders above it if they are not there.
+/// Writes a file, and the folders above it if they are not there. A plain file appears complete: several runs that share
+/// a folder write the same report at the same time.
 pub(super) fn write_file(path: &Path, content: &[u8]) -> Result<()> {
-    if let Some(parent) = path.parent().filter(|parent| !parent.as_os_str().is_empty()) {
-        std::fs::create_dir_all(parent).with_context(|| format!("cannot create {}", parent.display()))?;
+    if path.metadata().is_ok_and(|metadata| !metadata.is_file()) {
+        return std::fs::write(path, content).with_context(|| format!("cannot write {}", path.display()));
     }
-    std::fs::write(path, content).with_context(|| format!("cannot write {}", path.display()))
+    Ok(write_atomically(path, content)?)
 }

@@ -14,11 +14,11 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::args::RunArgs;
 use super::bar::Bar;
 use super::plan::{duration, step_limits};
-use super::{Ending, UsageError, servers, single_thread};
+use super::{Ending, UsageError, report, servers, single_thread};
 use crate::client::{Address, ClientError, LocalServer, LocalServerOptions, Servers};
 use crate::experiment::{
-    BUSY, Cell, CellEnd, FailureMark, Folder, NO_SERVER, Plan, RunEnd, RunOptions, RunStatus, run as run_cells,
-    run_cell,
+    Attempt, BUSY, Cell, CellEnd, FailureMark, Folder, NO_SERVER, Plan, RunEnd, RunOptions, RunStatus,
+    run as run_cells, run_cell,
 };
 use crate::interrupt::StopFlag;
 
@@ -56,11 +56,14 @@ fn one_cell(args: &RunArgs, plan: &Plan, folder: &Folder, name: &str, stop: &Sto
     if !args.exit_with_stdin {
         keep_plan(plan, folder)?;
     }
-    let servers = match servers(&args.server, cell.config.common.num_envs.max(TEST_ENVS)) {
+    let servers = match server_of(args, cell) {
         Ok(servers) => servers,
         Err(error) if error.chain().any(|cause| cause.is::<ClientError>()) => return no_server(&error),
         Err(error) => return Err(error),
     };
+    if args.exit_with_stdin {
+        servers.addresses().for_each(|address| eprintln!("on {address}"));
+    }
     let mut bar = (!args.exit_with_stdin).then(|| Bar::new(cell.id.as_str(), cell.config.common.episodes));
     let mut stage = String::new();
     let mut report = |what: &str, episodes| match &mut bar {
@@ -81,6 +84,16 @@ fn one_cell(args: &RunArgs, plan: &Plan, folder: &Folder, name: &str, stop: &Sto
         }
         CellEnd::NoServer(error) => no_server(&error),
     }
+}
+
+/// The server of one cell: one of those that were named, by turns, or one of its own.
+fn server_of(args: &RunArgs, cell: &Cell) -> Result<Servers> {
+    let named = &args.server.server;
+    if named.is_empty() {
+        return servers(&args.server, cell.config.common.num_envs.max(TEST_ENVS));
+    }
+    super::refuse_workers(&args.server)?;
+    Ok(Servers::connect_to_one(named, cell.index + args.losses as usize)?)
 }
 
 fn no_server(error: &anyhow::Error) -> Result<Ending> {
@@ -109,10 +122,13 @@ fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> R
     let jobs = args.jobs.unwrap_or(cores);
     let (local, addresses) = shared_servers(args, plan, jobs)?;
     let local = local.map(Mutex::new);
-    step_limits(&Servers::connect(&addresses)?, plan)?; // refuses environments that there are not
+    let (servers, troubles) = Servers::connect_to_some(&addresses)?;
+    troubles.iter().for_each(|trouble| eprintln!("perturb: {trouble}; going on with the other servers"));
+    step_limits(&servers, plan)?; // refuses environments that there are not
+    drop(servers);
     keep_plan(plan, folder)?;
     let addresses: Vec<String> = addresses.iter().map(Address::to_string).collect();
-    let worker = |cell: &Cell, retry| worker(folder, cell, retry, &addresses);
+    let worker = |cell: &Cell, attempt| worker(folder, cell, attempt, &addresses);
     let server_trouble = || {
         let status = local.as_ref()?.lock().ok()?.exit_status()?;
         Some(format!("the private server ended with {status}"))
@@ -122,7 +138,12 @@ fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> R
     let mut line = Line::new(plan.cells.len());
     let end = run_cells(plan, folder, &options, stop, &mut |status| line.show(status));
     line.finish();
-    match end? {
+    let end = end?;
+    if let (RunEnd::Finished { .. }, Some(page)) = (&end, &args.html) {
+        report::write(folder, Some(page))?;
+        eprintln!("the report is in {} and {}", page.display(), folder.path().join("report").display());
+    }
+    match end {
         RunEnd::Stopped(signal) => {
             eprintln!("stopped by signal {signal}; the same command goes on");
             Ok(Ending::Signal(signal))
@@ -170,7 +191,7 @@ fn shared_servers(args: &RunArgs, plan: &Plan, jobs: usize) -> Result<(Option<Lo
 }
 
 /// The command that does one cell.
-fn worker(folder: &Folder, cell: &Cell, retry: Option<FailureMark>, addresses: &[String]) -> std::io::Result<Command> {
+fn worker(folder: &Folder, cell: &Cell, attempt: Attempt, addresses: &[String]) -> std::io::Result<Command> {
     let place = folder.cell(&cell.id);
     std::fs::create_dir_all(place.path())?;
     let log = File::options().create(true).append(true).open(place.log())?;
@@ -179,7 +200,8 @@ fn worker(folder: &Folder, cell: &Cell, retry: Option<FailureMark>, addresses: &
     let mut command = Command::new(program);
     command.arg0("perturb").arg("run").arg(folder.plan_path()).arg("--out").arg(folder.path());
     command.args(["--cell", &cell.id, "--exit-with-stdin", "--server", &addresses.join(",")]);
-    if let Some(failure) = retry {
+    command.args(["--losses", &attempt.losses.to_string()]);
+    if let Some(failure) = attempt.retry {
         command.args(["--retry-failure", &failure.to_string()]);
     }
     single_thread::set(&mut command);

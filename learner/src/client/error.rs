@@ -17,6 +17,12 @@ pub enum ClientError {
         /// The transport's words.
         reason: String,
     },
+    /// None of several servers takes sessions.
+    #[error("no server answers ({reasons}); start one with `perturb-server --listen …` or correct --server")]
+    NoneConnects {
+        /// Every address with the transport's words.
+        reasons: String,
+    },
     /// The server understood a request and refused it. The session lives on.
     #[error("the server at {address} refused {request}: {message}")]
     Refused {
@@ -104,4 +110,26 @@ pub enum ClientError {
         /// Its answer.
         source: std::io::Error,
     },
+}
+
+/// A status in words, with the transport's cause.
+pub(super) fn describe(status: &tonic::Status) -> String {
+    let mut words = vec![format!("{} ({:?})", status.message(), status.code())];
+    if let Some(source) = std::error::Error::source(status) {
+        words.extend(causes(source));
+    }
+    words.dedup();
+    words.join(": ")
+}
+
+/// An error and its causes; without those whose words are contained in others.
+pub(super) fn causes(error: &dyn std::error::Error) -> Vec<String> {
+    let chain = std::iter::successors(Some(error), |error| error.source());
+    let mut words: Vec<String> = Vec::new();
+    for text in chain.map(ToString::to_string) {
+        if !words.iter().any(|known| known.contains(&text)) {
+            words.push(text);
+        }
+    }
+    words
 }

@@ -6,6 +6,7 @@
 //! Long computations between two calls belong into [`Servers::keep_alive_during`].
 
 mod address;
+mod connect;
 mod error;
 mod local;
 mod servers;

@@ -6,27 +6,17 @@ use std::time::Duration;
 
 use tokio::runtime::{Builder, Runtime};
 use tokio::sync::oneshot;
-use tonic::transport::{Channel, Endpoint};
+use tonic::transport::Channel;
 
 use super::address::Address;
-use super::error::ClientError;
+use super::connect::{Machines, connect, first_of, in_short, machines, own_turn};
+use super::error::{ClientError, describe};
 use super::local::{LocalServer, LocalServerOptions};
 use crate::proto;
 use crate::proto::perturb_client::PerturbClient;
 
-/// How long a connection may take to be made.
-const CONNECT_LIMIT: Duration = Duration::from_secs(5);
 /// How long a server may take for one reply; also that of a batch of thousands of environments comes much sooner.
 pub(super) const REPLY_LIMIT: Duration = Duration::from_secs(60);
-/// After so long without a word from the server it is asked whether it lives …
-const KEEPALIVE_INTERVAL: Duration = Duration::from_secs(5);
-/// … and is taken for dead after so long without an answer.
-const KEEPALIVE_LIMIT: Duration = Duration::from_secs(15);
-/// The largest reply that is accepted, in bytes.
-const LARGEST_MESSAGE: usize = 256 << 20;
-/// Flow-control window, in bytes: a reply of a large batch must not wait for permission to be sent.
-const WINDOW: u32 = 16 << 20;
-
 /// Connections to servers, all of which serve the same environments.
 #[derive(Debug)]
 pub struct Servers {
@@ -55,17 +45,72 @@ impl Servers {
         Ok(servers)
     }
 
-    /// Connects to every server of `addresses`, of which there must be at least one. Proxy settings are ignored.
+    /// Connects to every server of `addresses`, of which there must be at least one, and which share each batch. A name
+    /// that stands for several machines counts as one server: any of them. Proxy settings are ignored.
     ///
     /// # Errors
-    /// [`ClientError::Connect`] if one does not answer within 5 s.
+    /// [`ClientError::Connect`] if one does not answer within some seconds, or is shutting down.
     pub fn connect(addresses: &[Address]) -> Result<Self, ClientError> {
-        let runtime = Builder::new_current_thread()
-            .enable_all()
-            .build()
-            .map_err(|source| ClientError::System { action: "start the network runtime", source })?;
-        let links = addresses.iter().map(|address| runtime.block_on(connect(address))).collect::<Result<_, _>>()?;
+        let runtime = runtime()?;
+        let one = |address| async move { any_of(address, machines(address).await?.into_order(own_turn())).await };
+        let links = addresses.iter().map(|address| runtime.block_on(one(address))).collect::<Result<_, _>>()?;
         Ok(Self { links, runtime, local: None })
+    }
+
+    /// Connects to one server of `addresses`, where every machine that a name stands for counts: to number `turn`, counted
+    /// around, or to the next one that takes sessions. Whoever has successive turns spreads evenly.
+    ///
+    /// # Errors
+    /// [`ClientError::Connect`] if there is only one and it does not take sessions, [`ClientError::NoneConnects`] if none
+    /// of several does.
+    pub fn connect_to_one(addresses: &[Address], turn: usize) -> Result<Self, ClientError> {
+        let runtime = runtime()?;
+        let link = runtime.block_on(async {
+            let (all, mut errors) = all_machines(addresses).await;
+            match first_of(&all.into_order(turn)).await {
+                Ok(link) => Ok(link),
+                Err(others) => {
+                    errors.extend(others);
+                    Err(none_connects(errors))
+                }
+            }
+        })?;
+        Ok(Self { links: vec![link], runtime, local: None })
+    }
+
+    /// Connects to all servers of `addresses` that take sessions, where every machine that a name stands for counts, and
+    /// says what is wrong with the others.
+    ///
+    /// # Errors
+    /// Those of [`Servers::connect_to_one`].
+    pub fn connect_to_some(addresses: &[Address]) -> Result<(Self, Vec<ClientError>), ClientError> {
+        let runtime = runtime()?;
+        let (links, errors) = runtime.block_on(async {
+            let (all, mut errors) = all_machines(addresses).await;
+            let mut links = Vec::new();
+            for address in &all.equal {
+                match connect(address).await {
+                    Ok(link) => links.push(link),
+                    Err(error) => errors.push(error),
+                }
+            }
+            if links.is_empty() {
+                match first_of(&all.spare).await {
+                    Ok(link) => links.push(link),
+                    Err(others) => errors.extend(others),
+                }
+            }
+            (links, errors)
+        });
+        if links.is_empty() {
+            return Err(none_connects(errors));
+        }
+        Ok((Self { links, runtime, local: None }, errors))
+    }
+
+    /// Where the servers are, one address for each connection.
+    pub fn addresses(&self) -> impl Iterator<Item = &Address> {
+        self.links.iter().map(|link| &link.address)
     }
 
     /// The connections, in the order of their addresses.
@@ -165,46 +210,37 @@ impl Servers {
     }
 }
 
-async fn connect(address: &Address) -> Result<Link, ClientError> {
-    let fail = |error: tonic::transport::Error| ClientError::Connect {
-        address: address.clone(),
-        reason: causes(&error).join(": "),
-    };
-    let channel = Endpoint::from_shared(address.to_string())
-        .map_err(fail)?
-        .connect_timeout(CONNECT_LIMIT)
-        .tcp_nodelay(true)
-        .http2_keep_alive_interval(KEEPALIVE_INTERVAL)
-        .keep_alive_timeout(KEEPALIVE_LIMIT)
-        .initial_stream_window_size(WINDOW)
-        .initial_connection_window_size(WINDOW)
-        .connect()
-        .await
-        .map_err(fail)?;
-    let client = PerturbClient::new(channel)
-        .max_decoding_message_size(LARGEST_MESSAGE)
-        .max_encoding_message_size(LARGEST_MESSAGE);
-    Ok(Link { address: address.clone(), client })
+fn runtime() -> Result<Runtime, ClientError> {
+    Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .map_err(|source| ClientError::System { action: "start the network runtime", source })
 }
 
-/// A status in words, with the transport's cause.
-fn describe(status: &tonic::Status) -> String {
-    let mut words = vec![format!("{} ({:?})", status.message(), status.code())];
-    if let Some(source) = std::error::Error::source(status) {
-        words.extend(causes(source));
-    }
-    words.dedup();
-    words.join(": ")
-}
-
-/// An error and its causes; without those whose words are contained in others.
-fn causes(error: &dyn std::error::Error) -> Vec<String> {
-    let chain = std::iter::successors(Some(error), |error| error.source());
-    let mut words: Vec<String> = Vec::new();
-    for text in chain.map(ToString::to_string) {
-        if !words.iter().any(|known| known.contains(&text)) {
-            words.push(text);
+/// The machines of all addresses, and what is wrong with names that stand for none.
+async fn all_machines(addresses: &[Address]) -> (Machines, Vec<ClientError>) {
+    let (mut all, mut errors) = (Machines::default(), Vec::new());
+    for address in addresses {
+        match machines(address).await {
+            Ok(found) => all.extend(found),
+            Err(error) => errors.push(error),
         }
     }
-    words
+    (all, errors)
+}
+
+/// Connects to one of the machines that `address` stands for.
+async fn any_of(address: &Address, machines: Vec<Address>) -> Result<Link, ClientError> {
+    first_of(&machines).await.map_err(|errors| match none_connects(errors) {
+        ClientError::NoneConnects { reasons } => ClientError::Connect { address: address.clone(), reason: reasons },
+        error => error,
+    })
+}
+
+/// The errors of all addresses as one.
+fn none_connects(mut errors: Vec<ClientError>) -> ClientError {
+    if errors.len() == 1 {
+        return errors.remove(0);
+    }
+    ClientError::NoneConnects { reasons: errors.iter().map(in_short).collect::<Vec<_>>().join("; ") }
 }

@@ -208,9 +208,17 @@ fn lost_server(error: &anyhow::Error) -> bool {
         });
         direct.or(collecting).or(testing)
     });
-    use ClientError::{Connect, Disagreement, Lost, NoServerProgram, Protocol, Refused, Start, System, TimedOut};
+    use ClientError::{
+        Connect, Disagreement, Lost, NoServerProgram, NoneConnects, Protocol, Refused, Start, System, TimedOut,
+    };
     client.is_some_and(|error| match error {
-        Connect { .. } | Lost { .. } | TimedOut { .. } | NoServerProgram { .. } | Start { .. } | System { .. } => true,
+        Connect { .. }
+        | NoneConnects { .. }
+        | Lost { .. }
+        | TimedOut { .. }
+        | NoServerProgram { .. }
+        | Start { .. }
+        | System { .. } => true,
         Disagreement { .. } | Protocol { .. } => true, // servers of another version
         Refused { code, .. } => *code == tonic::Code::ResourceExhausted as i32, // full; others' sessions will end
         _ => false,

@@ -382,8 +382,8 @@ fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
 ///
 /// # Errors
 /// [`FolderError::Io`].
-pub(crate) fn write_atomically(path: &Path, content: &[u8]) -> Result<()> {
-    let directory = path.parent().unwrap_or(Path::new("."));
+pub fn write_atomically(path: &Path, content: &[u8]) -> Result<()> {
+    let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
     fs::create_dir_all(directory).map_err(io("create", directory))?;
     // As readable as any other file that is created here; temporary files are otherwise their owner's alone.
     let mode = <fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666);

@@ -22,12 +22,13 @@ pub use cost::{Estimate, Measurement, Speed, Work, estimate, measure, representa
 pub use curves::{Curve, EnvironmentCurves, Point, curves_csv, read_curves};
 pub use folder::{
     CellFolder, CellLock, CellResult, CellState, Failure, FailureMark, Folder, FolderError, Timing, Training,
+    write_atomically,
 };
 pub use heatmap::{Axis, Heatmap, HeatmapError, HeatmapOptions, MOST_POINTS, default_axes, heatmap, heatmap_csv};
 pub use heatmaps::{
     HeatmapPlace, HeatmapRecord, NoHeatmap, StoredHeatmap, heatmap_files, heatmap_places, store_heatmap,
 };
 pub use plan::{Cell, Counts, Learner, Plan, PlanError, Tests};
-pub use run::{BUSY, NO_SERVER, RunEnd, RunError, RunOptions, RunStatus, run};
+pub use run::{Attempt, BUSY, NO_SERVER, RunEnd, RunError, RunOptions, RunStatus, run};
 pub use selection::{Group, Metric, Results, Selected, average, interquartile};
 pub use statistics::{Iqm, Summary, interquartile_mean};

@@ -18,13 +18,18 @@ pub const BUSY: u8 = 75;
 pub const NO_SERVER: u8 = 69;
 /// A worker's exit status if its command makes no sense to it.
 const USAGE: i32 = 2;
-/// How often a worker may be killed before its cell counts as failed, or be without a server before the run ends.
+/// How often a worker may be killed before its cell counts as failed.
 const MOST_ATTEMPTS: u32 = 3;
+/// How often in a row the worker of a cell may be without a server before the run ends: after some fifteen seconds, in
+/// which a server may have been started again.
+const MOST_LOSSES: u32 = 5;
+/// A worker that ran for so long had a server, whatever became of it: what is lost then is not lost in a row.
+const HAD_A_SERVER: Duration = Duration::from_secs(60);
 /// How often it is said how far the run is, which looks at every cell that is left.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 /// How often workers are looked at.
 const TICK: Duration = Duration::from_millis(50);
-/// How long no worker is started after one had no server.
+/// How long no worker is started after one had no server; doubled at each time in a row.
 const SERVER_PAUSE: Duration = Duration::from_secs(1);
 /// How often cells are looked at that others work on.
 const BUSY_INTERVAL: Duration = Duration::from_secs(1);
@@ -35,11 +40,19 @@ pub struct RunOptions<'a> {
     pub jobs: usize,
     /// Whether cells that have failed before are tried again.
     pub retry_failed: bool,
-    /// Makes the command of a worker for a cell, which may forget this failure and no other; its standard input is set
-    /// here.
-    pub worker: &'a dyn Fn(&Cell, Option<FailureMark>) -> std::io::Result<Command>,
+    /// Makes the command of a worker for a cell; its standard input is set here.
+    pub worker: &'a dyn Fn(&Cell, Attempt) -> std::io::Result<Command>,
     /// Says what is wrong with the servers; `None` while nothing is known to be.
     pub server_trouble: &'a dyn Fn() -> Option<String>,
+}
+
+/// What a worker is told of those before it.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Attempt {
+    /// The failure that it may forget, and no other.
+    pub retry: Option<FailureMark>,
+    /// How many servers earlier workers of its cell have lost.
+    pub losses: u32,
 }
 
 /// How far a run is.
@@ -93,6 +106,26 @@ struct Job {
     start: Instant,
 }
 
+/// How often a cell's worker had no server, or lost it.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Losses {
+    all: u32,
+    in_a_row: u32,
+}
+
+impl Losses {
+    /// One more, of a worker that had run for `time`.
+    fn add(&mut self, time: Duration) {
+        self.all += 1;
+        self.in_a_row = if time < HAD_A_SERVER { self.in_a_row + 1 } else { 1 };
+    }
+
+    /// How long to wait before the next try; `None` if there should be none.
+    fn pause(self) -> Option<Duration> {
+        (self.in_a_row < MOST_LOSSES).then(|| SERVER_PAUSE * (1 << self.in_a_row.saturating_sub(1)))
+    }
+}
+
 struct Runner<'a> {
     plan: &'a Plan,
     folder: &'a Folder,
@@ -107,8 +140,7 @@ struct Runner<'a> {
     done: usize,
     failed: Vec<usize>,
     attempts: HashMap<usize, u32>,
-    /// How often a cell's worker had no server.
-    lost: HashMap<usize, u32>,
+    lost: HashMap<usize, Losses>,
     paused_until: Option<Instant>,
     times: Times<'a>,
 }
@@ -212,8 +244,9 @@ impl<'a> Runner<'a> {
             if self.settled(cell) {
                 continue;
             }
-            let forgiven = self.forgiven.get(&cell).copied();
-            let mut command = (self.options.worker)(&self.plan.cells[cell], forgiven).map_err(RunError::Spawn)?;
+            let losses = self.lost.get(&cell).copied().unwrap_or_default().all;
+            let attempt = Attempt { retry: self.forgiven.get(&cell).copied(), losses };
+            let mut command = (self.options.worker)(&self.plan.cells[cell], attempt).map_err(RunError::Spawn)?;
             let child = command.stdin(Stdio::piped()).spawn().map_err(RunError::Spawn)?;
             self.running.push(Job { cell, child, start: Instant::now() });
         }
@@ -226,14 +259,15 @@ impl<'a> Runner<'a> {
         for job in std::mem::take(&mut self.running) {
             let Job { cell, mut child, start } = job;
             match child.try_wait().map_err(RunError::Spawn)? {
-                Some(status) => ended.push((cell, status)),
+                Some(status) => ended.push((cell, status, start.elapsed())),
                 None => self.running.push(Job { cell, child, start }),
             }
         }
-        ended.into_iter().try_for_each(|(cell, status)| self.conclude(cell, status))
+        ended.into_iter().try_for_each(|(cell, status, time)| self.conclude(cell, status, time))
     }
 
-    fn conclude(&mut self, cell: usize, status: ExitStatus) -> Result<(), RunError> {
+    /// Takes note of the end of a worker that has run for `time`.
+    fn conclude(&mut self, cell: usize, status: ExitStatus, time: Duration) -> Result<(), RunError> {
         if self.settled(cell) {
             return Ok(());
         }
@@ -242,15 +276,15 @@ impl<'a> Runner<'a> {
             return Ok(());
         }
         if status.code() == Some(NO_SERVER.into()) {
-            let lost = self.lost.entry(cell).or_default();
-            *lost += 1;
-            if *lost >= MOST_ATTEMPTS {
+            let losses = self.lost.entry(cell).or_default();
+            losses.add(time);
+            let Some(pause) = losses.pause() else {
                 let id = &self.plan.cells[cell].id;
                 return Err(RunError::NoServer(format!("{id}: {}", self.last_words(cell))));
-            }
+            };
             // At the front: if the servers are gone, the run ends soon, however many cells it has.
             self.queue.push_front(cell);
-            self.paused_until = Some(Instant::now() + SERVER_PAUSE);
+            self.paused_until = Some(Instant::now() + pause);
             return Ok(());
         }
         if status.code() == Some(USAGE) {

@@ -18,11 +18,12 @@ fn run_with(
     stop: &StopFlag,
     script: &dyn Fn(&Cell, &Path) -> String,
 ) -> Result<RunEnd, RunError> {
-    let worker = |cell: &Cell, _: Option<FailureMark>| {
+    let worker = |cell: &Cell, attempt: Attempt| {
         let place = folder.cell(&cell.id);
         std::fs::create_dir_all(place.path())?;
         let mut command = Command::new("sh");
         command.arg("-c").arg(script(cell, place.path())).current_dir(place.path());
+        command.env("LOSSES", attempt.losses.to_string());
         Ok(command)
     };
     let options = RunOptions { jobs, retry_failed, worker: &worker, server_trouble: &|| None };
@@ -92,9 +93,10 @@ fn a_worker_that_is_killed_is_started_again_but_not_for_ever() {
 fn a_lost_server_or_plan_ends_the_run_and_blames_no_cell() {
     let directory = tempfile::tempdir().unwrap();
     let folder = Folder::new(directory.path());
-    let script = |_: &Cell, _: &Path| "echo gone > log.txt; exit 69".to_owned();
+    let script = |_: &Cell, _: &Path| "echo x >> count; echo gone > log.txt; exit 69".to_owned();
     let error = run_with(&folder, 1, false, &StopFlag::default(), &script).unwrap_err().to_string();
     assert!(error.contains("without a server") && error.contains("gone"), "{error}");
+    assert_eq!(lines(&folder.cell(&plan().cells[0].id).path().join("count")), 5);
     let script = |_: &Cell, _: &Path| "echo no such cell > log.txt; exit 2".to_owned();
     let error = run_with(&folder, 1, false, &StopFlag::default(), &script).unwrap_err().to_string();
     assert!(error.contains("refused its command: no such cell"), "{error}");
@@ -106,12 +108,26 @@ fn a_server_that_was_lost_for_a_moment_does_not_end_the_run() {
     let directory = tempfile::tempdir().unwrap();
     let folder = Folder::new(directory.path());
     let script = |cell: &Cell, _: &Path| match cell.index {
-        0 => "echo x >> count; test $(wc -l < count) = 3 || exit 69; echo x > result.json".to_owned(),
+        0 => "echo $LOSSES >> count; test $(wc -l < count) = 3 || exit 69; echo x > result.json".to_owned(),
         _ => "echo x > result.json".to_owned(),
     };
     let end = run_with(&folder, 1, false, &StopFlag::default(), &script).unwrap();
     assert_eq!(end, RunEnd::Finished { failed: Vec::new() });
-    assert_eq!(lines(&folder.cell(&plan().cells[0].id).path().join("count")), 3);
+    let losses = std::fs::read_to_string(folder.cell(&plan().cells[0].id).path().join("count")).unwrap();
+    assert_eq!(losses, "0\n1\n2\n", "each worker knows how many servers the earlier ones have lost");
+}
+
+#[test]
+fn servers_that_are_lost_in_a_row_are_waited_for_longer_and_longer_and_not_for_ever() {
+    let mut losses = Losses::default();
+    let mut pause = |seconds: u64| {
+        losses.add(Duration::from_secs(seconds));
+        losses.pause().map(|pause| pause.as_secs())
+    };
+    assert_eq!([0, 59, 0, 3].map(&mut pause), [1, 2, 4, 8].map(Some));
+    assert_eq!([60, 0].map(&mut pause), [1, 2].map(Some), "a worker that ran for a minute had a server");
+    assert_eq!([0, 0, 0].map(&mut pause), [Some(4), Some(8), None]);
+    assert_eq!(losses.all, 9);
 }
 
 #[test]

@@ -1,0 +1,20 @@
+#!/bin/sh
+# skeleton.sh DIR: makes in DIR what decides how the dependencies are built: the manifests of the workspace in the
+# current directory, around empty programs. It stays the same when sources are edited, and with it the image's layer of
+# compiled dependencies, of which libtorch's bindings take minutes.
+set -eu
+out=$1
+mkdir -p "$out"
+cp -R .cargo Cargo.lock "$out"
+find . -name Cargo.toml | while read -r manifest; do
+    package=$out/$(dirname "$manifest")
+    mkdir -p "$package/src"
+    # Targets that are named need their files; none is part of an image.
+    sed -E '/^\[\[(bench|test|example)\]\]/,/^$/d' "$manifest" >"$package/Cargo.toml"
+    echo '//! Empty.' >"$package/src/lib.rs"
+    for program in src/main.rs build.rs; do
+        if [ -e "$(dirname "$manifest")/$program" ]; then
+            printf '//! Empty.\n\nfn main() {}\n' >"$package/$program"
+        fi
+    done
+done

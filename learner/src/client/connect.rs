@@ -1,0 +1,203 @@
+//! Making one connection: which machine stands for a name, and whether it takes sessions.
+
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::net::{IpAddr, SocketAddr};
+use std::time::Duration;
+
+use tokio::time::timeout;
+use tonic::Code;
+use tonic::transport::{Channel, Endpoint};
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_client::HealthClient;
+
+use super::address::Address;
+use super::error::{ClientError, causes, describe};
+use super::servers::Link;
+use crate::proto::perturb_client::PerturbClient;
+
+/// How long each part of making a connection may take.
+const CONNECT_LIMIT: Duration = Duration::from_secs(5);
+/// After so long without a word from the server it is asked whether it lives …
+const KEEPALIVE_INTERVAL: Duration = Duration::from_secs(5);
+/// … and is taken for dead after so long without an answer.
+const KEEPALIVE_LIMIT: Duration = Duration::from_secs(15);
+/// The largest reply that is accepted, in bytes.
+const LARGEST_MESSAGE: usize = 256 << 20;
+/// Flow-control window, in bytes: a reply of a large batch must not wait for permission to be sent.
+const WINDOW: u32 = 16 << 20;
+/// What must be served.
+const SERVICE: &str = "perturb.v1.Perturb";
+
+/// The machines that addresses stand for.
+#[derive(Debug, Default, PartialEq)]
+pub(super) struct Machines {
+    /// Any of these is as good as the others.
+    pub(super) equal: Vec<Address>,
+    /// Other ways to the same machines, by the protocol family that the system likes less.
+    pub(super) spare: Vec<Address>,
+}
+
+impl Machines {
+    /// All of them, beginning with number `turn` of the equal ones, counted around.
+    pub(super) fn into_order(mut self, turn: usize) -> Vec<Address> {
+        if !self.equal.is_empty() {
+            let first = turn % self.equal.len();
+            self.equal.rotate_left(first);
+        }
+        self.equal.append(&mut self.spare);
+        self.equal
+    }
+
+    pub(super) fn extend(&mut self, other: Self) {
+        self.equal.extend(other.equal);
+        self.spare.extend(other.spare);
+    }
+}
+
+/// The machines behind `address`: several if it has a name that stands for several, as that of a service whose replicas
+/// share it. Their order is the same wherever it is asked, whatever the order of the answer.
+pub(super) async fn machines(address: &Address) -> Result<Machines, ClientError> {
+    let one = || Machines { equal: vec![address.clone()], spare: Vec::new() };
+    let Address::Tcp { host, port } = address else { return Ok(one()) };
+    if host.parse::<IpAddr>().is_ok() {
+        return Ok(one());
+    }
+    let fail = |reason| ClientError::Connect { address: address.clone(), reason };
+    let found: Vec<SocketAddr> = timeout(CONNECT_LIMIT, tokio::net::lookup_host((host.as_str(), *port)))
+        .await
+        .map_err(|_| fail(format!("its name was not resolved within {} s", CONNECT_LIMIT.as_secs())))?
+        .map_err(|error| fail(format!("its name cannot be resolved: {error}")))?
+        .collect();
+    // The name says more than a number, as long as it is clear whom it means.
+    Ok(if found.len() > 1 { sorted(found) } else { one() })
+}
+
+fn sorted(mut found: Vec<SocketAddr>) -> Machines {
+    let liked = found.first().is_some_and(SocketAddr::is_ipv4); // a resolver puts what can be reached first
+    found.sort_unstable();
+    found.dedup();
+    let (equal, spare): (Vec<_>, Vec<_>) = found.into_iter().partition(|found| found.is_ipv4() == liked);
+    let address = |found: SocketAddr| Address::Tcp { host: found.ip().to_string(), port: found.port() };
+    Machines { equal: equal.into_iter().map(address).collect(), spare: spare.into_iter().map(address).collect() }
+}
+
+/// A turn for a process that has no other: processes on one machine have different numbers, containers different names.
+pub(super) fn own_turn() -> usize {
+    let mut hasher = DefaultHasher::new(); // always with the same key
+    std::fs::read("/proc/sys/kernel/hostname").unwrap_or_default().hash(&mut hasher);
+    std::process::id().hash(&mut hasher);
+    hasher.finish() as usize
+}
+
+/// Connects to the first of `machines`, of which there must be at least one, that takes sessions.
+pub(super) async fn first_of(machines: &[Address]) -> Result<Link, Vec<ClientError>> {
+    let mut errors = Vec::new();
+    for (index, address) in machines.iter().enumerate() {
+        match connect(address).await {
+            Ok(link) => return Ok(link),
+            Err(error) => {
+                if index + 1 < machines.len() {
+                    tracing::warn!("{}; trying the next server", in_short(&error));
+                }
+                errors.push(error);
+            }
+        }
+    }
+    Err(errors)
+}
+
+/// Which address and why, for a list of several.
+pub(super) fn in_short(error: &ClientError) -> String {
+    match error {
+        ClientError::Connect { address, reason } => format!("{address}: {reason}"),
+        other => other.to_string(),
+    }
+}
+
+/// Connects to `address`, whose server must take sessions: one that is shutting down still answers.
+pub(super) async fn connect(address: &Address) -> Result<Link, ClientError> {
+    let fail = |reason: String| ClientError::Connect { address: address.clone(), reason };
+    let transport = |error: tonic::transport::Error| fail(causes(&error).join(": "));
+    let channel = Endpoint::from_shared(address.to_string())
+        .map_err(transport)?
+        .connect_timeout(CONNECT_LIMIT)
+        .tcp_nodelay(true)
+        .http2_keep_alive_interval(KEEPALIVE_INTERVAL)
+        .keep_alive_timeout(KEEPALIVE_LIMIT)
+        .initial_stream_window_size(WINDOW)
+        .initial_connection_window_size(WINDOW)
+        .connect()
+        .await
+        .map_err(transport)?;
+    takes_sessions(&channel).await.map_err(fail)?;
+    let client = PerturbClient::new(channel)
+        .max_decoding_message_size(LARGEST_MESSAGE)
+        .max_encoding_message_size(LARGEST_MESSAGE);
+    Ok(Link { address: address.clone(), client })
+}
+
+/// Asks a server for its health. A stopped or overloaded machine may accept connections and never answer.
+async fn takes_sessions(channel: &Channel) -> Result<(), String> {
+    let request = HealthCheckRequest { service: SERVICE.into() };
+    let answer = timeout(CONNECT_LIMIT, HealthClient::new(channel.clone()).check(request))
+        .await
+        .map_err(|_| format!("it accepted the connection, but did not answer within {} s", CONNECT_LIMIT.as_secs()))?;
+    match answer.map(|reply| reply.into_inner().status()) {
+        Ok(ServingStatus::NotServing) => Err("it is shutting down".into()),
+        Ok(_) => Ok(()),
+        Err(status) => match status.code() {
+            // Something in between that lets only perturb's own calls through.
+            Code::NotFound | Code::PermissionDenied | Code::Unauthenticated | Code::Unimplemented => Ok(()),
+            _ => Err(describe(&status)),
+        },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn addresses(texts: &[&str]) -> Vec<Address> {
+        texts.iter().map(|text| text.parse().unwrap()).collect()
+    }
+
+    fn found(texts: &[&str]) -> Vec<SocketAddr> {
+        texts.iter().map(|text| text.parse().unwrap()).collect()
+    }
+
+    #[test]
+    fn replicas_have_an_order_of_their_own_and_turns_go_around() {
+        let answers = [["10.0.0.9:7", "10.0.0.10:7", "10.0.0.2:7"], ["10.0.0.2:7", "10.0.0.9:7", "10.0.0.10:7"]];
+        for answer in answers {
+            let turn = |turn| sorted(found(&answer)).into_order(turn);
+            assert_eq!(turn(0), addresses(&["10.0.0.2:7", "10.0.0.9:7", "10.0.0.10:7"]));
+            assert_eq!(turn(1), addresses(&["10.0.0.9:7", "10.0.0.10:7", "10.0.0.2:7"]));
+            assert_eq!(turn(5), addresses(&["10.0.0.10:7", "10.0.0.2:7", "10.0.0.9:7"]));
+        }
+    }
+
+    #[test]
+    fn a_machine_with_two_protocols_is_one_machine() {
+        let machines = sorted(found(&["127.0.0.1:7", "[::1]:7", "127.0.0.1:7"]));
+        assert_eq!(machines.equal, addresses(&["127.0.0.1:7"]));
+        for turn in 0..3 {
+            assert_eq!(
+                sorted(found(&["127.0.0.1:7", "[::1]:7"])).into_order(turn),
+                addresses(&["127.0.0.1:7", "[::1]:7"])
+            );
+        }
+        assert_eq!(sorted(found(&["[::1]:7", "127.0.0.1:7"])).equal, addresses(&["[::1]:7"]));
+    }
+
+    #[test]
+    fn numbers_and_sockets_stand_for_themselves() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        for text in ["10.1.2.3:7", "[::1]:7", "unix:/a"] {
+            let machines = runtime.block_on(machines(&text.parse().unwrap())).unwrap();
+            assert_eq!(machines.equal, addresses(&[text]));
+        }
+        let error = runtime.block_on(machines(&"no-such-host.invalid:7".parse().unwrap())).unwrap_err().to_string();
+        assert!(error.contains("http://no-such-host.invalid:7: its name"), "{error}");
+    }
+}
