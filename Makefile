@@ -2,6 +2,8 @@
 
 # Debian 12's packages: a compiler, libclang for bindgen, MuJoCo, libtorch, and a BLAS that is not the slow reference one.
 PACKAGES := build-essential pkg-config libclang-dev libmujoco-dev libtorch-dev libopenblas0-pthread
+# A whole Slurm on one machine, for its test.
+SLURM_PACKAGES := slurmctld slurmd slurm-client munge
 CARGO_DENY_VERSION := 0.20.2
 TARGET := $(or $(CARGO_TARGET_DIR),target)
 PROGRAMS := $(TARGET)/release
@@ -42,7 +44,7 @@ missing=; \
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help deps toolchain build demo all-pairs test lint bench audit cargo-deny python-test python-wheel python-acceptance \
+.PHONY: help deps toolchain build demo all-pairs test slurm-test slurm-acceptance lint bench audit cargo-deny python-test python-wheel python-acceptance \
 	python-server python-venv
 
 help: ## this list
@@ -66,6 +68,13 @@ all-pairs: build ## train and test every algorithm and architecture on every env
 test: deps ## run all tests, then those of the server without MuJoCo
 	cargo test $(ALL)
 	cargo test $(WITHOUT_MUJOCO)
+
+slurm-test: deps ## do a plan on a real Slurm of two nodes, started for it, one of which dies
+	@$(call install,$(SLURM_PACKAGES))
+	PERTURB_SLURM_REQUIRED=1 cargo test $(ALL) --test slurm
+
+slurm-acceptance: ## the same with experiments/quick.toml
+	PERTURB_SLURM_PLAN=$(CURDIR)/experiments/quick.toml $(MAKE) slurm-test
 
 lint: deps cargo-deny ## check formatting, clippy, documentation and dependencies
 	cargo fmt --all --check
