@@ -4,6 +4,8 @@
 PACKAGES := build-essential pkg-config libclang-dev libmujoco-dev libtorch-dev libopenblas0-pthread
 # What draws Hopper and HalfCheetah: OpenGL without a display, in software. The server runs without it.
 OPENGL := libegl1 libgl1-mesa-dri
+# A whole Slurm on one machine, for its test.
+SLURM_PACKAGES := slurmctld slurmd slurm-client munge
 CARGO_DENY_VERSION := 0.20.2
 TARGET := $(or $(CARGO_TARGET_DIR),target)
 PROGRAMS := $(TARGET)/release
@@ -50,7 +52,7 @@ missing=; \
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help deps opengl toolchain build demo all-pairs report-check test lint bench audit cargo-deny python-test python-wheel python-acceptance \
+.PHONY: help deps opengl toolchain build demo all-pairs report-check test slurm-test slurm-acceptance lint bench audit cargo-deny python-test python-wheel python-acceptance \
 	python-server python-venv docker docker-base docker-test
 
 help: ## this list
@@ -82,6 +84,13 @@ test: export PERTURB_TEST_DM_ENV_RPC_PYTHON := $(abspath $(DM_ENV_RPC))/bin/pyth
 test: deps opengl $(DM_ENV_RPC)/installed ## run all tests, then those of the server without MuJoCo
 	cargo test $(ALL)
 	cargo test $(WITHOUT_MUJOCO)
+
+slurm-test: deps ## do a plan on a real Slurm of two nodes, started for it, one of which dies
+	@$(call install,$(SLURM_PACKAGES))
+	PERTURB_SLURM_REQUIRED=1 cargo test $(ALL) --test slurm
+
+slurm-acceptance: ## the same with experiments/quick.toml
+	PERTURB_SLURM_PLAN=$(CURDIR)/experiments/quick.toml $(MAKE) slurm-test
 
 lint: deps cargo-deny ## check formatting, clippy, documentation and dependencies
 	cargo fmt --all --check

@@ -324,8 +324,60 @@ fn a_wrong_command_is_refused_before_anything_is_done() {
     let output = experiment.run("out", &["--cell", "8"]);
     assert_eq!(output.status.code(), Some(2));
     assert!(stderr(&output).contains("give an index from 0 to 7"), "{}", stderr(&output));
-    let output = experiment.run("out", &["--cell", "1", "--jobs", "2"]);
-    assert_eq!(output.status.code(), Some(2));
+    let wrong: [&[&str]; 7] = [
+        &["--cell", "1,2", "--exit-with-stdin"],
+        &["--cell", "1,8"],
+        &["--leave-plan"],
+        &["--time", "5"],
+        &["--engine", "slurm", "--time", "5m"],
+        &["--engine", "slurm", "--cells-per-job", "1001"],
+        &["--engine", "slurm", "--cell", "1"],
+    ];
+    for arguments in wrong {
+        let output = experiment.run("out", arguments);
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}: {}", stderr(&output));
+    }
+    assert!(!experiment.out("out").exists());
+}
+
+#[test]
+fn several_cells_are_done_and_the_missing_ones_listed() {
+    let experiment = Experiment::new(PLAN);
+    let ids: Vec<&str> = experiment.plan.cells.iter().map(|cell| cell.id.as_str()).collect();
+    let plan = |arguments: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_perturb"));
+        command
+            .arg("plan")
+            .arg(experiment.out("file.toml"))
+            .args(arguments)
+            .arg("--missing")
+            .arg(experiment.out("out"));
+        let output = command.output().expect("ended");
+        succeeded(&output);
+        String::from_utf8(output.stdout).expect("text")
+    };
+    assert_eq!(plan(&[]).lines().count(), 8);
+    succeeded(&experiment.run("out", &["--cell", &format!("1,{}", ids[3]), "--jobs", "2"]));
+    let results = experiment.results("out");
+    assert!(results.len() == 2 && results.contains_key(ids[1]) && results.contains_key(ids[3]));
+    let mut attempts = [0; 8];
+    (attempts[1], attempts[3]) = (1, 1);
+    assert_eq!(experiment.attempts("out"), attempts, "in worker processes");
+    let lines = plan(&[]);
+    let first: Vec<String> = lines.lines().take(2).map(|line| line.trim().replace("  ", " ")).collect();
+    assert_eq!(first, [format!("0 {}", ids[0]), format!("2 {}", ids[2])]);
+    let listed: serde_json::Value = serde_json::from_str(&plan(&["--json"])).expect("JSON");
+    assert_eq!(listed.as_array().map(Vec::len), Some(6));
+    assert_eq!(listed[1], serde_json::json!({ "index": 2, "id": ids[2] }));
+
+    // The folder's plan stays if it is told to.
+    let kept = || std::fs::read_to_string(experiment.out("out/plan.toml")).expect("a plan");
+    let before = kept();
+    std::fs::write(experiment.out("file.toml"), format!("{PLAN}\n# extended")).expect("written");
+    succeeded(&experiment.run("out", &["--cell", "0", "--leave-plan", "--jobs", "1"]));
+    assert_eq!(kept(), before);
+    succeeded(&experiment.run("out", &["--cell", "0"]));
+    assert_ne!(kept(), before);
 }
 
 fn shipped(name: &str) -> PathBuf {

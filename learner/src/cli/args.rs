@@ -8,6 +8,7 @@ use crate::client::Address;
 use crate::config::{AlgorithmName, Architecture};
 use crate::evaluation::Version;
 use crate::experiment::FailureMark;
+use crate::experiment::slurm::TimeLimit;
 
 /// Trains policies over environment servers and tests whether they still work when the physics changes.
 #[derive(Debug, Parser)]
@@ -159,6 +160,12 @@ pub(super) struct PlanArgs {
     /// List the cells with their indices and ids.
     #[arg(long)]
     pub(super) cells: bool,
+    /// List the cells that have neither a result in this folder nor failed there, and nothing else.
+    #[arg(long, value_name = "DIR", conflicts_with = "cells")]
+    pub(super) missing: Option<PathBuf>,
+    /// List --cells or --missing as JSON, and nothing else.
+    #[arg(long)]
+    pub(super) json: bool,
     /// Seconds that each measured training takes; 0 measures nothing and gives no estimate.
     #[arg(long, value_name = "SECONDS", default_value_t = 3)]
     pub(super) measure: u64,
@@ -174,29 +181,63 @@ pub(super) struct RunArgs {
     /// Directory of the results; what is done there already is kept.
     #[arg(long, value_name = "DIR")]
     pub(super) out: PathBuf,
-    /// Trainings at a time [default: one a core].
+    /// Trainings at a time [default: one a core; with --engine, one in each of its jobs].
     #[arg(long, value_name = "N", value_parser = at_least_one)]
     pub(super) jobs: Option<usize>,
     /// Try cells again that have failed.
     #[arg(long)]
     pub(super) retry_failed: bool,
-    /// Do this cell only, by its index or id, in this process.
-    #[arg(long, value_name = "K", conflicts_with = "jobs")]
-    pub(super) cell: Option<String>,
+    /// Do these cells only, by index or id, separated by commas: one in this process, several, or with --jobs, in worker
+    /// processes.
+    #[arg(long, value_name = "K", value_delimiter = ',')]
+    pub(super) cell: Vec<String>,
     /// When nothing is left to do, also write the report, as `perturb report DIR --html FILE` does.
     #[arg(long, value_name = "FILE", conflicts_with = "cell")]
     pub(super) html: Option<PathBuf>,
     /// With --cell and several servers: how many of them earlier tries have lost, so that the next one's turn comes.
     #[arg(long, value_name = "N", default_value_t = 0, requires = "cell", hide = true)]
     pub(super) losses: u32,
-    /// With --cell: stop when standard input is closed, and show no progress.
-    #[arg(long)]
-    pub(super) exit_with_stdin: bool,
     /// Of a worker: try again if this is how the cell has failed, and not if it has failed once more since.
     #[arg(long, value_name = "MARK", hide = true, requires = "exit_with_stdin")]
     pub(super) retry_failure: Option<FailureMark>,
+    /// With a single --cell: stop when standard input is closed, and show no progress.
+    #[arg(long)]
+    pub(super) exit_with_stdin: bool,
+    /// With --cell: leave DIR/plan.toml as it is if there is one, also if PLAN differs.
+    #[arg(long, requires = "cell")]
+    pub(super) leave_plan: bool,
+    #[command(flatten)]
+    pub(super) engine: EngineArgs,
     #[command(flatten)]
     pub(super) server: ServerArgs,
+}
+
+/// Who schedules a run past one machine.
+#[derive(Args, Debug)]
+pub(super) struct EngineArgs {
+    /// Submit the cells as jobs of this engine, watch them, and submit again what it lost. DIR and this program must be
+    /// at the same place on all its machines. --jobs and --workers are those of each of its jobs.
+    #[arg(long, value_name = "NAME", conflicts_with_all = ["cell", "exit_with_stdin"])]
+    pub(super) engine: Option<Engine>,
+    /// Slurm's partition [default: Slurm's].
+    #[arg(long, value_name = "NAME", requires = "engine")]
+    pub(super) partition: Option<String>,
+    /// How long a job may take: minutes, or another of Slurm's forms, e.g. 1-12:00:00 [default: the partition's].
+    #[arg(long, value_name = "TIME", requires = "engine")]
+    pub(super) time: Option<TimeLimit>,
+    /// Jobs that may run at a time [default: as many as there is room for].
+    #[arg(long, value_name = "N", requires = "engine", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(super) array_limit: Option<u32>,
+    /// Cells that a job does, one after the other [default: as many as take some minutes].
+    #[arg(long, value_name = "N", requires = "engine", value_parser = at_least_one)]
+    pub(super) cells_per_job: Option<usize>,
+}
+
+/// A scheduler of jobs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum Engine {
+    /// Slurm, with its commands sbatch, squeue and scontrol.
+    Slurm,
 }
 
 #[derive(Args, Debug)]

@@ -15,6 +15,7 @@ mod plan;
 mod report;
 mod run;
 mod single_thread;
+mod slurm;
 mod train;
 
 use std::io::IsTerminal;
@@ -26,6 +27,7 @@ use clap::Parser;
 use crate::client::{LocalServerOptions, Servers};
 use crate::config::ConfigError;
 use crate::evaluation::TestError;
+use crate::experiment::slurm::OptionError;
 use crate::experiment::{HeatmapError, PlanError};
 use args::{Cli, Command, ServerArgs};
 
@@ -91,7 +93,8 @@ fn fail(error: &anyhow::Error) -> ExitCode {
         return ExitCode::SUCCESS;
     }
     eprintln!("perturb: {error:#}");
-    let usage = error.is::<ConfigError>() || error.is::<UsageError>() || error.is::<PlanError>();
+    let usage =
+        error.is::<ConfigError>() || error.is::<UsageError>() || error.is::<PlanError>() || error.is::<OptionError>();
     ExitCode::from(if usage { 2 } else { 1 })
 }
 

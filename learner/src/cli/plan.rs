@@ -5,19 +5,35 @@ use std::io::Write;
 use std::time::Duration;
 
 use anyhow::Result;
+use serde_json::json;
 
 use super::args::PlanArgs;
-use super::{Ending, servers};
+use super::{Ending, UsageError, servers};
 use crate::client::Servers;
-use crate::experiment::{Estimate, Measurement, Plan, estimate, measure, representatives};
+use crate::experiment::{Cell, Estimate, Folder, Measurement, Plan, estimate, measure, representatives};
 
 pub(super) fn run(args: &PlanArgs) -> Result<Ending> {
     let plan = Plan::load(&args.file)?;
     let mut out = std::io::stdout();
-    if args.cells {
-        for cell in &plan.cells {
-            writeln!(out, "{:>6} {}", cell.index, cell.id)?;
-        }
+    if args.json && !args.cells && args.missing.is_none() {
+        return Err(UsageError("--json lists cells: give --cells or --missing DIR with it".into()).into());
+    }
+    let folder = args.missing.as_deref().map(Folder::new);
+    let listed: Vec<&Cell> = match &folder {
+        Some(folder) => plan.cells.iter().filter(|cell| !folder.cell(&cell.id).is_settled(true)).collect(),
+        None if args.cells => plan.cells.iter().collect(),
+        None => Vec::new(),
+    };
+    if args.json {
+        let listed: Vec<_> = listed.iter().map(|cell| json!({ "index": cell.index, "id": cell.id })).collect();
+        writeln!(out, "{}", serde_json::to_string_pretty(&listed)?)?;
+        return Ok(Ending::Done);
+    }
+    for cell in listed {
+        writeln!(out, "{:>6} {}", cell.index, cell.id)?;
+    }
+    if folder.is_some() {
+        return Ok(Ending::Done);
     }
     let counts = plan.counts();
     let runs = if counts.runs == 1 { "1 run".to_owned() } else { format!("{} runs", counts.runs) };

@@ -11,14 +11,13 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::args::RunArgs;
+use super::args::{Engine, RunArgs};
 use super::bar::Bar;
 use super::plan::{duration, step_limits};
-use super::{Ending, UsageError, report, servers, single_thread};
+use super::{Ending, UsageError, report, servers, single_thread, slurm};
 use crate::client::{Address, ClientError, LocalServer, LocalServerOptions, Servers};
 use crate::experiment::{
-    Attempt, BUSY, Cell, CellEnd, FailureMark, Folder, NO_SERVER, Plan, RunEnd, RunOptions, RunStatus,
-    run as run_cells, run_cell,
+    Attempt, BUSY, Cell, CellEnd, Folder, NO_SERVER, Plan, RunEnd, RunOptions, RunStatus, run as run_cells, run_cell,
 };
 use crate::interrupt::StopFlag;
 
@@ -31,22 +30,32 @@ pub(super) fn run(args: &RunArgs) -> Result<Ending> {
     let plan = Plan::load(&args.plan)?;
     let folder = Folder::new(&args.out);
     let stop = StopFlag::on_signals().context("cannot wait for signals")?;
-    match &args.cell {
-        Some(name) => one_cell(args, &plan, &folder, name, &stop),
-        None => all_cells(args, &plan, &folder, &stop),
+    if args.engine.engine == Some(Engine::Slurm) {
+        return slurm::run(args, &plan, &stop);
+    }
+    match &args.cell[..] {
+        [name] if args.jobs.is_none() => one_cell(args, &plan, &folder, find(args, &plan, name)?, &stop),
+        [] => all_cells(args, &plan, &folder, &stop),
+        names => {
+            let cells = names.iter().map(|name| find(args, &plan, name).cloned()).collect::<Result<_, _>>()?;
+            all_cells(args, &Plan { cells, ..plan.clone() }, &folder, &stop)
+        }
     }
 }
 
-/// Does one cell in this process.
-fn one_cell(args: &RunArgs, plan: &Plan, folder: &Folder, name: &str, stop: &StopFlag) -> Result<Ending> {
-    let Some(cell) = plan.find(name) else {
-        let message = format!(
+/// The cell that --cell names.
+fn find<'a>(args: &RunArgs, plan: &'a Plan, name: &str) -> Result<&'a Cell, UsageError> {
+    plan.find(name).ok_or_else(|| {
+        UsageError(format!(
             "{} has no cell `{name}`: give an index from 0 to {}, or an id that `perturb plan --cells` prints",
             args.plan.display(),
             plan.cells.len() - 1
-        );
-        return Err(UsageError(message).into());
-    };
+        ))
+    })
+}
+
+/// Does one cell in this process.
+fn one_cell(args: &RunArgs, plan: &Plan, folder: &Folder, cell: &Cell, stop: &StopFlag) -> Result<Ending> {
     if args.exit_with_stdin {
         stop_with_input(stop)?;
     }
@@ -54,7 +63,7 @@ fn one_cell(args: &RunArgs, plan: &Plan, folder: &Folder, name: &str, stop: &Sto
     let retry = args.retry_failure.or_else(|| place.failure_mark().filter(|_| args.retry_failed));
     // A worker has its plan from there.
     if !args.exit_with_stdin {
-        keep_plan(plan, folder)?;
+        keep_plan(args, plan, folder)?;
     }
     let servers = match server_of(args, cell) {
         Ok(servers) => servers,
@@ -116,7 +125,7 @@ fn stop_with_input(stop: &StopFlag) -> Result<()> {
 /// Does all cells in worker processes.
 fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> Result<Ending> {
     if args.exit_with_stdin {
-        return Err(UsageError("--exit-with-stdin needs --cell".into()).into());
+        return Err(UsageError("--exit-with-stdin needs a single --cell, and no --jobs".into()).into());
     }
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let jobs = args.jobs.unwrap_or(cores);
@@ -126,9 +135,9 @@ fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> R
     troubles.iter().for_each(|trouble| eprintln!("perturb: {trouble}; going on with the other servers"));
     step_limits(&servers, plan)?; // refuses environments that there are not
     drop(servers);
-    keep_plan(plan, folder)?;
+    keep_plan(args, plan, folder)?;
     let addresses: Vec<String> = addresses.iter().map(Address::to_string).collect();
-    let worker = |cell: &Cell, attempt| worker(folder, cell, attempt, &addresses);
+    let worker = |cell: &Cell, attempt| worker(args, folder, cell, attempt, &addresses);
     let server_trouble = || {
         let status = local.as_ref()?.lock().ok()?.exit_status()?;
         Some(format!("the private server ended with {status}"))
@@ -136,37 +145,40 @@ fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> R
     let options =
         RunOptions { jobs, retry_failed: args.retry_failed, worker: &worker, server_trouble: &server_trouble };
     let mut line = Line::new(plan.cells.len());
-    let end = run_cells(plan, folder, &options, stop, &mut |status| line.show(status));
+    let end = run_cells(plan, folder, &options, stop, &mut |status| show(&mut line, status));
     line.finish();
-    let end = end?;
-    if let (RunEnd::Finished { .. }, Some(page)) = (&end, &args.html) {
-        report::write(folder, Some(page))?;
-        eprintln!("the report is in {} and {}", page.display(), folder.path().join("report").display());
-    }
-    match end {
+    match end? {
         RunEnd::Stopped(signal) => {
             eprintln!("stopped by signal {signal}; the same command goes on");
             Ok(Ending::Signal(signal))
         }
-        RunEnd::Finished { failed } if failed.is_empty() => {
-            eprintln!("all {} cells are done; perturb report {}", plan.cells.len(), folder.path().display());
-            Ok(Ending::Done)
-        }
-        RunEnd::Finished { failed } => {
-            let cells = folder.path().join("cells");
-            bail!(
-                "{} of {} cells failed, the first is {}: see {} for the reason, and use --retry-failed to try again",
-                failed.len(),
-                plan.cells.len(),
-                failed[0],
-                cells.join(&failed[0]).join("failure.json").display()
-            )
-        }
+        RunEnd::Finished { failed } => finished(args, plan, folder, &failed),
     }
 }
 
+/// All cells are done, or have failed.
+pub(super) fn finished(args: &RunArgs, plan: &Plan, folder: &Folder, failed: &[String]) -> Result<Ending> {
+    if let Some(page) = &args.html {
+        report::write(folder, Some(page))?;
+        eprintln!("the report is in {} and {}", page.display(), folder.path().join("report").display());
+    }
+    let Some(first) = failed.first() else {
+        eprintln!("all {} cells are done; perturb report {}", plan.cells.len(), folder.path().display());
+        return Ok(Ending::Done);
+    };
+    bail!(
+        "{} of {} cells failed, the first is {first}: see {} for the reason, and use --retry-failed to try again",
+        failed.len(),
+        plan.cells.len(),
+        folder.path().join("cells").join(first).join("failure.json").display()
+    )
+}
+
 /// Copies the plan into its folder, and says so if another one was there.
-fn keep_plan(plan: &Plan, folder: &Folder) -> Result<()> {
+pub(super) fn keep_plan(args: &RunArgs, plan: &Plan, folder: &Folder) -> Result<()> {
+    if args.leave_plan && folder.plan_path().exists() {
+        return Ok(());
+    }
     if folder.keep_plan(&plan.text)? {
         eprintln!(
             "{} was another plan; it is replaced, and cells that both have are kept",
@@ -191,14 +203,22 @@ fn shared_servers(args: &RunArgs, plan: &Plan, jobs: usize) -> Result<(Option<Lo
 }
 
 /// The command that does one cell.
-fn worker(folder: &Folder, cell: &Cell, attempt: Attempt, addresses: &[String]) -> std::io::Result<Command> {
+fn worker(
+    args: &RunArgs,
+    folder: &Folder,
+    cell: &Cell,
+    attempt: Attempt,
+    addresses: &[String],
+) -> std::io::Result<Command> {
     let place = folder.cell(&cell.id);
     std::fs::create_dir_all(place.path())?;
     let log = File::options().create(true).append(true).open(place.log())?;
     // The running program, even if its file has been replaced meanwhile: all cells of a run are of one commit.
     let program = Path::new("/proc/self/exe");
     let mut command = Command::new(program);
-    command.arg0("perturb").arg("run").arg(folder.plan_path()).arg("--out").arg(folder.path());
+    // The copy, which nobody edits meanwhile.
+    let plan = if args.leave_plan { args.plan.clone() } else { folder.plan_path() };
+    command.arg0("perturb").arg("run").arg(plan).arg("--out").arg(folder.path());
     command.args(["--cell", &cell.id, "--exit-with-stdin", "--server", &addresses.join(",")]);
     command.args(["--losses", &attempt.losses.to_string()]);
     if let Some(failure) = attempt.retry {
@@ -209,26 +229,34 @@ fn worker(folder: &Folder, cell: &Cell, attempt: Attempt, addresses: &[String]) 
     Ok(command)
 }
 
-/// The line that says how far the run is.
-struct Line {
+/// Shows how far the run is.
+fn show(line: &mut Line, status: &RunStatus) {
+    line.show(status.done, status.failed, &format!("{} running", status.running.len()), status.remaining);
+}
+
+/// The line that says how far a run is.
+pub(super) struct Line {
     bar: Option<ProgressBar>,
     last_line: Option<Instant>,
+    cells: usize,
 }
 
 impl Line {
-    fn new(cells: usize) -> Self {
+    /// Of so many cells.
+    pub(super) fn new(cells: usize) -> Self {
         let bar = std::io::stderr().is_terminal().then(|| {
             let style = ProgressStyle::with_template("{wide_bar} {pos}/{len} cells  {msg}");
             ProgressBar::new(cells as u64).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
         });
-        Self { bar, last_line: None }
+        Self { bar, last_line: None, cells }
     }
 
-    fn show(&mut self, status: &RunStatus) {
-        let settled = status.done + status.failed;
-        let left = status.remaining.map_or_else(String::new, |left| format!(", {} left", duration(left.as_secs_f64())));
-        let failed = if status.failed > 0 { format!(", {} failed", status.failed) } else { String::new() };
-        let figures = format!("{} running{failed}{left}", status.running.len());
+    /// How many cells are done and have failed, what is going on, and how long it may take.
+    pub(super) fn show(&mut self, done: usize, failed: usize, doing: &str, remaining: Option<Duration>) {
+        let settled = done + failed;
+        let left = remaining.map_or_else(String::new, |left| format!(", {} left", duration(left.as_secs_f64())));
+        let failed = if failed > 0 { format!(", {failed} failed") } else { String::new() };
+        let figures = format!("{doing}{failed}{left}");
         if let Some(bar) = &self.bar {
             bar.set_position(settled as u64);
             bar.set_message(figures);
@@ -236,11 +264,20 @@ impl Line {
         }
         if self.last_line.is_none_or(|time| time.elapsed() >= LINE_INTERVAL) {
             self.last_line = Some(Instant::now());
-            eprintln!("{settled}/{} cells: {figures}", status.cells);
+            eprintln!("{settled}/{} cells: {figures}", self.cells);
         }
     }
 
-    fn finish(&self) {
+    /// A sentence beside it.
+    pub(super) fn say(&self, sentence: &str) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| eprintln!("{sentence}")),
+            None => eprintln!("{sentence}"),
+        }
+    }
+
+    /// Takes the line away.
+    pub(super) fn finish(&self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }

@@ -104,9 +104,29 @@ pub fn measure(servers: &Servers, cell: &Cell, limit: Duration) -> Result<Measur
 
 /// What `plan` costs at most, given measurements of its [`representatives`] and the step limit of each environment.
 pub fn estimate(plan: &Plan, measurements: &[Measurement], step_limit: impl Fn(&str) -> u32) -> Estimate {
+    cell_estimates(plan, measurements, step_limit).fold(Estimate::default(), |sum, cell| Estimate {
+        work: Work {
+            training_steps: sum.work.training_steps + cell.work.training_steps,
+            testing_steps: sum.work.testing_steps + cell.work.testing_steps,
+        },
+        training_seconds: sum.training_seconds + cell.training_seconds,
+        testing_seconds: sum.testing_seconds + cell.testing_seconds,
+    })
+}
+
+/// The seconds that each cell of `plan` takes at most, in its order; otherwise as [`estimate`].
+pub fn cell_seconds(plan: &Plan, measurements: &[Measurement], step_limit: impl Fn(&str) -> u32) -> Vec<f64> {
+    let estimates = cell_estimates(plan, measurements, step_limit);
+    estimates.map(|cell| cell.training_seconds + cell.testing_seconds).collect()
+}
+
+fn cell_estimates(
+    plan: &Plan,
+    measurements: &[Measurement],
+    step_limit: impl Fn(&str) -> u32,
+) -> impl Iterator<Item = Estimate> {
     let mut speeds: HashMap<(&str, Learner), Speed> = HashMap::new();
-    let mut estimate = Estimate::default();
-    for cell in &plan.cells {
+    plan.cells.iter().map(move |cell| {
         let pair = pair(cell);
         let speed = *speeds.entry(pair.clone()).or_insert_with(|| speed_of(&pair, measurements));
         let limit = f64::from(step_limit(pair.0));
@@ -116,12 +136,12 @@ pub fn estimate(plan: &Plan, measurements: &[Measurement], step_limit: impl Fn(&
                 * cell.tests.versions.len() as f64
                 * limit,
         };
-        estimate.work.training_steps += work.training_steps;
-        estimate.work.testing_steps += work.testing_steps;
-        estimate.training_seconds += work.training_steps * speed.training;
-        estimate.testing_seconds += work.testing_steps * speed.testing;
-    }
-    estimate
+        Estimate {
+            work,
+            training_seconds: work.training_steps * speed.training,
+            testing_seconds: work.testing_steps * speed.testing,
+        }
+    })
 }
 
 /// How many episodes a training has: more than its budget if it learns from the worst of them only.
@@ -207,6 +227,11 @@ mod tests {
         let hopper = 3.0 * 100.0 * 1000.0 * (3.0 * 8.0 + 3.0 * 16.0 + 9.0);
         assert!((total.training_seconds - cart_pole - hopper).abs() < 1e-6 * total.training_seconds);
         assert!((total.testing_seconds - total.training_seconds * 0.3 / 4.0).abs() < 1e-6 * total.testing_seconds);
+        let cells = cell_seconds(&plan, &measurements, |environment| if environment == "Hopper" { 1000 } else { 200 });
+        // The first is CartPole with A2C: 3 s a step, and a quarter of that in a test.
+        assert!((cells[0] - 100.0 * 200.0 * (3.0 + 0.3 * 3.0 / 4.0)).abs() < 1e-6 * cells[0], "{}", cells[0]);
+        let sum: f64 = cells.iter().sum();
+        assert!(cells.len() == 2 * 21 && (sum - total.training_seconds - total.testing_seconds).abs() < 1e-6 * sum);
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Experiments: from a file that states them to tables and pictures.
 //!
 //! [`Plan`] expands a file to cells, [`run_cell`] trains and tests one of them, [`run()`] does all in worker processes,
-//! and [`Folder`] is where they are kept. [`Results`] reads them back and selects, [`report`] makes tables of them,
+//! [`slurm`] has a cluster do them, and [`Folder`] is where they are kept. [`Results`] reads them back and selects, [`report`] makes tables of them,
 //! [`plot`] pictures.
 
 mod cell;
@@ -15,10 +15,11 @@ pub mod plot;
 pub mod report;
 mod run;
 mod selection;
+pub mod slurm;
 mod statistics;
 
 pub use cell::{CellEnd, run_cell};
-pub use cost::{Estimate, Measurement, Speed, Work, estimate, measure, representatives};
+pub use cost::{Estimate, Measurement, Speed, Work, cell_seconds, estimate, measure, representatives};
 pub use curves::{Curve, EnvironmentCurves, Point, curves_csv, read_curves};
 pub use folder::{
     CellFolder, CellLock, CellResult, CellState, Failure, FailureMark, Folder, FolderError, Timing, Training,

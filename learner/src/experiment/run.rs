@@ -377,7 +377,7 @@ fn signal_of(status: ExitStatus) -> Option<i32> {
 
 /// What finished cells took.
 #[derive(Default)]
-struct Times<'a> {
+pub(super) struct Times<'a> {
     by_pair: HashMap<(&'a str, Learner), Mean>,
     all: Mean,
 }
@@ -400,18 +400,22 @@ impl Mean {
 }
 
 impl<'a> Times<'a> {
-    fn add(&mut self, cell: &'a Cell, seconds: f64) {
+    pub(super) fn add(&mut self, cell: &'a Cell, seconds: f64) {
         self.by_pair.entry((&cell.config.common.environment, cell.learner())).or_default().add(seconds);
         self.all.add(seconds);
     }
 
+    /// What cells of the same environment and learner took; `None` before the first.
+    pub(super) fn of_pair(&self, cell: &Cell) -> Option<f64> {
+        self.by_pair.get(&(cell.config.common.environment.as_str(), cell.learner()))?.get()
+    }
+
     /// How long `cells`, which have run for so many seconds each, may still take.
-    fn remaining<'c>(&self, cells: impl Iterator<Item = (&'c Cell, f64)>, jobs: usize) -> Option<Duration> {
+    pub(super) fn remaining<'c>(&self, cells: impl Iterator<Item = (&'c Cell, f64)>, jobs: usize) -> Option<Duration> {
         let overall = self.all.get()?;
         let (mut seconds, mut longest, mut left) = (0.0, 0.0_f64, 0);
         for (cell, spent) in cells {
-            let pair = (cell.config.common.environment.as_str(), cell.learner());
-            let expected = self.by_pair.get(&pair).and_then(|mean| mean.get()).unwrap_or(overall);
+            let expected = self.of_pair(cell).unwrap_or(overall);
             let rest = (expected - spent).max(0.0);
             seconds += rest;
             longest = longest.max(rest);

@@ -1,0 +1,114 @@
+//! Which cells one job does: enough for minutes, since every job costs Slurm and its node seconds.
+
+use super::MOST_CELLS_PER_JOB;
+
+/// How long a job is meant to take. Estimates are for episodes that go on to the step limit; most end earlier.
+pub(super) const JOB_SECONDS: f64 = 300.0;
+
+/// How large jobs are.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Size {
+    /// So many cells.
+    Cells(usize),
+    /// So many seconds.
+    Seconds(f64),
+}
+
+/// A cell that is to be submitted.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Load {
+    /// Its place in the plan.
+    pub(super) cell: usize,
+    /// How long it may take.
+    pub(super) seconds: f64,
+    /// Whether it must have a job of its own: it was lost before, perhaps through its own fault, which should not cost
+    /// others their turn.
+    pub(super) alone: bool,
+}
+
+/// Puts `loads` into at most `most_jobs` jobs, in their order. If that is too few for jobs of so many seconds, jobs
+/// become longer; what still has no place is left out, for a later submission.
+pub(super) fn batches(loads: &[Load], size: Size, most_jobs: usize) -> Vec<Vec<usize>> {
+    let mut size = size;
+    let all: f64 = loads.iter().map(|load| load.seconds).sum();
+    loop {
+        let mut jobs = fill(loads, size);
+        match &mut size {
+            Size::Seconds(seconds) if jobs.len() > most_jobs && *seconds < all => *seconds *= 1.5,
+            _ => {
+                jobs.truncate(most_jobs);
+                return jobs;
+            }
+        }
+    }
+}
+
+fn fill(loads: &[Load], size: Size) -> Vec<Vec<usize>> {
+    let mut jobs: Vec<Vec<usize>> = Vec::new();
+    let mut filling = 0.0;
+    let mut closed = true;
+    for load in loads {
+        let (weight, room) = match size {
+            Size::Cells(cells) => (1.0, cells as f64),
+            Size::Seconds(seconds) => (load.seconds, seconds),
+        };
+        match jobs.last_mut() {
+            Some(job) if !closed && !load.alone && job.len() < MOST_CELLS_PER_JOB && filling + weight <= room => {
+                job.push(load.cell);
+                filling += weight;
+            }
+            _ => {
+                jobs.push(vec![load.cell]);
+                filling = weight;
+            }
+        }
+        closed = load.alone;
+    }
+    jobs
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn loads(seconds: &[f64]) -> Vec<Load> {
+        seconds.iter().enumerate().map(|(cell, &seconds)| Load { cell, seconds, alone: false }).collect()
+    }
+
+    #[test]
+    fn jobs_take_minutes_and_keep_the_order() {
+        let loads = loads(&[100.0, 150.0, 60.0, 400.0, 10.0, 290.0]);
+        let jobs = batches(&loads, Size::Seconds(300.0), 1000);
+        assert_eq!(jobs, [vec![0, 1], vec![2], vec![3], vec![4, 5]]);
+        assert_eq!(batches(&loads, Size::Cells(4), 1000), [vec![0, 1, 2, 3], vec![4, 5]]);
+        assert!(batches(&[], Size::Cells(4), 1000).is_empty());
+    }
+
+    #[test]
+    fn jobs_become_longer_if_there_may_not_be_so_many() {
+        let loads = loads(&[300.0; 40]);
+        assert_eq!(batches(&loads, Size::Seconds(300.0), 40).len(), 40);
+        let jobs = batches(&loads, Size::Seconds(300.0), 10);
+        assert!(jobs.len() <= 10 && jobs.len() > 5, "{jobs:?}");
+        assert_eq!(jobs.concat(), (0..40).collect::<Vec<_>>());
+        assert_eq!(batches(&loads, Size::Cells(3), 10).concat(), (0..30).collect::<Vec<_>>(), "the rest comes later");
+    }
+
+    #[test]
+    fn a_job_has_no_more_cells_than_fit_in_an_argument() {
+        let loads = loads(&vec![0.0; 2500]);
+        let jobs = batches(&loads, Size::Seconds(300.0), 2);
+        assert_eq!(jobs.iter().map(Vec::len).collect::<Vec<_>>(), [1000, 1000]);
+        let jobs = batches(&loads, Size::Seconds(300.0), 3);
+        assert_eq!(jobs.iter().map(Vec::len).collect::<Vec<_>>(), [1000, 1000, 500]);
+    }
+
+    #[test]
+    fn a_cell_that_was_lost_has_a_job_of_its_own() {
+        let mut loads = loads(&[1.0; 5]);
+        loads[2].alone = true;
+        assert_eq!(batches(&loads, Size::Cells(9), 1000), [vec![0, 1], vec![2], vec![3, 4]]);
+        loads.iter_mut().for_each(|load| load.alone = true);
+        assert_eq!(batches(&loads, Size::Seconds(9.0), 3).len(), 3, "it ends, though they cannot be put together");
+    }
+}

@@ -1,0 +1,199 @@
+//! What may be asked of Slurm, checked before anything is submitted.
+
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+use std::time::Duration;
+
+use super::MOST_CELLS_PER_JOB;
+
+/// How cells are submitted.
+#[derive(Clone, Debug)]
+pub struct SlurmOptions {
+    /// The partition; `None` leaves it to Slurm.
+    pub partition: Option<String>,
+    /// How long a job may take; `None` leaves it to the partition.
+    pub time: Option<TimeLimit>,
+    /// How many jobs of an array may run at a time, at least 1; `None` for as many as there is room for.
+    pub array_limit: Option<u32>,
+    /// How many cells a job does, 1 to [`MOST_CELLS_PER_JOB`]; `None` for as many as take some minutes.
+    pub cells_per_job: Option<usize>,
+    /// Whether cells that failed are tried again.
+    pub retry_failed: bool,
+    /// What a job runs.
+    pub task: Task,
+    /// How often Slurm is asked for its queue. A cell that is lost is noticed by two answers in succession.
+    pub queue_interval: Duration,
+    /// How often results are looked for in the folder.
+    pub folder_interval: Duration,
+}
+
+/// What a job runs on its node.
+#[derive(Clone, Debug)]
+pub struct Task {
+    /// The program `perturb`, at a place that all nodes see.
+    pub program: PathBuf,
+    /// Cells at a time, at least 1.
+    pub jobs: usize,
+    /// Physics threads of the server that the job starts on its node, at least 1; without meaning if there are `servers`.
+    pub workers: usize,
+    /// Addresses of servers that all jobs share; empty for a private one in each job.
+    pub servers: Vec<String>,
+}
+
+impl Task {
+    /// The cores that a job asks for. A cell's training and its environments take turns, so that one does for both.
+    pub fn cores(&self) -> usize {
+        if self.servers.is_empty() { self.jobs.max(self.workers) } else { self.jobs }
+    }
+}
+
+/// Why options were refused.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum OptionError {
+    /// A time limit that Slurm would not understand.
+    #[error(
+        "`{got}` is no time limit: expected minutes, or one of Slurm's other forms MM:SS, HH:MM:SS, DAYS-HH, \
+         DAYS-HH:MM, DAYS-HH:MM:SS, e.g. 90 or 1-12:00:00, and more than zero"
+    )]
+    Time {
+        /// What was given.
+        got: String,
+    },
+    /// A number of cells that cannot be.
+    #[error("{got} cells a job: expected 1 to {MOST_CELLS_PER_JOB}")]
+    CellsPerJob {
+        /// What was given.
+        got: usize,
+    },
+    /// A path that cannot stand in a script and in Slurm's options.
+    #[error("{path:?} cannot be handed to Slurm: {reason}; use another folder")]
+    Path {
+        /// What was given.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: &'static str,
+    },
+}
+
+impl SlurmOptions {
+    /// Checks what does not check itself.
+    ///
+    /// # Errors
+    /// [`OptionError`].
+    pub fn check(&self, folder: &Path) -> Result<(), OptionError> {
+        if let Some(got) = self.cells_per_job.filter(|number| !(1..=MOST_CELLS_PER_JOB).contains(number)) {
+            return Err(OptionError::CellsPerJob { got });
+        }
+        text_of(folder)?;
+        text_of(&self.task.program)?;
+        Ok(())
+    }
+}
+
+/// A path as the text that scripts and Slurm's options can hold.
+pub(super) fn text_of(path: &Path) -> Result<&str, OptionError> {
+    let refuse = |reason| OptionError::Path { path: path.to_owned(), reason };
+    let text = path.to_str().ok_or_else(|| refuse("it is not UTF-8"))?;
+    if !path.is_absolute() {
+        return Err(refuse("it does not begin with /"));
+    }
+    // Slurm reads a backslash in the name of a log as an order to take the rest literally.
+    if text.contains(|character: char| character.is_control() || character == '\\') {
+        return Err(refuse("it has a control character or a backslash"));
+    }
+    Ok(text)
+}
+
+/// A time limit in one of Slurm's forms.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct TimeLimit {
+    text: String,
+    seconds: u64,
+}
+
+impl TimeLimit {
+    /// As it was written.
+    pub fn text(&self) -> &str {
+        &self.text
+    }
+
+    /// How long it is.
+    pub fn seconds(&self) -> u64 {
+        self.seconds
+    }
+}
+
+impl FromStr for TimeLimit {
+    type Err = OptionError;
+
+    fn from_str(text: &str) -> Result<Self, OptionError> {
+        let refuse = || OptionError::Time { got: text.to_owned() };
+        let (days, rest) = match text.split_once('-') {
+            Some((days, rest)) => (Some(days), rest),
+            None => (None, text),
+        };
+        let number = |part: &str| {
+            let digits = !part.is_empty() && part.len() <= 6 && part.bytes().all(|byte| byte.is_ascii_digit());
+            digits.then(|| part.parse::<u64>().ok()).flatten().ok_or_else(refuse)
+        };
+        let parts = rest.split(':').map(number).collect::<Result<Vec<u64>, _>>()?;
+        let seconds = match (days.map(number).transpose()?, &parts[..]) {
+            (None, [minutes]) => minutes * 60,
+            (None, [minutes, seconds]) => minutes * 60 + seconds,
+            (None, [hours, minutes, seconds]) => hours * 3600 + minutes * 60 + seconds,
+            (Some(days), [hours]) => (days * 24 + hours) * 3600,
+            (Some(days), [hours, minutes]) => (days * 24 + hours) * 3600 + minutes * 60,
+            (Some(days), [hours, minutes, seconds]) => (days * 24 + hours) * 3600 + minutes * 60 + seconds,
+            _ => return Err(refuse()),
+        };
+        if seconds == 0 {
+            return Err(refuse());
+        }
+        Ok(Self { text: text.to_owned(), seconds })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_time_limit_has_one_of_slurms_forms() {
+        let seconds = |text: &str| text.parse::<TimeLimit>().map(|limit| limit.seconds());
+        let known = [
+            ("90", 5400),
+            ("1:30", 90),
+            ("2:00:01", 7201),
+            ("1-0", 86_400),
+            ("1-12:30", 131_400),
+            ("2-00:00:05", 172_805),
+        ];
+        for (text, expected) in known {
+            assert_eq!(seconds(text), Ok(expected), "{text}");
+        }
+        for text in
+            ["", "0", "00:00", "1h", "-5", "1-", "-", "1:2:3:4", "1-2:3:4:5", "1.5", "+5", " 5", "9999999", "1::2"]
+        {
+            let error = seconds(text).unwrap_err().to_string();
+            assert!(error.starts_with(&format!("`{text}` is no time limit: expected minutes")), "{error}");
+        }
+        assert_eq!("1-12:30".parse::<TimeLimit>().unwrap().text(), "1-12:30");
+    }
+
+    #[test]
+    fn paths_that_slurm_would_read_otherwise_are_refused() {
+        assert_eq!(text_of(Path::new("/shared/it's 100%")), Ok("/shared/it's 100%"));
+        for (path, reason) in [("runs/quick", "begin with /"), ("/a\nb", "control character"), ("/a\\b", "backslash")] {
+            let error = text_of(Path::new(path)).unwrap_err().to_string();
+            assert!(error.contains(reason) && error.contains("use another folder"), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_job_asks_for_the_cores_that_it_uses() {
+        let task = Task { program: "/x".into(), jobs: 2, workers: 3, servers: Vec::new() };
+        assert_eq!(task.cores(), 3);
+        assert_eq!(Task { servers: vec!["a:1".into()], ..task }.cores(), 2);
+    }
+}

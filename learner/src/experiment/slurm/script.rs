@@ -1,0 +1,88 @@
+//! What every job of an array runs.
+
+use std::path::Path;
+
+use super::options::{OptionError, Task, text_of};
+
+/// The script of the submission in `submission`, for the experiment in `folder`.
+///
+/// `exec` makes the program the process that Slurm signals: it then finishes its iterations and writes checkpoints.
+pub(super) fn script(task: &Task, folder: &Path, submission: &Path) -> Result<String, OptionError> {
+    let cells = quoted(text_of(&submission.join("cells.txt"))?);
+    let plan = quoted(text_of(&submission.join("plan.toml"))?);
+    let (folder, program) = (quoted(text_of(folder)?), quoted(text_of(&task.program)?));
+    let servers = if task.servers.is_empty() {
+        format!("--workers {}", task.workers)
+    } else {
+        format!("--server {}", quoted(&task.servers.join(",")))
+    };
+    let jobs = task.jobs;
+    Ok(format!(
+        r#"#!/bin/sh
+# One job of an array that `perturb run --engine slurm` submitted: it does the cells of its line in cells.txt.
+cells_file={cells}
+program={program}
+echo "job ${{SLURM_ARRAY_JOB_ID}}_${{SLURM_ARRAY_TASK_ID}} on ${{SLURMD_NODENAME}}, restarted ${{SLURM_RESTART_COUNT:-0}} times" >&2
+cells=$(sed -n "$((SLURM_ARRAY_TASK_ID + 1))p" "$cells_file")
+if [ -z "$cells" ]; then
+    echo "perturb: $SLURMD_NODENAME finds no cells in $cells_file: does it see the same folder?" >&2
+    exit 1
+fi
+if [ ! -x "$program" ]; then
+    echo "perturb: $SLURMD_NODENAME finds no program $program: put it in a folder that all nodes see" >&2
+    exit 1
+fi
+exec "$program" run {plan} --leave-plan --out {folder} --cell "$cells" --jobs {jobs} {servers}
+"#
+    ))
+}
+
+/// A word that the shell takes as it is.
+fn quoted(text: &str) -> String {
+    format!("'{}'", text.replace('\'', r"'\''"))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::process::Command;
+
+    use super::*;
+
+    /// Runs a script whose program prints its arguments.
+    fn run(task: &Task, directory: &Path, index: &str) -> (bool, String) {
+        let text = script(task, &directory.join("it's $HOME"), directory).unwrap();
+        let path = directory.join("job.sh");
+        std::fs::write(&path, text).unwrap();
+        let mut command = Command::new("sh");
+        command.arg(path).env("SLURM_ARRAY_TASK_ID", index).env("SLURM_ARRAY_JOB_ID", "7").env("SLURMD_NODENAME", "n1");
+        let output = command.output().unwrap();
+        (output.status.success(), String::from_utf8([output.stdout, output.stderr].concat()).unwrap())
+    }
+
+    #[test]
+    fn a_job_does_the_cells_of_its_line() {
+        use std::os::unix::fs::PermissionsExt;
+        let directory = tempfile::tempdir().unwrap();
+        std::fs::write(directory.path().join("cells.txt"), "a,b\nc\n").unwrap();
+        let program = directory.path().join("a program");
+        let mut task = Task { program: program.clone(), jobs: 2, workers: 3, servers: Vec::new() };
+        let (succeeded, said) = run(&task, directory.path(), "0");
+        assert!(!succeeded && said.contains("n1 finds no program") && said.contains("a program"), "{said}");
+
+        std::fs::write(&program, "#!/bin/sh\nprintf '[%s]' \"$@\"").unwrap();
+        std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
+        let (succeeded, said) = run(&task, directory.path(), "0");
+        let shown = directory.path().display();
+        let expected = format!(
+            "[run][{shown}/plan.toml][--leave-plan][--out][{shown}/it's $HOME][--cell][a,b][--jobs][2][--workers][3]"
+        );
+        assert!(succeeded && said.starts_with(&expected), "{said}");
+        assert!(said.contains("job 7_0 on n1, restarted 0 times"), "{said}");
+
+        task.servers = vec!["one:1".into(), "two:2".into()];
+        let (_, said) = run(&task, directory.path(), "1");
+        assert!(said.contains("[--cell][c][--jobs][2][--server][one:1,two:2]"), "{said}");
+        let (succeeded, said) = run(&task, directory.path(), "2");
+        assert!(!succeeded && said.contains("n1 finds no cells in"), "{said}");
+    }
+}
