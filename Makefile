@@ -4,6 +4,8 @@
 PACKAGES := build-essential pkg-config libclang-dev libmujoco-dev libtorch-dev libopenblas0-pthread
 # What draws Hopper and HalfCheetah: OpenGL without a display, in software. The server runs without it.
 OPENGL := libegl1 libgl1-mesa-dri
+# What encodes the .mp4 files of `perturb video`, some 60 MB; everything else runs without it.
+FFMPEG := ffmpeg
 CARGO_DENY_VERSION := 0.20.2
 TARGET := $(or $(CARGO_TARGET_DIR),target)
 PROGRAMS := $(TARGET)/release
@@ -69,6 +71,7 @@ all-pairs: build ## train and test every algorithm and architecture on every env
 	PROGRAMS=$(PROGRAMS) learner/tests/all_pairs.sh $(ALL_PAIRS_ARGS)
 
 test: deps opengl ## run all tests, then those of the server without MuJoCo
+	@$(call install,$(FFMPEG))
 	cargo test $(ALL)
 	cargo test $(WITHOUT_MUJOCO)
 
@@ -91,7 +94,7 @@ cargo-deny: toolchain
 		cargo install --locked --version $(CARGO_DENY_VERSION) cargo-deny; \
 	}
 
-python-test: $(VENV)/installed python-server ## lint, type-check and test the Python package
+python-test: $(VENV)/installed python-server opengl ## lint, type-check and test the Python package
 	cd python && $(abspath $(VENV))/bin/ruff check . && $(abspath $(VENV))/bin/ruff format --check .
 	cd python && $(abspath $(VENV))/bin/mypy
 	cd python && PERTURB_SERVER=$(abspath $(PROGRAMS))/perturb-server $(abspath $(VENV))/bin/pytest -q

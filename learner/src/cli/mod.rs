@@ -1,5 +1,5 @@
 //! The command line: `perturb envs | train | evaluate | demo | plan | run | report | curves |
-//! heatmap`.
+//! heatmap | video`.
 //!
 //! Results go to standard output, everything else to standard error. Exit status: 0 done, 1 failed, 2 wrong usage, 128 +
 //! the signal's number if Ctrl-C or SIGTERM ended it. `run --cell` has two more: 69 without a server, 75 if another
@@ -16,6 +16,7 @@ mod report;
 mod run;
 mod single_thread;
 mod train;
+mod video;
 
 use std::process::ExitCode;
 
@@ -26,6 +27,7 @@ use crate::client::{LocalServerOptions, Servers};
 use crate::config::ConfigError;
 use crate::evaluation::TestError;
 use crate::experiment::{HeatmapError, PlanError};
+use crate::video::VideoError;
 use args::{Cli, Command, ServerArgs};
 
 /// How a command ended that did not fail.
@@ -63,6 +65,7 @@ pub fn main() -> ExitCode {
         Command::Report(args) => report::run(&args),
         Command::Curves(args) => report::curves(&args),
         Command::Heatmap(args) => heatmap::run(&args),
+        Command::Video(args) => video::run(&args),
     };
     match result {
         Ok(Ending::Done) => ExitCode::SUCCESS,
@@ -73,8 +76,8 @@ pub fn main() -> ExitCode {
 }
 
 fn fail(error: &anyhow::Error) -> ExitCode {
-    let stopped = match error.downcast_ref() {
-        Some(HeatmapError::Test(error)) => Some(error),
+    let stopped = match (error.downcast_ref(), error.downcast_ref()) {
+        (Some(HeatmapError::Test(error)), _) | (_, Some(VideoError::Test(error))) => Some(error),
         _ => error.downcast_ref(),
     };
     if let Some(TestError::Stopped { signal }) = stopped {
@@ -89,7 +92,8 @@ fn fail(error: &anyhow::Error) -> ExitCode {
         return ExitCode::SUCCESS;
     }
     eprintln!("perturb: {error:#}");
-    let usage = error.is::<ConfigError>() || error.is::<UsageError>() || error.is::<PlanError>();
+    let extension = matches!(error.downcast_ref(), Some(VideoError::Extension { .. }));
+    let usage = error.is::<ConfigError>() || error.is::<UsageError>() || error.is::<PlanError>() || extension;
     ExitCode::from(if usage { 2 } else { 1 })
 }
 
