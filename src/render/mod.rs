@@ -23,7 +23,7 @@ use tokio::sync::{mpsc, oneshot};
 /// Requests that wait for the thread. More wait in their sessions.
 const QUEUE: usize = 64;
 /// What the thread's niceness is raised by. Its driver's threads inherit it: physics comes first.
-const NICENESS: i32 = 10;
+const NICENESS: i32 = 5;
 
 /// A picture's size in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -35,12 +35,14 @@ const CONFIG: [c_int; 15] = [
 const SURFACE: [c_int; 5] = [0x3057, 1, 0x3056, 1, NONE]; // EGL_WIDTH, EGL_HEIGHT
 
 type Handle = *mut c_void;
+type GetPlatformDisplay = unsafe extern "C" fn(c_uint, Handle, *const c_int) -> Handle;
+type QueryDevices = unsafe extern "C" fn(c_int, *mut Handle, *mut c_int) -> c_uint;
 
 /// The functions of EGL that are needed.
 struct Egl {
     get_display: unsafe extern "C" fn(Handle) -> Handle,
-    get_platform_display: Option<unsafe extern "C" fn(c_uint, Handle, *const c_int) -> Handle>,
-    query_devices: Option<unsafe extern "C" fn(c_int, *mut Handle, *mut c_int) -> c_uint>,
+    get_platform_display: Option<GetPlatformDisplay>,
+    query_devices: Option<QueryDevices>,
     initialize: unsafe extern "C" fn(Handle, *mut c_int, *mut c_int) -> c_uint,
     bind_api: unsafe extern "C" fn(c_uint) -> c_uint,
     choose_config: unsafe extern "C" fn(Handle, *const c_int, *mut Handle, c_int, *mut c_int) -> c_uint,
@@ -65,7 +67,7 @@ impl Egl {
         let missing = |error: libloading::Error| Error::NoOpenGl { reason: error.to_string() };
         // SAFETY: the initialisers that run are those of the system's EGL library, which any program may load.
         let library = unsafe { Library::new(name) }.map_err(missing)?;
-        /// The library's function of that name, and that type by the EGL registry.
+        // The library's function of that name, and that type by the EGL registry.
         macro_rules! function {
             ($name:literal) => {
                 // SAFETY: the field that it is put into has the type of the EGL registry's function.
@@ -75,12 +77,13 @@ impl Egl {
         let get_proc_address: unsafe extern "C" fn(*const c_char) -> *const c_void = function!(b"eglGetProcAddress\0");
         // SAFETY: a terminated string.
         let extension = |name: &CStr| unsafe { get_proc_address(name.as_ptr()) };
+        let (platform, devices) = (extension(c"eglGetPlatformDisplayEXT"), extension(c"eglQueryDevicesEXT"));
         let egl = Self {
             get_display: function!(b"eglGetDisplay\0"),
             // SAFETY: a null pointer, which is `None`, or the extension's function of the EGL registry's type.
-            get_platform_display: unsafe { mem::transmute(extension(c"eglGetPlatformDisplayEXT")) },
+            get_platform_display: unsafe { mem::transmute::<*const c_void, Option<GetPlatformDisplay>>(platform) },
             // SAFETY: as before.
-            query_devices: unsafe { mem::transmute(extension(c"eglQueryDevicesEXT")) },
+            query_devices: unsafe { mem::transmute::<*const c_void, Option<QueryDevices>>(devices) },
             initialize: function!(b"eglInitialize\0"),
             bind_api: function!(b"eglBindAPI\0"),
             choose_config: function!(b"eglChooseConfig\0"),
@@ -121,7 +124,8 @@ impl Egl {
     /// What failed.
     fn failed(&self, what: &str) -> String {
         // SAFETY: it reads this thread's last error.
-        format!("{what} failed with EGL's error 0x{:x}", unsafe { (self.get_error)() })
+        let error = unsafe { (self.get_error)() };
+        format!("{what} failed with EGL's error 0x{error:x}")
     }
 }
 

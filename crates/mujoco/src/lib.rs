@@ -21,8 +21,8 @@
 //! # Threads
 //!
 //! MuJoCo's engine keeps no state outside `mjModel` and `mjData`, except its error handlers, which the shim installs per
-//! thread and per call, and its callbacks, which nothing here sets. Only the compiler of MJCF is not thread-safe; loads
-//! are serialised.
+//! thread and per call, its callbacks, which nothing here sets, and the addresses of OpenGL's functions. Only the compiler
+//! of MJCF and drawing are not thread-safe; both are serialised.
 //!
 //! # Fatal errors
 //!
