@@ -128,8 +128,8 @@ impl Panel {
                 let (text, style) = (ending.text(), font(&ink, HPos::Right));
                 let (text_width, _) = area.estimate_text_size(&text, &style).map_err(words)?;
                 let corners = [
-                    (width - margin - text_width as i32 - margin / 2, y - margin / 4),
-                    (width - margin / 2, y + margin),
+                    (width - margin - text_width as i32 - margin / 2, y - margin * 2 / 5),
+                    (width - margin / 2, y + margin * 3 / 4),
                 ];
                 area.draw(&Rectangle::new(corners, ground.filled())).map_err(words)?;
                 area.draw_text(&text, &style, (width - margin, y)).map_err(words)?;
