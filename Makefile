@@ -6,6 +6,8 @@ PACKAGES := build-essential pkg-config libclang-dev libmujoco-dev libtorch-dev l
 OPENGL := libegl1 libgl1-mesa-dri
 # A whole Slurm on one machine, for its test.
 SLURM_PACKAGES := slurmctld slurmd slurm-client munge
+# What encodes the .mp4 files of `perturb video`, some 60 MB; everything else runs without it.
+FFMPEG := ffmpeg
 CARGO_DENY_VERSION := 0.20.2
 TARGET := $(or $(CARGO_TARGET_DIR),target)
 PROGRAMS := $(TARGET)/release
@@ -82,6 +84,7 @@ report-check: build ## make the report of a small experiment and look at it in C
 
 test: export PERTURB_TEST_DM_ENV_RPC_PYTHON := $(abspath $(DM_ENV_RPC))/bin/python
 test: deps opengl $(DM_ENV_RPC)/installed ## run all tests, then those of the server without MuJoCo
+	@$(call install,$(FFMPEG))
 	cargo test $(ALL)
 	cargo test $(WITHOUT_MUJOCO)
 
@@ -111,7 +114,7 @@ cargo-deny: toolchain
 		cargo install --locked --version $(CARGO_DENY_VERSION) cargo-deny; \
 	}
 
-python-test: $(VENV)/installed python-server ## lint, type-check and test the Python package
+python-test: $(VENV)/installed python-server opengl ## lint, type-check and test the Python package
 	cd python && $(abspath $(VENV))/bin/ruff check . && $(abspath $(VENV))/bin/ruff format --check .
 	cd python && $(abspath $(VENV))/bin/mypy
 	cd python && PERTURB_SERVER=$(abspath $(PROGRAMS))/perturb-server $(abspath $(VENV))/bin/pytest -q

@@ -20,6 +20,7 @@ pub mod random;
 pub mod rollout;
 mod run_directory;
 pub mod training;
+pub mod video;
 
 /// The version, and the commit that was built, e.g. "0.1.0 (1a2b3c4d5e6f)"; "-dirty" follows a commit whose files were
 /// changed.

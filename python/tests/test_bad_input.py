@@ -92,7 +92,11 @@ def test_wrong_actions_of_a_batch_move_nothing(actions: Any, says: str, server: 
         ({"timeout": True}, perturb.InvalidArgumentError, "timeout=True"),
         ({"timeout": [5.0]}, perturb.InvalidArgumentError, r"timeout=\[5\.0\]"),
         ({"timeout": 10**400}, perturb.InvalidArgumentError, "timeout=1000"),
-        ({"render_mode": "rgb_array"}, perturb.InvalidArgumentError, "pictures"),
+        ({"render_mode": "human"}, perturb.InvalidArgumentError, r"gymnasium\.wrappers\.HumanRendering"),
+        ({"render_mode": "ansi"}, perturb.InvalidArgumentError, "'ansi'; expected 'rgb_array'"),
+        ({"width": 15}, perturb.InvalidArgumentError, "width=15; expected an integer from 16 to 2048"),
+        ({"height": 2049}, perturb.InvalidArgumentError, "height=2049"),
+        ({"height": 480.0}, perturb.InvalidArgumentError, r"height=480\.0"),
     ],
 )
 def test_wrong_settings_are_refused(settings: dict[str, Any], error: type[Exception], says: str, server: str) -> None:

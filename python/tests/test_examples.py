@@ -5,6 +5,11 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from pathlib import Path
+
+from PIL import Image
+
+from perturb.catalogue import CATALOGUE
 
 from .conftest import ROOT
 
@@ -34,3 +39,12 @@ def test_the_sweep_shows_which_poles_stay_up(server: str) -> None:
     assert len(steps) == 9
     assert steps[0] < 100
     assert steps[4] == 200
+
+
+def test_the_gallery_has_a_picture_of_every_environment(server: str, tmp_path: Path) -> None:
+    files = run("gallery.py", "--server", server, "--out", str(tmp_path)).split()
+    assert [Path(file).name for file in files] == [f"{name}.png" for name in CATALOGUE]
+    for file in files:
+        with Image.open(file) as picture:
+            assert picture.size == (960, 480)
+            assert (picture.getcolors(2**19) or [])[2:], "a drawing has colours"

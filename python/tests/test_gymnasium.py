@@ -11,7 +11,6 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import vector as wrappers
 
-import perturb
 from perturb.catalogue import CATALOGUE
 
 NAMES = list(CATALOGUE)
@@ -181,11 +180,3 @@ def test_what_gymnasium_asks_of_batches_holds_for_seeds(server: str) -> None:
 def test_without_a_seed_episodes_differ(server: str) -> None:
     first = [gymnasium.make("perturb/Pendulum-v0", server=server).reset()[0].tobytes() for _ in range(3)]
     assert len(set(first)) == 3
-
-
-def test_pictures_are_refused_and_not_pretended(server: str) -> None:
-    with pytest.warns(UserWarning, match="render_mode"), pytest.raises(perturb.InvalidArgumentError, match="pictures"):
-        gymnasium.make("perturb/CartPole-v0", render_mode="rgb_array", server=server)
-    env = gymnasium.make("perturb/CartPole-v0", server=server).unwrapped
-    with pytest.raises(NotImplementedError, match="pictures"):
-        env.render()

@@ -48,7 +48,7 @@ class FakeServer:
 def opened() -> pb.Opened:
     channels = [pb.Channel(name=str(i), low=-float("inf"), high=float("inf")) for i in range(4)]
     action = pb.ActionSpace(discrete=pb.Discrete(names=["left", "right"]))
-    environment = pb.Environment(name="CartPole", observation=channels, action=action)
+    environment = pb.Environment(name="CartPole", observation=channels, action=action, control_timestep=0.02)
     return pb.Opened(environment=environment, observations=bytes(16))
 
 
@@ -158,3 +158,45 @@ def test_another_service_is_no_perturb_server() -> None:
     with pytest.raises(perturb.ProtocolError, match="no perturb-server"):
         perturb.PerturbEnv("CartPole", server=other.address).reset()
     other.end()
+
+
+def drawn(env: perturb.PerturbEnv, fake: FakeServer, *answers: Answer) -> perturb.PerturbEnv:
+    fake.answers = [Answer(opened=opened()), *answers]
+    env.reset()
+    return env
+
+
+@pytest.mark.parametrize(
+    ("code", "message", "says"),
+    [
+        (9, "libEGL.so.1 is missing; install libegl1", "^libEGL.so.1 is missing; install libegl1$"),
+        (3, "request is empty or of a kind this server does not know", "may be older than this package: request is"),
+    ],
+)
+def test_a_server_that_cannot_draw_says_so_and_steps_on(code: int, message: str, says: str, fake: FakeServer) -> None:
+    env = perturb.PerturbEnv("CartPole", server=fake.address, render_mode="rgb_array")
+    drawn(env, fake, Answer(error=pb.Error(code=code, message=message)), Answer(stepped=stepped()))
+    with pytest.raises(perturb.RenderError, match=says) as caught:
+        env.render()
+    assert isinstance(caught.value, RuntimeError)
+    assert env.step(0)[1:] == (0.0, False, False, {})
+    assert fake.sessions == 1
+
+
+@pytest.mark.parametrize(
+    "rendered",
+    [
+        pb.Rendered(pixels=bytes(20 * 16 * 3), width=16, height=20),
+        pb.Rendered(pixels=bytes(20 * 16 * 3 - 1), width=20, height=16),
+        pb.Rendered(),
+    ],
+)
+def test_a_picture_of_another_size_is_refused(rendered: pb.Rendered, fake: FakeServer) -> None:
+    env = perturb.PerturbEnv("CartPole", server=fake.address, render_mode="rgb_array", width=20, height=16)
+    good = pb.Rendered(pixels=bytes(range(240)) * 4, width=20, height=16)
+    picture = drawn(env, fake, Answer(render=good), Answer(render=rendered)).render()
+    assert picture.shape == (16, 20, 3)
+    assert picture[0, 1].tolist() == [3, 4, 5]
+    assert picture[1, 0].tolist() == [60, 61, 62]
+    with pytest.raises(perturb.ProtocolError, match=r"expected \[16, 20, 3\]"):
+        env.render()

@@ -38,6 +38,8 @@ pub(super) enum Command {
     Curves(CurvesArgs),
     /// Draw how trained policies do over two parameters: one policy, or those that an experiment selected.
     Heatmap(HeatmapArgs),
+    /// Film a trained policy.
+    Video(VideoArgs),
 }
 
 /// Where environments run.
@@ -295,6 +297,48 @@ pub(super) struct HeatmapArgs {
     pub(super) out: Option<PathBuf>,
     #[command(flatten)]
     pub(super) server: ServerArgs,
+}
+
+#[derive(Args, Debug)]
+pub(super) struct VideoArgs {
+    /// The --out of a training, or the checkpoint folder in it.
+    #[arg(long, value_name = "DIR")]
+    pub(super) checkpoint: PathBuf,
+    /// Where the environment's parameters come from.
+    #[arg(long, default_value = "D", ignore_case = true)]
+    pub(super) version: Version,
+    /// Episodes to play; of a policy trained with RL² all episodes of a trial are shown, one after the other.
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..))]
+    pub(super) episodes: u64,
+    /// The video; its name ends in .mp4, for which ffmpeg must be installed, or in .gif, which needs nothing.
+    #[arg(long, value_name = "FILE")]
+    pub(super) out: PathBuf,
+    /// Fixes all randomness; with the same number, `evaluate --episodes 1` tests the first episode [default: the
+    /// training's seed].
+    #[arg(long, value_name = "N")]
+    pub(super) seed: Option<u64>,
+    /// Width of the pictures, 240 to 2048 pixels.
+    #[arg(long, value_name = "PIXELS", default_value_t = 480, value_parser = pixels)]
+    pub(super) width: u32,
+    /// Height of the pictures, 240 to 2048 pixels; the text below them comes in addition.
+    #[arg(long, value_name = "PIXELS", default_value_t = 480, value_parser = pixels)]
+    pub(super) height: u32,
+    /// Steps shown in a second, 0.1 to 1000 [default: as many as the environment simulates in one: real time].
+    #[arg(long, value_name = "N", value_parser = frames_per_second)]
+    pub(super) fps: Option<f64>,
+    #[command(flatten)]
+    pub(super) server: ServerArgs,
+}
+
+fn pixels(text: &str) -> Result<u32, String> {
+    let (least, most) = (crate::video::SMALLEST, crate::video::LARGEST);
+    let number = text.parse().ok().filter(|number| (least..=most).contains(number));
+    number.ok_or_else(|| format!("expected {least} to {most}"))
+}
+
+fn frames_per_second(text: &str) -> Result<f64, String> {
+    let number = text.parse().ok().filter(|number| (0.1..=1000.0).contains(number));
+    number.ok_or_else(|| "expected 0.1 to 1000".into())
 }
 
 fn points(text: &str) -> Result<usize, String> {

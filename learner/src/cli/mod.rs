@@ -1,5 +1,5 @@
 //! The command line: `perturb envs | train | evaluate | demo | plan | run | report | curves |
-//! heatmap`.
+//! heatmap | video`.
 //!
 //! Results go to standard output, everything else to standard error. Exit status: 0 done, 1 failed, 2 wrong usage, 128 +
 //! the signal's number if Ctrl-C or SIGTERM ended it. `run --cell` has two more: 69 without a server, 75 if another
@@ -17,6 +17,7 @@ mod run;
 mod single_thread;
 mod slurm;
 mod train;
+mod video;
 
 use std::io::IsTerminal;
 use std::process::ExitCode;
@@ -29,6 +30,7 @@ use crate::config::ConfigError;
 use crate::evaluation::TestError;
 use crate::experiment::slurm::OptionError;
 use crate::experiment::{HeatmapError, PlanError};
+use crate::video::VideoError;
 use args::{Cli, Command, ServerArgs};
 
 /// How a command ended that did not fail.
@@ -67,6 +69,7 @@ pub fn main() -> ExitCode {
         Command::Report(args) => report::run(&args),
         Command::Curves(args) => report::curves(&args),
         Command::Heatmap(args) => heatmap::run(&args),
+        Command::Video(args) => video::run(&args),
     };
     match result {
         Ok(Ending::Done) => ExitCode::SUCCESS,
@@ -77,8 +80,8 @@ pub fn main() -> ExitCode {
 }
 
 fn fail(error: &anyhow::Error) -> ExitCode {
-    let stopped = match error.downcast_ref() {
-        Some(HeatmapError::Test(error)) => Some(error),
+    let stopped = match (error.downcast_ref(), error.downcast_ref()) {
+        (Some(HeatmapError::Test(error)), _) | (_, Some(VideoError::Test(error))) => Some(error),
         _ => error.downcast_ref(),
     };
     if let Some(TestError::Stopped { signal }) = stopped {
@@ -93,8 +96,11 @@ fn fail(error: &anyhow::Error) -> ExitCode {
         return ExitCode::SUCCESS;
     }
     eprintln!("perturb: {error:#}");
-    let usage =
-        error.is::<ConfigError>() || error.is::<UsageError>() || error.is::<PlanError>() || error.is::<OptionError>();
+    let usage = error.is::<ConfigError>()
+        || error.is::<UsageError>()
+        || error.is::<PlanError>()
+        || error.is::<OptionError>()
+        || matches!(error.downcast_ref(), Some(VideoError::Extension { .. }));
     ExitCode::from(if usage { 2 } else { 1 })
 }
 

@@ -1,7 +1,7 @@
 //! Environments over gRPC.
 //!
 //! [`Servers`] holds the connections, [`Session`] a batch of environments that may be spread over them, [`LocalServer`]
-//! a server of the learner's own. The interface is blocking: a single-threaded tokio runtime inside [`Servers`] runs on
+//! a server of the learner's own, [`Single`] one environment that is drawn. The interface is blocking: a single-threaded tokio runtime inside [`Servers`] runs on
 //! the caller's thread, while a call waits. A hand-over to another thread would double a step's latency.
 //! Long computations between two calls belong into [`Servers::keep_alive_during`].
 
@@ -11,9 +11,11 @@ mod error;
 mod local;
 mod servers;
 mod session;
+mod single;
 
 pub use address::{Address, AddressError};
 pub use error::ClientError;
 pub use local::{LocalServer, LocalServerOptions};
 pub use servers::Servers;
 pub use session::{EndedEpisode, OpenOptions, Session, StepReply};
+pub use single::{BegunEpisode, Picture, Single};

@@ -88,7 +88,7 @@ pub struct Session<'a> {
 
 /// The part of a batch that one server owns.
 #[derive(Debug)]
-struct Part {
+pub(super) struct Part {
     address: Address,
     range: Range<usize>,
     requests: mpsc::Sender<SessionRequest>,
@@ -112,7 +112,8 @@ impl<'a> Session<'a> {
             if range.is_empty() {
                 continue; // more servers than environments
             }
-            let (part, opened) = servers.runtime().block_on(open_part(servers, link, options, range))?;
+            let opening = open_part(servers, link, options, range, AutoresetMode::SameStep);
+            let (part, opened) = servers.runtime().block_on(opening)?;
             let described = opened.environment.unwrap_or_default();
             let expected = part.range.len() * described.observation.len();
             let first = observations.len();
@@ -305,7 +306,7 @@ impl<'a> Session<'a> {
 }
 
 impl StepReply {
-    fn resize(&mut self, num_envs: usize, observation_size: usize) {
+    pub(super) fn resize(&mut self, num_envs: usize, observation_size: usize) {
         self.observations.resize(num_envs * observation_size, 0.0);
         self.rewards.resize(num_envs, 0.0);
         self.terminated.resize(num_envs, false);
@@ -316,7 +317,12 @@ impl StepReply {
 }
 
 impl Part {
-    async fn send(&self, what: &'static str, request: Request, servers: &Servers) -> Result<(), ClientError> {
+    pub(super) async fn send(
+        &self,
+        what: &'static str,
+        request: Request,
+        servers: &Servers,
+    ) -> Result<(), ClientError> {
         let message = SessionRequest { request: Some(request) };
         // The channel has room for a request, and is closed only after the stream has ended.
         self.requests.send(message).await.map_err(|_| {
@@ -325,7 +331,7 @@ impl Part {
         })
     }
 
-    async fn receive(&mut self, what: &'static str, servers: &Servers) -> Result<Response, ClientError> {
+    pub(super) async fn receive(&mut self, what: &'static str, servers: &Servers) -> Result<Response, ClientError> {
         let address = || self.address.clone();
         let message = tokio::time::timeout(REPLY_LIMIT, self.replies.message())
             .await
@@ -345,7 +351,7 @@ impl Part {
     }
 
     /// Puts one server's reply in its place in the batch's.
-    fn store(&self, stepped: proto::Stepped, size: usize, reply: &mut StepReply) -> Result<(), ClientError> {
+    pub(super) fn store(&self, stepped: proto::Stepped, size: usize, reply: &mut StepReply) -> Result<(), ClientError> {
         let what = "a step";
         let Range { start, end } = self.range;
         self.decode(what, "observations", &stepped.observations, &mut reply.observations[start * size..end * size])?;
@@ -378,7 +384,7 @@ impl Part {
     }
 
     /// Little-endian f32 numbers, exactly as many as `out` takes.
-    fn decode(
+    pub(super) fn decode(
         &self,
         request: &'static str,
         field: &'static str,
@@ -407,28 +413,30 @@ impl Part {
         self.mismatch(request, format!("{got} bytes of {field}"), format!("{expected}"))
     }
 
-    fn unexpected(&self, request: &'static str, got: &Response, expected: &str) -> ClientError {
+    pub(super) fn unexpected(&self, request: &'static str, got: &Response, expected: &str) -> ClientError {
         let got = match got {
             Response::Opened(_) => "Opened",
             Response::Stepped(_) => "Stepped",
             Response::Reset(_) => "ResetDone",
             Response::Snapshot(_) => "Snapshotted",
             Response::Restore(_) => "Restored",
+            Response::Render(_) => "Rendered",
             Response::Error(_) => "Error",
         };
         self.mismatch(request, got.into(), expected.into())
     }
 
-    fn mismatch(&self, request: &'static str, got: String, expected: String) -> ClientError {
+    pub(super) fn mismatch(&self, request: &'static str, got: String, expected: String) -> ClientError {
         ClientError::Protocol { address: self.address.clone(), request, got, expected }
     }
 }
 
-async fn open_part(
+pub(super) async fn open_part(
     servers: &Servers,
     link: &Link,
     options: &OpenOptions,
     range: Range<usize>,
+    autoreset_mode: AutoresetMode,
 ) -> Result<(Part, proto::Opened), ClientError> {
     let what = "to open a session";
     let (requests, receiver) = mpsc::channel(4);
@@ -447,7 +455,7 @@ async fn open_part(
         seed: options.seed,
         first_environment_index: index(range.start)?,
         episodes_per_trial: options.episodes_per_trial,
-        autoreset_mode: AutoresetMode::SameStep.into(),
+        autoreset_mode: autoreset_mode.into(),
         receipts: true,
         ..proto::Open::default()
     };

@@ -3,12 +3,12 @@
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
+use super::agent::Agent;
 use super::protocol::Version;
 use super::statistics::{mean, wilson};
 use crate::checkpoint::{Checkpoint, EnvironmentSummary};
 use crate::client::{ClientError, EndedEpisode, OpenOptions, Servers, Session, StepReply};
 use crate::interrupt::StopFlag;
-use crate::policy::{Actor, Acts};
 use crate::random::{Purpose, stream};
 
 /// The most environments that are tested together.
@@ -116,12 +116,7 @@ pub(crate) fn play(
 ) -> Result<Vec<EndedEpisode>, TestError> {
     let state = &checkpoint.state;
     let mut reply = StepReply { observations, ..StepReply::default() };
-    let mut actor = Actor::new(&state.policy, quotas.len());
-    let mut inputs = state.inputs(quotas.len());
-    actor.load(&checkpoint.weights)?;
-    let mut rng = stream(seed, Purpose::TestActions);
-    let mut acts = Acts::new(state.policy.action, quotas.len());
-    let mut actions = Vec::new();
+    let mut agent = Agent::new(checkpoint, quotas.len(), seed)?;
     let mut done = vec![false; quotas.len()];
     let mut counted: Vec<EndedEpisode> = Vec::new();
     let episodes: u64 = quotas.iter().sum();
@@ -129,23 +124,12 @@ pub(crate) fn play(
         if let Some(signal) = stop.signal() {
             return Err(TestError::Stopped { signal });
         }
-        if let Some(normaliser) = &state.observation_normaliser {
-            normaliser.normalise(&mut reply.observations)?;
-        }
-        actor.act(inputs.of(&reply.observations), &mut rng, &mut acts)?;
-        acts.write_bytes(&mut actions);
-        session.step(&actions, &mut reply)?;
-        if let Some(normaliser) = &state.reward_normaliser {
-            normaliser.normalise(&mut reply.rewards);
-        }
+        session.step(agent.act(&mut reply.observations)?, &mut reply)?;
         done.fill(false);
         reply.ended.iter().for_each(|end| done[end.slot] = true);
-        inputs.remember(&acts, &reply.rewards, &done)?;
+        agent.remember(&mut reply.rewards, &done)?;
         reply.ended.retain(|end| end.episode_in_trial + 1 == state.episodes_per_trial);
-        for end in &reply.ended {
-            actor.forget(end.slot);
-            inputs.forget(end.slot);
-        }
+        reply.ended.iter().for_each(|end| agent.forget(end.slot));
         // Environments that are done go on, unseen: they cost less than a smaller batch would save.
         count(reply.ended.drain(..), quotas, &mut counted);
         report(counted.len() as u64);
@@ -154,7 +138,7 @@ pub(crate) fn play(
 }
 
 /// What a test opens of a policy without trials.
-fn open_options(environment: &str, version: Version, num_envs: usize, seed: u64) -> OpenOptions {
+pub(crate) fn open_options(environment: &str, version: Version, num_envs: usize, seed: u64) -> OpenOptions {
     OpenOptions {
         environment: environment.to_owned(),
         version: version.to_proto(),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
@@ -23,17 +23,25 @@ ANY: Range = (-math.inf, math.inf)
 
 @dataclass(frozen=True)
 class Description:
-    """An environment's name, revision and spaces. `actions` is the number of choices, or the range of each number."""
+    """An environment's name, revision and spaces. `actions` is the number of choices, or the range of each number.
+
+    `control_timestep` is the simulated time in one step, s.
+    """
 
     name: str
     revision: int
     observation: tuple[Range, ...]
     actions: int | tuple[Range, ...]
+    control_timestep: float
 
     @property
     def discrete(self) -> bool:
         """Whether actions are choices."""
         return isinstance(self.actions, int)
+
+    def metadata(self) -> dict[str, Any]:
+        """What Gymnasium wants to know of pictures; as many in a second as show real time."""
+        return {"render_modes": ["rgb_array"], "render_fps": 1 / self.control_timestep}
 
     def observation_space(self) -> spaces.Box:
         """A float32 Box [O]."""
@@ -53,6 +61,7 @@ class Description:
             len(action.discrete.names)
             if action.WhichOneof("kind") == "discrete"
             else tuple((channel.low, channel.high) for channel in action.continuous.channels),
+            served.control_timestep,
         )
         if theirs.revision != self.revision:
             raise ProtocolError(
@@ -71,7 +80,7 @@ def _box(ranges: tuple[Range, ...]) -> spaces.Box:
 def _robot(name: str, joints: int, contacts: int) -> Description:
     torso: tuple[Range, ...] = ((-5, 5), (-1, 1), (-1, 1), *[(-5.0, 5.0)] * 5)
     observation = (*torso, *[(-5.0, 5.0)] * (2 * joints), *[(0.0, 1.0)] * contacts)
-    return Description(name, 0, observation, ((-1.0, 1.0),) * joints)
+    return Description(name, 0, observation, ((-1.0, 1.0),) * joints, 0.0165)
 
 
 _UNIT: Range = (-1.0, 1.0)
@@ -79,10 +88,10 @@ _UNIT: Range = (-1.0, 1.0)
 CATALOGUE: dict[str, Description] = {
     description.name: description
     for description in (
-        Description("CartPole", 0, (ANY,) * 4, 2),
-        Description("MountainCar", 0, ((-1.2, 0.6), (-0.07, 0.07)), 3),
-        Description("Acrobot", 0, (*[_UNIT] * 4, (-4 * math.pi, 4 * math.pi), (-9 * math.pi, 9 * math.pi)), 3),
-        Description("Pendulum", 0, (_UNIT, _UNIT, (-8.0, 8.0)), ((-2.0, 2.0),)),
+        Description("CartPole", 0, (ANY,) * 4, 2, 0.02),
+        Description("MountainCar", 0, ((-1.2, 0.6), (-0.07, 0.07)), 3, 1.0),
+        Description("Acrobot", 0, (*[_UNIT] * 4, (-4 * math.pi, 4 * math.pi), (-9 * math.pi, 9 * math.pi)), 3, 0.2),
+        Description("Pendulum", 0, (_UNIT, _UNIT, (-8.0, 8.0)), ((-2.0, 2.0),), 0.05),
         _robot("HalfCheetah", joints=6, contacts=6),
         _robot("Hopper", joints=3, contacts=1),
     )

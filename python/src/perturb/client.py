@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 # How long a reply may take unless told otherwise, s.
 TIMEOUT = 60.0
+# The width and the height of pictures unless told otherwise, in pixels.
+PICTURE = 480
 
 
 class Client:
@@ -41,9 +43,12 @@ class Client:
         reward_terms: bool,
         timeout: float,
         render_mode: str | None,
+        width: int,
+        height: int,
     ) -> None:
-        if render_mode is not None:
-            raise InvalidArgumentError(f"render_mode={render_mode!r} is not supported: servers send no pictures")
+        requests.render_mode(render_mode)
+        self._drawn = render_mode is not None
+        self._width, self._height = requests.pixels(width, "width"), requests.pixels(height, "height")
         self.description = catalogue.find(environment)
         self.num_envs = requests.count(num_envs, "num_envs", 1)
         self._server = None if server is None else parse_address(server)
@@ -147,6 +152,17 @@ class Client:
             raise
         self._partly_changed = True  # from here on nobody but the server knows the parameters
         return restored
+
+    def render(self, slot: int) -> NDArray[np.uint8]:
+        """Draw an environment: a read-only array [height, width, 3] of the bytes that came."""
+        if not self._drawn:
+            raise OutOfOrderError("render() is for environments that were made with render_mode='rgb_array'")
+        rendered = self.session.render(pb.Render(slot=slot, width=self._width, height=self._height))
+        shape, size = (rendered.height, rendered.width, 3), len(rendered.pixels)
+        if shape[:2] != (self._height, self._width) or size != np.prod(shape):
+            what = f"the server sent a picture {list(shape)} in {size} bytes; expected {[self._height, self._width, 3]}"
+            raise ProtocolError(what)
+        return np.frombuffer(rendered.pixels, np.uint8).reshape(shape)
 
     def floats(self, data: bytes, *shape: int) -> NDArray[np.float32]:
         """Look at a reply's numbers as a read-only array, without a copy."""

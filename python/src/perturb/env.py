@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
 import numpy as np
@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from . import requests
-from .client import TIMEOUT, Client
+from .client import PICTURE, TIMEOUT, Client
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,12 +35,15 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
         receipts: whether infos have parameters and receipt.
         reward_terms: whether every step's info has the terms of the reward.
         timeout: how long a reply may take, s.
-        render_mode: None; servers send no pictures.
+        render_mode: `rgb_array` lets `render` draw; None.
+        width: of pictures, in pixels, 16 … 2048.
+        height: likewise.
 
-    The connection is made by the first `reset`. Observations are float32 [O], the caller's own to keep and to change.
+    The connection is made by the first `reset`. Observations, float32 [O], and pictures are the caller's own to
+    keep and to change.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}  # type: ignore[misc]
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012  (each environment adds its render_fps)
     action_space: spaces.Discrete | spaces.Box
 
     def __init__(
@@ -56,6 +59,8 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
         reward_terms: bool = False,
         timeout: float = TIMEOUT,
         render_mode: str | None = None,
+        width: int = PICTURE,
+        height: int = PICTURE,
     ) -> None:
         self._client = Client(
             environment=environment,
@@ -70,7 +75,11 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
             reward_terms=reward_terms,
             timeout=timeout,
             render_mode=render_mode,
+            width=width,
+            height=height,
         )
+        self.render_mode = render_mode
+        self.metadata = self._client.description.metadata()
         self._reward_terms = reward_terms
         self.observation_space = cast("spaces.Space[NDArray[np.float32]]", self._client.description.observation_space())
         self.action_space = self._client.description.action_space()
@@ -137,9 +146,15 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
         self._client.open([], self.np_random)
         return self._observation(self._client.restore([snapshot], None).observations)
 
-    def render(self) -> None:
-        """Raise NotImplementedError: servers send no pictures."""
-        raise NotImplementedError("servers send no pictures; only render_mode=None is supported")
+    def render(self) -> NDArray[np.uint8]:
+        """Draw the environment as it is now: red, green and blue, uint8 [height, width, 3]. Changes nothing.
+
+        Raises:
+            OutOfOrderError: before the first reset, or without `render_mode="rgb_array"`.
+            RenderError: if the server cannot draw; it says what is missing.
+            ServerConnectionError, ServerTimeoutError: and the environment is gone.
+        """
+        return self._client.render(0).copy()
 
     def close(self) -> None:
         """Free the environment on the server."""

@@ -21,6 +21,10 @@ class ServerFullError(PerturbError, RuntimeError):
     """The server has no room for so many environments or sessions."""
 
 
+class RenderError(PerturbError, RuntimeError):
+    """The server cannot draw: it has no graphics library, or is older than pictures. The environments are unharmed."""
+
+
 class OutOfOrderError(PerturbError, RuntimeError):
     """A call out of order: a step before the first reset, or after an episode's end without a reset."""
 
@@ -55,7 +59,11 @@ _BY_CODE: dict[int, type[PerturbError]] = {
 }
 
 
-def refusal(code: int, message: str) -> PerturbError:
-    """Turn the protocol's Error, a refusal by the server, into an exception with the server's sentence."""
-    kind = _BY_CODE.get(code)
-    return ProtocolError(f"error with the unknown code {code}: {message}") if kind is None else kind(message)
+def refusal(kind: str, code: int, message: str) -> PerturbError:
+    """Turn the protocol's Error, a refusal of a request by the server, into an exception with the server's sentence."""
+    if kind == "render" and code == 9:
+        return RenderError(message)
+    if kind == "render" and code == 3:  # sizes are checked before they are sent: it does not know the request
+        return RenderError(f"the server cannot draw, it may be older than this package: {message}")
+    error = _BY_CODE.get(code)
+    return ProtocolError(f"error with the unknown code {code}: {message}") if error is None else error(message)

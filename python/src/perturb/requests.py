@@ -121,6 +121,28 @@ def count(value: Any, name: str, least: int) -> int:
     return number
 
 
+def pixels(value: Any, name: str) -> int:
+    """The width or height of a picture that a server draws."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = 0
+    if not 16 <= number <= 2048:
+        raise InvalidArgumentError(f"{name}={value!r}; expected an integer from 16 to 2048")
+    return number
+
+
+def render_mode(value: Any) -> None:
+    """The one way in which environments are drawn, or none."""
+    if value == "human":
+        raise InvalidArgumentError(
+            "render_mode='human' needs a window, which gymnasium.wrappers.HumanRendering opens: give it an environment "
+            "with render_mode='rgb_array'"
+        )
+    if value not in (None, "rgb_array"):
+        raise InvalidArgumentError(f"render_mode={value!r}; expected 'rgb_array' or None")
+
+
 def seconds(value: Any, name: str) -> float:
     """A span of time, more than nothing; infinity is one."""
     try:

@@ -44,7 +44,14 @@ if TYPE_CHECKING:
 
 SERVICE = pb.DESCRIPTOR.services_by_name["Perturb"].full_name
 # Which reply each request gets.
-REPLIES = {"open": "opened", "step": "stepped", "reset": "reset", "snapshot": "snapshot", "restore": "restore"}
+REPLIES = {
+    "open": "opened",
+    "step": "stepped",
+    "reset": "reset",
+    "snapshot": "snapshot",
+    "restore": "restore",
+    "render": "render",
+}
 # How long a connection may take to be made, s.
 CONNECT_LIMIT = 10
 # How often a silent server is asked whether it lives, and how long it may take to answer, s. A very busy machine is no
@@ -133,6 +140,11 @@ class Session:
         restored: pb.Restored = self._call("restore", pb.SessionRequest(restore=request))
         return restored
 
+    def render(self, request: pb.Render) -> pb.Rendered:
+        """Draw an environment."""
+        rendered: pb.Rendered = self._call("render", pb.SessionRequest(render=request))
+        return rendered
+
     def close(self) -> None:
         """End the session; the server frees its environments."""
         self._lost = self._lost or "it was closed"
@@ -174,7 +186,7 @@ class Session:
         self._lost = None
         answered = response.WhichOneof("response")
         if answered == "error":
-            refused = refusal(response.error.code, response.error.message)
+            refused = refusal(kind, response.error.code, response.error.message)
             # A refusal changes nothing; a defect of the server costs the environments.
             raise self._fail(refused) if isinstance(refused, ServerDefectError) else refused
         if answered != REPLIES[kind]:

@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from . import requests
-from .client import TIMEOUT, Client
+from .client import PICTURE, TIMEOUT, Client
 from .errors import InvalidArgumentError
 from .infos import BatchInfos
 
@@ -37,10 +37,13 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         episodes_per_trial: parameters are drawn anew after so many episodes.
         receipts: whether infos have parameters and receipt.
         reward_terms: whether every step's infos have the terms of the reward.
-        copy: False returns observations as they came, read-only arrays without a copy; True returns copies, which can
-            be changed and which PyTorch takes without a warning. Either way the next step leaves them as they are.
+        copy: False returns observations and pictures as they came, read-only arrays without a copy; True returns
+            copies, which can be changed and which PyTorch takes without a warning. Either way the next step leaves them
+            as they are.
         timeout: how long a reply may take, s.
-        render_mode: None; servers send no pictures.
+        render_mode: `rgb_array` lets `render` draw; None.
+        width: of pictures, in pixels, 16 … 2048.
+        height: likewise.
 
     The connection is made by the first `reset`. Rewards are float32 [N], flags bool [N].
     """
@@ -61,6 +64,8 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         copy: bool = False,
         timeout: float = TIMEOUT,
         render_mode: str | None = None,
+        width: int = PICTURE,
+        height: int = PICTURE,
     ) -> None:
         self._mode = requests.autoreset_mode(autoreset_mode)
         self._client = Client(
@@ -76,10 +81,13 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
             reward_terms=reward_terms,
             timeout=timeout,
             render_mode=render_mode,
+            width=width,
+            height=height,
         )
+        self.render_mode = render_mode
         description = self._client.description
         self.num_envs = self._client.num_envs
-        self.metadata = {"render_modes": [], "autoreset_mode": self._mode}
+        self.metadata = {**description.metadata(), "autoreset_mode": self._mode}
         self.single_observation_space = description.observation_space()
         self.single_action_space = description.action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -171,9 +179,18 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         restored = self._client.restore(snapshots, selected)
         return self._merge(restored.observations, selected)
 
-    def render(self) -> None:
-        """Raise NotImplementedError: servers send no pictures."""
-        raise NotImplementedError("servers send no pictures; only render_mode=None is supported")
+    def render(self) -> tuple[NDArray[np.uint8], ...]:
+        """Draw the environments as they are now: of each, red, green and blue, uint8 [height, width, 3].
+
+        In same-step mode the environment of an ended episode is at the start of the next one already.
+
+        Raises:
+            OutOfOrderError: before the first reset, or without `render_mode="rgb_array"`.
+            RenderError: if the server cannot draw; it says what is missing.
+            ServerConnectionError, ServerTimeoutError: and the environments are gone.
+        """
+        frames = (self._client.render(slot) for slot in range(self.num_envs))
+        return tuple(frame.copy() if self._copy else frame for frame in frames)
 
     def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002
         """Free the environments on the server."""

@@ -20,7 +20,7 @@ pub use heatmap::draw_heatmap;
 /// DejaVu Sans, cut down to the letters that pictures have; its licence is beside it.
 const FONT: &[u8] = include_bytes!("../../../data/fonts/DejaVuSans-subset.ttf");
 /// What the font is called in an SVG.
-const FAMILY: &str = "sans-serif";
+pub(crate) const FAMILY: &str = "sans-serif";
 /// PNG has so many pixels for one unit of the SVG, so that it can be printed.
 pub const PNG_SCALE: u32 = 2;
 
@@ -104,7 +104,7 @@ pub fn save(picture: &impl Picture, path: &Path) -> Result<(), PlotError> {
 }
 
 /// Makes the font known to the library, once.
-fn load_font() -> Result<(), PlotError> {
+pub(crate) fn load_font() -> Result<(), PlotError> {
     static LOADED: OnceLock<bool> = OnceLock::new();
     let loaded = LOADED.get_or_init(|| register_font(FAMILY, FontStyle::Normal, FONT).is_ok());
     if *loaded { Ok(()) } else { Err(PlotError::Draw("the font is damaged".into())) }

@@ -1,0 +1,69 @@
+//! A trained policy as it acts in tests: sampled actions, frozen statistics.
+
+use rand_chacha::ChaCha8Rng;
+
+use crate::checkpoint::{Checkpoint, State};
+use crate::error::Result;
+use crate::policy::{Actor, Acts, Inputs};
+use crate::random::{Purpose, stream};
+
+/// The policy of a checkpoint in N environments, with what it remembers of each.
+pub(crate) struct Agent<'a> {
+    state: &'a State,
+    actor: Actor,
+    inputs: Inputs,
+    rng: ChaCha8Rng,
+    acts: Acts,
+    bytes: Vec<u8>,
+}
+
+impl<'a> Agent<'a> {
+    /// At the start of a trial in each of N = `n_envs` environments. `seed` fixes the actions that are sampled.
+    ///
+    /// # Errors
+    /// Weights that do not fit.
+    pub(crate) fn new(checkpoint: &'a Checkpoint, n_envs: usize, seed: u64) -> Result<Self> {
+        let state = &checkpoint.state;
+        let mut actor = Actor::new(&state.policy, n_envs);
+        actor.load(&checkpoint.weights)?;
+        Ok(Self {
+            state,
+            actor,
+            inputs: state.inputs(n_envs),
+            rng: stream(seed, Purpose::TestActions),
+            acts: Acts::new(state.policy.action, n_envs),
+            bytes: Vec::new(),
+        })
+    }
+
+    /// The next actions, as the protocol wants them, after `observations` `[N, O]`, which are normalised in place.
+    ///
+    /// # Errors
+    /// Numbers that are not finite.
+    pub(crate) fn act(&mut self, observations: &mut [f32]) -> Result<&[u8]> {
+        if let Some(normaliser) = &self.state.observation_normaliser {
+            normaliser.normalise(observations)?;
+        }
+        self.actor.act(self.inputs.of(observations), &mut self.rng, &mut self.acts)?;
+        self.acts.write_bytes(&mut self.bytes);
+        Ok(&self.bytes)
+    }
+
+    /// Remembers what came of the last actions: `rewards` `[N]`, which are normalised in place, and `done` `[N]` where an
+    /// episode ended.
+    ///
+    /// # Errors
+    /// Lengths that do not fit.
+    pub(crate) fn remember(&mut self, rewards: &mut [f32], done: &[bool]) -> Result<()> {
+        if let Some(normaliser) = &self.state.reward_normaliser {
+            normaliser.normalise(rewards);
+        }
+        self.inputs.remember(&self.acts, rewards, done)
+    }
+
+    /// A new trial begins in `environment`.
+    pub(crate) fn forget(&mut self, environment: usize) {
+        self.actor.forget(environment);
+        self.inputs.forget(environment);
+    }
+}

@@ -1,0 +1,178 @@
+//! The file of a video, which appears whole or not at all.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+
+use tempfile::NamedTempFile;
+
+use super::gif::{self, GifEncoder};
+use super::mp4::{self, Mp4Encoder};
+use super::{VideoError, io};
+
+/// How a video is encoded.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Format {
+    /// `.gif`: 256 colours a frame, and needs nothing.
+    Gif,
+    /// `.mp4`: H.264, by the program ffmpeg.
+    Mp4,
+}
+
+impl Format {
+    /// The format that the ending of `path` stands for, in upper or lower case.
+    ///
+    /// # Errors
+    /// [`VideoError::Extension`].
+    pub fn of(path: &Path) -> Result<Self, VideoError> {
+        let ending = path.extension().map(|ending| ending.to_ascii_lowercase());
+        match ending.as_ref().and_then(|ending| ending.to_str()) {
+            Some("gif") => Ok(Self::Gif),
+            Some("mp4") => Ok(Self::Mp4),
+            _ => Err(VideoError::Extension { path: path.to_owned() }),
+        }
+    }
+}
+
+/// A video that is to be written: a hidden file in the same folder until it is whole, deleted if it never is.
+#[derive(Debug)]
+pub struct VideoFile {
+    path: PathBuf,
+    format: Format,
+    temporary: NamedTempFile,
+}
+
+impl VideoFile {
+    /// Makes sure that `path` can be written before anything is played. A folder that is missing is created; a video that
+    /// is there is replaced at the end.
+    ///
+    /// # Errors
+    /// [`VideoError::Extension`], [`VideoError::NoFfmpeg`] and [`VideoError::Io`].
+    pub fn create(path: &Path) -> Result<Self, VideoError> {
+        let format = Format::of(path)?;
+        if path.is_dir() {
+            return Err(io("write", path)(std::io::ErrorKind::IsADirectory.into()));
+        }
+        if format == Format::Mp4 {
+            mp4::find_ffmpeg()?;
+        }
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        fs::create_dir_all(folder).map_err(io("create", folder))?;
+        let temporary = tempfile::Builder::new()
+            .prefix(".perturb-video-")
+            .permissions(fs::Permissions::from_mode(0o666)) // as any file; the umask takes its part
+            .tempfile_in(folder)
+            .map_err(io("write to", folder))?;
+        Ok(Self { path: path.to_owned(), format, temporary })
+    }
+
+    /// How long a frame is shown of which there should be `fps` in a second, s.
+    pub fn frame_seconds(&self, fps: f64) -> f64 {
+        match self.format {
+            Format::Gif => f64::from(gif::delay(1.0 / fps)) / 100.0,
+            Format::Mp4 => 1.0 / fps,
+        }
+    }
+
+    /// Begins to encode frames of `size`, width and height in pixels, both even. One is shown for 1 / `fps` seconds, or for
+    /// a whole multiple of it; in a GIF for whole hundredths of a second.
+    ///
+    /// # Errors
+    /// [`VideoError::Encode`].
+    pub fn begin(self, size: (u32, u32), fps: f64) -> Result<VideoWriter, VideoError> {
+        let encoder: Result<Box<dyn Encode>, String> = match self.format {
+            Format::Gif => GifEncoder::new(self.temporary.path(), size, fps).map(|encoder| Box::new(encoder) as _),
+            Format::Mp4 => Mp4Encoder::new(self.temporary.path(), size, fps).map(|encoder| Box::new(encoder) as _),
+        };
+        let encoder = encoder.map_err(|reason| VideoError::Encode { path: self.path.clone(), reason })?;
+        Ok(VideoWriter { encoder, file: self })
+    }
+}
+
+/// What encodes frames to a file.
+pub(super) trait Encode {
+    /// Adds a frame `[height, width, 3]` that is shown for about so many `seconds`. What went wrong is said in words.
+    fn write(&mut self, frame: &[u8], seconds: f64) -> Result<(), String>;
+
+    /// Completes the file.
+    fn finish(self: Box<Self>) -> Result<(), String>;
+}
+
+/// A video that is being written.
+pub struct VideoWriter {
+    // Dropped in this order: the encoder before the file that it writes to.
+    encoder: Box<dyn Encode>,
+    file: VideoFile,
+}
+
+impl VideoWriter {
+    /// Adds a frame `[height, width, 3]` that is shown for about so many `seconds`, but at least as long as any.
+    ///
+    /// # Errors
+    /// [`VideoError::Encode`].
+    pub fn write(&mut self, frame: &[u8], seconds: f64) -> Result<(), VideoError> {
+        let path = &self.file.path;
+        self.encoder.write(frame, seconds).map_err(|reason| VideoError::Encode { path: path.clone(), reason })
+    }
+
+    /// Completes the video and puts it into its place.
+    ///
+    /// # Errors
+    /// [`VideoError::Encode`] and [`VideoError::Io`]; a video that was there before is then still there.
+    pub fn finish(self) -> Result<(), VideoError> {
+        let VideoFile { path, temporary, .. } = self.file;
+        self.encoder.finish().map_err(|reason| VideoError::Encode { path: path.clone(), reason })?;
+        temporary.persist(&path).map_err(|error| io("rename a file to", &path)(error.error))?;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_ending_says_the_format() {
+        for (name, format) in [("a.gif", Format::Gif), ("a/b.c.mp4", Format::Mp4), ("A.GIF", Format::Gif)] {
+            assert_eq!(Format::of(Path::new(name)).unwrap(), format, "{name}");
+        }
+        for name in ["a", "a.avi", ".gif", "gif", "a.mp4.txt"] {
+            assert!(Format::of(Path::new(name)).unwrap_err().to_string().contains(".mp4 or .gif"), "{name}");
+        }
+    }
+
+    #[test]
+    fn a_video_that_is_not_finished_leaves_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("new/a.gif");
+        let frame = [7; 2 * 2 * 3];
+        let names = || fs::read_dir(folder.path().join("new")).unwrap().count();
+
+        let mut writer = VideoFile::create(&path).unwrap().begin((2, 2), 10.0).unwrap();
+        writer.write(&frame, 0.1).unwrap();
+        assert_eq!((names(), path.exists()), (1, false), "a hidden file");
+        drop(writer);
+        assert_eq!(names(), 0);
+
+        fs::write(&path, "the one before").unwrap();
+        let mut writer = VideoFile::create(&path).unwrap().begin((2, 2), 10.0).unwrap();
+        writer.write(&frame, 0.1).unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"the one before");
+        writer.finish().unwrap();
+        assert_eq!((names(), &fs::read(&path).unwrap()[..6]), (1, &b"GIF89a"[..]));
+        let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode();
+        fs::write(folder.path().join("other"), "").unwrap();
+        assert_eq!(mode(&path), mode(&folder.path().join("other")), "readable by whoever reads other files");
+    }
+
+    #[test]
+    fn what_cannot_be_written_is_refused_at_once() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(folder.path().join("file"), "").unwrap();
+        fs::create_dir(folder.path().join("folder.gif")).unwrap();
+        for (name, part) in [("file/a.gif", "file"), ("folder.gif", "is a directory"), ("a.avi", "a.avi")] {
+            let error = VideoFile::create(&folder.path().join(name)).unwrap_err().to_string();
+            assert!(error.contains(part), "{error}");
+        }
+    }
+}

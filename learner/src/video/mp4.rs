@@ -1,0 +1,104 @@
+//! Frames as an MP4, by the program ffmpeg.
+
+use std::fs::File;
+use std::io::{Read, Seek, Write};
+use std::os::unix::process::CommandExt;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+
+use super::VideoError;
+use super::file::Encode;
+
+const PROGRAM: &str = "ffmpeg";
+/// Constant quality: lower is better and larger; text stays clean at this one.
+const QUALITY: &str = "20";
+
+/// Makes sure that ffmpeg is there and has an encoder for H.264.
+///
+/// # Errors
+/// [`VideoError::NoFfmpeg`].
+pub(super) fn find_ffmpeg() -> Result<(), VideoError> {
+    let answer = Command::new(PROGRAM)
+        .args(["-hide_banner", "-loglevel", "error", "-h", "encoder=libx264"])
+        .stdin(Stdio::null())
+        .output()
+        .map_err(|error| VideoError::NoFfmpeg { reason: format!("`{PROGRAM}` cannot be started: {error}") })?;
+    if answer.stdout.starts_with(b"Encoder libx264") {
+        return Ok(());
+    }
+    Err(VideoError::NoFfmpeg { reason: format!("this `{PROGRAM}` has none") })
+}
+
+/// Hands frames to an ffmpeg, which ends with this value.
+pub(super) struct Mp4Encoder {
+    child: Child,
+    /// What ffmpeg says: in a file, since nobody reads a pipe while frames are written.
+    words: File,
+    fps: f64,
+}
+
+impl Mp4Encoder {
+    pub(super) fn new(path: &Path, (width, height): (u32, u32), fps: f64) -> Result<Self, String> {
+        let words = tempfile::tempfile().map_err(|error| error.to_string())?;
+        let (size, fps_text) = (format!("{width}x{height}"), fps.to_string());
+        let child = Command::new(PROGRAM)
+            .args(["-hide_banner", "-loglevel", "error", "-y"])
+            .args(["-f", "rawvideo", "-pixel_format", "rgb24", "-video_size", &size, "-framerate", &fps_text])
+            .args(["-i", "pipe:0"])
+            // What every player can show; RGB is turned into the colours of HD video, and says so.
+            .args(["-c:v", "libx264", "-crf", QUALITY, "-pix_fmt", "yuv420p", "-vf", "scale=out_color_matrix=bt709"])
+            .args(["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"])
+            // The index comes first, so that a browser shows it before it has all.
+            .args(["-movflags", "+faststart", "-f", "mp4"])
+            .arg(path)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::null())
+            .stderr(words.try_clone().map_err(|error| error.to_string())?)
+            // Ctrl-C is for this process, which then ends ffmpeg.
+            .process_group(0)
+            .spawn()
+            .map_err(|error| format!("`{PROGRAM}` cannot be started: {error}"))?;
+        Ok(Self { child, words, fps })
+    }
+
+    /// Why ffmpeg ended.
+    fn failure(&mut self) -> String {
+        drop(self.child.stdin.take());
+        let status = self.child.wait().map_or_else(|error| error.to_string(), |status| status.to_string());
+        let mut words = String::new();
+        let read = self.words.rewind().and_then(|()| self.words.read_to_string(&mut words));
+        match (read, words.trim()) {
+            (Ok(_), words) if !words.is_empty() => format!("{PROGRAM} ended with {status}: {words}"),
+            _ => format!("{PROGRAM} ended with {status}"),
+        }
+    }
+}
+
+impl Encode for Mp4Encoder {
+    fn write(&mut self, frame: &[u8], seconds: f64) -> Result<(), String> {
+        // Frames of H.264 all take the same time; equal ones take no room.
+        for _ in 0..((seconds * self.fps).round() as u64).max(1) {
+            let written = self.child.stdin.as_mut().map_or(Ok(()), |pipe| pipe.write_all(frame));
+            if written.is_err() {
+                return Err(self.failure());
+            }
+        }
+        Ok(())
+    }
+
+    fn finish(mut self: Box<Self>) -> Result<(), String> {
+        drop(self.child.stdin.take());
+        match self.child.wait() {
+            Ok(status) if status.success() => Ok(()),
+            _ => Err(self.failure()),
+        }
+    }
+}
+
+impl Drop for Mp4Encoder {
+    fn drop(&mut self) {
+        // Both fail only if it has ended.
+        self.child.kill().ok();
+        self.child.wait().ok();
+    }
+}

@@ -1,0 +1,47 @@
+"""Draws every environment, each as it is by default and with extreme physics, into one PNG file each. Needs Pillow.
+
+Run: python gallery.py [--out pictures] [--server unix:/path]
+"""
+
+import argparse
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+from PIL import Image
+
+from perturb.catalogue import CATALOGUE
+
+STEPS = 12
+
+
+def picture(name: str, version: str, server: str | None) -> np.ndarray:
+    """The environment after some random actions, which are the same in every version."""
+    env = gymnasium.make(f"perturb/{name}-v0", version=version, server=server, render_mode="rgb_array")
+    env.action_space.seed(1)
+    env.reset(seed=1)
+    for _ in range(STEPS):
+        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
+            break
+    frame = env.render()
+    env.close()
+    return np.asarray(frame)
+
+
+def main() -> None:
+    """Write one file of each environment: D on the left, E on the right."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("pictures"), help="the folder for the files")
+    parser.add_argument("--server", help="unix:/path or host:port; at first a server of its own")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    for name in CATALOGUE:
+        both = np.hstack([picture(name, version, args.server) for version in ("D", "E")])
+        file = args.out / f"{name}.png"
+        Image.fromarray(both).save(file)
+        print(file)
+
+
+if __name__ == "__main__":
+    main()
