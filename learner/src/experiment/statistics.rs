@@ -10,7 +10,8 @@ pub struct Summary {
     /// Arithmetic mean.
     pub mean: f64,
     /// Standard deviation with n in the denominator, not n - 1: that is what the paper's tables hold. Its 0.06 ± 0.12 %
-    /// over five runs of 1000 episodes can only be the rates 0.3, 0, 0, 0, 0, whose deviation with n - 1 were 0.13.
+    /// over five runs of 1000 episodes can only be the rates 0.3, 0, 0, 0, 0, whose deviation with n - 1 were 0.13. 0 of
+    /// a single run, which says nothing: [`Summary::deviation`].
     pub std: f64,
     /// Runs.
     pub runs: usize,
@@ -27,11 +28,19 @@ impl Summary {
         let variance = numbers.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / n;
         Some(Self { mean, std: variance.sqrt(), runs: numbers.len() })
     }
+
+    /// The standard deviation; `None` of a single run, which has none.
+    pub fn deviation(&self) -> Option<f64> {
+        (self.runs > 1).then_some(self.std)
+    }
 }
 
 impl std::fmt::Display for Summary {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.pad(&format!("{:.1} ± {:.1}", self.mean, self.std))
+        match self.deviation() {
+            Some(std) => f.pad(&format!("{:.1} ± {std:.1}", self.mean)),
+            None => f.pad(&format!("{:.1}", self.mean)),
+        }
     }
 }
 
@@ -40,14 +49,16 @@ impl std::fmt::Display for Summary {
 pub struct Iqm {
     /// The interquartile mean.
     pub iqm: f64,
-    /// 2.5th and 97.5th percentile of the bootstrap.
-    pub interval_95: [f64; 2],
+    /// 2.5th and 97.5th percentile of the bootstrap; `None` if no environment has a second run, and there is nothing to draw.
+    pub interval_95: Option<[f64; 2]>,
 }
 
 impl std::fmt::Display for Iqm {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let [low, high] = self.interval_95;
-        f.pad(&format!("{:.1} [{low:.1}, {high:.1}]", self.iqm))
+        match self.interval_95 {
+            Some([low, high]) => f.pad(&format!("{:.1} [{low:.1}, {high:.1}]", self.iqm)),
+            None => f.pad(&format!("{:.1}", self.iqm)),
+        }
     }
 }
 
@@ -61,6 +72,9 @@ impl Iqm {
         }
         let mut scores: Vec<f64> = strata.concat();
         let iqm = interquartile_mean(&mut scores);
+        if strata.iter().all(|runs| runs.len() == 1) {
+            return Some(Self { iqm, interval_95: None });
+        }
         let mut rng = stream(seed, Purpose::Bootstrap);
         let mut means = Vec::with_capacity(resamples);
         for _ in 0..resamples {
@@ -69,7 +83,7 @@ impl Iqm {
             means.push(interquartile_mean(&mut scores));
         }
         means.sort_unstable_by(f64::total_cmp);
-        Some(Self { iqm, interval_95: [percentile(&means, 2.5), percentile(&means, 97.5)] })
+        Some(Self { iqm, interval_95: Some([percentile(&means, 2.5), percentile(&means, 97.5)]) })
     }
 }
 
@@ -106,7 +120,8 @@ mod tests {
         let summary = Summary::of(&[0.3, 0.0, 0.0, 0.0, 0.0]).unwrap();
         assert_eq!((format!("{:.2} ± {:.2}", summary.mean, summary.std), summary.runs), ("0.06 ± 0.12".into(), 5));
         assert_eq!(Summary::of(&[]), None);
-        assert_eq!(Summary::of(&[7.0]).unwrap().to_string(), "7.0 ± 0.0");
+        assert_eq!(Summary::of(&[7.0]).unwrap().to_string(), "7.0", "one run does not deviate from itself");
+        assert_eq!(Summary::of(&[7.0, 7.0]).unwrap().to_string(), "7.0 ± 0.0");
     }
 
     #[test]
@@ -130,7 +145,9 @@ mod tests {
         assert_eq!(Iqm::of(&[], 10, 1), None);
         assert_eq!(Iqm::of(&[vec![1.0], vec![]], 10, 1), None);
         let alone = Iqm::of(&[vec![5.0], vec![7.0]], 10, 1).unwrap();
-        assert_eq!((alone.iqm, alone.interval_95), (6.0, [6.0, 6.0]), "a run alone can only be drawn again");
+        assert_eq!((alone.iqm, alone.interval_95), (6.0, None), "a run alone can only be drawn again");
+        assert_eq!(alone.to_string(), "6.0");
+        assert!(Iqm::of(&[vec![5.0], vec![7.0, 9.0]], 10, 1).unwrap().interval_95.is_some());
     }
 
     fn numbers(value: &serde_json::Value) -> Vec<f64> {
@@ -160,7 +177,7 @@ mod tests {
                 close(interquartile_mean(&mut scores), resample["iqm"].as_f64().unwrap(), 1e-9);
             }
             // Own resamples: an end of an interval over 50,000 of them is uncertain by about a tenth of a point.
-            for (got, expected) in ours.interval_95.into_iter().zip(numbers(&case["interval_95"])) {
+            for (got, expected) in ours.interval_95.unwrap().into_iter().zip(numbers(&case["interval_95"])) {
                 close(got, expected, 0.5);
             }
         }

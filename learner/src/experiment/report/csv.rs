@@ -55,7 +55,7 @@ fn iqm(results: &Results<'_>, groups: &[Group]) -> Lines {
             let groups = by_environment(groups, &learner, &environments);
             let iqm = groups.and_then(|groups| interquartile(&groups, metric, RESAMPLES));
             let runs = iqm.map_or(0, |(_, runs)| runs).to_string();
-            let [low, high] = [0, 1].map(|end| number(iqm.map(|(iqm, _)| iqm.interval_95[end])));
+            let [low, high] = [0, 1].map(|end| number(iqm.and_then(|(iqm, _)| Some(iqm.interval_95?[end]))));
             file.add("", &learner, [metric.to_string(), runs, number(iqm.map(|(iqm, _)| iqm.iqm)), low, high])?;
         }
     }
@@ -131,5 +131,5 @@ fn number(number: Option<f64>) -> String {
 
 fn summary(summary: Option<Summary>) -> [String; 3] {
     let runs = summary.map_or(0, |summary| summary.runs).to_string();
-    [runs, number(summary.map(|summary| summary.mean)), number(summary.map(|summary| summary.std))]
+    [runs, number(summary.map(|summary| summary.mean)), number(summary.and_then(|summary| summary.deviation()))]
 }
