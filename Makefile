@@ -54,7 +54,8 @@ missing=; \
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help deps opengl toolchain build demo all-pairs report-check test slurm-test slurm-acceptance lint bench audit cargo-deny python-test python-wheel python-acceptance \
+.PHONY: help deps opengl toolchain build demo all-pairs report-check test slurm-test slurm-acceptance lint bench audit \
+	cargo-deny python-test python-wheel python-acceptance \
 	python-server python-venv docker docker-base docker-test
 
 help: ## this list
@@ -88,7 +89,7 @@ test: deps opengl $(DM_ENV_RPC)/installed ## run all tests, then those of the se
 	cargo test $(ALL)
 	cargo test $(WITHOUT_MUJOCO)
 
-slurm-test: deps ## do a plan on a real Slurm of two nodes, started for it, one of which dies
+slurm-test: build ## do a plan on a real Slurm of two nodes, started for it, one of which dies
 	@$(call install,$(SLURM_PACKAGES))
 	PERTURB_SLURM_REQUIRED=1 cargo test $(ALL) --test slurm
 

@@ -152,7 +152,8 @@ pub(super) fn pendulum(
     canvas.polygon(&held, colour::PALE_GREEN);
     canvas.dashes(&[pivot, [0.0, length + ROD]], 0.02, colour::GREEN);
     rod(&mut canvas, pivot, polar(pivot, length, FRAC_PI_2 + angle), ROD, colour::VERMILLION);
-    if let Some(torque) = torque {
+    // None is drawn of a torque that is next to nothing: its arrow would have a head all the same.
+    if let Some(torque) = torque.filter(|torque| torque.abs() > 0.01) {
         // From below the pivot, in the direction of the turn, as far as the torque is large.
         let turn = MOST_TURN * torque;
         let (start, end) = (-FRAC_PI_2 - 0.5 * turn, -FRAC_PI_2 + 0.5 * turn);

@@ -17,6 +17,7 @@ use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{Mutex, PoisonError},
     thread::{self, JoinHandle},
+    time::Duration,
 };
 use tokio::sync::{mpsc, oneshot};
 
@@ -24,6 +25,8 @@ use tokio::sync::{mpsc, oneshot};
 const QUEUE: usize = 64;
 /// What the thread's niceness is raised by. Its driver's threads inherit it: physics comes first.
 const NICENESS: i32 = 5;
+/// How long the end of a server waits for the picture under way.
+const FAREWELL: Duration = Duration::from_secs(1);
 
 /// A picture's size in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -75,7 +78,7 @@ pub enum Error {
 }
 
 /// Draws pictures on a thread of its own, which starts with the first. Dropping it ends the thread after the picture
-/// under way.
+/// under way, for which it waits a second at most.
 #[derive(Default)]
 pub struct Renderer {
     studio: Mutex<Option<Studio>>,
@@ -133,8 +136,13 @@ impl Drop for Renderer {
         let studio = self.studio.get_mut().unwrap_or_else(PoisonError::into_inner);
         if let Some(Studio { jobs, thread }) = studio.take() {
             drop(jobs);
-            // A driver must not be drawing while the process ends. The thread does not panic: drawings are caught.
-            let _ = thread.join();
+            // A driver should not be drawing while the process ends; one that hangs must not keep it from ending.
+            for _ in 0..FAREWELL.as_millis() {
+                if thread.is_finished() {
+                    break;
+                }
+                thread::sleep(Duration::from_millis(1));
+            }
         }
     }
 }
@@ -153,7 +161,7 @@ fn work(mut jobs: mpsc::Receiver<Job>) {
             tracing::error!(?pose, "a drawing panicked");
             Err(Error::Defect)
         });
-        if drawn.is_err() {
+        if matches!(drawn, Err(Error::Failed { .. } | Error::Defect)) {
             easel = Easel::default(); // what a failed drawing leaves behind is not to be trusted
         }
         let _ = reply.send(drawn); // the session may be gone by now

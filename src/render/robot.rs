@@ -58,7 +58,11 @@ const FREE_RISE: f64 = 0.6;
 
 /// The robots that were drawn so far.
 #[derive(Default)]
-pub(super) struct Robots(Vec<Robot>);
+pub(super) struct Robots {
+    drawn: Vec<Robot>,
+    /// That there is no OpenGL, once that is known: it does not come while the server runs.
+    missing: Option<String>,
+}
 
 struct Robot {
     look: &'static Look,
@@ -71,21 +75,27 @@ struct Robot {
 impl Robots {
     /// The robot of that name and model, at these positions, `[Q]`.
     pub(super) fn draw(&mut self, name: &'static str, mjcf: &str, qpos: &[f64], size: Size) -> Result<Vec<u8>, Error> {
+        if let Some(reason) = &self.missing {
+            return Err(Error::Missing { environment: name, reason: reason.clone() });
+        }
         self.try_draw(name, mjcf, qpos, size).map_err(|error| match error {
-            mujoco::Error::NoOpenGl { .. } => Error::Missing { environment: name, reason: error.to_string() },
+            mujoco::Error::NoOpenGl { .. } => {
+                let reason = self.missing.insert(error.to_string()).clone();
+                Error::Missing { environment: name, reason }
+            }
             _ => Error::Failed { environment: name, reason: error.to_string() },
         })
     }
 
     fn try_draw(&mut self, name: &str, mjcf: &str, qpos: &[f64], size: Size) -> Result<Vec<u8>, mujoco::Error> {
-        let index = match self.0.iter().position(|robot| robot.look.name == name) {
+        let index = match self.drawn.iter().position(|robot| robot.look.name == name) {
             Some(index) => index,
             None => {
-                self.0.push(Robot::new(name, mjcf, size)?);
-                self.0.len() - 1
+                self.drawn.push(Robot::new(name, mjcf, size)?);
+                self.drawn.len() - 1
             }
         };
-        self.0[index].draw(qpos, size)
+        self.drawn[index].draw(qpos, size)
     }
 }
 

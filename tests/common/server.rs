@@ -105,8 +105,17 @@ impl Server {
 
     /// Its resident memory, in bytes.
     pub fn memory(&self) -> usize {
+        self.memory_line("VmRSS:")
+    }
+
+    /// The most that it ever had, in bytes.
+    pub fn peak_memory(&self) -> usize {
+        self.memory_line("VmHWM:")
+    }
+
+    fn memory_line(&self, name: &str) -> usize {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
-        let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
+        let line = status.lines().find(|line| line.starts_with(name)).unwrap();
         line.split_whitespace().nth(1).unwrap().parse::<usize>().unwrap() * 1024
     }
 }

@@ -82,7 +82,7 @@ impl Egl {
             get_display: function!(b"eglGetDisplay\0"),
             // SAFETY: a null pointer, which is `None`, or the extension's function of the EGL registry's type.
             get_platform_display: unsafe { mem::transmute::<*const c_void, Option<GetPlatformDisplay>>(platform) },
-            // SAFETY: as before.
+            // SAFETY: a null pointer, which is `None`, or the extension's function of the EGL registry's type.
             query_devices: unsafe { mem::transmute::<*const c_void, Option<QueryDevices>>(devices) },
             initialize: function!(b"eglInitialize\0"),
             bind_api: function!(b"eglBindAPI\0"),

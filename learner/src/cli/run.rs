@@ -17,7 +17,8 @@ use super::plan::{duration, step_limits};
 use super::{Ending, UsageError, report, servers, single_thread, slurm};
 use crate::client::{Address, ClientError, LocalServer, LocalServerOptions, Servers};
 use crate::experiment::{
-    Attempt, BUSY, Cell, CellEnd, Folder, NO_SERVER, Plan, RunEnd, RunOptions, RunStatus, run as run_cells, run_cell,
+    Attempt, BUSY, Cell, CellEnd, Folder, NO_SERVER, ON, Plan, RunEnd, RunOptions, RunStatus, run as run_cells,
+    run_cell,
 };
 use crate::interrupt::StopFlag;
 
@@ -71,7 +72,7 @@ fn one_cell(args: &RunArgs, plan: &Plan, folder: &Folder, cell: &Cell, stop: &St
         Err(error) => return Err(error),
     };
     if args.exit_with_stdin {
-        servers.addresses().for_each(|address| eprintln!("on {address}"));
+        servers.addresses().for_each(|address| eprintln!("{ON}{address}"));
     }
     let mut bar = (!args.exit_with_stdin).then(|| Bar::new(cell.id.as_str(), cell.config.common.episodes));
     let mut stage = String::new();

@@ -49,7 +49,8 @@ pub(super) fn run(args: &RunArgs, plan: &Plan, stop: &StopFlag) -> Result<Ending
         }
         SlurmEnd::Stopped { signal, arrays } => {
             eprintln!(
-                "stopped by signal {signal}, but Slurm job {} goes on: the same command watches it again, scancel {} ends it",
+                "stopped by signal {signal}, but Slurm job {} goes on: the same command watches it again, scancel {} ends \
+                 it",
                 arrays.join(", "),
                 arrays.join(" ")
             );

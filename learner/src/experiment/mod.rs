@@ -1,8 +1,8 @@
 //! Experiments: from a file that states them to tables and pictures.
 //!
 //! [`Plan`] expands a file to cells, [`run_cell`] trains and tests one of them, [`run()`] does all in worker processes,
-//! [`slurm`] has a cluster do them, and [`Folder`] is where they are kept. [`Results`] reads them back and selects, [`report`] makes tables of them,
-//! [`plot`] pictures.
+//! [`slurm`] has a cluster do them, and [`Folder`] is where they are kept. [`Results`] reads them back and selects,
+//! [`report`] makes tables of them, [`plot`] pictures.
 
 mod cell;
 mod cost;
@@ -30,6 +30,6 @@ pub use heatmaps::{
     HeatmapPlace, HeatmapRecord, NoHeatmap, StoredHeatmap, heatmap_files, heatmap_places, store_heatmap,
 };
 pub use plan::{Cell, Counts, Learner, Plan, PlanError, Tests};
-pub use run::{Attempt, BUSY, NO_SERVER, RunEnd, RunError, RunOptions, RunStatus, run};
+pub use run::{Attempt, BUSY, NO_SERVER, ON, RunEnd, RunError, RunOptions, RunStatus, run};
 pub use selection::{Group, Metric, Results, Selected, average, interquartile};
 pub use statistics::{Iqm, Summary, interquartile_mean};

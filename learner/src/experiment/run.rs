@@ -14,6 +14,8 @@ use crate::interrupt::StopFlag;
 
 /// A worker's exit status if somebody else works on its cell (EX_TEMPFAIL of sysexits.h).
 pub const BUSY: u8 = 75;
+/// What a worker's line in its log begins with once it has a server, before its address.
+pub const ON: &str = "on ";
 /// A worker's exit status if there is no server, or no longer (EX_UNAVAILABLE of sysexits.h).
 pub const NO_SERVER: u8 = 69;
 /// A worker's exit status if its command makes no sense to it.
@@ -23,7 +25,7 @@ const MOST_ATTEMPTS: u32 = 3;
 /// How often in a row the worker of a cell may be without a server before the run ends: after some fifteen seconds, in
 /// which a server may have been started again.
 const MOST_LOSSES: u32 = 5;
-/// A worker that ran for so long had a server, whatever became of it: what is lost then is not lost in a row.
+/// A worker that had a server and ran for so long made some progress: what is lost then is not lost in a row.
 const HAD_A_SERVER: Duration = Duration::from_secs(60);
 /// How often it is said how far the run is, which looks at every cell that is left.
 const STATUS_INTERVAL: Duration = Duration::from_secs(1);
@@ -104,6 +106,8 @@ struct Job {
     cell: usize,
     child: Child,
     start: Instant,
+    /// Where its words begin in the cell's log, in bytes.
+    log_start: u64,
 }
 
 /// How often a cell's worker had no server, or lost it.
@@ -247,8 +251,9 @@ impl<'a> Runner<'a> {
             let losses = self.lost.get(&cell).copied().unwrap_or_default().all;
             let attempt = Attempt { retry: self.forgiven.get(&cell).copied(), losses };
             let mut command = (self.options.worker)(&self.plan.cells[cell], attempt).map_err(RunError::Spawn)?;
+            let log_start = std::fs::metadata(self.log(cell)).map_or(0, |log| log.len());
             let child = command.stdin(Stdio::piped()).spawn().map_err(RunError::Spawn)?;
-            self.running.push(Job { cell, child, start: Instant::now() });
+            self.running.push(Job { cell, child, start: Instant::now(), log_start });
         }
         Ok(())
     }
@@ -257,16 +262,32 @@ impl<'a> Runner<'a> {
     fn reap(&mut self) -> Result<(), RunError> {
         let mut ended = Vec::new();
         for job in std::mem::take(&mut self.running) {
-            let Job { cell, mut child, start } = job;
+            let Job { cell, mut child, start, log_start } = job;
             match child.try_wait().map_err(RunError::Spawn)? {
-                Some(status) => ended.push((cell, status, start.elapsed())),
-                None => self.running.push(Job { cell, child, start }),
+                Some(status) => ended.push((cell, status, start.elapsed(), log_start)),
+                None => self.running.push(Job { cell, child, start, log_start }),
             }
         }
-        ended.into_iter().try_for_each(|(cell, status, time)| self.conclude(cell, status, time))
+        ended.into_iter().try_for_each(|(cell, status, time, log_start)| {
+            // Looking for a server, of which many may be silent, is not having one.
+            let served = if self.found_a_server(cell, log_start) { time } else { Duration::ZERO };
+            self.conclude(cell, status, served)
+        })
     }
 
-    /// Takes note of the end of a worker that has run for `time`.
+    /// Whether a cell's worker says so in what it logged from `start` on.
+    fn found_a_server(&self, cell: usize, start: u64) -> bool {
+        let log = std::fs::read(self.log(cell)).unwrap_or_default();
+        let said = log.get(start as usize..).unwrap_or_default();
+        String::from_utf8_lossy(said).lines().any(|line| line.starts_with(ON))
+    }
+
+    /// What a cell's workers have to say.
+    fn log(&self, cell: usize) -> std::path::PathBuf {
+        self.folder.cell(&self.plan.cells[cell].id).log()
+    }
+
+    /// Takes note of the end of a worker that had a server for `time` at most.
     fn conclude(&mut self, cell: usize, status: ExitStatus, time: Duration) -> Result<(), RunError> {
         if self.settled(cell) {
             return Ok(());
@@ -321,7 +342,7 @@ impl<'a> Runner<'a> {
 
     /// The last line of a worker's log.
     fn last_words(&self, cell: usize) -> String {
-        let log = self.folder.cell(&self.plan.cells[cell].id).log();
+        let log = self.log(cell);
         let text = std::fs::read_to_string(&log).unwrap_or_default();
         let line = text.lines().rev().find(|line| !line.trim().is_empty());
         line.map_or_else(|| format!("see {}", log.display()), str::to_owned)

@@ -118,6 +118,22 @@ fn a_server_that_was_lost_for_a_moment_does_not_end_the_run() {
 }
 
 #[test]
+fn a_worker_that_only_looked_for_a_server_had_none() {
+    let directory = tempfile::tempdir().unwrap();
+    let folder = Folder::new(directory.path());
+    let (plan, worker) = (plan(), |_: &Cell, _: Attempt| Ok(Command::new("true")));
+    let options = RunOptions { jobs: 1, retry_failed: false, worker: &worker, server_trouble: &|| None };
+    let runner = Runner::new(&plan, &folder, &options);
+    let log = folder.cell(&plan.cells[0].id).log();
+    std::fs::create_dir_all(log.parent().unwrap()).unwrap();
+    let earlier = format!("{ON}127.0.0.1:1\n");
+    std::fs::write(&log, format!("{earlier}WARN the server 127.0.0.1:1 is silent\nno server answers\n")).unwrap();
+    assert!(runner.found_a_server(0, 0));
+    assert!(!runner.found_a_server(0, earlier.len() as u64), "an earlier worker had it");
+    assert!(!runner.found_a_server(1, 0), "no log");
+}
+
+#[test]
 fn servers_that_are_lost_in_a_row_are_waited_for_longer_and_longer_and_not_for_ever() {
     let mut losses = Losses::default();
     let mut pause = |seconds: u64| {

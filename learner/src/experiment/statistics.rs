@@ -49,7 +49,7 @@ impl std::fmt::Display for Summary {
 pub struct Iqm {
     /// The interquartile mean.
     pub iqm: f64,
-    /// 2.5th and 97.5th percentile of the bootstrap; `None` if no environment has a second run, and there is nothing to draw.
+    /// 2.5th and 97.5th percentile of the bootstrap; `None` if no environment has a second run.
     pub interval_95: Option<[f64; 2]>,
 }
 

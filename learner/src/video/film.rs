@@ -5,11 +5,13 @@ use std::time::{Duration, Instant};
 use super::panel::{Ending, Panel, Shown, parameter};
 use super::{VideoError, VideoFile, VideoWriter};
 use crate::checkpoint::{Checkpoint, EnvironmentSummary, State};
-use crate::client::{BegunEpisode, OpenOptions, Servers, Single, StepReply};
+use crate::client::{BegunEpisode, ClientError, OpenOptions, Picture, Servers, Single, StepReply};
 use crate::evaluation::{Agent, TestError, Version, check_unchanged, open_options};
 use crate::interrupt::StopFlag;
 use crate::proto;
 
+/// gRPC's code of a request that cannot be done in the present state.
+const FAILED_PRECONDITION: i32 = 9;
 /// The end of an episode stays for so many seconds.
 const HOLD: f64 = 1.0;
 
@@ -120,6 +122,8 @@ struct Film<'a> {
     begun: BegunEpisode,
     panel: Panel,
     shown: Shown,
+    /// The last picture.
+    last: Option<Picture>,
     frame: Vec<u8>,
     fps: f64,
     summary: Summary,
@@ -149,6 +153,7 @@ impl<'a> Film<'a> {
             agent: Agent::new(checkpoint, 1, options.seed).map_err(TestError::Numbers)?,
             reply,
             shown: Shown::default(),
+            last: None,
             frame: Vec::new(),
             fps: options.fps.unwrap_or(1.0 / environment.control_timestep),
             summary: Summary { size: panel.size(), ..Summary::default() },
@@ -185,11 +190,20 @@ impl<'a> Film<'a> {
     /// Takes the picture of the present state, and writes its frame.
     fn expose(&mut self, writer: &mut VideoWriter) -> Result<(), VideoError> {
         let asked = Instant::now();
-        let picture = self.single.picture()?;
+        let picture = match (self.single.picture(), &self.last) {
+            // Physics that diverged ends its episode and cannot be drawn: the picture before it stays.
+            (Err(ClientError::Refused { code, .. }), Some(last))
+                if code == FAILED_PRECONDITION && self.shown.ending.is_some() =>
+            {
+                last.clone()
+            }
+            (picture, _) => picture?,
+        };
         let came = Instant::now();
         self.panel.compose(&picture, &self.shown, &mut self.frame)?;
         writer.write(&self.frame, if self.shown.ending.is_some() { HOLD } else { 0.0 })?;
         self.summary.frames += 1;
+        self.last = Some(picture);
         self.summary.waiting += came - asked;
         self.summary.writing += came.elapsed();
         Ok(())

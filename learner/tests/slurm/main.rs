@@ -24,12 +24,12 @@ const PLAN_FILE: &str = "PERTURB_SLURM_PLAN";
 /// How long anything may take that must not hang.
 const LIMIT: Duration = Duration::from_secs(1800);
 
-/// Eight cells of a second or two on a free core, with a checkpoint several times a second.
+/// Eight cells of a few seconds on a free core, with a checkpoint several times a second.
 const PLAN: &str = "
 environments = ['CartPole', 'MountainCar']
 versions = ['D', 'E']
 test_episodes = 30
-settings = { episodes = 150, checkpoint_interval = 10 }
+settings = { episodes = 400, checkpoint_interval = 10 }
 
 [[algorithm]]
 name = 'a2c'
@@ -157,7 +157,7 @@ fn a_plan_survives_the_loss_of_a_node() {
     let first = end(first);
     assert_eq!(first.status.code(), Some(130), "{}", stderr(&first));
     assert!(stderr(&first).contains("goes on: the same command watches it again, scancel "), "{}", stderr(&first));
-    let second = experiment.on(&cluster, "slurm", &arguments).spawn().expect("started");
+    let mut second = experiment.on(&cluster, "slurm", &arguments).spawn().expect("started");
 
     // A node dies in the middle of a training.
     let jobs = experiment.jobs("slurm");
@@ -173,6 +173,11 @@ fn a_plan_survives_the_loss_of_a_node() {
     wait_for("a training on n1", LIMIT, || {
         let cells = cluster.running_on("n1").into_iter().flat_map(|job| jobs[job].clone());
         victim = cells.into_iter().find(in_work);
+        let ended = second.try_wait().expect("its status");
+        assert!(
+            victim.is_some() || ended.is_none(),
+            "no training on n1 was seen in its first half before all had ended"
+        );
         victim.is_some()
     });
     cluster.kill_node(1);

@@ -22,7 +22,10 @@ class ServerFullError(PerturbError, RuntimeError):
 
 
 class RenderError(PerturbError, RuntimeError):
-    """The server cannot draw: it has no graphics library, or is older than pictures. The environments are unharmed."""
+    """The server cannot draw the environment, which is unharmed.
+
+    It has no graphics library, or is older than pictures; the physics diverged; or the drawing failed.
+    """
 
 
 class OutOfOrderError(PerturbError, RuntimeError):
@@ -61,7 +64,7 @@ _BY_CODE: dict[int, type[PerturbError]] = {
 
 def refusal(kind: str, code: int, message: str) -> PerturbError:
     """Turn the protocol's Error, a refusal of a request by the server, into an exception with the server's sentence."""
-    if kind == "render" and code == 9:
+    if kind == "render" and code in (9, 13):  # a drawing that failed leaves the environments alone
         return RenderError(message)
     if kind == "render" and code == 3:  # sizes are checked before they are sent: it does not know the request
         return RenderError(f"the server cannot draw, it may be older than this package: {message}")

@@ -1,14 +1,14 @@
 //! `dm_env_rpc.v1`: the same environments for DeepMind's agents. A world is one environment.
 //!
-//! - [`service`]: the stream.
-//! - [`agent`]: the legal order of a stream's requests.
-//! - [`worlds`]: all worlds of the server, by name; how long each lives.
-//! - [`world`]: what requests of any stream may change about a world.
-//! - [`runner`]: a world's episodes, on the pool.
-//! - [`settings`]: settings to the domain, through the checks that `perturb.v1` has.
-//! - [`specs`]: actions and observations, their uids, names and bounds.
-//! - [`tensors`]: what a tensor must be.
-//! - [`properties`]: values by name.
+//! - `service`: the stream.
+//! - `agent`: the legal order of a stream's requests.
+//! - `worlds`: all worlds of the server, by name; how long each lives.
+//! - `world`: what requests of any stream may change about a world.
+//! - `runner`: a world's episodes, on the pool.
+//! - `settings`: settings to the domain, through the checks that `perturb.v1` has.
+//! - `specs`: actions and observations, their uids, names and bounds.
+//! - `tensors`: what a tensor must be.
+//! - `properties`: values by name.
 
 mod agent;
 mod properties;

@@ -112,7 +112,11 @@ pub(super) fn response(outcome: &Outcome, requested: &[u64]) -> StepResponse {
     };
     StepResponse {
         state: outcome.state.into(),
-        observations: requested.iter().map(|&uid| (uid, observation(uid))).collect(),
+        // Each once, however often it is asked for: a reply must not be many times as large as its request.
+        observations: (OBSERVATION..=DIVERGED)
+            .filter(|uid| requested.contains(uid))
+            .map(|uid| (uid, observation(uid)))
+            .collect(),
     }
 }
 

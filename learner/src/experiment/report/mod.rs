@@ -138,8 +138,8 @@ fn overview(results: &Results<'_>, groups: &[Group]) -> Vec<String> {
         lines.push(format!("Done by perturb {}.", commits.into_iter().collect::<Vec<_>>().join(", ")));
     }
     lines.push(
-        "Numbers are success rates in percent: mean ± standard deviation over runs; one run has none. The paper's are those of its five \
-         runs; a difference is ours less the paper's. Hopper and HalfCheetah run on another physics engine than the \
+        "Numbers are success rates in percent: mean ± standard deviation over runs; one run has none. The paper's \
+         are those of its five runs; a difference is ours less the paper's. Hopper and HalfCheetah run on another physics engine than the \
          paper's."
             .into(),
     );

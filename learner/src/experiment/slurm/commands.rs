@@ -7,9 +7,9 @@ use std::path::PathBuf;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
+use super::error::SlurmError;
 use super::options::{OptionError, SlurmOptions, text_of};
 use super::submission::Submission;
-use super::watch::SlurmError;
 use crate::interrupt::StopFlag;
 
 /// How long Slurm may take to answer.

@@ -61,7 +61,6 @@ mod tests {
 
     #[test]
     fn a_job_does_the_cells_of_its_line() {
-        use std::os::unix::fs::PermissionsExt;
         let directory = tempfile::tempdir().unwrap();
         std::fs::write(directory.path().join("cells.txt"), "a,b\nc\n").unwrap();
         let program = directory.path().join("a program");
@@ -69,8 +68,7 @@ mod tests {
         let (succeeded, said) = run(&task, directory.path(), "0");
         assert!(!succeeded && said.contains("n1 finds no program") && said.contains("a program"), "{said}");
 
-        std::fs::write(&program, "#!/bin/sh\nprintf '[%s]' \"$@\"").unwrap();
-        std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
+        super::super::tests::install(&program, "#!/bin/sh\nprintf '[%s]' \"$@\"");
         let (succeeded, said) = run(&task, directory.path(), "0");
         let shown = directory.path().display();
         let expected = format!(

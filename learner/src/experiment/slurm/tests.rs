@@ -2,8 +2,9 @@
 
 use std::cell::Cell;
 use std::fs;
-use std::os::unix::fs::PermissionsExt;
+use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use tempfile::TempDir;
@@ -59,6 +60,19 @@ struct Fake {
     costs: Cell<u32>,
 }
 
+/// Writes a program, by another process: a file that this one has open for writing cannot be run, and a child that another
+/// test starts just then would keep it open.
+pub(super) fn install(path: &Path, text: &str) {
+    let mut shell = Command::new("sh")
+        .args(["-c", "cat >\"$0.new\" && chmod +x \"$0.new\" && mv \"$0.new\" \"$0\""])
+        .arg(path)
+        .stdin(Stdio::piped())
+        .spawn()
+        .unwrap();
+    shell.stdin.take().unwrap().write_all(text.as_bytes()).unwrap();
+    assert!(shell.wait().unwrap().success());
+}
+
 impl Fake {
     fn new() -> Self {
         let directory = tempfile::tempdir().unwrap();
@@ -79,11 +93,7 @@ impl Fake {
 
     fn command(&self, name: &str, script: &str) {
         let text = format!("#!/bin/sh\n[ \"$1\" != --version ] || exit 0\ncd '{}'\n{script}\n", self.bin().display());
-        // Renamed: a script that is just being written cannot be run.
-        let path = self.bin().join("new");
-        fs::write(&path, text).unwrap();
-        fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
-        fs::rename(path, self.bin().join(name)).unwrap();
+        install(&self.bin().join(name), &text);
     }
 
     fn hook(&self, script: &str) {
@@ -267,14 +277,14 @@ fn slurms_refusal_is_shown_and_leaves_nothing_behind() {
 fn a_silent_slurm_is_no_reason_to_submit_again() {
     let mut fake = Fake::new();
     assert_eq!(fake.run_until("submitted 4 cells").unwrap(), stopped(&["1"]));
-    fake.limit = Duration::from_millis(200);
     fake.command("squeue", "echo 'slurm_load_jobs error: Unable to contact slurm controller' >&2; exit 1");
     let message = fake.run().unwrap_err().to_string();
     assert_eq!(message, "squeue refused: slurm_load_jobs error: Unable to contact slurm controller");
     let silent = "exec sleep 60";
     fake.command("squeue", silent);
+    fake.limit = Duration::from_secs(2); // enough to refuse or to answer, also on a busy machine
     let message = fake.run().unwrap_err().to_string();
-    assert!(message.contains("squeue did not answer within 0 s; is Slurm's controller up?"), "{message}");
+    assert!(message.contains("squeue did not answer within 2 s; is Slurm's controller up?"), "{message}");
 
     // It falls silent while it is watched: results are found all the same.
     fake.command("squeue", "cat queue");

@@ -1,0 +1,90 @@
+//! Why cells cannot be done by Slurm.
+
+use std::time::Duration;
+
+use super::super::folder::FolderError;
+use super::options::OptionError;
+use super::watch::{MOST_ATTEMPTS, count};
+
+/// Why cells cannot be done by Slurm.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SlurmError {
+    /// Slurm's commands are not here.
+    #[error("there is no `{program}` here: start this on a machine that submits to Slurm, or install slurm-client")]
+    NotInstalled {
+        /// The command.
+        program: &'static str,
+    },
+    /// A command could not be run.
+    #[error("cannot run {program}: {source}")]
+    System {
+        /// The command.
+        program: &'static str,
+        /// The operating system's answer.
+        source: std::io::Error,
+    },
+    /// Slurm said no.
+    #[error("{program} refused: {words}")]
+    Refused {
+        /// The command.
+        program: &'static str,
+        /// Its words.
+        words: String,
+    },
+    /// Slurm said nothing.
+    #[error("{program} did not answer within {} s; is Slurm's controller up? The same command goes on", limit.as_secs())]
+    Silent {
+        /// The command.
+        program: &'static str,
+        /// How long it was waited for.
+        limit: Duration,
+    },
+    /// Slurm said something else than expected.
+    #[error("{program} printed `{got}`, expected {expected}")]
+    NotUnderstood {
+        /// The command.
+        program: &'static str,
+        /// What was expected.
+        expected: &'static str,
+        /// What was printed.
+        got: String,
+    },
+    /// Slurm has no arrays.
+    #[error("this Slurm takes no job arrays (MaxArraySize = 0), which --engine slurm needs; use `perturb run --cell`")]
+    NoArrays,
+    /// An option was refused.
+    #[error(transparent)]
+    Option(#[from] OptionError),
+    /// The folder cannot be read or written.
+    #[error(transparent)]
+    Folder(#[from] FolderError),
+    /// It cannot be found out what cells cost.
+    #[error("cannot estimate what cells cost, which says how many a job does: {0:#}; give --cells-per-job instead")]
+    Cost(anyhow::Error),
+    /// Somebody cancelled everything.
+    #[error(
+        "Slurm job {} was cancelled; the same command submits what has no result again: {}",
+        arrays.join(", "),
+        count(*missing, "cell")
+    )]
+    Cancelled {
+        /// Numbers of arrays.
+        arrays: Vec<String>,
+        /// How many cells are missing.
+        missing: usize,
+    },
+    /// Cells were submitted several times, and their jobs ended without bringing them any further.
+    #[error(
+        "{} without a result after {MOST_ATTEMPTS} jobs, the first is {}: {words}; when that is mended, the same command \
+         tries again",
+        count(ids.len(), "cell"),
+        ids[0]
+    )]
+    GaveUp {
+        /// Ids, at least one.
+        ids: Vec<String>,
+        /// How the last job of the first one ended, and what it said last.
+        words: String,
+    },
+}
