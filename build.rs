@@ -1,20 +1,38 @@
-//! Compiles the protocols: Rust types, clients, servers, and the descriptors for reflection.
+//! Finds out which commit is built. Every package that tells it runs this.
 
-use std::{env, error::Error, fs, path::PathBuf};
+use std::error::Error;
+use std::path::Path;
+use std::process::Command;
 
-const FOLDER: &str = "proto";
-/// Those with services, and what is sent inside `google.protobuf.Any`.
-const PROTOCOLS: [&str; 3] =
-    ["perturb/v1/perturb.proto", "dm_env_rpc/v1/dm_env_rpc.proto", "dm_env_rpc/v1/extensions/properties.proto"];
+/// Names the commit where there is no repository to ask, e.g. in a container.
+const VARIABLE: &str = "PERTURB_COMMIT";
+/// What the programs are made of, from the top of the repository.
+const SOURCES: [&str; 8] = ["Cargo.lock", "cli", "crates", "learner", "models", "proto", "src", "study"];
 
 fn main() -> Result<(), Box<dyn Error>> {
-    println!("cargo:rerun-if-changed={FOLDER}");
-    let mut compiler = protox::Compiler::new([FOLDER])?;
-    compiler.include_source_info(true).include_imports(true).open_files(PROTOCOLS)?;
-    let descriptors = PathBuf::from(env::var("OUT_DIR")?).join("descriptors.bin");
-    fs::write(descriptors, compiler.encode_file_descriptor_set())?;
-    // Of two equal messages with maps, only ordered ones have equal bytes.
-    let builder = tonic_prost_build::configure().bytes(".").btree_map(".dm_env_rpc");
-    builder.compile_fds(compiler.file_descriptor_set())?;
+    println!("cargo:rerun-if-env-changed={VARIABLE}");
+    let commit = std::env::var(VARIABLE).ok().or_else(described).unwrap_or_else(|| "unknown commit".into());
+    println!("cargo:rustc-env={VARIABLE}={commit}");
     Ok(())
+}
+
+/// The commit that is checked out, with "-dirty" if the programs' files differ from it.
+fn described() -> Option<String> {
+    let top = git(".", &["rev-parse", "--show-toplevel"])?;
+    let log = git(&top, &["rev-parse", "--git-path", "logs/HEAD"])?; // grows with every commit and checkout
+    for path in [log.as_str()].iter().chain(&SOURCES).map(|path| Path::new(&top).join(path)) {
+        if path.exists() {
+            println!("cargo:rerun-if-changed={}", path.display());
+        }
+    }
+    let commit = git(&top, &["rev-parse", "--short=12", "HEAD"])?;
+    let status = ["status", "--porcelain", "--untracked-files=no", "--"];
+    let changed = git(&top, &[&status[..], &SOURCES].concat())?;
+    Some(if changed.is_empty() { commit } else { format!("{commit}-dirty") })
+}
+
+fn git(directory: &str, arguments: &[&str]) -> Option<String> {
+    let output = Command::new("git").current_dir(directory).args(arguments).output().ok()?;
+    let output = Some(output).filter(|output| output.status.success())?;
+    Some(String::from_utf8(output.stdout).ok()?.trim().to_owned())
 }

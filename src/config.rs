@@ -14,7 +14,7 @@ const MAX_KEEPALIVE_SECONDS: u64 = 86_400;
 /// Every flag may also stand in the TOML file given by --config (`max_envs = 64`) or in an environment variable
 /// (`PERTURB_SERVER_MAX_ENVS=64`). A flag beats a variable, a variable beats the file.
 #[derive(Debug, Default, Parser, Serialize)]
-#[command(name = "perturb-server", version)]
+#[command(name = "perturb-server", version = crate::VERSION)]
 pub struct Arguments {
     /// A TOML file with settings.
     #[arg(long, value_name = "FILE", env = "PERTURB_SERVER_CONFIG")]

@@ -10,7 +10,7 @@
 //! - [`classic`]: CartPole, MountainCar, Acrobot, Pendulum.
 //! - [`locomotion`]: Hopper and HalfCheetah on MuJoCo (feature `mujoco`).
 //!
-//! [`config`] is the server's configuration and [`proto`] the generated protocol.
+//! [`config`] is the server's configuration and [`proto`] the protocol.
 #![forbid(unsafe_code)]
 #![deny(clippy::disallowed_methods)]
 
@@ -24,35 +24,8 @@ pub mod pool;
 pub mod render;
 pub mod server;
 
-/// The protocols: generated from `proto`, whose comments specify every field. `perturb.v1` is here at the top.
-#[allow(missing_docs, clippy::all)]
-pub mod proto {
-    tonic::include_proto!("perturb.v1");
+pub use perturb_protocol::proto;
 
-    /// DeepMind's protocol between agents and environments.
-    pub mod dm_env_rpc {
-        /// Its first version.
-        pub mod v1 {
-            tonic::include_proto!("dm_env_rpc.v1");
-
-            /// Its extensions.
-            pub mod extensions {
-                /// Values by name.
-                pub mod properties {
-                    tonic::include_proto!("dm_env_rpc.v1.extensions.properties");
-                }
-            }
-        }
-    }
-
-    /// Google's messages that dm_env_rpc uses.
-    pub mod google {
-        /// Errors.
-        pub mod rpc {
-            tonic::include_proto!("google.rpc");
-        }
-    }
-
-    /// The encoded descriptors of all protocols, for server reflection.
-    pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
-}
+/// The version, and the commit that was built, e.g. "0.1.0 (1a2b3c4d5e6f)"; "-dirty" follows a commit whose files were
+/// changed.
+pub const VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), " (", env!("PERTURB_COMMIT"), ")");

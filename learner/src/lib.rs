@@ -26,8 +26,4 @@ pub mod video;
 /// changed.
 pub const VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), " (", env!("PERTURB_COMMIT"), ")");
 
-/// The protocol: generated from `proto/perturb/v1/perturb.proto`, whose comments specify every field.
-#[allow(missing_docs, clippy::all)]
-pub mod proto {
-    tonic::include_proto!("perturb.v1");
-}
+pub use perturb_protocol::proto;
