@@ -217,8 +217,13 @@ pub fn environment(spec: &EnvironmentSpec, model_hash: &str) -> proto::Environme
         applied: spec.applied.iter().map(quantity).collect(),
         step_limit: spec.step_limit,
         control_timestep: spec.control_timestep,
-        success: Some(proto::Success { description: spec.success_description.into(), steps: spec.success.steps() }),
+        success: Some(proto::Success {
+            description: spec.success_description.into(),
+            steps: spec.success.steps(),
+            ..proto::Success::default()
+        }),
         model_hash: model_hash.into(),
+        ..proto::Environment::default()
     }
 }
 
@@ -242,6 +247,7 @@ fn parameter(p: &Parameter) -> proto::Parameter {
         high: p.bounds.high,
         random: set(Version::Random),
         extreme: set(Version::Extreme),
+        ..proto::Parameter::default()
     }
 }
 
@@ -289,6 +295,7 @@ fn ended((slot, end): (u32, EpisodeEnd)) -> proto::EpisodeEnd {
         success: end.success,
         diverged: end.diverged,
         receipt: end.receipt.map(receipt),
+        ..proto::EpisodeEnd::default()
     }
 }
 
