@@ -58,7 +58,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<Ending> {
         representatives.len(),
         args.measure
     )?;
-    writeln!(out, "environment   learner              steps/s training   steps/s testing")?;
+    writeln!(out, "environment   method              steps/s training   steps/s testing")?;
     let mut measurements = Vec::new();
     for cell in representatives {
         let measurement = measure(&servers, cell, Duration::from_secs(args.measure))?;
@@ -77,10 +77,10 @@ pub(super) fn step_limits<'a>(servers: &Servers, plan: &'a Plan) -> Result<HashM
 }
 
 fn print_measurement(out: &mut impl Write, measurement: &Measurement) -> std::io::Result<()> {
-    let Measurement { environment, learner, speed } = measurement;
+    let Measurement { environment, method, speed } = measurement;
     let per_second = |seconds: f64| grouped((1.0 / seconds.max(1e-9)).round() as usize);
     let (training, testing) = (per_second(speed.training), per_second(speed.testing));
-    writeln!(out, "{environment:<13} {learner:<20} {training:>16} {testing:>17}")
+    writeln!(out, "{environment:<13} {method:<20} {training:>16} {testing:>17}")
 }
 
 fn print_estimate(out: &mut impl Write, plan: &Plan, estimate: &Estimate) -> std::io::Result<()> {

@@ -120,7 +120,7 @@ fn train_and_test(
             environment_revision: state.environment_spec.revision,
             model_hash: state.environment_spec.model_hash,
             version: state.train_version,
-            learner: cell.learner(),
+            method: cell.method(),
             configuration: cell.configuration.clone(),
             run: cell.run,
             seed: state.seed,

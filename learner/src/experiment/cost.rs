@@ -1,14 +1,14 @@
 //! What a plan costs, from a short measurement.
 //!
-//! A step costs what its environment costs plus what its learner costs. So each environment is measured with one
-//! learner, and each learner in one environment; the other pairs follow.
+//! A step costs what its environment costs plus what its method costs. So each environment is measured with one
+//! method, and each method in one environment; the other pairs follow.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
 
-use super::plan::{Cell, Learner, Plan, distinct};
+use super::plan::{Cell, Method, Plan, distinct};
 use crate::client::Servers;
 use crate::config::{TrainConfig, WrapperSettings};
 use crate::interrupt::StopFlag;
@@ -29,7 +29,7 @@ pub struct Measurement {
     /// Its environment.
     pub environment: String,
     /// What learned.
-    pub learner: Learner,
+    pub method: Method,
     /// How fast it was.
     pub speed: Speed,
 }
@@ -54,25 +54,25 @@ pub struct Estimate {
     pub testing_seconds: f64,
 }
 
-/// The trainings to measure: of each environment with its first learner, and of each learner in its first environment,
+/// The trainings to measure: of each environment with its first method, and of each method in its first environment,
 /// the one in the middle of the grid.
 pub fn representatives(plan: &Plan) -> Vec<&Cell> {
     let pairs = distinct(plan.cells.iter().map(pair));
-    let mut chosen: Vec<(&str, Learner)> = Vec::new();
+    let mut chosen: Vec<(&str, Method)> = Vec::new();
     for pair in pairs {
         if chosen.iter().all(|known| known.0 != pair.0) || chosen.iter().all(|known| known.1 != pair.1) {
             chosen.push(pair);
         }
     }
-    let middle = |wanted: &(&str, Learner)| {
+    let middle = |wanted: &(&str, Method)| {
         let cells: Vec<&Cell> = plan.cells.iter().filter(|cell| cell.run == 1 && pair(cell) == *wanted).collect();
         cells.get(cells.len() / 2).copied()
     };
     chosen.iter().filter_map(middle).collect()
 }
 
-fn pair(cell: &Cell) -> (&str, Learner) {
-    (&cell.config.common.environment, cell.learner())
+fn pair(cell: &Cell) -> (&str, Method) {
+    (&cell.config.common.environment, cell.method())
 }
 
 /// Trains as `cell` does for about `limit`, at least one iteration, and forgets what was learned.
@@ -99,7 +99,7 @@ pub fn measure(servers: &Servers, cell: &Cell, limit: Duration) -> Result<Measur
     let seconds = since(before.map(|first| first.elapsed), last.elapsed);
     let updating = since(before.map(|first| first.shares[2]), last.shares[2]);
     let speed = Speed { training: seconds / steps, testing: (seconds - updating).max(0.0) / steps };
-    Ok(Measurement { environment: cell.config.common.environment.clone(), learner: cell.learner(), speed })
+    Ok(Measurement { environment: cell.config.common.environment.clone(), method: cell.method(), speed })
 }
 
 /// What `plan` costs at most, given measurements of its [`representatives`] and the step limit of each environment.
@@ -125,7 +125,7 @@ fn cell_estimates(
     measurements: &[Measurement],
     step_limit: impl Fn(&str) -> u32,
 ) -> impl Iterator<Item = Estimate> {
-    let mut speeds: HashMap<(&str, Learner), Speed> = HashMap::new();
+    let mut speeds: HashMap<(&str, Method), Speed> = HashMap::new();
     plan.cells.iter().map(move |cell| {
         let pair = pair(cell);
         let speed = *speeds.entry(pair.clone()).or_insert_with(|| speed_of(&pair, measurements));
@@ -152,24 +152,24 @@ fn generated_episodes(config: &TrainConfig) -> f64 {
     full + (budget - full) / epopt.epsilon
 }
 
-/// A pair's speed: measured, or the learner's in another environment plus what this environment takes more.
-fn speed_of((environment, learner): &(&str, Learner), measurements: &[Measurement]) -> Speed {
-    let find = |environment: &str, learner: &Learner| {
-        measurements.iter().find(|known| known.environment == environment && known.learner == *learner)
+/// A pair's speed: measured, or the method's in another environment plus what this environment takes more.
+fn speed_of((environment, method): &(&str, Method), measurements: &[Measurement]) -> Speed {
+    let find = |environment: &str, method: &Method| {
+        measurements.iter().find(|known| known.environment == environment && known.method == *method)
     };
-    if let Some(known) = find(environment, learner) {
+    if let Some(known) = find(environment, method) {
         return known.speed;
     }
     let nothing = Speed { training: 0.0, testing: 0.0 };
     let of_environment = measurements.iter().find(|known| known.environment == *environment);
-    let of_learner = measurements.iter().find(|known| known.learner == *learner);
-    let (Some(of_environment), Some(of_learner)) = (of_environment, of_learner) else {
-        return of_environment.or(of_learner).map_or(nothing, |known| known.speed);
+    let of_method = measurements.iter().find(|known| known.method == *method);
+    let (Some(of_environment), Some(of_method)) = (of_environment, of_method) else {
+        return of_environment.or(of_method).map_or(nothing, |known| known.speed);
     };
-    let common = find(&of_learner.environment, &of_environment.learner).map_or(nothing, |known| known.speed);
+    let common = find(&of_method.environment, &of_environment.method).map_or(nothing, |known| known.speed);
     let combine = |of: fn(&Speed) -> f64| {
-        let (environment, learner) = (of(&of_environment.speed), of(&of_learner.speed));
-        (environment + learner - of(&common)).max(environment).max(learner)
+        let (environment, method) = (of(&of_environment.speed), of(&of_method.speed));
+        (environment + method - of(&common)).max(environment).max(method)
     };
     Speed { training: combine(|speed| speed.training), testing: combine(|speed| speed.testing) }
 }
@@ -185,17 +185,17 @@ mod tests {
         Plan::parse("test", text.into()).unwrap()
     }
 
-    fn measured(environment: &str, learner: &Learner, training: f64) -> Measurement {
+    fn measured(environment: &str, method: &Method, training: f64) -> Measurement {
         let speed = Speed { training, testing: training / 4.0 };
-        Measurement { environment: environment.into(), learner: learner.clone(), speed }
+        Measurement { environment: environment.into(), method: method.clone(), speed }
     }
 
     #[test]
-    fn each_environment_and_each_learner_is_measured_once() {
+    fn each_environment_and_each_method_is_measured_once() {
         let plan = plan();
         let chosen: Vec<String> = representatives(&plan)
             .iter()
-            .map(|cell| format!("{} {}", cell.config.common.environment, cell.learner()))
+            .map(|cell| format!("{} {}", cell.config.common.environment, cell.method()))
             .collect();
         assert_eq!(chosen, ["CartPole a2c ff", "CartPole a2c rc", "CartPole ppo ff", "Hopper a2c ff"]);
         assert_eq!(
@@ -206,10 +206,10 @@ mod tests {
     }
 
     #[test]
-    fn costs_of_environments_and_learners_add_up() {
+    fn costs_of_environments_and_methods_add_up() {
         let plan = plan();
-        let learners = plan.learners();
-        let [a2c, rc, ppo] = &learners[..] else { panic!() };
+        let methods = plan.methods();
+        let [a2c, rc, ppo] = &methods[..] else { panic!() };
         let measurements = [
             measured("CartPole", a2c, 3.0),
             measured("CartPole", rc, 11.0),
@@ -217,7 +217,7 @@ mod tests {
             measured("Hopper", a2c, 8.0),
         ];
         let of =
-            |environment: &str, learner: &Learner| speed_of(&(environment, learner.clone()), &measurements).training;
+            |environment: &str, method: &Method| speed_of(&(environment, method.clone()), &measurements).training;
         assert_eq!((of("Hopper", a2c), of("Hopper", rc), of("Hopper", ppo)), (8.0, 16.0, 9.0));
         let total = estimate(&plan, &measurements, |environment| if environment == "Hopper" { 1000 } else { 200 });
         // 3 runs of 3, 3 and 1 configurations; 100 training episodes each.
@@ -253,8 +253,8 @@ mod tests {
     #[test]
     fn a_slower_environment_is_never_estimated_faster() {
         let plan = plan();
-        let learners = plan.learners();
-        let [a2c, rc, ppo] = &learners[..] else { panic!() };
+        let methods = plan.methods();
+        let [a2c, rc, ppo] = &methods[..] else { panic!() };
         let measurements =
             [measured("CartPole", a2c, 3.0), measured("CartPole", rc, 2.0), measured("Hopper", a2c, 8.0)];
         assert_eq!(speed_of(&("Hopper", rc.clone()), &measurements).training, 8.0);

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use super::folder::{Folder, FolderError, io};
-use super::plan::Learner;
+use super::plan::Method;
 use super::selection::{Group, Results};
 use super::statistics::Summary;
 use crate::evaluation::Version;
@@ -20,15 +20,15 @@ const MOST_POINTS: usize = 100;
 pub struct EnvironmentCurves {
     /// The environment.
     pub environment: String,
-    /// For each learner and training version that has a finished training.
+    /// For each method and training version that has a finished training.
     pub curves: Vec<Curve>,
 }
 
-/// A learner's curve on a training version.
+/// A method's curve on a training version.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Curve {
     /// What learned.
-    pub learner: Learner,
+    pub method: Method,
     /// Where it was trained.
     pub version: Version,
     /// In order of episodes.
@@ -79,7 +79,7 @@ pub fn read_curves(
                 }
                 let points = points(&runs);
                 if !points.is_empty() {
-                    curves.push(Curve { learner: group.learner.clone(), version, points });
+                    curves.push(Curve { method: group.method.clone(), version, points });
                 }
             }
         }
@@ -143,9 +143,9 @@ pub fn curves_csv(all: &[EnvironmentCurves]) -> Result<Vec<u8>, csv::Error> {
         "success_std",
     ])?;
     for EnvironmentCurves { environment, curves } in all {
-        for Curve { learner, version, points } in curves {
-            let trials = learner.episodes_per_trial.map(|episodes| episodes.to_string()).unwrap_or_default();
-            let (algorithm, architecture) = (&learner.algorithm, &learner.architecture);
+        for Curve { method, version, points } in curves {
+            let trials = method.episodes_per_trial.map(|episodes| episodes.to_string()).unwrap_or_default();
+            let (algorithm, architecture) = (&method.algorithm, &method.architecture);
             for Point { episodes, episode_return, success } in points {
                 let numbers = [*episodes, episode_return.mean, episode_return.std, success.mean, success.std];
                 let names =

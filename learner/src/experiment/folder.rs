@@ -23,7 +23,7 @@ use std::path::{Path, PathBuf};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use super::plan::{Cell, Learner};
+use super::plan::{Cell, Method};
 use crate::checkpoint::Counters;
 use crate::evaluation::{TestResult, Version};
 
@@ -102,7 +102,7 @@ pub struct Training {
     pub version: Version,
     /// What learned.
     #[serde(flatten)]
-    pub learner: Learner,
+    pub method: Method,
     /// Names the settings.
     pub configuration: String,
     /// The run, from 1.
@@ -420,7 +420,7 @@ mod tests {
                 environment_revision: 1,
                 model_hash: String::new(),
                 version: Version::R,
-                learner: Learner { algorithm: "ppo".into(), architecture: "ff".into(), episodes_per_trial: None },
+                method: Method { algorithm: "ppo".into(), architecture: "ff".into(), episodes_per_trial: None },
                 configuration: "00000000".into(),
                 run: 2,
                 seed: 8,

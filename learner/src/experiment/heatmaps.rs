@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 
 use super::folder::{Folder, FolderError, read_bytes, write_atomically};
 use super::heatmap::{Heatmap, HeatmapOptions, default_axes, heatmap_csv};
-use super::plan::{Cell, Learner};
+use super::plan::{Cell, Method};
 use super::plot::{self, PlotError};
 use super::selection::{Group, Results};
 use crate::evaluation::Version;
@@ -29,7 +29,7 @@ pub struct HeatmapPlace<'a> {
     /// The environment.
     pub environment: &'a str,
     /// What learned.
-    pub learner: &'a Learner,
+    pub method: &'a Method,
     /// Where it was trained.
     pub version: Version,
     /// The cell that was selected in the first run; `None` if none has a result.
@@ -87,12 +87,12 @@ pub fn heatmap_places<'a>(results: &Results<'a>, groups: &'a [Group]) -> Vec<Hea
     let mut places = Vec::new();
     for group in groups {
         let of_group =
-            |cell: &&Cell| cell.config.common.environment == group.environment && cell.learner() == group.learner;
+            |cell: &&Cell| cell.config.common.environment == group.environment && cell.method() == group.method;
         let first = group.runs.values().next();
         for version in Version::ALL {
             if plan.cells.iter().filter(of_group).any(|cell| cell.config.common.version == version) {
                 let cell = first.and_then(|run| run.cells[version as usize]).map(|index| &plan.cells[index]);
-                places.push(HeatmapPlace { environment: &group.environment, learner: &group.learner, version, cell });
+                places.push(HeatmapPlace { environment: &group.environment, method: &group.method, version, cell });
             }
         }
     }
@@ -135,7 +135,7 @@ impl HeatmapPlace<'_> {
 
 impl std::fmt::Display for HeatmapPlace<'_> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{}, {} trained on {}", self.environment, self.learner, self.version)
+        write!(f, "{}, {} trained on {}", self.environment, self.method, self.version)
     }
 }
 
@@ -244,8 +244,8 @@ mod tests {
         let cell = &plan.cells[0];
         let result = folder.cell(&cell.id).path().join("result.json");
         write_atomically(&result, b"{}").unwrap();
-        let learner = cell.learner();
-        let place = HeatmapPlace { environment: "Pendulum", learner: &learner, version: Version::D, cell: Some(cell) };
+        let method = cell.method();
+        let place = HeatmapPlace { environment: "Pendulum", method: &method, version: Version::D, cell: Some(cell) };
         assert_eq!(place.read(&folder).unwrap(), Err(NoHeatmap::NotMade));
         let nobody = HeatmapPlace { cell: None, ..place.clone() };
         assert_eq!(nobody.read(&folder).unwrap(), Err(NoHeatmap::NoResult));

@@ -29,7 +29,7 @@ pub use heatmap::{Axis, Heatmap, HeatmapError, HeatmapOptions, MOST_POINTS, defa
 pub use heatmaps::{
     HeatmapPlace, HeatmapRecord, NoHeatmap, StoredHeatmap, heatmap_files, heatmap_places, store_heatmap,
 };
-pub use plan::{Cell, Counts, Learner, Plan, PlanError, Tests};
+pub use plan::{Cell, Counts, Method, Plan, PlanError, Tests};
 pub use run::{Attempt, BUSY, NO_SERVER, ON, RunEnd, RunError, RunOptions, RunStatus, run};
 pub use selection::{Group, Metric, Results, Selected, average, interquartile};
 pub use statistics::{Iqm, Summary, interquartile_mean};

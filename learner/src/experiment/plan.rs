@@ -54,9 +54,9 @@ pub struct Tests {
     pub versions: Vec<Version>,
 }
 
-/// What learns: a row of the paper's tables.
+/// An algorithm with its architecture and, of RL², the episodes in a trial: a row of the paper's tables.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-pub struct Learner {
+pub struct Method {
     /// The algorithm, e.g. "ppo".
     pub algorithm: String,
     /// The architecture, "ff" or "rc".
@@ -65,7 +65,7 @@ pub struct Learner {
     pub episodes_per_trial: Option<u32>,
 }
 
-impl std::fmt::Display for Learner {
+impl std::fmt::Display for Method {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let trials = self.episodes_per_trial.map(|episodes| format!(" N={episodes}")).unwrap_or_default();
         f.pad(&format!("{} {}{trials}", self.algorithm, self.architecture))
@@ -224,7 +224,7 @@ impl Plan {
     /// How much it asks for.
     pub fn counts(&self) -> Counts {
         let first = self.cells.iter().filter(|cell| cell.run == 1);
-        let configurations: BTreeSet<_> = first.clone().map(|cell| (cell.learner(), &cell.configuration)).collect();
+        let configurations: BTreeSet<_> = first.clone().map(|cell| (cell.method(), &cell.configuration)).collect();
         Counts {
             configurations: configurations.len(),
             trainings: first.clone().count(),
@@ -245,18 +245,18 @@ impl Plan {
         distinct(self.cells.iter().map(|cell| cell.config.common.environment.as_str()))
     }
 
-    /// What learns, in the plan's order.
-    pub fn learners(&self) -> Vec<Learner> {
-        distinct(self.cells.iter().map(Cell::learner))
+    /// The methods, in the plan's order.
+    pub fn methods(&self) -> Vec<Method> {
+        distinct(self.cells.iter().map(Cell::method))
     }
 }
 
 impl Cell {
-    /// What learns.
-    pub fn learner(&self) -> Learner {
+    /// What trains.
+    pub fn method(&self) -> Method {
         let TrainConfig { common, settings } = &self.config;
         let has_trials = matches!(settings.wrapper, WrapperSettings::Rl2(_));
-        Learner {
+        Method {
             algorithm: common.algorithm.to_string(),
             architecture: common.architecture.to_string(),
             episodes_per_trial: has_trials.then(|| settings.episodes_per_trial()),

@@ -36,8 +36,8 @@ fn a_file_expands_to_the_product_of_its_lists() {
     assert_eq!(plan.counts(), expected);
     assert!(plan.cells.iter().enumerate().all(|(index, cell)| cell.index == index));
     assert_eq!(plan.environments(), ["CartPole", "Pendulum"]);
-    let learners: Vec<String> = plan.learners().iter().map(ToString::to_string).collect();
-    assert_eq!(learners, ["a2c ff", "a2c rc", "ppo ff"]);
+    let methods: Vec<String> = plan.methods().iter().map(ToString::to_string).collect();
+    assert_eq!(methods, ["a2c ff", "a2c rc", "ppo ff"]);
 }
 
 #[test]
@@ -168,13 +168,13 @@ fn a_table_may_choose_its_environments_and_versions() {
 }
 
 #[test]
-fn trials_of_different_lengths_are_different_learners() {
+fn trials_of_different_lengths_are_different_methods() {
     let text = "environments = ['CartPole']
         [[algorithm]]\nname = 'rl2-a2c'\narchitectures = ['rc']\nsettings = { episodes_per_trial = 1 }
         [[algorithm]]\nname = 'rl2-a2c'\narchitectures = ['rc']
         [[algorithm]]\nname = 'epopt-a2c'\narchitectures = ['rc']";
-    let learners: Vec<String> = parse(text).unwrap().learners().iter().map(ToString::to_string).collect();
-    assert_eq!(learners, ["rl2-a2c rc N=1", "rl2-a2c rc N=2", "epopt-a2c rc"]);
+    let methods: Vec<String> = parse(text).unwrap().methods().iter().map(ToString::to_string).collect();
+    assert_eq!(methods, ["rl2-a2c rc N=1", "rl2-a2c rc N=2", "epopt-a2c rc"]);
 }
 
 #[test]

@@ -9,7 +9,7 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
 use super::folder::{Failure, FailureMark, Folder, FolderError};
-use super::plan::{Cell, Learner, Plan};
+use super::plan::{Cell, Method, Plan};
 use crate::interrupt::StopFlag;
 
 /// A worker's exit status if somebody else works on its cell (EX_TEMPFAIL of sysexits.h).
@@ -399,7 +399,7 @@ fn signal_of(status: ExitStatus) -> Option<i32> {
 /// What finished cells took.
 #[derive(Default)]
 pub(super) struct Times<'a> {
-    by_pair: HashMap<(&'a str, Learner), Mean>,
+    by_pair: HashMap<(&'a str, Method), Mean>,
     all: Mean,
 }
 
@@ -422,13 +422,13 @@ impl Mean {
 
 impl<'a> Times<'a> {
     pub(super) fn add(&mut self, cell: &'a Cell, seconds: f64) {
-        self.by_pair.entry((&cell.config.common.environment, cell.learner())).or_default().add(seconds);
+        self.by_pair.entry((&cell.config.common.environment, cell.method())).or_default().add(seconds);
         self.all.add(seconds);
     }
 
-    /// What cells of the same environment and learner took; `None` before the first.
+    /// What cells of the same environment and method took; `None` before the first.
     pub(super) fn of_pair(&self, cell: &Cell) -> Option<f64> {
-        self.by_pair.get(&(cell.config.common.environment.as_str(), cell.learner()))?.get()
+        self.by_pair.get(&(cell.config.common.environment.as_str(), cell.method()))?.get()
     }
 
     /// How long `cells`, which have run for so many seconds each, may still take.

@@ -1,6 +1,6 @@
 //! From the results of cells to the paper's numbers.
 //!
-//! Per environment, learner, training version and run, one configuration is selected: the one with the highest success
+//! Per environment, method, training version and run, one configuration is selected: the one with the highest success
 //! rate when tested on the version that it was trained on. Of equal ones the one with the higher mean return in the same
 //! test is taken, of still equal ones the one that the plan lists first; so is it where that version was not tested. Like
 //! in the paper, the test that selects is the test that is reported; with a large grid that makes Default and
@@ -9,7 +9,7 @@
 use std::collections::BTreeMap;
 
 use super::folder::{CellResult, CellState, Failure, Folder, FolderError};
-use super::plan::{Cell, Learner, Plan};
+use super::plan::{Cell, Method, Plan};
 use super::statistics::{Iqm, Summary};
 use crate::evaluation::{Rates, Scenario, Version, mean};
 
@@ -48,13 +48,13 @@ impl std::fmt::Display for Metric {
     }
 }
 
-/// A row of the paper's tables: an environment and a learner.
+/// A row of the paper's tables: an environment and a method.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Group {
     /// The environment.
     pub environment: String,
     /// What learned.
-    pub learner: Learner,
+    pub method: Method,
     /// Cells that the plan has for it.
     pub cells: usize,
     /// Of these, cells with a result. If some are missing, selection was among fewer than the plan asks for.
@@ -103,18 +103,18 @@ impl<'a> Results<'a> {
         })
     }
 
-    /// Selects; one group for each environment and learner of the plan, in its order.
+    /// Selects; one group for each environment and method of the plan, in its order.
     pub fn select(&self) -> Vec<Group> {
         let mut groups: Vec<Group> = Vec::new();
         for cell in &self.plan.cells {
-            let (environment, learner) = (&cell.config.common.environment, cell.learner());
-            let known = groups.iter_mut().find(|group| group.environment == *environment && group.learner == learner);
+            let (environment, method) = (&cell.config.common.environment, cell.method());
+            let known = groups.iter_mut().find(|group| group.environment == *environment && group.method == method);
             let group = match known {
                 Some(group) => group,
                 None => {
                     groups.push(Group {
                         environment: environment.clone(),
-                        learner,
+                        method,
                         cells: 0,
                         done: 0,
                         runs: BTreeMap::new(),

@@ -3,7 +3,7 @@ use crate::checkpoint::Counters;
 use crate::evaluation::{TestResult, paper};
 use crate::experiment::Training;
 
-/// Two configurations (A: 7e-3, B: 7e-4) of one learner, on two environments, in two runs.
+/// Two configurations (A: 7e-3, B: 7e-4) of one method, on two environments, in two runs.
 const PLAN: &str = "
 environments = ['CartPole', 'Pendulum']
 runs = 2
@@ -35,7 +35,7 @@ fn done(cell: &Cell, rates: [f64; 3], mean_return: f64) -> CellState {
             environment_revision: 1,
             model_hash: String::new(),
             version: common.version,
-            learner: cell.learner(),
+            method: cell.method(),
             configuration: cell.configuration.clone(),
             run: cell.run,
             seed: common.seed,
@@ -198,7 +198,7 @@ fn the_papers_averages_are_those_of_its_environments() {
                 Metric::Interpolation => row.interpolation.mean,
                 Metric::Extrapolation => row.extrapolation.mean,
             };
-            let learner = Learner {
+            let method = Method {
                 algorithm: algorithm.clone(),
                 architecture: architecture.clone(),
                 episodes_per_trial: trials,
@@ -209,13 +209,13 @@ fn the_papers_averages_are_those_of_its_environments() {
                     // One run whose scenarios all have the metric's mean: then that is the metric.
                     let selected = Selected { cells: [None; 3], rates: [[Some(of(&row)); 3]; 3] };
                     let runs = BTreeMap::from([(1, selected)]);
-                    Group { environment: environment.into(), learner: learner.clone(), cells: 1, done: 1, runs }
+                    Group { environment: environment.into(), method: method.clone(), cells: 1, done: 1, runs }
                 })
                 .into();
             let ours = super::average(&groups.iter().collect::<Vec<_>>(), metric).expect("a number");
             let difference = (ours.mean - of(&average)).abs();
             // Either is rounded to 0.01: half of that each, and some for the binary fractions.
-            assert!(difference < 0.0101, "{learner} {metric}: {} is not {}", ours.mean, of(&average));
+            assert!(difference < 0.0101, "{method} {metric}: {} is not {}", ours.mean, of(&average));
             compared += 1;
         }
     }

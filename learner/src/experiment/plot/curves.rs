@@ -5,7 +5,7 @@ use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 
 use super::super::curves::{Curve, EnvironmentCurves, Point};
-use super::super::plan::Learner;
+use super::super::plan::Method;
 use super::super::plan::distinct;
 use super::super::statistics::Summary;
 use super::{Picture, PlotError, drawing, font, line_style};
@@ -48,19 +48,19 @@ impl std::fmt::Display for Quantity {
 
 /// The picture of `curves`.
 pub fn draw_curves(curves: &EnvironmentCurves, quantity: Quantity) -> impl Picture + '_ {
-    let learners = distinct(curves.curves.iter().map(|curve| curve.learner.clone()));
-    CurvesPicture { curves, quantity, learners }
+    let methods = distinct(curves.curves.iter().map(|curve| curve.method.clone()));
+    CurvesPicture { curves, quantity, methods }
 }
 
 struct CurvesPicture<'a> {
     curves: &'a EnvironmentCurves,
     quantity: Quantity,
-    learners: Vec<Learner>,
+    methods: Vec<Method>,
 }
 
 impl Picture for CurvesPicture<'_> {
     fn size(&self) -> (u32, u32) {
-        let lines = self.learners.len().div_ceil(LEGEND_COLUMNS) as u32;
+        let lines = self.methods.len().div_ceil(LEGEND_COLUMNS) as u32;
         (3 * PANEL.0, TITLE + PANEL.1 + LEGEND_LINE * lines + 10)
     }
 
@@ -112,8 +112,8 @@ impl CurvesPicture<'_> {
             .set_all_tick_mark_size(3 * scale)
             .draw()
             .map_err(drawing)?;
-        for Curve { learner, points, .. } in self.curves.curves.iter().filter(|curve| curve.version == version) {
-            let index = self.learners.iter().position(|known| known == learner).unwrap_or_default();
+        for Curve { method, points, .. } in self.curves.curves.iter().filter(|curve| curve.version == version) {
+            let index = self.methods.iter().position(|known| known == method).unwrap_or_default();
             let (colour, dashes) = line_style(index);
             let at = |point: &Point, sign: f64| {
                 let summary = self.quantity.of(point);
@@ -157,7 +157,7 @@ impl CurvesPicture<'_> {
 
     fn legend<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError> {
         let (width, unit) = ((3 * PANEL.0 - 50) as i32 / LEGEND_COLUMNS as i32, scale as i32);
-        for (index, learner) in self.learners.iter().enumerate() {
+        for (index, method) in self.methods.iter().enumerate() {
             let (colour, dashes) = line_style(index);
             let (column, line) = ((index % LEGEND_COLUMNS) as i32, (index / LEGEND_COLUMNS) as i32);
             let (x, y) = ((50 + column * width) * unit, (line * LEGEND_LINE as i32 + 11) * unit);
@@ -169,7 +169,7 @@ impl CurvesPicture<'_> {
                     area.draw(&DashedPathElement::new(ends, dash * scale, gap * scale, style)).map_err(drawing)?;
                 }
             }
-            area.draw_text(&learner.to_string(), &font(12, scale), (x + 42 * unit, y - 6 * unit)).map_err(drawing)?;
+            area.draw_text(&method.to_string(), &font(12, scale), (x + 42 * unit, y - 6 * unit)).map_err(drawing)?;
         }
         Ok(())
     }

@@ -231,6 +231,6 @@ mod tests {
                 ((c.0, c.1, c.2), dash)
             })
             .collect();
-        assert_eq!(styles.len(), 10, "as many as the paper has learners");
+        assert_eq!(styles.len(), 10, "as many as the paper has methods");
     }
 }

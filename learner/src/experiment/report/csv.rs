@@ -1,6 +1,6 @@
 //! The numbers of a report as CSV; an empty field is a number that there is not.
 
-use super::super::plan::Learner;
+use super::super::plan::Method;
 use super::super::selection::{Group, Metric, Results, average, interquartile};
 use super::super::statistics::Summary;
 use super::{PaperCell, RESAMPLES, by_environment, paper_average, paper_cell};
@@ -25,23 +25,23 @@ fn metrics(results: &Results<'_>, groups: &[Group]) -> Lines {
     let mut file = File::new(&["metric", "runs", "mean", "std", "paper_mean", "paper_std", "difference"], true)?;
     let environments = results.plan.environments();
     let mut line =
-        |environment: &str, learner: &Learner, metric: Metric, ours: Option<Summary>, paper: Option<PaperCell>| {
+        |environment: &str, method: &Method, metric: Metric, ours: Option<Summary>, paper: Option<PaperCell>| {
             let difference = ours.zip(paper).map(|(ours, paper)| ours.mean - paper.mean);
             let [runs, mean, std] = summary(ours);
             let numbers =
                 [number(paper.map(|paper| paper.mean)), number(paper.and_then(|paper| paper.std)), number(difference)];
-            file.add(environment, learner, [metric.to_string(), runs, mean, std].into_iter().chain(numbers))
+            file.add(environment, method, [metric.to_string(), runs, mean, std].into_iter().chain(numbers))
         };
     for group in groups {
         for metric in Metric::ALL {
-            let paper = paper_cell(&group.environment, &group.learner, metric);
-            line(&group.environment, &group.learner, metric, group.summary(metric), paper)?;
+            let paper = paper_cell(&group.environment, &group.method, metric);
+            line(&group.environment, &group.method, metric, group.summary(metric), paper)?;
         }
     }
-    for learner in results.plan.learners() {
+    for method in results.plan.methods() {
         for metric in Metric::ALL {
-            let ours = by_environment(groups, &learner, &environments).and_then(|groups| average(&groups, metric));
-            line("Average", &learner, metric, ours, paper_average(&environments, &learner, metric))?;
+            let ours = by_environment(groups, &method, &environments).and_then(|groups| average(&groups, metric));
+            line("Average", &method, metric, ours, paper_average(&environments, &method, metric))?;
         }
     }
     file.finish()
@@ -50,13 +50,13 @@ fn metrics(results: &Results<'_>, groups: &[Group]) -> Lines {
 fn iqm(results: &Results<'_>, groups: &[Group]) -> Lines {
     let mut file = File::new(&["metric", "runs", "iqm", "low_95", "high_95"], false)?;
     let environments = results.plan.environments();
-    for learner in results.plan.learners() {
+    for method in results.plan.methods() {
         for metric in Metric::ALL {
-            let groups = by_environment(groups, &learner, &environments);
+            let groups = by_environment(groups, &method, &environments);
             let iqm = groups.and_then(|groups| interquartile(&groups, metric, RESAMPLES));
             let runs = iqm.map_or(0, |(_, runs)| runs).to_string();
             let [low, high] = [0, 1].map(|end| number(iqm.and_then(|(iqm, _)| Some(iqm.interval_95?[end]))));
-            file.add("", &learner, [metric.to_string(), runs, number(iqm.map(|(iqm, _)| iqm.iqm)), low, high])?;
+            file.add("", &method, [metric.to_string(), runs, number(iqm.map(|(iqm, _)| iqm.iqm)), low, high])?;
         }
     }
     file.finish()
@@ -68,7 +68,7 @@ fn scenarios(groups: &[Group]) -> Lines {
         for scenario in Scenario::all() {
             let [runs, mean, std] = summary(group.scenario(scenario));
             let fields = [scenario.train.to_string(), scenario.test.to_string(), runs, mean, std];
-            file.add(&group.environment, &group.learner, fields)?;
+            file.add(&group.environment, &group.method, fields)?;
         }
     }
     file.finish()
@@ -86,14 +86,14 @@ fn selected(results: &Results<'_>, groups: &[Group]) -> Lines {
                 let names = [version.to_string(), run.to_string(), seed, result.id.clone()];
                 let commits = result.commits().collect::<Vec<_>>().join("; ");
                 let origin = [commits, result.command.clone()];
-                file.add(&group.environment, &group.learner, names.into_iter().chain(rates).chain(origin))?;
+                file.add(&group.environment, &group.method, names.into_iter().chain(rates).chain(origin))?;
             }
         }
     }
     file.finish()
 }
 
-/// Lines that begin with an environment, if it has one, and a learner.
+/// Lines that begin with an environment, if it has one, and a method.
 struct File {
     writer: csv::Writer<Vec<u8>>,
     by_environment: bool,
@@ -103,21 +103,21 @@ impl File {
     fn new(columns: &[&str], by_environment: bool) -> Result<Self, csv::Error> {
         let mut writer = csv::Writer::from_writer(Vec::new());
         let environment = by_environment.then_some("environment");
-        let learner = ["algorithm", "architecture", "episodes_per_trial"];
-        writer.write_record(environment.into_iter().chain(learner).chain(columns.iter().copied()))?;
+        let method = ["algorithm", "architecture", "episodes_per_trial"];
+        writer.write_record(environment.into_iter().chain(method).chain(columns.iter().copied()))?;
         Ok(Self { writer, by_environment })
     }
 
     fn add(
         &mut self,
         environment: &str,
-        learner: &Learner,
+        method: &Method,
         fields: impl IntoIterator<Item = String>,
     ) -> Result<(), csv::Error> {
         let environment = self.by_environment.then(|| environment.to_owned());
-        let trials = learner.episodes_per_trial.map(|episodes| episodes.to_string()).unwrap_or_default();
-        let learner = [learner.algorithm.clone(), learner.architecture.clone(), trials];
-        self.writer.write_record(environment.into_iter().chain(learner).chain(fields))
+        let trials = method.episodes_per_trial.map(|episodes| episodes.to_string()).unwrap_or_default();
+        let method = [method.algorithm.clone(), method.architecture.clone(), trials];
+        self.writer.write_record(environment.into_iter().chain(method).chain(fields))
     }
 
     fn finish(self) -> Lines {

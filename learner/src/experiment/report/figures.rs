@@ -14,7 +14,7 @@ pub struct Figures {
     pub curves: Vec<Figure>,
     /// What is said of curves that are missing.
     pub no_curves: Vec<String>,
-    /// Heatmaps in rows, one of a learner's trainings.
+    /// Heatmaps in rows, one of a method's trainings.
     pub heatmaps: Vec<Vec<Figure>>,
     /// What to do about heatmaps that are missing.
     pub no_heatmaps: Vec<String>,
@@ -93,7 +93,7 @@ impl Figures {
     fn add_heatmaps(&mut self, results: &Results<'_>, groups: &[Group], folder: &Folder) -> Result<(), FigureError> {
         let places = heatmap_places(results, groups);
         let mut missing = [0; 4];
-        for row in places.chunk_by(|a, b| (a.environment, a.learner) == (b.environment, b.learner)) {
+        for row in places.chunk_by(|a, b| (a.environment, a.method) == (b.environment, b.method)) {
             let mut figures = Vec::new();
             for place in row {
                 let (caption, picture) = match place.read(folder)? {

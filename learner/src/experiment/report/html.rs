@@ -142,7 +142,7 @@ impl Page {
         }
         out.push_str("</tr>\n</thead>\n<tbody>\n");
         for (row, entries) in table.rows.iter().enumerate() {
-            // A line above a learner's first row, where learners have several.
+            // A line above a method's first row, where methods have several.
             let first = |row: usize| table.rows.get(row).and_then(|row| row.first());
             let next = look == Look::Shaded && row > 0 && first(row) != first(row - 1);
             let _ = write!(out, "<tr{}>", class(&[(next, "next")]));

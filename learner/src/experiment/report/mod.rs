@@ -9,7 +9,7 @@ mod figures;
 mod html;
 mod render;
 
-use super::plan::{Cell, Learner};
+use super::plan::{Cell, Method};
 use super::selection::{Group, Metric, Results, average, interquartile};
 use super::statistics::{Iqm, Summary};
 use crate::evaluation::{Scenario, Version, paper};
@@ -168,18 +168,18 @@ fn metrics_of(environment: &str, groups: &[&Group], runs: u32) -> Table {
     let row = |group: &&Group| {
         let cells = format!("{}/{}", group.done, group.cells);
         metrics_row(
-            &group.learner,
+            &group.method,
             runs,
             cells,
             |metric| group.summary(metric),
-            |metric| paper_cell(environment, &group.learner, metric),
+            |metric| paper_cell(environment, &group.method, metric),
         )
     };
     metrics_table(environment.to_owned(), groups.iter().map(row).collect())
 }
 
 fn metrics_table(title: String, rows: Vec<Vec<Entry>>) -> Table {
-    let mut header = vec!["learner".to_owned()];
+    let mut header = vec!["method".to_owned()];
     header.extend(Metric::ALL.iter().flat_map(|metric| [metric.to_string(), "paper".into(), "difference".into()]));
     header.extend(["runs".into(), "cells".into()]);
     let ours_and_papers = Metric::ALL.map(|metric| (metric.to_string(), 3));
@@ -188,13 +188,13 @@ fn metrics_table(title: String, rows: Vec<Vec<Entry>>) -> Table {
 }
 
 fn metrics_row(
-    learner: &Learner,
+    method: &Method,
     runs: u32,
     cells: String,
     ours: impl Fn(Metric) -> Option<Summary>,
     paper: impl Fn(Metric) -> Option<PaperCell>,
 ) -> Vec<Entry> {
-    let mut row: Vec<Entry> = vec![learner.to_string().into()];
+    let mut row: Vec<Entry> = vec![method.to_string().into()];
     let mut least = usize::MAX;
     for metric in Metric::ALL {
         let (ours, paper) = (ours(metric), paper(metric));
@@ -212,67 +212,67 @@ fn metrics_row(
 /// Averages over the plan's environments.
 fn averages(results: &Results<'_>, groups: &[Group]) -> Table {
     let environments = results.plan.environments();
-    let row = |learner: &Learner| {
-        let of_learner = by_environment(groups, learner, &environments);
-        let ours = |metric| average(&of_learner.clone()?, metric);
-        let paper = |metric| paper_average(&environments, learner, metric);
+    let row = |method: &Method| {
+        let of_method = by_environment(groups, method, &environments);
+        let ours = |metric| average(&of_method.clone()?, metric);
+        let paper = |metric| paper_average(&environments, method, metric);
         let (done, cells) = groups
             .iter()
-            .filter(|group| group.learner == *learner)
+            .filter(|group| group.method == *method)
             .fold((0, 0), |(done, cells), group| (done + group.done, cells + group.cells));
-        metrics_row(learner, results.plan.runs, format!("{done}/{cells}"), ours, paper)
+        metrics_row(method, results.plan.runs, format!("{done}/{cells}"), ours, paper)
     };
     let title = format!("Average over {}", environments.join(", "));
-    metrics_table(title, results.plan.learners().iter().map(row).collect())
+    metrics_table(title, results.plan.methods().iter().map(row).collect())
 }
 
-/// The groups of a learner in all `environments`; `None` if one is not in the plan.
+/// The groups of a method in all `environments`; `None` if one is not in the plan.
 pub(super) fn by_environment<'a>(
     groups: &'a [Group],
-    learner: &Learner,
+    method: &Method,
     environments: &[&str],
 ) -> Option<Vec<&'a Group>> {
-    let find = |name: &&str| groups.iter().find(|group| group.environment == **name && group.learner == *learner);
+    let find = |name: &&str| groups.iter().find(|group| group.environment == **name && group.method == *method);
     environments.iter().map(find).collect()
 }
 
 fn iqm(results: &Results<'_>, groups: &[Group]) -> Table {
     let environments = results.plan.environments();
-    let row = |learner: &Learner| {
-        let of_learner = by_environment(groups, learner, &environments);
+    let row = |method: &Method| {
+        let of_method = by_environment(groups, method, &environments);
         let numbers =
-            Metric::ALL.map(|metric| of_learner.as_ref().and_then(|groups| interquartile(groups, metric, RESAMPLES)));
+            Metric::ALL.map(|metric| of_method.as_ref().and_then(|groups| interquartile(groups, metric, RESAMPLES)));
         let entry = |number: &Option<(Iqm, usize)>| -> Entry {
             number.map_or_else(|| MISSING.to_owned(), |(iqm, _)| iqm.to_string()).into()
         };
         let runs = results.plan.runs;
         let least = numbers.iter().map(|number| number.map_or(0, |(_, runs)| runs)).min().unwrap_or_default();
         let least = if least == runs as usize { runs.to_string() } else { format!("{least} of {runs}") };
-        let name = std::iter::once(learner.to_string().into());
+        let name = std::iter::once(method.to_string().into());
         name.chain(numbers.iter().map(entry)).chain(std::iter::once(least.into())).collect()
     };
     Table {
         title: "Interquartile mean over all environments and the runs that all of them have, with its 95 % stratified \
                 bootstrap interval"
             .into(),
-        header: std::iter::once("learner".to_owned())
+        header: std::iter::once("method".to_owned())
             .chain(Metric::ALL.map(|metric| metric.to_string()))
             .chain(std::iter::once("runs".to_owned()))
             .collect(),
         spans: Vec::new(),
         texts: 1,
-        rows: results.plan.learners().iter().map(row).collect(),
+        rows: results.plan.methods().iter().map(row).collect(),
     }
 }
 
 fn scenarios_of(environment: &str, groups: &[&Group]) -> Table {
     let row = |group: &Group, train: Version| {
         let tests = Version::ALL.map(|test| shown(group.scenario(Scenario { train, test })));
-        [group.learner.to_string().into(), train.to_string().into()].into_iter().chain(tests).collect()
+        [group.method.to_string().into(), train.to_string().into()].into_iter().chain(tests).collect()
     };
     Table {
         title: format!("{environment}: the nine scenarios"),
-        header: ["learner", "trained on", "tested on D", "on R", "on E"].map(str::to_owned).into(),
+        header: ["method", "trained on", "tested on D", "on R", "on E"].map(str::to_owned).into(),
         spans: Vec::new(),
         texts: 2,
         rows: groups.iter().flat_map(|group| Version::ALL.map(|train| row(group, train))).collect(),
@@ -288,7 +288,7 @@ fn selected(results: &Results<'_>, groups: &[Group]) -> Table {
                 let rate = selected.rates[version as usize][version as usize];
                 rows.push(vec![
                     group.environment.as_str().into(),
-                    group.learner.to_string().into(),
+                    group.method.to_string().into(),
                     version.to_string().into(),
                     run.to_string().into(),
                     result.training.seed.to_string().into(),
@@ -301,7 +301,7 @@ fn selected(results: &Results<'_>, groups: &[Group]) -> Table {
     Table {
         title: "Where the numbers come from: the selected cell of each run (selected.csv has its settings and command)"
             .into(),
-        header: ["environment", "learner", "trained on", "run", "seed", "cell", "success on it"]
+        header: ["environment", "method", "trained on", "run", "seed", "cell", "success on it"]
             .map(str::to_owned)
             .into(),
         spans: Vec::new(),
@@ -328,9 +328,9 @@ fn shown(summary: Option<Summary>) -> Entry {
     }
 }
 
-/// The paper's number for a metric of a learner; `None` if it has none.
-pub(super) fn paper_cell(environment: &str, learner: &Learner, metric: Metric) -> Option<PaperCell> {
-    let Learner { algorithm, architecture, episodes_per_trial } = learner;
+/// The paper's number for a metric of a method; `None` if it has none.
+pub(super) fn paper_cell(environment: &str, method: &Method, metric: Metric) -> Option<PaperCell> {
+    let Method { algorithm, architecture, episodes_per_trial } = method;
     let row = paper::row_with_trials(environment, algorithm, architecture, *episodes_per_trial)?;
     let cell = match metric {
         Metric::Default => row.default,
@@ -341,11 +341,11 @@ pub(super) fn paper_cell(environment: &str, learner: &Learner, metric: Metric) -
 }
 
 /// The paper's average over `environments`: the published one if they are all six, otherwise the mean of theirs.
-pub(super) fn paper_average(environments: &[&str], learner: &Learner, metric: Metric) -> Option<PaperCell> {
+pub(super) fn paper_average(environments: &[&str], method: &Method, metric: Metric) -> Option<PaperCell> {
     let means: Vec<f64> =
-        environments.iter().map(|name| Some(paper_cell(name, learner, metric)?.mean)).collect::<Option<_>>()?;
+        environments.iter().map(|name| Some(paper_cell(name, method, metric)?.mean)).collect::<Option<_>>()?;
     if means.len() == 6 {
-        return paper_cell("Average", learner, metric);
+        return paper_cell("Average", method, metric);
     }
     Some(PaperCell { mean: means.iter().sum::<f64>() / means.len() as f64, std: None })
 }
@@ -392,12 +392,12 @@ mod tests {
 
     #[test]
     fn the_papers_average_is_over_the_same_environments() {
-        let learner = Learner { algorithm: "a2c".into(), architecture: "ff".into(), episodes_per_trial: None };
-        let two = paper_average(&["CartPole", "MountainCar"], &learner, Metric::Default).unwrap();
+        let method = Method { algorithm: "a2c".into(), architecture: "ff".into(), episodes_per_trial: None };
+        let two = paper_average(&["CartPole", "MountainCar"], &method, Metric::Default).unwrap();
         assert!((two.mean - (100.0 + 79.78) / 2.0).abs() < 1e-9 && two.std.is_none());
         let six = ["Acrobot", "CartPole", "MountainCar", "Pendulum", "HalfCheetah", "Hopper"];
-        let all = paper_average(&six, &learner, Metric::Default).unwrap();
+        let all = paper_average(&six, &method, Metric::Default).unwrap();
         assert_eq!((all.mean, all.std), (78.14, Some(6.07)));
-        assert_eq!(paper_average(&["CartPole", "Ant"], &learner, Metric::Default), None);
+        assert_eq!(paper_average(&["CartPole", "Ant"], &method, Metric::Default), None);
     }
 }
