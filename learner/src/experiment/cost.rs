@@ -216,8 +216,7 @@ mod tests {
             measured("CartPole", ppo, 4.0),
             measured("Hopper", a2c, 8.0),
         ];
-        let of =
-            |environment: &str, method: &Method| speed_of(&(environment, method.clone()), &measurements).training;
+        let of = |environment: &str, method: &Method| speed_of(&(environment, method.clone()), &measurements).training;
         assert_eq!((of("Hopper", a2c), of("Hopper", rc), of("Hopper", ppo)), (8.0, 16.0, 9.0));
         let total = estimate(&plan, &measurements, |environment| if environment == "Hopper" { 1000 } else { 200 });
         // 3 runs of 3, 3 and 1 configurations; 100 training episodes each.

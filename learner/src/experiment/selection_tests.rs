@@ -198,11 +198,8 @@ fn the_papers_averages_are_those_of_its_environments() {
                 Metric::Interpolation => row.interpolation.mean,
                 Metric::Extrapolation => row.extrapolation.mean,
             };
-            let method = Method {
-                algorithm: algorithm.clone(),
-                architecture: architecture.clone(),
-                episodes_per_trial: trials,
-            };
+            let method =
+                Method { algorithm: algorithm.clone(), architecture: architecture.clone(), episodes_per_trial: trials };
             let groups: Vec<Group> = ["Acrobot", "CartPole", "MountainCar", "Pendulum", "HalfCheetah", "Hopper"]
                 .map(|environment| {
                     let row = paper::row_with_trials(environment, &algorithm, &architecture, trials).expect("a row");
