@@ -147,7 +147,10 @@ impl Renderer {
     /// Makes the OpenGL context current and keeps other threads out.
     fn enter(&self) -> Result<MutexGuard<'static, ()>, Error> {
         let guard = exclusive();
-        if self.gl.make_current() { Ok(guard) } else { Err(Error::Fatal { message: "eglMakeCurrent failed".into() }) }
+        match self.gl.make_current() {
+            Ok(()) => Ok(guard),
+            Err(_) => Err(Error::Fatal { message: "eglMakeCurrent failed".into() }),
+        }
     }
 }
 
