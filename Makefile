@@ -142,7 +142,7 @@ $(VENV)/installed: python/requirements-dev.txt python/pyproject.toml python/hatc
 	$(VENV)/bin/pip install -q --disable-pip-version-check --no-deps --editable python
 	touch $@
 
-$(DM_ENV_RPC)/installed: tests/dm_env_rpc/requirements.txt | python-venv
+$(DM_ENV_RPC)/installed: tests/server/dm_env_rpc/requirements.txt | python-venv
 	python3 -m venv $(DM_ENV_RPC)
 	$(DM_ENV_RPC)/bin/pip install -q --disable-pip-version-check -r $<
 	touch $@

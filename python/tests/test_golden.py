@@ -1,4 +1,4 @@
-"""The classic tasks give through this package what Gymnasium 1.4 computed: tests/data/classic_control.jsonl."""
+"""The classic tasks give through this package what Gymnasium 1.4 computed: tests/server/data/classic_control.jsonl."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from .conftest import ROOT
 
-CASES = [json.loads(line) for line in (ROOT / "tests/data/classic_control.jsonl").read_text().splitlines()]
+CASES = [json.loads(line) for line in (ROOT / "tests/server/data/classic_control.jsonl").read_text().splitlines()]
 
 # Rounding to float32, half an ulp by each side, relative, or absolute below 1. Pendulum's torque is rounded too, by
 # 2^-24 of at most 2 N m; light rods of E turn this into 3 / (m l²) · 0.05 s ≤ 1.2 times as much speed.

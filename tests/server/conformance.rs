@@ -1,15 +1,11 @@
 //! What every server of the protocol must do, seen from outside: at PERTURB_ADDRESS, or at a server started here.
-#![allow(clippy::unwrap_used)]
 
-#[path = "common/server.rs"]
-mod server;
-
+use crate::common::server::{self, Actor, Server, Session, action, doubles, floats, open, parameters, stepped};
 use bytes::Bytes;
 use perturb::proto::{
     AutoresetMode, Distribution, Environment, EpisodeEnd, EpisodeStart, Open, Opened, Reset, Restore, Snapshot, Step,
     Stepped, Version, action_space::Kind, session_request::Request, session_response::Response,
 };
-use server::{Actor, Server, Session, action, doubles, floats, open, parameters, stepped};
 use std::collections::HashSet;
 use tonic::Code;
 

@@ -1,16 +1,12 @@
 //! Bad input, bad clients and bad luck, each tried against a running server beside another session, which must not
 //! notice: its bytes equal those of an undisturbed run.
-#![allow(clippy::unwrap_used)]
 
-#[path = "common/server.rs"]
-mod server;
-
+use crate::common::server::{self, Actor, Server, Session, doubles, environment, open, parameters, until, within};
 use bytes::Bytes;
 use perturb::proto::{
     self, Environment, Open, Reset, Restore, SessionRequest, SessionResponse, Snapshot, Step, session_request::Request,
     session_response::Response,
 };
-use server::{Actor, Server, Session, doubles, environment, open, parameters, until, within};
 use std::{
     io::{Read, Write},
     net::TcpStream,
@@ -446,7 +442,9 @@ impl ClientProcess {
     /// Starts it and waits until it steps.
     async fn start(address: &str) -> Self {
         let mut command = Command::new(std::env::current_exe().unwrap());
-        command.args(["--ignored", "--exact", "--nocapture", "client_that_steps_for_ever"]).env(CLIENT, address);
+        command
+            .args(["--ignored", "--exact", "--nocapture", "faults::client_that_steps_for_ever"])
+            .env(CLIENT, address);
         let mut client = Self(command.stdout(Stdio::piped()).spawn().unwrap());
         let lines = server::lines(client.0.stdout.take().unwrap());
         until("the client steps", async || lines.try_iter().any(|line| line == "stepping")).await;

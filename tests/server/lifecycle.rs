@@ -1,11 +1,7 @@
 //! How the server begins and ends: configuration, addresses, health, reflection, signals, draining.
-#![allow(clippy::unwrap_used)]
 
-#[path = "common/server.rs"]
-mod server;
-
+use crate::common::server::{self, Actor, Server, Session, command, environment, open, until, within};
 use perturb::proto::{Step, session_request::Request, session_response::Response};
-use server::{Actor, Server, Session, command, environment, open, until, within};
 use std::{
     io::Write,
     net::{TcpListener, TcpStream},

@@ -1,9 +1,6 @@
 //! Pictures, asked of a real server. Tests need OpenGL in software: Debian's libegl1 and libgl1-mesa-dri.
-#![allow(clippy::unwrap_used)]
 
-#[path = "common/server.rs"]
-mod server;
-
+use crate::common::server::{self, Actor, Server, Session, catalogue, doubles, open, parameters};
 use bytes::Bytes;
 use perturb::{
     env,
@@ -12,7 +9,6 @@ use perturb::{
         session_response::Response,
     },
 };
-use server::{Actor, Server, Session, catalogue, doubles, open, parameters};
 use std::{
     collections::HashSet,
     f64::consts::{FRAC_PI_2, PI},

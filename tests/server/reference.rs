@@ -1,5 +1,4 @@
 //! The classic tasks compute what Gymnasium computes: trajectories that Gymnasium 1.4 ran in f64 under edited parameters.
-#![allow(clippy::unwrap_used)]
 
 use perturb::{
     classic::Pendulum,

@@ -1,9 +1,6 @@
 //! Endings and success, at the boundaries of their rules.
-#![allow(clippy::unwrap_used)]
 
-mod common;
-
-use common::{episodes, observe, settings, step};
+use crate::common::{episodes, observe, settings, step};
 use perturb::{
     env::{
         self, Action, ActionSpace, Channel, Environment, EnvironmentSpec, EpisodeEnd, Episodes, Error, Outcome, Pose,

@@ -1,16 +1,11 @@
 //! Worlds of dm_env_rpc: how long they live, what resets and properties do to them, limits, shutdown, and their
 //! neighbours.
-#![allow(clippy::unwrap_used)]
 
-#[path = "dm_env_rpc/client.rs"]
-mod client;
-#[path = "common/server.rs"]
-mod server;
-
-use client::{
+use super::client::{
     Agent, Seen, Settings, choice, create, destroy, double, floats, int64, join, list, property, read, settings, step,
     text, uint64, vector, write,
 };
+use crate::common::server::{self, Actor, Server, Session, environment, open, until};
 use perturb::proto::{
     SessionResponse,
     dm_env_rpc::v1::{
@@ -18,7 +13,6 @@ use perturb::proto::{
         environment_request::Payload as Request, environment_response::Payload as Response, tensor::Payload,
     },
 };
-use server::{Actor, Server, Session, environment, open, until};
 use tonic::{Code, transport::Channel};
 use tonic_health::pb::{HealthCheckRequest, health_check_response::ServingStatus, health_client::HealthClient};
 

@@ -1,12 +1,8 @@
 //! The same session gives the same bytes, whatever the number of workers, the transport, or the split of the batch.
-#![allow(clippy::unwrap_used)]
 
-#[path = "common/server.rs"]
-mod server;
-
+use crate::common::server::{Actor, Server, Session, catalogue, open, stepped};
 use perturb::proto::{EpisodeEnd, EpisodeStart, Open, SessionResponse, Stepped, session_response::Response};
 use prost::Message;
-use server::{Actor, Server, Session, catalogue, open, stepped};
 use sha2::{Digest, Sha256};
 use std::io::Write;
 

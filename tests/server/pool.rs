@@ -1,10 +1,7 @@
 //! The pool: batches give the bytes of their environments, whoever steps them, and give back what they took.
-#![allow(clippy::unwrap_used)]
 
-mod common;
-
+use crate::common::{self, action_bytes, floats, observe, step};
 use bytes::Bytes;
-use common::{action_bytes, floats, observe, step};
 use perturb::{
     env::{self, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings},
     physics::{Distribution, Version},

@@ -1,7 +1,5 @@
 //! What MuJoCo does when it fails: nothing ends the process, nothing is passed over.
 
-#![allow(clippy::unwrap_used)]
-
 use perturb_mujoco::{Error, Model, Simulation, Warning};
 use std::{sync::Barrier, thread};
 

@@ -1,8 +1,6 @@
 //! The random streams are NumPy's Philox, number for number, so that another language can repeat them.
-#![allow(clippy::unwrap_used)]
 
-mod common;
-
+use crate::common;
 use perturb::{
     env::{self, Environment, Purpose, Stream},
     physics::Version,

@@ -1,9 +1,6 @@
 //! What holds for every environment of the catalogue, whichever it is.
-#![allow(clippy::unwrap_used)]
 
-mod common;
-
-use common::{action_bytes, episodes, observe, play, settings, start_line, step};
+use crate::common::{action_bytes, episodes, observe, play, settings, start_line, step};
 use perturb::{
     env::{self, ActionSpace, Channel, EnvironmentSpec, Episodes, Error, Purpose, Stream},
     physics::{Distribution, Version},

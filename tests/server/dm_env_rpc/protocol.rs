@@ -1,15 +1,10 @@
 //! The server of dm_env_rpc, seen from outside: the package's own compliance cases, and what they do not ask.
-#![allow(clippy::unwrap_used)]
 
-#[path = "dm_env_rpc/client.rs"]
-mod client;
-#[path = "common/server.rs"]
-mod server;
-
-use client::{
-    ACTION, ALL, Agent, PROPERTIES, Seen, choice, create, destroy, double, floats, int64, join, leave, property, read,
-    settings, step, text, uint64, vector,
+use super::client::{
+    self, ACTION, ALL, Agent, PROPERTIES, Seen, choice, create, destroy, double, floats, int64, join, leave, property,
+    read, settings, step, text, uint64, vector,
 };
+use crate::common::server::{self, Server, Session, action, environment, open};
 use perturb::proto::{
     self, Environment, Open, Version,
     action_space::Kind,
@@ -19,14 +14,13 @@ use perturb::proto::{
     },
 };
 use prost_types::Any;
-use server::{Server, Session, action, environment, open};
 use std::{collections::BTreeMap, path::Path, process::Command};
 use tonic::Code;
 
-/// A Python with the package of tests/dm_env_rpc/requirements.txt.
+/// A Python with the package of tests/server/dm_env_rpc/requirements.txt.
 const PYTHON: &str = "PERTURB_TEST_DM_ENV_RPC_PYTHON";
 
-/// Runs a program of tests/dm_env_rpc with that Python, if there is one. Returns what it printed.
+/// Runs a program of tests/server/dm_env_rpc with that Python, if there is one. Returns what it printed.
 fn python(program: &str, arguments: &[&str]) -> Option<String> {
     let Ok(python) = std::env::var(PYTHON) else {
         eprintln!(
@@ -34,7 +28,7 @@ fn python(program: &str, arguments: &[&str]) -> Option<String> {
         );
         return None;
     };
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/dm_env_rpc").join(program);
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/server/dm_env_rpc").join(program);
     let mut command = Command::new(&python);
     command.arg(path).args(arguments).env("PYTHONDONTWRITEBYTECODE", "1").env("no_proxy", "*");
     let output = command.output().unwrap_or_else(|error| panic!("{PYTHON} is {python}, which cannot be run: {error}"));

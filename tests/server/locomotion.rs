@@ -1,6 +1,4 @@
 //! Hopper and HalfCheetah: physics, task, determinism.
-#![cfg(feature = "mujoco")]
-#![allow(clippy::unwrap_used)]
 
 use perturb::{
     env::{Action, ActionSpace, Environment, Purpose, Stream},

@@ -1,10 +1,7 @@
 //! What follows a restored snapshot is what followed the snapshot, wherever it is restored; what is none does no harm.
-#![allow(clippy::unwrap_used)]
 
-mod common;
-
+use crate::common::{self, action_bytes, episodes, observe, play, start_line, step};
 use bytes::Bytes;
-use common::{action_bytes, episodes, observe, play, start_line, step};
 use perturb::{
     env::{self, EnvironmentSpec, Episodes, Error},
     physics::{Distribution, Interval, Version},
@@ -202,7 +199,7 @@ fn a_snapshot_continues_in_another_process() {
         std::fs::write(directory.path().join(spec.name), used(spec).snapshot()).unwrap();
     }
     let output = Command::new(std::env::current_exe().unwrap())
-        .args(["--exact", "a_snapshot_continues_in_another_process"])
+        .args(["--exact", "snapshots::a_snapshot_continues_in_another_process"])
         .env(CHILD, directory.path())
         .output()
         .unwrap();

@@ -1,5 +1,6 @@
 //! What several test files need: environments at their first episode, actions, and transcripts to compare.
-#![allow(dead_code, clippy::unwrap_used, reason = "every test file uses its part")]
+
+pub mod server;
 
 use perturb::{
     env::{self, Action, ActionSpace, EnvironmentSpec, Episodes, Outcome, Purpose, Settings, Stream},

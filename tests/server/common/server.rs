@@ -1,5 +1,4 @@
 //! A real `perturb-server` in a process of its own, and a client for its sessions.
-#![allow(dead_code, clippy::unwrap_used, reason = "every test file uses its part")]
 
 use bytes::Bytes;
 use perturb::proto::{

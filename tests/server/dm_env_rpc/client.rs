@@ -1,7 +1,6 @@
 //! A client of dm_env_rpc, made of the generated code.
-#![allow(dead_code, clippy::unwrap_used, reason = "every test file uses its part")]
 
-use crate::server::{self, within};
+use crate::common::server::{self, within};
 use perturb::proto::dm_env_rpc::v1::{
     self as rpc, ActionObservationSpecs, EnvironmentRequest, EnvironmentResponse, StepResponse, Tensor,
     environment_client::EnvironmentClient,

@@ -1,8 +1,6 @@
 //! Parameters are drawn as the paper says: D exact, R uniform, E uniform over the union around R; nothing else passes.
-#![allow(clippy::unwrap_used)]
 
-mod common;
-
+use crate::common;
 use perturb::{
     env::{self, EnvironmentSpec, Error, Purpose, Stream},
     physics::{Distribution, Interval, Parameter, Version, check_bounds, resolve},

@@ -1,5 +1,4 @@
 //! Pictures. They need OpenGL in software: Debian's libegl1 and libgl1-mesa-dri.
-#![allow(clippy::unwrap_used)]
 
 use perturb_mujoco::{Camera, Error, Model, Renderer};
 use std::{sync::Barrier, thread};

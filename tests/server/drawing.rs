@@ -1,5 +1,4 @@
 //! The renderer in process: its queue, what is given up, what is absurd, what fails.
-#![allow(clippy::unwrap_used)]
 
 use futures_util::future::join_all;
 use perturb::{
@@ -75,7 +74,7 @@ fn a_failed_drawing_fails_alone() {
     use perturb::render::Error;
 
     let renderer = Renderer::new();
-    let mjcf = include_str!("../models/hopper.xml");
+    let mjcf = include_str!("../../models/hopper.xml");
     let hopper = |mjcf, n| renderer.draw(Pose::Robot { name: "Hopper", mjcf, qpos: vec![0.1; n] }, SIZE);
     let expected = run(hopper(mjcf, 6)).unwrap();
     // A defect: positions of another robot.
