@@ -1,0 +1,7 @@
+//! The tests of the bindings, one program, so that it is linked once.
+#![allow(clippy::unwrap_used)]
+
+mod faults;
+#[cfg(target_os = "linux")]
+mod memory;
+mod render;

@@ -1,0 +1,5 @@
+//! The server's other protocol.
+
+mod client;
+mod protocol;
+mod worlds;

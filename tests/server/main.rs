@@ -1,0 +1,21 @@
+//! The server's tests, one program, so that it is linked once.
+#![allow(clippy::unwrap_used)]
+
+mod common;
+
+mod catalogue;
+mod conformance;
+mod determinism;
+mod distributions;
+mod dm_env_rpc;
+mod drawing;
+mod faults;
+mod lifecycle;
+#[cfg(feature = "mujoco")]
+mod locomotion;
+mod pool;
+mod reference;
+mod rendering;
+mod snapshots;
+mod streams;
+mod success;
