@@ -10,7 +10,7 @@ use common::{
     SECONDS, addresses, child_server, config, is_running, kill, perturb, read, run, server, stderr, wait_for,
 };
 use perturb_learner::checkpoint::Checkpoint;
-use perturb_learner::client::{Address, LocalServer, OpenOptions, Servers, Session, StepReply};
+use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers, Session, StepReply};
 use perturb_learner::evaluation::{Version, test};
 use perturb_learner::interrupt::StopFlag;
 use perturb_learner::policy::{ActionKind, Inputs, Policy, PolicySpec, Sequences};
@@ -73,14 +73,14 @@ fn continuous_actions_are_learned_from() {
 #[test]
 fn equal_seeds_give_equal_weights_with_any_number_of_servers_and_workers() {
     let text = "environment = 'CartPole'\nversion = 'E'\nepisodes = 40\nnum_envs = 5\nn_steps = 32";
-    let train_on = |servers: &[LocalServer], text: &str| {
+    let train_on = |servers: &[PrivateServer], text: &str| {
         let servers = Servers::connect(&addresses(servers)).expect("connections");
         run(&servers, text).1.checkpoint
     };
     let reference = train_on(&[server(1)], text);
     assert_eq!(train_on(&[server(2)], text), reference, "two workers");
     assert_eq!(train_on(&[server(1), server(2)], text), reference, "two servers");
-    let many: Vec<LocalServer> = (0..7).map(|_| server(1)).collect();
+    let many: Vec<PrivateServer> = (0..7).map(|_| server(1)).collect();
     assert_eq!(train_on(&many, text), reference, "more servers than environments");
     let other = train_on(&[server(1)], &format!("{text}\nseed = 2"));
     assert_ne!(other.weights, reference.weights, "another seed");

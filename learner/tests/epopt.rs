@@ -10,7 +10,7 @@ use common::{bases, connect, contents, moved, options, server};
 use perturb_learner::algorithm::{
     A2c, A2cConfig, Algorithm, AlgorithmState, Epopt, EpoptConfig, Ppo, PpoConfig, Selection, UpdateStats,
 };
-use perturb_learner::client::{EndedEpisode, LocalServer, Session};
+use perturb_learner::client::{EndedEpisode, PrivateServer, Session};
 use perturb_learner::error::Error;
 use perturb_learner::policy::{
     ActionKind, Actor, Acts, Inputs, ObservationNormaliser, Policy, PolicySpec, RewardNormaliser, Sequences,
@@ -469,7 +469,7 @@ fn blind(input_size: usize) -> Policy {
 }
 
 /// Two rollouts of complete episodes with those that ended, and the statistics after them.
-fn collect(servers: &[LocalServer], normalised: bool) -> (Vec<(Rollout, Vec<EndedEpisode>)>, Normalisers) {
+fn collect(servers: &[PrivateServer], normalised: bool) -> (Vec<(Rollout, Vec<EndedEpisode>)>, Normalisers) {
     let servers = connect(servers);
     let mut observations = Vec::new();
     let session = Session::open(&servers, &options("CartPole", CARTPOLES, 1), &mut observations).expect("a session");

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-use perturb_learner::client::{LocalServer, LocalServerOptions};
+use perturb_learner::client::{PrivateServer, PrivateServerOptions};
 use perturb_learner::experiment::{CellResult, CellState, Counts, Folder, Plan, default_axes};
 use tempfile::TempDir;
 
@@ -285,8 +285,8 @@ fn a_signal_stops_the_workers_and_the_same_command_goes_on() {
 #[test]
 fn a_lost_server_is_no_cells_failure() {
     let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 100000"));
-    let options = LocalServerOptions { workers: Some(1), ..LocalServerOptions::default() };
-    let server = LocalServer::start(options).unwrap_or_else(|error| panic!("{error}"));
+    let options = PrivateServerOptions { workers: Some(1), ..PrivateServerOptions::default() };
+    let server = PrivateServer::start(options).unwrap_or_else(|error| panic!("{error}"));
     let address = server.address().to_string();
     let child = experiment.command("out", &["--jobs", "2", "--server", &address]).spawn().expect("started");
     let progress = experiment.out("out/cells").join(&experiment.plan.cells[0].id).join("training/progress.csv");

@@ -117,7 +117,7 @@ fn go_on(servers: &Servers, path: &Path) -> Result<Outcome, String> {
     outcome.map_err(|error| format!("{error:#}"))
 }
 
-fn servers_of(number: usize) -> (Vec<perturb_learner::client::LocalServer>, Servers) {
+fn servers_of(number: usize) -> (Vec<perturb_learner::client::PrivateServer>, Servers) {
     let local: Vec<_> = (0..number).map(|i| server(1 + i % 2)).collect();
     let servers = Servers::connect(&addresses(&local)).expect("connections");
     (local, servers)

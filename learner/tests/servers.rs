@@ -9,7 +9,7 @@ use std::process::Child;
 use std::time::{Duration, Instant};
 
 use common::{addresses, kill, perturb, server, stderr};
-use perturb_learner::client::{Address, LocalServer, OpenOptions, Servers, Session};
+use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers, Session};
 use perturb_learner::experiment::{Folder, Plan};
 use perturb_learner::proto;
 
@@ -97,7 +97,7 @@ fn silent() -> (TcpListener, Address) {
 }
 
 /// A server with a session that keeps it from ending, which it has been asked to do.
-fn shutting_down(with_session: impl FnOnce(&LocalServer)) {
+fn shutting_down(with_session: impl FnOnce(&PrivateServer)) {
     let server = server(1);
     let servers = Servers::connect(&addresses(std::slice::from_ref(&server))).expect("a connection");
     let session = Session::open(&servers, &options(), &mut Vec::new()).expect("a session");

@@ -10,14 +10,14 @@ use std::process::{Command, Output};
 use common::{addresses, child_server, kill, perturb, run, server, stderr, wait_for};
 use gif::{ColorOutput, DecodeOptions};
 use perturb_learner::checkpoint::Checkpoint;
-use perturb_learner::client::{LocalServer, Servers};
+use perturb_learner::client::{PrivateServer, Servers};
 use perturb_learner::evaluation::{Version, test};
 use perturb_learner::interrupt::StopFlag;
 use perturb_learner::video::{Summary, VideoFile, VideoOptions, film};
 use tempfile::TempDir;
 
 /// A policy that was trained for a moment.
-fn trained(server: &LocalServer, text: &str) -> (TempDir, Checkpoint) {
+fn trained(server: &PrivateServer, text: &str) -> (TempDir, Checkpoint) {
     let servers = Servers::connect(std::slice::from_ref(server.address())).expect("a connection");
     let (out, outcome) = run(&servers, text);
     (out, outcome.checkpoint)

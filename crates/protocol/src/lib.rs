@@ -1,5 +1,27 @@
 //! The contract between perturb's servers and their clients, which both sides take from here.
+//!
+//! - [`proto`]: the messages.
+//! - [`Version`], [`Distribution`], [`Address`], [`limits`]: what both sides mean by them.
+//! - [`Connection`] and [`Stream`]: a client's side of a session, one typed reply for each request.
+//! - [`PrivateServer`]: a server of a program's own.
 #![forbid(unsafe_code)]
+
+mod address;
+mod connection;
+mod distribution;
+mod error;
+pub mod limits;
+mod private_server;
+mod stream;
+mod version;
+
+pub use address::{Address, AddressError};
+pub use connection::{Connection, Machines, first_of, machines};
+pub use distribution::{Distribution, DistributionError, Interval};
+pub use error::ClientError;
+pub use private_server::{PrivateServer, PrivateServerOptions};
+pub use stream::{Ask, REPLY_LIMIT, Stream};
+pub use version::{UnknownVersion, Version};
 
 /// The protocols: generated from `proto`, whose comments specify every field. `perturb.v1` is here at the top.
 #[allow(missing_docs, clippy::all)]

@@ -25,7 +25,7 @@ use std::process::ExitCode;
 use anyhow::{Context, Result};
 use clap::Parser;
 
-use crate::client::{LocalServerOptions, Servers};
+use crate::client::{PrivateServerOptions, Servers};
 use crate::config::ConfigError;
 use crate::evaluation::TestError;
 use crate::experiment::slurm::OptionError;
@@ -111,7 +111,7 @@ fn signal_code(number: i32) -> ExitCode {
 /// The servers that were named, or one of our own that takes `num_envs` environments.
 fn servers(args: &ServerArgs, num_envs: usize) -> Result<Servers> {
     if args.server.is_empty() {
-        let options = LocalServerOptions { workers: args.workers, num_envs };
+        let options = PrivateServerOptions { workers: args.workers, num_envs };
         return Servers::local(options).context("cannot start a server for this run");
     }
     refuse_workers(args)?;

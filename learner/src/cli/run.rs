@@ -15,7 +15,7 @@ use super::args::{Engine, RunArgs};
 use super::bar::Bar;
 use super::plan::{duration, step_limits};
 use super::{Ending, UsageError, report, servers, single_thread, slurm};
-use crate::client::{Address, ClientError, LocalServer, LocalServerOptions, Servers};
+use crate::client::{Address, ClientError, PrivateServer, PrivateServerOptions, Servers};
 use crate::experiment::{
     Attempt, BUSY, Cell, CellEnd, Folder, NO_SERVER, ON, Plan, RunEnd, RunOptions, RunStatus, run as run_cells,
     run_cell,
@@ -190,15 +190,15 @@ pub(super) fn keep_plan(args: &RunArgs, plan: &Plan, folder: &Folder) -> Result<
 }
 
 /// The servers that all workers share.
-fn shared_servers(args: &RunArgs, plan: &Plan, jobs: usize) -> Result<(Option<LocalServer>, Vec<Address>)> {
+fn shared_servers(args: &RunArgs, plan: &Plan, jobs: usize) -> Result<(Option<PrivateServer>, Vec<Address>)> {
     let named = &args.server.server;
     if !named.is_empty() {
         super::refuse_workers(&args.server)?;
         return Ok((None, named.clone()));
     }
     let most = plan.cells.iter().map(|cell| cell.config.common.num_envs).max().unwrap_or_default();
-    let options = LocalServerOptions { workers: args.server.workers, num_envs: jobs * most.max(TEST_ENVS) };
-    let server = LocalServer::start(options).context("cannot start a server for this run")?;
+    let options = PrivateServerOptions { workers: args.server.workers, num_envs: jobs * most.max(TEST_ENVS) };
+    let server = PrivateServer::start(options).context("cannot start a server for this run")?;
     let address = server.address().clone();
     Ok((Some(server), vec![address]))
 }

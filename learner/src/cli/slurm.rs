@@ -8,7 +8,7 @@ use super::args::RunArgs;
 use super::plan::step_limits;
 use super::run::{Line, finished, keep_plan};
 use super::{Ending, refuse_workers};
-use crate::client::{Address, LocalServerOptions, Servers};
+use crate::client::{Address, PrivateServerOptions, Servers};
 use crate::experiment::slurm::{Event, Slurm, SlurmEnd, SlurmOptions, SlurmStatus, Task, count, run_on_slurm};
 use crate::experiment::{Folder, Plan, cell_seconds, measure, representatives};
 use crate::interrupt::StopFlag;
@@ -29,7 +29,7 @@ pub(super) fn run(args: &RunArgs, plan: &Plan, stop: &StopFlag) -> Result<Ending
     slurm.check(stop)?;
     // Which environments there are, and what they cost, is found out here: servers that jobs share may be out of reach.
     let most = plan.cells.iter().map(|cell| cell.config.common.num_envs).max().unwrap_or_default();
-    let local = LocalServerOptions { workers: args.server.workers, num_envs: most };
+    let local = PrivateServerOptions { workers: args.server.workers, num_envs: most };
     let servers = || Servers::local(local).context("cannot start a server for this run");
     step_limits(&servers()?, plan)?;
     keep_plan(args, plan, &folder)?;

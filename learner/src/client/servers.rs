@@ -1,45 +1,35 @@
 //! Connections to one or several servers.
 
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::io::ErrorKind;
 use std::sync::Mutex;
 use std::time::Duration;
 
 use tokio::runtime::{Builder, Runtime};
 use tokio::sync::oneshot;
-use tonic::transport::Channel;
 
-use super::address::Address;
-use super::connect::{Machines, connect, first_of, in_short, machines, own_turn};
-use super::error::{ClientError, describe};
-use super::local::{LocalServer, LocalServerOptions};
+use perturb_protocol::{
+    Address, ClientError, Connection, Machines, PrivateServer, PrivateServerOptions, first_of, machines,
+};
+
 use crate::proto;
-use crate::proto::perturb_client::PerturbClient;
 
-/// How long a server may take for one reply; also that of a batch of thousands of environments comes much sooner.
-pub(super) const REPLY_LIMIT: Duration = Duration::from_secs(60);
 /// Connections to servers, all of which serve the same environments.
 #[derive(Debug)]
 pub struct Servers {
     // Dropped in this order: connections, the runtime that drives them, the server.
-    links: Vec<Link>,
+    connections: Vec<Connection>,
     runtime: Runtime,
-    local: Option<Mutex<LocalServer>>,
-}
-
-/// A connection.
-#[derive(Clone, Debug)]
-pub(super) struct Link {
-    pub(super) address: Address,
-    pub(super) client: PerturbClient<Channel>,
+    local: Option<Mutex<PrivateServer>>,
 }
 
 impl Servers {
     /// Starts a private server and connects to it.
     ///
     /// # Errors
-    /// Those of [`LocalServer::start`] and of [`Servers::connect`].
-    pub fn local(options: LocalServerOptions) -> Result<Self, ClientError> {
-        let server = LocalServer::start(options)?;
+    /// Those of [`PrivateServer::start`] and of [`Servers::connect`].
+    pub fn local(options: PrivateServerOptions) -> Result<Self, ClientError> {
+        let server = PrivateServer::start(options)?;
         let mut servers = Self::connect(std::slice::from_ref(server.address()))?;
         servers.local = Some(Mutex::new(server));
         Ok(servers)
@@ -53,8 +43,8 @@ impl Servers {
     pub fn connect(addresses: &[Address]) -> Result<Self, ClientError> {
         let runtime = runtime()?;
         let one = |address| async move { any_of(address, machines(address).await?.into_order(own_turn())).await };
-        let links = addresses.iter().map(|address| runtime.block_on(one(address))).collect::<Result<_, _>>()?;
-        Ok(Self { links, runtime, local: None })
+        let connections = addresses.iter().map(|address| runtime.block_on(one(address))).collect::<Result<_, _>>()?;
+        Ok(Self { connections, runtime, local: None })
     }
 
     /// Connects to one server of `addresses`, where every machine that a name stands for counts: to number `turn`, counted
@@ -65,17 +55,17 @@ impl Servers {
     /// of several does.
     pub fn connect_to_one(addresses: &[Address], turn: usize) -> Result<Self, ClientError> {
         let runtime = runtime()?;
-        let link = runtime.block_on(async {
+        let connection = runtime.block_on(async {
             let (all, mut errors) = all_machines(addresses).await;
             match first_of(&all.into_order(turn)).await {
-                Ok(link) => Ok(link),
+                Ok(connection) => Ok(connection),
                 Err(others) => {
                     errors.extend(others);
-                    Err(none_connects(errors))
+                    Err(ClientError::of_all(errors))
                 }
             }
         })?;
-        Ok(Self { links: vec![link], runtime, local: None })
+        Ok(Self { connections: vec![connection], runtime, local: None })
     }
 
     /// Connects to all servers of `addresses` that take sessions, where every machine that a name stands for counts, and
@@ -85,37 +75,37 @@ impl Servers {
     /// Those of [`Servers::connect_to_one`].
     pub fn connect_to_some(addresses: &[Address]) -> Result<(Self, Vec<ClientError>), ClientError> {
         let runtime = runtime()?;
-        let (links, errors) = runtime.block_on(async {
+        let (connections, errors) = runtime.block_on(async {
             let (all, mut errors) = all_machines(addresses).await;
-            let mut links = Vec::new();
+            let mut connections = Vec::new();
             for address in &all.equal {
-                match connect(address).await {
-                    Ok(link) => links.push(link),
+                match Connection::open(address).await {
+                    Ok(connection) => connections.push(connection),
                     Err(error) => errors.push(error),
                 }
             }
-            if links.is_empty() {
+            if connections.is_empty() {
                 match first_of(&all.spare).await {
-                    Ok(link) => links.push(link),
+                    Ok(connection) => connections.push(connection),
                     Err(others) => errors.extend(others),
                 }
             }
-            (links, errors)
+            (connections, errors)
         });
-        if links.is_empty() {
-            return Err(none_connects(errors));
+        if connections.is_empty() {
+            return Err(ClientError::of_all(errors));
         }
-        Ok((Self { links, runtime, local: None }, errors))
+        Ok((Self { connections, runtime, local: None }, errors))
     }
 
     /// Where the servers are, one address for each connection.
     pub fn addresses(&self) -> impl Iterator<Item = &Address> {
-        self.links.iter().map(|link| &link.address)
+        self.connections.iter().map(Connection::address)
     }
 
     /// The connections, in the order of their addresses.
-    pub(super) fn links(&self) -> &[Link] {
-        &self.links
+    pub(super) fn connections(&self) -> &[Connection] {
+        &self.connections
     }
 
     /// What drives the connections.
@@ -143,22 +133,13 @@ impl Servers {
     /// # Errors
     /// [`ClientError::Lost`] or [`ClientError::TimedOut`].
     pub fn catalogue(&self) -> Result<proto::ListEnvironmentsResponse, ClientError> {
-        self.links
+        self.connections
             .first()
-            .map_or_else(|| Ok(proto::ListEnvironmentsResponse::default()), |link| self.catalogue_of(link))
+            .map_or_else(|| Ok(proto::ListEnvironmentsResponse::default()), |first| self.catalogue_of(first))
     }
 
-    fn catalogue_of(&self, link: &Link) -> Result<proto::ListEnvironmentsResponse, ClientError> {
-        let request = "the catalogue";
-        let mut client = link.client.clone();
-        self.runtime
-            .block_on(async {
-                let call = client.list_environments(proto::ListEnvironmentsRequest {});
-                tokio::time::timeout(REPLY_LIMIT, call).await
-            })
-            .map_err(|_| ClientError::TimedOut { address: link.address.clone(), request, limit: REPLY_LIMIT })?
-            .map(tonic::Response::into_inner)
-            .map_err(|status| self.lost(&link.address, request, &status))
+    fn catalogue_of(&self, connection: &Connection) -> Result<proto::ListEnvironmentsResponse, ClientError> {
+        self.runtime.block_on(connection.catalogue()).map_err(|error| self.explain(error))
     }
 
     /// The entry `name` of the catalogues, which must be the same in all of them.
@@ -167,7 +148,7 @@ impl Servers {
     /// [`ClientError::Refused`] with the names that there are, [`ClientError::Disagreement`], and those of
     /// [`Servers::catalogue`].
     pub fn environment(&self, name: &str) -> Result<proto::Environment, ClientError> {
-        let Some((first, others)) = self.links.split_first() else {
+        let Some((first, others)) = self.connections.split_first() else {
             return Err(ClientError::System {
                 action: "ask for an environment",
                 source: ErrorKind::NotConnected.into(),
@@ -176,37 +157,35 @@ impl Servers {
         let environment = self.environment_of(first, name)?;
         for other in others {
             if self.environment_of(other, name)? != environment {
-                let (first, other) = (first.address.clone(), other.address.clone());
+                let (first, other) = (first.address().clone(), other.address().clone());
                 return Err(ClientError::Disagreement { first, other, environment: name.into() });
             }
         }
         Ok(environment)
     }
 
-    fn environment_of(&self, link: &Link, name: &str) -> Result<proto::Environment, ClientError> {
-        let catalogue = self.catalogue_of(link)?.environments;
+    fn environment_of(&self, connection: &Connection, name: &str) -> Result<proto::Environment, ClientError> {
+        let catalogue = self.catalogue_of(connection)?.environments;
         let names: Vec<&str> = catalogue.iter().map(|environment| environment.name.as_str()).collect();
         let message = format!("there is no environment `{name}`; there are {}", names.join(", "));
         catalogue.iter().find(|environment| environment.name == name).cloned().ok_or_else(|| ClientError::Refused {
-            address: link.address.clone(),
+            address: connection.address().clone(),
             request: "the environment",
-            code: tonic::Code::NotFound as i32,
+            code: tonic::Code::NotFound,
             message,
         })
     }
 
-    /// The error for a stream that ended with `status`; says how the private server ended, if it did.
-    pub(super) fn lost(&self, address: &Address, request: &'static str, status: &tonic::Status) -> ClientError {
-        let ended = self.local.as_ref().and_then(|server| {
-            // The connection may break a moment before the process can be waited for.
-            std::thread::sleep(Duration::from_millis(50));
-            server.lock().ok()?.exit_status()
-        });
-        let reason = match ended {
-            Some(status) => format!("the private server ended with {status}"),
-            None => describe(status),
+    /// Says how the private server ended, if it did and a stream was lost with it.
+    pub(super) fn explain(&self, error: ClientError) -> ClientError {
+        let (ClientError::Lost { address, request, code, .. }, Some(server)) = (&error, &self.local) else {
+            return error;
         };
-        ClientError::Lost { address: address.clone(), request, reason }
+        // The connection may break a moment before the process can be waited for.
+        std::thread::sleep(Duration::from_millis(50));
+        let Some(status) = server.lock().ok().and_then(|mut server| server.exit_status()) else { return error };
+        let reason = format!("the private server ended with {status}");
+        ClientError::Lost { address: address.clone(), request, code: *code, reason }
     }
 }
 
@@ -230,17 +209,17 @@ async fn all_machines(addresses: &[Address]) -> (Machines, Vec<ClientError>) {
 }
 
 /// Connects to one of the machines that `address` stands for.
-async fn any_of(address: &Address, machines: Vec<Address>) -> Result<Link, ClientError> {
-    first_of(&machines).await.map_err(|errors| match none_connects(errors) {
+async fn any_of(address: &Address, machines: Vec<Address>) -> Result<Connection, ClientError> {
+    first_of(&machines).await.map_err(|errors| match ClientError::of_all(errors) {
         ClientError::NoneConnects { reasons } => ClientError::Connect { address: address.clone(), reason: reasons },
         error => error,
     })
 }
 
-/// The errors of all addresses as one.
-fn none_connects(mut errors: Vec<ClientError>) -> ClientError {
-    if errors.len() == 1 {
-        return errors.remove(0);
-    }
-    ClientError::NoneConnects { reasons: errors.iter().map(in_short).collect::<Vec<_>>().join("; ") }
+/// A turn for a process that has no other: processes on one machine have different numbers, containers different names.
+fn own_turn() -> usize {
+    let mut hasher = DefaultHasher::new(); // always with the same key
+    std::fs::read("/proc/sys/kernel/hostname").unwrap_or_default().hash(&mut hasher);
+    std::process::id().hash(&mut hasher);
+    hasher.finish() as usize
 }

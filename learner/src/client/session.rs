@@ -3,16 +3,10 @@
 use std::ops::Range;
 
 use bytes::{Bytes, BytesMut};
-use tokio::sync::mpsc;
-use tokio_stream::wrappers::ReceiverStream;
-use tonic::Streaming;
+use perturb_protocol::{Ask, ClientError, Connection, Stream};
 
-use super::address::Address;
-use super::error::ClientError;
-use super::servers::{Link, REPLY_LIMIT, Servers};
-use crate::proto::{
-    self, AutoresetMode, SessionRequest, SessionResponse, session_request::Request, session_response::Response,
-};
+use super::servers::Servers;
+use crate::proto::{self, AutoresetMode};
 
 /// What to open.
 #[derive(Clone, Debug)]
@@ -89,10 +83,8 @@ pub struct Session<'a> {
 /// The part of a batch that one server owns.
 #[derive(Debug)]
 pub(super) struct Part {
-    address: Address,
+    pub(super) stream: Stream,
     range: Range<usize>,
-    requests: mpsc::Sender<SessionRequest>,
-    replies: Streaming<SessionResponse>,
     /// Encoded actions; its memory comes back when a request has been sent.
     actions: BytesMut,
 }
@@ -104,26 +96,26 @@ impl<'a> Session<'a> {
     /// [`ClientError::Refused`] with the server's sentence, [`ClientError::Disagreement`] between servers, and the
     /// failures of a connection.
     pub fn open(servers: &'a Servers, options: &OpenOptions, observations: &mut Vec<f32>) -> Result<Self, ClientError> {
-        let ranges = split(options.num_envs, servers.links().len());
+        let ranges = split(options.num_envs, servers.connections().len());
         let mut parts: Vec<Part> = Vec::new();
         let mut environment: Option<proto::Environment> = None;
         observations.clear();
-        for (link, range) in servers.links().iter().zip(ranges) {
+        for (connection, range) in servers.connections().iter().zip(ranges) {
             if range.is_empty() {
                 continue; // more servers than environments
             }
-            let opening = open_part(servers, link, options, range, AutoresetMode::SameStep);
-            let (part, opened) = servers.runtime().block_on(opening)?;
+            let opening = open_part(connection, options, range, AutoresetMode::SameStep);
+            let (part, opened) = servers.runtime().block_on(opening).map_err(|error| servers.explain(error))?;
             let described = opened.environment.unwrap_or_default();
             let expected = part.range.len() * described.observation.len();
             let first = observations.len();
             observations.resize(first + expected, 0.0);
-            part.decode("open", "observations", &opened.observations, &mut observations[first..])?;
+            part.stream.decode::<proto::Open>("observations", &opened.observations, &mut observations[first..])?;
             match &environment {
                 Some(known) if *known != described => {
                     return Err(ClientError::Disagreement {
-                        first: parts[0].address.clone(),
-                        other: part.address,
+                        first: parts[0].stream.address().clone(),
+                        other: part.stream.address().clone(),
                         environment: options.environment.clone(),
                     });
                 }
@@ -170,12 +162,9 @@ impl<'a> Session<'a> {
         let request = |part: &mut Part| {
             part.actions.clear();
             part.actions.extend_from_slice(&actions[part.range.start * width..part.range.end * width]);
-            Request::Step(proto::Step { actions: part.actions.split().freeze() })
+            proto::Step { actions: part.actions.split().freeze() }
         };
-        self.exchange("a step", request, |part, response| match response {
-            Response::Stepped(stepped) => part.store(stepped, size, reply),
-            other => Err(part.unexpected("a step", &other, "Stepped")),
-        })
+        self.exchange(request, |part, stepped| part.store(stepped, size, reply))
     }
 
     /// Begins a new trial in the environment of `slot`, whose named parameters have the given values from now on; the
@@ -192,7 +181,6 @@ impl<'a> Session<'a> {
         seed: u64,
         observations: &mut [f32],
     ) -> Result<(), ClientError> {
-        let what = "a reset with parameters";
         let fixed = |value: f64| proto::Distribution { intervals: vec![proto::Interval { low: value, high: value }] };
         let Self { servers, parts, observation_size: size, .. } = self;
         let Some(part) = parts.iter_mut().find(|part| part.range.contains(&slot)) else { return Ok(()) };
@@ -202,15 +190,9 @@ impl<'a> Session<'a> {
             parameters: parameters.iter().map(|(name, value)| ((*name).to_owned(), fixed(*value))).collect(),
             ..proto::Reset::default()
         };
-        servers.runtime().block_on(async {
-            part.send(what, Request::Reset(request), servers).await?;
-            match part.receive(what, servers).await? {
-                Response::Reset(done) => {
-                    part.decode(what, "observations", &done.observations, &mut observations[slot * *size..][..*size])
-                }
-                other => Err(part.unexpected(what, &other, "ResetDone")),
-            }
-        })
+        let done = servers.runtime().block_on(part.stream.ask(request)).map_err(|error| servers.explain(error))?;
+        let first = &mut observations[slot * *size..][..*size];
+        part.stream.decode::<proto::Reset>("observations", &done.observations, first)
     }
 
     /// Saves every environment whole: N opaque snapshots in order of slots. Changes nothing. All servers work at the same
@@ -219,20 +201,18 @@ impl<'a> Session<'a> {
     /// # Errors
     /// The failures of a connection.
     pub fn snapshot(&mut self) -> Result<Vec<Bytes>, ClientError> {
-        let what = "a snapshot";
         let mut snapshots = Vec::with_capacity(self.num_envs);
-        let request = |_: &mut Part| Request::Snapshot(proto::Snapshot::default());
-        self.exchange(what, request, |part, response| match response {
-            Response::Snapshot(saved) if saved.snapshots.len() == part.range.len() => {
+        self.exchange(
+            |_| proto::Snapshot::default(),
+            |part, saved| {
+                if saved.snapshots.len() != part.range.len() {
+                    let got = format!("{} snapshots", saved.snapshots.len());
+                    return Err(part.stream.mismatch::<proto::Snapshot>(got, part.range.len().to_string()));
+                }
                 snapshots.extend(saved.snapshots);
                 Ok(())
-            }
-            Response::Snapshot(saved) => {
-                let got = format!("{} snapshots", saved.snapshots.len());
-                Err(part.mismatch(what, got, part.range.len().to_string()))
-            }
-            other => Err(part.unexpected(what, &other, "Snapshotted")),
-        })?;
+            },
+        )?;
         Ok(snapshots)
     }
 
@@ -243,26 +223,23 @@ impl<'a> Session<'a> {
     /// [`ClientError::Snapshots`] if there are not N, [`ClientError::Refused`] if one is of something else, and the
     /// failures of a connection. After the latter two some environments may have been restored.
     pub fn restore(&mut self, snapshots: &[Bytes], observations: &mut [f32]) -> Result<(), ClientError> {
-        let what = "to restore snapshots";
         if snapshots.len() != self.num_envs {
             return Err(ClientError::Snapshots { got: snapshots.len(), expected: self.num_envs });
         }
         let Self { servers, parts, observation_size: size, .. } = self;
-        servers.runtime().block_on(async {
+        let restored = servers.runtime().block_on(async {
             for part in parts.iter_mut() {
                 for slots in chunks(part.range.clone()) {
                     let mask = part.range.clone().map(|slot| u8::from(slots.contains(&slot))).collect();
                     let request = proto::Restore { mask, snapshots: snapshots[slots.clone()].to_vec() };
-                    part.send(what, Request::Restore(request), servers).await?;
+                    let done = part.stream.ask(request).await?;
                     let out = &mut observations[slots.start * *size..slots.end * *size];
-                    match part.receive(what, servers).await? {
-                        Response::Restore(done) => part.decode(what, "observations", &done.observations, out)?,
-                        other => return Err(part.unexpected(what, &other, "Restored")),
-                    }
+                    part.stream.decode::<proto::Restore>("observations", &done.observations, out)?;
                 }
             }
             Ok(())
-        })
+        });
+        restored.map_err(|error| servers.explain(error))
     }
 
     /// Begins a new episode in every environment and writes its first observations `[N, O]`.
@@ -271,37 +248,36 @@ impl<'a> Session<'a> {
     /// The failures of a connection.
     pub fn reset(&mut self, observations: &mut [f32]) -> Result<(), ClientError> {
         let size = self.observation_size;
-        let request = |_: &mut Part| Request::Reset(proto::Reset::default());
-        self.exchange("a reset", request, |part, response| match response {
-            Response::Reset(done) => {
+        self.exchange(
+            |_| proto::Reset::default(),
+            |part, done| {
                 let range = part.range.start * size..part.range.end * size;
-                part.decode("a reset", "observations", &done.observations, &mut observations[range])
-            }
-            other => Err(part.unexpected("a reset", &other, "ResetDone")),
-        })
+                part.stream.decode::<proto::Reset>("observations", &done.observations, &mut observations[range])
+            },
+        )
     }
 
-    /// Sends every server its request and takes its response. All are heard before the first failure is returned, so
-    /// that no response is left for a later request.
-    fn exchange(
+    /// Sends every server its request and takes its reply. All are heard before the first failure is returned, so that
+    /// no reply is left for a later request.
+    fn exchange<A: Ask>(
         &mut self,
-        what: &'static str,
-        mut request: impl FnMut(&mut Part) -> Request,
-        mut take: impl FnMut(&Part, Response) -> Result<(), ClientError>,
+        mut request: impl FnMut(&mut Part) -> A,
+        mut take: impl FnMut(&Part, A::Reply) -> Result<(), ClientError>,
     ) -> Result<(), ClientError> {
         let Self { servers, parts, .. } = self;
-        servers.runtime().block_on(async {
+        let exchanged = servers.runtime().block_on(async {
             for part in parts.iter_mut() {
                 let request = request(part);
-                part.send(what, request, servers).await?;
+                part.stream.send(request).await?;
             }
             let mut outcome = Ok(());
             for part in parts.iter_mut() {
-                let taken = part.receive(what, servers).await.and_then(|response| take(part, response));
+                let taken = part.stream.receive::<A>().await.and_then(|reply| take(part, reply));
                 outcome = outcome.and(taken);
             }
             outcome
-        })
+        });
+        exchanged.map_err(|error| servers.explain(error))
     }
 }
 
@@ -317,55 +293,21 @@ impl StepReply {
 }
 
 impl Part {
-    pub(super) async fn send(
-        &self,
-        what: &'static str,
-        request: Request,
-        servers: &Servers,
-    ) -> Result<(), ClientError> {
-        let message = SessionRequest { request: Some(request) };
-        // The channel has room for a request, and is closed only after the stream has ended.
-        self.requests.send(message).await.map_err(|_| {
-            let status = tonic::Status::unavailable("the stream has ended");
-            servers.lost(&self.address, what, &status)
-        })
-    }
-
-    pub(super) async fn receive(&mut self, what: &'static str, servers: &Servers) -> Result<Response, ClientError> {
-        let address = || self.address.clone();
-        let message = tokio::time::timeout(REPLY_LIMIT, self.replies.message())
-            .await
-            .map_err(|_| ClientError::TimedOut { address: address(), request: what, limit: REPLY_LIMIT })?
-            .map_err(|status| servers.lost(&self.address, what, &status))?;
-        match message.map(|message| message.response) {
-            Some(Some(Response::Error(error))) => Err(ClientError::Refused {
-                address: address(),
-                request: what,
-                code: error.code,
-                message: error.message,
-            }),
-            Some(Some(response)) => Ok(response),
-            Some(None) => Err(self.mismatch(what, "an empty reply".into(), "a reply".into())),
-            None => Err(servers.lost(&self.address, what, &tonic::Status::unavailable("the server ended the stream"))),
-        }
-    }
-
     /// Puts one server's reply in its place in the batch's.
     pub(super) fn store(&self, stepped: proto::Stepped, size: usize, reply: &mut StepReply) -> Result<(), ClientError> {
-        let what = "a step";
         let Range { start, end } = self.range;
-        self.decode(what, "observations", &stepped.observations, &mut reply.observations[start * size..end * size])?;
-        self.decode(what, "rewards", &stepped.rewards, &mut reply.rewards[start..end])?;
+        self.decode("observations", &stepped.observations, &mut reply.observations[start * size..end * size])?;
+        self.decode("rewards", &stepped.rewards, &mut reply.rewards[start..end])?;
         self.decode_flags("terminated", &stepped.terminated, &mut reply.terminated[start..end])?;
         self.decode_flags("truncated", &stepped.truncated, &mut reply.truncated[start..end])?;
         let first = reply.final_observations.len();
         reply.final_observations.resize(first + stepped.ended.len() * size, 0.0);
         let finals = &mut reply.final_observations[first..];
-        self.decode(what, "final_observations", &stepped.final_observations, finals)?;
+        self.decode("final_observations", &stepped.final_observations, finals)?;
         for end in stepped.ended {
             let slot = start + end.slot as usize;
             let Some(episode) = end.episode.filter(|_| self.range.contains(&slot)) else {
-                return Err(self.mismatch(what, format!("an ended episode of slot {slot}"), "a named episode".into()));
+                return Err(self.mismatch(format!("an ended episode of slot {slot}"), "a named episode".into()));
             };
             reply.ended.push(EndedEpisode {
                 slot,
@@ -383,68 +325,34 @@ impl Part {
         Ok(())
     }
 
-    /// Little-endian f32 numbers, exactly as many as `out` takes.
-    pub(super) fn decode(
-        &self,
-        request: &'static str,
-        field: &'static str,
-        bytes: &Bytes,
-        out: &mut [f32],
-    ) -> Result<(), ClientError> {
-        let (numbers, rest) = bytes.as_chunks::<4>();
-        if numbers.len() != out.len() || !rest.is_empty() {
-            return Err(self.wrong_length(request, field, bytes.len(), out.len() * 4));
-        }
-        for (out, number) in out.iter_mut().zip(numbers) {
-            *out = f32::from_le_bytes(*number);
-        }
-        Ok(())
+    fn decode(&self, field: &'static str, bytes: &Bytes, out: &mut [f32]) -> Result<(), ClientError> {
+        self.stream.decode::<proto::Step>(field, bytes, out)
     }
 
     fn decode_flags(&self, field: &'static str, bytes: &Bytes, out: &mut [bool]) -> Result<(), ClientError> {
         if bytes.len() != out.len() {
-            return Err(self.wrong_length("a step", field, bytes.len(), out.len()));
+            return Err(self.mismatch(format!("{} bytes of {field}", bytes.len()), out.len().to_string()));
         }
         out.iter_mut().zip(bytes.iter()).for_each(|(out, byte)| *out = *byte != 0);
         Ok(())
     }
 
-    fn wrong_length(&self, request: &'static str, field: &'static str, got: usize, expected: usize) -> ClientError {
-        self.mismatch(request, format!("{got} bytes of {field}"), format!("{expected}"))
-    }
-
-    pub(super) fn unexpected(&self, request: &'static str, got: &Response, expected: &str) -> ClientError {
-        let got = match got {
-            Response::Opened(_) => "Opened",
-            Response::Stepped(_) => "Stepped",
-            Response::Reset(_) => "ResetDone",
-            Response::Snapshot(_) => "Snapshotted",
-            Response::Restore(_) => "Restored",
-            Response::Render(_) => "Rendered",
-            Response::Error(_) => "Error",
-        };
-        self.mismatch(request, got.into(), expected.into())
-    }
-
-    pub(super) fn mismatch(&self, request: &'static str, got: String, expected: String) -> ClientError {
-        ClientError::Protocol { address: self.address.clone(), request, got, expected }
+    fn mismatch(&self, got: String, expected: String) -> ClientError {
+        self.stream.mismatch::<proto::Step>(got, expected)
     }
 }
 
 pub(super) async fn open_part(
-    servers: &Servers,
-    link: &Link,
+    connection: &Connection,
     options: &OpenOptions,
     range: Range<usize>,
     autoreset_mode: AutoresetMode,
 ) -> Result<(Part, proto::Opened), ClientError> {
-    let what = "to open a session";
-    let (requests, receiver) = mpsc::channel(4);
     let index = |index: usize| {
         u32::try_from(index).map_err(|_| ClientError::Refused {
-            address: link.address.clone(),
-            request: what,
-            code: tonic::Code::InvalidArgument as i32,
+            address: connection.address().clone(),
+            request: proto::Open::NAME,
+            code: tonic::Code::InvalidArgument,
             message: format!("{index} environments are more than the protocol can number (2^32 - 1)"),
         })
     };
@@ -459,25 +367,8 @@ pub(super) async fn open_part(
         receipts: true,
         ..proto::Open::default()
     };
-    // The request lies in the channel before the call is made: a server may wait for it before it answers at all.
-    let message = SessionRequest { request: Some(Request::Open(open)) };
-    requests.try_send(message).map_err(|error| servers.lost(&link.address, what, &closed(&error.to_string())))?;
-    let mut client = link.client.clone();
-    let call = client.session(ReceiverStream::new(receiver));
-    let replies = tokio::time::timeout(REPLY_LIMIT, call)
-        .await
-        .map_err(|_| ClientError::TimedOut { address: link.address.clone(), request: what, limit: REPLY_LIMIT })?
-        .map_err(|status| servers.lost(&link.address, what, &status))?
-        .into_inner();
-    let mut part = Part { address: link.address.clone(), range, requests, replies, actions: BytesMut::new() };
-    match part.receive(what, servers).await? {
-        Response::Opened(opened) => Ok((part, opened)),
-        other => Err(part.unexpected(what, &other, "Opened")),
-    }
-}
-
-fn closed(reason: &str) -> tonic::Status {
-    tonic::Status::internal(reason)
+    let (stream, opened) = Stream::open(connection, open).await?;
+    Ok((Part { stream, range, actions: BytesMut::new() }, opened))
 }
 
 /// Cuts 0 … `num_envs` into `parts` contiguous ranges, whose lengths differ by at most 1.

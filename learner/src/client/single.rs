@@ -2,10 +2,11 @@
 
 use tonic::Code;
 
-use super::error::ClientError;
+use perturb_protocol::{Ask, ClientError};
+
 use super::servers::Servers;
 use super::session::{OpenOptions, Part, StepReply, open_part};
-use crate::proto::{self, AutoresetMode, session_request::Request, session_response::Response};
+use crate::proto::{self, AutoresetMode};
 
 /// An episode that began.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -43,10 +44,6 @@ pub struct Single<'a> {
     size: (u32, u32),
 }
 
-const STEP: &str = "a step";
-const RESET: &str = "a reset";
-const PICTURE: &str = "a picture";
-
 impl<'a> Single<'a> {
     /// Opens one environment on the first server, whatever number `options` says, and writes its first observation
     /// `[O]`.
@@ -58,18 +55,17 @@ impl<'a> Single<'a> {
         options: &OpenOptions,
         observation: &mut Vec<f32>,
     ) -> Result<(Self, BegunEpisode), ClientError> {
-        let what = "to open a session";
-        let Some(link) = servers.links().first() else {
+        let Some(connection) = servers.connections().first() else {
             let source = std::io::ErrorKind::NotConnected.into();
             return Err(ClientError::System { action: "open an environment", source });
         };
-        let opening = open_part(servers, link, options, 0..1, AutoresetMode::Disabled);
-        let (part, opened) = servers.runtime().block_on(opening)?;
+        let opening = open_part(connection, options, 0..1, AutoresetMode::Disabled);
+        let (part, opened) = servers.runtime().block_on(opening).map_err(|error| servers.explain(error))?;
         let environment = opened.environment.unwrap_or_default();
         observation.resize(environment.observation.len(), 0.0);
-        part.decode(what, "observations", &opened.observations, observation)?;
+        part.stream.decode::<proto::Open>("observations", &opened.observations, observation)?;
         let single = Self { servers, part, environment, size: (0, 0) };
-        let begun = single.begun_of(what, opened.started)?;
+        let begun = single.begun_of::<proto::Open>(opened.started)?;
         Ok((single, begun))
     }
 
@@ -84,7 +80,7 @@ impl<'a> Single<'a> {
     /// The failures of a connection, as of all requests.
     pub fn request_step(&mut self, action: &[u8]) -> Result<(), ClientError> {
         let actions = bytes::Bytes::copy_from_slice(action);
-        self.request(STEP, Request::Step(proto::Step { actions }))
+        self.request(proto::Step { actions })
     }
 
     /// Asks for the next episode; the trial goes on, if it has another one.
@@ -92,7 +88,7 @@ impl<'a> Single<'a> {
     /// # Errors
     /// The failures of a connection.
     pub fn request_reset(&mut self) -> Result<(), ClientError> {
-        self.request(RESET, Request::Reset(proto::Reset::default()))
+        self.request(proto::Reset::default())
     }
 
     /// Asks for a picture of so many pixels of the state after the requests before.
@@ -101,7 +97,7 @@ impl<'a> Single<'a> {
     /// The failures of a connection.
     pub fn request_picture(&mut self, width: u32, height: u32) -> Result<(), ClientError> {
         self.size = (width, height);
-        self.request(PICTURE, Request::Render(proto::Render { slot: 0, width, height }))
+        self.request(proto::Render { slot: 0, width, height })
     }
 
     /// Takes the answer to [`Self::request_step`]. Replaces what is in `reply`, whose N is 1; `observations` is the last
@@ -112,10 +108,8 @@ impl<'a> Single<'a> {
     pub fn stepped(&mut self, reply: &mut StepReply) -> Result<(), ClientError> {
         let size = self.environment.observation.len();
         reply.resize(1, size);
-        match self.response(STEP)? {
-            Response::Stepped(stepped) => self.part.store(stepped, size, reply),
-            other => Err(self.part.unexpected(STEP, &other, "Stepped")),
-        }
+        let stepped = self.reply::<proto::Step>()?;
+        self.part.store(stepped, size, reply)
     }
 
     /// Takes the answer to [`Self::request_reset`], and writes the first observation `[O]`.
@@ -123,13 +117,9 @@ impl<'a> Single<'a> {
     /// # Errors
     /// The failures of a connection.
     pub fn begun(&mut self, observation: &mut [f32]) -> Result<BegunEpisode, ClientError> {
-        match self.response(RESET)? {
-            Response::Reset(done) => {
-                self.part.decode(RESET, "observations", &done.observations, observation)?;
-                self.begun_of(RESET, done.started)
-            }
-            other => Err(self.part.unexpected(RESET, &other, "ResetDone")),
-        }
+        let done = self.reply::<proto::Reset>()?;
+        self.part.stream.decode::<proto::Reset>("observations", &done.observations, observation)?;
+        self.begun_of::<proto::Reset>(done.started)
     }
 
     /// Takes the answer to [`Self::request_picture`].
@@ -138,11 +128,10 @@ impl<'a> Single<'a> {
     /// [`ClientError::Refused`] with the server's sentence if it cannot draw, and the failures of a connection.
     pub fn picture(&mut self) -> Result<Picture, ClientError> {
         let (width, height) = self.size;
-        let rendered = match self.response(PICTURE) {
-            Ok(Response::Render(rendered)) => rendered,
-            Ok(other) => return Err(self.part.unexpected(PICTURE, &other, "Rendered")),
+        let rendered = match self.reply::<proto::Render>() {
+            Ok(rendered) => rendered,
             // Sizes are checked before they are sent: a server that calls the request wrong does not know it.
-            Err(ClientError::Refused { address, request, code, message }) if code == Code::InvalidArgument as i32 => {
+            Err(ClientError::Refused { address, request, code, message }) if code == Code::InvalidArgument => {
                 let message = format!("{message}; is the server older than this program?");
                 return Err(ClientError::Refused { address, request, code, message });
             }
@@ -152,26 +141,32 @@ impl<'a> Single<'a> {
         if (got_width, got_height) != (width, height) || pixels.len() as u64 != u64::from(width) * u64::from(height) * 3
         {
             let got = format!("{got_width} × {got_height} pixels in {} bytes", pixels.len());
-            return Err(self.part.mismatch(PICTURE, got, format!("{width} × {height}, three bytes each")));
+            return Err(self
+                .part
+                .stream
+                .mismatch::<proto::Render>(got, format!("{width} × {height}, three bytes each")));
         }
         Ok(Picture { width, height, pixels })
     }
 
-    fn request(&mut self, what: &'static str, request: Request) -> Result<(), ClientError> {
+    fn request(&mut self, request: impl Ask) -> Result<(), ClientError> {
         let Self { servers, part, .. } = self;
-        servers.runtime().block_on(part.send(what, request, servers))
+        servers.runtime().block_on(part.stream.send(request)).map_err(|error| servers.explain(error))
     }
 
-    fn response(&mut self, what: &'static str) -> Result<Response, ClientError> {
+    fn reply<A: Ask>(&mut self) -> Result<A::Reply, ClientError> {
         let Self { servers, part, .. } = self;
-        servers.runtime().block_on(part.receive(what, servers))
+        servers.runtime().block_on(part.stream.receive::<A>()).map_err(|error| servers.explain(error))
     }
 
-    fn begun_of(&self, what: &'static str, started: Vec<proto::EpisodeStart>) -> Result<BegunEpisode, ClientError> {
+    fn begun_of<A: Ask>(&self, started: Vec<proto::EpisodeStart>) -> Result<BegunEpisode, ClientError> {
         let count = started.len();
         let start = started.into_iter().next().and_then(|start| Some((start.episode?, start.receipt?)));
         let Some((episode, receipt)) = start.filter(|_| count == 1) else {
-            return Err(self.part.mismatch(what, format!("{count} begun episodes"), "one with its receipt".into()));
+            return Err(self
+                .part
+                .stream
+                .mismatch::<A>(format!("{count} begun episodes"), "one with its receipt".into()));
         };
         Ok(BegunEpisode {
             episode_index: episode.episode_index,

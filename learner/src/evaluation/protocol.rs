@@ -2,48 +2,9 @@
 
 use std::fmt;
 
-use serde::{Deserialize, Serialize};
-
 use super::statistics::geometric_mean;
-use crate::proto;
 
-/// Where an environment's parameters come from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, clap::ValueEnum)]
-pub enum Version {
-    /// Default: fixed values.
-    #[value(name = "D")]
-    D,
-    /// Random: drawn from intervals around the defaults.
-    #[value(name = "R")]
-    R,
-    /// Extreme: drawn from sets outside those intervals.
-    #[value(name = "E")]
-    E,
-}
-
-impl Version {
-    /// All, in the paper's order.
-    pub const ALL: [Version; 3] = [Version::D, Version::R, Version::E];
-
-    /// The protocol's name for it.
-    pub fn to_proto(self) -> proto::Version {
-        match self {
-            Version::D => proto::Version::Default,
-            Version::R => proto::Version::Random,
-            Version::E => proto::Version::Extreme,
-        }
-    }
-}
-
-impl fmt::Display for Version {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            Version::D => "D",
-            Version::R => "R",
-            Version::E => "E",
-        })
-    }
-}
+pub use perturb_protocol::Version;
 
 /// Training on one version and testing on another, e.g. "DR".
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -208,21 +208,7 @@ fn lost_server(error: &anyhow::Error) -> bool {
         });
         direct.or(collecting).or(testing)
     });
-    use ClientError::{
-        Connect, Disagreement, Lost, NoServerProgram, NoneConnects, Protocol, Refused, Start, System, TimedOut,
-    };
-    client.is_some_and(|error| match error {
-        Connect { .. }
-        | NoneConnects { .. }
-        | Lost { .. }
-        | TimedOut { .. }
-        | NoServerProgram { .. }
-        | Start { .. }
-        | System { .. } => true,
-        Disagreement { .. } | Protocol { .. } => true, // servers of another version
-        Refused { code, .. } => *code == tonic::Code::ResourceExhausted as i32, // full; others' sessions will end
-        _ => false,
-    })
+    client.is_some_and(ClientError::can_be_retried)
 }
 
 /// What gives a cell's numbers again without the plan.
@@ -305,11 +291,16 @@ mod tests {
     #[test]
     fn a_lost_server_is_told_from_a_failure() {
         let address: crate::client::Address = "unix:/x".parse().unwrap();
-        let lost = || ClientError::Lost { address: address.clone(), request: "a step", reason: "gone".into() };
+        let lost = || ClientError::Lost {
+            address: address.clone(),
+            request: "a step",
+            code: tonic::Code::Unavailable,
+            reason: "gone".into(),
+        };
         let refused_with =
             |code| ClientError::Refused { address: address.clone(), request: "open", code, message: "no".into() };
-        let refused = || refused_with(5);
-        assert!(lost_server(&anyhow::Error::new(refused_with(8))), "the server is full");
+        let refused = || refused_with(tonic::Code::NotFound);
+        assert!(lost_server(&anyhow::Error::new(refused_with(tonic::Code::ResourceExhausted))), "the server is full");
         assert!(lost_server(&anyhow::Error::new(lost())));
         assert!(lost_server(&anyhow::Error::new(CollectError::Client(lost())).context("training failed")));
         assert!(lost_server(&anyhow::Error::new(TestError::Client(lost())).context("testing")));

@@ -10,8 +10,6 @@ use crate::evaluation::{Agent, TestError, Version, check_unchanged, open_options
 use crate::interrupt::StopFlag;
 use crate::proto;
 
-/// gRPC's code of a request that cannot be done in the present state.
-const FAILED_PRECONDITION: i32 = 9;
 /// The end of an episode stays for so many seconds.
 const HOLD: f64 = 1.0;
 
@@ -193,7 +191,7 @@ impl<'a> Film<'a> {
         let picture = match (self.single.picture(), &self.last) {
             // Physics that diverged ends its episode and cannot be drawn: the picture before it stays.
             (Err(ClientError::Refused { code, .. }), Some(last))
-                if code == FAILED_PRECONDITION && self.shown.ending.is_some() =>
+                if code == tonic::Code::FailedPrecondition && self.shown.ending.is_some() =>
             {
                 last.clone()
             }

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-use perturb_learner::client::{Address, LocalServer, LocalServerOptions, Servers};
+use perturb_learner::client::{Address, PrivateServer, PrivateServerOptions, Servers};
 use perturb_learner::config::TrainConfig;
 use perturb_learner::interrupt::StopFlag;
 use perturb_learner::training::{Outcome, RunDirectory, train};
@@ -14,12 +14,12 @@ use tempfile::TempDir;
 /// How long anything may take that must not hang.
 pub const SECONDS: Duration = Duration::from_secs(20);
 
-pub fn server(workers: usize) -> LocalServer {
-    LocalServer::start(LocalServerOptions { workers: Some(workers), ..LocalServerOptions::default() })
+pub fn server(workers: usize) -> PrivateServer {
+    PrivateServer::start(PrivateServerOptions { workers: Some(workers), ..PrivateServerOptions::default() })
         .unwrap_or_else(|error| panic!("{error}"))
 }
 
-pub fn addresses(servers: &[LocalServer]) -> Vec<Address> {
+pub fn addresses(servers: &[PrivateServer]) -> Vec<Address> {
     servers.iter().map(|server| server.address().clone()).collect()
 }
 

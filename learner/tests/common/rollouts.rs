@@ -1,20 +1,20 @@
 //! What the tests of EPOpt and of RL² share.
 
 use perturb_learner::algorithm::{A2c, A2cConfig, Algorithm, Ppo, PpoConfig};
-use perturb_learner::client::{Address, LocalServer, LocalServerOptions, OpenOptions, Servers};
+use perturb_learner::client::{Address, OpenOptions, PrivateServer, PrivateServerOptions, Servers};
 use perturb_learner::policy::{Policy, PolicySpec};
 use perturb_learner::proto;
 use perturb_learner::random::{Purpose, normal, stream};
 use perturb_learner::rollout::Rollout;
 
 /// A server with one physics thread.
-pub fn server() -> LocalServer {
-    LocalServer::start(LocalServerOptions { workers: Some(1), ..LocalServerOptions::default() })
+pub fn server() -> PrivateServer {
+    PrivateServer::start(PrivateServerOptions { workers: Some(1), ..PrivateServerOptions::default() })
         .unwrap_or_else(|error| panic!("{error}"))
 }
 
 /// Connections to all of `servers`.
-pub fn connect(servers: &[LocalServer]) -> Servers {
+pub fn connect(servers: &[PrivateServer]) -> Servers {
     let addresses: Vec<Address> = servers.iter().map(|server| server.address().clone()).collect();
     Servers::connect(&addresses).expect("connections")
 }

@@ -1,4 +1,4 @@
-//! A server of the learner's own, on a private Unix socket.
+//! A server of a program's own, on a private Unix socket.
 
 use std::fs::Permissions;
 use std::io::{BufRead, BufReader};
@@ -12,8 +12,9 @@ use std::time::{Duration, Instant};
 
 use tempfile::TempDir;
 
-use super::address::Address;
-use super::error::ClientError;
+use crate::address::Address;
+use crate::error::ClientError;
+use crate::limits::DEFAULT_MAX_ENVS;
 
 const PROGRAM: &str = "perturb-server";
 /// Overrides where the program is looked for.
@@ -23,12 +24,9 @@ const START_LIMIT: Duration = Duration::from_secs(20);
 /// How long a server may take to end before it is killed.
 const END_LIMIT: Duration = Duration::from_secs(5);
 
-/// As many environments a server takes unless told otherwise.
-const DEFAULT_MAX_ENVS: usize = 16_384;
-
-/// How to start a [`LocalServer`].
+/// How to start a [`PrivateServer`].
 #[derive(Clone, Copy, Debug, Default)]
-pub struct LocalServerOptions {
+pub struct PrivateServerOptions {
     /// Physics threads; `None` leaves it to the server: one a core.
     pub workers: Option<usize>,
     /// How many environments must be able to run at once; more may.
@@ -38,21 +36,21 @@ pub struct LocalServerOptions {
 /// A `perturb-server` that lives no longer than this value, and no longer than this process: it holds the other end of
 /// the server's standard input, whose closing ends the server even if this process is killed.
 ///
-/// It runs in a process group of its own, so that Ctrl-C reaches the learner alone, which can then finish its iteration.
+/// It runs in a process group of its own, so that Ctrl-C reaches this process alone, which can then finish what it does.
 #[derive(Debug)]
-pub struct LocalServer {
+pub struct PrivateServer {
     child: Child,
     address: Address,
     /// Holds the socket; only its owner may enter.
     _directory: TempDir,
 }
 
-impl LocalServer {
+impl PrivateServer {
     /// Starts a server and waits until it listens.
     ///
     /// # Errors
     /// [`ClientError::NoServerProgram`] if there is none, [`ClientError::Start`] if it ends or does not listen within 20 s.
-    pub fn start(options: LocalServerOptions) -> Result<Self, ClientError> {
+    pub fn start(options: PrivateServerOptions) -> Result<Self, ClientError> {
         let program = find_program()?;
         let system = |action| move |source| ClientError::System { action, source };
         let directory = tempfile::Builder::new()
@@ -67,7 +65,7 @@ impl LocalServer {
 
         let mut command = Command::new(&program);
         command.arg("--listen").arg(address.to_string()).args(["--exit-with-stdin", "--log", "warn"]);
-        // Between two steps the learner may compute for long; its death closes the socket and the pipe anyway.
+        // Between two steps its owner may compute for long, whose death closes the socket and the pipe anyway.
         command.args(["--keepalive-seconds", "3600"]);
         if let Some(workers) = options.workers {
             command.args(["--workers", &workers.to_string()]);
@@ -127,7 +125,7 @@ impl LocalServer {
     }
 }
 
-impl Drop for LocalServer {
+impl Drop for PrivateServer {
     fn drop(&mut self) {
         drop(self.child.stdin.take());
         let deadline = Instant::now() + END_LIMIT;

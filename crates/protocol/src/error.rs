@@ -1,9 +1,11 @@
-//! What can go wrong between the learner and its servers.
+//! What can go wrong between a client and its servers.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
-use super::address::Address;
+use tonic::Code;
+
+use crate::address::Address;
 
 /// A failure of a server, of the connection to it, or of a request.
 #[derive(Debug, thiserror::Error)]
@@ -30,8 +32,8 @@ pub enum ClientError {
         address: Address,
         /// Which request.
         request: &'static str,
-        /// A gRPC status code.
-        code: i32,
+        /// Why.
+        code: Code,
         /// The server's sentence.
         message: String,
     },
@@ -42,6 +44,8 @@ pub enum ClientError {
         address: Address,
         /// Which request.
         request: &'static str,
+        /// The status that ended the stream.
+        code: Code,
         /// The transport's words.
         reason: String,
     },
@@ -52,7 +56,7 @@ pub enum ClientError {
         address: Address,
         /// Which request.
         request: &'static str,
-        /// How long the learner waited.
+        /// How long was waited.
         limit: Duration,
     },
     /// A reply does not follow the protocol.
@@ -102,7 +106,7 @@ pub enum ClientError {
         /// What happened instead.
         reason: String,
     },
-    /// The operating system refused something that the learner needs.
+    /// The operating system refused something that a client needs.
     #[error("cannot {action}: {source}")]
     System {
         /// What was tried.
@@ -112,8 +116,43 @@ pub enum ClientError {
     },
 }
 
+impl ClientError {
+    /// Which address and why, for a list of several.
+    pub(crate) fn in_short(&self) -> String {
+        match self {
+            Self::Connect { address, reason } => format!("{address}: {reason}"),
+            other => other.to_string(),
+        }
+    }
+
+    /// The errors of all addresses that were tried as one.
+    pub fn of_all(mut errors: Vec<Self>) -> Self {
+        if errors.len() == 1 {
+            return errors.remove(0);
+        }
+        Self::NoneConnects { reasons: errors.iter().map(Self::in_short).collect::<Vec<_>>().join("; ") }
+    }
+
+    /// Whether the same may go well later or with another server: the fault is not that of what was asked for.
+    pub fn can_be_retried(&self) -> bool {
+        match self {
+            Self::Refused { code, .. } => *code == Code::ResourceExhausted, // full; others' sessions will end
+            Self::Snapshots { .. } => false,
+            Self::Connect { .. }
+            | Self::NoneConnects { .. }
+            | Self::Lost { .. }
+            | Self::TimedOut { .. }
+            | Self::Protocol { .. } // a server of another version
+            | Self::Disagreement { .. }
+            | Self::NoServerProgram { .. }
+            | Self::Start { .. }
+            | Self::System { .. } => true,
+        }
+    }
+}
+
 /// A status in words, with the transport's cause.
-pub(super) fn describe(status: &tonic::Status) -> String {
+pub(crate) fn describe(status: &tonic::Status) -> String {
     let mut words = vec![format!("{} ({:?})", status.message(), status.code())];
     if let Some(source) = std::error::Error::source(status) {
         words.extend(causes(source));
@@ -123,7 +162,7 @@ pub(super) fn describe(status: &tonic::Status) -> String {
 }
 
 /// An error and its causes; without those whose words are contained in others.
-pub(super) fn causes(error: &dyn std::error::Error) -> Vec<String> {
+pub(crate) fn causes(error: &dyn std::error::Error) -> Vec<String> {
     let chain = std::iter::successors(Some(error), |error| error.source());
     let mut words: Vec<String> = Vec::new();
     for text in chain.map(ToString::to_string) {

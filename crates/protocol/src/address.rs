@@ -1,11 +1,10 @@
-//! Addresses of environment servers.
+//! Addresses of servers.
 
 use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
-/// The longest path that a Unix socket can have on Linux, in bytes.
-const LONGEST_SOCKET_PATH: usize = 107;
+use crate::limits::LONGEST_SOCKET_PATH;
 
 /// Where a server listens.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]

@@ -1,6 +1,5 @@
 //! Making one connection: which machine stands for a name, and whether it takes sessions.
 
-use std::hash::{DefaultHasher, Hash, Hasher};
 use std::net::{IpAddr, SocketAddr};
 use std::time::Duration;
 
@@ -11,10 +10,11 @@ use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
-use super::address::Address;
-use super::error::{ClientError, causes, describe};
-use super::servers::Link;
-use crate::proto::perturb_client::PerturbClient;
+use crate::address::Address;
+use crate::error::{ClientError, causes, describe};
+use crate::limits::SERVICE;
+use crate::proto::{self, perturb_client::PerturbClient};
+use crate::stream::{REPLY_LIMIT, lost, timed_out};
 
 /// How long each part of making a connection may take.
 const CONNECT_LIMIT: Duration = Duration::from_secs(5);
@@ -26,21 +26,76 @@ const KEEPALIVE_LIMIT: Duration = Duration::from_secs(15);
 const LARGEST_MESSAGE: usize = 256 << 20;
 /// Flow-control window, in bytes: a reply of a large batch must not wait for permission to be sent.
 const WINDOW: u32 = 16 << 20;
-/// What must be served.
-const SERVICE: &str = "perturb.v1.Perturb";
 
+/// A connection to a server that takes sessions.
+#[derive(Clone, Debug)]
+pub struct Connection {
+    address: Address,
+    client: PerturbClient<Channel>,
+}
+
+impl Connection {
+    /// Connects to `address`, whose server must take sessions: one that is shutting down still answers.
+    ///
+    /// # Errors
+    /// [`ClientError::Connect`].
+    pub async fn open(address: &Address) -> Result<Self, ClientError> {
+        let fail = |reason: String| ClientError::Connect { address: address.clone(), reason };
+        let transport = |error: tonic::transport::Error| fail(causes(&error).join(": "));
+        let channel = Endpoint::from_shared(address.to_string())
+            .map_err(transport)?
+            .connect_timeout(CONNECT_LIMIT)
+            .tcp_nodelay(true)
+            .http2_keep_alive_interval(KEEPALIVE_INTERVAL)
+            .keep_alive_timeout(KEEPALIVE_LIMIT)
+            .initial_stream_window_size(WINDOW)
+            .initial_connection_window_size(WINDOW)
+            .connect()
+            .await
+            .map_err(transport)?;
+        takes_sessions(&channel).await.map_err(fail)?;
+        let client = PerturbClient::new(channel)
+            .max_decoding_message_size(LARGEST_MESSAGE)
+            .max_encoding_message_size(LARGEST_MESSAGE);
+        Ok(Self { address: address.clone(), client })
+    }
+
+    /// Where the server is.
+    pub fn address(&self) -> &Address {
+        &self.address
+    }
+
+    /// What calls are made with.
+    pub fn client(&self) -> PerturbClient<Channel> {
+        self.client.clone()
+    }
+
+    /// What the server can run.
+    ///
+    /// # Errors
+    /// [`ClientError::Lost`] or [`ClientError::TimedOut`].
+    pub async fn catalogue(&self) -> Result<proto::ListEnvironmentsResponse, ClientError> {
+        let what = "the catalogue";
+        let mut client = self.client();
+        tokio::time::timeout(REPLY_LIMIT, client.list_environments(proto::ListEnvironmentsRequest {}))
+            .await
+            .map_err(|_| timed_out(&self.address, what))?
+            .map(tonic::Response::into_inner)
+            .map_err(|status| lost(&self.address, what, &status))
+    }
+}
 /// The machines that addresses stand for.
 #[derive(Debug, Default, PartialEq)]
-pub(super) struct Machines {
+pub struct Machines {
     /// Any of these is as good as the others.
-    pub(super) equal: Vec<Address>,
+    pub equal: Vec<Address>,
     /// Other ways to the same machines, by the protocol family that the system likes less.
-    pub(super) spare: Vec<Address>,
+    pub spare: Vec<Address>,
 }
 
 impl Machines {
     /// All of them, beginning with number `turn` of the equal ones, counted around.
-    pub(super) fn into_order(mut self, turn: usize) -> Vec<Address> {
+    pub fn into_order(mut self, turn: usize) -> Vec<Address> {
         if !self.equal.is_empty() {
             let first = turn % self.equal.len();
             self.equal.rotate_left(first);
@@ -49,7 +104,8 @@ impl Machines {
         self.equal
     }
 
-    pub(super) fn extend(&mut self, other: Self) {
+    /// Adds those of other addresses.
+    pub fn extend(&mut self, other: Self) {
         self.equal.extend(other.equal);
         self.spare.extend(other.spare);
     }
@@ -57,7 +113,10 @@ impl Machines {
 
 /// The machines behind `address`: several if it has a name that stands for several, as that of a service whose replicas
 /// share it. Their order is the same wherever it is asked, whatever the order of the answer.
-pub(super) async fn machines(address: &Address) -> Result<Machines, ClientError> {
+///
+/// # Errors
+/// [`ClientError::Connect`] for a name that stands for none.
+pub async fn machines(address: &Address) -> Result<Machines, ClientError> {
     let one = || Machines { equal: vec![address.clone()], spare: Vec::new() };
     let Address::Tcp { host, port } = address else { return Ok(one()) };
     if host.parse::<IpAddr>().is_ok() {
@@ -82,59 +141,24 @@ fn sorted(mut found: Vec<SocketAddr>) -> Machines {
     Machines { equal: equal.into_iter().map(address).collect(), spare: spare.into_iter().map(address).collect() }
 }
 
-/// A turn for a process that has no other: processes on one machine have different numbers, containers different names.
-pub(super) fn own_turn() -> usize {
-    let mut hasher = DefaultHasher::new(); // always with the same key
-    std::fs::read("/proc/sys/kernel/hostname").unwrap_or_default().hash(&mut hasher);
-    std::process::id().hash(&mut hasher);
-    hasher.finish() as usize
-}
-
 /// Connects to the first of `machines`, of which there must be at least one, that takes sessions.
-pub(super) async fn first_of(machines: &[Address]) -> Result<Link, Vec<ClientError>> {
+///
+/// # Errors
+/// What is wrong with each.
+pub async fn first_of(machines: &[Address]) -> Result<Connection, Vec<ClientError>> {
     let mut errors = Vec::new();
     for (index, address) in machines.iter().enumerate() {
-        match connect(address).await {
-            Ok(link) => return Ok(link),
+        match Connection::open(address).await {
+            Ok(connection) => return Ok(connection),
             Err(error) => {
                 if index + 1 < machines.len() {
-                    tracing::warn!("{}; trying the next server", in_short(&error));
+                    tracing::warn!("{}; trying the next server", error.in_short());
                 }
                 errors.push(error);
             }
         }
     }
     Err(errors)
-}
-
-/// Which address and why, for a list of several.
-pub(super) fn in_short(error: &ClientError) -> String {
-    match error {
-        ClientError::Connect { address, reason } => format!("{address}: {reason}"),
-        other => other.to_string(),
-    }
-}
-
-/// Connects to `address`, whose server must take sessions: one that is shutting down still answers.
-pub(super) async fn connect(address: &Address) -> Result<Link, ClientError> {
-    let fail = |reason: String| ClientError::Connect { address: address.clone(), reason };
-    let transport = |error: tonic::transport::Error| fail(causes(&error).join(": "));
-    let channel = Endpoint::from_shared(address.to_string())
-        .map_err(transport)?
-        .connect_timeout(CONNECT_LIMIT)
-        .tcp_nodelay(true)
-        .http2_keep_alive_interval(KEEPALIVE_INTERVAL)
-        .keep_alive_timeout(KEEPALIVE_LIMIT)
-        .initial_stream_window_size(WINDOW)
-        .initial_connection_window_size(WINDOW)
-        .connect()
-        .await
-        .map_err(transport)?;
-    takes_sessions(&channel).await.map_err(fail)?;
-    let client = PerturbClient::new(channel)
-        .max_decoding_message_size(LARGEST_MESSAGE)
-        .max_encoding_message_size(LARGEST_MESSAGE);
-    Ok(Link { address: address.clone(), client })
 }
 
 /// Asks a server for its health. A stopped or overloaded machine may accept connections and never answer.

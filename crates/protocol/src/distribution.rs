@@ -1,0 +1,222 @@
+//! Uniform distributions over unions of intervals, as data.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use crate::limits::MOST_INTERVALS;
+use crate::proto;
+
+/// The most intervals that a refusal repeats.
+const SHOWN_INTERVALS: usize = 8;
+
+/// The closed interval [low, high].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Interval {
+    /// Lower end.
+    pub low: f64,
+    /// Upper end, not below `low`.
+    pub high: f64,
+}
+
+impl Interval {
+    /// The interval [low, high].
+    pub const fn new(low: f64, high: f64) -> Self {
+        Self { low, high }
+    }
+
+    fn length(self) -> f64 {
+        self.high - self.low
+    }
+}
+
+impl fmt::Display for Interval {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.low == self.high { write!(f, "{}", self.low) } else { write!(f, "[{}, {}]", self.low, self.high) }
+    }
+}
+
+/// Uniform over a union of intervals: a point is as likely in any of them, so an interval's probability is its share
+/// of the total length. One interval of length 0 is a fixed value.
+///
+/// Written `0.1` or `0.3..0.4,0.8..0.9`; in TOML and JSON a fixed value may also be a number.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "Written", into = "Written")]
+pub struct Distribution(Vec<Interval>);
+
+/// Why intervals or a text are no distribution.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{got} is no set of values; expected {expected}")]
+pub struct DistributionError {
+    /// What came.
+    pub got: String,
+    /// What would be right.
+    pub expected: &'static str,
+}
+
+impl Distribution {
+    /// Always `value`.
+    ///
+    /// # Panics
+    /// If it is not finite.
+    pub fn fixed(value: f64) -> Self {
+        assert!(value.is_finite(), "a fixed value of {value}");
+        Self(vec![Interval::new(value, value)])
+    }
+
+    /// Over the union of `intervals`.
+    ///
+    /// # Errors
+    /// [`DistributionError`] unless there are 1 to 64 intervals, all ends are finite, each `low` is at most its
+    /// `high`, they ascend without overlap, and of several each has a positive length.
+    pub fn union(intervals: &[Interval]) -> Result<Self, DistributionError> {
+        let refuse = |expected| {
+            let shown = &intervals[..intervals.len().min(SHOWN_INTERVALS)];
+            let mut got = shown.iter().map(Interval::to_string).collect::<Vec<_>>().join(" ∪ ");
+            if intervals.is_empty() {
+                got = "empty".into();
+            } else if intervals.len() > SHOWN_INTERVALS {
+                got = format!("{got} ∪ … ({} intervals)", intervals.len());
+            }
+            Err(DistributionError { got, expected })
+        };
+        if !(1..=MOST_INTERVALS).contains(&intervals.len()) {
+            return refuse("1 to 64 intervals");
+        }
+        if intervals.iter().any(|i| !i.low.is_finite() || !i.high.is_finite()) {
+            return refuse("finite ends");
+        }
+        if intervals.iter().any(|i| i.low > i.high) {
+            return refuse("low at most high in every interval");
+        }
+        if intervals.len() > 1 && intervals.iter().any(|i| i.length() <= 0.0) {
+            return refuse("intervals of positive length; a fixed value stands alone");
+        }
+        if intervals.windows(2).any(|w| w[0].high > w[1].low) {
+            return refuse("ascending intervals that do not overlap");
+        }
+        Ok(Self(intervals.to_vec()))
+    }
+
+    /// The intervals, ascending.
+    pub fn intervals(&self) -> &[Interval] {
+        &self.0
+    }
+
+    /// The value at the fraction `u` in [0, 1) of the total length: uniform if `u` is.
+    pub fn at(&self, u: f64) -> f64 {
+        let mut rest = u * self.0.iter().map(|i| i.length()).sum::<f64>();
+        for interval in &self.0 {
+            if rest < interval.length() {
+                return interval.low + rest;
+            }
+            rest -= interval.length();
+        }
+        // A fixed value, or u so close to 1 that rounding ate the rest.
+        self.0[self.0.len() - 1].high
+    }
+
+    /// Least and greatest value.
+    pub fn range(&self) -> (f64, f64) {
+        (self.0[0].low, self.0[self.0.len() - 1].high)
+    }
+}
+
+impl fmt::Display for Distribution {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (i, interval) in self.0.iter().enumerate() {
+            write!(f, "{}{interval}", if i > 0 { " ∪ " } else { "" })?;
+        }
+        Ok(())
+    }
+}
+
+impl FromStr for Distribution {
+    type Err = DistributionError;
+
+    /// A value, an interval `low..high`, or several intervals with commas between them.
+    fn from_str(text: &str) -> Result<Self, DistributionError> {
+        let expected = "a value, an interval such as 0.3..0.4, or several with commas between them";
+        let number = |text: &str| text.trim().parse::<f64>().ok();
+        let interval = |part: &str| match part.split_once("..") {
+            Some((low, high)) => Some(Interval::new(number(low)?, number(high)?)),
+            None => number(part).map(|value| Interval::new(value, value)),
+        };
+        let intervals: Option<Vec<Interval>> = text.split(',').map(interval).collect();
+        Self::union(&intervals.ok_or_else(|| DistributionError { got: format!("`{text}`"), expected })?)
+    }
+}
+
+impl From<&Distribution> for proto::Distribution {
+    fn from(distribution: &Distribution) -> Self {
+        let interval = |&Interval { low, high }: &Interval| proto::Interval { low, high };
+        Self { intervals: distribution.0.iter().map(interval).collect() }
+    }
+}
+
+impl TryFrom<&proto::Distribution> for Distribution {
+    type Error = DistributionError;
+
+    fn try_from(distribution: &proto::Distribution) -> Result<Self, DistributionError> {
+        let interval = |&proto::Interval { low, high }: &proto::Interval| Interval { low, high };
+        Self::union(&distribution.intervals.iter().map(interval).collect::<Vec<_>>())
+    }
+}
+
+/// A distribution in a file.
+#[derive(Serialize, Deserialize)]
+#[serde(untagged)]
+enum Written {
+    Number(f64),
+    Text(String),
+}
+
+impl From<Distribution> for Written {
+    fn from(distribution: Distribution) -> Self {
+        match distribution.0[..] {
+            [Interval { low, high }] if low == high => Self::Number(low),
+            _ => {
+                let interval = |&Interval { low, high }: &Interval| format!("{low}..{high}");
+                Self::Text(distribution.0.iter().map(interval).collect::<Vec<_>>().join(","))
+            }
+        }
+    }
+}
+
+impl TryFrom<Written> for Distribution {
+    type Error = DistributionError;
+
+    fn try_from(written: Written) -> Result<Self, DistributionError> {
+        match written {
+            Written::Number(value) => Self::union(&[Interval::new(value, value)]),
+            Written::Text(text) => text.parse(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_distribution_reads_back_from_what_is_written() {
+        for text in ["0.1", "0.3..0.4", "0.3..0.4,0.8..0.9", "-1..1"] {
+            let distribution: Distribution = text.parse().unwrap();
+            let json = serde_json::to_string(&distribution).unwrap();
+            assert_eq!(json.trim_matches('"'), text);
+            assert_eq!(serde_json::from_str::<Distribution>(&json).unwrap(), distribution);
+            assert_eq!(Distribution::try_from(&proto::Distribution::from(&distribution)), Ok(distribution));
+        }
+        assert_eq!(" 1 .. 2 ".parse::<Distribution>().unwrap().range(), (1.0, 2.0));
+    }
+
+    #[test]
+    fn a_text_that_is_none_is_refused_with_what_would_be() {
+        for text in ["", "x", "1..", "..2", "1..2..3", "1,", "2..1", "1..3,2..4", "1,2", "nan", "inf"] {
+            let error = text.parse::<Distribution>().unwrap_err().to_string();
+            assert!(error.contains("expected"), "{text}: {error}");
+        }
+        assert!("x..1".parse::<Distribution>().unwrap_err().to_string().starts_with("`x..1` is no set of values"));
+    }
+}

@@ -1,0 +1,180 @@
+//! A session's stream, typed: every request has its reply.
+
+use std::time::Duration;
+
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::{Code, Status, Streaming};
+
+use crate::address::Address;
+use crate::connection::Connection;
+use crate::error::{ClientError, describe};
+use crate::proto::{self, SessionRequest, SessionResponse, session_request::Request, session_response::Response};
+
+/// How long a server may take for one reply; also that of a batch of thousands of environments comes much sooner.
+pub const REPLY_LIMIT: Duration = Duration::from_secs(60);
+/// Requests that may lie in the channel before they are sent.
+const QUEUE: usize = 4;
+
+/// A request of a session.
+pub trait Ask: Into<Request> {
+    /// What answers it.
+    type Reply;
+    /// What it is called in errors.
+    const NAME: &'static str;
+
+    /// Its reply in a response, or the name of another one that came instead.
+    ///
+    /// # Errors
+    /// The response, if it is another one.
+    fn reply(response: Response) -> Result<Self::Reply, Response>;
+}
+
+macro_rules! requests {
+    ($($request:ident => $reply:ident, $variant:ident, $answer:ident, $name:literal;)*) => {
+        $(
+            impl From<proto::$request> for Request {
+                fn from(request: proto::$request) -> Self {
+                    Request::$variant(request)
+                }
+            }
+
+            impl Ask for proto::$request {
+                type Reply = proto::$reply;
+                const NAME: &'static str = $name;
+
+                fn reply(response: Response) -> Result<Self::Reply, Response> {
+                    match response {
+                        Response::$answer(reply) => Ok(reply),
+                        other => Err(other),
+                    }
+                }
+            }
+        )*
+
+        fn name_of(response: &Response) -> &'static str {
+            match response {
+                $(Response::$answer(_) => stringify!($reply),)*
+                Response::Error(_) => "Error",
+            }
+        }
+    };
+}
+
+requests! {
+    Open => Opened, Open, Opened, "to open a session";
+    Step => Stepped, Step, Stepped, "a step";
+    Reset => ResetDone, Reset, Reset, "a reset";
+    Snapshot => Snapshotted, Snapshot, Snapshot, "a snapshot";
+    Restore => Restored, Restore, Restore, "to restore snapshots";
+    Render => Rendered, Render, Render, "a picture";
+}
+
+/// One session. Requests may be sent ahead; replies are taken in the order of their requests.
+#[derive(Debug)]
+pub struct Stream {
+    address: Address,
+    requests: mpsc::Sender<SessionRequest>,
+    replies: Streaming<SessionResponse>,
+}
+
+impl Stream {
+    /// Opens environments.
+    ///
+    /// # Errors
+    /// [`ClientError::Refused`] with the server's sentence, and the failures of a connection.
+    pub async fn open(connection: &Connection, open: proto::Open) -> Result<(Self, proto::Opened), ClientError> {
+        let (requests, receiver) = mpsc::channel(QUEUE);
+        let address = connection.address().clone();
+        let lost = |status: &Status| lost(&address, proto::Open::NAME, status);
+        // The request lies in the channel before the call is made: a server may wait for it before it answers at all.
+        let message = SessionRequest { request: Some(open.into()) };
+        requests.try_send(message).map_err(|error| lost(&Status::internal(error.to_string())))?;
+        let mut client = connection.client();
+        let call = client.session(ReceiverStream::new(receiver));
+        let replies = tokio::time::timeout(REPLY_LIMIT, call)
+            .await
+            .map_err(|_| timed_out(&address, proto::Open::NAME))?
+            .map_err(|status| lost(&status))?
+            .into_inner();
+        let mut stream = Self { address, requests, replies };
+        let opened = stream.receive::<proto::Open>().await?;
+        Ok((stream, opened))
+    }
+
+    /// Where the server is.
+    pub fn address(&self) -> &Address {
+        &self.address
+    }
+
+    /// Sends a request.
+    ///
+    /// # Errors
+    /// [`ClientError::Lost`].
+    pub async fn send<A: Ask>(&self, request: A) -> Result<(), ClientError> {
+        let message = SessionRequest { request: Some(request.into()) };
+        // The channel has room for a request, and is closed only after the stream has ended.
+        let ended = |_| lost(&self.address, A::NAME, &Status::unavailable("the stream has ended"));
+        self.requests.send(message).await.map_err(ended)
+    }
+
+    /// Takes the reply to the oldest request that has none yet, which must have been an `A`.
+    ///
+    /// # Errors
+    /// [`ClientError::Refused`] with the server's sentence; then the session lives on. Otherwise the failures of a
+    /// connection.
+    pub async fn receive<A: Ask>(&mut self) -> Result<A::Reply, ClientError> {
+        let message = tokio::time::timeout(REPLY_LIMIT, self.replies.message())
+            .await
+            .map_err(|_| timed_out(&self.address, A::NAME))?
+            .map_err(|status| lost(&self.address, A::NAME, &status))?;
+        match message.map(|message| message.response) {
+            Some(Some(Response::Error(proto::Error { code, message }))) => {
+                let address = self.address.clone();
+                Err(ClientError::Refused { address, request: A::NAME, code: Code::from_i32(code), message })
+            }
+            Some(Some(response)) => A::reply(response).map_err(|other| {
+                let expected = format!("the reply to {}", A::NAME);
+                self.mismatch::<A>(name_of(&other).into(), expected)
+            }),
+            Some(None) => Err(self.mismatch::<A>("an empty reply".into(), "a reply".into())),
+            None => Err(lost(&self.address, A::NAME, &Status::unavailable("the server ended the stream"))),
+        }
+    }
+
+    /// Sends a request and takes its reply.
+    ///
+    /// # Errors
+    /// Those of [`Stream::receive`].
+    pub async fn ask<A: Ask>(&mut self, request: A) -> Result<A::Reply, ClientError> {
+        self.send(request).await?;
+        self.receive::<A>().await
+    }
+
+    /// Little-endian f32 numbers, exactly as many as `out` takes.
+    ///
+    /// # Errors
+    /// [`ClientError::Protocol`] if there are more or fewer.
+    pub fn decode<A: Ask>(&self, field: &'static str, bytes: &[u8], out: &mut [f32]) -> Result<(), ClientError> {
+        let (numbers, rest) = bytes.as_chunks::<4>();
+        if numbers.len() != out.len() || !rest.is_empty() {
+            let got = format!("{} bytes of {field}", bytes.len());
+            return Err(self.mismatch::<A>(got, (out.len() * 4).to_string()));
+        }
+        out.iter_mut().zip(numbers).for_each(|(out, number)| *out = f32::from_le_bytes(*number));
+        Ok(())
+    }
+
+    /// The error for a reply to an `A` that does not follow the protocol.
+    pub fn mismatch<A: Ask>(&self, got: String, expected: String) -> ClientError {
+        ClientError::Protocol { address: self.address.clone(), request: A::NAME, got, expected }
+    }
+}
+
+pub(crate) fn lost(address: &Address, request: &'static str, status: &Status) -> ClientError {
+    ClientError::Lost { address: address.clone(), request, code: status.code(), reason: describe(status) }
+}
+
+pub(crate) fn timed_out(address: &Address, request: &'static str) -> ClientError {
+    ClientError::TimedOut { address: address.clone(), request, limit: REPLY_LIMIT }
+}
