@@ -2,11 +2,13 @@
 //!
 //! - [`proto`]: the messages.
 //! - [`Version`], [`Distribution`], [`Address`], [`limits`]: what both sides mean by them.
+//! - [`catalogue`]: the environments and limits as JSON.
 //! - [`Connection`] and [`Stream`]: a client's side of a session, one typed reply for each request.
 //! - [`PrivateServer`]: a server of a program's own.
 #![forbid(unsafe_code)]
 
 mod address;
+pub mod catalogue;
 mod connection;
 mod distribution;
 mod error;

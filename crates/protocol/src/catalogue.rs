@@ -1,0 +1,110 @@
+//! The catalogue as JSON, for those who do not speak the protocol.
+
+use serde_json::{Value, json};
+
+use crate::limits;
+use crate::proto::{
+    Channel, Comparison, Distribution, Environment, ListEnvironmentsResponse, Parameter, Success, action_space::Kind,
+};
+
+/// Everything that a server tells of its environments, and the [`limits`] that hold for clients too. Names are those of
+/// the protocol; versions are called D, R and E. JSON has no infinity: an open end is null.
+pub fn to_json(catalogue: &ListEnvironmentsResponse) -> Value {
+    json!({
+        "server_version": catalogue.server_version,
+        "max_batch_size": catalogue.max_batch_size,
+        "environments": catalogue.environments.iter().map(environment).collect::<Vec<_>>(),
+        "limits": {
+            "picture_pixels": [limits::PICTURE_PIXELS.start(), limits::PICTURE_PIXELS.end()],
+            "usual_picture_pixels": limits::USUAL_PICTURE_PIXELS,
+            "most_intervals": limits::MOST_INTERVALS,
+            "longest_socket_path": limits::LONGEST_SOCKET_PATH,
+            "default_port": limits::DEFAULT_PORT,
+            "default_max_envs": limits::DEFAULT_MAX_ENVS,
+            "default_max_message_bytes": limits::DEFAULT_MAX_MESSAGE_BYTES,
+        },
+    })
+}
+
+fn environment(environment: &Environment) -> Value {
+    let action = match environment.action.as_ref().and_then(|action| action.kind.as_ref()) {
+        Some(Kind::Discrete(discrete)) => json!({ "discrete": discrete.names }),
+        Some(Kind::Continuous(continuous)) => json!({ "continuous": channels(&continuous.channels) }),
+        None => Value::Null,
+    };
+    let named = |name: &str, key: &str, text: &str| json!({ "name": name, key: text });
+    let reward_terms = environment.reward_terms.iter().map(|term| named(&term.name, "description", &term.description));
+    let applied = environment.applied.iter().map(|quantity| named(&quantity.name, "unit", &quantity.unit));
+    json!({
+        "name": environment.name,
+        "revision": environment.revision,
+        "description": environment.description,
+        "step_limit": environment.step_limit,
+        "control_timestep": environment.control_timestep,
+        "observation": channels(&environment.observation),
+        "action": action,
+        "state": channels(&environment.state),
+        "reward_terms": reward_terms.collect::<Vec<_>>(),
+        "success": environment.success.as_ref().map(success),
+        "parameters": environment.parameters.iter().map(parameter).collect::<Vec<_>>(),
+        "applied": applied.collect::<Vec<_>>(),
+        "heatmap_axes": environment.heatmap_axes,
+        "model_hash": environment.model_hash,
+    })
+}
+
+fn parameter(parameter: &Parameter) -> Value {
+    let intervals = |distribution: Option<&Distribution>| {
+        let intervals = distribution.map(|distribution| distribution.intervals.as_slice()).unwrap_or_default();
+        intervals.iter().map(|interval| json!([interval.low, interval.high])).collect::<Vec<_>>()
+    };
+    json!({
+        "name": parameter.name,
+        "unit": parameter.unit,
+        "description": parameter.description,
+        "low": parameter.low,
+        "high": parameter.high,
+        "D": parameter.default_value,
+        "R": intervals(parameter.random.as_ref()),
+        "E": intervals(parameter.extreme.as_ref()),
+        "applied": parameter.applied,
+    })
+}
+
+fn success(success: &Success) -> Value {
+    let comparison = match success.comparison() {
+        Comparison::AtLeast => json!("at_least"),
+        Comparison::AtMost => json!("at_most"),
+        Comparison::Unspecified => Value::Null,
+    };
+    json!({
+        "description": success.description,
+        "quantity": success.quantity,
+        "unit": success.unit,
+        "comparison": comparison,
+        "threshold": success.threshold,
+    })
+}
+
+fn channels(channels: &[Channel]) -> Vec<Value> {
+    channels
+        .iter()
+        .map(|channel| json!({ "name": channel.name, "unit": channel.unit, "low": channel.low, "high": channel.high }))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_open_end_is_null() {
+        let open = Channel { name: "x".into(), unit: "m".into(), low: f64::NEG_INFINITY, high: 1.5 };
+        let told = to_json(&ListEnvironmentsResponse {
+            environments: vec![Environment { observation: vec![open], ..Environment::default() }],
+            ..ListEnvironmentsResponse::default()
+        });
+        let expected = json!([{ "name": "x", "unit": "m", "low": null, "high": 1.5 }]);
+        assert_eq!(told["environments"][0]["observation"], expected);
+    }
+}
