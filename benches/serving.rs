@@ -11,8 +11,7 @@
 
 use bytes::Bytes;
 use perturb::{
-    env::{self, Action, ActionSpace, EnvironmentSpec, Episodes, Settings},
-    physics::Version,
+    env::{Action, ActionSpace, EnvironmentSpec, Episodes, Settings, Version},
     proto::{
         self, SessionRequest, SessionResponse,
         perturb_client::PerturbClient,
@@ -20,6 +19,7 @@ use perturb::{
         session_request::Request as Ask,
         session_response::Response as Answer,
     },
+    tasks,
 };
 use std::{
     env as process_env, fs,
@@ -57,7 +57,7 @@ fn main() -> Result<(), Failure> {
         if wanted("step/CartPole/256") {
             classic().await?;
         }
-        for name in env::names().filter(|name| ["Hopper", "HalfCheetah"].contains(name)) {
+        for name in tasks::catalogue().names().filter(|name| ["Hopper", "HalfCheetah"].contains(name)) {
             if wanted(&format!("step/{name}/64")) {
                 locomotion(name).await?;
             }
@@ -68,7 +68,7 @@ fn main() -> Result<(), Failure> {
         if wanted("memory/Hopper") {
             memory().await?;
         }
-        for name in env::names() {
+        for name in tasks::catalogue().names() {
             if wanted(&format!("render/{name}/480")) {
                 pictures(name).await?;
             }
@@ -159,7 +159,7 @@ async fn round_trip() -> Result<(), Failure> {
 /// (d) Resident memory of a Hopper, stepped so that its pages are in use.
 async fn memory() -> Result<(), Failure> {
     const BATCH: usize = 2000;
-    if env::find("Hopper").is_err() {
+    if tasks::catalogue().find("Hopper").is_err() {
         return Ok(());
     }
     let server = Process::server(2)?;
@@ -206,10 +206,10 @@ async fn bare_loop(name: &'static str, steps: usize) -> Result<f64, Failure> {
 }
 
 fn bare_loop_here(name: &str, steps: usize) -> Result<f64, Failure> {
-    let spec = env::find(name)?;
+    let spec = tasks::catalogue().find(name)?;
     let distributions = spec.parameters.iter().map(|p| p.distribution(Version::Default)).collect();
     let settings = Settings { seed: 1, environment_index: 0, distributions, episodes_per_trial: 1 };
-    let mut episodes = Episodes::new(env::make(name)?, settings);
+    let mut episodes = Episodes::new(tasks::catalogue().find(name).and_then(|spec| (spec.make)())?, settings);
     let (mut terms, mut observation) = (vec![0.0; spec.reward_terms.len()], vec![0.0; spec.observation.len()]);
     let mut noise = Noise(1);
     let mut action = vec![0.0; width(spec)];
@@ -274,7 +274,7 @@ impl Client {
         let mut responses = client.session(ReceiverStream::new(outgoing)).await?.into_inner();
         let opened = responses.message().await?.and_then(|r| r.response);
         assert!(matches!(opened, Some(Answer::Opened(_))), "{opened:?}");
-        Ok(Self { spec: env::find(name)?, batch, requests, responses, noise: Noise(7) })
+        Ok(Self { spec: tasks::catalogue().find(name)?, batch, requests, responses, noise: Noise(7) })
     }
 
     /// Takes `trips` steps, each after the reply to the last. Returns the seconds.

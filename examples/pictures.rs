@@ -2,11 +2,11 @@
 //! `cargo run --release --example pictures -- docs/pictures`.
 
 use perturb::{
-    env::{self, Action, Episodes, Settings},
-    physics::Version,
+    env::{Action, Episodes, Settings, Version},
     render::{Renderer, Size},
+    tasks,
 };
-use std::{env as process, error::Error, fs::File, io::BufWriter, path::Path};
+use std::{env, error::Error, fs::File, io::BufWriter, path::Path};
 
 /// Exact states that show what a task is about.
 const SCENES: &[(&str, &[f64])] = &[
@@ -21,18 +21,18 @@ const SIZE: Size = Size { width: 280, height: 280 };
 
 #[tokio::main(flavor = "current_thread")]
 async fn main() -> Result<(), Box<dyn Error>> {
-    let folder = process::args().nth(1).ok_or("give a folder to write the pictures to")?;
+    let folder = env::args().nth(1).ok_or("give a folder to write the pictures to")?;
     let renderer = Renderer::new();
     for &(name, state) in SCENES {
-        let Ok(spec) = env::find(name) else { continue }; // built without MuJoCo
+        let Ok(spec) = tasks::catalogue().find(name) else { continue }; // built without MuJoCo
         let distributions = spec.parameters.iter().map(|p| p.distribution(Version::Default)).collect();
         let settings = Settings { seed: 1, environment_index: 0, distributions, episodes_per_trial: 1 };
-        let mut episodes = Episodes::new(env::make(name)?, settings);
+        let mut episodes = Episodes::new((spec.make)()?, settings);
         episodes.begin(Some(state));
         if name == "Pendulum" {
             episodes.step(Action::Continuous(&[-1.6]), &mut [0.0; 3]); // its torque is shown
         }
-        let pixels = renderer.draw(episodes.pose().ok_or("its physics diverged")?, SIZE).await?;
+        let pixels = renderer.draw(episodes.scene().ok_or("its physics diverged")?, SIZE).await?;
         let path = Path::new(&folder).join(format!("{name}.png"));
         let file = BufWriter::new(File::create(&path)?);
         let mut encoder = png::Encoder::new(file, SIZE.width.into(), SIZE.height.into());

@@ -4,25 +4,21 @@
 //!
 //! - [`server`]: gRPC in, gRPC out; the legal order of a session's calls; all validation.
 //! - [`pool`]: batches of environments, stepped by worker threads.
-//! - [`env`](mod@env): the trait of an environment, episodes, trials, receipts, random streams.
-//! - [`render`]: pictures of environments, drawn by a thread of their own.
-//! - [`physics`]: parameters, their bounds, and the distributions of the versions D, R and E.
-//! - [`classic`]: CartPole, MountainCar, Acrobot, Pendulum.
-//! - [`locomotion`]: Hopper and HalfCheetah on MuJoCo (feature `mujoco`).
+//! - [`env`](mod@env): the trait of an environment, parameters, episodes, trials, receipts, random streams.
+//! - [`tasks`]: the environments, one folder each, and their catalogue.
+//! - [`scene`]: what a picture shows, and [`render`]: drawing it, by a thread of its own.
 //!
 //! [`config`] is the server's configuration and [`proto`] the protocol.
 #![forbid(unsafe_code)]
 #![deny(clippy::disallowed_methods)]
 
-pub mod classic;
 pub mod config;
 pub mod env;
-#[cfg(feature = "mujoco")]
-pub mod locomotion;
-pub mod physics;
 pub mod pool;
 pub mod render;
+pub mod scene;
 pub mod server;
+pub mod tasks;
 
 pub use perturb_protocol::proto;
 

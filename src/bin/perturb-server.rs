@@ -5,6 +5,7 @@ use clap::Parser;
 use perturb::{
     config::{Arguments, Config},
     server::{self, listen::Listener, probe::probe},
+    tasks,
 };
 use std::{
     error::Error,
@@ -53,7 +54,7 @@ fn run(config: &Config) -> Result<(), Box<dyn Error>> {
             let _ = writeln!(io::stdout(), "listening on {}", listener.address()?);
             listeners.push(listener);
         }
-        server::run(listeners, config, shutdown).await?;
+        server::run(listeners, config, tasks::catalogue(), shutdown).await?;
         Ok(())
     });
     // Connections that did not close by themselves must not keep the program.

@@ -1,52 +1,40 @@
-//! Every environment there is, by name.
+//! The environments that a server has, by name.
 
-use super::{Environment, EnvironmentSpec, Error, shorten};
-use crate::classic;
-#[cfg(feature = "mujoco")]
-use crate::locomotion;
+use super::{EnvironmentSpec, Error, shorten};
 
-type Make = fn() -> Result<Box<dyn Environment>, Error>;
+/// Environments in a fixed order. Each has a name of its own.
+#[derive(Debug, Clone, Default)]
+pub struct Catalogue(Vec<&'static EnvironmentSpec>);
 
-const CATALOGUE: &[(&EnvironmentSpec, Make)] = &[
-    (&classic::CART_POLE, || Ok(Box::new(classic::CartPole::new()))),
-    (&classic::MOUNTAIN_CAR, || Ok(Box::new(classic::MountainCar::new()))),
-    (&classic::ACROBOT, || Ok(Box::new(classic::Acrobot::new()))),
-    (&classic::PENDULUM, || Ok(Box::new(classic::Pendulum::new()))),
-    #[cfg(feature = "mujoco")]
-    (&locomotion::HALF_CHEETAH, || Ok(Box::new(locomotion::half_cheetah()?))),
-    #[cfg(feature = "mujoco")]
-    (&locomotion::HOPPER, || Ok(Box::new(locomotion::hopper()?))),
-];
+impl Catalogue {
+    /// The same catalogue with one more environment, at its end.
+    ///
+    /// # Panics
+    /// If an environment has its name already.
+    #[must_use]
+    pub fn with(mut self, spec: &'static EnvironmentSpec) -> Self {
+        assert!(self.names().all(|name| name != spec.name), "there are two environments {}", spec.name);
+        self.0.push(spec);
+        self
+    }
 
-/// The specs of all environments, in the catalogue's order.
-pub fn specs() -> impl Iterator<Item = &'static EnvironmentSpec> {
-    CATALOGUE.iter().map(|(spec, _)| *spec)
-}
+    /// All of them.
+    pub fn specs(&self) -> impl Iterator<Item = &'static EnvironmentSpec> {
+        self.0.iter().copied()
+    }
 
-/// The names of all environments, in the catalogue's order.
-pub fn names() -> impl Iterator<Item = &'static str> {
-    specs().map(|spec| spec.name)
-}
+    /// Their names.
+    pub fn names(&self) -> impl Iterator<Item = &'static str> {
+        self.specs().map(|spec| spec.name)
+    }
 
-/// The spec of the environment of that name.
-///
-/// # Errors
-/// [`Error::UnknownEnvironment`].
-pub fn find(name: &str) -> Result<&'static EnvironmentSpec, Error> {
-    entry(name).map(|(spec, _)| *spec)
-}
-
-/// A new environment of that name, with default parameters.
-///
-/// # Errors
-/// [`Error::UnknownEnvironment`], or [`Error::Model`] if its model cannot be loaded.
-pub fn make(name: &str) -> Result<Box<dyn Environment>, Error> {
-    entry(name)?.1()
-}
-
-fn entry(name: &str) -> Result<&'static (&'static EnvironmentSpec, Make), Error> {
-    CATALOGUE
-        .iter()
-        .find(|(spec, _)| spec.name == name)
-        .ok_or_else(|| Error::UnknownEnvironment { name: shorten(name), known: names().collect::<Vec<_>>().join(", ") })
+    /// The environment of that name.
+    ///
+    /// # Errors
+    /// [`Error::UnknownEnvironment`].
+    pub fn find(&self, name: &str) -> Result<&'static EnvironmentSpec, Error> {
+        let known = || self.names().collect::<Vec<_>>().join(", ");
+        let found = self.specs().find(|spec| spec.name == name);
+        found.ok_or_else(|| Error::UnknownEnvironment { name: shorten(name), known: known() })
+    }
 }

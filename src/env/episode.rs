@@ -1,7 +1,7 @@
 //! One environment and its episodes: trials, step limit, success, receipts, snapshots.
 
-use super::{Action, Environment, EnvironmentSpec, Pose, Purpose, Stream, SuccessRule};
-use crate::physics::Distribution;
+use super::{Action, Distribution, Environment, EnvironmentSpec, Purpose, Stream, SuccessRule};
+use crate::scene::Scene;
 
 /// What fixes an environment's episodes.
 #[derive(Debug, Clone, PartialEq)]
@@ -198,8 +198,8 @@ impl Episodes {
     }
 
     /// What a picture of the current state shows; none where the physics diverged.
-    pub fn pose(&self) -> Option<Pose> {
-        self.environment.pose()
+    pub fn scene(&self) -> Option<Scene> {
+        self.environment.scene()
     }
 
     /// Whether the current episode has ended.

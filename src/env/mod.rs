@@ -1,20 +1,24 @@
 //! Environments: the trait that each implements, what they declare of themselves, and the episodes they run.
 
 mod catalogue;
+mod distribution;
 mod episode;
 mod error;
-mod pose;
+mod parameter;
 mod seeding;
 mod snapshot;
 mod spaces;
 
-pub use catalogue::{find, make, names, specs};
+pub use catalogue::Catalogue;
+pub use distribution::{Distribution, Interval};
 pub use episode::{EpisodeEnd, EpisodeId, EpisodeStart, Episodes, Outcome, Receipt, Settings};
 pub use error::Error;
 pub(crate) use error::shorten;
-pub use pose::Pose;
+pub use parameter::{Parameter, Version, check_bounds, resolve};
 pub use seeding::{Purpose, Stream};
 pub use spaces::{Action, ActionSpace, Channel, EnvironmentSpec, Quantity, RewardTerm, SuccessRule};
+
+use crate::scene::Scene;
 
 /// What one step did, besides the reward.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -57,7 +61,7 @@ pub trait Environment: Send {
     fn observe(&self, out: &mut [f32]);
 
     /// What a picture of the current state shows; none where the physics diverged and no state is left to be shown.
-    fn pose(&self) -> Option<Pose>;
+    fn scene(&self) -> Option<Scene>;
 
     /// Advances by one control step and writes the reward's terms, in the spec's order.
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition;

@@ -1,7 +1,6 @@
 //! Saving an environment whole, and bringing it back in another session, process or server.
 
-use super::{EnvironmentSpec, Episodes, Error, Settings, episode::Progress};
-use crate::physics::{Distribution, Interval, check_bounds};
+use super::{Distribution, EnvironmentSpec, Episodes, Error, Interval, Settings, check_bounds, episode::Progress};
 use serde::{Deserialize, Serialize};
 
 /// Raised by every change of the layout below.

@@ -1,6 +1,6 @@
 //! What an environment looks like from outside: observations, actions, rewards, success.
 
-use crate::physics::Parameter;
+use super::{Environment, Error, Parameter};
 
 /// A named entry of a vector, with its unit and range.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -84,7 +84,7 @@ impl SuccessRule {
 }
 
 /// Everything that is fixed about an environment.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy)]
 pub struct EnvironmentSpec {
     /// The name to open it by.
     pub name: &'static str,
@@ -92,6 +92,8 @@ pub struct EnvironmentSpec {
     pub revision: u32,
     /// One sentence.
     pub description: &'static str,
+    /// Makes one with default parameters; fails with [`Error::Model`] if its model cannot be loaded.
+    pub make: fn() -> Result<Box<dyn Environment>, Error>,
     /// The parameters that can be changed.
     pub parameters: &'static [Parameter],
     /// The entries of an observation, `[O]`.

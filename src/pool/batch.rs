@@ -6,8 +6,8 @@ use super::{
     workers::{Job, Shared, lock},
 };
 use crate::{
-    env::{ActionSpace, EnvironmentSpec, EpisodeEnd, EpisodeStart, Pose, Settings},
-    physics::Distribution,
+    env::{ActionSpace, Distribution, EnvironmentSpec, EpisodeEnd, EpisodeStart, Settings},
+    scene::Scene,
 };
 use bytes::{Bytes, BytesMut};
 use std::sync::{Arc, Mutex, atomic::Ordering};
@@ -19,7 +19,7 @@ const SHARD_COST: f64 = 20.0;
 const LEAST_SHARE: f64 = 10.0;
 
 /// What a batch is opened with.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct BatchSettings {
     /// The environment.
     pub spec: &'static EnvironmentSpec,
@@ -192,16 +192,16 @@ impl Batch {
         }
     }
 
-    /// What a picture of a slot shows; none where its physics diverged. A few numbers, read between two requests: no
-    /// worker is asked.
+    /// What a picture of a slot shows; none where its physics diverged. Little is read, between two requests: no worker
+    /// is asked.
     ///
     /// # Errors
     /// [`Error::Defect`].
-    pub fn pose(&self, slot: usize) -> Result<Option<Pose>, Error> {
+    pub fn scene(&self, slot: usize) -> Result<Option<Scene>, Error> {
         if self.job.failed() {
             return Err(Error::Defect);
         }
-        Ok(lock(&self.job.shards[slot / self.shard_size]).pose(slot))
+        Ok(lock(&self.job.shards[slot / self.shard_size]).scene(slot))
     }
 
     async fn run(&mut self) -> Result<(), Error> {

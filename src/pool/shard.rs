@@ -1,8 +1,8 @@
 //! A part of a batch: what one worker runs at a time.
 
 use crate::{
-    env::{self, Action, ActionSpace, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Pose, Settings},
-    physics::Distribution,
+    env::{self, Action, ActionSpace, Distribution, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings},
+    scene::Scene,
 };
 use bytes::Bytes;
 use std::sync::Arc;
@@ -125,8 +125,8 @@ impl Shard {
     }
 
     /// What a picture of a slot of the batch shows.
-    pub(super) fn pose(&self, slot: usize) -> Option<Pose> {
-        self.slots[slot - self.first_slot].pose()
+    pub(super) fn scene(&self, slot: usize) -> Option<Scene> {
+        self.slots[slot - self.first_slot].scene()
     }
 
     /// Carries out the command.
@@ -148,7 +148,7 @@ impl Shard {
 
     fn open(&mut self) {
         for slot in 0..self.size {
-            match env::make(self.spec.name) {
+            match (self.spec.make)() {
                 Ok(environment) => {
                     // The batch has checked that the last index fits.
                     let environment_index = self.settings.environment_index + (self.first_slot + slot) as u32;

@@ -1,93 +1,68 @@
-//! A picture in the making: shapes in metres, y upwards.
+//! A picture of a drawing: paths in m, anti-aliased, by a library in Rust.
 
 use super::Size;
+use crate::scene::{Colour, Drawing, Graph, Point, Shape, colour};
 use tiny_skia::{Color, FillRule, LineCap, LineJoin, Paint, Path, PathBuilder, Pixmap, Stroke, StrokeDash, Transform};
 
-/// A point in m.
-pub(super) type Point = [f64; 2];
-
-/// A colour: red, green, blue.
-pub(super) type Colour = [u8; 3];
-
-/// Colours that colour-blind people tell apart (Okabe and Ito, 2008), and greys.
-pub(super) mod colour {
-    use super::Colour;
-
-    pub(in crate::render) const BACKGROUND: Colour = [247, 249, 251];
-    pub(in crate::render) const GROUND: Colour = [214, 219, 224];
-    pub(in crate::render) const FAINT: Colour = [172, 180, 188];
-    pub(in crate::render) const DARK: Colour = [52, 60, 68];
-    pub(in crate::render) const BLUE: Colour = [0, 114, 178];
-    pub(in crate::render) const SKY_BLUE: Colour = [86, 180, 233];
-    pub(in crate::render) const ORANGE: Colour = [230, 159, 0];
-    pub(in crate::render) const VERMILLION: Colour = [213, 94, 0];
-    pub(in crate::render) const GREEN: Colour = [0, 158, 115];
-    pub(in crate::render) const PALE_GREEN: Colour = [224, 240, 234];
-}
-
+/// Parts of a graph.
+const SMOOTH: usize = 64;
 /// Farther from the picture, in pixels, nothing is drawn exactly: absurd numbers must not overflow.
 const FAR: f64 = 1e5;
 /// No line is thinner, in pixels.
 const THINNEST: f64 = 1.0;
 
+/// The pixels of a drawing, `[height, width, 3]`.
+pub(super) fn draw(drawing: &Drawing, size: Size) -> Vec<u8> {
+    let mut canvas = Canvas::new(size, drawing.low, drawing.high);
+    for shape in &drawing.shapes {
+        canvas.add(shape);
+    }
+    let rgb = |pixel: &[u8; 4]| [pixel[0], pixel[1], pixel[2]]; // all are opaque
+    canvas.pixmap.data().as_chunks::<4>().0.iter().flat_map(rgb).collect()
+}
+
 /// A picture in the making.
-pub(super) struct Canvas {
+struct Canvas {
     pixmap: Pixmap,
     /// Pixels in a metre.
     scale: f64,
     /// The picture's lower left and upper right corner.
-    pub(super) low: Point,
-    pub(super) high: Point,
+    low: Point,
+    high: Point,
 }
 
 impl Canvas {
-    /// A blank picture that shows at least the rectangle from `low` to `high`, in its middle, as large as can be. None
-    /// for a size of zero.
-    pub(super) fn new(size: Size, low: Point, high: Point) -> Option<Self> {
+    /// A blank picture that shows at least the rectangle from `low` to `high`, in its middle, as large as can be.
+    fn new(size: Size, low: Point, high: Point) -> Self {
         let (width, height) = (f64::from(size.width), f64::from(size.height));
-        let mut pixmap = Pixmap::new(size.width.into(), size.height.into())?;
+        let mut pixmap = Pixmap::new(size.width.into(), size.height.into()).expect("sizes are at least 16");
         pixmap.fill(paint(colour::BACKGROUND));
         let scale = (width / (high[0] - low[0])).min(height / (high[1] - low[1]));
         let (x, y) = ((low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0);
         let half = [width / scale / 2.0, height / scale / 2.0];
-        Some(Self { pixmap, scale, low: [x - half[0], y - half[1]], high: [x + half[0], y + half[1]] })
+        Self { pixmap, scale, low: [x - half[0], y - half[1]], high: [x + half[0], y + half[1]] }
     }
 
-    /// The pixels, `[height, width, 3]`.
-    pub(super) fn into_rgb(self) -> Vec<u8> {
-        let rgb = |pixel: &[u8; 4]| [pixel[0], pixel[1], pixel[2]]; // all are opaque
-        self.pixmap.data().as_chunks::<4>().0.iter().flat_map(rgb).collect()
-    }
-
-    /// A filled polygon.
-    pub(super) fn polygon(&mut self, corners: &[Point], colour: Colour) {
-        if let Some(path) = self.path(corners, true) {
-            self.fill(&path, colour);
+    fn add(&mut self, shape: &Shape) {
+        match *shape {
+            Shape::Polygon { ref corners, colour } => self.fill(self.path(corners, true), colour),
+            Shape::Disc { centre, radius, colour } => {
+                let (x, y) = self.pixel(centre);
+                let radius = (radius * self.scale).max(THINNEST) as f32;
+                self.fill(PathBuilder::from_circle(x, y, radius), colour);
+            }
+            Shape::Line { ref points, width, colour } => self.stroke(points, width, colour, None),
+            Shape::Dashes { ref points, width, colour } => {
+                let dash = (4.0 * width * self.scale).max(4.0 * THINNEST) as f32;
+                self.stroke(points, width, colour, StrokeDash::new(vec![dash, dash], 0.0));
+            }
+            Shape::Graph { graph, width, colour } => self.stroke(&self.points(graph), width, colour, None),
+            Shape::Ground { graph, colour } => {
+                let mut corners = self.points(graph);
+                corners.extend([[graph.to, f64::NEG_INFINITY], [graph.from, f64::NEG_INFINITY]]);
+                self.fill(self.path(&corners, true), colour);
+            }
         }
-    }
-
-    /// A filled rectangle, by its lower left and upper right corner.
-    pub(super) fn rectangle(&mut self, [x0, y0]: Point, [x1, y1]: Point, colour: Colour) {
-        self.polygon(&[[x0, y0], [x1, y0], [x1, y1], [x0, y1]], colour);
-    }
-
-    /// A filled disc of a radius in m.
-    pub(super) fn disc(&mut self, centre: Point, radius: f64, colour: Colour) {
-        let (x, y) = self.pixel(centre);
-        if let Some(path) = PathBuilder::from_circle(x, y, (radius * self.scale).max(THINNEST) as f32) {
-            self.fill(&path, colour);
-        }
-    }
-
-    /// A line through points, with round ends, of a width in m.
-    pub(super) fn line(&mut self, points: &[Point], width: f64, colour: Colour) {
-        self.stroke(points, width, colour, None);
-    }
-
-    /// A dashed line through points, of a width in m.
-    pub(super) fn dashes(&mut self, points: &[Point], width: f64, colour: Colour) {
-        let dash = (4.0 * width * self.scale).max(4.0 * THINNEST) as f32;
-        self.stroke(points, width, colour, StrokeDash::new(vec![dash, dash], 0.0));
     }
 
     fn stroke(&mut self, points: &[Point], width: f64, colour: Colour, dash: Option<StrokeDash>) {
@@ -98,8 +73,9 @@ impl Canvas {
         self.pixmap.stroke_path(&path, &solid(colour), &stroke, Transform::identity(), None);
     }
 
-    fn fill(&mut self, path: &Path, colour: Colour) {
-        self.pixmap.fill_path(path, &solid(colour), FillRule::Winding, Transform::identity(), None);
+    fn fill(&mut self, path: Option<Path>, colour: Colour) {
+        let Some(path) = path else { return };
+        self.pixmap.fill_path(&path, &solid(colour), FillRule::Winding, Transform::identity(), None);
     }
 
     fn path(&self, points: &[Point], close: bool) -> Option<Path> {
@@ -116,7 +92,23 @@ impl Canvas {
 
     fn pixel(&self, [x, y]: Point) -> (f32, f32) {
         let clamp = |pixels: f64| pixels.clamp(-FAR, FAR) as f32;
+        let (x, y) = (self.within(0, x), self.within(1, y));
         (clamp((x - self.low[0]) * self.scale), clamp((self.high[1] - y) * self.scale))
+    }
+
+    /// The coordinate along an axis, or the picture's edge if it is infinite.
+    fn within(&self, axis: usize, coordinate: f64) -> f64 {
+        match coordinate {
+            f64::INFINITY => self.high[axis],
+            f64::NEG_INFINITY => self.low[axis],
+            finite => finite,
+        }
+    }
+
+    fn points(&self, Graph { height, from, to }: Graph) -> Vec<Point> {
+        let to = self.within(0, to);
+        let x = |i: usize| from + (to - from) * i as f64 / SMOOTH as f64;
+        (0..=SMOOTH).map(x).map(|x| [x, height(x)]).collect()
     }
 }
 

@@ -1,17 +1,16 @@
 //! Pictures of environments.
 //!
 //! One thread for a server draws them all, so that neither the physics' workers nor the transport's thread ever draws
-//! or waits for OpenGL: a session hands over a [`Pose`], a few numbers, and gets pixels back.
+//! or waits for OpenGL: a session hands over a [`Scene`] and gets pixels back.
 //!
-//! - `classic` draws the analytic tasks, on `canvas`: paths in metres, anti-aliased, by a library in Rust.
-//! - `robot` draws Hopper and HalfCheetah with MuJoCo, on a model of its own with colours, floor, light and sky.
+//! - `canvas` draws shapes in a plane: paths in metres, anti-aliased, by a library in Rust.
+//! - `model` draws MuJoCo's models, each on one of its own with colours, floor, light and sky.
 
 mod canvas;
-mod classic;
 #[cfg(feature = "mujoco")]
-mod robot;
+mod model;
 
-use crate::env::Pose;
+use crate::scene::Scene;
 use bytes::Bytes;
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
@@ -91,7 +90,7 @@ struct Studio {
 }
 
 struct Job {
-    pose: Pose,
+    scene: Scene,
     size: Size,
     reply: oneshot::Sender<Result<Vec<u8>, Error>>,
 }
@@ -103,16 +102,16 @@ impl Renderer {
     }
 
     /// A picture, `[height, width, 3]`: red, green, blue, the uppermost row first. Pictures are drawn one after the
-    /// other, in the order of their requests; where too many wait, this one waits for its place. The same pose and size
+    /// other, in the order of their requests; where too many wait, this one waits for its place. The same scene and size
     /// give the same bytes.
     ///
     /// # Errors
     /// [`Error`].
-    pub async fn draw(&self, pose: Pose, size: Size) -> Result<Bytes, Error> {
+    pub async fn draw(&self, scene: Scene, size: Size) -> Result<Bytes, Error> {
         let (reply, picture) = oneshot::channel();
         let jobs = self.jobs()?;
         // The thread ends only when this is dropped.
-        jobs.send(Job { pose, size, reply }).await.map_err(|_| Error::Defect)?;
+        jobs.send(Job { scene, size, reply }).await.map_err(|_| Error::Defect)?;
         picture.await.map_err(|_| Error::Defect)?.map(Bytes::from)
     }
 
@@ -153,12 +152,12 @@ fn work(mut jobs: mpsc::Receiver<Job>) {
         tracing::debug!(%error, "pictures are drawn at the priority of physics");
     }
     let mut easel = Easel::default();
-    while let Some(Job { pose, size, reply }) = jobs.blocking_recv() {
+    while let Some(Job { scene, size, reply }) = jobs.blocking_recv() {
         if reply.is_closed() {
             continue; // its session is gone
         }
-        let drawn = catch_unwind(AssertUnwindSafe(|| easel.draw(&pose, size))).unwrap_or_else(|_| {
-            tracing::error!(?pose, "a drawing panicked");
+        let drawn = catch_unwind(AssertUnwindSafe(|| easel.draw(&scene, size))).unwrap_or_else(|_| {
+            tracing::error!(?scene, "a drawing panicked");
             Err(Error::Defect)
         });
         if matches!(drawn, Err(Error::Failed { .. } | Error::Defect)) {
@@ -172,24 +171,15 @@ fn work(mut jobs: mpsc::Receiver<Job>) {
 #[derive(Default)]
 struct Easel {
     #[cfg(feature = "mujoco")]
-    robots: robot::Robots,
+    models: model::Models,
 }
 
 impl Easel {
-    fn draw(&mut self, pose: &Pose, size: Size) -> Result<Vec<u8>, Error> {
-        match *pose {
-            Pose::CartPole { position, angle, half_pole_length, position_limit, angle_limit } => {
-                classic::cart_pole(size, position, angle, half_pole_length, (position_limit, angle_limit))
-            }
-            Pose::MountainCar { position, low, high, goal } => classic::mountain_car(size, position, (low, high), goal),
-            Pose::Acrobot { angles, link_length, goal_height } => {
-                classic::acrobot(size, angles, link_length, goal_height)
-            }
-            Pose::Pendulum { angle, length, upright, torque } => {
-                classic::pendulum(size, angle, length, upright, torque)
-            }
+    fn draw(&mut self, scene: &Scene, size: Size) -> Result<Vec<u8>, Error> {
+        match scene {
+            Scene::Drawing(drawing) => Ok(canvas::draw(drawing, size)),
             #[cfg(feature = "mujoco")]
-            Pose::Robot { name, mjcf, ref qpos } => self.robots.draw(name, mjcf, qpos, size),
+            Scene::Model(model) => self.models.draw(model, size),
         }
     }
 }

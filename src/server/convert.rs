@@ -2,8 +2,10 @@
 
 use super::status::Refusal;
 use crate::{
-    env::{self, ActionSpace, Channel, EnvironmentSpec, EpisodeEnd, EpisodeId, EpisodeStart, Receipt, Settings},
-    physics::{Distribution, Interval, Parameter, Version, resolve},
+    env::{
+        self, ActionSpace, Catalogue, Channel, Distribution, EnvironmentSpec, EpisodeEnd, EpisodeId, EpisodeStart,
+        Interval, Parameter, Receipt, Settings, Version, resolve,
+    },
     pool::{Autoreset, BatchSettings, ResetEntry, Stepped},
     proto,
     render::Size,
@@ -12,8 +14,8 @@ use bytes::Bytes;
 use std::{collections::HashMap, sync::Arc};
 
 /// Checks an `open`.
-pub fn open(request: proto::Open) -> Result<BatchSettings, Refusal> {
-    let spec = env::find(&request.environment)?;
+pub fn open(catalogue: &Catalogue, request: proto::Open) -> Result<BatchSettings, Refusal> {
+    let spec = catalogue.find(&request.environment)?;
     let version = match request.version() {
         proto::Version::Default => Version::Default,
         proto::Version::Random => Version::Random,

@@ -21,7 +21,7 @@ pub mod status;
 
 use crate::{
     config::Config,
-    env,
+    env::{self, Catalogue},
     pool::Pool,
     proto::{self, dm_env_rpc::v1::environment_server::EnvironmentServer, perturb_server::PerturbServer},
 };
@@ -58,22 +58,28 @@ pub enum Error {
     Reflection(#[from] tonic_reflection::server::Error),
 }
 
-/// Serves on the listeners until `shutdown` resolves; then drains: new sessions are refused, running ones may go on for
+/// Serves these environments on the listeners until `shutdown` resolves; then drains: new sessions are refused, running ones may go on for
 /// the grace period, and connections are closed. Must run on a tokio runtime; a current-thread one is fastest.
 ///
 /// # Errors
 /// [`Error`], before anything is served, or when a listener fails.
-pub async fn run(listeners: Vec<Listener>, config: &Config, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
-    let catalogue = catalogue()?;
+pub async fn run(
+    listeners: Vec<Listener>,
+    config: &Config,
+    catalogue: Catalogue,
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), Error> {
+    let entries = entries(&catalogue)?;
+    let catalogue = Arc::new(catalogue);
     let pool = Arc::new(Pool::new(config.workers, config.max_envs)?);
     let (controller, drain) = Controller::new();
     let idle = (config.idle_seconds > 0).then(|| Duration::from_secs(config.idle_seconds));
     let sessions = Sessions::new(config.max_sessions, idle, drain.clone());
-    let worlds = dm_env_rpc::service::Service::new(Arc::clone(&pool), sessions.clone());
+    let worlds = dm_env_rpc::service::Service::new(Arc::clone(&pool), Arc::clone(&catalogue), sessions.clone());
     let worlds = EnvironmentServer::new(worlds)
         .max_decoding_message_size(config.max_message_bytes)
         .max_encoding_message_size(usize::MAX);
-    let service = Service::new(pool, catalogue, sessions);
+    let service = Service::new(pool, catalogue, entries, sessions);
     let service = PerturbServer::new(service)
         .max_decoding_message_size(config.max_message_bytes)
         .max_encoding_message_size(usize::MAX);
@@ -136,6 +142,6 @@ pub async fn run(listeners: Vec<Listener>, config: &Config, shutdown: impl Futur
 
 /// The catalogue as the protocol tells it. Builds each environment once, so that a model that cannot be loaded is known
 /// before anything is served.
-fn catalogue() -> Result<Arc<[proto::Environment]>, env::Error> {
-    env::specs().map(|spec| Ok(convert::environment(spec, env::make(spec.name)?.model_hash()))).collect()
+fn entries(catalogue: &Catalogue) -> Result<Arc<[proto::Environment]>, env::Error> {
+    catalogue.specs().map(|spec| Ok(convert::environment(spec, (spec.make)()?.model_hash()))).collect()
 }

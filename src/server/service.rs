@@ -5,6 +5,7 @@ use super::{
     session::Session,
 };
 use crate::{
+    env::Catalogue,
     pool::Pool,
     proto::{self, perturb_server::Perturb},
     render::Renderer,
@@ -16,15 +17,22 @@ use tonic::{Request, Response, Status, Streaming};
 #[derive(Clone)]
 pub struct Service {
     pool: Arc<Pool>,
-    catalogue: Arc<[proto::Environment]>,
+    catalogue: Arc<Catalogue>,
+    /// The catalogue as the protocol tells it.
+    entries: Arc<[proto::Environment]>,
     renderer: Arc<Renderer>,
     sessions: Sessions,
 }
 
 impl Service {
     /// A service over a pool.
-    pub fn new(pool: Arc<Pool>, catalogue: Arc<[proto::Environment]>, sessions: Sessions) -> Self {
-        Self { pool, catalogue, renderer: Arc::default(), sessions }
+    pub fn new(
+        pool: Arc<Pool>,
+        catalogue: Arc<Catalogue>,
+        entries: Arc<[proto::Environment]>,
+        sessions: Sessions,
+    ) -> Self {
+        Self { pool, catalogue, entries, renderer: Arc::default(), sessions }
     }
 }
 
@@ -37,7 +45,7 @@ impl Perturb for Service {
         _: Request<proto::ListEnvironmentsRequest>,
     ) -> Result<Response<proto::ListEnvironmentsResponse>, Status> {
         Ok(Response::new(proto::ListEnvironmentsResponse {
-            environments: self.catalogue.to_vec(),
+            environments: self.entries.to_vec(),
             server_version: env!("CARGO_PKG_VERSION").into(),
             max_batch_size: u32::try_from(self.pool.max_environments()).unwrap_or(u32::MAX),
         }))
@@ -47,7 +55,8 @@ impl Perturb for Service {
         &self,
         requests: Request<Streaming<proto::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        let session = Session::new(Arc::clone(&self.pool), Arc::clone(&self.catalogue), Arc::clone(&self.renderer));
+        let Self { pool, catalogue, entries, renderer, .. } = self.clone();
+        let session = Session::new(pool, catalogue, entries, renderer);
         Ok(Response::new(self.sessions.begin(requests.into_inner(), session)?))
     }
 }

@@ -2,6 +2,7 @@
 
 use super::{convert, status::Refusal};
 use crate::{
+    env::Catalogue,
     pool::{Batch, Pool},
     proto::{self, session_request::Request, session_response::Response},
     render::Renderer,
@@ -11,15 +12,21 @@ use std::sync::Arc;
 /// A client's session. Dropping it frees its environments.
 pub struct Session {
     pool: Arc<Pool>,
-    catalogue: Arc<[proto::Environment]>,
+    catalogue: Arc<Catalogue>,
+    entries: Arc<[proto::Environment]>,
     renderer: Arc<Renderer>,
     batch: Option<Batch>,
 }
 
 impl Session {
     /// A session that is not open yet.
-    pub fn new(pool: Arc<Pool>, catalogue: Arc<[proto::Environment]>, renderer: Arc<Renderer>) -> Self {
-        Self { pool, catalogue, renderer, batch: None }
+    pub fn new(
+        pool: Arc<Pool>,
+        catalogue: Arc<Catalogue>,
+        entries: Arc<[proto::Environment]>,
+        renderer: Arc<Renderer>,
+    ) -> Self {
+        Self { pool, catalogue, entries, renderer, batch: None }
     }
 
     /// Whether it owns environments.
@@ -50,9 +57,9 @@ impl Session {
             return Err(Refusal::AlreadyOpen);
         }
         let autoreset_mode = request.autoreset_mode;
-        let settings = convert::open(request)?;
+        let settings = convert::open(&self.catalogue, request)?;
         tracing::debug!(environment = settings.spec.name, batch_size = settings.size, "opening a session");
-        let environment = self.catalogue.iter().find(|entry| entry.name == settings.spec.name).cloned();
+        let environment = self.entries.iter().find(|entry| entry.name == settings.spec.name).cloned();
         let (batch, observations, started) = Batch::open(&self.pool, settings).await?;
         self.batch = Some(batch);
         Ok(proto::Opened { environment, observations, started: convert::started(started), autoreset_mode })
@@ -86,8 +93,8 @@ impl Session {
     async fn render(&mut self, request: proto::Render) -> Result<proto::Rendered, Refusal> {
         let batch = self.opened("render")?;
         let (slot, size) = convert::render(batch.settings().size, request)?;
-        let pose = batch.pose(slot)?.ok_or(Refusal::NothingToDraw { slot })?;
-        let pixels = self.renderer.draw(pose, size).await?;
+        let scene = batch.scene(slot)?.ok_or(Refusal::NothingToDraw { slot })?;
+        let pixels = self.renderer.draw(scene, size).await?;
         Ok(proto::Rendered { pixels, width: size.width.into(), height: size.height.into() })
     }
 

@@ -2,10 +2,10 @@
 
 use crate::common::{action_bytes, episodes, observe, play, settings, start_line, step};
 use perturb::{
-    env::{self, ActionSpace, Channel, EnvironmentSpec, Episodes, Error, Purpose, Stream},
-    physics::{Distribution, Version},
+    env::{self, ActionSpace, Channel, Distribution, EnvironmentSpec, Episodes, Error, Purpose, Stream, Version},
+    tasks,
 };
-use std::collections::HashSet;
+use std::{collections::HashSet, ptr};
 
 const VERSIONS: [Version; 3] = [Version::Default, Version::Random, Version::Extreme];
 
@@ -24,14 +24,14 @@ fn some_state(spec: &EnvironmentSpec, seed: u64) -> Vec<f64> {
 
 #[test]
 fn names_are_unique_and_found() {
-    assert!(unique(env::names()));
-    for spec in env::specs() {
-        assert_eq!(env::find(spec.name).unwrap(), spec);
-        assert_eq!(env::make(spec.name).unwrap().spec(), spec);
+    assert!(unique(tasks::catalogue().names()));
+    for spec in tasks::catalogue().specs() {
+        assert!(ptr::eq(tasks::catalogue().find(spec.name).unwrap(), spec));
+        assert!(ptr::eq((spec.make)().unwrap().spec(), spec));
     }
     for name in ["", "cartpole", "CartPole-v0", "CartPole "] {
-        assert!(matches!(env::find(name), Err(Error::UnknownEnvironment { .. })), "{name:?}");
-        assert!(env::make(name).is_err_and(|error| error.to_string().contains("MountainCar")), "{name:?}");
+        let refused = tasks::catalogue().find(name).unwrap_err();
+        assert!(matches!(refused, Error::UnknownEnvironment { .. }) && refused.to_string().contains("MountainCar"));
     }
 }
 
@@ -39,12 +39,12 @@ fn names_are_unique_and_found() {
 fn the_catalogue_has_the_papers_environments() {
     let classic = ["CartPole", "MountainCar", "Acrobot", "Pendulum"];
     let locomotion: &[&str] = if cfg!(feature = "mujoco") { &["HalfCheetah", "Hopper"] } else { &[] };
-    assert_eq!(env::names().collect::<Vec<_>>(), [&classic, locomotion].concat());
+    assert_eq!(tasks::catalogue().names().collect::<Vec<_>>(), [&classic, locomotion].concat());
 }
 
 #[test]
 fn specs_are_complete_and_consistent() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         let name = spec.name;
         assert!(unique(spec.parameters.iter().map(|p| p.name)), "{name}: parameters");
         assert!(unique(spec.observation.iter().map(|c| c.name)), "{name}: observation");
@@ -82,7 +82,7 @@ fn limits_and_success_rules_are_the_documents() {
         ("HalfCheetah", 1000, ReachedWithin(1000)),
         ("Hopper", 1000, ReachedWithin(1000)),
     ];
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         let row = document.iter().find(|row| row.0 == spec.name).unwrap();
         assert_eq!((spec.name, spec.step_limit, spec.success), *row);
     }
@@ -90,7 +90,7 @@ fn limits_and_success_rules_are_the_documents() {
 
 #[test]
 fn observations_and_rewards_keep_to_the_spec() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         for version in VERSIONS {
             let mut e = episodes(spec, version, 11, 4, 1);
             for t in 0..2000 {
@@ -115,7 +115,7 @@ fn observations_and_rewards_keep_to_the_spec() {
 
 #[test]
 fn the_reward_is_the_sum_of_its_terms_and_the_return_that_of_the_rewards() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         let mut e = episodes(spec, Version::Random, 3, 0, 1);
         let mut total = 0.0;
         for t in 0..1500 {
@@ -137,7 +137,7 @@ fn the_reward_is_the_sum_of_its_terms_and_the_return_that_of_the_rewards() {
 
 #[test]
 fn the_same_seed_gives_the_same_bytes() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         for version in VERSIONS {
             let run = || {
                 let mut e = episodes(spec, version, 5, 7, 2);
@@ -151,7 +151,7 @@ fn the_same_seed_gives_the_same_bytes() {
 
 #[test]
 fn another_seed_index_or_episode_gives_another_start() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         let mut observations = Vec::new();
         let mut parameters = Vec::new();
         for seed in [0, 1, u64::MAX] {
@@ -171,7 +171,7 @@ fn another_seed_index_or_episode_gives_another_start() {
 
 #[test]
 fn what_ran_before_does_not_matter() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         for version in VERSIONS {
             let run = |history: &[u64], actor| {
                 let mut e = episodes(spec, version, 21, 6, 2);
@@ -195,7 +195,7 @@ fn what_ran_before_does_not_matter() {
 
 #[test]
 fn a_reset_after_use_equals_a_fresh_environment() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         for version in VERSIONS {
             let mut fresh = episodes(spec, version, 77, 2, 3);
             let mut used = episodes(spec, Version::Extreme, 1, 2, 3);
@@ -210,7 +210,7 @@ fn a_reset_after_use_equals_a_fresh_environment() {
 
 #[test]
 fn an_exact_state_gives_the_same_bytes_whatever_ran_before() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         let state = some_state(spec, 1);
         let mut fresh = episodes(spec, Version::Random, 4, 0, 10);
         let mut used = episodes(spec, Version::Random, 4, 0, 10);
@@ -232,7 +232,7 @@ fn an_exact_state_gives_the_same_bytes_whatever_ran_before() {
 
 #[test]
 fn an_exact_state_spends_no_draw_of_later_episodes() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         let mut drawn = episodes(spec, Version::Random, 4, 0, 1);
         let mut exact = episodes(spec, Version::Random, 4, 0, 1);
         drawn.begin(None);
@@ -248,7 +248,7 @@ fn an_exact_state_spends_no_draw_of_later_episodes() {
 
 #[test]
 fn parameters_stay_within_a_trial_and_are_drawn_anew_after_it() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         for n in [1, 2, 5] {
             let mut e = episodes(spec, Version::Random, 8, 1, n);
             let mut trials: Vec<Vec<f64>> = Vec::new();
@@ -282,7 +282,7 @@ fn play_to_its_end(e: &mut Episodes, steps: u64) {
 
 #[test]
 fn the_trial_alone_fixes_the_parameters() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         let parameters = |n: u32| {
             let mut e = episodes(spec, Version::Extreme, 8, 1, n);
             (0..3 * n).for_each(|_| e.begin(None));
@@ -295,7 +295,7 @@ fn the_trial_alone_fixes_the_parameters() {
 
 #[test]
 fn new_distributions_or_seeds_begin_a_trial() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         let mut e = episodes(spec, Version::Random, 8, 1, 3);
         e.begin(None);
         assert_eq!((e.id().trial_index, e.id().episode_index, e.id().episode_in_trial), (0, 1, 1));
@@ -312,7 +312,7 @@ fn new_distributions_or_seeds_begin_a_trial() {
 
 #[test]
 fn receipts_read_back_what_was_requested() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         let mut e = episodes(spec, Version::Extreme, 13, 0, 1);
         for _ in 0..50 {
             let receipt = e.receipt();
@@ -331,7 +331,7 @@ fn receipts_read_back_what_was_requested() {
 
 #[test]
 fn derived_quantities_follow_every_edit() {
-    let mut e = episodes(env::find("CartPole").unwrap(), Version::Extreme, 13, 0, 1);
+    let mut e = episodes(tasks::catalogue().find("CartPole").unwrap(), Version::Extreme, 13, 0, 1);
     for _ in 0..50 {
         let [_, length, mass] = e.receipt().requested[..] else { panic!("three parameters") };
         // 1 kg is the cart's mass.
@@ -342,7 +342,7 @@ fn derived_quantities_follow_every_edit() {
 
 #[test]
 fn every_parameter_changes_the_receipt_and_the_physics() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         let run = |edited: Option<usize>| {
             let value = |i: usize| {
                 let p = spec.parameters[i];
@@ -350,7 +350,7 @@ fn every_parameter_changes_the_receipt_and_the_physics() {
             };
             let distributions = (0..spec.parameters.len()).map(value).collect();
             let settings = env::Settings { distributions, ..settings(spec, Version::Default, 1, 0, 1) };
-            let mut e = Episodes::new(env::make(spec.name).unwrap(), settings);
+            let mut e = Episodes::new((spec.make)().unwrap(), settings);
             let applied = e.receipt().applied;
             // Steps until every parameter had its effect, contacts with the floor included.
             let observations: Vec<_> = (0..40)
@@ -374,7 +374,7 @@ fn every_parameter_changes_the_receipt_and_the_physics() {
 
 #[test]
 fn edits_do_not_accumulate() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         let mut fresh = episodes(spec, Version::Default, 1, 0, 1);
         let mut edited = episodes(spec, Version::Extreme, 1, 0, 1);
         (0..100).for_each(|_| edited.begin(None));
@@ -389,7 +389,7 @@ fn edits_do_not_accumulate() {
 
 #[test]
 fn an_episode_is_truncated_exactly_at_the_step_limit() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         let mut e = episodes(spec, Version::Default, 2, 0, 1);
         let (mut length, mut truncations) = (0, 0);
         for t in 0..u64::from(6 * spec.step_limit) {
@@ -412,7 +412,7 @@ fn an_episode_is_truncated_exactly_at_the_step_limit() {
 
 #[test]
 fn everything_stays_finite_at_the_corners_of_the_bounds() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         for ends in 0..1 << spec.parameters.len() {
             let corner = |i: usize| {
                 let bounds = spec.parameters[i].bounds;
@@ -420,7 +420,7 @@ fn everything_stays_finite_at_the_corners_of_the_bounds() {
             };
             let distributions = (0..spec.parameters.len()).map(corner).collect();
             let settings = env::Settings { distributions, ..settings(spec, Version::Default, 1, 0, 1) };
-            let mut e = Episodes::new(env::make(spec.name).unwrap(), settings);
+            let mut e = Episodes::new((spec.make)().unwrap(), settings);
             for t in 0..600 {
                 let (outcome, terms) = step(&mut e, &action_bytes(spec, 2, t));
                 let place = format!("{}, corner {ends:b} of the bounds", spec.name);

@@ -2,16 +2,19 @@
 
 use futures_util::future::join_all;
 use perturb::{
-    env::Pose,
     render::{Renderer, Size},
+    scene::{Drawing, Graph, Scene, Shape, colour},
 };
 
 /// More requests than wait for the thread.
 const MANY: usize = 200;
 const SIZE: Size = Size { width: 24, height: 16 };
 
-fn cart(position: f64) -> Pose {
-    Pose::CartPole { position, angle: 0.1, half_pole_length: 0.5, position_limit: 2.4, angle_limit: 0.2 }
+/// A disc at this place.
+fn disc(x: f64) -> Scene {
+    let mut drawing = Drawing::new([-3.0, -1.0], [3.0, 1.0]);
+    drawing.disc([x, 0.0], 0.5, colour::BLUE);
+    Scene::Drawing(drawing)
 }
 
 fn run<T>(future: impl Future<Output = T>) -> T {
@@ -23,9 +26,9 @@ fn more_requests_than_the_queue_holds_are_all_answered_each_with_its_own_picture
     let renderer = Renderer::new();
     let position = |i: usize| (i % 7) as f64 - 3.0;
     run(async {
-        let pictures = join_all((0..MANY).map(|i| renderer.draw(cart(position(i)), SIZE))).await;
+        let pictures = join_all((0..MANY).map(|i| renderer.draw(disc(position(i)), SIZE))).await;
         for (i, picture) in pictures.into_iter().enumerate() {
-            assert!(picture.unwrap() == renderer.draw(cart(position(i)), SIZE).await.unwrap(), "{i}");
+            assert!(picture.unwrap() == renderer.draw(disc(position(i)), SIZE).await.unwrap(), "{i}");
         }
     });
 }
@@ -34,16 +37,16 @@ fn more_requests_than_the_queue_holds_are_all_answered_each_with_its_own_picture
 fn a_request_that_is_given_up_does_not_hold_up_the_others() {
     let renderer = Renderer::new();
     run(async {
-        let expected = renderer.draw(cart(0.0), SIZE).await.unwrap();
+        let expected = renderer.draw(disc(0.0), SIZE).await.unwrap();
         for _ in 0..MANY {
-            let given_up = renderer.draw(cart(1.0), Size { width: 2048, height: 2048 });
+            let given_up = renderer.draw(disc(1.0), Size { width: 2048, height: 2048 });
             tokio::select! {
                 biased;
                 _ = given_up => {}
                 () = std::future::ready(()) => {}
             }
         }
-        assert_eq!(renderer.draw(cart(0.0), SIZE).await.unwrap(), expected);
+        assert_eq!(renderer.draw(disc(0.0), SIZE).await.unwrap(), expected);
     });
 }
 
@@ -54,41 +57,62 @@ fn absurd_numbers_are_drawn_somehow() {
     let sizes = [SIZE, Size { width: 2048, height: 16 }, Size { width: 16, height: 2048 }];
     let pairs = absurd.into_iter().flat_map(|x| absurd.map(|y| (x, y)));
     for ((x, y), size) in pairs.zip(sizes.into_iter().cycle()) {
-        let poses = [
-            Pose::CartPole { position: x, angle: y, half_pole_length: y, position_limit: 2.4, angle_limit: 0.2 },
-            Pose::MountainCar { position: x, low: -1.2, high: 0.6, goal: y },
-            Pose::Acrobot { angles: [x, y], link_length: y.abs(), goal_height: x },
-            Pose::Pendulum { angle: x, length: y, upright: 1.0, torque: Some(x) },
+        let graph = Graph { height: |x| x * x, from: x, to: y };
+        let (points, colour) = (vec![[x, y], [y, x], [0.0, 0.0]], colour::BLUE);
+        let shapes = [
+            Shape::Polygon { corners: points.clone(), colour },
+            Shape::Disc { centre: [x, y], radius: y, colour },
+            Shape::Line { points: points.clone(), width: x, colour },
+            Shape::Dashes { points, width: y, colour },
+            Shape::Graph { graph, width: y, colour },
+            Shape::Ground { graph, colour },
         ];
-        for pose in poses {
-            let picture = run(renderer.draw(pose.clone(), size));
+        for (low, high) in [([-1.0, -1.0], [1.0, 1.0]), ([-x, -y], [x, y])] {
+            let scene = Scene::Drawing(Drawing { low, high, shapes: shapes.to_vec() });
+            let picture = run(renderer.draw(scene.clone(), size));
             let bytes = 3 * usize::from(size.width) * usize::from(size.height);
-            assert_eq!(picture.map(|pixels| pixels.len()), Ok(bytes), "{pose:?}");
+            assert_eq!(picture.map(|pixels| pixels.len()), Ok(bytes), "{scene:?}");
         }
     }
+}
+
+#[test]
+fn an_infinite_coordinate_is_the_pictures_edge() {
+    let renderer = Renderer::new();
+    let draw = |low: [f64; 2], high: [f64; 2]| {
+        let mut drawing = Drawing::new([-1.0, -1.0], [1.0, 1.0]);
+        drawing.rectangle(low, high, colour::BLUE);
+        run(renderer.draw(Scene::Drawing(drawing), Size { width: 48, height: 16 })).unwrap()
+    };
+    let (least, most) = (f64::NEG_INFINITY, f64::INFINITY);
+    assert_eq!(draw([least, least], [0.0, 0.0]), draw([-3.0, -1.0], [0.0, 0.0]));
+    assert_eq!(draw([0.0, 0.0], [most, most]), draw([0.0, 0.0], [3.0, 1.0]));
 }
 
 #[cfg(feature = "mujoco")]
 #[test]
 fn a_failed_drawing_fails_alone() {
-    use perturb::render::Error;
+    use perturb::{
+        env::Environment,
+        render::Error,
+        scene::{Look, PosedModel},
+        tasks,
+    };
 
+    let Some(Scene::Model(PosedModel { look, qpos })) = tasks::hopper::hopper().unwrap().scene() else {
+        panic!("a new hopper can be seen")
+    };
     let renderer = Renderer::new();
-    let mjcf = include_str!("../../models/hopper.xml");
-    let hopper = |mjcf, n| renderer.draw(Pose::Robot { name: "Hopper", mjcf, qpos: vec![0.1; n] }, SIZE);
-    let expected = run(hopper(mjcf, 6)).unwrap();
+    let draw = |look, qpos: &[f64]| run(renderer.draw(Scene::Model(PosedModel { look, qpos: qpos.to_vec() }), SIZE));
+    let expected = draw(look, &qpos).unwrap();
     // A defect: positions of another robot.
-    assert_eq!(run(hopper(mjcf, 5)), Err(Error::Defect));
-    assert_eq!(run(hopper(mjcf, 6)), Ok(expected.clone()));
-    // A robot that nobody knows makes the thread start afresh, which leaves no trace either.
-    let unknown = Pose::Robot { name: "Walker", mjcf, qpos: vec![0.0; 6] };
-    let Err(Error::Failed { environment: "Walker", reason }) = run(renderer.draw(unknown, SIZE)) else {
-        panic!("it was drawn")
-    };
-    assert!(reason.contains("how to show Walker"), "{reason}");
-    let Err(Error::Failed { environment: "Hopper", reason }) = run(hopper("<mujoco/>", 6)) else {
-        panic!("it was drawn")
-    };
-    assert!(reason.contains("no end"), "{reason}");
-    assert_eq!(run(hopper(mjcf, 6)), Ok(expected));
+    assert_eq!(draw(look, &qpos[1..]), Err(Error::Defect));
+    assert_eq!(draw(look, &qpos), Ok(expected.clone()));
+    // A model that cannot be compiled makes the thread start afresh, which leaves no trace either.
+    for (mjcf, words) in [("<mujoco/>", "no end"), ("<mujoco></mujoco>", "torso")] {
+        let bad: &'static Look = Box::leak(Box::new(Look { mjcf, ..*look }));
+        let Err(Error::Failed { environment: "Hopper", reason }) = draw(bad, &qpos) else { panic!("it was drawn") };
+        assert!(reason.contains(words), "{reason}");
+    }
+    assert_eq!(draw(look, &qpos), Ok(expected));
 }

@@ -2,7 +2,7 @@
 
 use perturb::{
     env::{Action, ActionSpace, Environment, Purpose, Stream},
-    locomotion::{Walker, half_cheetah, hopper},
+    tasks::{half_cheetah::half_cheetah, hopper::hopper, locomotion::Walker},
 };
 use perturb_mujoco::{Kind, Model, Simulation};
 use std::thread;
@@ -430,7 +430,7 @@ fn divergence_ends_the_episode_with_finite_numbers() {
             assert!(transition.terminated && transition.diverged && !transition.goal);
             assert_eq!(terms, [-1.0, 0.0, 0.0, 0.0, 0.0]);
             assert_eq!(observation(walker), seen);
-            assert_eq!(walker.pose(), None, "what MuJoCo put in the state's place is not shown");
+            assert!(walker.scene().is_none(), "what MuJoCo put in the state's place is not shown");
             let state = saved(walker);
             walker.load(&state).unwrap();
             assert_eq!(saved(walker), state);
@@ -450,6 +450,6 @@ fn divergence_ends_the_episode_with_finite_numbers() {
         walker.set_parameters(&[1.0, 1000.0, 0.8]);
         walker.reset(&mut stream(0));
         assert!(!walker.step(Action::Continuous(&action), &mut [0.0; 5]).diverged);
-        assert!(walker.pose().is_some());
+        assert!(walker.scene().is_some());
     }
 }

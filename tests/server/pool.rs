@@ -3,9 +3,9 @@
 use crate::common::{self, action_bytes, floats, observe, step};
 use bytes::Bytes;
 use perturb::{
-    env::{self, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings},
-    physics::{Distribution, Version},
+    env::{Distribution, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings, Version},
     pool::{Autoreset, Batch, BatchSettings, Error, Pool, ResetEntry, Stepped},
+    tasks,
 };
 use std::{
     future::{Future, poll_fn},
@@ -57,7 +57,7 @@ impl Model {
         let model = |slot| {
             let environment_index = settings.episodes.environment_index + slot as u32;
             let settings_of_slot = Settings { environment_index, ..settings.episodes.clone() };
-            Episodes::new(env::make(settings.spec.name).unwrap(), settings_of_slot)
+            Episodes::new((settings.spec.make)().unwrap(), settings_of_slot)
         };
         Self { models: (0..settings.size).map(model).collect(), autoreset: settings.autoreset }
     }
@@ -112,7 +112,7 @@ impl Model {
 
 #[tokio::test]
 async fn a_batch_gives_the_bytes_of_its_environments_in_every_autoreset_mode() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         for mode in MODES {
             let size = 5;
             let pool = Pool::new(2, size).unwrap();
@@ -149,7 +149,7 @@ async fn a_batch_gives_the_bytes_of_its_environments_in_every_autoreset_mode() {
 
 /// A CartPole batch of one, pushed to one side until it falls; the step at which it does and what it gave.
 async fn fall(pool: &Pool, mode: Autoreset) -> (Batch, Stepped) {
-    let spec = env::find("CartPole").unwrap();
+    let spec = tasks::catalogue().find("CartPole").unwrap();
     let (mut batch, _, _) = Batch::open(pool, batch_settings(spec, 1, mode)).await.unwrap();
     loop {
         let stepped = batch.step(&[1, 0, 0, 0]).await.unwrap();
@@ -224,7 +224,7 @@ async fn in_disabled_mode_an_ended_environment_refuses_the_step_until_it_is_rese
 
 #[tokio::test]
 async fn a_refused_step_names_the_slots_that_ended() {
-    let spec = env::find("CartPole").unwrap();
+    let spec = tasks::catalogue().find("CartPole").unwrap();
     let pool = Pool::new(4, 2000).unwrap();
     // So many that there are several shards.
     let size = 2000;
@@ -245,7 +245,7 @@ async fn a_refused_step_names_the_slots_that_ended() {
 
 #[tokio::test]
 async fn what_was_not_asked_for_is_not_sent() {
-    let spec = env::find("CartPole").unwrap();
+    let spec = tasks::catalogue().find("CartPole").unwrap();
     let pool = Pool::new(1, 4).unwrap();
     let asked = batch_settings(spec, 4, Autoreset::SameStep);
     let settings = BatchSettings { receipts: false, reward_terms: false, ..asked };
@@ -292,7 +292,7 @@ fn cut(spec: &EnvironmentSpec, size: usize, stepped: &Stepped) -> Vec<Seen> {
 
 #[tokio::test]
 async fn bytes_do_not_depend_on_the_number_of_workers() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         // Several shards, also for the cheapest environment.
         let size = (100.0 / spec.step_cost).ceil() as usize;
         let mut runs: Vec<Vec<Stepped>> = Vec::new();
@@ -312,7 +312,7 @@ async fn bytes_do_not_depend_on_the_number_of_workers() {
 
 #[tokio::test]
 async fn bytes_do_not_depend_on_how_a_batch_is_split() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         for mode in [Autoreset::NextStep, Autoreset::SameStep] {
             let size = 12;
             let steps = u64::from(spec.step_limit) + 20;
@@ -359,7 +359,7 @@ impl Wake for Bell {
 #[tokio::test]
 async fn small_batches_finish_before_a_large_one_that_came_first() {
     const ATTEMPTS: usize = 50;
-    let spec = env::find("Acrobot").unwrap();
+    let spec = tasks::catalogue().find("Acrobot").unwrap();
     let size = 40_000; // over 200 shards
     // Still too long for their sessions to wait awake, which would ring the bells before the end.
     let small = 1000;
@@ -412,7 +412,9 @@ async fn wait_until(condition: impl Fn() -> bool) {
 #[tokio::test]
 async fn workers_that_fell_asleep_are_woken_for_every_job() {
     let pool = Pool::new(2, 1000).unwrap();
-    let open = |name, size| Batch::open(&pool, batch_settings(env::find(name).unwrap(), size, Autoreset::SameStep));
+    let open = |name, size| {
+        Batch::open(&pool, batch_settings(tasks::catalogue().find(name).unwrap(), size, Autoreset::SameStep))
+    };
     let work = async {
         let (mut small, ..) = open("CartPole", 1).await.unwrap();
         let (mut other, ..) = open("CartPole", 1).await.unwrap();
@@ -430,7 +432,7 @@ async fn workers_that_fell_asleep_are_woken_for_every_job() {
 
 #[tokio::test]
 async fn a_full_pool_refuses_and_has_room_again_when_a_batch_is_dropped() {
-    let spec = env::find("CartPole").unwrap();
+    let spec = tasks::catalogue().find("CartPole").unwrap();
     let pool = Pool::new(2, 10).unwrap();
     let open = |size| Batch::open(&pool, batch_settings(spec, size, Autoreset::SameStep));
     assert_eq!(open(11).await.err(), Some(Error::Full { requested: 11, used: 0, limit: 10 }));
@@ -449,7 +451,7 @@ async fn a_full_pool_refuses_and_has_room_again_when_a_batch_is_dropped() {
 
 #[tokio::test]
 async fn a_batch_dropped_in_mid_step_gives_its_environments_back() {
-    let spec = env::find("Acrobot").unwrap();
+    let spec = tasks::catalogue().find("Acrobot").unwrap();
     let size = 20_000;
     let pool = Pool::new(2, size).unwrap();
     let mut in_mid_step = 0;
@@ -477,7 +479,7 @@ async fn a_batch_dropped_in_mid_step_gives_its_environments_back() {
 async fn a_batch_whose_step_nobody_waits_for_settles_and_goes_on_after_it() {
     const N: usize = 2000;
     let pool = Pool::new(2, N * 2).unwrap();
-    let spec = env::find("Acrobot").unwrap();
+    let spec = tasks::catalogue().find("Acrobot").unwrap();
     let settings = batch_settings(spec, N, Autoreset::SameStep);
     let (mut batch, ..) = Batch::open(&pool, settings.clone()).await.unwrap();
     let (mut twin, ..) = Batch::open(&pool, settings).await.unwrap();
@@ -495,7 +497,7 @@ async fn a_batch_whose_step_nobody_waits_for_settles_and_goes_on_after_it() {
 
 #[tokio::test]
 async fn a_batch_outlives_others_and_a_pool_ends_with_batches_alive() {
-    let spec = env::find("Pendulum").unwrap();
+    let spec = tasks::catalogue().find("Pendulum").unwrap();
     let pool = Pool::new(2, 20).unwrap();
     let open = || Batch::open(&pool, batch_settings(spec, 10, Autoreset::SameStep));
     let (mut a, ..) = open().await.unwrap();
@@ -509,7 +511,7 @@ async fn a_batch_outlives_others_and_a_pool_ends_with_batches_alive() {
 // Resets, as proto/perturb/v1/perturb.proto specifies them.
 
 async fn open_four(pool: &Pool, name: &str) -> Batch {
-    let settings = batch_settings(env::find(name).unwrap(), 4, Autoreset::SameStep);
+    let settings = batch_settings(tasks::catalogue().find(name).unwrap(), 4, Autoreset::SameStep);
     Batch::open(pool, settings).await.unwrap().0
 }
 
@@ -519,7 +521,7 @@ fn ids(started: &[(u32, EpisodeStart)]) -> Vec<(u32, u64, u64, u32)> {
 
 #[tokio::test]
 async fn a_reset_touches_the_selected_slots_only_and_goes_on_with_their_trials() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         let pool = Pool::new(2, 8).unwrap();
         let (mut batch, mut untouched) = (open_four(&pool, spec.name).await, open_four(&pool, spec.name).await);
         for t in 0..5 {
@@ -533,7 +535,7 @@ async fn a_reset_touches_the_selected_slots_only_and_goes_on_with_their_trials()
         let opened = |slot: u32| {
             let settings =
                 Settings { environment_index: 100 + slot, ..batch_settings(spec, 4, Autoreset::SameStep).episodes };
-            Episodes::new(env::make(spec.name).unwrap(), settings)
+            Episodes::new((spec.make)().unwrap(), settings)
         };
         assert_eq!(started[0].1.receipt, Some(opened(1).receipt()));
         let (_, started) = batch.reset(vec![entry(1), entry(3)]).await.unwrap();
@@ -548,7 +550,7 @@ async fn a_reset_touches_the_selected_slots_only_and_goes_on_with_their_trials()
 
 #[tokio::test]
 async fn a_broken_off_episode_is_not_reported() {
-    let spec = env::find("CartPole").unwrap();
+    let spec = tasks::catalogue().find("CartPole").unwrap();
     let pool = Pool::new(1, 4).unwrap();
     let mut batch = open_four(&pool, "CartPole").await;
     batch.step(&[0; 16]).await.unwrap();
@@ -559,7 +561,7 @@ async fn a_broken_off_episode_is_not_reported() {
 
 #[tokio::test]
 async fn seeds_restart_the_counts_and_keep_the_index() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         let pool = Pool::new(1, 8).unwrap();
         let mut batch = open_four(&pool, spec.name).await;
         for t in 0..30 {
@@ -572,7 +574,7 @@ async fn seeds_restart_the_counts_and_keep_the_index() {
         for (k, (slot, seed)) in [(0, u64::MAX), (2, 5)].into_iter().enumerate() {
             let settings = batch_settings(spec, 4, Autoreset::SameStep).episodes;
             let settings = Settings { seed, environment_index: 100 + slot, ..settings };
-            let fresh = Episodes::new(env::make(spec.name).unwrap(), settings);
+            let fresh = Episodes::new((spec.make)().unwrap(), settings);
             assert_eq!(started[k].1, fresh.started(true));
             let width = spec.observation.len();
             assert_eq!(floats(&first)[k * width..][..width], observe(&fresh)[..], "{}", spec.name);
@@ -583,7 +585,7 @@ async fn seeds_restart_the_counts_and_keep_the_index() {
 
 #[tokio::test]
 async fn distributions_hold_from_now_on_and_begin_a_trial() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         let pool = Pool::new(1, 4).unwrap();
         let mut batch = open_four(&pool, spec.name).await;
         let values: Vec<f64> = spec.parameters.iter().map(|p| p.extreme[1].high).collect();
@@ -609,13 +611,13 @@ async fn exact_states_are_taken_and_hold_for_this_episode() {
         ("Acrobot", &[0.5, -0.5, 1.0, -1.0]),
         ("Pendulum", &[0.5, -1.0]),
     ] {
-        let spec = env::find(name).unwrap();
+        let spec = tasks::catalogue().find(name).unwrap();
         let pool = Pool::new(1, 4).unwrap();
         let mut batch = open_four(&pool, name).await;
         let exact = |slot| ResetEntry { state: Some(state.to_vec()), ..entry(slot) };
         let (first, started) = batch.reset(vec![exact(1), entry(2), exact(3)]).await.unwrap();
         assert_eq!(ids(&started), [(1, 0, 1, 1), (2, 0, 1, 1), (3, 0, 1, 1)], "the trial goes on");
-        let mut environment = env::make(name).unwrap();
+        let mut environment = tasks::catalogue().find(name).and_then(|spec| (spec.make)()).unwrap();
         environment.reset_to(state);
         let mut expected = vec![0.0; spec.observation.len()];
         environment.observe(&mut expected);
@@ -628,7 +630,7 @@ async fn exact_states_are_taken_and_hold_for_this_episode() {
 
 #[tokio::test]
 async fn a_seed_a_distribution_and_a_state_go_together() {
-    let spec = env::find("CartPole").unwrap();
+    let spec = tasks::catalogue().find("CartPole").unwrap();
     let pool = Pool::new(1, 4).unwrap();
     let mut batch = open_four(&pool, "CartPole").await;
     let fixed: Arc<[Distribution]> = [9.0, 0.5, 0.25].map(Distribution::fixed).into();

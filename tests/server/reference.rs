@@ -1,8 +1,8 @@
 //! The classic tasks compute what Gymnasium computes: trajectories that Gymnasium 1.4 ran in f64 under edited parameters.
 
 use perturb::{
-    classic::Pendulum,
-    env::{self, Action, Environment, Transition},
+    env::{Action, Environment, Transition},
+    tasks::{self, pendulum::Pendulum},
 };
 use serde_json::Value;
 
@@ -38,7 +38,7 @@ fn cases() -> Vec<Case> {
     let case = |(i, line): (usize, &str)| {
         let row: Value = serde_json::from_str(line).unwrap();
         let environment = row["env"].as_str().unwrap().to_owned();
-        let spec = env::find(&environment).unwrap();
+        let spec = tasks::catalogue().find(&environment).unwrap();
         let list = |key: &str| row[key].as_array().unwrap().iter().map(numbers).collect::<Vec<_>>();
         let states = std::iter::once(numbers(&row["state0"])).chain(list("states")).collect();
         Case {
@@ -65,7 +65,7 @@ impl Replay {
     fn new(case: &Case) -> Self {
         let mut replay = match case.environment.as_str() {
             "Pendulum" => Self::Pendulum(Pendulum::new()),
-            name => Self::Discrete(env::make(name).unwrap()),
+            name => Self::Discrete(tasks::catalogue().find(name).and_then(|spec| (spec.make)()).unwrap()),
         };
         replay.environment().set_parameters(&case.parameters);
         replay

@@ -3,11 +3,11 @@
 use crate::common::server::{self, Actor, Server, Session, catalogue, doubles, open, parameters};
 use bytes::Bytes;
 use perturb::{
-    env,
     proto::{
         AutoresetMode, Environment, Open, Render, Reset, Step, Version, session_request::Request,
         session_response::Response,
     },
+    tasks,
 };
 use std::{
     collections::HashSet,
@@ -21,7 +21,7 @@ const SMALL: (u32, u32) = (120, 120);
 const ROBOTS: [&str; 2] = ["Hopper", "HalfCheetah"];
 
 fn robots() -> impl Iterator<Item = &'static str> {
-    ROBOTS.into_iter().filter(|name| env::find(name).is_ok())
+    ROBOTS.into_iter().filter(|name| tasks::catalogue().find(name).is_ok())
 }
 
 fn start() -> Server {
@@ -47,7 +47,7 @@ async fn at(server: &Server, environment: &str, state: &[f64], size: (u32, u32))
 
 /// A robot's state: at this place, all else at its initial pose and at rest.
 fn robot_state(name: &str, x: f64) -> Vec<f64> {
-    let mut state = vec![0.0; env::find(name).unwrap().state.len()];
+    let mut state = vec![0.0; tasks::catalogue().find(name).unwrap().state.len()];
     state[0] = x;
     state
 }
@@ -183,7 +183,7 @@ async fn up_is_up_and_right_is_right() {
         assert!(bluish(&row(2)) > 100, "{name}: the sky is above");
         assert!(bluish(&row(SMALL.1 - 3)) < 20, "{name}: the floor is below");
     }
-    if env::find("HalfCheetah").is_ok() {
+    if tasks::catalogue().find("HalfCheetah").is_ok() {
         let pixels = at(&server, "HalfCheetah", &robot_state("HalfCheetah", 0.0), SMALL).await;
         let (back, _, _) = centre(&pixels, SMALL, |pixel| strong(pixel) && pixel[2] > pixel[0]);
         let (front, _, _) = centre(&pixels, SMALL, |pixel| strong(pixel) && pixel[0] > pixel[2]);

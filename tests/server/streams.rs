@@ -2,8 +2,8 @@
 
 use crate::common;
 use perturb::{
-    env::{self, Environment, Purpose, Stream},
-    physics::Version,
+    env::{Environment, Purpose, Stream, Version},
+    tasks,
 };
 use serde_json::Value;
 use std::f64::consts::PI;
@@ -58,7 +58,7 @@ fn uniform_spends_one_number_and_scales_it() {
 
 #[test]
 fn parameters_are_the_trials_numbers_in_the_catalogues_order() {
-    for spec in env::specs() {
+    for spec in tasks::catalogue().specs() {
         let mut e = common::episodes(spec, Version::Random, 12, 34, 2);
         for trial in 0..3 {
             for _ in 0..2 {
@@ -90,7 +90,8 @@ fn initial_states_are_the_episodes_numbers_in_the_states_order() {
     for (name, ranges) in ranges {
         for episode in [0, 1, 7] {
             let mut stream = Stream::new(12, 34, Purpose::InitialState, episode);
-            let mut environment: Box<dyn Environment> = env::make(name).unwrap();
+            let mut environment: Box<dyn Environment> =
+                tasks::catalogue().find(name).and_then(|spec| (spec.make)()).unwrap();
             environment.reset(&mut stream.clone());
             let mut state = Vec::new();
             environment.save(&mut state);
@@ -98,7 +99,7 @@ fn initial_states_are_the_episodes_numbers_in_the_states_order() {
             assert_eq!(state, ranges.iter().map(draw).collect::<Vec<_>>(), "{name}");
 
             // And the episodes use this stream.
-            let mut episodes = common::episodes(env::find(name).unwrap(), Version::Default, 12, 34, 1);
+            let mut episodes = common::episodes(tasks::catalogue().find(name).unwrap(), Version::Default, 12, 34, 1);
             (0..episode).for_each(|_| episodes.begin(None));
             let mut observation = vec![0.0; environment.spec().observation.len()];
             environment.observe(&mut observation);

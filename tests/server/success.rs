@@ -3,10 +3,11 @@
 use crate::common::{episodes, observe, settings, step};
 use perturb::{
     env::{
-        self, Action, ActionSpace, Channel, Environment, EnvironmentSpec, EpisodeEnd, Episodes, Error, Outcome, Pose,
-        Purpose, RewardTerm, Stream, SuccessRule, Transition,
+        Action, ActionSpace, Channel, Environment, EnvironmentSpec, EpisodeEnd, Episodes, Error, Outcome, Purpose,
+        RewardTerm, Stream, SuccessRule, Transition, Version,
     },
-    physics::Version,
+    scene::Scene,
+    tasks,
 };
 
 const LIMIT: u32 = 8;
@@ -17,6 +18,7 @@ const fn scripted_spec(success: SuccessRule) -> EnvironmentSpec {
         name: "Scripted",
         revision: 0,
         description: "Plays a script of transitions.",
+        make: || unreachable!("it is given its script"),
         parameters: &[],
         observation: TIME,
         action: ActionSpace::Discrete(&["nothing", "something"]),
@@ -63,7 +65,7 @@ impl Environment for Scripted {
         out[0] = self.time as f32;
     }
 
-    fn pose(&self) -> Option<Pose> {
+    fn scene(&self) -> Option<Scene> {
         None
     }
 
@@ -148,7 +150,7 @@ fn divergence_is_reported_with_the_episode() {
 #[test]
 fn a_state_beyond_f32_ends_the_episode_with_the_last_one_that_was_not() {
     for (name, state) in [("CartPole", [0.0, 0.0, 0.1, 1e30]), ("Acrobot", [0.1, 0.1, 1e300, 1e300])] {
-        let mut environment = env::make(name).unwrap();
+        let mut environment = tasks::catalogue().find(name).and_then(|spec| (spec.make)()).unwrap();
         environment.reset_to(&state);
         let mut terms = vec![f64::NAN; 1];
         let transition = environment.step(Action::Discrete(1), &mut terms);
@@ -180,7 +182,7 @@ fn counts_start_anew_with_every_episode() {
 
 /// The discrete environment from this state, acting by `policy` (of the time and the observation) until the end.
 fn drive(name: &str, state: &[f64], policy: impl Fn(u32, &[f32]) -> i32) -> (Outcome, EpisodeEnd) {
-    let mut e = episodes(env::find(name).unwrap(), Version::Default, 0, 0, 1);
+    let mut e = episodes(tasks::catalogue().find(name).unwrap(), Version::Default, 0, 0, 1);
     e.begin(Some(state));
     for t in 0.. {
         let action = policy(t, &observe(&e)).to_le_bytes();
@@ -261,15 +263,14 @@ fn acrobot_succeeds_up_to_80_steps() {
 
 #[test]
 fn pendulum_succeeds_if_the_last_100_steps_were_near_upright() {
-    let spec = env::find("Pendulum").unwrap();
+    let spec = tasks::catalogue().find("Pendulum").unwrap();
     // A rod so light that the torque can hold it anywhere.
-    let light =
-        [("length", 1.0), ("mass", 0.1)].map(|(name, value)| (name, perturb::physics::Distribution::fixed(value)));
+    let light = [("length", 1.0), ("mass", 0.1)].map(|(name, value)| (name, perturb::env::Distribution::fixed(value)));
     let mut settings = settings(spec, Version::Default, 0, 0, 1);
-    perturb::physics::resolve(spec, &mut settings.distributions, light).unwrap();
+    perturb::env::resolve(spec, &mut settings.distributions, light).unwrap();
     let mut entries = Vec::new();
     for release in 80..110 {
-        let mut e = Episodes::new(env::make(spec.name).unwrap(), settings.clone());
+        let mut e = Episodes::new((spec.make)().unwrap(), settings.clone());
         e.begin(Some(&[1.3, 0.0]));
         let mut near = Vec::new();
         for t in 0..spec.step_limit {
@@ -300,7 +301,7 @@ fn check_goal(
     expected: impl Fn(&[f64]) -> (bool, bool),
     margin: impl Fn(&[f64]) -> f64,
 ) {
-    let mut environment = env::make(name).unwrap();
+    let mut environment = tasks::catalogue().find(name).and_then(|spec| (spec.make)()).unwrap();
     let mut stream = Stream::new(1, 0, Purpose::InitialState, 0);
     let mut terms = vec![0.0; environment.spec().reward_terms.len()];
     let mut near = [0, 0];

@@ -54,7 +54,9 @@ impl Agent {
                 Ok(Response::LeaveWorld(rpc::LeaveWorldResponse {}))
             }
             Some(Request::DestroyWorld(destroy)) => self.destroy_world(&destroy).map(Response::DestroyWorld),
-            Some(Request::Extension(any)) => properties::answer(self.joined.as_ref(), &any).map(Response::Extension),
+            Some(Request::Extension(any)) => {
+                properties::answer(self.worlds.catalogue(), self.joined.as_ref(), &any).map(Response::Extension)
+            }
             None => {
                 let expected = "create_world, join_world, step, …";
                 Err(Refusal::value("request", "empty or of a kind this server does not know", expected))
@@ -71,7 +73,7 @@ impl Agent {
         if self.sessions.phase() != Phase::Running {
             return Err(Refusal::Draining);
         }
-        let (settings, version) = settings::create(&request.settings)?;
+        let (settings, version) = settings::create(self.worlds.catalogue(), &request.settings)?;
         let runner = Runner::open(self.worlds.pool(), settings, version).await?;
         Ok(rpc::CreateWorldResponse { world_name: self.worlds.add(self.id, runner) })
     }

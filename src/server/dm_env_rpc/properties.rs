@@ -7,7 +7,7 @@ use super::{
     tensors,
 };
 use crate::{
-    env::{self, EpisodeId, Receipt, shorten},
+    env::{Catalogue, EpisodeId, Receipt, shorten},
     proto::dm_env_rpc::v1::{
         DataType, Tensor, TensorSpec,
         extensions::properties::{
@@ -54,7 +54,7 @@ enum Value {
 ///
 /// # Errors
 /// If it is of another extension or cannot be decoded, or for what the request is refused for.
-pub(super) fn answer(joined: Option<&Joined>, request: &Any) -> Result<Any, Refusal> {
+pub(super) fn answer(catalogue: &Catalogue, joined: Option<&Joined>, request: &Any) -> Result<Any, Refusal> {
     let name = request.type_url.rsplit('/').next().unwrap_or_default();
     if name != REQUEST {
         return Err(Refusal::UnknownExtension { name: shorten(name), known: REQUEST });
@@ -62,7 +62,7 @@ pub(super) fn answer(joined: Option<&Joined>, request: &Any) -> Result<Any, Refu
     let expected = "read_property, write_property or list_property";
     let request = PropertyRequest::decode(request.value.as_slice())
         .map_err(|error| Refusal::value("extension", format!("no {REQUEST}: {error}"), expected))?;
-    let properties = properties(joined);
+    let properties = properties(catalogue, joined);
     let response = match request.payload {
         Some(Request::ReadProperty(read)) => {
             let property = find(&properties, &read.key)?;
@@ -84,8 +84,8 @@ pub(super) fn answer(joined: Option<&Joined>, request: &Any) -> Result<Any, Refu
 }
 
 /// All properties, in a fixed order: the server's, then those of the joined world.
-fn properties(joined: Option<&Joined>) -> Vec<Property> {
-    let names = env::names().map(String::from).collect();
+fn properties(catalogue: &Catalogue, joined: Option<&Joined>) -> Vec<Property> {
+    let names = catalogue.names().map(String::from).collect();
     let mut all = vec![
         Property::new("server_version", "the server's version", Value::Text(env!("CARGO_PKG_VERSION").into())),
         Property::new("environments", "what env_id may be in create_world", Value::Texts(names)),

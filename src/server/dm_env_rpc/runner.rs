@@ -2,8 +2,7 @@
 
 use super::world::Changes;
 use crate::{
-    env::{EnvironmentSpec, EpisodeStart},
-    physics::Version,
+    env::{EnvironmentSpec, EpisodeStart, Version},
     pool::{Batch, BatchSettings, Pool, ResetEntry, Stepped},
     proto::dm_env_rpc::v1::EnvironmentStateType as State,
     server::status::Refusal,

@@ -2,6 +2,7 @@
 
 use super::{agent::Agent, worlds::Worlds};
 use crate::{
+    env::Catalogue,
     pool::Pool,
     proto::dm_env_rpc::v1::{EnvironmentRequest, EnvironmentResponse, environment_server::Environment},
     server::conversation::{Dialogue, Responses, Sessions},
@@ -18,8 +19,8 @@ pub struct Service {
 
 impl Service {
     /// A service over a pool, without worlds.
-    pub fn new(pool: Arc<Pool>, sessions: Sessions) -> Self {
-        Self { worlds: Arc::new(Worlds::new(pool)), sessions }
+    pub fn new(pool: Arc<Pool>, catalogue: Arc<Catalogue>, sessions: Sessions) -> Self {
+        Self { worlds: Arc::new(Worlds::new(pool, catalogue)), sessions }
     }
 }
 

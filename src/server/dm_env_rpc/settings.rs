@@ -2,8 +2,7 @@
 
 use super::tensors;
 use crate::{
-    env::{self, EnvironmentSpec, shorten},
-    physics::Version,
+    env::{Catalogue, EnvironmentSpec, Version, shorten},
     pool::BatchSettings,
     proto::{self, dm_env_rpc::v1::Tensor},
     server::{convert, status::Refusal},
@@ -33,12 +32,12 @@ pub(super) struct Change {
 ///
 /// # Errors
 /// For settings that are missing, unknown, of a wrong type or out of range.
-pub(super) fn create(settings: &Settings) -> Result<(BatchSettings, Version), Refusal> {
+pub(super) fn create(catalogue: &Catalogue, settings: &Settings) -> Result<(BatchSettings, Version), Refusal> {
     let id = settings.get(ENV_ID).ok_or_else(|| {
-        let expected = format!("a STRING scalar, one of {}", env::names().collect::<Vec<_>>().join(", "));
+        let expected = format!("a STRING scalar, one of {}", catalogue.names().collect::<Vec<_>>().join(", "));
         Refusal::value(field(ENV_ID), "missing", expected)
     })?;
-    let spec = environment(tensors::text(&field(ENV_ID), id)?)?;
+    let spec = environment(catalogue, tensors::text(&field(ENV_ID), id)?)?;
     let own = [ENV_ID, VERSION, SEED, ENVIRONMENT_INDEX, EPISODES_PER_TRIAL];
     check_names(spec, "create_world", &own, settings)?;
     let integer = |name, default, low, high| match settings.get(name) {
@@ -48,24 +47,27 @@ pub(super) fn create(settings: &Settings) -> Result<(BatchSettings, Version), Re
     let small =
         |name, default, low| integer(name, default, low, u32::MAX.into()).map(|n| u32::try_from(n).unwrap_or(u32::MAX));
     let version = version(settings)?.unwrap_or(Version::Default);
-    let batch = convert::open(proto::Open {
-        environment: spec.name.into(),
-        version: match version {
-            Version::Default => proto::Version::Default,
-            Version::Random => proto::Version::Random,
-            Version::Extreme => proto::Version::Extreme,
-        }
-        .into(),
-        parameters: parameters(spec, settings)?,
-        batch_size: 1,
-        seed: integer(SEED, 0, 0, u64::MAX)?,
-        first_environment_index: small(ENVIRONMENT_INDEX, 0, 0)?,
-        episodes_per_trial: small(EPISODES_PER_TRIAL, 1, 1)?,
-        // An agent's step after the end begins the next episode by a reset.
-        autoreset_mode: proto::AutoresetMode::Disabled.into(),
-        receipts: true,
-        reward_terms: false,
-    })?;
+    let batch = convert::open(
+        catalogue,
+        proto::Open {
+            environment: spec.name.into(),
+            version: match version {
+                Version::Default => proto::Version::Default,
+                Version::Random => proto::Version::Random,
+                Version::Extreme => proto::Version::Extreme,
+            }
+            .into(),
+            parameters: parameters(spec, settings)?,
+            batch_size: 1,
+            seed: integer(SEED, 0, 0, u64::MAX)?,
+            first_environment_index: small(ENVIRONMENT_INDEX, 0, 0)?,
+            episodes_per_trial: small(EPISODES_PER_TRIAL, 1, 1)?,
+            // An agent's step after the end begins the next episode by a reset.
+            autoreset_mode: proto::AutoresetMode::Disabled.into(),
+            receipts: true,
+            reward_terms: false,
+        },
+    )?;
     Ok((batch, version))
 }
 
@@ -125,9 +127,9 @@ pub(super) fn fixed(value: f64) -> proto::Distribution {
 }
 
 /// By the catalogue's name, or the id that Gymnasium knows it by.
-fn environment(id: &str) -> Result<&'static EnvironmentSpec, Refusal> {
+fn environment(catalogue: &Catalogue, id: &str) -> Result<&'static EnvironmentSpec, Refusal> {
     let gymnasium = |spec: &&EnvironmentSpec| id == format!("perturb/{}-v{}", spec.name, spec.revision);
-    Ok(env::specs().find(gymnasium).map_or_else(|| env::find(id), Ok)?)
+    Ok(catalogue.specs().find(gymnasium).map_or_else(|| catalogue.find(id), Ok)?)
 }
 
 fn version(settings: &Settings) -> Result<Option<Version>, Refusal> {

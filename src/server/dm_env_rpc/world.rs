@@ -2,8 +2,7 @@
 
 use super::{runner::Runner, settings::Change};
 use crate::{
-    env::EnvironmentSpec,
-    physics::{Distribution, Version},
+    env::{Distribution, EnvironmentSpec, Version},
     server::{convert, status::Refusal},
 };
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};

@@ -1,7 +1,11 @@
 //! All worlds of the server, by name. A world lives as long as the stream that made it or an agent that is in it.
 
 use super::{runner::Runner, world::World};
-use crate::{env::shorten, pool::Pool, server::status::Refusal};
+use crate::{
+    env::{Catalogue, shorten},
+    pool::Pool,
+    server::status::Refusal,
+};
 use std::{
     collections::BTreeMap,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
@@ -13,6 +17,7 @@ pub(super) type StreamId = u64;
 /// The registry that all streams share.
 pub(super) struct Worlds {
     pool: Arc<Pool>,
+    catalogue: Arc<Catalogue>,
     registry: Mutex<Registry>,
 }
 
@@ -34,13 +39,18 @@ struct Entry {
 
 impl Worlds {
     /// No worlds yet.
-    pub(super) fn new(pool: Arc<Pool>) -> Self {
-        Self { pool, registry: Mutex::default() }
+    pub(super) fn new(pool: Arc<Pool>, catalogue: Arc<Catalogue>) -> Self {
+        Self { pool, catalogue, registry: Mutex::default() }
     }
 
     /// Where worlds' environments run.
     pub(super) fn pool(&self) -> &Pool {
         &self.pool
+    }
+
+    /// The environments that there may be worlds of.
+    pub(super) fn catalogue(&self) -> &Catalogue {
+        &self.catalogue
     }
 
     /// A new stream's id.

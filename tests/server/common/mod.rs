@@ -2,10 +2,7 @@
 
 pub mod server;
 
-use perturb::{
-    env::{self, Action, ActionSpace, EnvironmentSpec, Episodes, Outcome, Purpose, Settings, Stream},
-    physics::Version,
-};
+use perturb::env::{Action, ActionSpace, EnvironmentSpec, Episodes, Outcome, Purpose, Settings, Stream, Version};
 
 /// Settings of an environment of this version.
 pub fn settings(spec: &EnvironmentSpec, version: Version, seed: u64, index: u32, per_trial: u32) -> Settings {
@@ -19,7 +16,7 @@ pub fn settings(spec: &EnvironmentSpec, version: Version, seed: u64, index: u32,
 
 /// The environment at the start of its first episode.
 pub fn episodes(spec: &EnvironmentSpec, version: Version, seed: u64, index: u32, per_trial: u32) -> Episodes {
-    Episodes::new(env::make(spec.name).unwrap(), settings(spec, version, seed, index, per_trial))
+    Episodes::new((spec.make)().unwrap(), settings(spec, version, seed, index, per_trial))
 }
 
 /// The wire's bytes of the action that actor number `actor` takes at time `t`: random, but a function of these alone.

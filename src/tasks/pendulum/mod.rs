@@ -3,21 +3,28 @@
 //! Source: Gymnasium 1.4 `Pendulum-v1`, g = 10. The speed is clipped before it moves the angle; the Gym of 2018, which
 //! the paper used, clipped it after.
 
+mod drawing;
+
+use super::analytic;
 use crate::{
     env::{
-        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Pose, Quantity, RewardTerm, Stream,
+        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Parameter, Quantity, RewardTerm, Stream,
         SuccessRule, Transition,
     },
-    physics,
+    scene::Scene,
 };
 use std::f64::consts::PI;
 
 /// What is fixed about Pendulum.
-pub static PENDULUM: EnvironmentSpec = EnvironmentSpec {
+pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "Pendulum",
     revision: 0,
     description: "Swing a rod up with a weak torque and hold it upright.",
-    parameters: physics::PENDULUM,
+    make: || Ok(Box::new(Pendulum::new())),
+    parameters: &[
+        Parameter::new("length", "m", "length of the rod", (0.01, 100.0)).versions(1.0, (0.75, 1.25), (0.5, 1.5)),
+        Parameter::new("mass", "kg", "mass of the rod", (0.001, 1000.0)).versions(1.0, (0.75, 1.25), (0.5, 1.5)),
+    ],
     observation: &[
         Channel::new("cos_theta", "1", -1.0, 1.0),
         Channel::new("sin_theta", "1", -1.0, 1.0),
@@ -61,7 +68,7 @@ pub struct Pendulum {
 impl Pendulum {
     /// With default parameters, upright.
     pub fn new() -> Self {
-        let [length, mass] = [0, 1].map(|i: usize| physics::PENDULUM[i].default);
+        let [length, mass] = [0, 1].map(|i: usize| SPEC.parameters[i].default);
         Self { length, mass, state: [0.0; 2], torque: None }
     }
 
@@ -77,7 +84,7 @@ impl Pendulum {
 
         let acceleration = 3.0 * GRAVITY / (2.0 * l) * theta.sin() + 3.0 / (m * (l * l)) * u;
         let velocity = (velocity + acceleration * DT).clamp(-MAX_SPEED, MAX_SPEED);
-        let diverged = super::advance(&mut self.state, [theta + velocity * DT, velocity]);
+        let diverged = analytic::advance(&mut self.state, [theta + velocity * DT, velocity]);
         Transition { terminated: diverged, goal: normalise(self.state[0]).abs() < UPRIGHT, diverged }
     }
 }
@@ -95,7 +102,7 @@ fn normalise(angle: f64) -> f64 {
 
 impl Environment for Pendulum {
     fn spec(&self) -> &'static EnvironmentSpec {
-        &PENDULUM
+        &SPEC
     }
 
     fn set_parameters(&mut self, values: &[f64]) {
@@ -121,10 +128,9 @@ impl Environment for Pendulum {
         out.copy_from_slice(&[theta.cos() as f32, theta.sin() as f32, velocity as f32]);
     }
 
-    fn pose(&self) -> Option<Pose> {
+    fn scene(&self) -> Option<Scene> {
         let [angle, _] = self.state;
-        let torque = self.torque.map(|torque| torque / MAX_TORQUE);
-        Some(Pose::Pendulum { angle, length: self.length, upright: UPRIGHT, torque })
+        Some(Scene::Drawing(drawing::drawing(angle, self.length, self.torque)))
     }
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
@@ -139,7 +145,7 @@ impl Environment for Pendulum {
     }
 
     fn load(&mut self, state: &[f64]) -> Result<(), Error> {
-        self.state = super::load(state)?;
+        self.state = analytic::load(state)?;
         self.torque = None;
         Ok(())
     }

@@ -3,21 +3,33 @@
 //! Source: Sutton (1996); Gymnasium 1.4 `Acrobot-v1` ("book" equations, fourth-order Runge-Kutta). As in the paper's
 //! code the links' centres of mass stay at 0.5 m when `length` changes.
 
+mod drawing;
+
+use super::analytic;
 use crate::{
     env::{
-        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Pose, Quantity, RewardTerm, Stream,
+        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Parameter, Quantity, RewardTerm, Stream,
         SuccessRule, Transition,
     },
-    physics,
+    scene::Scene,
 };
 use std::f64::consts::PI;
 
 /// What is fixed about Acrobot.
-pub static ACROBOT: EnvironmentSpec = EnvironmentSpec {
+pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "Acrobot",
     revision: 0,
     description: "Swing the tip of a two-link pendulum above a line.",
-    parameters: physics::ACROBOT,
+    make: || Ok(Box::new(Acrobot::new())),
+    parameters: &[
+        Parameter::new("length", "m", "length of both links", (0.01, 100.0)).versions(1.0, (0.75, 1.25), (0.5, 1.5)),
+        Parameter::new("mass", "kg", "mass of both links", (0.001, 1000.0)).versions(1.0, (0.75, 1.25), (0.5, 1.5)),
+        Parameter::new("moi", "kg m²", "moment of inertia of both links", (0.001, 1000.0)).versions(
+            1.0,
+            (0.75, 1.25),
+            (0.5, 1.5),
+        ),
+    ],
     observation: &[
         Channel::new("cos_theta1", "1", -1.0, 1.0),
         Channel::new("sin_theta1", "1", -1.0, 1.0),
@@ -67,7 +79,7 @@ pub struct Acrobot {
 impl Acrobot {
     /// With default parameters, hanging.
     pub fn new() -> Self {
-        let [link_length, link_mass, link_moi] = [0, 1, 2].map(|i: usize| physics::ACROBOT[i].default);
+        let [link_length, link_mass, link_moi] = [0, 1, 2].map(|i: usize| SPEC.parameters[i].default);
         Self { link_length, link_mass, link_moi, state: [0.0; 4] }
     }
 
@@ -124,7 +136,7 @@ fn wrap(mut angle: f64) -> f64 {
 
 impl Environment for Acrobot {
     fn spec(&self) -> &'static EnvironmentSpec {
-        &ACROBOT
+        &SPEC
     }
 
     fn set_parameters(&mut self, values: &[f64]) {
@@ -136,7 +148,7 @@ impl Environment for Acrobot {
     }
 
     fn reset(&mut self, stream: &mut Stream) {
-        self.state = super::draw(stream, -RESET_RANGE, RESET_RANGE);
+        self.state = analytic::draw(stream, -RESET_RANGE, RESET_RANGE);
     }
 
     fn reset_to(&mut self, state: &[f64]) {
@@ -149,15 +161,13 @@ impl Environment for Acrobot {
         out.copy_from_slice(&values.map(|x| x as f32));
     }
 
-    fn pose(&self) -> Option<Pose> {
+    fn scene(&self) -> Option<Scene> {
         let [theta1, theta2, _, _] = self.state;
-        // The task's height is in lengths of a link: it adds cosines.
-        let goal_height = HEIGHT * self.link_length;
-        Some(Pose::Acrobot { angles: [theta1, theta2], link_length: self.link_length, goal_height })
+        Some(Scene::Drawing(drawing::drawing([theta1, theta2], self.link_length)))
     }
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
-        let torque = f64::from(super::choice(action)) - 1.0;
+        let torque = f64::from(analytic::choice(action)) - 1.0;
         let [theta1, theta2, dtheta1, dtheta2] = self.runge_kutta(self.state, torque);
         let next = [
             wrap(theta1),
@@ -165,7 +175,7 @@ impl Environment for Acrobot {
             dtheta1.clamp(-MAX_VELOCITY_1, MAX_VELOCITY_1),
             dtheta2.clamp(-MAX_VELOCITY_2, MAX_VELOCITY_2),
         ];
-        let diverged = super::advance(&mut self.state, next);
+        let diverged = analytic::advance(&mut self.state, next);
 
         let goal = -self.state[0].cos() - (self.state[1] + self.state[0]).cos() > HEIGHT;
         reward_terms[0] = if goal { 0.0 } else { -1.0 };
@@ -177,7 +187,7 @@ impl Environment for Acrobot {
     }
 
     fn load(&mut self, state: &[f64]) -> Result<(), Error> {
-        self.state = super::load(state)?;
+        self.state = analytic::load(state)?;
         Ok(())
     }
 }

@@ -1,7 +1,6 @@
 //! A physical parameter, and the three versions of an environment.
 
-use super::{Distribution, Interval};
-use crate::env::{EnvironmentSpec, Error, shorten};
+use super::{Distribution, EnvironmentSpec, Error, Interval, shorten};
 
 /// Where parameters come from: the three versions of every environment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -34,6 +33,21 @@ pub struct Parameter {
 }
 
 impl Parameter {
+    /// A parameter with physical bounds, whose sets are given by [`Parameter::versions`].
+    pub const fn new(name: &'static str, unit: &'static str, description: &'static str, bounds: (f64, f64)) -> Self {
+        let (bounds, none) = (Interval::new(bounds.0, bounds.1), Interval::new(0.0, 0.0));
+        Self { name, unit, description, default: 0.0, random: none, extreme: [none; 2], bounds }
+    }
+
+    /// The same with the sets of its versions: the value of D, the interval of R, and the interval that E fills up around
+    /// it.
+    pub const fn versions(mut self, default: f64, random: (f64, f64), around: (f64, f64)) -> Self {
+        self.default = default;
+        self.random = Interval::new(random.0, random.1);
+        self.extreme = [Interval::new(around.0, random.0), Interval::new(random.1, around.1)];
+        self
+    }
+
     /// The distribution of a version.
     pub fn distribution(&self, version: Version) -> Distribution {
         let intervals: &[Interval] = match version {

@@ -1,12 +1,16 @@
 //! Hopper: hop forward on one leg.
 
-use super::{
-    channels::{APPLIED, CONTROL_TIMESTEP, REWARD_TERMS, joint_state, position, root_state, speed, torso, velocity},
-    walker::{Posture, Task, Walker},
+use super::locomotion::{
+    Posture, SCENERY, Task, Walker,
+    channels::{
+        APPLIED, CONTROL_TIMESTEP, DENSITY, FRICTION, REWARD_TERMS, joint_state, position, power, root_state, speed,
+        torso, velocity,
+    },
+    colours::*,
 };
 use crate::{
     env::{ActionSpace, Channel, EnvironmentSpec, Error, SuccessRule},
-    physics,
+    scene::Look,
 };
 use std::sync::OnceLock;
 
@@ -26,11 +30,12 @@ use std::sync::OnceLock;
 /// above 0.8 m and its pitch within ±1 rad.
 ///
 /// Revision 0: Roboschool's `RoboschoolHopper-v1` on MuJoCo.
-pub static HOPPER: EnvironmentSpec = EnvironmentSpec {
+pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "Hopper",
     revision: 0,
     description: "Hop forward on one leg without falling.",
-    parameters: physics::HOPPER,
+    make: || Ok(Box::new(hopper()?)),
+    parameters: &[power(0.75, (0.6, 0.9), (0.4, 1.1)), DENSITY, FRICTION],
     observation: &[
         torso::HEIGHT,
         torso::TARGET_SIN,
@@ -77,8 +82,17 @@ pub static HOPPER: EnvironmentSpec = EnvironmentSpec {
 };
 
 static TASK: Task = Task {
-    spec: &HOPPER,
-    mjcf: include_str!("../../models/hopper.xml"),
+    spec: &SPEC,
+    look: Look {
+        name: SPEC.name,
+        mjcf: include_str!("../../../models/hopper.xml"),
+        scenery: SCENERY,
+        hidden: "floor",
+        followed: "torso",
+        camera_distance: 3.0,
+        camera_height: 0.75,
+        colours: &[("torso", BLUE), ("thigh", SKY_BLUE), ("leg", ORANGE), ("foot", VERMILLION)],
+    },
     joints: &["thigh", "leg", "foot"],
     contacts: &["foot"],
     alive,

@@ -1,22 +1,9 @@
-//! The four analytic tasks, with Gymnasium 1.4's dynamics in f64.
-//!
-//! Every file has the same parts in the same order: spec, parameters and derived quantities, reset, dynamics, reward
-//! and termination.
-
-mod acrobot;
-mod cart_pole;
-mod mountain_car;
-mod pendulum;
-
-pub use acrobot::{ACROBOT, Acrobot};
-pub use cart_pole::{CART_POLE, CartPole};
-pub use mountain_car::{MOUNTAIN_CAR, MountainCar};
-pub use pendulum::{PENDULUM, Pendulum};
+//! What the analytic tasks share. Their dynamics are Gymnasium 1.4's in f64.
 
 use crate::env::{Action, Error, Stream};
 
 /// The choice that a validated action holds. The pool checks actions against the space before they get here.
-fn choice(action: Action<'_>) -> u32 {
+pub(super) fn choice(action: Action<'_>) -> u32 {
     match action {
         Action::Discrete(choice) => choice,
         Action::Continuous(_) => unreachable!("a discrete environment is stepped with validated choices"),
@@ -25,7 +12,7 @@ fn choice(action: Action<'_>) -> u32 {
 
 /// Takes over the state that the dynamics computed, or keeps the last one if that cannot be observed as f32: then the
 /// dynamics diverged, which absurd parameters or states can bring about. Returns whether they did.
-fn advance<const N: usize>(state: &mut [f64; N], next: [f64; N]) -> bool {
+pub(super) fn advance<const N: usize>(state: &mut [f64; N], next: [f64; N]) -> bool {
     let diverged = !observable(&next);
     if !diverged {
         *state = next;
@@ -38,7 +25,7 @@ fn observable(state: &[f64]) -> bool {
 }
 
 /// Takes back a saved state of exactly `N` finite numbers.
-fn load<const N: usize>(state: &[f64]) -> Result<[f64; N], Error> {
+pub(super) fn load<const N: usize>(state: &[f64]) -> Result<[f64; N], Error> {
     match <[f64; N]>::try_from(state) {
         Ok(state) if observable(&state) => Ok(state),
         Ok(_) => Err(Error::Snapshot { reason: "its state is not finite".into() }),
@@ -47,6 +34,6 @@ fn load<const N: usize>(state: &[f64]) -> Result<[f64; N], Error> {
 }
 
 /// Draws a state with every entry uniform in [low, high), in order.
-fn draw<const N: usize>(stream: &mut Stream, low: f64, high: f64) -> [f64; N] {
+pub(super) fn draw<const N: usize>(stream: &mut Stream, low: f64, high: f64) -> [f64; N] {
     std::array::from_fn(|_| stream.uniform(low, high))
 }

@@ -1,12 +1,16 @@
 //! HalfCheetah: run forward on two legs.
 
-use super::{
-    channels::{APPLIED, CONTROL_TIMESTEP, REWARD_TERMS, joint_state, position, root_state, speed, torso, velocity},
-    walker::{Posture, Task, Walker},
+use super::locomotion::{
+    Posture, SCENERY, Task, Walker,
+    channels::{
+        APPLIED, CONTROL_TIMESTEP, DENSITY, FRICTION, REWARD_TERMS, joint_state, position, power, root_state, speed,
+        torso, velocity,
+    },
+    colours::*,
 };
 use crate::{
     env::{ActionSpace, Channel, EnvironmentSpec, Error, SuccessRule},
-    physics,
+    scene::Look,
 };
 use std::sync::OnceLock;
 
@@ -26,11 +30,12 @@ use std::sync::OnceLock;
 /// within ±1 rad and no thigh or shin touches the floor.
 ///
 /// Revision 0: Roboschool's `RoboschoolHalfCheetah-v1` on MuJoCo.
-pub static HALF_CHEETAH: EnvironmentSpec = EnvironmentSpec {
+pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "HalfCheetah",
     revision: 0,
     description: "Run forward on two legs without falling.",
-    parameters: physics::HALF_CHEETAH,
+    make: || Ok(Box::new(half_cheetah()?)),
+    parameters: &[power(0.9, (0.7, 1.1), (0.5, 1.3)), DENSITY, FRICTION],
     observation: &[
         torso::HEIGHT,
         torso::TARGET_SIN,
@@ -97,8 +102,26 @@ pub static HALF_CHEETAH: EnvironmentSpec = EnvironmentSpec {
 };
 
 static TASK: Task = Task {
-    spec: &HALF_CHEETAH,
-    mjcf: include_str!("../../models/half_cheetah.xml"),
+    spec: &SPEC,
+    look: Look {
+        name: SPEC.name,
+        mjcf: include_str!("../../../models/half_cheetah.xml"),
+        scenery: SCENERY,
+        hidden: "floor",
+        followed: "torso",
+        camera_distance: 3.0,
+        camera_height: 0.55,
+        colours: &[
+            ("torso", GREY),
+            ("head", GREY),
+            ("bthigh", BLUE),
+            ("bshin", BLUE),
+            ("bfoot", SKY_BLUE),
+            ("fthigh", VERMILLION),
+            ("fshin", VERMILLION),
+            ("ffoot", ORANGE),
+        ],
+    },
     joints: &["bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"],
     contacts: &["ffoot", "fshin", "fthigh", "bfoot", "bshin", "bthigh"],
     alive,

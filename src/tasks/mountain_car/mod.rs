@@ -2,12 +2,15 @@
 //!
 //! Source: Moore (1990); Gymnasium 1.4 `MountainCar-v0`.
 
+mod drawing;
+
+use super::analytic;
 use crate::{
     env::{
-        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Pose, Quantity, RewardTerm, Stream,
+        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Parameter, Quantity, RewardTerm, Stream,
         SuccessRule, Transition,
     },
-    physics,
+    scene::Scene,
 };
 
 const STATE: &[Channel] = &[
@@ -16,11 +19,23 @@ const STATE: &[Channel] = &[
 ];
 
 /// What is fixed about MountainCar.
-pub static MOUNTAIN_CAR: EnvironmentSpec = EnvironmentSpec {
+pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "MountainCar",
     revision: 0,
     description: "Swing an underpowered car up a hill.",
-    parameters: physics::MOUNTAIN_CAR,
+    make: || Ok(Box::new(MountainCar::new())),
+    parameters: &[
+        Parameter::new("force", "1", "the engine's push per step", (0.0, 1.0)).versions(
+            0.001,
+            (0.0005, 0.005),
+            (0.0001, 0.01),
+        ),
+        Parameter::new("mass", "1", "the gravity term's factor", (0.0, 1.0)).versions(
+            0.0025,
+            (0.001, 0.005),
+            (0.0005, 0.01),
+        ),
+    ],
     observation: STATE,
     action: ActionSpace::Discrete(&["push_left", "coast", "push_right"]),
     state: STATE,
@@ -52,7 +67,7 @@ pub struct MountainCar {
 impl MountainCar {
     /// With default parameters, at the valley's bottom.
     pub fn new() -> Self {
-        let [force, gravity] = [0, 1].map(|i: usize| physics::MOUNTAIN_CAR[i].default);
+        let [force, gravity] = [0, 1].map(|i: usize| SPEC.parameters[i].default);
         Self { force, gravity, state: [-0.5, 0.0] }
     }
 }
@@ -65,7 +80,7 @@ impl Default for MountainCar {
 
 impl Environment for MountainCar {
     fn spec(&self) -> &'static EnvironmentSpec {
-        &MOUNTAIN_CAR
+        &SPEC
     }
 
     fn set_parameters(&mut self, values: &[f64]) {
@@ -88,14 +103,14 @@ impl Environment for MountainCar {
         out.copy_from_slice(&self.state.map(|x| x as f32));
     }
 
-    fn pose(&self) -> Option<Pose> {
+    fn scene(&self) -> Option<Scene> {
         let [position, _] = self.state;
-        Some(Pose::MountainCar { position, low: MIN_POSITION, high: MAX_POSITION, goal: GOAL_POSITION })
+        Some(Scene::Drawing(drawing::drawing(position)))
     }
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
         let [mut position, mut velocity] = self.state;
-        let push = f64::from(super::choice(action)) - 1.0;
+        let push = f64::from(analytic::choice(action)) - 1.0;
         velocity += push * self.force + (3.0 * position).cos() * -self.gravity;
         velocity = velocity.clamp(-MAX_SPEED, MAX_SPEED);
         position = (position + velocity).clamp(MIN_POSITION, MAX_POSITION);
@@ -114,7 +129,7 @@ impl Environment for MountainCar {
     }
 
     fn load(&mut self, state: &[f64]) -> Result<(), Error> {
-        self.state = super::load(state)?;
+        self.state = analytic::load(state)?;
         Ok(())
     }
 }

@@ -1,6 +1,6 @@
 //! Uniform distributions over unions of intervals, as data.
 
-use crate::env::{Error, shorten};
+use super::{Error, shorten};
 use std::fmt;
 
 /// The most intervals of one distribution: every environment holds its own copy.

@@ -2,21 +2,33 @@
 //!
 //! Source: Barto, Sutton and Anderson (1983); Gymnasium 1.4 `CartPole-v1` (explicit Euler) with the paper's step limit.
 
+mod drawing;
+
+use super::analytic;
 use crate::{
     env::{
-        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Pose, Quantity, RewardTerm, Stream,
+        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Parameter, Quantity, RewardTerm, Stream,
         SuccessRule, Transition,
     },
-    physics,
+    scene::Scene,
 };
 
 /// What is fixed about CartPole. The last observation of an episode lies beyond the limits that ended it, which is why
 /// the observation has no bounds.
-pub static CART_POLE: EnvironmentSpec = EnvironmentSpec {
+pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "CartPole",
     revision: 0,
     description: "Balance a pole on a cart by pushing the cart left or right.",
-    parameters: physics::CART_POLE,
+    make: || Ok(Box::new(CartPole::new())),
+    parameters: &[
+        Parameter::new("force", "N", "push on the cart", (0.0, 1000.0)).versions(10.0, (5.0, 15.0), (1.0, 20.0)),
+        Parameter::new("length", "m", "half the pole's length", (0.001, 100.0)).versions(
+            0.5,
+            (0.25, 0.75),
+            (0.05, 1.0),
+        ),
+        Parameter::new("mass", "kg", "the pole's mass", (0.0001, 1000.0)).versions(0.1, (0.05, 0.5), (0.01, 1.0)),
+    ],
     observation: &[
         Channel::unbounded("cart_position", "m"),
         Channel::unbounded("cart_velocity", "m/s"),
@@ -77,7 +89,7 @@ impl CartPole {
             inverse_total_mass: 0.0,
             state: [0.0; 4],
         };
-        cart_pole.set_parameters(&[0, 1, 2].map(|i: usize| physics::CART_POLE[i].default));
+        cart_pole.set_parameters(&[0, 1, 2].map(|i: usize| SPEC.parameters[i].default));
         cart_pole
     }
 }
@@ -90,7 +102,7 @@ impl Default for CartPole {
 
 impl Environment for CartPole {
     fn spec(&self) -> &'static EnvironmentSpec {
-        &CART_POLE
+        &SPEC
     }
 
     fn set_parameters(&mut self, values: &[f64]) {
@@ -106,7 +118,7 @@ impl Environment for CartPole {
     }
 
     fn reset(&mut self, stream: &mut Stream) {
-        self.state = super::draw(stream, -RESET_RANGE, RESET_RANGE);
+        self.state = analytic::draw(stream, -RESET_RANGE, RESET_RANGE);
     }
 
     fn reset_to(&mut self, state: &[f64]) {
@@ -117,20 +129,14 @@ impl Environment for CartPole {
         out.copy_from_slice(&self.state.map(|x| x as f32));
     }
 
-    fn pose(&self) -> Option<Pose> {
+    fn scene(&self) -> Option<Scene> {
         let [position, _, angle, _] = self.state;
-        Some(Pose::CartPole {
-            position,
-            angle,
-            half_pole_length: self.half_pole_length,
-            position_limit: POSITION_LIMIT,
-            angle_limit: ANGLE_LIMIT,
-        })
+        Some(Scene::Drawing(drawing::drawing(position, angle, self.half_pole_length)))
     }
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
         let [x, x_dot, theta, theta_dot] = self.state;
-        let force = if super::choice(action) == 1 { self.force } else { -self.force };
+        let force = if analytic::choice(action) == 1 { self.force } else { -self.force };
         let (sin, cos) = theta.sin_cos();
         let (pole_mass_length, inverse) = (self.pole_mass_length, self.inverse_total_mass);
         let temp = (force + pole_mass_length * (theta_dot * theta_dot) * sin) * inverse;
@@ -138,7 +144,7 @@ impl Environment for CartPole {
             / (self.half_pole_length * (4.0 / 3.0 - self.pole_mass * (cos * cos) * inverse));
         let x_acc = temp - pole_mass_length * theta_acc * cos * inverse;
         let next = [x + TAU * x_dot, x_dot + TAU * x_acc, theta + TAU * theta_dot, theta_dot + TAU * theta_acc];
-        let diverged = super::advance(&mut self.state, next);
+        let diverged = analytic::advance(&mut self.state, next);
 
         reward_terms[0] = 1.0;
         let inside = self.state[0].abs() <= POSITION_LIMIT && self.state[2].abs() <= ANGLE_LIMIT;
@@ -150,7 +156,7 @@ impl Environment for CartPole {
     }
 
     fn load(&mut self, state: &[f64]) -> Result<(), Error> {
-        self.state = super::load(state)?;
+        self.state = analytic::load(state)?;
         Ok(())
     }
 }

@@ -4,7 +4,10 @@ use super::{
     channels::{CLIP, CONTROL_TIMESTEP},
     model_edit::Targets,
 };
-use crate::env::{Action, Environment, EnvironmentSpec, Error, Pose, Stream, Transition};
+use crate::{
+    env::{Action, Environment, EnvironmentSpec, Error, Stream, Transition},
+    scene::{Look, PosedModel, Scene},
+};
 use perturb_mujoco::{Error as SimulationError, Kind, Model, Simulation};
 use sha2::{Digest, Sha256};
 use std::{fmt::Write, sync::OnceLock};
@@ -29,30 +32,31 @@ const MOST_JOINTS: usize = 6;
 const MOST_OBSERVATION: usize = N_TORSO + 2 * MOST_JOINTS + MOST_JOINTS;
 
 /// What differs between the robots.
-pub(super) struct Task {
-    pub(super) spec: &'static EnvironmentSpec,
-    pub(super) mjcf: &'static str,
+pub struct Task {
+    pub spec: &'static EnvironmentSpec,
+    /// The model, and how it is shown.
+    pub look: Look,
     /// Joints with motors, in the order of observations and actions.
-    pub(super) joints: &'static [&'static str],
+    pub joints: &'static [&'static str],
     /// Geoms whose contacts are observed, in order.
-    pub(super) contacts: &'static [&'static str],
-    pub(super) alive: fn(&Posture<'_>) -> bool,
+    pub contacts: &'static [&'static str],
+    pub alive: fn(&Posture<'_>) -> bool,
     /// Compiled once in the process.
-    pub(super) pristine: OnceLock<Result<Pristine, SimulationError>>,
+    pub pristine: OnceLock<Result<Pristine, SimulationError>>,
 }
 
 /// What decides whether a robot is alive.
-pub(super) struct Posture<'a> {
+pub struct Posture<'a> {
     /// The torso's centre of mass above the floor, m.
-    pub(super) height: f64,
+    pub height: f64,
     /// The torso's turn about +y, rad.
-    pub(super) pitch: f64,
+    pub pitch: f64,
     /// The contact flags of the step before, in the task's order.
-    pub(super) contacts: &'a [bool],
+    pub contacts: &'a [bool],
 }
 
 /// A model as compiled, and where its parts are.
-pub(super) struct Pristine {
+pub struct Pristine {
     model: Model,
     hash: String,
     targets: Targets,
@@ -79,7 +83,7 @@ impl Joint {
 
 impl Pristine {
     fn compile(task: &Task) -> Result<Self, SimulationError> {
-        let model = Model::from_xml(task.mjcf)?;
+        let model = Model::from_xml(task.look.mjcf)?;
         assert_eq!(model.timestep(), TIMESTEP, "the control timestep is four of these");
         assert_eq!((model.n_q(), model.n_act()), (N_ROOT + task.joints.len(), 0), "the model does not fit the task");
         let (qpos, dof) = (model.joint_qpos_address(), model.joint_dof_address());
@@ -93,7 +97,7 @@ impl Pristine {
         for (flag, name) in task.contacts.iter().enumerate() {
             flag_of_geom[model.id(Kind::Geom, name)?] = Some(flag);
         }
-        let hash = Sha256::digest(task.mjcf).iter().fold(String::new(), |mut hex, byte| {
+        let hash = Sha256::digest(task.look.mjcf).iter().fold(String::new(), |mut hex, byte| {
             let _ = write!(hex, "{byte:02x}"); // writing to a String cannot fail
             hex
         });
@@ -138,7 +142,7 @@ pub struct Walker {
 }
 
 impl Walker {
-    pub(super) fn new(task: &'static Task) -> Result<Self, Error> {
+    pub(in crate::tasks) fn new(task: &'static Task) -> Result<Self, Error> {
         let refuse = |error: &SimulationError| Error::Model { environment: task.spec.name, reason: error.to_string() };
         let pristine = task.pristine.get_or_init(|| Pristine::compile(task)).as_ref().map_err(refuse)?;
         let simulation = pristine.model.try_clone().and_then(Simulation::new).map_err(|error| refuse(&error))?;
@@ -166,7 +170,7 @@ impl Walker {
 
     /// The model's MJCF text, with default parameters.
     pub fn mjcf(&self) -> &'static str {
-        self.task.mjcf
+        self.task.look.mjcf
     }
 
     // ---- reset
@@ -332,11 +336,11 @@ impl Environment for Walker {
         out.copy_from_slice(&self.observation[..self.task.spec.observation.len()]);
     }
 
-    fn pose(&self) -> Option<Pose> {
+    fn scene(&self) -> Option<Scene> {
         let qpos = self.simulation.qpos();
         // After divergence MuJoCo may have put the initial state in its place.
         let known = !self.diverged && qpos.iter().all(|q| q.is_finite());
-        known.then(|| Pose::Robot { name: self.task.spec.name, mjcf: self.task.mjcf, qpos: qpos.to_vec() })
+        known.then(|| Scene::Model(PosedModel { look: &self.task.look, qpos: qpos.to_vec() }))
     }
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {

@@ -1,0 +1,203 @@
+//! What a picture of an environment shows, as data: environments tell it, and who draws it knows none of them.
+
+/// A point in m, y upwards. An infinite coordinate is the picture's edge.
+pub type Point = [f64; 2];
+
+/// Red, green, blue.
+pub type Colour = [u8; 3];
+
+/// Colours that colour-blind people tell apart (Okabe and Ito, 2008), and greys.
+#[allow(missing_docs, reason = "their names say it")]
+pub mod colour {
+    use super::Colour;
+
+    pub const BACKGROUND: Colour = [247, 249, 251];
+    pub const GROUND: Colour = [214, 219, 224];
+    pub const FAINT: Colour = [172, 180, 188];
+    pub const DARK: Colour = [52, 60, 68];
+    pub const BLUE: Colour = [0, 114, 178];
+    pub const SKY_BLUE: Colour = [86, 180, 233];
+    pub const ORANGE: Colour = [230, 159, 0];
+    pub const VERMILLION: Colour = [213, 94, 0];
+    pub const GREEN: Colour = [0, 158, 115];
+    pub const PALE_GREEN: Colour = [224, 240, 234];
+}
+
+/// What a picture shows.
+#[derive(Debug, Clone)]
+pub enum Scene {
+    /// Shapes in a plane.
+    Drawing(Drawing),
+    /// A MuJoCo model.
+    #[cfg(feature = "mujoco")]
+    Model(PosedModel),
+}
+
+/// Shapes, the hindmost first. Numbers may be absurdly large.
+#[derive(Debug, Clone)]
+pub struct Drawing {
+    /// The lower left corner of what has to be seen.
+    pub low: Point,
+    /// Its upper right corner.
+    pub high: Point,
+    /// What is drawn.
+    pub shapes: Vec<Shape>,
+}
+
+/// A shape of one colour.
+#[derive(Debug, Clone)]
+pub enum Shape {
+    /// A filled polygon.
+    Polygon {
+        /// In order.
+        corners: Vec<Point>,
+        /// Of its inside.
+        colour: Colour,
+    },
+    /// A filled disc.
+    Disc {
+        /// Its middle.
+        centre: Point,
+        /// In m.
+        radius: f64,
+        /// Of its inside.
+        colour: Colour,
+    },
+    /// A line through points, with round ends.
+    Line {
+        /// In order.
+        points: Vec<Point>,
+        /// In m.
+        width: f64,
+        /// Of the line.
+        colour: Colour,
+    },
+    /// A dashed line through points.
+    Dashes {
+        /// In order.
+        points: Vec<Point>,
+        /// In m.
+        width: f64,
+        /// Of the dashes.
+        colour: Colour,
+    },
+    /// The line of a graph.
+    Graph {
+        /// The line's course.
+        graph: Graph,
+        /// In m.
+        width: f64,
+        /// Of the line.
+        colour: Colour,
+    },
+    /// All that is below a graph.
+    Ground {
+        /// The upper side.
+        graph: Graph,
+        /// Of the ground.
+        colour: Colour,
+    },
+}
+
+/// A height as a function of x.
+#[derive(Debug, Clone, Copy)]
+pub struct Graph {
+    /// In m, both.
+    pub height: fn(f64) -> f64,
+    /// The least x.
+    pub from: f64,
+    /// The greatest x, which may be infinite.
+    pub to: f64,
+}
+
+impl Drawing {
+    /// A blank drawing of which at least the rectangle from `low` to `high` has to be seen.
+    pub fn new(low: Point, high: Point) -> Self {
+        Self { low, high, shapes: Vec::new() }
+    }
+
+    /// Adds a filled polygon.
+    pub fn polygon(&mut self, corners: &[Point], colour: Colour) {
+        self.shapes.push(Shape::Polygon { corners: corners.to_vec(), colour });
+    }
+
+    /// Adds a filled rectangle, by its lower left and upper right corner.
+    pub fn rectangle(&mut self, [x0, y0]: Point, [x1, y1]: Point, colour: Colour) {
+        self.polygon(&[[x0, y0], [x1, y0], [x1, y1], [x0, y1]], colour);
+    }
+
+    /// Adds a filled disc of a radius in m.
+    pub fn disc(&mut self, centre: Point, radius: f64, colour: Colour) {
+        self.shapes.push(Shape::Disc { centre, radius, colour });
+    }
+
+    /// Adds a line through points, with round ends, of a width in m.
+    pub fn line(&mut self, points: &[Point], width: f64, colour: Colour) {
+        self.shapes.push(Shape::Line { points: points.to_vec(), width, colour });
+    }
+
+    /// Adds a dashed line through points, of a width in m.
+    pub fn dashes(&mut self, points: &[Point], width: f64, colour: Colour) {
+        self.shapes.push(Shape::Dashes { points: points.to_vec(), width, colour });
+    }
+
+    /// Adds the line of a graph, of a width in m.
+    pub fn graph(&mut self, graph: Graph, width: f64, colour: Colour) {
+        self.shapes.push(Shape::Graph { graph, width, colour });
+    }
+
+    /// Fills all that is below a graph.
+    pub fn ground(&mut self, graph: Graph, colour: Colour) {
+        self.shapes.push(Shape::Ground { graph, colour });
+    }
+
+    /// Adds a rod with a bright outline that sets it off from what is behind.
+    pub fn rod(&mut self, from: Point, to: Point, width: f64, colour: Colour) {
+        self.line(&[from, to], 1.25 * width, colour::BACKGROUND);
+        self.line(&[from, to], width, colour);
+    }
+
+    /// Adds a joint: a dark disc with a bright middle.
+    pub fn joint(&mut self, at: Point, radius: f64) {
+        self.disc(at, radius, colour::DARK);
+        self.disc(at, 0.45 * radius, colour::BACKGROUND);
+    }
+}
+
+/// The point at a distance from `from`, in the direction of an angle from +x.
+pub fn polar(from: Point, distance: f64, angle: f64) -> Point {
+    let (sin, cos) = angle.sin_cos();
+    [from[0] + distance * cos, from[1] + distance * sin]
+}
+
+/// A MuJoCo model at certain positions.
+#[cfg(feature = "mujoco")]
+#[derive(Debug, Clone)]
+pub struct PosedModel {
+    /// What does not move.
+    pub look: &'static Look,
+    /// `[Q]`
+    pub qpos: Vec<f64>,
+}
+
+/// How a MuJoCo model is shown.
+#[cfg(feature = "mujoco")]
+#[derive(Debug, Clone, Copy)]
+pub struct Look {
+    /// The environment's name.
+    pub name: &'static str,
+    /// The model, as MJCF.
+    pub mjcf: &'static str,
+    /// Elements that follow the model's own: ground, light, sky.
+    pub scenery: &'static str,
+    /// The geom that the scenery replaces.
+    pub hidden: &'static str,
+    /// The body that the camera follows.
+    pub followed: &'static str,
+    /// The camera's distance, m.
+    pub camera_distance: f64,
+    /// The height that the camera looks at, m.
+    pub camera_height: f64,
+    /// Geoms and their colours: red, green, blue, in 0 … 1.
+    pub colours: &'static [(&'static str, [f32; 3])],
+}

@@ -1,0 +1,42 @@
+//! A rod on a pivot, the angles within which it counts as held, and an arrow for the torque of the last step.
+
+use super::{MAX_TORQUE, UPRIGHT};
+use crate::scene::{Drawing, Point, colour, polar};
+use std::f64::consts::{FRAC_PI_2, PI};
+
+const ROD: f64 = 0.16;
+const RADIUS: f64 = 0.36;
+const MOST_TURN: f64 = 0.75 * PI;
+/// Parts of an arc.
+const SMOOTH: usize = 64;
+
+fn arc(centre: Point, radius: f64, from: f64, to: f64) -> Vec<Point> {
+    (0..=SMOOTH).map(|i| polar(centre, radius, from + (to - from) * i as f64 / SMOOTH as f64)).collect()
+}
+
+/// The angle is from upright, anticlockwise; the torque the last step's, if a step led to this state.
+pub(super) fn drawing(angle: f64, length: f64, torque: Option<f64>) -> Drawing {
+    let half = (1.2 * length).max(1.8); // the longest rod of version E has room
+    let mut drawing = Drawing::new([-half, -half], [half, half]);
+
+    let pivot = [0.0, 0.0];
+    let mut held = arc(pivot, length + ROD, FRAC_PI_2 - UPRIGHT, FRAC_PI_2 + UPRIGHT);
+    held.push(pivot);
+    drawing.polygon(&held, colour::PALE_GREEN);
+    drawing.dashes(&[pivot, [0.0, length + ROD]], 0.02, colour::GREEN);
+    drawing.rod(pivot, polar(pivot, length, FRAC_PI_2 + angle), ROD, colour::VERMILLION);
+    // None is drawn of a torque that is next to nothing: its arrow would have a head all the same.
+    let share = torque.map(|torque| torque / MAX_TORQUE);
+    if let Some(share) = share.filter(|share| share.abs() > 0.01) {
+        // From below the pivot, in the direction of the turn, as far as the torque is large.
+        let turn = MOST_TURN * share;
+        let (start, end) = (-FRAC_PI_2 - 0.5 * turn, -FRAC_PI_2 + 0.5 * turn);
+        drawing.line(&arc(pivot, RADIUS, start, end), 0.035, colour::BLUE);
+        let forward = turn.signum() * 0.3;
+        let head =
+            [polar(pivot, RADIUS - 0.09, end), polar(pivot, RADIUS + 0.09, end), polar(pivot, RADIUS, end + forward)];
+        drawing.polygon(&head, colour::BLUE);
+    }
+    drawing.joint(pivot, 0.07);
+    drawing
+}
