@@ -8,7 +8,7 @@ use tiny_skia::{Color, FillRule, LineCap, LineJoin, Paint, Path, PathBuilder, Pi
 const SMOOTH: usize = 64;
 /// Farther from the picture, in pixels, nothing is drawn exactly: absurd numbers must not overflow.
 const FAR: f64 = 1e5;
-/// No line is thinner, in pixels.
+/// Nothing is thinner, in pixels.
 const THINNEST: f64 = 1.0;
 
 /// The pixels of a drawing, `[height, width, 3]`.
@@ -48,12 +48,12 @@ impl Canvas {
             Shape::Polygon { ref corners, colour } => self.fill(self.path(corners, true), colour),
             Shape::Disc { centre, radius, colour } => {
                 let (x, y) = self.pixel(centre);
-                let radius = (radius * self.scale).max(THINNEST) as f32;
+                let radius = self.pixels(radius);
                 self.fill(PathBuilder::from_circle(x, y, radius), colour);
             }
             Shape::Line { ref points, width, colour } => self.stroke(points, width, colour, None),
             Shape::Dashes { ref points, width, colour } => {
-                let dash = (4.0 * width * self.scale).max(4.0 * THINNEST) as f32;
+                let dash = 4.0 * self.pixels(width);
                 self.stroke(points, width, colour, StrokeDash::new(vec![dash, dash], 0.0));
             }
             Shape::Graph { graph, width, colour } => self.stroke(&self.points(graph), width, colour, None),
@@ -67,7 +67,7 @@ impl Canvas {
 
     fn stroke(&mut self, points: &[Point], width: f64, colour: Colour, dash: Option<StrokeDash>) {
         let Some(path) = self.path(points, false) else { return };
-        let width = (width * self.scale).max(THINNEST) as f32;
+        let width = self.pixels(width);
         let line_cap = if dash.is_some() { LineCap::Butt } else { LineCap::Round };
         let stroke = Stroke { width, line_cap, line_join: LineJoin::Round, dash, ..Stroke::default() };
         self.pixmap.stroke_path(&path, &solid(colour), &stroke, Transform::identity(), None);
@@ -94,6 +94,11 @@ impl Canvas {
         let clamp = |pixels: f64| pixels.clamp(-FAR, FAR) as f32;
         let (x, y) = (self.within(0, x), self.within(1, y));
         (clamp((x - self.low[0]) * self.scale), clamp((self.high[1] - y) * self.scale))
+    }
+
+    /// A length in pixels.
+    fn pixels(&self, length: f64) -> f32 {
+        (length * self.scale).max(THINNEST).min(FAR) as f32
     }
 
     /// The coordinate along an axis, or the picture's edge if it is infinite.
