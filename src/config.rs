@@ -2,12 +2,23 @@
 
 use clap::Parser;
 use config::{Environment, File, FileFormat};
+use perturb_protocol::limits::{DEFAULT_MAX_ENVS, DEFAULT_MAX_MESSAGE_BYTES, DEFAULT_PORT};
 use serde::{Deserialize, Serialize};
 use std::{fmt, net::SocketAddr, path::PathBuf, time::Duration};
 
 const ENV_PREFIX: &str = "PERTURB_SERVER";
 /// A day. The transport adds the interval to the present, which must not overflow.
 const MAX_KEEPALIVE_SECONDS: u64 = 86_400;
+/// The settings of `--private`. The limits guard shared servers; the memory is the program's own affair. Between two
+/// steps it may compute for long: its death closes the socket and the pipe anyway.
+const PRIVATE: &str = "
+    exit_with_stdin = true
+    grace_seconds = 1
+    keepalive_seconds = 3600
+    max_envs = 16777216
+    max_sessions = 65536
+    max_message_bytes = 1073741824
+";
 
 /// Serves reinforcement-learning environments whose physics can be changed, over gRPC.
 ///
@@ -64,6 +75,12 @@ pub struct Arguments {
     #[arg(long)]
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub exit_with_stdin: bool,
+    /// Serve the one program that starts this server: --exit-with-stdin, no limits (they guard shared servers), time to
+    /// compute for an hour between two requests, a second to end. Only flags count then, neither file nor variables,
+    /// which are for servers that people run themselves.
+    #[arg(long)]
+    #[serde(skip)]
+    pub private: bool,
     /// Start no server, but ask the one that runs with these settings, at its first address, whether it takes sessions:
     /// exit status 0 if so, else 1. For the health checks of containers.
     #[arg(long)]
@@ -100,11 +117,11 @@ pub struct Config {
 impl Default for Config {
     fn default() -> Self {
         Self {
-            listen: vec![Address::Tcp(SocketAddr::from(([127, 0, 0, 1], 7447)))],
+            listen: vec![Address::Tcp(SocketAddr::from(([127, 0, 0, 1], DEFAULT_PORT)))],
             workers: std::thread::available_parallelism().map_or(1, usize::from),
-            max_envs: 16_384,
+            max_envs: DEFAULT_MAX_ENVS,
             max_sessions: 1024,
-            max_message_bytes: 64 << 20,
+            max_message_bytes: DEFAULT_MAX_MESSAGE_BYTES,
             grace_seconds: 30,
             idle_seconds: 0,
             keepalive_seconds: 60,
@@ -112,6 +129,20 @@ impl Default for Config {
             exit_with_stdin: false,
         }
     }
+}
+
+/// The environment variables that are settings.
+fn variables() -> Environment {
+    // Other programs' variables need not be UTF-8. A setting that is not is refused with its odd characters replaced.
+    let text = std::env::vars_os().map(|(k, v)| (k.to_string_lossy().into_owned(), v.to_string_lossy().into_owned()));
+    // The variable that names the file is no setting.
+    let settings = text.filter(|(name, _)| !name.eq_ignore_ascii_case("PERTURB_SERVER_CONFIG"));
+    Environment::with_prefix(ENV_PREFIX)
+        .prefix_separator("_")
+        .try_parsing(true)
+        .list_separator(",")
+        .with_list_parse_key("listen")
+        .source(Some(settings.collect()))
 }
 
 /// Where to listen.
@@ -175,22 +206,15 @@ impl Config {
     /// [`Error`]: nothing has been bound or started.
     pub fn load(arguments: &Arguments) -> Result<Self, Error> {
         let mut builder = config::Config::builder();
-        if let Some(path) = &arguments.config {
-            builder = builder.add_source(File::from(path.as_path()).format(FileFormat::Toml));
+        if arguments.private {
+            builder = builder.add_source(File::from_str(PRIVATE, FileFormat::Toml));
+        } else {
+            if let Some(path) = &arguments.config {
+                builder = builder.add_source(File::from(path.as_path()).format(FileFormat::Toml));
+            }
+            builder = builder.add_source(variables());
         }
-        let variables = Environment::with_prefix(ENV_PREFIX)
-            .prefix_separator("_")
-            .try_parsing(true)
-            .list_separator(",")
-            .with_list_parse_key("listen");
-        // Other programs' variables need not be UTF-8. A setting that is not is refused with its odd characters replaced.
-        let text =
-            std::env::vars_os().map(|(k, v)| (k.to_string_lossy().into_owned(), v.to_string_lossy().into_owned()));
-        // The variable that names the file is no setting.
-        let settings = text.filter(|(name, _)| !name.eq_ignore_ascii_case("PERTURB_SERVER_CONFIG"));
-        let variables = variables.source(Some(settings.collect()));
-        let merged = builder.add_source(variables).add_source(config::Config::try_from(arguments)?).build()?;
-        merged.try_deserialize::<Self>()?.validated()
+        builder.add_source(config::Config::try_from(arguments)?).build()?.try_deserialize::<Self>()?.validated()
     }
 
     fn validated(self) -> Result<Self, Error> {

@@ -212,6 +212,25 @@ async fn exit_with_stdin_ends_the_server_when_its_input_closes_and_only_then() {
 }
 
 #[tokio::test]
+async fn a_private_server_ends_with_its_input_has_room_for_all_and_heeds_flags_alone() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut others = command();
+    others
+        .args(["--private", "--max-sessions", "1", "--listen", "tcp://127.0.0.1:0"])
+        .env("PERTURB_SERVER_MAX_ENVS", "7");
+    others.env("PERTURB_SERVER_CONFIG", file(directory.path(), "workers = 0"));
+    let mut server = Server::spawn(others, directory, 1);
+    assert_eq!(max_envs(&server).await, 1 << 24);
+    let (_session, _) = Session::open(server.tcp(), open("CartPole", 20_000, 1)).await;
+    let second = Session::start(&mut server::client(server.tcp()).await).await.err().expect("flags beat --private");
+    assert_eq!(second.code(), Code::ResourceExhausted, "{second:?}");
+    let closed = Instant::now();
+    server.stdin = None;
+    assert_eq!(server.ended().await.code(), Some(0));
+    assert!(closed.elapsed() < Duration::from_secs(10), "a second's grace, although a session runs");
+}
+
+#[tokio::test]
 async fn a_stale_socket_is_replaced_a_live_one_and_a_file_are_not() {
     let directory = tempfile::tempdir().unwrap();
     let socket = directory.path().join("perturb.sock");
