@@ -199,7 +199,7 @@ fn a_snapshot_continues_in_another_process() {
         std::fs::write(directory.path().join(spec.name), used(spec).snapshot()).unwrap();
     }
     let output = Command::new(std::env::current_exe().unwrap())
-        .args(["--exact", "snapshots::a_snapshot_continues_in_another_process"])
+        .args(["--exact", "restoring::a_snapshot_continues_in_another_process"])
         .env(CHILD, directory.path())
         .output()
         .unwrap();
