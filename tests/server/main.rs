@@ -16,6 +16,6 @@ mod locomotion;
 mod pool;
 mod reference;
 mod rendering;
-mod restoring;
+mod snapshots;
 mod streams;
 mod success;

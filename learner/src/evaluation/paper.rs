@@ -1,0 +1,137 @@
+//! What the paper reports: Packer et al. (2018), arXiv:1810.12282.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use super::protocol::Metric;
+
+/// Every number of its tables.
+const TABLE: &str = include_str!("../../data/paper_results.csv");
+/// What it averages over.
+const ENVIRONMENTS: usize = 6;
+
+/// An algorithm with its architecture and, of RL², the episodes in a trial: a row of the paper's tables.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct Method {
+    /// E.g. "ppo".
+    pub algorithm: String,
+    /// "ff" or "rc".
+    pub architecture: String,
+    /// `None` of algorithms without trials.
+    pub episodes_per_trial: Option<u32>,
+}
+
+impl fmt::Display for Method {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} {}", self.algorithm, self.architecture)?;
+        self.episodes_per_trial.map_or(Ok(()), |episodes| write!(f, " N={episodes}"))
+    }
+}
+
+/// Mean and standard deviation over the paper's five runs, %.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PaperNumber {
+    /// Mean, %.
+    pub mean: f64,
+    /// Standard deviation, %; not known for averages over other environments than all of the paper's.
+    pub std: Option<f64>,
+}
+
+impl fmt::Display for PaperNumber {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:.1}", self.mean)?;
+        self.std.map_or(Ok(()), |std| write!(f, " ± {std:.1}"))
+    }
+}
+
+#[derive(Deserialize)]
+struct Record {
+    environment: String,
+    algorithm: String,
+    architecture: String,
+    episodes_per_trial: Option<u32>,
+    metric: Metric,
+    mean_percent: f64,
+    std_percent: f64,
+}
+
+impl Record {
+    fn is_of(&self, environment: &str, method: &Method) -> bool {
+        self.environment == environment
+            && self.algorithm.eq_ignore_ascii_case(&method.algorithm)
+            && self.architecture.eq_ignore_ascii_case(&method.architecture)
+            && self.episodes_per_trial == method.episodes_per_trial
+    }
+}
+
+/// The paper's number for a method in an environment; `None` if it has none. The environment "Average" is all six.
+pub fn number(environment: &str, method: &Method, metric: Metric) -> Option<PaperNumber> {
+    let record = records().find(|record| record.metric == metric && record.is_of(environment, method))?;
+    Some(PaperNumber { mean: record.mean_percent, std: Some(record.std_percent) })
+}
+
+/// The paper's average over `environments`: the published one if they are all six, otherwise the mean of theirs.
+pub fn average(environments: &[&str], method: &Method, metric: Metric) -> Option<PaperNumber> {
+    let means: Option<Vec<f64>> = environments.iter().map(|name| Some(number(name, method, metric)?.mean)).collect();
+    let means = means?;
+    if means.len() == ENVIRONMENTS {
+        return number("Average", method, metric);
+    }
+    Some(PaperNumber { mean: means.iter().sum::<f64>() / means.len() as f64, std: None })
+}
+
+fn records() -> impl Iterator<Item = Record> {
+    csv::Reader::from_reader(TABLE.as_bytes()).into_deserialize().filter_map(Result::ok) // the test reads every line
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ALL: [&str; ENVIRONMENTS] = ["Acrobot", "CartPole", "MountainCar", "Pendulum", "HalfCheetah", "Hopper"];
+
+    fn method(algorithm: &str, architecture: &str, episodes_per_trial: Option<u32>) -> Method {
+        Method { algorithm: algorithm.into(), architecture: architecture.into(), episodes_per_trial }
+    }
+
+    #[test]
+    fn every_line_is_read() {
+        let records: Result<Vec<Record>, _> = csv::Reader::from_reader(TABLE.as_bytes()).deserialize().collect();
+        assert_eq!(records.unwrap().len(), TABLE.lines().count() - 1);
+    }
+
+    #[test]
+    fn a_number_is_found_by_environment_method_and_metric() {
+        let ppo = method("ppo", "ff", None);
+        let shown = |metric| number("CartPole", &ppo, metric).unwrap().to_string();
+        assert_eq!(Metric::ALL.map(shown), ["100.0 ± 0.0", "100.0 ± 0.0", "86.2 ± 12.6"]);
+        assert_eq!(number("CartPole", &method("ppo", "transformer", None), Metric::Default), None);
+        assert_eq!(number("Pendulum", &method("rl2-a2c", "rc", None), Metric::Default), None, "it has trials");
+        let with = |trials| number("Average", &method("rl2-a2c", "rc", Some(trials)), Metric::Default).unwrap().mean;
+        assert_eq!([1, 2, 5].map(with), [66.83, 45.79, 41.08]);
+    }
+
+    #[test]
+    fn an_average_is_over_the_same_environments() {
+        let a2c = method("a2c", "ff", None);
+        let two = average(&["CartPole", "MountainCar"], &a2c, Metric::Default).unwrap();
+        assert!((two.mean - (100.0 + 79.78) / 2.0).abs() < 1e-9 && two.std.is_none());
+        assert_eq!(average(&ALL, &a2c, Metric::Default), number("Average", &a2c, Metric::Default));
+        assert_eq!(average(&["CartPole", "Ant"], &a2c, Metric::Default), None);
+    }
+
+    /// The paper's averages follow from its tables of the environments, to the two digits that they are rounded to.
+    #[test]
+    fn the_published_averages_are_those_of_the_environments() {
+        let averages: Vec<Record> = records().filter(|record| record.environment == "Average").collect();
+        assert_eq!(averages.len(), 42);
+        for Record { algorithm, architecture, episodes_per_trial, metric, mean_percent, .. } in averages {
+            let method = Method { algorithm, architecture, episodes_per_trial };
+            let means = ALL.map(|environment| number(environment, &method, metric).unwrap().mean);
+            let mean = means.iter().sum::<f64>() / means.len() as f64;
+            // Either is rounded to 0.01: half of that each, and some for the binary fractions.
+            assert!((mean - mean_percent).abs() < 0.0101, "{method} {metric}: {mean} is not {mean_percent}");
+        }
+    }
+}

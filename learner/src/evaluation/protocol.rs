@@ -1,0 +1,94 @@
+//! The paper's protocol: versions, scenarios and metrics.
+
+use std::fmt;
+
+use serde::Deserialize;
+
+use super::statistics::geometric_mean;
+
+pub use perturb_protocol::Version;
+
+/// Training on one version and testing on another, e.g. "DR".
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Scenario {
+    /// Where the policy was trained.
+    pub train: Version,
+    /// Where it is tested.
+    pub test: Version,
+}
+
+impl Scenario {
+    /// The nine pairs: DD, DR, DE, RD, … EE.
+    pub fn all() -> impl Iterator<Item = Scenario> {
+        Version::ALL.into_iter().flat_map(|train| Version::ALL.map(|test| Scenario { train, test }))
+    }
+}
+
+impl fmt::Display for Scenario {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}{}", self.train, self.test)
+    }
+}
+
+/// One of the paper's three numbers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Metric {
+    /// The success rate of DD.
+    Default,
+    /// The success rate of RR.
+    Interpolation,
+    /// The geometric mean of the success rates of DR, DE and RE.
+    Extrapolation,
+}
+
+impl Metric {
+    /// All, in the paper's order.
+    pub const ALL: [Metric; 3] = [Metric::Default, Metric::Interpolation, Metric::Extrapolation];
+
+    /// The metric from the success rates of scenarios; `None` if one that it needs has none.
+    pub fn of(self, rate: impl Fn(Scenario) -> Option<f64>) -> Option<f64> {
+        use Version::{D, E, R};
+        let rate = |train, test| rate(Scenario { train, test });
+        match self {
+            Metric::Default => rate(D, D),
+            Metric::Interpolation => rate(R, R),
+            Metric::Extrapolation => Some(geometric_mean(&[rate(D, R)?, rate(D, E)?, rate(R, E)?])),
+        }
+    }
+}
+
+impl fmt::Display for Metric {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Debug::fmt(self, f)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_nine_scenarios_are_named_by_training_and_testing() {
+        let names: Vec<String> = Scenario::all().map(|scenario| scenario.to_string()).collect();
+        assert_eq!(names, ["DD", "DR", "DE", "RD", "RR", "RE", "ED", "ER", "EE"]);
+    }
+
+    #[test]
+    fn metrics_take_their_scenarios() {
+        let rate = |scenario: Scenario| match scenario.to_string().as_str() {
+            "DD" => Some(90.0),
+            "RR" => Some(70.0),
+            "DR" => Some(20.0),
+            "DE" => Some(40.0),
+            "RE" => Some(10.0),
+            _ => None,
+        };
+        assert_eq!((Metric::Default.of(rate), Metric::Interpolation.of(rate)), (Some(90.0), Some(70.0)));
+        let extrapolation = Metric::Extrapolation.of(rate).unwrap();
+        assert!((extrapolation - 20.0).abs() < 1e-12, "the third root of 20 · 40 · 10");
+        for needed in ["DR", "DE", "RE"] {
+            assert_eq!(Metric::Extrapolation.of(|s| rate(s).filter(|_| s.to_string() != needed)), None, "{needed}");
+        }
+    }
+}

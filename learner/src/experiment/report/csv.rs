@@ -1,0 +1,87 @@
+//! The numbers of a report as lines of files; an empty field is a number that there is not.
+
+use super::Report;
+use crate::evaluation::{Method, Metric, Scenario, Version};
+use crate::experiment::statistics::Summary;
+use crate::experiment::table::{Table, TableBuilder};
+
+impl Report<'_> {
+    /// The files that a report has beside its documents, by their titles.
+    pub fn files(&self) -> [Table; 4] {
+        [self.metrics_file(), self.iqm_file(), self.scenarios_file(), self.selected_file()]
+    }
+
+    fn metrics_file(&self) -> Table {
+        let rows = self.metrics.iter().chain(&self.averages);
+        let lines: Vec<_> = rows.flat_map(|row| Metric::ALL.map(|metric| (row, metric))).collect();
+        Table::of("metrics.csv", &lines)
+            .text("environment", |(row, _)| row.environment)
+            .method(|(row, _)| &row.method)
+            .text("metric", |(_, metric)| metric)
+            .summary(|(row, metric)| row.ours.get(metric).copied())
+            .number("paper_mean", |(row, metric)| or_empty(row.papers.get(metric).map(|paper| paper.mean)))
+            .number("paper_std", |(row, metric)| or_empty(row.papers.get(metric).and_then(|paper| paper.std)))
+            .number("difference", |(row, metric)| or_empty(row.difference(*metric)))
+            .build()
+    }
+
+    fn iqm_file(&self) -> Table {
+        let of_method = self.iqms.iter().flat_map(|row| Metric::ALL.map(|metric| (row, metric, row.iqms.get(&metric))));
+        let lines: Vec<_> = of_method.collect();
+        Table::of("iqm.csv", &lines)
+            .method(|(row, ..)| &row.method)
+            .text("metric", |(_, metric, _)| metric)
+            .number("runs", |(.., iqm)| iqm.map_or(0, |iqm| iqm.runs))
+            .number("iqm", |(.., iqm)| or_empty(iqm.map(|iqm| iqm.iqm)))
+            .number("low_95", |(.., iqm)| or_empty(iqm.and_then(|iqm| Some(iqm.interval_95?[0]))))
+            .number("high_95", |(.., iqm)| or_empty(iqm.and_then(|iqm| Some(iqm.interval_95?[1]))))
+            .build()
+    }
+
+    fn scenarios_file(&self) -> Table {
+        let of_selection = |selection| Scenario::all().map(move |scenario| (selection, scenario));
+        let lines: Vec<_> = self.selections.iter().flat_map(of_selection).collect();
+        Table::of("scenarios.csv", &lines)
+            .text("environment", |(selection, _)| selection.environment)
+            .method(|(selection, _)| &selection.method)
+            .text("train", |(_, scenario)| scenario.train)
+            .text("test", |(_, scenario)| scenario.test)
+            .summary(|(selection, scenario)| selection.scenario(*scenario))
+            .build()
+    }
+
+    fn selected_file(&self) -> Table {
+        Table::of("selected.csv", &self.selected())
+            .text("environment", |selected| &selected.result.training.environment)
+            .method(|selected| &selected.result.training.method)
+            .text("train", |selected| selected.result.training.version)
+            .text("run", |selected| selected.cell.run)
+            .text("seed", |selected| selected.result.training.seed)
+            .text("cell", |selected| &selected.cell.id)
+            .number("success_d", |selected| or_empty(selected.rate(Version::D)))
+            .number("success_r", |selected| or_empty(selected.rate(Version::R)))
+            .number("success_e", |selected| or_empty(selected.rate(Version::E)))
+            .text("commit", |selected| selected.result.commits().collect::<Vec<_>>().join("; "))
+            .text("command", |selected| &selected.result.command)
+            .build()
+    }
+}
+
+impl<'r, R> TableBuilder<'r, R> {
+    /// What identifies a method.
+    pub(in crate::experiment) fn method(self, method: impl Fn(&'r R) -> &'r Method) -> Self {
+        self.text("algorithm", |row| &method(row).algorithm)
+            .text("architecture", |row| &method(row).architecture)
+            .text("episodes_per_trial", |row| or_empty(method(row).episodes_per_trial))
+    }
+
+    fn summary(self, summary: impl Fn(&'r R) -> Option<Summary>) -> Self {
+        self.number("runs", |row| summary(row).map_or(0, |summary| summary.runs))
+            .number("mean", |row| or_empty(summary(row).map(|summary| summary.mean)))
+            .number("std", |row| or_empty(summary(row).and_then(|summary| summary.deviation())))
+    }
+}
+
+fn or_empty(number: Option<impl ToString>) -> String {
+    number.map(|number| number.to_string()).unwrap_or_default()
+}

@@ -1,0 +1,249 @@
+//! A report as one HTML page, complete in itself: no network, no script, all pictures inside.
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use maud::{DOCTYPE, Markup, PreEscaped, html};
+
+use super::{Figure, FigureData, Figures, MISSING, Report};
+use crate::experiment::plot;
+use crate::experiment::table::{Column, Entry, Table};
+
+pub(super) const STYLE: &str = include_str!("style.css");
+const METRICS: &str = "Default is the success rate of policies that were trained and tested on D, Interpolation that of \
+                       policies trained and tested on R. Extrapolation is the geometric mean of three: trained on D and \
+                       tested on R, trained on D and tested on E, trained on R and tested on E.";
+const HEATMAPS: &str = "How the policies that were selected in the first run do over two parameters. Colours are mean \
+                        return and success rate; the whole line is R's box, dashed lines are E's.";
+/// A text of so many bytes is broken into lines.
+const LONG: usize = 60;
+
+/// What has a heading, and a place in the list of contents.
+struct Section {
+    id: &'static str,
+    title: &'static str,
+    notes: Markup,
+    parts: Vec<Part>,
+    /// Parts stand side by side where there is room.
+    side_by_side: bool,
+}
+
+struct Part {
+    title: String,
+    content: Markup,
+}
+
+/// The page.
+pub fn html(report: &Report<'_>, figures: &Figures) -> String {
+    let plain = |table: Table| table_part(&table, false);
+    let section = |id, title, notes, parts| Section { id, title, notes, parts, side_by_side: false };
+    let metrics = report.metrics_tables().into_iter().map(plain).collect();
+    let scenarios = report.scenario_tables().iter().map(|table| table_part(table, true)).collect();
+    let cells = [report.selected_table()].into_iter().chain(report.failure_table()).map(plain).collect();
+    let sections = [
+        section("metrics", "Default, Interpolation, Extrapolation", html! { p { (METRICS) } }, metrics),
+        section("iqm", "Interquartile means", html! {}, vec![plain(report.iqm_table())]),
+        Section {
+            side_by_side: true,
+            ..section(
+                "scenarios",
+                "The nine scenarios",
+                html! { p { "The darker, the higher the success rate." } },
+                scenarios,
+            )
+        },
+        section("curves", "Training curves", list(&figures.no_curves), curves(figures)),
+        section("heatmaps", "Heatmaps", html! { p { (HEATMAPS) } (list(&figures.no_heatmaps)) }, heatmaps(figures)),
+        section("cells", "Cells", html! {}, cells),
+    ];
+    page(report, &sections).into_string()
+}
+
+fn page(report: &Report<'_>, sections: &[Section]) -> Markup {
+    html! {
+        (DOCTYPE)
+        html lang="en" {
+            head {
+                meta charset="utf-8";
+                meta name="viewport" content="width=device-width, initial-scale=1";
+                title { "perturb: results" }
+                link rel="icon" href="data:,";
+                style { (PreEscaped(STYLE)) }
+            }
+            body {
+                header {
+                    h1 { "Results" }
+                    @for line in &report.overview { p { (prose(line)) } }
+                }
+                nav aria-label="Contents" { ol { @for section in sections { (section.contents()) } } }
+                main { @for section in sections { (section.body()) } }
+            }
+        }
+    }
+}
+
+impl Section {
+    fn part_id(&self, index: usize) -> String {
+        format!("{}-{}", self.id, index + 1)
+    }
+
+    fn contents(&self) -> Markup {
+        html! {
+            li {
+                a href={ "#" (self.id) } { (self.title) }
+                @if self.parts.len() > 1 {
+                    " "
+                    span {
+                        @for (i, part) in self.parts.iter().enumerate() {
+                            @if i > 0 { " · " }
+                            a href={ "#" (self.part_id(i)) } { (short(&part.title)) }
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    fn body(&self) -> Markup {
+        html! {
+            section id=(self.id) {
+                h2 { (self.title) }
+                (self.notes)
+                div class=[self.side_by_side.then_some("columns")] {
+                    @for (i, part) in self.parts.iter().enumerate() {
+                        div id=(self.part_id(i)) { (part.content) }
+                    }
+                }
+            }
+        }
+    }
+}
+
+fn table_part(table: &Table, shaded: bool) -> Part {
+    let groups: Vec<&[Column]> = table.columns.chunk_by(|a, b| a.group == b.group).collect();
+    // Where each but the first group of columns begins.
+    let starts = |column: usize| {
+        groups.len() > 1 && column > 0 && table.columns[column].group != table.columns[column - 1].group
+    };
+    let content = html! {
+        h3 { (table.title) }
+        div.wide {
+            table {
+                thead {
+                    @if groups.len() > 1 {
+                        tr {
+                            @for columns in &groups {
+                                @if let Some(name) = &columns[0].group {
+                                    th.span scope="colgroup" colspan=(columns.len()) { (name) }
+                                } @else {
+                                    th colspan=(columns.len()) {}
+                                }
+                            }
+                        }
+                    }
+                    tr {
+                        @for (i, column) in table.columns.iter().enumerate() {
+                            th class=[classes(&[("text", !column.is_number), ("start", starts(i))])] scope="col" {
+                                // The first column of a group is what the group is called; the others are not.
+                                @if column.group.as_ref() == Some(&column.name) { "here" } @else { (column.name) }
+                            }
+                        }
+                    }
+                }
+                tbody {
+                    @for (row, entries) in table.rows.iter().enumerate() {
+                        // A line above a method's first row, where methods have several.
+                        @let next = shaded && row > 0 && entries[0] != table.rows[row - 1][0];
+                        tr class=[next.then_some("next")] {
+                            @for (i, (entry, column)) in entries.iter().zip(&table.columns).enumerate() {
+                                (cell(entry, column, starts(i), shaded))
+                            }
+                        }
+                    }
+                }
+            }
+        }
+    };
+    Part { title: table.title.clone(), content }
+}
+
+fn cell(entry: &Entry, column: &Column, starts: bool, shaded: bool) -> Markup {
+    let style = entry.heat.filter(|_| shaded).map(|percent| {
+        let colour = plot::shade(percent / 100.0);
+        let (ink, (r, g, b)) = (if plot::is_dark(colour) { "#fff" } else { "#000" }, colour);
+        format!("background:#{r:02x}{g:02x}{b:02x};color:{ink}")
+    });
+    let class = classes(&[
+        ("text", !column.is_number),
+        ("long", !column.is_number && entry.text.len() > LONG),
+        ("missing", entry.text == MISSING),
+        ("start", starts),
+    ]);
+    html! { td class=[class] style=[style] { (entry.text) } }
+}
+
+/// Those names that apply; `None` if none does.
+fn classes(names: &[(&str, bool)]) -> Option<String> {
+    let applying: Vec<&str> = names.iter().filter(|(_, applies)| *applies).map(|(name, _)| *name).collect();
+    (!applying.is_empty()).then(|| applying.join(" "))
+}
+
+fn curves(figures: &Figures) -> Vec<Part> {
+    let of_environments = figures.curves.chunk_by(|a, b| a.environment == b.environment);
+    of_environments
+        .map(|of| Part { title: of[0].environment.clone(), content: html! { @for curve in of { (figure(curve)) } } })
+        .collect()
+}
+
+fn heatmaps(figures: &Figures) -> Vec<Part> {
+    let of_environments = figures.heatmaps.chunk_by(|a, b| a[0].environment == b[0].environment);
+    let part = |rows: &[Vec<Figure>]| {
+        let environment = rows[0][0].environment.clone();
+        let content = html! {
+            h3 { (environment) }
+            @for row in rows {
+                div.row style={ "--columns:" (row.len()) } { @for heatmap in row { (figure(heatmap)) } }
+            }
+        };
+        Part { title: environment, content }
+    };
+    of_environments.map(part).collect()
+}
+
+fn figure(Figure { name, caption, picture, .. }: &Figure) -> Markup {
+    html! {
+        figure class=[matches!(picture, FigureData::Missing).then_some("missing")] {
+            @match picture {
+                FigureData::Missing => {}
+                // Named for those who do not see it.
+                FigureData::Svg(svg) => div role="img" aria-label=(name) { (PreEscaped(svg)) }
+                FigureData::Png(png) => {
+                    @let size = png_size(png);
+                    img alt=(name) width=[size.map(|size| size.0)] height=[size.map(|size| size.1)]
+                        src={ "data:image/png;base64," (STANDARD.encode(png)) };
+                }
+            }
+            figcaption { (caption) }
+        }
+    }
+}
+
+/// Width and height of a PNG file, as many units as the picture has: the first numbers of its first chunk.
+fn png_size(png: &[u8]) -> Option<(u32, u32)> {
+    let number = |from: usize| Some(u32::from_be_bytes(png.get(from..from + 4)?.try_into().ok()?) / plot::PNG_SCALE);
+    Some((number(16)?, number(20)?))
+}
+
+fn list(notes: &[String]) -> Markup {
+    html! { @if !notes.is_empty() { ul.missing { @for note in notes { li { (prose(note)) } } } } }
+}
+
+/// A sentence, in which `names` stand between backticks.
+fn prose(text: &str) -> Markup {
+    html! { @for (i, part) in text.split('`').enumerate() { @if i % 2 == 1 { code { (part) } } @else { (part) } } }
+}
+
+/// What comes before a title's details.
+fn short(title: &str) -> &str {
+    let end = [": ", " over "].iter().filter_map(|separator| title.find(separator)).min();
+    &title[..end.unwrap_or(title.len())]
+}

@@ -1,0 +1,127 @@
+//! An experiment's results beside the paper's.
+//!
+//! [`Report::new`] has the numbers; [`Report::text`], [`Report::markdown`] and [`html`] make documents of them,
+//! [`Report::files`] CSV. Nothing in them depends on when, where or in how many attempts the cells were done.
+
+mod csv;
+mod figures;
+mod html;
+mod numbers;
+mod tables;
+
+use std::collections::BTreeSet;
+
+use super::folder::Failure;
+use super::plan::{Cell, Plan};
+use super::selection::{Results, Selected, Selection};
+use super::table::Table;
+use numbers::{MethodIqms, MethodMetrics};
+
+pub use figures::{Figure, FigureData, FigureError, Figures};
+pub use html::html;
+
+/// The paper's budgets.
+const PAPER_EPISODES: u64 = 15_000;
+const PAPER_TEST_EPISODES: u64 = 1000;
+/// What stands for a number that there is not.
+const MISSING: &str = "missing";
+
+/// What is reported of an experiment.
+pub struct Report<'a> {
+    plan: &'a Plan,
+    selections: &'a [Selection<'a>],
+    /// Sentences, with `names` between backticks.
+    overview: Vec<String>,
+    metrics: Vec<MethodMetrics<'a>>,
+    averages: Vec<MethodMetrics<'a>>,
+    iqms: Vec<MethodIqms>,
+    failures: Vec<&'a Failure>,
+}
+
+impl<'a> Report<'a> {
+    /// Of `results`, from which `selections` were made.
+    pub fn new(results: &'a Results<'a>, selections: &'a [Selection<'a>]) -> Self {
+        Self {
+            plan: results.plan,
+            selections,
+            overview: overview(results, selections),
+            metrics: numbers::metrics(selections),
+            averages: numbers::averages(results.plan, selections),
+            iqms: numbers::iqms(results.plan, selections),
+            failures: results.failures().collect(),
+        }
+    }
+
+    /// For a terminal. The selected cells are left out; `selected.csv` has them.
+    pub fn text(&self) -> String {
+        let tables = self.number_tables().chain(self.failure_table());
+        let shown = tables.map(|table| format!("\n{}\n{}\n", table.title, table.to_text()));
+        format!("{}\n{}", self.overview.join("\n"), shown.collect::<String>())
+    }
+
+    /// For GitHub and the like.
+    pub fn markdown(&self) -> String {
+        let tables = self.number_tables().chain([self.selected_table()]).chain(self.failure_table());
+        let shown = tables.map(|table| format!("\n## {}\n\n{}\n", table.title, table.to_markdown()));
+        format!("# Results\n\n{}\n{}", self.overview.join("\n\n"), shown.collect::<String>())
+    }
+
+    fn number_tables(&self) -> impl Iterator<Item = Table> {
+        self.metrics_tables().into_iter().chain([self.iqm_table()]).chain(self.scenario_tables())
+    }
+
+    /// All cells that numbers come from.
+    fn selected(&self) -> Vec<Selected<'a>> {
+        let runs = self.selections.iter().flat_map(|selection| selection.runs.values());
+        runs.flat_map(|run| run.0.values().flatten().copied()).collect()
+    }
+}
+
+fn overview(results: &Results<'_>, selections: &[Selection<'_>]) -> Vec<String> {
+    let (cells, done, failed) = (results.plan.cells.len(), results.done().count(), results.failures().count());
+    let mut lines =
+        vec![format!("{done} of {cells} cells are done, {failed} failed, {} are missing.", cells - done - failed)];
+    lines.extend(budgets(results.plan));
+    let incomplete = selections.iter().filter(|selection| selection.done < selection.cells).count();
+    if incomplete > 0 {
+        lines.push(format!(
+            "{incomplete} of {} rows lack cells, so that their configurations were selected among fewer than the plan \
+             has; the column `cells` says which.",
+            selections.len()
+        ));
+    }
+    let commits: BTreeSet<&str> = results.done().flat_map(|result| result.commits()).collect();
+    if !commits.is_empty() {
+        lines.push(format!("Done by perturb {}.", commits.into_iter().collect::<Vec<_>>().join(", ")));
+    }
+    lines.push(
+        "Numbers are success rates in percent: mean ± standard deviation over runs; one run has none. The paper's are \
+         those of its five runs; a difference is ours less the paper's. Hopper and HalfCheetah run on another physics \
+         engine than the paper's."
+            .into(),
+    );
+    lines
+}
+
+/// Budgets that are not the paper's.
+fn budgets(plan: &Plan) -> Option<String> {
+    let distinct = |of: fn(&Cell) -> u64| plan.cells.iter().map(of).collect::<BTreeSet<u64>>();
+    let trained = distinct(|cell| cell.config.common.episodes);
+    let tested = distinct(|cell| cell.tests.episodes);
+    if trained == [PAPER_EPISODES].into() && tested == [PAPER_TEST_EPISODES].into() {
+        return None;
+    }
+    let shown = |budgets: BTreeSet<u64>| match (budgets.first(), budgets.last()) {
+        (Some(least), Some(most)) if least < most => format!("{least} to {most}"),
+        (least, _) => least.map(u64::to_string).unwrap_or_default(),
+    };
+    Some(format!(
+        "Other budgets than the paper's: {} episodes in a training, where the paper has {PAPER_EPISODES}, and {} in a \
+         test, where it has {PAPER_TEST_EPISODES}.",
+        shown(trained),
+        shown(tested)
+    ))
+}
+
+#[cfg(test)]
+mod tests;

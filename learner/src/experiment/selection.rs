@@ -1,0 +1,176 @@
+//! From the results of cells to the paper's numbers.
+//!
+//! Per environment, method, training version and run, one configuration is selected: the one with the highest success
+//! rate when tested on the version that it was trained on. Of equal ones the one with the higher mean return in the same
+//! test is taken, of still equal ones the one that the plan lists first; so is it where that version was not tested. Like
+//! in the paper, the test that selects is the test that is reported; with a large grid that makes Default and
+//! Interpolation look a little better than they are.
+
+use std::collections::BTreeMap;
+
+use super::folder::{CellResult, CellState, Failure, Folder, FolderError};
+use super::plan::{Cell, Plan};
+use super::statistics::{Iqm, Summary};
+use crate::evaluation::{Method, Metric, Scenario, Version, mean};
+
+/// What is known of a plan's cells.
+#[derive(Debug)]
+pub struct Results<'a> {
+    /// The plan.
+    pub plan: &'a Plan,
+    /// By the cells' indices.
+    pub states: Vec<CellState>,
+}
+
+/// What was selected for a row of the paper's tables, which is a method in an environment.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Selection<'a> {
+    /// The environment's name.
+    pub environment: &'a str,
+    /// What was trained.
+    pub method: Method,
+    /// Cells that the plan has for it.
+    pub cells: usize,
+    /// Of these, cells with a result. If some are missing, selection was among fewer than the plan asks for.
+    pub done: usize,
+    /// By the runs' numbers, from 1.
+    pub runs: BTreeMap<u32, SelectedRun<'a>>,
+}
+
+/// What was selected in a run, by the versions that the plan trains on; `None` for one that has no result yet.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct SelectedRun<'a>(pub BTreeMap<Version, Option<Selected<'a>>>);
+
+/// A cell that was selected.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Selected<'a> {
+    /// What the plan says of it.
+    pub cell: &'a Cell,
+    /// What it came to.
+    pub result: &'a CellResult,
+}
+
+impl<'a> Results<'a> {
+    /// Reads all cells of `plan` in `folder`.
+    ///
+    /// # Errors
+    /// [`FolderError`] if a file is there that cannot be read.
+    pub fn read(plan: &'a Plan, folder: &Folder) -> Result<Self, FolderError> {
+        let states = plan.cells.iter().map(|cell| folder.state(cell)).collect::<Result<_, _>>()?;
+        Ok(Self { plan, states })
+    }
+
+    /// The results that there are, in the plan's order.
+    pub fn done(&self) -> impl Iterator<Item = &CellResult> {
+        self.states.iter().filter_map(|state| match state {
+            CellState::Done(result) => Some(&**result),
+            _ => None,
+        })
+    }
+
+    /// The failures, in the plan's order.
+    pub fn failures(&self) -> impl Iterator<Item = &Failure> {
+        self.states.iter().filter_map(|state| match state {
+            CellState::Failed(failure) => Some(failure),
+            _ => None,
+        })
+    }
+
+    /// Selects for each environment and method of the plan, in its order.
+    pub fn select(&self) -> Vec<Selection<'_>> {
+        let mut selections: Vec<Selection<'_>> = Vec::new();
+        for (cell, state) in self.plan.cells.iter().zip(&self.states) {
+            let (environment, method) = (cell.config.common.environment.as_str(), cell.method());
+            let known = selections.iter().position(|known| known.environment == environment && known.method == method);
+            let place = known.unwrap_or_else(|| {
+                selections.push(Selection { environment, method, cells: 0, done: 0, runs: BTreeMap::new() });
+                selections.len() - 1
+            });
+            selections[place].consider(cell, state);
+        }
+        selections
+    }
+}
+
+impl<'a> Selection<'a> {
+    /// Takes `cell` into account, which comes after all cells that the plan lists before it.
+    fn consider(&mut self, cell: &'a Cell, state: &'a CellState) {
+        self.cells += 1;
+        let best = self.runs.entry(cell.run).or_default().0.entry(cell.config.common.version).or_default();
+        let CellState::Done(result) = state else { return };
+        self.done += 1;
+        let candidate = Selected { cell, result };
+        if best.is_none_or(|best| candidate.rank() > best.rank()) {
+            *best = Some(candidate);
+        }
+    }
+
+    /// A metric of each run that has it, %, by the run's number.
+    pub fn metric(&self, metric: Metric) -> BTreeMap<u32, f64> {
+        let of_run =
+            |(&number, run): (&u32, &SelectedRun<'_>)| Some((number, metric.of(|scenario| run.rate(scenario))?));
+        self.runs.iter().filter_map(of_run).collect()
+    }
+
+    /// A metric's mean and deviation over runs, %.
+    pub fn summary(&self, metric: Metric) -> Option<Summary> {
+        Summary::of(&self.metric(metric).into_values().collect::<Vec<_>>())
+    }
+
+    /// A scenario's success rate over runs, %.
+    pub fn scenario(&self, scenario: Scenario) -> Option<Summary> {
+        Summary::of(&self.runs.values().filter_map(|run| run.rate(scenario)).collect::<Vec<_>>())
+    }
+}
+
+impl<'a> SelectedRun<'a> {
+    /// What was trained on `version`.
+    pub fn trained_on(&self, version: Version) -> Option<Selected<'a>> {
+        self.0.get(&version).copied().flatten()
+    }
+
+    /// The success rate of a scenario, %; `None` if nothing was tested there.
+    pub fn rate(&self, scenario: Scenario) -> Option<f64> {
+        self.trained_on(scenario.train)?.rate(scenario.test)
+    }
+}
+
+impl Selected<'_> {
+    /// The success rate on `version`, %; `None` if it was not tested there.
+    pub fn rate(&self, version: Version) -> Option<f64> {
+        Some(self.result.results.get(&version)?.success_percent)
+    }
+
+    /// The highest is selected.
+    fn rank(&self) -> Option<(f64, f64)> {
+        let test = self.result.results.get(&self.cell.config.common.version)?;
+        Some((test.success_percent, test.mean_return))
+    }
+}
+
+/// A metric averaged over the environments of `selections`, in each run that all of them have; mean and deviation over
+/// these runs.
+pub fn average(selections: &[&Selection<'_>], metric: Metric) -> Option<Summary> {
+    let runs = common_runs(selections, metric);
+    Summary::of(&runs.into_iter().map(|numbers| mean(numbers.into_iter())).collect::<Vec<_>>())
+}
+
+/// The interquartile mean of a metric over the environments of `selections` and the runs that all of them have, with
+/// its bootstrap interval.
+pub fn interquartile(selections: &[&Selection<'_>], metric: Metric, resamples: usize) -> Option<Iqm> {
+    let runs = common_runs(selections, metric);
+    let strata: Vec<Vec<f64>> =
+        (0..selections.len()).map(|i| runs.iter().map(|numbers| numbers[i]).collect()).collect();
+    Iqm::of(&strata, resamples, 1)
+}
+
+/// For each run that all `selections` have, the metric in each of them.
+fn common_runs(selections: &[&Selection<'_>], metric: Metric) -> Vec<Vec<f64>> {
+    let by_environment: Vec<BTreeMap<u32, f64>> = selections.iter().map(|selection| selection.metric(metric)).collect();
+    let of_run = |run: &u32| by_environment.iter().map(|runs| runs.get(run).copied()).collect();
+    by_environment.first().map_or_else(Vec::new, |first| first.keys().filter_map(of_run).collect())
+}
+
+#[cfg(test)]
+#[path = "selection_tests.rs"]
+mod tests;

@@ -1,0 +1,157 @@
+use super::*;
+use crate::experiment::fixture;
+
+/// Two configurations (A: 7e-3, B: 7e-4) of one method, on two environments, in two runs.
+const PLAN: &str = "
+environments = ['CartPole', 'Pendulum']
+runs = 2
+[[algorithm]]
+name = 'a2c'
+architectures = ['ff']
+grid = { learning_rate = [7e-3, 7e-4] }
+";
+
+fn plan() -> Plan {
+    Plan::parse("test", PLAN.into()).unwrap()
+}
+
+/// Success rates on D, R and E and a mean return, by environment, training version, configuration ("A" or "B") and run.
+type Known<'f> = &'f dyn Fn(&str, Version, &str, u32) -> Option<([f64; 3], f64)>;
+
+/// What `rates` does not know is missing.
+fn results<'a>(plan: &'a Plan, rates: Known<'_>) -> Results<'a> {
+    fixture::results(plan, |cell| {
+        let common = &cell.config.common;
+        rates(&common.environment, common.version, if is_a(cell) { "A" } else { "B" }, cell.run)
+    })
+}
+
+fn is_a(cell: &Cell) -> bool {
+    cell.config.table()["learning_rate"].as_float() == Some(7e-3)
+}
+
+/// All hand-made; the best on the trained version is marked by *.
+fn synthetic(environment: &str, version: Version, name: &str, run: u32) -> Option<([f64; 3], f64)> {
+    use Version::{D, E, R};
+    let rates = match (environment, version, name, run) {
+        ("CartPole", D, "A", 1) => [90.0, 20.0, 40.0], // *
+        ("CartPole", D, "B", 1) => [80.0, 99.0, 99.0],
+        ("CartPole", D, "A", 2) => [70.0, 99.0, 99.0],
+        ("CartPole", D, "B", 2) => [80.0, 50.0, 20.0], // *
+        ("CartPole", R, "A", 1) => [99.0, 50.0, 99.0],
+        ("CartPole", R, "B", 1) => [10.0, 60.0, 10.0], // *
+        ("CartPole", R, "A", 2) => [10.0, 70.0, 64.0], // *
+        ("CartPole", R, "B", 2) => [99.0, 60.0, 99.0],
+        ("CartPole", E, "A", 1) => [1.0, 2.0, 33.0], // *
+        ("CartPole", E, "B", 1) => [3.0, 4.0, 32.0],
+        ("CartPole", E, "A", 2) => [5.0, 6.0, 7.0],
+        ("CartPole", E, "B", 2) => [8.0, 9.0, 10.0],    // *
+        ("Pendulum", D, "A", 1) => [50.0, 0.0, 50.0],   // *
+        ("Pendulum", D, "A", 2) => [60.0, 100.0, 25.0], // *
+        ("Pendulum", R, "A", 1) => [0.0, 30.0, 80.0],   // *
+        ("Pendulum", R, "A", 2) => [0.0, 50.0, 40.0],   // *
+        ("Pendulum", _, "B", _) => [0.0; 3],
+        _ => return None,
+    };
+    Some((rates, 0.0))
+}
+
+fn close(got: f64, expected: f64) {
+    assert!((got - expected).abs() < 1e-9, "{got} is not {expected}");
+}
+
+#[track_caller]
+fn assert_summary(got: Option<Summary>, mean: f64, std: f64, runs: usize) {
+    let got = got.expect("a number");
+    close(got.mean, mean);
+    close(got.std, std);
+    assert_eq!(got.runs, runs);
+}
+
+#[test]
+fn each_run_and_training_version_has_its_best_configuration() {
+    let plan = plan();
+    let results = results(&plan, &synthetic);
+    let selections = results.select();
+    assert_eq!(selections.len(), 2);
+    let chosen = |run: u32| {
+        let trained_on = |version| selections[0].runs[&run].trained_on(version).map(|selected| is_a(selected.cell));
+        Version::ALL.map(trained_on)
+    };
+    assert_eq!(chosen(1), [Some(true), Some(false), Some(true)]);
+    assert_eq!(chosen(2), [Some(false), Some(true), Some(false)]);
+    let rates: Vec<f64> = Scenario::all().filter_map(|scenario| selections[0].runs[&1].rate(scenario)).collect();
+    assert_eq!(rates, [90.0, 20.0, 40.0, 10.0, 60.0, 10.0, 1.0, 2.0, 33.0]);
+    assert_eq!((selections[0].cells, selections[0].done), (12, 12));
+    assert_eq!((selections[1].cells, selections[1].done), (12, 10), "Pendulum's E of A is missing");
+}
+
+#[test]
+fn metrics_are_those_computed_by_hand() {
+    let plan = plan();
+    let results = results(&plan, &synthetic);
+    let selections = results.select();
+    let cart_pole = &selections[0];
+    assert_summary(cart_pole.summary(Metric::Default), 85.0, 5.0, 2);
+    assert_summary(cart_pole.summary(Metric::Interpolation), 65.0, 5.0, 2);
+    // Run 1: ∛(20 · 40 · 10) = 20. Run 2: ∛(50 · 20 · 64) = 40.
+    assert_summary(cart_pole.summary(Metric::Extrapolation), 30.0, 10.0, 2);
+    assert_summary(cart_pole.scenario(Scenario { train: Version::E, test: Version::E }), 21.5, 11.5, 2);
+    let pendulum = &selections[1];
+    // Run 1 has a 0 among its three: 0. Run 2: ∛(100 · 25 · 40) = 46.415888….
+    let second = 100_000.0_f64.cbrt();
+    assert_summary(pendulum.summary(Metric::Extrapolation), second / 2.0, second / 2.0, 2);
+
+    let both: Vec<&Selection<'_>> = selections.iter().collect();
+    // Run 1: (90 + 50) / 2 = 70, run 2: (80 + 60) / 2 = 70. Deviations of environments do not add up.
+    assert_summary(average(&both, Metric::Default), 70.0, 0.0, 2);
+    assert_summary(average(&both, Metric::Interpolation), 52.5, 7.5, 2);
+    let [first, second] = [20.0 / 2.0, (40.0 + second) / 2.0];
+    assert_summary(average(&both, Metric::Extrapolation), (first + second) / 2.0, (second - first) / 2.0, 2);
+    // Of 90, 80, 50, 60 the lowest and the highest go.
+    let iqm = interquartile(&both, Metric::Default, 100).unwrap();
+    close(iqm.iqm, 70.0);
+    assert_eq!(iqm.runs, 2);
+}
+
+#[test]
+fn of_equal_configurations_the_return_and_then_the_plan_decide() {
+    let plan = plan();
+    // A and B are told apart by their rates on R.
+    let on_r = |name: &str| [100.0, if name == "A" { 1.0 } else { 2.0 }, 0.0];
+    let chosen = |rates: Known<'_>| {
+        let results = results(&plan, rates);
+        let selections = results.select();
+        [1, 2].map(|run| selections[0].runs[&run].rate(Scenario { train: Version::D, test: Version::R }))
+    };
+    let higher = ["A", "B"];
+    let by_return = |_: &str, _: Version, name: &str, run: u32| {
+        Some((on_r(name), f64::from(u8::from(name == higher[run as usize - 1]))))
+    };
+    assert_eq!(chosen(&by_return), [Some(1.0), Some(2.0)]);
+    let equal = |_: &str, _: Version, name: &str, _: u32| Some((on_r(name), 5.0));
+    assert_eq!(chosen(&equal), [Some(1.0), Some(1.0)], "A is listed first");
+}
+
+#[test]
+fn what_is_missing_is_missing_and_never_zero() {
+    let plan = plan();
+    // Run 2 has no training on R, and of CartPole no run at all on D.
+    let gaps = |environment: &str, version: Version, name: &str, run: u32| match (environment, version, run) {
+        (_, Version::R, 2) | ("CartPole", Version::D, _) => None,
+        _ => synthetic(environment, version, name, run),
+    };
+    let results = results(&plan, &gaps);
+    let selections = results.select();
+    let [cart_pole, pendulum] = &selections[..] else { panic!() };
+    assert_eq!(cart_pole.summary(Metric::Default), None);
+    assert_eq!(cart_pole.summary(Metric::Extrapolation), None);
+    assert_summary(cart_pole.summary(Metric::Interpolation), 60.0, 0.0, 1);
+    assert_summary(pendulum.summary(Metric::Default), 55.0, 5.0, 2);
+    assert_summary(pendulum.summary(Metric::Extrapolation), 0.0, 0.0, 1);
+    let both: Vec<&Selection<'_>> = selections.iter().collect();
+    assert_eq!(average(&both, Metric::Default), None);
+    assert_eq!(interquartile(&both, Metric::Default, 10), None);
+    assert_summary(average(&both, Metric::Interpolation), 45.0, 0.0, 1);
+    assert_eq!(average(&[], Metric::Default), None);
+}
