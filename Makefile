@@ -77,11 +77,11 @@ demo: build ## train and test PPO on CartPole over gRPC; the paper's row beside 
 	$(PROGRAMS)/perturb demo $(DEMO_ARGS)
 
 all-pairs: build ## train and test every algorithm and architecture on every environment, shortly
-	PROGRAMS=$(PROGRAMS) learner/tests/all_pairs.sh $(ALL_PAIRS_ARGS)
+	PROGRAMS=$(PROGRAMS) cli/tests/all_pairs.sh $(ALL_PAIRS_ARGS)
 
 report-check: build ## make the report of a small experiment and look at it in Chromium, which it installs; minutes
 	@$(call install,chromium python3)
-	PROGRAMS=$(PROGRAMS) learner/tests/report_check.sh $(TARGET)/report-check
+	PROGRAMS=$(PROGRAMS) cli/tests/report_check.sh $(TARGET)/report-check
 
 test: export PERTURB_TEST_DM_ENV_RPC_PYTHON := $(abspath $(DM_ENV_RPC))/bin/python
 test: deps opengl $(DM_ENV_RPC)/installed ## run all tests, then those of the server without MuJoCo
@@ -151,11 +151,13 @@ $(DM_ENV_RPC)/installed: tests/server/dm_env_rpc/requirements.txt | python-venv
 python-venv:
 	@command -v python3 >/dev/null && python3 -c 'import ensurepip' 2>/dev/null || { $(call install,python3 python3-venv); }
 
-# The commit as the learner's build script writes it: the repository is no part of the images' context.
+# The commit as the build script writes it: the repository is no part of the images' context.
 docker: docker-base ## build the container images perturb-server and perturb-learner
-	docker build $(DOCKER_ARGS) --file docker/server.Dockerfile --tag perturb-server .
-	docker build $(DOCKER_ARGS) --file docker/learner.Dockerfile --tag perturb-learner \
-		--build-arg PERTURB_COMMIT="$$(git describe --always --abbrev=12 --dirty --exclude='*' 2>/dev/null || echo unknown commit)" .
+	for program in server learner; do \
+		docker build $(DOCKER_ARGS) --file docker/$$program.Dockerfile --tag perturb-$$program \
+			--build-arg PERTURB_COMMIT="$$(git describe --always --abbrev=12 --dirty --exclude='*' 2>/dev/null || echo unknown commit)" . \
+			|| exit 1; \
+	done
 
 docker-base:
 	@command -v docker >/dev/null || { echo "docker is missing; install Docker 20.10 or later, on Debian the package docker.io" >&2; exit 1; }

@@ -16,11 +16,11 @@ ENV CARGO_PROFILE_RELEASE_DEBUG=false
 WORKDIR /perturb
 # Dependencies first, as in server.Dockerfile: libtorch's bindings take minutes.
 COPY --from=skeleton /skeleton .
-RUN cargo build --package perturb-learner --release --locked && rm -rf target/release/.fingerprint/perturb*
+RUN cargo build --package perturb-cli --release --locked && rm -rf target/release/.fingerprint/perturb*
 COPY . .
 # The commit, which results name: the repository is not in the build's context.
 ARG PERTURB_COMMIT="unknown commit"
-RUN cargo build --package perturb-learner --release --locked
+RUN cargo build --package perturb-cli --release --locked
 # The shared libraries that the program loads: some 280, nearly all of them because libtorch does. Debian's packages
 # would bring 360 MB more, which nobody loads. The C library is left out: the image has its own.
 RUN mkdir /libraries \

@@ -18,6 +18,8 @@ WORKDIR /perturb
 COPY --from=skeleton /skeleton .
 RUN cargo build --package perturb --release --locked && rm -rf target/release/.fingerprint/perturb*
 COPY . .
+# The commit, which the program tells: the repository is not in the build's context.
+ARG PERTURB_COMMIT="unknown commit"
 RUN cargo build --package perturb --release --locked
 
 FROM debian:bookworm-slim

@@ -4,11 +4,12 @@
 
 use std::time::Instant;
 
-use perturb_learner::algorithm::{A2c, A2cConfig, Algorithm, Ppo, PpoConfig};
-use perturb_learner::config::Architecture;
-use perturb_learner::policy::{ActionKind, Actor, Acts, ObservationNormaliser, Policy};
-use perturb_learner::random::{Purpose, normal, stream};
+use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
+use perturb_learner::policy::{ActionKind, Actor, Acts, ObservationNormaliser, Policy, PolicySpec};
 use perturb_learner::rollout::{Rollout, RolloutStep};
+use perturb_study::random::{Purpose, normal, stream};
+use perturb_study::settings::Architecture;
+use perturb_study::settings::{A2cConfig, PpoConfig};
 
 const TASKS: [(&str, usize, ActionKind); 2] =
     [("cart_pole", 4, ActionKind::Discrete { n: 2 }), ("half_cheetah", 26, ActionKind::Continuous { size: 6 })];
@@ -32,7 +33,7 @@ fn time(id: &str, repetitions: usize, mut run: impl FnMut()) {
 }
 
 fn policy(observation_size: usize, action: ActionKind) -> Policy {
-    Policy::new(Architecture::Ff.spec(observation_size, action), 1).expect("a policy")
+    Policy::new(PolicySpec::of(Architecture::Ff, observation_size, action), 1).expect("a policy")
 }
 
 fn observations(size: usize) -> Vec<f32> {
@@ -71,7 +72,7 @@ fn rollout(policy: &Policy, n_steps: usize, n_envs: usize) -> Rollout {
 /// Recurrent policies of the paper's size. `plain` names updates whose gradient is left to libtorch, the measure of the
 /// two-stage one.
 fn recurrent(task: &str, observation_size: usize, action: ActionKind) {
-    let policy = || Policy::new(Architecture::Rc.spec(observation_size, action), 1).expect("a policy");
+    let policy = || Policy::new(PolicySpec::of(Architecture::Rc, observation_size, action), 1).expect("a policy");
     let (first, plain) = (policy(), policy().with_plain_autograd());
     for n_envs in [1, 16] {
         let mut actor = Actor::new(first.spec(), n_envs);

@@ -2,9 +2,9 @@
 //! server on a Unix socket. Prints env steps/s and where the time went.
 
 use perturb_learner::client::{PrivateServerOptions, Servers};
-use perturb_learner::config::TrainConfig;
-use perturb_learner::interrupt::StopFlag;
 use perturb_learner::training::{RunDirectory, train};
+use perturb_study::interrupt::StopFlag;
+use perturb_study::settings::TrainConfig;
 
 const CONFIG: &str = "
 environment = 'CartPole'

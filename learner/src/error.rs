@@ -1,19 +1,14 @@
 //! What can go wrong in the numerical half of the learner.
 
+use perturb_study::settings::SettingError;
+
 /// A failure of a policy, a rollout or an update.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
     /// A setting is outside its range.
-    #[error("{name} is {got}, but must be {expected}")]
-    Setting {
-        /// The setting, as written in the configuration file.
-        name: &'static str,
-        /// The value that was given.
-        got: String,
-        /// What is accepted.
-        expected: &'static str,
-    },
+    #[error(transparent)]
+    Setting(#[from] SettingError),
     /// An array has the wrong number of elements.
     #[error("{name} has {got} elements, expected {expected}")]
     Length {
@@ -94,11 +89,6 @@ pub enum Error {
 
 /// A result with this module's [`Error`].
 pub type Result<T> = std::result::Result<T, Error>;
-
-/// `Ok` if `value` is finite and `accepted`; otherwise an [`Error::Setting`].
-pub(crate) fn check(name: &'static str, value: f64, accepted: bool, expected: &'static str) -> Result<()> {
-    if value.is_finite() && accepted { Ok(()) } else { Err(Error::Setting { name, got: value.to_string(), expected }) }
-}
 
 /// `Ok` if a slice has the expected length; otherwise an [`Error::Length`].
 pub(crate) fn check_length(name: &'static str, got: usize, expected: usize) -> Result<()> {

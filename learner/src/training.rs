@@ -10,15 +10,16 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 
-use crate::algorithm::{Algorithm, Experience, UpdateStats};
-use crate::checkpoint::{Checkpoint, Counters, EnvironmentSummary, History, ResumeState, State};
+use crate::algorithm::{self, Algorithm, Experience, UpdateStats};
+use crate::checkpoint::{Checkpoint, EnvironmentSummary, History, ResumeState, State};
 use crate::client::{EndedEpisode, OpenOptions, Servers, Session};
-use crate::config::{Common, TrainConfig, Wrapper};
-use crate::interrupt::StopFlag;
 use crate::logging::{Clock, Logs, Progress};
-use crate::policy::{Inputs, ObservationNormaliser, Policy, RewardNormaliser, Weights};
+use crate::policy::{Inputs, ObservationNormaliser, Policy, PolicySpec, RewardNormaliser, Weights};
 use crate::rollout::{Collector, Normalisers, Rollout};
 pub use crate::run_directory::RunDirectory;
+use perturb_study::Counters;
+use perturb_study::interrupt::StopFlag;
+use perturb_study::settings::{Common, TrainConfig, Wrapper};
 
 /// Means are over so many episodes, as in stable-baselines3.
 const RECENT: usize = 100;
@@ -108,7 +109,7 @@ impl<'a> Training<'a> {
         let observation_size = session.observation_size();
         let with_outcomes = common.algorithm.wrapper() == Wrapper::Rl2;
         let inputs = Inputs::new(observation_size, summary.action, common.num_envs, with_outcomes);
-        let spec = common.architecture.spec(inputs.size(), summary.action);
+        let spec = PolicySpec::of(common.architecture, inputs.size(), summary.action);
         let policy = Policy::new(spec.clone(), common.seed)?;
         let normalisers = Normalisers {
             observations: common.normalize_observations.then(|| ObservationNormaliser::new(observation_size)),
@@ -176,9 +177,9 @@ impl<'a> Training<'a> {
         collector: Collector<'a>,
         mut whole: Checkpoint,
     ) -> Result<Self> {
-        let algorithm = config.algorithm(&policy)?;
-        if !whole.state.commits.iter().any(|commit| commit == crate::VERSION) {
-            whole.state.commits.push(crate::VERSION.into());
+        let algorithm = algorithm::build(&config.settings, &policy, config.common.seed)?;
+        if !whole.state.commits.iter().any(|commit| commit == perturb_study::VERSION) {
+            whole.state.commits.push(perturb_study::VERSION.into());
         }
         let spec = policy.spec();
         let (n_envs, input_size, width) = (config.common.num_envs, spec.observation_size, spec.action.width());

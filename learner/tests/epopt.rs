@@ -7,18 +7,17 @@ mod common;
 use std::collections::{BTreeMap, HashSet};
 
 use common::{bases, connect, contents, moved, options, server};
-use perturb_learner::algorithm::{
-    A2c, A2cConfig, Algorithm, AlgorithmState, Epopt, EpoptConfig, Ppo, PpoConfig, Selection, UpdateStats,
-};
+use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Epopt, Ppo, Selection, UpdateStats};
 use perturb_learner::client::{EndedEpisode, PrivateServer, Session};
 use perturb_learner::error::Error;
 use perturb_learner::policy::{
     ActionKind, Actor, Acts, Inputs, ObservationNormaliser, Policy, PolicySpec, RewardNormaliser, Sequences,
 };
-use perturb_learner::random::{Purpose, normal, stream, uniform};
 use perturb_learner::rollout::{
     Collector, Estimates, Normalisers, Rollout, RolloutStep, Span, Trajectories, gae, n_step_returns,
 };
+use perturb_study::random::{Purpose, normal, stream, uniform};
+use perturb_study::settings::{A2cConfig, EpoptConfig, PpoConfig};
 use proptest::prelude::*;
 use rand_chacha::ChaCha8Rng;
 use tch::{Kind, Tensor};

@@ -1,10 +1,11 @@
 //! Whether the algorithms learn, on tasks of seconds; and what their updates promise.
 
-use perturb_learner::algorithm::{A2c, A2cConfig, Algorithm, AlgorithmState, Ppo, PpoConfig, Schedule};
+use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Ppo};
 use perturb_learner::error::Error;
 use perturb_learner::policy::{ActionKind, Actor, Acts, Policy, PolicySpec, Sequences};
-use perturb_learner::random::{Purpose, normal, stream, uniform};
 use perturb_learner::rollout::{Rollout, RolloutStep};
+use perturb_study::random::{Purpose, normal, stream, uniform};
+use perturb_study::settings::{A2cConfig, PpoConfig, Schedule, SettingError};
 use rand_chacha::ChaCha8Rng;
 use tch::{Kind, Tensor};
 
@@ -345,14 +346,14 @@ fn rollouts_that_do_not_fit_are_refused() {
     assert!(matches!(short.update(&mut training.policy, &training.rollout, 1.0), Err(Error::Length { .. })));
     let mut odd = ppo(&training, 3);
     let result = odd.update(&mut training.policy, &training.rollout, 1.0);
-    assert!(matches!(result, Err(Error::Setting { name: "n_minibatches", .. })), "{result:?}");
+    assert!(matches!(&result, Err(Error::Setting(error)) if error.name == "n_minibatches"), "{result:?}");
     assert!(matches!(training.rollout.finish(&[0.0; 3]), Err(Error::Length { .. })));
 }
 
 #[test]
 fn settings_outside_their_ranges_are_refused_by_name() {
-    let refused = |result: Result<(), Error>, setting| {
-        assert!(matches!(result, Err(Error::Setting { name, .. }) if name == setting), "{setting}: {result:?}");
+    let refused = |result: Result<(), SettingError>, setting| {
+        assert!(matches!(&result, Err(error) if error.name == setting), "{setting}: {result:?}");
     };
     A2cConfig::default().validate().expect("defaults are valid");
     PpoConfig::default().validate().expect("defaults are valid");

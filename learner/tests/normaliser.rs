@@ -2,7 +2,7 @@
 
 use perturb_learner::error::Error;
 use perturb_learner::policy::{ObservationNormaliser, RewardNormaliser};
-use perturb_learner::random::{Purpose, normal, stream};
+use perturb_study::random::{Purpose, normal, stream};
 use proptest::prelude::*;
 
 /// Mean and population variance in two passes.

@@ -1,11 +1,12 @@
 //! Recurrent policies: acting and learning see the same function of the past, its gradient is right, and it can be used
 //! to remember.
 
-use perturb_learner::algorithm::{A2c, A2cConfig, Algorithm, AlgorithmState, Ppo, PpoConfig};
+use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Ppo};
 use perturb_learner::error::Error;
 use perturb_learner::policy::{ActionKind, Actor, Acts, Evaluated, Policy, PolicySpec, Sequences, Weights};
-use perturb_learner::random::{Purpose, normal, stream, uniform};
 use perturb_learner::rollout::{Rollout, RolloutStep};
+use perturb_study::random::{Purpose, normal, stream, uniform};
+use perturb_study::settings::{A2cConfig, PpoConfig};
 use rand_chacha::ChaCha8Rng;
 use tch::{Kind, Tensor};
 
@@ -419,7 +420,7 @@ fn what_does_not_fit_a_recurrent_policy_is_refused() {
     training.collect();
     let mut odd = ppo(&training, 3); // divides T·N = 96, but not N = 16
     let result = odd.update(&mut training.policy, &training.rollout, 1.0);
-    assert!(matches!(result, Err(Error::Setting { name: "n_minibatches", .. })), "{result:?}");
+    assert!(matches!(&result, Err(Error::Setting(error)) if error.name == "n_minibatches"), "{result:?}");
 
     let mut forgetful = Training::new(None, 6);
     forgetful.collect();
@@ -430,5 +431,5 @@ fn what_does_not_fit_a_recurrent_policy_is_refused() {
         Err(Error::Length { .. })
     ));
     let spec = PolicySpec { lstm: Some(0), ..training.policy.spec().clone() };
-    assert!(matches!(Policy::new(spec, 1), Err(Error::Setting { name: "the width of the LSTM", .. })));
+    assert!(matches!(Policy::new(spec, 1), Err(Error::Setting(error)) if error.name == "the width of the LSTM"));
 }

@@ -5,16 +5,18 @@
 mod common;
 
 use common::{bases, connect, contents, moved, options, server};
-use perturb_learner::algorithm::{A2c, A2cConfig, Algorithm, Ppo, PpoConfig};
+use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{EndedEpisode, OpenOptions, Servers, Session, StepReply};
-use perturb_learner::config::TrainConfig;
-use perturb_learner::evaluation::{Version, test};
-use perturb_learner::interrupt::StopFlag;
+use perturb_learner::evaluation::test;
 use perturb_learner::policy::{ActionKind, Actor, Acts, Inputs, Policy, PolicySpec};
-use perturb_learner::random::{Purpose, stream, uniform};
 use perturb_learner::rollout::{Collector, Normalisers, Rollout, RolloutStep, gae};
 use perturb_learner::training::{RunDirectory, train};
+use perturb_study::Version;
+use perturb_study::interrupt::StopFlag;
+use perturb_study::random::{Purpose, stream, uniform};
+use perturb_study::settings::TrainConfig;
+use perturb_study::settings::{A2cConfig, PpoConfig};
 use rand_chacha::ChaCha8Rng;
 
 const TWO: ActionKind = ActionKind::Discrete { n: 2 };

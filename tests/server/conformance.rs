@@ -3,7 +3,7 @@
 use crate::common::server::{self, Actor, Server, Session, action, doubles, floats, open, parameters, stepped};
 use bytes::Bytes;
 use perturb::proto::{
-    AutoresetMode, Distribution, Environment, EpisodeEnd, EpisodeStart, Open, Opened, Reset, Restore, Snapshot, Step,
+    AutoresetMode, Distribution, Environment, EpisodeEnd, EpisodeStart, Open, Opened, Reset, Restore, Snapshot,
     Stepped, Version, action_space::Kind, session_request::Request, session_response::Response,
 };
 use std::collections::HashSet;
@@ -106,8 +106,8 @@ async fn every_request_is_answered_once_and_in_order_also_when_pipelined() {
     let target = Target::get();
     for e in &target.catalogue().await {
         let actor = Actor::new(e, 3);
-        let step = |t| Request::Step(Step { actions: actor.actions(t) });
-        let bad = || Request::Step(Step { actions: Bytes::from_static(b"x") });
+        let step = |t| server::step(actor.actions(t));
+        let bad = || server::step(Bytes::from_static(b"x"));
         let mut requests = vec![step(0), Request::Open(open(&e.name, 3, 1)), Request::Open(open(&e.name, 3, 1))];
         for t in 0..300 {
             requests.extend(if t % 10 == 0 { vec![bad(), step(t)] } else { vec![step(t)] });
@@ -120,7 +120,7 @@ async fn every_request_is_answered_once_and_in_order_also_when_pipelined() {
         let mut one_by_one = Session::connect(&target.address).await;
         let mut expected = Vec::new();
         for request in &requests {
-            expected.push(one_by_one.ask(request.clone()).await);
+            expected.push(one_by_one.answer(request.clone()).await);
         }
         let mut pipelined = Session::connect(&target.address).await;
         for request in &requests {
@@ -259,11 +259,11 @@ async fn episodes(target: &Target, e: &Environment, autoreset: AutoresetMode, ep
         assert_eq!(ends.next(), None);
         if autoreset == AutoresetMode::Disabled && !broken.is_empty() {
             let actions = Actor::new(e, N).actions(0);
-            let (code, message) = session.refused(Request::Step(Step { actions })).await;
+            let (code, message) = session.refused(server::step(actions)).await;
             assert_eq!(code, Code::FailedPrecondition, "{message}");
             assert!(broken.iter().all(|slot| message.contains(&slot.to_string())), "names the slots: {message}");
             let mask: Vec<u8> = (0..N).map(|slot| broken.contains(&slot).into()).collect();
-            let done = session.reset(Reset { mask: mask.into(), ..Reset::default() }).await;
+            let done = session.ask(Reset { mask: mask.into(), ..Reset::default() }).await;
             for (i, &slot) in broken.iter().enumerate() {
                 seen[slot].push(begin(&done.observations, i));
             }
@@ -303,7 +303,7 @@ async fn a_reset_touches_the_selected_environments_only() {
         let (mut twin, _) = target.open(open(&e.name, N as u32, 2)).await;
         let actor = Actor::new(e, N);
         assert_eq!(session.play(actor, 0, 5).await, twin.play(actor, 0, 5).await);
-        let done = session.reset(Reset { mask: Bytes::from_static(&[0, 1, 0, 1]), ..Reset::default() }).await;
+        let done = session.ask(Reset { mask: Bytes::from_static(&[0, 1, 0, 1]), ..Reset::default() }).await;
         let o = 4 * e.observation.len();
         assert_eq!(done.observations.len(), 2 * o);
         let starts: Vec<_> = done.started.iter().map(|s| (s.slot, numbers(&s.episode))).collect();
@@ -313,7 +313,7 @@ async fn a_reset_touches_the_selected_environments_only() {
             let same = row(&after.observations, slot, o) == row(&twin.observations, slot, o);
             assert_eq!(same, slot % 2 == 0, "{}: slot {slot}", e.name);
         }
-        let none = session.reset(Reset { mask: Bytes::from_static(&[0; N]), ..Reset::default() }).await;
+        let none = session.ask(Reset { mask: Bytes::from_static(&[0; N]), ..Reset::default() }).await;
         assert_eq!((none.observations.len(), none.started.len()), (0, 0), "a mask may select nothing");
     }
 }
@@ -325,7 +325,7 @@ async fn reset_with_seeds_begins_like_a_fresh_session_of_those_seeds() {
         let (mut session, _) = target.open(open(&e.name, 3, 1)).await;
         session.play(Actor::new(e, 3), 0, 50).await;
         let mask = Bytes::from_static(&[0, 1, 1]);
-        let done = session.reset(Reset { mask, seeds: vec![77, u64::MAX], ..Reset::default() }).await;
+        let done = session.ask(Reset { mask, seeds: vec![77, u64::MAX], ..Reset::default() }).await;
         let o = 4 * e.observation.len();
         for (i, (slot, seed)) in [(1, 77), (2, u64::MAX)].into_iter().enumerate() {
             let fresh = Open { first_environment_index: slot, ..open(&e.name, 1, seed) };
@@ -425,13 +425,13 @@ async fn parameters_given_at_reset_begin_a_trial_and_stay_in_force_for_the_selec
         let x = last.default_value * 1.05;
         let given = parameters(&[(&last.name, &[(x, x)])]);
         let mask = Bytes::from_static(&[0, 1]);
-        let done = session.reset(Reset { mask, parameters: given, ..Reset::default() }).await;
+        let done = session.ask(Reset { mask, parameters: given, ..Reset::default() }).await;
         assert_eq!(numbers(&done.started[0].episode), (1, 1, 1, 0), "a new trial");
         let mut expected: Vec<f64> = e.parameters.iter().map(|p| p.default_value).collect();
         let defaults = expected.clone();
         *expected.last_mut().unwrap() = x;
         assert_eq!(requested(&done.started), [expected.clone()], "{}", e.name);
-        let done = session.reset(Reset::default()).await;
+        let done = session.ask(Reset::default()).await;
         assert_eq!(numbers(&done.started[0].episode), (0, 0, 1, 1), "the trial goes on");
         assert_eq!(numbers(&done.started[1].episode), (1, 1, 2, 1), "the trial goes on");
         assert_eq!(requested(&done.started), [defaults, expected], "{}", e.name);
@@ -447,7 +447,7 @@ async fn parameters_are_drawn_anew_when_a_trial_begins_and_only_then() {
             let (mut session, opened) = target.open(request).await;
             let mut starts = opened.started;
             for _ in 1..3 * expected {
-                starts.extend(session.reset(Reset::default()).await.started);
+                starts.extend(session.ask(Reset::default()).await.started);
             }
             let drawn = requested(&starts);
             for (i, start) in starts.iter().enumerate() {
@@ -468,7 +468,7 @@ async fn an_exact_state_replaces_the_drawn_one_for_one_episode() {
         let (mut session, _) = target.open(version(open(&e.name, 2, 1), Version::Default)).await;
         let (mut twin, _) = target.open(version(open(&e.name, 2, 1), Version::Default)).await;
         let same = [state(e, 0), state(e, 0)].concat();
-        let done = session.reset(Reset { states: doubles(&same), ..Reset::default() }).await;
+        let done = session.ask(Reset { states: doubles(&same), ..Reset::default() }).await;
         let o = 4 * e.observation.len();
         assert_eq!(row(&done.observations, 0, o), row(&done.observations, 1, o), "{}: one state, one look", e.name);
         for (i, channel) in e.observation.iter().enumerate() {
@@ -477,14 +477,14 @@ async fn an_exact_state_replaces_the_drawn_one_for_one_episode() {
             }
         }
         let mask = Bytes::from_static(&[0, 1]);
-        let one = session.reset(Reset { mask, states: doubles(&state(e, 3)), ..Reset::default() }).await;
+        let one = session.ask(Reset { mask, states: doubles(&state(e, 3)), ..Reset::default() }).await;
         assert_ne!(one.observations, row(&done.observations, 1, o), "{}: another state, another look", e.name);
         // The next episode is drawn as if nothing had happened.
         for _ in 0..2 {
-            twin.reset(Reset::default()).await;
+            twin.ask(Reset::default()).await;
         }
-        session.reset(Reset { mask: Bytes::from_static(&[1, 0]), ..Reset::default() }).await;
-        assert_eq!(session.reset(Reset::default()).await, twin.reset(Reset::default()).await, "{}", e.name);
+        session.ask(Reset { mask: Bytes::from_static(&[1, 0]), ..Reset::default() }).await;
+        assert_eq!(session.ask(Reset::default()).await, twin.ask(Reset::default()).await, "{}", e.name);
     }
 }
 
@@ -517,7 +517,7 @@ async fn a_restored_environment_goes_on_as_it_did() {
         let o = 4 * e.observation.len();
         let restored = moved.restore(&[0, 0, 1], vec![snapshots[0].clone()]).await;
         assert_eq!(restored, row(&before, 0, o), "{}", e.name);
-        let done = moved.reset(Reset::default()).await;
+        let done = moved.ask(Reset::default()).await;
         assert_eq!(done.started.iter().map(|s| numbers(&s.episode).0).collect::<Vec<_>>(), [0, 1, 0]);
         assert_eq!(opened.started.len(), N);
     }
@@ -567,7 +567,7 @@ async fn a_refused_request_changes_nothing() {
         *states.last_mut().unwrap() = f64::INFINITY;
         let bad = [
             Request::Open(open(&e.name, N as u32, 1)),
-            Request::Step(Step { actions: actor.actions(0).slice(1..) }),
+            server::step(actor.actions(0).slice(1..)),
             Request::Reset(Reset { mask: Bytes::from_static(&[1, 1, 2]), ..Reset::default() }),
             Request::Reset(Reset { seeds: vec![1; N + 1], ..Reset::default() }),
             Request::Reset(Reset { seeds: vec![1; N], parameters: half, ..Reset::default() }),
@@ -601,7 +601,7 @@ async fn sessions_on_one_connection_are_independent() {
         let mut sessions = Vec::new();
         for seed in 0..4 {
             let mut session = Session::start(&mut client).await.unwrap();
-            session.ask(Request::Open(open(&e.name, 2, seed))).await;
+            session.answer(open(&e.name, 2, seed)).await;
             sessions.push(session);
         }
         let mut interleaved = vec![Vec::new(); 4];

@@ -1,7 +1,7 @@
 //! The same session gives the same bytes, whatever the number of workers, the transport, or the split of the batch.
 
 use crate::common::server::{Actor, Server, Session, catalogue, open, stepped};
-use perturb::proto::{EpisodeEnd, EpisodeStart, Open, SessionResponse, Stepped, session_response::Response};
+use perturb::proto::{EpisodeEnd, EpisodeStart, Open, Reset, SessionResponse, Stepped, session_response::Response};
 use prost::Message;
 use sha2::{Digest, Sha256};
 use std::io::Write;
@@ -19,7 +19,7 @@ async fn transcript(address: &str, open: Open, actor: Actor<'_>, steps: u64) -> 
             response: Some(Response::Snapshot(perturb::proto::Snapshotted { snapshots: vec![snapshot] })),
         });
     }
-    all.push(SessionResponse { response: Some(Response::Reset(session.reset(Default::default()).await)) });
+    all.push(SessionResponse { response: Some(Response::Reset(session.ask(Reset::default()).await)) });
     all
 }
 

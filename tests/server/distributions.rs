@@ -9,6 +9,7 @@ use perturb::{
     tasks,
 };
 use proptest::prelude::*;
+use rstest::rstest;
 
 /// Environment, parameter, unit, D, R, E: docs/environments.md and the paper's table of parameter ranges.
 #[rustfmt::skip]
@@ -213,32 +214,25 @@ fn an_override_does_not_move_the_other_parameters_draws() {
     assert_eq!(receipt(base)[1..], receipt(changed)[1..]);
 }
 
-#[test]
-fn unions_that_are_none_are_refused() {
-    let (inf, nan) = (f64::INFINITY, f64::NAN);
-    let cases: &[(&[(f64, f64)], &str)] = &[
-        (&[], "1 to 64 intervals"),
-        (&[(nan, 1.0)], "finite ends"),
-        (&[(0.0, nan)], "finite ends"),
-        (&[(-inf, 1.0)], "finite ends"),
-        (&[(0.0, inf)], "finite ends"),
-        (&[(0.0, 1.0), (2.0, inf)], "finite ends"),
-        (&[(2.0, 1.0)], "low at most high in every interval"),
-        (&[(0.0, 1.0), (3.0, 2.0)], "low at most high in every interval"),
-        (&[(0.0, 0.0), (1.0, 2.0)], "intervals of positive length; a fixed value stands alone"),
-        (&[(0.0, 1.0), (1.0, 1.0)], "intervals of positive length; a fixed value stands alone"),
-        (&[(0.0, 2.0), (1.0, 3.0)], "ascending intervals that do not overlap"),
-        (&[(2.0, 3.0), (0.0, 1.0)], "ascending intervals that do not overlap"),
-        (&[(0.0, 1.0), (0.0, 1.0)], "ascending intervals that do not overlap"),
-    ];
-    for (pairs, reason) in cases {
-        let intervals: Vec<_> = pairs.iter().map(|&(low, high)| Interval::new(low, high)).collect();
-        match Distribution::union("mass", &intervals) {
-            Err(Error::Distribution { parameter, expected, .. }) => {
-                assert_eq!((parameter.as_str(), expected), ("mass", *reason), "{pairs:?}");
-            }
-            other => panic!("{pairs:?}: {other:?}"),
-        }
+#[rstest]
+#[case::empty(&[], "1 to 64 intervals")]
+#[case::nan_low(&[(f64::NAN, 1.0)], "finite ends")]
+#[case::nan_high(&[(0.0, f64::NAN)], "finite ends")]
+#[case::infinite_low(&[(-f64::INFINITY, 1.0)], "finite ends")]
+#[case::infinite_high(&[(0.0, f64::INFINITY)], "finite ends")]
+#[case::the_second_infinite(&[(0.0, 1.0), (2.0, f64::INFINITY)], "finite ends")]
+#[case::reversed(&[(2.0, 1.0)], "low at most high in every interval")]
+#[case::the_second_reversed(&[(0.0, 1.0), (3.0, 2.0)], "low at most high in every interval")]
+#[case::a_point_first(&[(0.0, 0.0), (1.0, 2.0)], "intervals of positive length; a fixed value stands alone")]
+#[case::a_point_second(&[(0.0, 1.0), (1.0, 1.0)], "intervals of positive length; a fixed value stands alone")]
+#[case::overlapping(&[(0.0, 2.0), (1.0, 3.0)], "ascending intervals that do not overlap")]
+#[case::descending(&[(2.0, 3.0), (0.0, 1.0)], "ascending intervals that do not overlap")]
+#[case::twice(&[(0.0, 1.0), (0.0, 1.0)], "ascending intervals that do not overlap")]
+fn a_union_that_is_none_is_refused(#[case] pairs: &[(f64, f64)], #[case] reason: &str) {
+    let intervals: Vec<_> = pairs.iter().map(|&(low, high)| Interval::new(low, high)).collect();
+    match Distribution::union("mass", &intervals) {
+        Err(Error::Distribution { parameter, expected, .. }) => assert_eq!((&*parameter, expected), ("mass", reason)),
+        other => panic!("{other:?}"),
     }
 }
 

@@ -1,7 +1,8 @@
 //! How the server begins and ends: configuration, addresses, health, reflection, signals, draining.
 
 use crate::common::server::{self, Actor, Server, Session, command, environment, open, until, within};
-use perturb::proto::{Step, session_request::Request, session_response::Response};
+use insta::assert_snapshot;
+use rstest::rstest;
 use std::{
     io::Write,
     net::{TcpListener, TcpStream},
@@ -62,45 +63,46 @@ async fn max_envs(server: &Server) -> u32 {
     reply.into_inner().max_batch_size
 }
 
+#[rstest]
 #[tokio::test]
-async fn after_sigterm_running_sessions_go_on_new_ones_are_refused_and_the_exit_status_is_0() {
-    for signal in ["TERM", "INT"] {
-        let mut server = Server::start(&["--grace-seconds", "100000"]);
-        let e = environment(server.tcp(), "CartPole").await;
-        let actor = Actor::new(&e, 4);
-        let (mut session, _) = Session::open(server.tcp(), open("CartPole", 4, 1)).await;
-        let (mut twin, _) = Session::open(server.tcp(), open("CartPole", 4, 1)).await;
-        let mut not_opened = Session::connect(server.tcp()).await;
-        let reference = twin.play(actor, 0, 400).await;
-        drop(twin);
-        let mut replies = session.play(actor, 0, 200).await;
-        let mut client = server::client(server.tcp()).await;
-        assert_eq!(health(server.tcp(), SERVICE).await.unwrap(), ServingStatus::Serving);
-        assert_eq!(health(server.tcp(), "").await.unwrap(), ServingStatus::Serving);
+async fn after_a_signal_running_sessions_go_on_new_ones_are_refused_and_the_exit_status_is_0(
+    #[values("TERM", "INT")] signal: &str,
+) {
+    let mut server = Server::start(&["--grace-seconds", "100000"]);
+    let e = environment(server.tcp(), "CartPole").await;
+    let actor = Actor::new(&e, 4);
+    let (mut session, _) = Session::open(server.tcp(), open("CartPole", 4, 1)).await;
+    let (mut twin, _) = Session::open(server.tcp(), open("CartPole", 4, 1)).await;
+    let mut not_opened = Session::connect(server.tcp()).await;
+    let reference = twin.play(actor, 0, 400).await;
+    drop(twin);
+    let mut replies = session.play(actor, 0, 200).await;
+    let mut client = server::client(server.tcp()).await;
+    assert_eq!(health(server.tcp(), SERVICE).await.unwrap(), ServingStatus::Serving);
+    assert_eq!(health(server.tcp(), "").await.unwrap(), ServingStatus::Serving);
 
-        server.signal(signal);
-        until("health tells of the end", async || {
-            health(server.tcp(), SERVICE).await.unwrap() == ServingStatus::NotServing
-        })
-        .await;
-        assert_eq!(health(server.unix(), "").await.unwrap(), ServingStatus::NotServing, "the whole server drains");
-        let status = Session::start(&mut client).await.err().expect("a new session is refused");
-        assert_eq!(status.code(), Code::Unavailable, "{status:?}");
-        assert!(status.message().contains("shutting down"), "{status:?}");
-        let status = Session::start(&mut server::client(server.unix()).await).await.err().expect("is refused");
-        assert_eq!(status.code(), Code::Unavailable, "also on a new connection: {status:?}");
-        not_opened.send(Request::Open(open("CartPole", 1, 1))).await;
-        let status = not_opened.end().await;
-        assert_eq!(status.code(), Code::Unavailable, "nothing is opened any more: {status:?}");
+    server.signal(signal);
+    until("health tells of the end", async || {
+        health(server.tcp(), SERVICE).await.unwrap() == ServingStatus::NotServing
+    })
+    .await;
+    assert_eq!(health(server.unix(), "").await.unwrap(), ServingStatus::NotServing, "the whole server drains");
+    let status = Session::start(&mut client).await.err().expect("a new session is refused");
+    assert_eq!(status.code(), Code::Unavailable, "{status:?}");
+    assert!(status.message().contains("shutting down"), "{status:?}");
+    let status = Session::start(&mut server::client(server.unix()).await).await.err().expect("is refused");
+    assert_eq!(status.code(), Code::Unavailable, "also on a new connection: {status:?}");
+    not_opened.send(open("CartPole", 1, 1)).await;
+    let status = not_opened.end().await;
+    assert_eq!(status.code(), Code::Unavailable, "nothing is opened any more: {status:?}");
 
-        replies.extend(session.play(actor, 200, 400).await);
-        assert!(replies == reference, "the running session goes on as if nothing had happened");
-        assert!(server.child.try_wait().unwrap().is_none(), "the server waits for its session");
-        session.close();
-        assert_eq!(session.receive().await.unwrap(), None);
-        assert_eq!(server.ended().await.code(), Some(0));
-        assert!(!server.socket().exists(), "the socket's file is gone");
-    }
+    replies.extend(session.play(actor, 200, 400).await);
+    assert!(replies == reference, "the running session goes on as if nothing had happened");
+    assert!(server.child.try_wait().unwrap().is_none(), "the server waits for its session");
+    session.close();
+    assert_eq!(session.receive().await.unwrap(), None);
+    assert_eq!(server.ended().await.code(), Some(0));
+    assert!(!server.socket().exists(), "the socket's file is gone");
 }
 
 #[tokio::test]
@@ -115,7 +117,7 @@ async fn after_the_grace_period_sessions_end_with_unavailable_and_the_exit_statu
         let environment = opened.environment.unwrap();
         for t in 0.. {
             let actions = Actor::new(&environment, 200).actions(t % 100);
-            let request = Some(Request::Step(Step { actions }));
+            let request = Some(server::step(actions));
             if sender.send(perturb::proto::SessionRequest { request }).await.is_err() {
                 return;
             }
@@ -274,93 +276,100 @@ fn a_port_in_use_is_an_error_that_names_it() {
 
 #[test]
 fn a_bad_flag_is_refused_before_any_port_is_bound() {
-    let cases: &[(&[&str], &[&str])] = &[
-        (&["--workers", "0"], &["workers is 0", "1 … 1024"]),
-        (&["--workers", "1025"], &["workers is 1025"]),
-        (&["--workers", "-1"], &["-1"]),
-        (&["--workers", "two"], &["two", "--workers"]),
-        (&["--max-envs", "0"], &["max_envs is 0"]),
-        (&["--max-envs", "16777217"], &["max_envs is 16777217", "16777216"]),
-        (&["--max-sessions", "0"], &["max_sessions is 0"]),
-        (&["--max-message-bytes", "1023"], &["max_message_bytes is 1023", "1024"]),
-        (&["--keepalive-seconds", "0"], &["keepalive_seconds is 0"]),
-        (&["--keepalive-seconds", "18446744073709551615"], &["keepalive_seconds is 18446744073709551615"]),
-        (&["--grace-seconds", "-1"], &["-1"]),
-        (&["--log", "perturb=loud"], &["log is perturb=loud"]),
-        (&["--listen", "127.0.0.1"], &["127.0.0.1", "no address to listen at", "unix:/path"]),
-        (&["--listen", "http://127.0.0.1:0"], &["http://", "no address"]),
-        (&["--listen", "unix:"], &["no address"]),
-        (&["--colour", "red"], &["--colour"]),
-        (&["--config", "/nowhere/server.toml"], &["/nowhere/server.toml"]),
+    let wrong: &[&[&str]] = &[
+        &["--workers", "0"],
+        &["--workers", "1025"],
+        &["--workers", "-1"],
+        &["--workers", "two"],
+        &["--max-envs", "0"],
+        &["--max-envs", "16777217"],
+        &["--max-sessions", "0"],
+        &["--max-message-bytes", "1023"],
+        &["--keepalive-seconds", "0"],
+        &["--keepalive-seconds", "18446744073709551615"],
+        &["--grace-seconds", "-1"],
+        &["--log", "perturb=loud"],
+        &["--listen", "127.0.0.1"],
+        &["--listen", "http://127.0.0.1:0"],
+        &["--listen", "unix:"],
+        &["--colour", "red"],
+        &["--config", "/nowhere/server.toml"],
     ];
-    for (flags, words) in cases {
+    let said = wrong.iter().map(|flags| {
         let mut command = command();
         command.args(["--listen", "tcp://127.0.0.1:0"]).args(*flags);
-        let message = refused(command);
-        for word in *words {
-            assert!(message.contains(word), "{flags:?}: {message:?} does not say {word:?}");
-        }
-    }
+        format!("{}\n{}\n", flags.join(" "), refused(command))
+    });
+    assert_snapshot!(said.collect::<String>());
 }
 
 #[test]
-fn a_bad_file_or_variable_is_refused_before_any_port_is_bound() {
+fn a_bad_file_is_refused_before_any_port_is_bound() {
     let directory = tempfile::tempdir().unwrap();
-    let cases = [
-        ("max_env = 3", "max_env"),
-        ("workers = 0", "workers is 0"),
-        ("workers = \"many\"", "workers"),
-        ("workers = -3", "workers"),
-        ("listen = [\"127.0.0.1\"]", "no address to listen at"),
-        ("listen = []", "listen is empty"),
-        ("workers = ", "server.toml"),
-        ("[server]\nworkers = 1", "server"),
+    let wrong = [
+        "max_env = 3",
+        "workers = 0",
+        "workers = \"many\"",
+        "workers = -3",
+        "listen = [\"127.0.0.1\"]",
+        "listen = []",
+        "workers = ",
+        "[server]\nworkers = 1",
     ];
-    for (text, word) in cases {
+    let said = wrong.map(|text| {
         let mut command = command();
-        command.arg("--config").arg(file(directory.path(), text));
-        let message = refused(command);
-        assert!(message.contains(word), "{text:?}: {message:?} does not say {word:?}");
-    }
-    let cases = [
-        ("PERTURB_SERVER_MAX_ENV", "3", "max_env"),
-        ("PERTURB_SERVER_WORKERS", "0", "workers is 0"),
-        ("PERTURB_SERVER_WORKERS", "many", "many"),
-        ("PERTURB_SERVER_LISTEN", "tcp://127.0.0.1:0,somewhere", "somewhere"),
-        ("PERTURB_SERVER_CONFIG", "/nowhere/server.toml", "/nowhere/server.toml"),
-    ];
-    for (name, value, word) in cases {
-        let mut command = command();
-        command.env(name, value);
-        let message = refused(command);
-        assert!(message.contains(word), "{name}={value}: {message:?} does not say {word:?}");
-    }
+        // Messages name the file as seen from here.
+        command.arg("--config").arg(file(directory.path(), text)).current_dir(directory.path());
+        format!("{text}\n{}\n", refused(command))
+    });
+    assert_snapshot!(said.concat());
 }
 
-#[tokio::test]
-async fn a_flag_beats_a_variable_and_a_variable_beats_the_file() {
-    let start = |file_has: Option<&str>, variable: Option<&str>, flag: Option<&str>| {
-        let directory = tempfile::tempdir().unwrap();
+#[test]
+fn a_bad_variable_is_refused_before_any_port_is_bound() {
+    let wrong = [
+        ("PERTURB_SERVER_MAX_ENV", "3"),
+        ("PERTURB_SERVER_WORKERS", "0"),
+        ("PERTURB_SERVER_WORKERS", "many"),
+        ("PERTURB_SERVER_LISTEN", "tcp://127.0.0.1:0,somewhere"),
+        ("PERTURB_SERVER_CONFIG", "/nowhere/server.toml"),
+    ];
+    let said = wrong.map(|(name, value)| {
         let mut command = command();
-        // The address comes from the file or from a variable, too.
-        match file_has {
-            Some(n) => {
-                let text = format!("max_envs = {n}\nlisten = [\"tcp://127.0.0.1:0\", \"tcp://[::1]:0\"]\n");
-                command.env("PERTURB_SERVER_CONFIG", file(directory.path(), &text));
-            }
-            None => {
-                command.env("PERTURB_SERVER_LISTEN", "tcp://127.0.0.1:0,127.0.0.1:0");
-            }
-        }
-        variable.map(|n| command.env("PERTURB_SERVER_MAX_ENVS", n));
-        flag.map(|n| command.args(["--max-envs", n]));
-        Server::spawn(command, directory, 2)
-    };
-    assert_eq!(max_envs(&start(None, None, None)).await, 16_384);
-    assert_eq!(max_envs(&start(Some("11"), None, None)).await, 11);
-    assert_eq!(max_envs(&start(Some("11"), Some("22"), None)).await, 22);
-    assert_eq!(max_envs(&start(Some("11"), Some("22"), Some("33"))).await, 33);
-    assert_eq!(max_envs(&start(Some("11"), None, Some("33"))).await, 33);
+        command.env(name, value);
+        format!("{name}={value}\n{}\n", refused(command))
+    });
+    assert_snapshot!(said.concat());
+}
+
+#[rstest]
+#[case::none([None, None, None], 16_384)]
+#[case::file([Some("11"), None, None], 11)]
+#[case::file_and_variable([Some("11"), Some("22"), None], 22)]
+#[case::file_and_flag([Some("11"), None, Some("33")], 33)]
+#[case::all([Some("11"), Some("22"), Some("33")], 33)]
+#[tokio::test]
+async fn a_flag_beats_a_variable_and_a_variable_beats_the_file(
+    #[case] given: [Option<&str>; 3],
+    #[case] expected: u32,
+) {
+    let [in_file, variable, flag] = given;
+    let directory = tempfile::tempdir().unwrap();
+    let mut command = command();
+    // The address comes from the file or from a variable, too.
+    if let Some(n) = in_file {
+        let text = format!("max_envs = {n}\nlisten = [\"tcp://127.0.0.1:0\", \"tcp://[::1]:0\"]\n");
+        command.env("PERTURB_SERVER_CONFIG", file(directory.path(), &text));
+    } else {
+        command.env("PERTURB_SERVER_LISTEN", "tcp://127.0.0.1:0,127.0.0.1:0");
+    }
+    if let Some(n) = variable {
+        command.env("PERTURB_SERVER_MAX_ENVS", n);
+    }
+    if let Some(n) = flag {
+        command.args(["--max-envs", n]);
+    }
+    assert_eq!(max_envs(&Server::spawn(command, directory, 2)).await, expected);
 }
 
 #[tokio::test]
@@ -431,9 +440,7 @@ async fn many_sessions_share_a_connection() {
     let mut sessions = Vec::new();
     for seed in 0..500 {
         let mut session = Session::start(&mut client).await.unwrap();
-        match session.ask(Request::Open(open("MountainCar", 1, seed))).await {
-            Response::Opened(_) => sessions.push(session),
-            other => panic!("{other:?}"),
-        }
+        session.ask(open("MountainCar", 1, seed)).await;
+        sessions.push(session);
     }
 }

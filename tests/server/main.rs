@@ -16,6 +16,6 @@ mod locomotion;
 mod pool;
 mod reference;
 mod rendering;
-mod snapshots;
+mod restoring;
 mod streams;
 mod success;

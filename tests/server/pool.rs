@@ -7,6 +7,7 @@ use perturb::{
     pool::{Autoreset, Batch, BatchSettings, Error, Pool, ResetEntry, Stepped},
     tasks,
 };
+use rstest::rstest;
 use std::{
     future::{Future, poll_fn},
     pin::{Pin, pin},
@@ -603,29 +604,26 @@ async fn distributions_hold_from_now_on_and_begin_a_trial() {
     }
 }
 
+#[rstest]
+#[case("CartPole", &[0.5, -0.25, 0.125, 1.0])]
+#[case("MountainCar", &[-0.75, 0.03125])]
+#[case("Acrobot", &[0.5, -0.5, 1.0, -1.0])]
+#[case("Pendulum", &[0.5, -1.0])]
 #[tokio::test]
-async fn exact_states_are_taken_and_hold_for_this_episode() {
-    for (name, state) in [
-        ("CartPole", &[0.5, -0.25, 0.125, 1.0][..]),
-        ("MountainCar", &[-0.75, 0.03125]),
-        ("Acrobot", &[0.5, -0.5, 1.0, -1.0]),
-        ("Pendulum", &[0.5, -1.0]),
-    ] {
-        let spec = tasks::catalogue().find(name).unwrap();
-        let pool = Pool::new(1, 4).unwrap();
-        let mut batch = open_four(&pool, name).await;
-        let exact = |slot| ResetEntry { state: Some(state.to_vec()), ..entry(slot) };
-        let (first, started) = batch.reset(vec![exact(1), entry(2), exact(3)]).await.unwrap();
-        assert_eq!(ids(&started), [(1, 0, 1, 1), (2, 0, 1, 1), (3, 0, 1, 1)], "the trial goes on");
-        let mut environment = tasks::catalogue().find(name).and_then(|spec| (spec.make)()).unwrap();
-        environment.reset_to(state);
-        let mut expected = vec![0.0; spec.observation.len()];
-        environment.observe(&mut expected);
-        let rows: Vec<_> = floats(&first).chunks(expected.len()).map(<[f32]>::to_vec).collect();
-        assert!(rows[0] == expected && rows[1] != expected && rows[2] == expected, "{name}: {rows:?}");
-        let (first, _) = batch.reset(vec![entry(1)]).await.unwrap();
-        assert_ne!(floats(&first), expected, "{name}: the next state is drawn");
-    }
+async fn an_exact_state_is_taken_and_holds_for_this_episode(#[case] name: &str, #[case] state: &[f64]) {
+    let pool = Pool::new(1, 4).unwrap();
+    let mut batch = open_four(&pool, name).await;
+    let exact = |slot| ResetEntry { state: Some(state.to_vec()), ..entry(slot) };
+    let (first, started) = batch.reset(vec![exact(1), entry(2), exact(3)]).await.unwrap();
+    assert_eq!(ids(&started), [(1, 0, 1, 1), (2, 0, 1, 1), (3, 0, 1, 1)], "the trial goes on");
+    let mut environment = tasks::catalogue().find(name).and_then(|spec| (spec.make)()).unwrap();
+    environment.reset_to(state);
+    let mut expected = vec![0.0; environment.spec().observation.len()];
+    environment.observe(&mut expected);
+    let rows: Vec<_> = floats(&first).chunks(expected.len()).map(<[f32]>::to_vec).collect();
+    assert!(rows[0] == expected && rows[1] != expected && rows[2] == expected, "{rows:?}");
+    let (first, _) = batch.reset(vec![entry(1)]).await.unwrap();
+    assert_ne!(floats(&first), expected, "the next state is drawn");
 }
 
 #[tokio::test]

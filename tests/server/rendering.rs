@@ -1,12 +1,10 @@
 //! Pictures, asked of a real server. Tests need OpenGL in software: Debian's libegl1 and libgl1-mesa-dri.
 
-use crate::common::server::{self, Actor, Server, Session, catalogue, doubles, open, parameters};
+use crate::common::server::{self, Actor, Server, Session, catalogue, doubles, open, parameters, refusal};
 use bytes::Bytes;
+use insta::assert_snapshot;
 use perturb::{
-    proto::{
-        AutoresetMode, Environment, Open, Render, Reset, Step, Version, session_request::Request,
-        session_response::Response,
-    },
+    proto::{AutoresetMode, Environment, Open, Render, Reset, Version, session_response::Response},
     tasks,
 };
 use std::{
@@ -41,7 +39,7 @@ async fn session(server: &Server, environment: &str, n: u32) -> Session {
 /// A picture of one environment at an exact state.
 async fn at(server: &Server, environment: &str, state: &[f64], size: (u32, u32)) -> Bytes {
     let mut session = session(server, environment, 1).await;
-    session.reset(Reset { states: doubles(state), ..Reset::default() }).await;
+    session.ask(Reset { states: doubles(state), ..Reset::default() }).await;
     session.render(0, size).await
 }
 
@@ -92,10 +90,7 @@ async fn every_environment_is_drawn_in_the_size_that_was_asked_for() {
             [((0, 0), (480, 480)), ((0, 100), (480, 100)), ((16, 33), (16, 33)), ((301, 17), (301, 17))]
         {
             let (width, height) = asked;
-            let Response::Render(picture) = session.ask(Request::Render(Render { slot: 1, width, height })).await
-            else {
-                panic!("{name} was not drawn")
-            };
+            let picture = session.ask(Render { slot: 1, width, height }).await;
             assert_eq!((picture.width, picture.height), given, "{name}");
             assert_eq!(picture.pixels.len(), 3 * (given.0 * given.1) as usize, "{name}");
             let colours: HashSet<&[u8; 3]> = picture.pixels.as_chunks::<3>().0.iter().collect();
@@ -229,7 +224,7 @@ async fn the_camera_follows_a_robot_wherever_it_runs() {
         for x in [1.3, 19.9, 77.7, -10_000.0] {
             let mut state = robot_state(name, x);
             state[1] = 0.3; // in the air
-            session.reset(Reset { states: doubles(&state), ..Reset::default() }).await;
+            session.ask(Reset { states: doubles(&state), ..Reset::default() }).await;
             let n = in_view(&session.render(0, SMALL).await);
             assert!((0.7..1.4).contains(&(n / at_start)), "{name} at {x} m: {n} pixels, {at_start} at the start");
             let again = at(&server, name, &robot_state(name, 0.0), SMALL).await;
@@ -242,7 +237,7 @@ async fn the_camera_follows_a_robot_wherever_it_runs() {
         let environment = opened.environment.unwrap();
         let mut state = robot_state(name, 0.0);
         state[environment.state.len() / 2] = 6.0; // m/s
-        session.reset(Reset { states: doubles(&state), ..Reset::default() }).await;
+        session.ask(Reset { states: doubles(&state), ..Reset::default() }).await;
         for t in 0..100 {
             session.step(Actor::new(&environment, 1).actions(t)).await;
             if t % 10 == 9 {
@@ -274,7 +269,7 @@ async fn sessions_draw_side_by_side() {
                 let mut session = session(&server, &name, 4).await;
                 let slots: Vec<u32> = (0..4).cycle().take(12).collect();
                 for &slot in &slots {
-                    session.send(Request::Render(Render { slot, width: 64 + 8 * slot, height: 80 })).await;
+                    session.send(Render { slot, width: 64 + 8 * slot, height: 80 }).await;
                 }
                 for slot in slots {
                     let Some(Response::Render(picture)) = session.receive().await.unwrap().unwrap().response else {
@@ -309,7 +304,7 @@ async fn nobody_waits_for_anothers_pictures() {
             drawing.render(0, (side, side)).await; // what the first one takes longer does not count
             ready.send(()).unwrap();
             for _ in 0..PICTURES {
-                drawing.send(Request::Render(Render { slot: 0, width: side, height: side })).await;
+                drawing.send(Render { slot: 0, width: side, height: side }).await;
             }
             for _ in 0..PICTURES {
                 let response = drawing.receive().await.unwrap().unwrap().response;
@@ -331,24 +326,29 @@ async fn nobody_waits_for_anothers_pictures() {
 async fn bad_requests_are_refused_and_change_nothing() {
     let server = start();
     let mut session = Session::connect(server.unix()).await;
-    let render = |slot, width, height| Request::Render(Render { slot, width, height });
-    let (code, message) = session.refused(render(0, 0, 0)).await;
-    assert_eq!(code, Code::FailedPrecondition);
-    assert!(message.contains("render came before open"), "{message}");
-    session.ask(Request::Open(plain("CartPole", 3))).await;
+    let render = |slot, width, height| Render { slot, width, height };
+    let mut refusals = refusal(session.refused(render(0, 0, 0)).await);
+    session.ask(plain("CartPole", 3)).await;
     let before = session.render(2, SMALL).await;
-    for (request, words) in [
-        (render(3, 0, 0), ["render.slot is 3", "0 … 2"]),
-        (render(u32::MAX, 0, 0), ["render.slot is 4294967295", "0 … 2"]),
-        (render(0, 15, 0), ["render.width is 15", "16 … 2048 pixels, or 0 for 480"]),
-        (render(0, 0, 2049), ["render.height is 2049", "16 … 2048 pixels, or 0 for 480"]),
-        (render(0, 65_536, 65_536), ["render.width is 65536", "16 … 2048"]),
-        (render(0, 480, u32::MAX), ["render.height is 4294967295", "16 … 2048"]),
+    for wrong in [
+        render(3, 0, 0),
+        render(u32::MAX, 0, 0),
+        render(0, 15, 0),
+        render(0, 0, 2049),
+        render(0, 65_536, 65_536),
+        render(0, 480, u32::MAX),
     ] {
-        let (code, message) = session.refused(request).await;
-        assert_eq!(code, Code::InvalidArgument, "{message}");
-        assert!(words.iter().all(|word| message.contains(word)), "{message}");
+        refusals += &refusal(session.refused(wrong).await);
     }
+    assert_snapshot!(refusals, @r"
+    FailedPrecondition: render came before open; send open first
+    InvalidArgument: render.slot is 3; expected a slot of the batch, 0 … 2
+    InvalidArgument: render.slot is 4294967295; expected a slot of the batch, 0 … 2
+    InvalidArgument: render.width is 15; expected 16 … 2048 pixels, or 0 for 480
+    InvalidArgument: render.height is 2049; expected 16 … 2048 pixels, or 0 for 480
+    InvalidArgument: render.width is 65536; expected 16 … 2048 pixels, or 0 for 480
+    InvalidArgument: render.height is 4294967295; expected 16 … 2048 pixels, or 0 for 480
+    ");
     assert_eq!(session.render(2, SMALL).await, before);
 }
 
@@ -377,7 +377,7 @@ async fn without_opengl_the_server_runs_and_says_what_is_missing() {
             let mut session = session(&server, name, 1).await;
             for t in 0..2 {
                 if ROBOTS.contains(&name.as_str()) {
-                    let (code, message) = session.refused(Request::Render(Render::default())).await;
+                    let (code, message) = session.refused(Render::default()).await;
                     assert_eq!(code, Code::FailedPrecondition, "{message}");
                     for part in [name.as_str(), "OpenGL", "libegl1", "libgl1-mesa-dri"] {
                         assert!(message.contains(part), "{message}");
@@ -385,7 +385,7 @@ async fn without_opengl_the_server_runs_and_says_what_is_missing() {
                 } else {
                     session.render(0, SMALL).await;
                 }
-                session.ask(Request::Step(Step { actions: Actor::new(&environment, 1).actions(t) })).await;
+                session.step(Actor::new(&environment, 1).actions(t)).await;
             }
         }
     }

@@ -5,6 +5,7 @@ use perturb::{
     env::{Environment, Purpose, Stream, Version},
     tasks,
 };
+use rstest::rstest;
 use serde_json::Value;
 use std::f64::consts::PI;
 
@@ -79,31 +80,28 @@ fn parameters_are_the_trials_numbers_in_the_catalogues_order() {
     }
 }
 
-#[test]
-fn initial_states_are_the_episodes_numbers_in_the_states_order() {
-    let ranges: [(&str, &[(f64, f64)]); 4] = [
-        ("CartPole", &[(-0.05, 0.05); 4]),
-        ("MountainCar", &[(-0.6, -0.4), (0.0, 0.0)]),
-        ("Acrobot", &[(-0.1, 0.1); 4]),
-        ("Pendulum", &[(-PI, PI), (-1.0, 1.0)]),
-    ];
-    for (name, ranges) in ranges {
-        for episode in [0, 1, 7] {
-            let mut stream = Stream::new(12, 34, Purpose::InitialState, episode);
-            let mut environment: Box<dyn Environment> =
-                tasks::catalogue().find(name).and_then(|spec| (spec.make)()).unwrap();
-            environment.reset(&mut stream.clone());
-            let mut state = Vec::new();
-            environment.save(&mut state);
-            let draw = |&(low, high): &(f64, f64)| if low == high { low } else { low + (high - low) * stream.unit() };
-            assert_eq!(state, ranges.iter().map(draw).collect::<Vec<_>>(), "{name}");
+#[rstest]
+#[case("CartPole", &[(-0.05, 0.05); 4])]
+#[case("MountainCar", &[(-0.6, -0.4), (0.0, 0.0)])]
+#[case("Acrobot", &[(-0.1, 0.1); 4])]
+#[case("Pendulum", &[(-PI, PI), (-1.0, 1.0)])]
+fn initial_states_are_the_episodes_numbers_in_the_states_order(
+    #[case] name: &str,
+    #[case] ranges: &[(f64, f64)],
+    #[values(0, 1, 7)] episode: u64,
+) {
+    let mut stream = Stream::new(12, 34, Purpose::InitialState, episode);
+    let mut environment: Box<dyn Environment> = tasks::catalogue().find(name).and_then(|spec| (spec.make)()).unwrap();
+    environment.reset(&mut stream.clone());
+    let mut state = Vec::new();
+    environment.save(&mut state);
+    let draw = |&(low, high): &(f64, f64)| if low == high { low } else { low + (high - low) * stream.unit() };
+    assert_eq!(state, ranges.iter().map(draw).collect::<Vec<_>>());
 
-            // And the episodes use this stream.
-            let mut episodes = common::episodes(tasks::catalogue().find(name).unwrap(), Version::Default, 12, 34, 1);
-            (0..episode).for_each(|_| episodes.begin(None));
-            let mut observation = vec![0.0; environment.spec().observation.len()];
-            environment.observe(&mut observation);
-            assert_eq!(common::observe(&episodes), observation, "{name}");
-        }
-    }
+    // And the episodes use this stream.
+    let mut episodes = common::episodes(tasks::catalogue().find(name).unwrap(), Version::Default, 12, 34, 1);
+    (0..episode).for_each(|_| episodes.begin(None));
+    let mut observation = vec![0.0; environment.spec().observation.len()];
+    environment.observe(&mut observation);
+    assert_eq!(common::observe(&episodes), observation);
 }

@@ -9,6 +9,7 @@ use perturb::{
     scene::Scene,
     tasks,
 };
+use rstest::rstest;
 
 const LIMIT: u32 = 8;
 const TIME: &[Channel] = &[Channel::unbounded("time", "1")];
@@ -97,48 +98,45 @@ fn run(spec: &'static EnvironmentSpec, script: &'static str) -> (Outcome, Episod
     panic!("{script} does not end")
 }
 
-fn succeeds(spec: &'static EnvironmentSpec, script: &'static str) -> bool {
-    run(spec, script).1.success
+#[rstest]
+#[case::a_step_too_few("...T", false)]
+#[case::the_last_step_counts("....T", true)]
+#[case::to_the_limit("........", true)]
+#[case::the_goal_does_not_matter("gggG", false)]
+fn lasting_counts_every_step_the_last_included(#[case] script: &'static str, #[case] success: bool) {
+    assert_eq!(run(&LASTED_5, script).1.success, success);
 }
 
-#[test]
-fn lasting_counts_every_step_the_last_included() {
-    assert!(!succeeds(&LASTED_5, "...T"));
-    assert!(succeeds(&LASTED_5, "....T"));
-    assert!(succeeds(&LASTED_5, "........"));
-    assert!(!succeeds(&LASTED_5, "gggG"), "the goal does not matter");
+#[rstest]
+#[case::in_the_last_step("....G", true)]
+#[case::a_step_too_late(".....G", false)]
+#[case::in_the_first_step("G", true)]
+#[case::never("........", false)]
+#[case::it_need_not_hold_on_nor_end_the_episode("....g...", true)]
+#[case::holding_does_not_help(".....ggg", false)]
+#[case::the_first_time_counts("..g...gg", true)]
+fn reaching_counts_the_first_step_after_which_the_goal_held(#[case] script: &'static str, #[case] success: bool) {
+    assert_eq!(run(&REACHED_WITHIN_5, script).1.success, success);
 }
 
-#[test]
-fn reaching_counts_the_first_step_after_which_the_goal_held() {
-    assert!(succeeds(&REACHED_WITHIN_5, "....G"));
-    assert!(!succeeds(&REACHED_WITHIN_5, ".....G"));
-    assert!(succeeds(&REACHED_WITHIN_5, "G"));
-    assert!(!succeeds(&REACHED_WITHIN_5, "........"));
-    assert!(succeeds(&REACHED_WITHIN_5, "....g..."), "it need not hold on, nor end the episode");
-    assert!(!succeeds(&REACHED_WITHIN_5, ".....ggg"));
-    assert!(succeeds(&REACHED_WITHIN_5, "..g...gg"), "the first time counts");
+#[rstest]
+#[case::the_last_three(".....ggg", true)]
+#[case::a_step_too_few("......gg", false)]
+#[case::a_gap_before_the_last("gggggg.g", false)]
+#[case::a_gap_before_the_last_two("ggggg.gg", false)]
+#[case::not_in_the_last("ggggggg.", false)]
+#[case::always("gggggggg", true)]
+fn holding_counts_the_last_steps_without_a_gap(#[case] script: &'static str, #[case] success: bool) {
+    assert_eq!(run(&HELD_FOR_LAST_3, script).1.success, success);
 }
 
-#[test]
-fn holding_counts_the_last_steps_without_a_gap() {
-    assert!(succeeds(&HELD_FOR_LAST_3, ".....ggg"));
-    assert!(!succeeds(&HELD_FOR_LAST_3, "......gg"));
-    assert!(!succeeds(&HELD_FOR_LAST_3, "gggggg.g"));
-    assert!(!succeeds(&HELD_FOR_LAST_3, "ggggg.gg"));
-    assert!(!succeeds(&HELD_FOR_LAST_3, "ggggggg."));
-    assert!(succeeds(&HELD_FOR_LAST_3, "gggggggg"));
-}
-
-#[test]
-fn terminated_and_truncated_are_independent() {
-    let flags = |script| {
-        let (outcome, end) = run(&LASTED_5, script);
-        (outcome.terminated, outcome.truncated, end.length)
-    };
-    assert_eq!(flags("......T"), (true, false, LIMIT - 1));
-    assert_eq!(flags("........"), (false, true, LIMIT));
-    assert_eq!(flags(".......T"), (true, true, LIMIT), "both may be set");
+#[rstest]
+#[case::terminated("......T", (true, false, LIMIT - 1))]
+#[case::truncated("........", (false, true, LIMIT))]
+#[case::both(".......T", (true, true, LIMIT))]
+fn terminated_and_truncated_are_independent(#[case] script: &'static str, #[case] flags: (bool, bool, u32)) {
+    let (outcome, end) = run(&LASTED_5, script);
+    assert_eq!((outcome.terminated, outcome.truncated, end.length), flags);
 }
 
 #[test]
@@ -147,22 +145,22 @@ fn divergence_is_reported_with_the_episode() {
     assert!(!run(&LASTED_5, "..T").1.diverged);
 }
 
-#[test]
-fn a_state_beyond_f32_ends_the_episode_with_the_last_one_that_was_not() {
-    for (name, state) in [("CartPole", [0.0, 0.0, 0.1, 1e30]), ("Acrobot", [0.1, 0.1, 1e300, 1e300])] {
-        let mut environment = tasks::catalogue().find(name).and_then(|spec| (spec.make)()).unwrap();
-        environment.reset_to(&state);
-        let mut terms = vec![f64::NAN; 1];
-        let transition = environment.step(Action::Discrete(1), &mut terms);
-        assert!(transition.diverged && transition.terminated, "{name}");
-        assert!(terms[0].is_finite(), "{name}");
-        let mut kept = Vec::new();
-        environment.save(&mut kept);
-        assert_eq!(kept, state, "{name}");
+#[rstest]
+#[case("CartPole", [0.0, 0.0, 0.1, 1e30])]
+#[case("Acrobot", [0.1, 0.1, 1e300, 1e300])]
+fn a_state_beyond_f32_ends_the_episode_with_the_last_one_that_was_not(#[case] name: &str, #[case] state: [f64; 4]) {
+    let mut environment = tasks::catalogue().find(name).and_then(|spec| (spec.make)()).unwrap();
+    environment.reset_to(&state);
+    let mut terms = [f64::NAN];
+    let transition = environment.step(Action::Discrete(1), &mut terms);
+    assert!(transition.diverged && transition.terminated);
+    assert!(terms[0].is_finite());
+    let mut kept = Vec::new();
+    environment.save(&mut kept);
+    assert_eq!(kept, state);
 
-        let (_, end) = drive(name, &state, |_, _| 1);
-        assert!(end.diverged && !end.success && end.length == 1, "{name}");
-    }
+    let (_, end) = drive(name, &state, |_, _| 1);
+    assert!(end.diverged && !end.success && end.length == 1);
 }
 
 #[test]
@@ -323,14 +321,25 @@ fn check_goal(
     assert!(near[0] > 10 && near[1] > 10, "{name}: {near:?} states close to the threshold");
 }
 
-#[test]
-fn cart_pole_ends_beyond_2_4_m_or_12_degrees() {
-    let inside = |s: &[f64]| s[0].abs() <= 2.4 && s[2].abs() <= 12.0_f64.to_radians();
-    let angle = |s: &[f64]| 12.0_f64.to_radians() - s[2].abs();
-    check_goal("CartPole", &[-0.1, -1.0, -0.25, -1.0], &[0.1, 1.0, 0.25, 1.0], |s| (!inside(s), inside(s)), angle);
-    let position = |s: &[f64]| 2.4 - s[0].abs();
-    check_goal("CartPole", &[2.3, -1.0, -0.1, -1.0], &[2.5, 1.0, 0.1, 1.0], |s| (!inside(s), inside(s)), position);
-    check_goal("CartPole", &[-2.5, -1.0, -0.1, -1.0], &[-2.3, 1.0, 0.1, 1.0], |s| (!inside(s), inside(s)), position);
+fn angle_left(s: &[f64]) -> f64 {
+    12.0_f64.to_radians() - s[2].abs()
+}
+
+fn track_left(s: &[f64]) -> f64 {
+    2.4 - s[0].abs()
+}
+
+#[rstest]
+#[case::either_angle([-0.1, -1.0, -0.25, -1.0], [0.1, 1.0, 0.25, 1.0], angle_left)]
+#[case::right([2.3, -1.0, -0.1, -1.0], [2.5, 1.0, 0.1, 1.0], track_left)]
+#[case::left([-2.5, -1.0, -0.1, -1.0], [-2.3, 1.0, 0.1, 1.0], track_left)]
+fn cart_pole_ends_beyond_2_4_m_or_12_degrees(
+    #[case] low: [f64; 4],
+    #[case] high: [f64; 4],
+    #[case] margin: fn(&[f64]) -> f64,
+) {
+    let inside = |s: &[f64]| angle_left(s) >= 0.0 && track_left(s) >= 0.0;
+    check_goal("CartPole", &low, &high, |s| (!inside(s), inside(s)), margin);
 }
 
 #[test]

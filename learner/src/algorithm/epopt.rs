@@ -1,37 +1,10 @@
 //! EPOpt: learning from the worst episodes.
 
-use serde::{Deserialize, Serialize};
-
-use super::{Algorithm, AlgorithmState, Experience, UpdateStats, check_episodes};
-use crate::error::{Result, check};
+use super::{Algorithm, AlgorithmState, Experience, UpdateStats};
+use crate::error::Result;
 use crate::policy::Policy;
 use crate::rollout::{Rollout, Span};
-
-/// Settings of [`Epopt`]. The defaults are the paper's.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct EpoptConfig {
-    /// L: complete episodes in an iteration, 1 … 10⁶ (default: `100`).
-    pub episodes_per_iteration: usize,
-    /// ε: the share of worst episodes that is learned from, above 0 and at most 1 (default: `0.1`).
-    pub epsilon: f64,
-    /// Iterations at the start that learn from all episodes, ε = 1 (default: `100`).
-    pub full_iterations: u64,
-}
-
-impl Default for EpoptConfig {
-    fn default() -> Self {
-        EpoptConfig { episodes_per_iteration: 100, epsilon: 0.1, full_iterations: 100 }
-    }
-}
-
-impl EpoptConfig {
-    /// Refuses values outside their ranges, NaN included.
-    pub fn validate(&self) -> Result<()> {
-        check_episodes("episodes_per_iteration", self.episodes_per_iteration)?;
-        check("epsilon", self.epsilon, self.epsilon > 0.0 && self.epsilon <= 1.0, "above 0 and at most 1")
-    }
-}
+use perturb_study::settings::EpoptConfig;
 
 /// EPOpt-ε, Rajeswaran et al. (2017), arXiv:1610.01283, around another algorithm: an iteration generates L complete
 /// episodes, each in a freshly drawn environment, and the other algorithm learns from those whose undiscounted return is

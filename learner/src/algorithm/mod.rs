@@ -5,18 +5,17 @@ mod batch;
 mod epopt;
 mod optimiser;
 mod ppo;
-mod rl2;
 
-pub use a2c::{A2c, A2cConfig};
-pub use epopt::{Epopt, EpoptConfig, Selection};
-pub use ppo::{Ppo, PpoConfig};
-pub use rl2::Rl2Config;
+pub use a2c::A2c;
+pub use epopt::{Epopt, Selection};
+pub use ppo::Ppo;
 
+use perturb_study::settings::{BaseSettings, Settings, WrapperSettings};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use tch::Tensor;
 
-use crate::error::{Error, Result, check, check_length};
+use crate::error::{Result, check_length};
 use crate::loss;
 use crate::policy::{NamedArray, Policy};
 use crate::rollout::{Estimates, Rollout};
@@ -59,28 +58,6 @@ pub struct AlgorithmState {
     pub optimiser: Vec<NamedArray>,
     /// The stream of minibatch orders, where there is one.
     pub rng: Option<ChaCha8Rng>,
-}
-
-/// How a learning rate moves.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Schedule {
-    /// Stays.
-    Constant,
-    /// Falls linearly to 0 at the end of training.
-    Linear,
-}
-
-impl Schedule {
-    /// The learning rate when `progress_remaining`, 1 … 0, of the training is left.
-    fn at(self, learning_rate: f64, progress_remaining: f64) -> Result<f64> {
-        let in_range = (0.0..=1.0).contains(&progress_remaining);
-        check("progress_remaining", progress_remaining, in_range, "between 0 and 1")?;
-        Ok(match self {
-            Schedule::Constant => learning_rate,
-            Schedule::Linear => learning_rate * progress_remaining,
-        })
-    }
 }
 
 /// What happened in an update, by stable-baselines3's names. Averages are over the update's gradient steps.
@@ -126,6 +103,21 @@ fn check_rollout(rollout: &Rollout, policy: &Policy, n_steps: usize) -> Result<(
     check_length("the rollout's memory [N, S]", rollout.memory().len(), rollout.n_envs() * policy.spec().memory_size())
 }
 
+/// The algorithm of `settings` with fresh state for `policy`; `seed` fixes its randomness.
+///
+/// # Errors
+/// A setting out of its range.
+pub fn build(settings: &Settings, policy: &Policy, seed: u64) -> Result<Box<dyn Algorithm>> {
+    let base: Box<dyn Algorithm> = match &settings.base {
+        BaseSettings::A2c(settings) => Box::new(A2c::new(settings.clone(), policy)?),
+        BaseSettings::Ppo(settings) => Box::new(Ppo::new(settings.clone(), policy, seed)?),
+    };
+    Ok(match &settings.wrapper {
+        WrapperSettings::Plain | WrapperSettings::Rl2(_) => base,
+        WrapperSettings::Epopt(settings) => Box::new(Epopt::new(settings.clone(), base)?),
+    })
+}
+
 /// The share of the variance of the returns that the rollout's values explain.
 fn explained_variance(rollout: &Rollout, estimates: &Estimates) -> Option<f64> {
     match rollout.samples() {
@@ -142,32 +134,4 @@ fn scalars<const K: usize>(tensors: [&Tensor; K]) -> Result<[f64; K]> {
     let mut numbers = [0.0f32; K];
     Tensor::f_stack(&tensors, 0)?.f_copy_data(&mut numbers, K)?;
     Ok(numbers.map(f64::from))
-}
-
-/// `Ok` if `value` is at least 1.
-fn check_count(name: &'static str, value: usize) -> Result<()> {
-    if value > 0 { Ok(()) } else { Err(Error::Setting { name, got: value.to_string(), expected: "at least 1" }) }
-}
-
-/// `Ok` if `value` is a number of episodes that can be waited for.
-fn check_episodes(name: &'static str, value: usize) -> Result<()> {
-    if (1..=1_000_000).contains(&value) {
-        return Ok(());
-    }
-    Err(Error::Setting { name, got: value.to_string(), expected: "between 1 and 1000000" })
-}
-
-/// `Ok` if `value` is a positive number.
-fn check_positive(name: &'static str, value: f64) -> Result<()> {
-    check(name, value, value > 0.0, "a positive number")
-}
-
-/// `Ok` if `value` is a number that is not negative.
-fn check_not_negative(name: &'static str, value: f64) -> Result<()> {
-    check(name, value, value >= 0.0, "a number that is not negative")
-}
-
-/// `Ok` if `value` is between 0 and 1.
-fn check_fraction(name: &'static str, value: f64) -> Result<()> {
-    check(name, value, (0.0..=1.0).contains(&value), "between 0 and 1")
 }

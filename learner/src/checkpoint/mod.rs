@@ -18,10 +18,11 @@ use serde::{Deserialize, Serialize};
 use self::arrays::{decode_weights, encode_weights};
 use self::files::{ArraysFile, damaged, io, remove_others, write_atomically};
 pub use self::resume::{History, ResumeState};
-use crate::config::{AlgorithmName, Architecture, TrainConfig, Wrapper};
-use crate::evaluation::Version;
 use crate::policy::{ActionKind, Inputs, ObservationNormaliser, PolicySpec, RewardNormaliser, Weights};
 use crate::proto;
+use perturb_protocol::Version;
+use perturb_study::Counters;
+use perturb_study::settings::{AlgorithmName, Architecture, ConfigError, TrainConfig, Wrapper};
 
 /// Of the JSON's layout; raised when older programs could misread it.
 const FORMAT_VERSION: u32 = 1;
@@ -92,24 +93,6 @@ pub struct EnvironmentSummary {
     pub parameters: Vec<String>,
     /// SHA-256 of the model; empty without one.
     pub model_hash: String,
-}
-
-/// How far a training has come.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Counters {
-    /// Rollouts and updates.
-    pub iterations: u64,
-    /// Steps of all environments together; EPOpt's are those of complete episodes.
-    pub timesteps: u64,
-    /// Episodes that the budget counts: those that ended or, with EPOpt, those that it learned from.
-    pub episodes: u64,
-    /// Episodes that ended; EPOpt generates more than it learns from.
-    #[serde(default)]
-    pub generated_episodes: u64,
-    /// Steps that were learned from.
-    #[serde(default)]
-    pub learned_timesteps: u64,
 }
 
 /// `checkpoint.json`.
@@ -288,7 +271,7 @@ impl Checkpoint {
     ///
     /// # Errors
     /// A configuration that this program does not understand.
-    pub fn config(&self) -> std::result::Result<TrainConfig, crate::config::ConfigError> {
+    pub fn config(&self) -> std::result::Result<TrainConfig, ConfigError> {
         TrainConfig::from_table("the checkpoint's configuration", self.state.config.clone())
     }
 }

@@ -5,8 +5,8 @@ use super::*;
 use crate::algorithm::AlgorithmState;
 use crate::logging::LogLengths;
 use crate::policy::{NamedArray, Policy};
-use crate::random::{Purpose, stream};
 use crate::rollout::CollectorState;
+use perturb_study::random::{Purpose, stream};
 
 fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
     // Odd seeds feed-forward, even ones recurrent.

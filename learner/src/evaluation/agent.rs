@@ -5,10 +5,10 @@ use rand_chacha::ChaCha8Rng;
 use crate::checkpoint::{Checkpoint, State};
 use crate::error::Result;
 use crate::policy::{Actor, Acts, Inputs};
-use crate::random::{Purpose, stream};
+use perturb_study::random::{Purpose, stream};
 
 /// The policy of a checkpoint in N environments, with what it remembers of each.
-pub(crate) struct Agent<'a> {
+pub struct Agent<'a> {
     state: &'a State,
     actor: Actor,
     inputs: Inputs,
@@ -22,7 +22,7 @@ impl<'a> Agent<'a> {
     ///
     /// # Errors
     /// Weights that do not fit.
-    pub(crate) fn new(checkpoint: &'a Checkpoint, n_envs: usize, seed: u64) -> Result<Self> {
+    pub fn new(checkpoint: &'a Checkpoint, n_envs: usize, seed: u64) -> Result<Self> {
         let state = &checkpoint.state;
         let mut actor = Actor::new(&state.policy, n_envs);
         actor.load(&checkpoint.weights)?;
@@ -40,7 +40,7 @@ impl<'a> Agent<'a> {
     ///
     /// # Errors
     /// Numbers that are not finite.
-    pub(crate) fn act(&mut self, observations: &mut [f32]) -> Result<&[u8]> {
+    pub fn act(&mut self, observations: &mut [f32]) -> Result<&[u8]> {
         if let Some(normaliser) = &self.state.observation_normaliser {
             normaliser.normalise(observations)?;
         }
@@ -54,7 +54,7 @@ impl<'a> Agent<'a> {
     ///
     /// # Errors
     /// Lengths that do not fit.
-    pub(crate) fn remember(&mut self, rewards: &mut [f32], done: &[bool]) -> Result<()> {
+    pub fn remember(&mut self, rewards: &mut [f32], done: &[bool]) -> Result<()> {
         if let Some(normaliser) = &self.state.reward_normaliser {
             normaliser.normalise(rewards);
         }
@@ -62,7 +62,7 @@ impl<'a> Agent<'a> {
     }
 
     /// A new trial begins in `environment`.
-    pub(crate) fn forget(&mut self, environment: usize) {
+    pub fn forget(&mut self, environment: usize) {
         self.actor.forget(environment);
         self.inputs.forget(environment);
     }

@@ -1,14 +1,9 @@
 //! Testing: does a trained policy still work when the physics changes?
 
 mod agent;
-pub mod paper;
-mod protocol;
-mod statistics;
+mod heatmap;
 mod test;
 
-pub(crate) use agent::Agent;
-pub use paper::Method;
-pub use protocol::{Metric, Scenario, Version};
-pub use statistics::{geometric_mean, mean, wilson};
-pub use test::{TestError, TestResult, environment_seed, test};
-pub(crate) use test::{check_unchanged, open_options, play};
+pub use agent::Agent;
+pub use heatmap::{HeatmapError, heatmap};
+pub use test::{TestError, check_unchanged, environment_seed, open_options, play, test};

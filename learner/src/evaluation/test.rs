@@ -1,33 +1,16 @@
 //! Testing a checkpoint on a version of its environment.
 
+use perturb_study::{TestResult, Version, mean, wilson};
 use rand::Rng;
-use serde::{Deserialize, Serialize};
 
 use super::agent::Agent;
-use super::protocol::Version;
-use super::statistics::{mean, wilson};
 use crate::checkpoint::{Checkpoint, EnvironmentSummary};
 use crate::client::{ClientError, EndedEpisode, OpenOptions, Servers, Session, StepReply};
-use crate::interrupt::StopFlag;
-use crate::random::{Purpose, stream};
+use perturb_study::interrupt::StopFlag;
+use perturb_study::random::{Purpose, stream};
 
 /// The most environments that are tested together.
 const MOST_ENVS: u64 = 100;
-
-/// Figures over test episodes.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct TestResult {
-    /// Episodes tested.
-    pub episodes: u64,
-    /// Successes, %.
-    pub success_percent: f64,
-    /// The 95 % Wilson interval of `success_percent`, [low, high], %.
-    pub success_percent_95: [f64; 2],
-    /// Mean undiscounted return, never normalised.
-    pub mean_return: f64,
-    /// Mean number of steps.
-    pub mean_length: f64,
-}
 
 /// Why a checkpoint could not be tested.
 #[derive(Debug, thiserror::Error)]
@@ -105,7 +88,10 @@ pub fn test(
 
 /// Lets the policy act in the environments of `session`, which are at their first `observations` `[N, O]`, until each has
 /// ended as many episodes as `quotas` `[N]` says, and returns these. Calls `report` with their number.
-pub(crate) fn play(
+///
+/// # Errors
+/// [`TestError`].
+pub fn play(
     session: &mut Session<'_>,
     observations: Vec<f32>,
     checkpoint: &Checkpoint,
@@ -138,7 +124,7 @@ pub(crate) fn play(
 }
 
 /// What a test opens of a policy without trials.
-pub(crate) fn open_options(environment: &str, version: Version, num_envs: usize, seed: u64) -> OpenOptions {
+pub fn open_options(environment: &str, version: Version, num_envs: usize, seed: u64) -> OpenOptions {
     OpenOptions {
         environment: environment.to_owned(),
         version: version.to_proto(),
@@ -173,7 +159,10 @@ fn summarise(episodes: &[EndedEpisode]) -> TestResult {
 }
 
 /// Whether the served environment is the one that the policy was trained in.
-pub(crate) fn check_unchanged(checkpoint: &Checkpoint, served: Option<EnvironmentSummary>) -> Result<(), TestError> {
+///
+/// # Errors
+/// [`TestError::Changed`].
+pub fn check_unchanged(checkpoint: &Checkpoint, served: Option<EnvironmentSummary>) -> Result<(), TestError> {
     let (trained, environment) = (&checkpoint.state.environment_spec, checkpoint.state.environment.clone());
     let advice = "test with the version of perturb that trained it, or train again";
     let (what, trained, served) = match served {

@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use tch::{Kind, Tensor};
 
 use crate::error::Result;
-use crate::random::{normal, uniform};
+use perturb_study::random::{normal, uniform};
 
 /// log 2π.
 const LOG_TAU: f64 = 1.837_877_066_409_345_3;
@@ -101,7 +101,7 @@ pub(super) fn sample_gaussian(means: &[f32], log_std: &[f32], rng: &mut ChaCha8R
 mod tests {
     use super::*;
     use crate::fixture::{assert_close, fixture, tensor};
-    use crate::random::{Purpose, stream};
+    use perturb_study::random::{Purpose, stream};
 
     /// Of results around 10 in f32, from up to ten roundings of 2⁻²⁴ each.
     const TOLERANCE: f64 = 5e-6;

@@ -3,7 +3,7 @@
 use rand_chacha::ChaCha8Rng;
 
 use super::{NamedArray, PolicySpec, Weights};
-use crate::random::normal;
+use perturb_study::random::normal;
 
 /// Gain of hidden layers, which undoes what tanh takes from the variance.
 const HIDDEN_GAIN: f64 = std::f64::consts::SQRT_2;
@@ -71,7 +71,7 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::{Purpose, stream};
+    use perturb_study::random::{Purpose, stream};
 
     #[test]
     fn the_shorter_side_is_orthogonal() {

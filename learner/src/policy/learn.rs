@@ -6,7 +6,7 @@ use super::distribution::{Distributions, categorical, gaussian};
 use super::initial::initial_weights;
 use super::{ActionKind, NamedArray, PolicySpec, Sequences, Weights, ff, rc};
 use crate::error::{Result, check_length};
-use crate::random::{Purpose, stream};
+use perturb_study::random::{Purpose, stream};
 
 /// A policy of either architecture: feed-forward, two separate multilayer perceptrons of which one gives logits or means
 /// and the other V(s); or recurrent, hidden layers, an LSTM, and two linear heads. Continuous actions have one more weight

@@ -21,6 +21,7 @@ pub use learn::{Evaluated, Policy};
 pub use normaliser::{ObservationNormaliser, RewardNormaliser, RunningMoments};
 pub use sequences::Sequences;
 
+use perturb_study::settings::{Architecture, SettingError};
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
@@ -76,10 +77,23 @@ pub struct PolicySpec {
 }
 
 impl PolicySpec {
+    /// The shape of a policy for inputs of `input_size` numbers.
+    pub fn of(architecture: Architecture, input_size: usize, action: ActionKind) -> Self {
+        let (width, lstm) = match architecture {
+            Architecture::Ff => (64, None),
+            Architecture::Rc => (256, Some(256)),
+        };
+        Self { observation_size: input_size, action, hidden: vec![width, width], lstm }
+    }
+
     /// Refuses empty spaces and layers.
     pub fn validate(&self) -> Result<()> {
         let positive = |name, got: usize| {
-            if got > 0 { Ok(()) } else { Err(Error::Setting { name, got: got.to_string(), expected: "at least 1" }) }
+            if got > 0 {
+                Ok(())
+            } else {
+                Err(SettingError { name, got: got.to_string(), expected: "at least 1" }.into())
+            }
         };
         positive("observation_size", self.observation_size)?;
         positive("the number of action outputs", self.action.outputs())?;

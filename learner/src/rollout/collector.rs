@@ -9,7 +9,7 @@ use super::{Normalisers, Rollout, RolloutStep};
 use crate::client::{ClientError, EndedEpisode, Session, StepReply};
 use crate::error::check_length;
 use crate::policy::{Actor, Acts, Inputs, PolicySpec, Weights};
-use crate::random::{Purpose, stream};
+use perturb_study::random::{Purpose, stream};
 
 /// Why a rollout could not be collected.
 #[derive(Debug, thiserror::Error)]

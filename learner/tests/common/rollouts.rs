@@ -1,11 +1,12 @@
 //! What the tests of EPOpt and of RL² share.
 
-use perturb_learner::algorithm::{A2c, A2cConfig, Algorithm, Ppo, PpoConfig};
+use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
 use perturb_learner::client::{Address, OpenOptions, PrivateServer, PrivateServerOptions, Servers};
 use perturb_learner::policy::{Policy, PolicySpec};
 use perturb_learner::proto;
-use perturb_learner::random::{Purpose, normal, stream};
 use perturb_learner::rollout::Rollout;
+use perturb_study::random::{Purpose, normal, stream};
+use perturb_study::settings::{A2cConfig, PpoConfig};
 
 /// A server with one physics thread.
 pub fn server() -> PrivateServer {

@@ -2,10 +2,10 @@
 
 use bytes::Bytes;
 use perturb::proto::{
-    self, AutoresetMode, Environment, Open, Render, Reset, Restore, SessionRequest, SessionResponse, Snapshot, Step,
-    Stepped, Version, action_space::Kind, perturb_client::PerturbClient, session_request::Request,
-    session_response::Response,
+    self, AutoresetMode, Environment, Open, Render, Restore, SessionRequest, SessionResponse, Snapshot, Step, Stepped,
+    Version, action_space::Kind, perturb_client::PerturbClient, session_request::Request, session_response::Response,
 };
+use perturb_protocol::Ask;
 use std::{
     future::Future,
     io::{BufRead, BufReader},
@@ -215,16 +215,14 @@ impl Session {
     /// An open session on a connection of its own.
     pub async fn open(address: &str, open: Open) -> (Self, proto::Opened) {
         let mut session = Self::connect(address).await;
-        match session.ask(Request::Open(open)).await {
-            Response::Opened(opened) => (session, opened),
-            other => panic!("open was answered by {other:?}"),
-        }
+        let opened = session.ask(open).await;
+        (session, opened)
     }
 
     /// Sends a request; its response is still to be received. If the session is over, receiving tells why.
-    pub async fn send(&self, request: Request) {
+    pub async fn send(&self, request: impl Into<Request>) {
         let requests = self.requests.as_ref().expect("closed already");
-        let _ = within(requests.send(SessionRequest { request: Some(request) })).await;
+        let _ = within(requests.send(SessionRequest { request: Some(request.into()) })).await;
     }
 
     /// Where requests go, for senders of their own.
@@ -253,59 +251,45 @@ impl Session {
         }
     }
 
-    /// The response to a request.
-    pub async fn ask(&mut self, request: Request) -> Response {
+    /// The response to a request, whatever it is.
+    pub async fn answer(&mut self, request: impl Into<Request>) -> Response {
         self.send(request).await;
         let response = self.receive().await.unwrap().expect("the stream ended");
         response.response.expect("a response is never empty")
     }
 
-    /// A step of these actions, as the response that came.
+    /// The reply to a request that is not refused.
+    pub async fn ask<A: Ask>(&mut self, request: A) -> A::Reply {
+        let response = self.answer(request).await;
+        A::reply(response).unwrap_or_else(|other| panic!("{} was answered by {other:?}", A::NAME))
+    }
+
+    /// Why a request is refused.
+    pub async fn refused(&mut self, request: impl Into<Request>) -> (Code, String) {
+        match self.answer(request).await {
+            Response::Error(error) => (Code::from_i32(error.code), error.message),
+            other => panic!("was not refused but answered by {other:?}"),
+        }
+    }
+
+    /// A step of these actions.
     pub async fn step(&mut self, actions: Bytes) -> Stepped {
-        match self.ask(Request::Step(Step { actions })).await {
-            Response::Stepped(stepped) => stepped,
-            other => panic!("step was answered by {other:?}"),
-        }
+        self.ask(Step { actions }).await
     }
 
-    /// A reset.
-    pub async fn reset(&mut self, reset: Reset) -> proto::ResetDone {
-        match self.ask(Request::Reset(reset)).await {
-            Response::Reset(done) => done,
-            other => panic!("reset was answered by {other:?}"),
-        }
-    }
-
-    /// A snapshot of the environments that the mask selects.
+    /// Snapshots of the environments that the mask selects.
     pub async fn snapshot(&mut self, mask: &[u8]) -> Vec<Bytes> {
-        match self.ask(Request::Snapshot(Snapshot { mask: Bytes::copy_from_slice(mask) })).await {
-            Response::Snapshot(done) => done.snapshots,
-            other => panic!("snapshot was answered by {other:?}"),
-        }
+        self.ask(Snapshot { mask: Bytes::copy_from_slice(mask) }).await.snapshots
     }
 
     /// A restore of the environments that the mask selects; their observations.
     pub async fn restore(&mut self, mask: &[u8], snapshots: Vec<Bytes>) -> Bytes {
-        match self.ask(Request::Restore(Restore { mask: Bytes::copy_from_slice(mask), snapshots })).await {
-            Response::Restore(done) => done.observations,
-            other => panic!("restore was answered by {other:?}"),
-        }
+        self.ask(Restore { mask: Bytes::copy_from_slice(mask), snapshots }).await.observations
     }
 
-    /// A picture: its pixels, `[height, width, 3]`.
+    /// A picture's pixels, `[height, width, 3]`.
     pub async fn render(&mut self, slot: u32, (width, height): (u32, u32)) -> Bytes {
-        match self.ask(Request::Render(Render { slot, width, height })).await {
-            Response::Render(picture) => picture.pixels,
-            other => panic!("render was answered by {other:?}"),
-        }
-    }
-
-    /// A request that is refused.
-    pub async fn refused(&mut self, request: Request) -> (Code, String) {
-        match self.ask(request).await {
-            Response::Error(error) => (Code::from_i32(error.code), error.message),
-            other => panic!("was not refused but answered by {other:?}"),
-        }
+        self.ask(Render { slot, width, height }).await.pixels
     }
 
     /// Steps with the random actions of times `from` … `to`-1, pipelined; the responses.
@@ -314,7 +298,7 @@ impl Session {
         let mut sent = from;
         for t in from..to {
             while sent < to && sent < t + AHEAD {
-                self.send(Request::Step(Step { actions: actor.actions(sent) })).await;
+                self.send(step(actor.actions(sent))).await;
                 sent += 1;
             }
             responses.push(self.receive().await.unwrap().expect("the stream ended"));
@@ -376,6 +360,17 @@ pub fn open(environment: &str, batch_size: u32, seed: u64) -> Open {
         reward_terms: true,
         ..Open::default()
     }
+}
+
+/// A step of these actions.
+pub fn step(actions: impl Into<Bytes>) -> Request {
+    Request::Step(Step { actions: actions.into() })
+}
+
+/// A refusal as a line of a snapshot.
+pub fn refusal((code, message): (Code, String)) -> String {
+    // A server without MuJoCo has two environments less.
+    format!("{code:?}: {}\n", message.replace(", HalfCheetah, Hopper", ""))
 }
 
 /// The step among these responses.

@@ -1,0 +1,374 @@
+//! What can be typed.
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand};
+
+use perturb_learner::client::Address;
+use perturb_study::FailureMark;
+use perturb_study::Version;
+use perturb_study::settings::{AlgorithmName, Architecture};
+use perturb_study::slurm::TimeLimit;
+
+/// Trains policies over environment servers and tests whether they still work when the physics changes.
+#[derive(Debug, Parser)]
+#[command(name = "perturb", version)]
+pub(super) struct Cli {
+    #[command(subcommand)]
+    pub(super) command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub(super) enum Command {
+    /// List the environments with their parameters.
+    Envs(EnvsArgs),
+    /// Train a policy.
+    Train(Box<TrainArgs>),
+    /// Test a trained policy.
+    Evaluate(EvaluateArgs),
+    /// Train and test on CartPole in a few minutes, and print the result beside the paper's.
+    Demo(DemoArgs),
+    /// Say what an experiment file asks for, and what it costs.
+    Plan(PlanArgs),
+    /// Do all trainings and tests of an experiment file; called again, it goes on.
+    Run(RunArgs),
+    /// Make tables of an experiment's results, beside the paper's.
+    Report(ReportArgs),
+    /// Draw the training curves of an experiment.
+    Curves(CurvesArgs),
+    /// Draw how trained policies do over two parameters: one policy, or those that an experiment selected.
+    Heatmap(HeatmapArgs),
+    /// Film a trained policy.
+    Video(VideoArgs),
+}
+
+/// Where environments run.
+#[derive(Args, Clone, Debug)]
+pub(super) struct ServerArgs {
+    /// Running servers, separated by commas: unix:/path, host:port, http://host:port or tcp://host:port. Without this,
+    /// perturb starts a server of its own and ends it afterwards.
+    #[arg(long, value_name = "ADDRESS", value_delimiter = ',')]
+    pub(super) server: Vec<Address>,
+    /// Physics threads of the server that perturb starts itself [default: one a core].
+    #[arg(long, value_name = "N", value_parser = at_least_one)]
+    pub(super) workers: Option<usize>,
+}
+
+#[derive(Args, Debug)]
+pub(super) struct EnvsArgs {
+    #[command(flatten)]
+    pub(super) server: ServerArgs,
+    /// Print JSON.
+    #[arg(long)]
+    pub(super) json: bool,
+}
+
+/// Flags beat --set, which beats --config, which beats the algorithm's defaults.
+#[derive(Args, Debug)]
+pub(super) struct TrainArgs {
+    /// The environment's name; `perturb envs` lists them.
+    #[arg(long, value_name = "NAME")]
+    pub(super) env: Option<String>,
+    /// Where its parameters come from [default: D].
+    #[arg(long, ignore_case = true)]
+    pub(super) version: Option<Version>,
+    /// What learns [default: ppo].
+    #[arg(long)]
+    pub(super) algorithm: Option<AlgorithmName>,
+    /// What acts [default: ff; with RL², which has no other, rc].
+    #[arg(long)]
+    pub(super) architecture: Option<Architecture>,
+    /// RL² only: episodes in a trial [default: 2].
+    #[arg(long, value_name = "N")]
+    pub(super) episodes_per_trial: Option<u64>,
+    /// Episodes to train for; EPOpt counts those that it learns from [default: 15000].
+    #[arg(long, value_name = "N")]
+    pub(super) episodes: Option<u64>,
+    /// Fixes all randomness [default: 1].
+    #[arg(long, value_name = "N")]
+    pub(super) seed: Option<u64>,
+    /// Directory for the checkpoint and the logs.
+    #[arg(long, value_name = "DIR", required_unless_present = "resume")]
+    pub(super) out: Option<PathBuf>,
+    /// Delete the run that is in --out already.
+    #[arg(long)]
+    pub(super) overwrite: bool,
+    /// A TOML file of settings, e.g. the config.toml of an earlier run.
+    #[arg(long, value_name = "FILE")]
+    pub(super) config: Option<PathBuf>,
+    /// A setting, e.g. learning_rate=3e-4; repeatable.
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub(super) set: Vec<String>,
+    /// Go on with the run in this directory from its last checkpoint, exactly as if it had not been broken off. Its
+    /// settings are those that it began with.
+    #[arg(
+        long,
+        value_name = "DIR",
+        conflicts_with_all = [
+            "env", "version", "algorithm", "architecture", "episodes_per_trial", "episodes", "seed", "out",
+            "overwrite", "config", "set"
+        ]
+    )]
+    pub(super) resume: Option<PathBuf>,
+    #[command(flatten)]
+    pub(super) server: ServerArgs,
+}
+
+#[derive(Args, Debug)]
+pub(super) struct EvaluateArgs {
+    /// The --out of a training, or the checkpoint folder in it.
+    #[arg(long, value_name = "DIR")]
+    pub(super) checkpoint: PathBuf,
+    /// Versions to test on, separated by commas.
+    #[arg(long, value_delimiter = ',', default_value = "D,R,E", ignore_case = true)]
+    pub(super) versions: Vec<Version>,
+    /// Episodes to test on each version; of a policy trained with RL² trials, of each of which the last episode counts.
+    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u64).range(1..))]
+    pub(super) episodes: u64,
+    /// Fixes the tests' randomness; its environments differ from those of any training, also with the same number
+    /// [default: the training's seed].
+    #[arg(long, value_name = "N")]
+    pub(super) seed: Option<u64>,
+    /// Also write the result to a file, as JSON.
+    #[arg(long, value_name = "FILE")]
+    pub(super) json: Option<PathBuf>,
+    #[command(flatten)]
+    pub(super) server: ServerArgs,
+}
+
+#[derive(Args, Debug)]
+pub(super) struct DemoArgs {
+    /// Episodes of each of the three trainings.
+    #[arg(long, value_name = "N", default_value_t = super::demo::EPISODES, value_parser = clap::value_parser!(u64).range(1..))]
+    pub(super) episodes: u64,
+    /// Episodes of each of the nine tests.
+    #[arg(long, value_name = "N", default_value_t = super::demo::TEST_EPISODES, value_parser = clap::value_parser!(u64).range(1..))]
+    pub(super) test_episodes: u64,
+    /// Fixes all randomness.
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub(super) seed: u64,
+    /// Keep the three runs here; without this they are deleted at the end.
+    #[arg(long, value_name = "DIR")]
+    pub(super) out: Option<PathBuf>,
+    #[command(flatten)]
+    pub(super) server: ServerArgs,
+}
+
+#[derive(Args, Debug)]
+pub(super) struct PlanArgs {
+    /// An experiment file, e.g. experiments/paper.toml.
+    #[arg(value_name = "FILE")]
+    pub(super) file: PathBuf,
+    /// List the cells with their indices and ids.
+    #[arg(long)]
+    pub(super) cells: bool,
+    /// List the cells that have neither a result in this folder nor failed there, and nothing else.
+    #[arg(long, value_name = "DIR", conflicts_with = "cells")]
+    pub(super) missing: Option<PathBuf>,
+    /// List --cells or --missing as JSON, and nothing else.
+    #[arg(long)]
+    pub(super) json: bool,
+    /// Seconds that each measured training takes; 0 measures nothing and gives no estimate.
+    #[arg(long, value_name = "SECONDS", default_value_t = 3)]
+    pub(super) measure: u64,
+    #[command(flatten)]
+    pub(super) server: ServerArgs,
+}
+
+#[derive(Args, Debug)]
+pub(super) struct RunArgs {
+    /// An experiment file, e.g. experiments/quick.toml.
+    #[arg(value_name = "PLAN")]
+    pub(super) plan: PathBuf,
+    /// Directory of the results; what is done there already is kept.
+    #[arg(long, value_name = "DIR")]
+    pub(super) out: PathBuf,
+    /// Trainings at a time [default: one a core; with --engine, one in each of its jobs].
+    #[arg(long, value_name = "N", value_parser = at_least_one)]
+    pub(super) jobs: Option<usize>,
+    /// Try cells again that have failed.
+    #[arg(long)]
+    pub(super) retry_failed: bool,
+    /// Do these cells only, by index or id, separated by commas: one in this process, several, or with --jobs, in worker
+    /// processes.
+    #[arg(long, value_name = "K", value_delimiter = ',')]
+    pub(super) cell: Vec<String>,
+    /// When nothing is left to do, also write the report, as `perturb report DIR --html FILE` does.
+    #[arg(long, value_name = "FILE", conflicts_with = "cell")]
+    pub(super) html: Option<PathBuf>,
+    /// With --cell and several servers: how many of them earlier tries have lost, so that the next one's turn comes.
+    #[arg(long, value_name = "N", default_value_t = 0, requires = "cell", hide = true)]
+    pub(super) losses: u32,
+    /// Of a worker: try again if this is how the cell has failed, and not if it has failed once more since.
+    #[arg(long, value_name = "MARK", hide = true, requires = "exit_with_stdin")]
+    pub(super) retry_failure: Option<FailureMark>,
+    /// With a single --cell: stop when standard input is closed, and show no progress.
+    #[arg(long)]
+    pub(super) exit_with_stdin: bool,
+    /// With --cell: leave DIR/plan.toml as it is if there is one, also if PLAN differs.
+    #[arg(long, requires = "cell")]
+    pub(super) leave_plan: bool,
+    #[command(flatten)]
+    pub(super) engine: EngineArgs,
+    #[command(flatten)]
+    pub(super) server: ServerArgs,
+}
+
+/// Who schedules a run past one machine.
+#[derive(Args, Debug)]
+pub(super) struct EngineArgs {
+    /// Submit the cells as jobs of this engine, watch them, and submit again what it lost. DIR and this program must be
+    /// at the same place on all its machines. --jobs and --workers are those of each of its jobs.
+    #[arg(long, value_name = "NAME", conflicts_with_all = ["cell", "exit_with_stdin"])]
+    pub(super) engine: Option<Engine>,
+    /// Slurm's partition [default: Slurm's].
+    #[arg(long, value_name = "NAME", requires = "engine")]
+    pub(super) partition: Option<String>,
+    /// How long a job may take: minutes, or another of Slurm's forms, e.g. 1-12:00:00 [default: the partition's].
+    #[arg(long, value_name = "TIME", requires = "engine")]
+    pub(super) time: Option<TimeLimit>,
+    /// Jobs that may run at a time [default: as many as there is room for].
+    #[arg(long, value_name = "N", requires = "engine", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(super) array_limit: Option<u32>,
+    /// Cells that a job does, one after the other [default: as many as take some minutes].
+    #[arg(long, value_name = "N", requires = "engine", value_parser = at_least_one)]
+    pub(super) cells_per_job: Option<usize>,
+}
+
+/// A scheduler of jobs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum Engine {
+    /// Slurm, with its commands sbatch, squeue and scontrol.
+    Slurm,
+}
+
+#[derive(Args, Debug)]
+pub(super) struct ReportArgs {
+    /// The --out of `perturb run`; tables go to its folder report/.
+    #[arg(value_name = "DIR")]
+    pub(super) dir: PathBuf,
+    /// Also write everything, with training curves and the heatmaps of `perturb heatmap`, as one HTML page that needs
+    /// nothing else.
+    #[arg(long, value_name = "FILE")]
+    pub(super) html: Option<PathBuf>,
+}
+
+#[derive(Args, Debug)]
+pub(super) struct CurvesArgs {
+    /// The --out of `perturb run`.
+    #[arg(value_name = "DIR")]
+    pub(super) dir: PathBuf,
+    /// Where the pictures go [default: DIR/report].
+    #[arg(long, value_name = "DIR")]
+    pub(super) out: Option<PathBuf>,
+}
+
+#[derive(Args, Debug)]
+pub(super) struct HeatmapArgs {
+    /// The --out of `perturb run`: every training that was selected in its first run, over the environment's usual two
+    /// parameters. Heatmaps go to its folder heatmaps/; those that are there are kept.
+    #[arg(
+        value_name = "DIR",
+        required_unless_present = "checkpoint",
+        conflicts_with_all = ["checkpoint", "x", "y", "out"]
+    )]
+    pub(super) dir: Option<PathBuf>,
+    /// One policy instead: the --out of a training, or the checkpoint folder in it.
+    #[arg(long, value_name = "DIR")]
+    pub(super) checkpoint: Option<PathBuf>,
+    /// The parameter along x, e.g. force; `perturb envs` lists them [default: the environment's usual two].
+    #[arg(long, value_name = "PARAMETER", requires = "y")]
+    pub(super) x: Option<String>,
+    /// The parameter along y, e.g. mass.
+    #[arg(long, value_name = "PARAMETER", requires = "x")]
+    pub(super) y: Option<String>,
+    /// Points along each axis, at most 100.
+    #[arg(long, value_name = "N", default_value_t = 40, value_parser = points)]
+    pub(super) grid: usize,
+    /// Episodes at each point.
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..))]
+    pub(super) episodes: u64,
+    /// Fixes the tests' randomness [default: the training's seed].
+    #[arg(long, value_name = "N")]
+    pub(super) seed: Option<u64>,
+    /// The files without their endings .csv, .svg, .png [default: in the working directory, named after environment,
+    /// algorithm, architecture, version, seed and parameters].
+    #[arg(long, value_name = "PATH")]
+    pub(super) out: Option<PathBuf>,
+    #[command(flatten)]
+    pub(super) server: ServerArgs,
+}
+
+#[derive(Args, Debug)]
+pub(super) struct VideoArgs {
+    /// The --out of a training, or the checkpoint folder in it.
+    #[arg(long, value_name = "DIR")]
+    pub(super) checkpoint: PathBuf,
+    /// Where the environment's parameters come from.
+    #[arg(long, default_value = "D", ignore_case = true)]
+    pub(super) version: Version,
+    /// Episodes to play; of a policy trained with RL² all episodes of a trial are shown, one after the other.
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..))]
+    pub(super) episodes: u64,
+    /// The video; its name ends in .mp4, for which ffmpeg must be installed, or in .gif, which needs nothing.
+    #[arg(long, value_name = "FILE")]
+    pub(super) out: PathBuf,
+    /// Fixes all randomness; with the same number, `evaluate --episodes 1` tests the first episode [default: the
+    /// training's seed].
+    #[arg(long, value_name = "N")]
+    pub(super) seed: Option<u64>,
+    /// Width of the pictures, 240 to 2048 pixels.
+    #[arg(long, value_name = "PIXELS", default_value_t = 480, value_parser = pixels)]
+    pub(super) width: u32,
+    /// Height of the pictures, 240 to 2048 pixels; the text below them comes in addition.
+    #[arg(long, value_name = "PIXELS", default_value_t = 480, value_parser = pixels)]
+    pub(super) height: u32,
+    /// Steps shown in a second, 0.1 to 1000 [default: as many as the environment simulates in one: real time].
+    #[arg(long, value_name = "N", value_parser = frames_per_second)]
+    pub(super) fps: Option<f64>,
+    #[command(flatten)]
+    pub(super) server: ServerArgs,
+}
+
+fn pixels(text: &str) -> Result<u32, String> {
+    let (least, most) = (crate::video::SMALLEST, crate::video::LARGEST);
+    let number = text.parse().ok().filter(|number| (least..=most).contains(number));
+    number.ok_or_else(|| format!("expected {least} to {most}"))
+}
+
+fn frames_per_second(text: &str) -> Result<f64, String> {
+    let number = text.parse().ok().filter(|number| (0.1..=1000.0).contains(number));
+    number.ok_or_else(|| "expected 0.1 to 1000".into())
+}
+
+fn points(text: &str) -> Result<usize, String> {
+    let most = perturb_study::MOST_POINTS;
+    text.parse().ok().filter(|number| (1..=most).contains(number)).ok_or_else(|| format!("expected 1 to {most}"))
+}
+
+fn at_least_one(text: &str) -> Result<usize, String> {
+    match text.parse() {
+        Ok(0) | Err(_) => Err("expected a whole number, at least 1".into()),
+        Ok(number) => Ok(number),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    #[test]
+    fn a_run_is_resumed_with_its_own_settings_only() {
+        let cli = Cli::command();
+        let train = cli.find_subcommand("train").unwrap();
+        let of = |name: &str| train.get_arguments().find(|argument| argument.get_id() == name).unwrap();
+        let refused: Vec<&str> =
+            train.get_arg_conflicts_with(of("resume")).iter().map(|argument| argument.get_id().as_str()).collect();
+        for argument in train.get_arguments().map(|argument| argument.get_id().as_str()) {
+            let accepted = ["resume", "server", "workers", "help"].contains(&argument);
+            assert_ne!(refused.contains(&argument), accepted, "--{argument}");
+        }
+    }
+}

@@ -1,0 +1,60 @@
+//! `perturb envs`.
+
+use std::io::Write;
+
+use anyhow::Result;
+use perturb_protocol::catalogue;
+
+use super::args::EnvsArgs;
+use super::{Ending, servers};
+use perturb_learner::proto::{Channel, Distribution, Environment, action_space::Kind};
+
+pub(super) fn run(args: &EnvsArgs) -> Result<Ending> {
+    let catalogue = servers(&args.server, 0)?.catalogue()?;
+    let mut out = std::io::stdout().lock();
+    if args.json {
+        writeln!(out, "{:#}", catalogue::to_json(&catalogue))?;
+        return Ok(Ending::Done);
+    }
+    for environment in &catalogue.environments {
+        print(&mut out, environment)?;
+    }
+    Ok(Ending::Done)
+}
+
+fn print(out: &mut impl Write, environment: &Environment) -> std::io::Result<()> {
+    writeln!(out, "{} (v{})  {}", environment.name, environment.revision, environment.description)?;
+    let seconds = f64::from(environment.step_limit) * environment.control_timestep;
+    writeln!(out, "  at most {} steps ({seconds:.0} s)", environment.step_limit)?;
+    let names = |channels: &[Channel]| channels.iter().map(|channel| channel.name.clone()).collect::<Vec<_>>();
+    writeln!(out, "  observation  {}", names(&environment.observation).join(", "))?;
+    let action = match environment.action.as_ref().and_then(|action| action.kind.as_ref()) {
+        Some(Kind::Discrete(discrete)) => format!("one of {}", discrete.names.join(", ")),
+        Some(Kind::Continuous(continuous)) => format!("numbers: {}", names(&continuous.channels).join(", ")),
+        None => "unknown".into(),
+    };
+    writeln!(out, "  action       {action}")?;
+    if let Some(success) = &environment.success {
+        writeln!(out, "  success      {}", success.description)?;
+    }
+    writeln!(out, "  {:<18} {:<8} {:>8}  {:<20} E", "parameter", "unit", "D", "R")?;
+    for parameter in &environment.parameters {
+        writeln!(
+            out,
+            "  {:<18} {:<8} {:>8}  {:<20} {}",
+            parameter.name,
+            parameter.unit,
+            parameter.default_value,
+            show(parameter.random.as_ref()),
+            show(parameter.extreme.as_ref())
+        )?;
+    }
+    writeln!(out)
+}
+
+/// Intervals as mathematicians write them.
+fn show(distribution: Option<&Distribution>) -> String {
+    let intervals = distribution.map(|distribution| distribution.intervals.as_slice()).unwrap_or_default();
+    let texts = intervals.iter().map(|interval| format!("[{}, {}]", interval.low, interval.high));
+    texts.collect::<Vec<_>>().join(" ∪ ")
+}

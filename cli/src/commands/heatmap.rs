@@ -1,0 +1,134 @@
+//! `perturb heatmap`.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+
+use super::args::HeatmapArgs;
+use super::bar::Bar;
+use super::report::write_file;
+use super::{Ending, UsageError, servers};
+use perturb_learner::checkpoint::{Checkpoint, State};
+use perturb_learner::client::Servers;
+use perturb_learner::evaluation::heatmap;
+use perturb_study::interrupt::StopFlag;
+use perturb_study::{
+    Cell, Folder, Heatmap, HeatmapOptions, HeatmapPlace, Plan, Results, default_axes, heatmap_files, heatmap_places,
+    store_heatmap,
+};
+
+pub(super) fn run(args: &HeatmapArgs) -> Result<Ending> {
+    match (&args.dir, &args.checkpoint) {
+        (Some(directory), _) => of_experiment(args, directory),
+        (None, Some(checkpoint)) => of_checkpoint(args, checkpoint),
+        (None, None) => Err(UsageError("give the directory of an experiment, or --checkpoint".into()).into()),
+    }
+}
+
+/// Of one policy.
+fn of_checkpoint(args: &HeatmapArgs, path: &Path) -> Result<Ending> {
+    let checkpoint = Checkpoint::load(path)?;
+    let state = &checkpoint.state;
+    let parameters = match (&args.x, &args.y) {
+        (Some(x), Some(y)) => [x.clone(), y.clone()],
+        _ => default_axes(&state.environment).map(|names| names.map(str::to_owned)).ok_or_else(|| {
+            let message = format!("give --x and --y: it is not known which of {}'s to show", state.environment);
+            UsageError(message)
+        })?,
+    };
+    let options = options(args, parameters, state);
+    let stop = StopFlag::on_signals().context("cannot wait for signals")?;
+    let servers = servers(&args.server, args.grid * args.grid)?;
+    let heatmap = test(&servers, &checkpoint, &options, &stop)?;
+    let path = args.out.clone().unwrap_or_else(|| default_path(state, &options.parameters));
+    let mut out = std::io::stdout();
+    for (ending, content) in heatmap_files(&heatmap)? {
+        let mut name = path.clone().into_os_string();
+        name.push(format!(".{ending}"));
+        write_file(Path::new(&name), &content)?;
+        writeln!(out, "{}", Path::new(&name).display())?;
+    }
+    Ok(Ending::Done)
+}
+
+/// In the working directory: a training's folder has nothing in it that its training did not write.
+fn default_path(state: &State, [x, y]: &[String; 2]) -> PathBuf {
+    let State { environment, algorithm, architecture, train_version, seed, .. } = state;
+    format!("{environment}-{algorithm}-{architecture}-{train_version}-s{seed}-{x}-{y}").into()
+}
+
+/// Of everything that was selected in the first run of an experiment, unless it is there already.
+fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<Ending> {
+    let folder = Folder::new(directory);
+    let plan = Plan::load(&folder.require_plan()?)?;
+    let results = Results::read(&plan, &folder)?;
+    let groups = results.select();
+    let places = heatmap_places(&results, &groups);
+    let stop = StopFlag::on_signals().context("cannot wait for signals")?;
+    let mut servers_of_all = None;
+    let mut out = std::io::stdout();
+    let mut failed = 0;
+    for place in &places {
+        let (Some(cell), Some(parameters)) = (place.cell, default_axes(place.environment)) else {
+            let reason =
+                if place.cell.is_none() { "no result yet" } else { "it is not known which parameters to show" };
+            eprintln!("{place}: {reason}");
+            continue;
+        };
+        let checkpoint = match checkpoint_of(&folder, cell, &results) {
+            Ok(checkpoint) => checkpoint,
+            Err(error) => {
+                eprintln!("{place}: {error:#}");
+                failed += 1;
+                continue;
+            }
+        };
+        let options = options(args, parameters.map(str::to_owned), &checkpoint.state);
+        if is_there(place, &folder, &options)? {
+            eprintln!("{place}: is there already");
+            continue;
+        }
+        let servers = match &mut servers_of_all {
+            Some(servers) => servers,
+            none => none.insert(servers(&args.server, args.grid * args.grid)?),
+        };
+        let heatmap = test(servers, &checkpoint, &options, &stop).with_context(|| place.to_string())?;
+        let id = checkpoint.id().map_err(|reason| anyhow::anyhow!("{place}: {reason}"))?;
+        let path = store_heatmap(&folder, cell, id, options, &heatmap)?;
+        writeln!(out, "{}.png, .svg and .csv", path.display())?;
+    }
+    if failed > 0 {
+        bail!("{failed} of {} heatmaps could not be made", places.len());
+    }
+    Ok(Ending::Done)
+}
+
+/// The checkpoint that a cell's result comes from.
+fn checkpoint_of(folder: &Folder, cell: &Cell, results: &Results<'_>) -> Result<Checkpoint> {
+    let checkpoint = Checkpoint::load(&folder.cell(&cell.id).training())?;
+    let state = &checkpoint.state;
+    let same = results.result(cell.index).is_some_and(|result| {
+        let training = &result.training;
+        training.settings == state.config && training.counters == state.counters
+    });
+    if !same {
+        bail!("the checkpoint of {} is not the one that its result.json came from", cell.id);
+    }
+    Ok(checkpoint)
+}
+
+/// Whether there is a heatmap of the current result, made like this.
+fn is_there(place: &HeatmapPlace<'_>, folder: &Folder, options: &HeatmapOptions) -> Result<bool> {
+    Ok(place.read(folder)?.is_ok_and(|heatmap| heatmap.record.options == *options))
+}
+
+fn options(args: &HeatmapArgs, parameters: [String; 2], state: &State) -> HeatmapOptions {
+    HeatmapOptions { parameters, grid: args.grid, episodes: args.episodes, seed: args.seed.unwrap_or(state.seed) }
+}
+
+fn test(servers: &Servers, checkpoint: &Checkpoint, options: &HeatmapOptions, stop: &StopFlag) -> Result<Heatmap> {
+    let HeatmapOptions { parameters: [x, y], grid, episodes, .. } = options;
+    let mut bar = Bar::new(format!("testing over {x} and {y}"), (grid * grid) as u64 * episodes);
+    Ok(heatmap(servers, checkpoint, options, stop, &mut |episodes| bar.testing(episodes))?)
+}

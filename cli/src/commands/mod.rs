@@ -1,0 +1,129 @@
+//! The command line: `perturb envs | train | evaluate | demo | plan | run | report | curves |
+//! heatmap | video`.
+//!
+//! Results go to standard output, everything else to standard error. Exit status: 0 done, 1 failed, 2 wrong usage, 128 +
+//! the signal's number if Ctrl-C or SIGTERM ended it. `run --cell` has two more: 69 without a server, 75 if another
+//! process works on the cell.
+
+mod args;
+mod bar;
+mod demo;
+mod envs;
+mod evaluate;
+mod heatmap;
+mod plan;
+mod report;
+mod run;
+mod single_thread;
+mod slurm;
+mod train;
+mod video;
+
+use std::io::IsTerminal;
+use std::process::ExitCode;
+
+use anyhow::{Context, Result};
+use clap::Parser;
+
+use crate::video::VideoError;
+use args::{Cli, Command, ServerArgs};
+use perturb_learner::client::{PrivateServerOptions, Servers};
+use perturb_learner::evaluation::HeatmapError;
+use perturb_learner::evaluation::TestError;
+use perturb_study::PlanError;
+use perturb_study::settings::ConfigError;
+use perturb_study::slurm::OptionError;
+
+/// How a command ended that did not fail.
+enum Ending {
+    /// All was done.
+    Done,
+    /// It was asked to end by this signal.
+    Signal(i32),
+    /// It could not do its work now, for the reason that this exit status stands for.
+    Status(u8),
+}
+
+/// A mistake of the person who typed the command.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+struct UsageError(String);
+
+/// Runs the program with the process's arguments.
+pub fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn"));
+    let colours = std::io::stderr().is_terminal(); // a worker's is a file
+    tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours).with_writer(std::io::stderr).init();
+    if matches!(cli.command, Command::Train(_) | Command::Demo(_) | Command::Plan(_) | Command::Run(_)) {
+        // An experiment's results must not depend on what a cluster's profile exports.
+        single_thread::ensure(matches!(cli.command, Command::Run(_)));
+    }
+    let result = match cli.command {
+        Command::Envs(args) => envs::run(&args),
+        Command::Train(args) => train::run(&args),
+        Command::Evaluate(args) => evaluate::run(&args),
+        Command::Demo(args) => demo::run(&args),
+        Command::Plan(args) => plan::run(&args),
+        Command::Run(args) => run::run(&args),
+        Command::Report(args) => report::run(&args),
+        Command::Curves(args) => report::curves(&args),
+        Command::Heatmap(args) => heatmap::run(&args),
+        Command::Video(args) => video::run(&args),
+    };
+    match result {
+        Ok(Ending::Done) => ExitCode::SUCCESS,
+        Ok(Ending::Signal(number)) => signal_code(number),
+        Ok(Ending::Status(status)) => ExitCode::from(status),
+        Err(error) => fail(&error),
+    }
+}
+
+fn fail(error: &anyhow::Error) -> ExitCode {
+    let stopped = match (error.downcast_ref(), error.downcast_ref()) {
+        (Some(HeatmapError::Test(error)), _) | (_, Some(VideoError::Test(error))) => Some(error),
+        _ => error.downcast_ref(),
+    };
+    if let Some(TestError::Stopped { signal }) = stopped {
+        eprintln!("perturb: {error:#}");
+        return signal_code(*signal);
+    }
+    // A closed pipe is how `perturb envs | head` ends.
+    let closed = |cause: &(dyn std::error::Error + 'static)| {
+        cause.downcast_ref::<std::io::Error>().is_some_and(|error| error.kind() == std::io::ErrorKind::BrokenPipe)
+    };
+    if error.chain().any(closed) {
+        return ExitCode::SUCCESS;
+    }
+    eprintln!("perturb: {error:#}");
+    let usage = error.is::<ConfigError>()
+        || error.is::<UsageError>()
+        || error.is::<PlanError>()
+        || error.is::<OptionError>()
+        || matches!(error.downcast_ref(), Some(VideoError::Extension { .. }));
+    ExitCode::from(if usage { 2 } else { 1 })
+}
+
+fn signal_code(number: i32) -> ExitCode {
+    ExitCode::from(u8::try_from(128 + number).unwrap_or(1))
+}
+
+/// The servers that were named, or one of our own that takes `num_envs` environments.
+fn servers(args: &ServerArgs, num_envs: usize) -> Result<Servers> {
+    if args.server.is_empty() {
+        let options = PrivateServerOptions { workers: args.workers, num_envs };
+        return Servers::local(options).context("cannot start a server for this run");
+    }
+    refuse_workers(args)?;
+    Ok(Servers::connect(&args.server)?)
+}
+
+/// Servers that were named have their threads already.
+fn refuse_workers(args: &ServerArgs) -> Result<(), UsageError> {
+    if args.workers.is_some() {
+        let message = "--workers is for the server that perturb starts itself; give it to perturb-server instead";
+        return Err(UsageError(message.into()));
+    }
+    Ok(())
+}

@@ -1,0 +1,147 @@
+//! `perturb plan`.
+
+use std::collections::HashMap;
+use std::io::Write;
+use std::time::Duration;
+
+use anyhow::Result;
+use serde_json::json;
+
+use super::args::PlanArgs;
+use super::{Ending, UsageError, servers};
+use perturb_learner::client::Servers;
+use perturb_learner::measure::measure;
+use perturb_study::{Cell, Estimate, Folder, Measurement, Plan, estimate, representatives};
+
+pub(super) fn run(args: &PlanArgs) -> Result<Ending> {
+    let plan = Plan::load(&args.file)?;
+    let mut out = std::io::stdout();
+    if args.json && !args.cells && args.missing.is_none() {
+        return Err(UsageError("--json lists cells: give --cells or --missing DIR with it".into()).into());
+    }
+    let folder = args.missing.as_deref().map(Folder::new);
+    let listed: Vec<&Cell> = match &folder {
+        Some(folder) => plan.cells.iter().filter(|cell| !folder.cell(&cell.id).is_settled(true)).collect(),
+        None if args.cells => plan.cells.iter().collect(),
+        None => Vec::new(),
+    };
+    if args.json {
+        let listed: Vec<_> = listed.iter().map(|cell| json!({ "index": cell.index, "id": cell.id })).collect();
+        writeln!(out, "{}", serde_json::to_string_pretty(&listed)?)?;
+        return Ok(Ending::Done);
+    }
+    for cell in listed {
+        writeln!(out, "{:>6} {}", cell.index, cell.id)?;
+    }
+    if folder.is_some() {
+        return Ok(Ending::Done);
+    }
+    let counts = plan.counts();
+    let runs = if counts.runs == 1 { "1 run".to_owned() } else { format!("{} runs", counts.runs) };
+    writeln!(
+        out,
+        "{} configurations, {} trainings, {} train/test pairs, {} with {runs}",
+        grouped(counts.configurations),
+        grouped(counts.trainings),
+        grouped(counts.pairs),
+        grouped(counts.all_pairs)
+    )?;
+    if args.measure == 0 {
+        return Ok(Ending::Done);
+    }
+    let most = plan.cells.iter().map(|cell| cell.config.common.num_envs).max().unwrap_or_default();
+    let servers = servers(&args.server, most)?;
+    let limits = step_limits(&servers, &plan)?;
+    let representatives = representatives(&plan);
+    writeln!(
+        out,
+        "\nmeasured: {} trainings for some {} s each, one after the other, with the settings in the middle of their grid",
+        representatives.len(),
+        args.measure
+    )?;
+    writeln!(out, "environment   method              steps/s training   steps/s testing")?;
+    let mut measurements = Vec::new();
+    for cell in representatives {
+        let measurement = measure(&servers, cell, Duration::from_secs(args.measure))?;
+        print_measurement(&mut out, &measurement)?;
+        measurements.push(measurement);
+    }
+    let estimate = estimate(&plan, &measurements, |environment| limits.get(environment).copied().unwrap_or_default());
+    print_estimate(&mut out, &plan, &estimate)?;
+    Ok(Ending::Done)
+}
+
+/// The step limits of the plan's environments.
+pub(super) fn step_limits<'a>(servers: &Servers, plan: &'a Plan) -> Result<HashMap<&'a str, u32>> {
+    let limit = |name: &'a str| Ok((name, servers.environment(name)?.step_limit));
+    plan.environments().into_iter().map(limit).collect()
+}
+
+fn print_measurement(out: &mut impl Write, measurement: &Measurement) -> std::io::Result<()> {
+    let Measurement { environment, method, speed } = measurement;
+    let per_second = |seconds: f64| grouped((1.0 / seconds.max(1e-9)).round() as usize);
+    let (training, testing) = (per_second(speed.training), per_second(speed.testing));
+    writeln!(out, "{environment:<13} {method:<20} {training:>16} {testing:>17}")
+}
+
+fn print_estimate(out: &mut impl Write, plan: &Plan, estimate: &Estimate) -> std::io::Result<()> {
+    let steps = |number: f64| format!("{number:.2e}");
+    writeln!(
+        out,
+        "\nat most, if every episode of {} cells lasts until the step limit: {} steps of training, {} of testing",
+        grouped(plan.cells.len()),
+        steps(estimate.work.training_steps),
+        steps(estimate.work.testing_steps)
+    )?;
+    let (training, testing) = (estimate.training_seconds, estimate.testing_seconds);
+    writeln!(
+        out,
+        "which takes {} as measured: {} of training, {} of testing; with two jobs on as many free cores half of it",
+        duration(training + testing),
+        duration(training),
+        duration(testing)
+    )
+}
+
+/// A number with its digits in groups of three.
+pub(super) fn grouped(number: usize) -> String {
+    let digits = number.to_string();
+    let mut text = String::new();
+    for (i, digit) in digits.chars().enumerate() {
+        if i > 0 && (digits.len() - i).is_multiple_of(3) {
+            text.push(' ');
+        }
+        text.push(digit);
+    }
+    text
+}
+
+/// A time in two of its units.
+pub(super) fn duration(seconds: f64) -> String {
+    let seconds = seconds.round() as u64;
+    let (minutes, hours, days) = (seconds / 60, seconds / 3600, seconds / 86_400);
+    match (days, hours, minutes) {
+        (0, 0, 0) => format!("{seconds} s"),
+        (0, 0, _) => format!("{minutes} min {} s", seconds % 60),
+        (0, _, _) => format!("{hours} h {} min", minutes % 60),
+        (0..1000, _, _) => format!("{days} d {} h", hours % 24),
+        _ => format!("{} years", grouped((days as f64 / 365.25).round() as usize)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn digits_stand_in_groups_of_three() {
+        let shown = [0, 12, 183, 3294, 9882, 49_410, 1_234_567].map(grouped);
+        assert_eq!(shown, ["0", "12", "183", "3 294", "9 882", "49 410", "1 234 567"]);
+    }
+
+    #[test]
+    fn times_have_two_units() {
+        let shown = [0.4, 59.4, 61.0, 3600.0, 90_000.0, 86_400.0 * 400.0, 86_400.0 * 3652.5].map(duration);
+        assert_eq!(shown, ["0 s", "59 s", "1 min 1 s", "1 h 0 min", "1 d 1 h", "400 d 0 h", "10 years"]);
+    }
+}

@@ -1,0 +1,71 @@
+//! `perturb report` and `perturb curves`.
+
+use std::io::Write;
+use std::path::Path;
+
+use anyhow::{Context, Result};
+
+use super::Ending;
+use super::args::{CurvesArgs, ReportArgs};
+use perturb_study::plot::{Quantity, draw_curves, save};
+use perturb_study::report::{Figures, Report, csv_files, html, markdown, text};
+use perturb_study::{EnvironmentCurves, Folder, Plan, Results, curves_csv, read_curves, write_atomically};
+
+pub(super) fn run(args: &ReportArgs) -> Result<Ending> {
+    let folder = Folder::new(&args.dir);
+    let text = write(&folder, args.html.as_deref())?;
+    write!(std::io::stdout(), "{text}")?;
+    eprintln!("\nthe tables are also in {}", args.dir.join("report").display());
+    Ok(Ending::Done)
+}
+
+/// Writes the tables of an experiment and, with `page`, everything as HTML; returns the tables as text.
+pub(super) fn write(folder: &Folder, page: Option<&Path>) -> Result<String> {
+    let plan = Plan::load(&folder.require_plan()?)?;
+    let results = Results::read(&plan, folder)?;
+    let groups = results.select();
+    let report = Report::new(&results, &groups);
+
+    let out = folder.path().join("report");
+    write_file(&out.join("report.md"), markdown(&report).as_bytes())?;
+    for (name, content) in csv_files(&results, &groups)? {
+        write_file(&out.join(name), &content)?;
+    }
+    if let Some(path) = page {
+        let figures = Figures::read(&results, &groups, folder)?;
+        write_file(path, html(&report, &figures).as_bytes())?;
+    }
+    Ok(text(&report))
+}
+
+pub(super) fn curves(args: &CurvesArgs) -> Result<Ending> {
+    let folder = Folder::new(&args.dir);
+    let plan = Plan::load(&folder.require_plan()?)?;
+    let results = Results::read(&plan, &folder)?;
+    let all: Vec<EnvironmentCurves> = read_curves(&results, &results.select(), &folder)?;
+    let out = args.out.clone().unwrap_or_else(|| args.dir.join("report"));
+    write_file(&out.join("curves.csv"), &curves_csv(&all)?)?;
+    let mut stdout = std::io::stdout();
+    for curves in &all {
+        if curves.curves.is_empty() {
+            eprintln!("{}: no finished training with a monitor.csv", curves.environment);
+            continue;
+        }
+        for quantity in Quantity::ALL {
+            let path = out.join(format!("{}-{quantity}.svg", curves.environment));
+            save(&draw_curves(curves, quantity), &path)?;
+            writeln!(stdout, "{} and .png", path.display())?;
+        }
+    }
+    writeln!(stdout, "{}", out.join("curves.csv").display())?;
+    Ok(Ending::Done)
+}
+
+/// Writes a file, and the folders above it if they are not there. A plain file appears complete: several runs that share
+/// a folder write the same report at the same time.
+pub(super) fn write_file(path: &Path, content: &[u8]) -> Result<()> {
+    if path.metadata().is_ok_and(|metadata| !metadata.is_file()) {
+        return std::fs::write(path, content).with_context(|| format!("cannot write {}", path.display()));
+    }
+    Ok(write_atomically(path, content)?)
+}

@@ -1,0 +1,57 @@
+//! `perturb video`.
+
+use std::io::Write;
+
+use anyhow::{Context, Result};
+
+use super::args::VideoArgs;
+use super::bar::Bar;
+use super::{Ending, servers};
+use crate::video::{Summary, VideoFile, VideoOptions, film};
+use perturb_learner::checkpoint::Checkpoint;
+use perturb_study::interrupt::StopFlag;
+
+pub(super) fn run(args: &VideoArgs) -> Result<Ending> {
+    let file = VideoFile::create(&args.out)?;
+    let checkpoint = Checkpoint::load(&args.checkpoint)?;
+    let stop = StopFlag::on_signals().context("cannot wait for signals")?;
+    let servers = servers(&args.server, 0)?;
+    let options = VideoOptions {
+        version: args.version,
+        episodes: args.episodes,
+        seed: args.seed.unwrap_or(checkpoint.state.seed),
+        size: (args.width, args.height),
+        fps: args.fps,
+    };
+    let mut bar = Bar::new(format!("filming on {}", args.version), args.episodes);
+    let summary = film(&servers, &checkpoint, &options, file, &stop, &mut |episodes| bar.testing(episodes))?;
+    drop(bar);
+    let mut out = std::io::stdout();
+    writeln!(out, "episode     return  steps  success  parameters")?;
+    for (number, episode) in summary.episodes.iter().enumerate() {
+        let parameters: Vec<String> =
+            episode.parameters.iter().map(|(name, value)| format!("{name}={value}")).collect();
+        let success = if episode.success { "yes" } else { "no" };
+        let (number, parameters) = (number + 1, parameters.join(" "));
+        writeln!(
+            out,
+            "{number:>7} {:>10.2} {:>6}  {success:<7}  {parameters}",
+            episode.episode_return, episode.length
+        )?;
+    }
+    writeln!(out, "{}: {}", args.out.display(), figures(&summary))?;
+    Ok(Ending::Done)
+}
+
+/// How many frames there are, how fast they are shown, and how fast they were made.
+fn figures(summary: &Summary) -> String {
+    let Summary { frames, size: (width, height), speed, total, waiting, writing, .. } = summary;
+    let milliseconds = |time: &std::time::Duration| 1e3 * time.as_secs_f64() / *frames as f64;
+    format!(
+        "{frames} frames of {width} × {height} pixels at {speed:.2} × real time; rendered and written at {:.0} frames/s: \
+         each waited {:.1} ms for the server and took {:.1} ms to write",
+        *frames as f64 / total.as_secs_f64(),
+        milliseconds(waiting),
+        milliseconds(writing),
+    )
+}

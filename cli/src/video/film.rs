@@ -1,0 +1,262 @@
+//! Plays episodes and films them.
+
+use std::time::{Duration, Instant};
+
+use super::panel::{Ending, Panel, Shown, parameter};
+use super::{VideoError, VideoFile, VideoWriter};
+use perturb_learner::checkpoint::{Checkpoint, EnvironmentSummary, State};
+use perturb_learner::client::{BegunEpisode, ClientError, OpenOptions, Picture, Servers, Single, StepReply};
+use perturb_learner::evaluation::{Agent, TestError, check_unchanged, open_options};
+use perturb_learner::proto;
+use perturb_study::Version;
+use perturb_study::interrupt::StopFlag;
+
+/// The end of an episode stays for so many seconds.
+const HOLD: f64 = 1.0;
+
+/// What to film.
+#[derive(Clone, Debug)]
+pub struct VideoOptions {
+    /// Where parameters come from.
+    pub version: Version,
+    /// How many episodes, at least 1.
+    pub episodes: u64,
+    /// Fixes all randomness.
+    pub seed: u64,
+    /// Of the pictures, in pixels, [`super::SMALLEST`] … [`super::LARGEST`]; frames are higher by the text below.
+    pub size: (u32, u32),
+    /// Frames shown in a second, more than 0; `None` is real time.
+    pub fps: Option<f64>,
+}
+
+/// An episode that was filmed.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Filmed {
+    /// The parameters' names and values, in the catalogue's order.
+    pub parameters: Vec<(String, f64)>,
+    /// The undiscounted sum of its rewards.
+    pub episode_return: f64,
+    /// Its number of steps.
+    pub length: u32,
+    /// Whether it was a success.
+    pub success: bool,
+}
+
+/// What was filmed, and how fast.
+#[derive(Clone, Debug, Default)]
+pub struct Summary {
+    /// In order.
+    pub episodes: Vec<Filmed>,
+    /// One for each step and one for each episode's start.
+    pub frames: u64,
+    /// Of a frame, width and height in pixels.
+    pub size: (u32, u32),
+    /// Simulated seconds that pass in one second of the video: 1 is real time.
+    pub speed: f64,
+    /// From the first request to the finished file.
+    pub total: Duration,
+    /// The part of it that passed with waiting for the server.
+    pub waiting: Duration,
+    /// The part of it that passed with drawing text, encoding and writing.
+    pub writing: Duration,
+}
+
+/// Plays `options.episodes` episodes with the policy of `checkpoint`, sampled actions and frozen statistics, and writes
+/// them to `file`: a frame of the start of each episode and one after each step. Calls `report` with the number of
+/// episodes done.
+///
+/// It is environment 0 of a test with the same seed: what is filmed of one episode is what a test of one episode sees. Of
+/// a policy that was trained in trials all episodes of a trial are filmed, and the policy remembers them.
+///
+/// # Errors
+/// [`VideoError`]; the file is then not there.
+pub fn film(
+    servers: &Servers,
+    checkpoint: &Checkpoint,
+    options: &VideoOptions,
+    file: VideoFile,
+    stop: &StopFlag,
+    report: &mut dyn FnMut(u64),
+) -> Result<Summary, VideoError> {
+    let start = Instant::now();
+    let mut film = Film::open(servers, checkpoint, options)?;
+    film.summary.speed = film.environment.control_timestep / file.frame_seconds(film.fps);
+    let mut writer = file.begin(film.summary.size, film.fps)?;
+    loop {
+        if let Some(signal) = stop.signal() {
+            return Err(TestError::Stopped { signal }.into());
+        }
+        // The next step is on its way before the picture of this state is there: server and learner work at once.
+        let next = film.request_next()?;
+        film.expose(&mut writer)?;
+        match next {
+            Next::Step => film.step()?,
+            Next::Episode => film.begin()?,
+            Next::Nothing => break,
+        }
+        report(film.summary.episodes.len() as u64);
+    }
+    let completing = Instant::now();
+    writer.finish()?;
+    film.summary.writing += completing.elapsed();
+    film.summary.total = start.elapsed();
+    Ok(film.summary)
+}
+
+/// What follows a state.
+enum Next {
+    Step,
+    Episode,
+    Nothing,
+}
+
+/// A policy that acts and is filmed.
+struct Film<'a> {
+    options: &'a VideoOptions,
+    state: &'a State,
+    single: Single<'a>,
+    environment: proto::Environment,
+    agent: Agent<'a>,
+    reply: StepReply,
+    begun: BegunEpisode,
+    panel: Panel,
+    shown: Shown,
+    /// The last picture.
+    last: Option<Picture>,
+    frame: Vec<u8>,
+    fps: f64,
+    summary: Summary,
+}
+
+impl<'a> Film<'a> {
+    /// At the start of the first episode, whose picture has been asked for.
+    fn open(servers: &'a Servers, checkpoint: &'a Checkpoint, options: &'a VideoOptions) -> Result<Self, VideoError> {
+        let state = &checkpoint.state;
+        let open = OpenOptions {
+            episodes_per_trial: state.episodes_per_trial,
+            ..open_options(&state.environment, options.version, 1, options.seed)
+        };
+        let mut reply = StepReply::default();
+        let (single, begun) = Single::open(servers, &open, &mut reply.observations)?;
+        check_unchanged(checkpoint, EnvironmentSummary::of(single.environment()))?;
+        let environment = single.environment().clone();
+        let title = (
+            format!("{} {}", environment.name, options.version),
+            format!("{} {}, trained on {}", state.algorithm, state.architecture, state.train_version),
+        );
+        let panel = Panel::new(options.size, title, environment.parameters.len())?;
+        let mut film = Self {
+            options,
+            state,
+            single,
+            agent: Agent::new(checkpoint, 1, options.seed).map_err(TestError::Numbers)?,
+            reply,
+            shown: Shown::default(),
+            last: None,
+            frame: Vec::new(),
+            fps: options.fps.unwrap_or(1.0 / environment.control_timestep),
+            summary: Summary { size: panel.size(), ..Summary::default() },
+            begun,
+            panel,
+            environment,
+        };
+        film.announce();
+        film.request_picture()?;
+        Ok(film)
+    }
+
+    /// Asks for what follows the present state, and for a picture of that.
+    fn request_next(&mut self) -> Result<Next, VideoError> {
+        let next = if self.shown.ending.is_none() {
+            let action = self.agent.act(&mut self.reply.observations).map_err(TestError::Numbers)?;
+            self.single.request_step(action)?;
+            Next::Step
+        } else if (self.summary.episodes.len() as u64) < self.options.episodes {
+            self.single.request_reset()?;
+            Next::Episode
+        } else {
+            return Ok(Next::Nothing);
+        };
+        self.request_picture()?;
+        Ok(next)
+    }
+
+    fn request_picture(&mut self) -> Result<(), VideoError> {
+        let (width, height) = self.options.size;
+        Ok(self.single.request_picture(width, height)?)
+    }
+
+    /// Takes the picture of the present state, and writes its frame.
+    fn expose(&mut self, writer: &mut VideoWriter) -> Result<(), VideoError> {
+        let asked = Instant::now();
+        let picture = match (self.single.picture(), &self.last) {
+            // Physics that diverged ends its episode and cannot be drawn: the picture before it stays.
+            (Err(ClientError::Refused { code, .. }), Some(last))
+                if code == tonic::Code::FailedPrecondition && self.shown.ending.is_some() =>
+            {
+                last.clone()
+            }
+            (picture, _) => picture?,
+        };
+        let came = Instant::now();
+        self.panel.compose(&picture, &self.shown, &mut self.frame)?;
+        writer.write(&self.frame, if self.shown.ending.is_some() { HOLD } else { 0.0 })?;
+        self.summary.frames += 1;
+        self.last = Some(picture);
+        self.summary.waiting += came - asked;
+        self.summary.writing += came.elapsed();
+        Ok(())
+    }
+
+    /// Takes the outcome of a step.
+    fn step(&mut self) -> Result<(), VideoError> {
+        let asked = Instant::now();
+        self.single.stepped(&mut self.reply)?;
+        self.summary.waiting += asked.elapsed();
+        let Self { reply, shown, .. } = self;
+        shown.step += 1;
+        shown.time = f64::from(shown.step) * self.environment.control_timestep;
+        shown.episode_return += f64::from(reply.rewards[0]);
+        let end = reply.ended.pop();
+        self.agent.remember(&mut reply.rewards, &[end.is_some()]).map_err(TestError::Numbers)?;
+        let Some(end) = end else { return Ok(()) };
+        if end.episode_in_trial + 1 == self.state.episodes_per_trial {
+            self.agent.forget(0);
+        }
+        shown.episode_return = end.episode_return;
+        let truncated = reply.truncated[0];
+        shown.ending = Some(Ending { success: end.success, terminated: end.terminated, truncated });
+        let names = self.environment.parameters.iter().map(|parameter| parameter.name.clone());
+        self.summary.episodes.push(Filmed {
+            parameters: names.zip(self.begun.parameters.iter().copied()).collect(),
+            episode_return: end.episode_return,
+            length: end.length,
+            success: end.success,
+        });
+        Ok(())
+    }
+
+    /// Takes the start of the next episode.
+    fn begin(&mut self) -> Result<(), VideoError> {
+        let asked = Instant::now();
+        self.begun = self.single.begun(&mut self.reply.observations)?;
+        self.summary.waiting += asked.elapsed();
+        self.announce();
+        Ok(())
+    }
+
+    /// Shows the episode that has begun.
+    fn announce(&mut self) {
+        let (number, episodes) = (self.summary.episodes.len() + 1, self.options.episodes);
+        let trial = match self.state.episodes_per_trial {
+            1 => String::new(),
+            _ => format!(", trial {}", self.begun.trial_index + 1),
+        };
+        let parameters = self.environment.parameters.iter().zip(&self.begun.parameters);
+        self.shown = Shown {
+            episode: format!("episode {number} of {episodes}{trial}"),
+            parameters: parameters.map(|(known, value)| parameter(&known.name, *value, &known.unit)).collect(),
+            ..Shown::default()
+        };
+    }
+}

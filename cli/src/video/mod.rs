@@ -1,0 +1,76 @@
+//! Videos of a policy that acts: `perturb video`.
+//!
+//! [`film`] plays the episodes and asks the server for a picture of every state; `panel` writes below it which episode
+//! it is and how it goes; [`VideoFile`] is where the frames end up, through `gif` or `mp4`.
+
+mod file;
+mod film;
+mod gif;
+mod mp4;
+mod panel;
+
+use std::path::{Path, PathBuf};
+
+pub use file::{VideoFile, VideoWriter};
+pub use film::{Summary, VideoOptions, film};
+pub use panel::{LARGEST, SMALLEST};
+
+use perturb_learner::evaluation::TestError;
+use perturb_study::plot::PlotError;
+
+/// Why there is no video.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum VideoError {
+    /// The policy cannot act, or the server cannot draw.
+    #[error(transparent)]
+    Test(#[from] TestError),
+    /// The file's name does not say what to write.
+    #[error("`{}` is not a video: expected a name that ends in .mp4 or .gif", path.display())]
+    Extension {
+        /// What was given.
+        path: PathBuf,
+    },
+    /// The program that encodes .mp4 is missing, or cannot do it.
+    #[error(
+        "an .mp4 is encoded by the program ffmpeg with its encoder libx264, but {reason}: install it, on Debian with \
+         `apt-get install ffmpeg`, or write a .gif, which needs nothing"
+    )]
+    NoFfmpeg {
+        /// What happened when it was called.
+        reason: String,
+    },
+    /// The operating system refused a file.
+    #[error("cannot {action} {}: {source}", path.display())]
+    Io {
+        /// What was tried.
+        action: &'static str,
+        /// On what.
+        path: PathBuf,
+        /// Its answer.
+        source: std::io::Error,
+    },
+    /// A frame could not be encoded.
+    #[error("cannot encode {}: {reason}", path.display())]
+    Encode {
+        /// The video.
+        path: PathBuf,
+        /// The encoder's words.
+        reason: String,
+    },
+    /// The text below a picture could not be drawn.
+    #[error(transparent)]
+    Plot(#[from] PlotError),
+}
+
+impl From<perturb_learner::client::ClientError> for VideoError {
+    fn from(error: perturb_learner::client::ClientError) -> Self {
+        Self::Test(error.into())
+    }
+}
+
+/// Names the file in the operating system's error.
+fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> VideoError {
+    let path = path.to_owned();
+    move |source| VideoError::Io { action, path, source }
+}

@@ -1,0 +1,78 @@
+//! What several tests need to run the programs. Each test uses a part of it.
+#![allow(dead_code)]
+
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use perturb_learner::client::{Address, PrivateServer, PrivateServerOptions, Servers};
+use perturb_learner::training::{Outcome, RunDirectory, train};
+use perturb_study::interrupt::StopFlag;
+use perturb_study::settings::TrainConfig;
+use tempfile::TempDir;
+
+/// How long anything may take that must not hang.
+pub const SECONDS: Duration = Duration::from_secs(20);
+
+pub fn server(workers: usize) -> PrivateServer {
+    PrivateServer::start(PrivateServerOptions { workers: Some(workers), ..PrivateServerOptions::default() })
+        .unwrap_or_else(|error| panic!("{error}"))
+}
+
+pub fn addresses(servers: &[PrivateServer]) -> Vec<Address> {
+    servers.iter().map(|server| server.address().clone()).collect()
+}
+
+pub fn config(text: &str) -> TrainConfig {
+    TrainConfig::from_table("the test", text.parse().expect("TOML")).unwrap_or_else(|error| panic!("{error}"))
+}
+
+/// Trains in a fresh directory.
+pub fn run(servers: &Servers, text: &str) -> (TempDir, Outcome) {
+    let out = tempfile::tempdir().expect("a directory");
+    let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
+    let outcome = train(servers, &config(text), &directory, &StopFlag::default(), |_| {});
+    (out, outcome.unwrap_or_else(|error| panic!("{error:#}")))
+}
+
+pub fn perturb(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_perturb"));
+    command.args(arguments).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+pub fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// Waits until `condition` holds.
+pub fn wait_for(what: &str, mut condition: impl FnMut() -> bool) {
+    let start = Instant::now();
+    while !condition() {
+        assert!(start.elapsed() < SECONDS, "{what} did not happen within {SECONDS:?}");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// The process that `parent` started and that is called perturb-server.
+pub fn child_server(parent: u32) -> Option<u32> {
+    let children = std::fs::read_to_string(format!("/proc/{parent}/task/{parent}/children")).ok()?;
+    let is_server = |id: &u32| {
+        std::fs::read_to_string(format!("/proc/{id}/comm")).is_ok_and(|name| name.trim().starts_with("perturb-serv"))
+    };
+    children.split_whitespace().filter_map(|id| id.parse().ok()).find(is_server)
+}
+
+/// Whether a process runs; one that has ended and waits for its parent does not.
+pub fn is_running(id: u32) -> bool {
+    std::fs::read_to_string(format!("/proc/{id}/stat")).is_ok_and(|stat| !stat.contains(") Z "))
+}
+
+pub fn kill(signal: &str, id: u32) {
+    let status = Command::new("kill").args([signal, &id.to_string()]).status().expect("kill");
+    assert!(status.success());
+}
+
+pub fn read(directory: &Path, name: &str) -> String {
+    std::fs::read_to_string(directory.join(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
+}

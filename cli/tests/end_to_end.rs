@@ -1,0 +1,452 @@
+//! The learner against real servers. Needs the program `perturb-server`: run `cargo build --release` first.
+
+mod common;
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use common::{
+    SECONDS, addresses, child_server, config, is_running, kill, perturb, read, run, server, stderr, wait_for,
+};
+use perturb_learner::checkpoint::Checkpoint;
+use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers, Session, StepReply};
+use perturb_learner::evaluation::test;
+use perturb_learner::policy::{ActionKind, Inputs, Policy, PolicySpec, Sequences};
+use perturb_learner::proto;
+use perturb_learner::rollout::{Collector, Normalisers, Rollout};
+use perturb_study::Version;
+use perturb_study::interrupt::StopFlag;
+use tch::Tensor;
+
+#[test]
+fn a_policy_is_trained_written_and_tested_with_both_algorithms() {
+    let server = [server(1)];
+    let servers = Servers::connect(&addresses(&server)).expect("a connection");
+    for algorithm in ["ppo", "a2c"] {
+        let text = format!(
+            "environment = 'CartPole'\nversion = 'R'\nalgorithm = '{algorithm}'\nepisodes = 50\nnum_envs = 4\nlog_interval = 1\n"
+        );
+        let (out, outcome) = run(&servers, &text);
+        assert!(outcome.progress.episodes >= 50, "{algorithm}");
+        assert_eq!(outcome.signal, None);
+
+        let monitor = read(out.path(), "monitor.csv");
+        let lines: Vec<Vec<f64>> = monitor
+            .lines()
+            .skip(2)
+            .map(|line| line.split(',').map(|field| field.parse().expect("a number")).collect())
+            .collect();
+        assert_eq!(lines.len() as u64, outcome.progress.episodes);
+        assert_eq!(
+            monitor.lines().nth(1),
+            Some(
+                "r,l,t,success,terminated,episode_index,environment_index,trial_index,episode_in_trial,force,length,mass"
+            )
+        );
+        for line in &lines {
+            assert_eq!(line[0], line[1], "CartPole pays 1 a step");
+            assert!((5.0..=15.0).contains(&line[9]) && (0.25..=0.75).contains(&line[10]), "R's intervals");
+        }
+        let progress = read(out.path(), "progress.csv");
+        assert_eq!(progress.lines().count() as u64, 1 + outcome.progress.iterations);
+        assert_eq!(config(&read(out.path(), "config.toml")), config(&text), "the run can be repeated");
+
+        let checkpoint = Checkpoint::load(out.path()).expect("a checkpoint");
+        assert_eq!(checkpoint, outcome.checkpoint);
+        let result = test(&servers, &checkpoint, Version::D, 30, 1, &StopFlag::default(), |_| {}).expect("a test");
+        assert_eq!(result.episodes, 30);
+        assert_eq!(result.mean_return, result.mean_length);
+        assert!((8.0..=200.0).contains(&result.mean_length), "{}", result.mean_length);
+    }
+}
+
+#[test]
+fn continuous_actions_are_learned_from() {
+    let server = [server(1)];
+    let servers = Servers::connect(&addresses(&server)).expect("a connection");
+    let (_out, outcome) = run(&servers, "environment = 'Pendulum'\nepisodes = 8\nn_steps = 64");
+    assert!(outcome.progress.update.std.is_some_and(|std| std != 1.0), "the standard deviation moved");
+    let test = |episodes| test(&servers, &outcome.checkpoint, Version::E, episodes, 1, &StopFlag::default(), |_| {});
+    assert_eq!(test(4).expect("a test").mean_length, 200.0);
+}
+
+#[test]
+fn equal_seeds_give_equal_weights_with_any_number_of_servers_and_workers() {
+    let text = "environment = 'CartPole'\nversion = 'E'\nepisodes = 40\nnum_envs = 5\nn_steps = 32";
+    let train_on = |servers: &[PrivateServer], text: &str| {
+        let servers = Servers::connect(&addresses(servers)).expect("connections");
+        run(&servers, text).1.checkpoint
+    };
+    let reference = train_on(&[server(1)], text);
+    assert_eq!(train_on(&[server(2)], text), reference, "two workers");
+    assert_eq!(train_on(&[server(1), server(2)], text), reference, "two servers");
+    let many: Vec<PrivateServer> = (0..7).map(|_| server(1)).collect();
+    assert_eq!(train_on(&many, text), reference, "more servers than environments");
+    let other = train_on(&[server(1)], &format!("{text}\nseed = 2"));
+    assert_ne!(other.weights, reference.weights, "another seed");
+}
+
+#[test]
+fn recurrent_policies_are_trained_and_tested_alike_on_one_server_and_on_two() {
+    let both = [server(1), server(2)];
+    let one = Servers::connect(&addresses(&both[..1])).expect("a connection");
+    let two = Servers::connect(&addresses(&both)).expect("connections");
+    for settings in
+        ["algorithm = 'a2c'\nn_steps = 7", "algorithm = 'ppo'\nn_steps = 40\nn_epochs = 2\nn_minibatches = 3"]
+    {
+        let text = format!(
+            "environment = 'CartPole'\narchitecture = 'rc'\nversion = 'R'\nepisodes = 12\nnum_envs = 3\n{settings}"
+        );
+        let (out, outcome) = run(&one, &text);
+        assert!(outcome.progress.episodes >= 12);
+        let checkpoint = Checkpoint::load(out.path()).expect("a checkpoint");
+        assert_eq!(checkpoint, outcome.checkpoint);
+        assert_eq!(checkpoint.state.policy.lstm, Some(256));
+        assert_eq!(run(&two, &text).1.checkpoint, checkpoint, "{settings}");
+        let figures = |servers: &Servers| {
+            test(servers, &checkpoint, Version::E, 10, 1, &StopFlag::default(), |_| {}).expect("a test")
+        };
+        assert_eq!(figures(&one), figures(&two));
+    }
+}
+
+/// Pendulum's episodes have 200 steps, so that two rollouts of 150 hold one end, and begin in the middle of an episode.
+#[test]
+fn rollouts_keep_what_a_recurrent_policy_remembers() {
+    let server = [server(1)];
+    let servers = Servers::connect(&addresses(&server)).expect("a connection");
+    let (n_envs, n_steps) = (2, 150);
+    let options = OpenOptions {
+        environment: "Pendulum".into(),
+        version: proto::Version::Random,
+        num_envs: n_envs,
+        seed: 3,
+        episodes_per_trial: 1,
+    };
+    let mut observations = Vec::new();
+    let session = Session::open(&servers, &options, &mut observations).expect("a session");
+    let size = session.observation_size();
+    let action = ActionKind::Continuous { size: 1 };
+    let spec = PolicySpec { observation_size: size, action, hidden: vec![16], lstm: Some(8) };
+    let policy = Policy::new(spec.clone(), 1).expect("a policy");
+    let none = Normalisers { observations: None, rewards: None };
+    let mut collector = Collector::new(session, observations, &spec, Inputs::new(size, action, n_envs, false), none, 1)
+        .expect("a collector");
+    let rollouts = [(); 2].map(|()| {
+        let mut rollout = Rollout::new(n_steps, n_envs, size, 1);
+        collector.collect(&policy.weights(), &mut rollout, |_| {}).expect("a rollout");
+        rollout
+    });
+    drop(collector);
+
+    let [first, second] = &rollouts;
+    assert_eq!(first.memory(), vec![0.0; n_envs * 16]);
+    assert!(second.memory().iter().all(|&x| x != 0.0), "the episodes go on");
+    let starts: Vec<usize> = second.starts().iter().enumerate().filter(|(_, start)| **start).map(|(i, _)| i).collect();
+    assert_eq!(starts, [100, 101], "after 200 steps");
+    let last_values = first.trajectories().expect("a finished rollout").last_values;
+    assert_eq!(last_values, &second.values()[..n_envs], "looking ahead moves nothing on");
+
+    // libtorch sees the same values: in each rollout from its own memory, and at the end of the episode.
+    let values = |n_steps: usize, observations: &[f32], starts: &[bool], memory: &[f32]| {
+        let sequences = Sequences::new(&spec, n_steps, observations, starts, memory).expect("shapes that fit");
+        Vec::<f32>::from(policy.evaluate(&sequences, &Tensor::of_slice(&vec![0.0f32; starts.len()])).values)
+    };
+    // Values of order 1, as in the tests of the policy.
+    let close = |got: &[f32], expected: &[f32]| {
+        got.len() == expected.len() && got.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-5)
+    };
+    for rollout in &rollouts {
+        let expected = values(n_steps, rollout.observations(), rollout.starts(), rollout.memory());
+        assert!(close(rollout.values(), &expected));
+    }
+
+    let mut replayed = Session::open(&servers, &options, &mut Vec::new()).expect("a session");
+    let mut reply = StepReply::default();
+    let actions: Vec<f32> = rollouts.iter().flat_map(|rollout| rollout.actions().to_vec()).collect();
+    for actions in actions.chunks(n_envs).take(200) {
+        let bytes: Vec<u8> = actions.iter().flat_map(|action| action.to_le_bytes()).collect();
+        replayed.step(&bytes, &mut reply).expect("a step");
+    }
+    let mut episode = observations_of(&rollouts)[..200 * n_envs * size].to_vec();
+    episode.extend(&reply.final_observations);
+    let expected = values(201, &episode, &vec![false; 201 * n_envs], &vec![0.0; n_envs * 16]);
+    let got = second.trajectories().expect("a finished rollout").truncation_values;
+    assert!(close(&got[49 * n_envs..50 * n_envs], &expected[200 * n_envs..]), "{got:?}");
+}
+
+fn observations_of(rollouts: &[Rollout]) -> Vec<f32> {
+    rollouts.iter().flat_map(|rollout| rollout.observations().to_vec()).collect()
+}
+
+/// An LSTM of one cell that counts the steps: to the left in the first five, then to the right until the pole falls.
+/// Whoever remembers the episode before goes right at once, which ends sooner.
+#[test]
+fn every_test_episode_begins_without_memories() {
+    let server = [server(1)];
+    let servers = Servers::connect(&addresses(&server)).expect("a connection");
+    let (_out, outcome) = run(&servers, "environment = 'CartPole'\nepisodes = 1\nnormalize_observations = false");
+    let mut checkpoint = outcome.checkpoint;
+    let action = checkpoint.state.policy.action;
+    let spec = PolicySpec { observation_size: 4, action, hidden: vec![], lstm: Some(1) };
+    let mut weights = Policy::new(spec.clone(), 1).expect("a policy").weights();
+    for array in &mut weights {
+        array.data = match array.name.as_str() {
+            "lstm.bias" => vec![20.0, 20.0, 0.1, 20.0], // keeps all, adds tanh 0.1 a step, shows all
+            "policy.weight" => vec![0.0, 1e4],
+            "policy.bias" => vec![0.0, -1e4 * 0.55f32.tanh()],
+            _ => vec![0.0; array.data.len()],
+        };
+    }
+    checkpoint.state.policy = spec;
+    checkpoint.weights = weights;
+    let length = |episodes| {
+        let result = test(&servers, &checkpoint, Version::D, episodes, 1, &StopFlag::default(), |_| {});
+        result.expect("a test").mean_length
+    };
+    let (first_episodes, ten_of_each) = (length(100), length(1000));
+    // Lengths differ by the start of an episode, by about 1; means of 100 by a tenth of that.
+    assert!((first_episodes - ten_of_each).abs() < 0.5, "{first_episodes} {ten_of_each}");
+}
+
+#[test]
+fn a_test_gives_the_same_figures_on_any_number_of_servers_and_others_with_another_seed() {
+    let both = [server(1), server(1)];
+    let one = Servers::connect(&addresses(&both[..1])).expect("a connection");
+    let two = Servers::connect(&addresses(&both)).expect("connections");
+    let (_out, outcome) = run(&one, "environment = 'CartPole'\nepisodes = 20");
+    let figures = |servers: &Servers, seed| {
+        test(servers, &outcome.checkpoint, Version::E, 150, seed, &StopFlag::default(), |_| {}).expect("a test")
+    };
+    assert_eq!(figures(&one, 1), figures(&two, 1));
+    assert_ne!(figures(&one, 1), figures(&one, 2));
+}
+
+#[test]
+fn a_refused_request_is_told_in_the_servers_words_and_the_session_lives_on() {
+    let server = [server(1)];
+    let servers = Servers::connect(&addresses(&server)).expect("a connection");
+    let options = OpenOptions {
+        environment: "CartPole".into(),
+        version: proto::Version::Default,
+        num_envs: 2,
+        seed: 1,
+        episodes_per_trial: 1,
+    };
+    let mut observations = Vec::new();
+    let mut session = Session::open(&servers, &options, &mut observations).expect("a session");
+    let mut reply = StepReply::default();
+    let error = session.step(&[9, 0, 0, 0, 0, 0, 0, 0], &mut reply).expect_err("there is no action 9").to_string();
+    assert!(error.contains("refused a step") && error.contains('9'), "{error}");
+    session.step(&[1, 0, 0, 0, 0, 0, 0, 0], &mut reply).expect("a step");
+    assert_eq!(reply.rewards, [1.0, 1.0]);
+    session.reset(&mut observations).expect("a reset");
+    assert!(observations.iter().all(|x| x.abs() <= 0.05), "CartPole starts near 0");
+
+    let wrong = OpenOptions { environment: "CartPool".into(), ..options };
+    let error = Session::open(&servers, &wrong, &mut observations).expect_err("no such environment").to_string();
+    assert!(error.contains("CartPool"), "{error}");
+}
+
+#[test]
+fn a_server_that_is_killed_ends_the_training_soon_and_leaves_a_checkpoint() {
+    let out = tempfile::tempdir().expect("a directory");
+    let path = out.path().to_str().expect("a path");
+    let arguments = ["train", "--env", "CartPole", "--episodes", "1000000", "--out", path];
+    let child = perturb(&arguments).spawn().expect("perturb");
+    wait_for("a few iterations", || {
+        out.path().join("progress.csv").exists() && read(out.path(), "progress.csv").lines().count() > 4
+    });
+    let server = child_server(child.id()).expect("a private server");
+    let killed = Instant::now();
+    kill("-KILL", server);
+    let output = child.wait_with_output().expect("perturb ends");
+    assert!(killed.elapsed() < SECONDS, "{:?}", killed.elapsed());
+    assert_eq!(output.status.code(), Some(1));
+    let message = stderr(&output);
+    assert!(message.contains("lost the server at unix:") && message.contains("signal: 9"), "{message}");
+    let episodes = Checkpoint::load(out.path()).expect("a whole checkpoint").state.counters.episodes;
+    let kept = format!("the checkpoint after {episodes} episodes is kept in {path}; go on from there: perturb train");
+    assert!(message.contains(&kept), "{message}");
+}
+
+#[test]
+fn a_learner_that_is_killed_takes_its_server_along() {
+    let out = tempfile::tempdir().expect("a directory");
+    let path = out.path().to_str().expect("a path");
+    let arguments = ["train", "--env", "CartPole", "--episodes", "1000000", "--out", path];
+    let mut child = perturb(&arguments).spawn().expect("perturb");
+    wait_for("a checkpoint", || out.path().join("checkpoint/checkpoint.json").exists());
+    let server = child_server(child.id()).expect("a private server");
+    child.kill().expect("kill -9");
+    child.wait().expect("it ends");
+    wait_for("the server's end", || !is_running(server));
+    Checkpoint::load(out.path()).expect("a whole checkpoint");
+}
+
+#[test]
+fn a_signal_ends_a_training_after_the_iteration_with_its_checkpoint() {
+    for (signal, status) in [("-INT", 130), ("-TERM", 143)] {
+        let out = tempfile::tempdir().expect("a directory");
+        let path = out.path().to_str().expect("a path");
+        let arguments = ["train", "--env", "CartPole", "--episodes", "1000000", "--out", path];
+        let child = perturb(&arguments).spawn().expect("perturb");
+        wait_for("a checkpoint", || out.path().join("checkpoint/checkpoint.json").exists());
+        let server = child_server(child.id()).expect("a private server");
+        kill(signal, child.id());
+        let output = child.wait_with_output().expect("perturb ends");
+        assert_eq!(output.status.code(), Some(status), "{}", stderr(&output));
+        assert!(stderr(&output).contains("stopped by signal"), "{}", stderr(&output));
+        assert!(stderr(&output).contains(&format!("perturb train --resume {path}")), "{}", stderr(&output));
+        assert!(!is_running(server));
+        let episodes = Checkpoint::load(out.path()).expect("a whole checkpoint").state.counters.episodes;
+        assert_eq!(read(out.path(), "monitor.csv").lines().count() as u64, 2 + episodes);
+    }
+}
+
+#[test]
+fn the_program_trains_tests_and_refuses_with_sentences() {
+    let out = tempfile::tempdir().expect("a directory");
+    let run = out.path().join("run");
+    let run = run.to_str().expect("a path");
+    let call = |arguments: &[&str]| perturb(arguments).output().expect("perturb runs");
+    let refused = |arguments: &[&str], status: i32, part: &str| {
+        let output = call(arguments);
+        assert_eq!(output.status.code(), Some(status), "{arguments:?}: {}", stderr(&output));
+        assert!(stderr(&output).contains(part), "{arguments:?}: {}", stderr(&output));
+    };
+
+    let base = ["train", "--env", "CartPole", "--episodes", "20", "--out", run];
+    let output = call(&base);
+    assert!(output.status.success(), "{}", stderr(&output));
+    refused(&base, 1, "already holds a run");
+    refused(
+        &["train", "--env", "CartPole", "--out", run, "--algorithm", "dqn"],
+        2,
+        "possible values: a2c, ppo, epopt-a2c",
+    );
+    let forgetful = ["train", "--env", "CartPole", "--out", run, "--algorithm", "rl2-ppo", "--architecture", "ff"];
+    refused(&forgetful, 2, "rl2-ppo cannot train the architecture ff");
+    refused(&["train", "--env", "CartPole", "--out", run, "--architecture", "mlp"], 2, "possible values: ff, rc");
+    refused(&["train", "--env", "CartPole", "--out", run, "--set", "foo=1"], 2, "unknown key `foo`");
+    refused(&["train", "--out", run], 2, "no environment was named");
+    refused(&["train", "--env", "Pong", "--out", run, "--overwrite"], 1, "there is no environment `Pong`");
+    let overwrite = ["train", "--env", "CartPole", "--out", run, "--overwrite"];
+    refused(&[&overwrite[..], &["--set", "n_minibatches=3"]].concat(), 2, "a divisor of n_steps · num_envs");
+    let other = server(1);
+    let too_many = ["--server", &other.address().to_string(), "--set", "num_envs=20000"];
+    refused(&[&overwrite[..], &too_many].concat(), 1, "refused to open a session");
+    refused(&["evaluate", "--checkpoint", "/nonexistent"], 1, "holds no checkpoint");
+    refused(&["envs", "--server", "nowhere"], 2, "the port is missing");
+    refused(&["envs", "--server", "127.0.0.1:1"], 1, "no server answers at http://127.0.0.1:1");
+    assert!(Path::new(run).join("checkpoint").exists(), "refusals delete nothing");
+
+    let json: PathBuf = out.path().join("result.json");
+    let json_text = json.to_str().expect("a path");
+    let output = call(&["evaluate", "--checkpoint", run, "--versions", "D,E", "--episodes", "20", "--json", json_text]);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let value: serde_json::Value = serde_json::from_str(&read(out.path(), "result.json")).expect("JSON");
+    for (key, expected) in [
+        ("environment", serde_json::json!("CartPole")),
+        ("algorithm", "ppo".into()),
+        ("architecture", "ff".into()),
+        ("train_version", "D".into()),
+        ("seed", 1.into()),
+    ] {
+        assert_eq!(value[key], expected);
+    }
+    let results = value["results"].as_object().expect("results");
+    assert_eq!(results.keys().collect::<Vec<_>>(), ["D", "E"]);
+    assert_eq!(results["E"]["episodes"], 20);
+    for key in ["success_percent", "mean_return", "mean_length"] {
+        assert!(results["D"][key].is_number(), "{key}");
+    }
+
+    let output = call(&["envs", "--json"]);
+    let catalogue: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(catalogue["environments"][0]["parameters"][0]["name"], "force");
+    assert_eq!(catalogue["environments"][0]["parameters"][0]["E"], serde_json::json!([[1.0, 5.0], [15.0, 20.0]]));
+}
+
+#[test]
+fn a_private_server_takes_as_many_environments_as_the_training_has() {
+    let out = tempfile::tempdir().expect("a directory");
+    let path = out.path().to_str().expect("a path");
+    let settings = ["--set", "num_envs=20000", "--set", "n_steps=10", "--set", "n_epochs=1"];
+    let arguments = [&["train", "--env", "CartPole", "--episodes", "1", "--out", path][..], &settings].concat();
+    let output = perturb(&arguments).output().expect("perturb runs");
+    assert!(output.status.success(), "{}", stderr(&output));
+}
+
+#[test]
+fn a_reader_that_has_read_enough_ends_the_program_quietly() {
+    let out = tempfile::tempdir().expect("a directory");
+    let run = out.path().join("run");
+    let run = run.to_str().expect("a path");
+    let json = out.path().join("result.json");
+    let json = json.to_str().expect("a path");
+    let evaluate = ["evaluate", "--checkpoint", run, "--versions", "D,E", "--episodes", "5"];
+    for arguments in [
+        &["envs"][..],
+        &["train", "--env", "CartPole", "--episodes", "5", "--out", run],
+        &evaluate,
+        &[&evaluate[..], &["--json", json]].concat(),
+        &["demo", "--episodes", "5", "--test-episodes", "5"],
+    ] {
+        let mut child = perturb(arguments).spawn().expect("perturb");
+        drop(child.stdout.take());
+        let output = child.wait_with_output().expect("perturb ends");
+        assert!(output.status.success(), "{arguments:?}: {}", stderr(&output));
+        assert!(!stderr(&output).contains("panicked"), "{}", stderr(&output));
+    }
+    assert!(Path::new(json).exists(), "the file was asked for");
+}
+
+/// A server that asks every second whether its learner lives, and gives it a second to answer.
+#[test]
+fn a_server_keeps_a_learner_that_computes_for_long() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let socket = directory.path().join("server.sock");
+    let address: Address = format!("unix:{}", socket.display()).parse().expect("an address");
+    let program = std::env::var_os("PERTURB_SERVER").map(PathBuf::from).unwrap_or_else(|| {
+        let test = std::env::current_exe().expect("this test's path");
+        test.parent().and_then(Path::parent).expect("target/release").join("perturb-server")
+    });
+    let mut server = Command::new(program)
+        .args(["--listen", &address.to_string(), "--keepalive-seconds", "1", "--exit-with-stdin", "--log", "error"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .spawn()
+        .expect("perturb-server");
+    wait_for("the socket", || socket.exists());
+    let servers = Servers::connect(&[address]).expect("a connection");
+    let options = OpenOptions {
+        environment: "CartPole".into(),
+        version: proto::Version::Default,
+        num_envs: 1,
+        seed: 1,
+        episodes_per_trial: 1,
+    };
+    let mut session = Session::open(&servers, &options, &mut Vec::new()).expect("a session");
+    let compute = || std::thread::sleep(Duration::from_secs(4));
+    servers.keep_alive_during(compute);
+    session.step(&[1, 0, 0, 0], &mut StepReply::default()).expect("the session lives");
+    compute();
+    let error = session.step(&[1, 0, 0, 0], &mut StepReply::default()).expect_err("nobody answered the server");
+    assert!(error.to_string().contains("lost the server"), "{error}");
+    drop(server.stdin.take());
+    server.wait().expect("it ends");
+}
+
+#[test]
+fn the_demo_prints_nine_rates_and_the_papers_row() {
+    let output = perturb(&["demo", "--episodes", "20", "--test-episodes", "20"]).output().expect("perturb runs");
+    assert!(output.status.success(), "{}", stderr(&output));
+    let text = String::from_utf8_lossy(&output.stdout);
+    for part in
+        ["Reduced budget: 20 episodes in each training", "train D", "train R", "train E", "Default (DD)", "86.2 ± 12.6"]
+    {
+        assert!(text.contains(part), "{part}: {text}");
+    }
+}

@@ -1,0 +1,445 @@
+//! Trainings that are broken off go on to the same bytes. Needs the program `perturb-server`: run `cargo build
+//! --release` first.
+
+mod common;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Child;
+use std::time::Duration;
+
+use common::{addresses, child_server, config, kill, perturb, read, run, server, stderr, wait_for};
+use perturb_learner::checkpoint::Checkpoint;
+use perturb_learner::client::{ClientError, OpenOptions, Servers, Session, StepReply};
+use perturb_learner::proto;
+use perturb_learner::training::{Outcome, RunDirectory, resume, train};
+use perturb_study::interrupt::StopFlag;
+use tempfile::TempDir;
+
+/// Each algorithm with each architecture, discrete and continuous actions, and MuJoCo. Rollouts end in mid-episode,
+/// checkpoints come often and between two lines of progress.csv, and no number divides the next.
+const RUNS: [&str; 9] = [
+    "environment = 'CartPole'\nversion = 'E'\nalgorithm = 'a2c'\nepisodes = 90\nnum_envs = 5\nn_steps = 5\nlog_interval = 3\n\
+     checkpoint_interval = 7",
+    "environment = 'CartPole'\nversion = 'R'\nepisodes = 60\nnum_envs = 4\nn_steps = 32\nn_epochs = 2\n\
+     n_minibatches = 4\nlog_interval = 2\ncheckpoint_interval = 7",
+    "environment = 'CartPole'\nversion = 'R'\narchitecture = 'rc'\nepisodes = 18\nnum_envs = 4\nn_steps = 15\n\
+     n_epochs = 2\nn_minibatches = 2\nlog_interval = 2\ncheckpoint_interval = 4",
+    "environment = 'CartPole'\narchitecture = 'rc'\nalgorithm = 'a2c'\nepisodes = 15\nnum_envs = 3\nn_steps = 7\n\
+     log_interval = 4\ncheckpoint_interval = 2",
+    "environment = 'CartPole'\nversion = 'R'\nalgorithm = 'epopt-ppo'\nepisodes = 30\nnum_envs = 3\n\
+     episodes_per_iteration = 5\nepsilon = 0.4\nfull_iterations = 2\nn_epochs = 2\nlog_interval = 2\n\
+     checkpoint_interval = 3",
+    "environment = 'CartPole'\nversion = 'E'\nalgorithm = 'rl2-a2c'\nepisodes = 20\nnum_envs = 3\nn_steps = 11\n\
+     log_interval = 4\ncheckpoint_interval = 3",
+    "environment = 'Pendulum'\nversion = 'R'\nalgorithm = 'rl2-ppo'\nepisodes = 9\nepisodes_per_trial = 3\n\
+     num_envs = 3\nn_steps = 70\nn_epochs = 2\nkl_coef = 0.2\ncheckpoint_interval = 1",
+    "environment = 'Pendulum'\nversion = 'E'\nepisodes = 9\nnum_envs = 3\nn_steps = 70\nn_epochs = 2\n\
+     n_minibatches = 3\ncheckpoint_interval = 1",
+    "environment = 'Hopper'\nversion = 'R'\nepisodes = 15\nnum_envs = 3\nn_steps = 9\nn_epochs = 2\n\
+     checkpoint_interval = 3",
+];
+
+/// Copies a directory at this moment, which is what kill -9 would leave now.
+fn copy(from: &Path, to: &Path) {
+    fs::create_dir_all(to).expect("a directory");
+    for entry in fs::read_dir(from).expect("a list") {
+        let entry = entry.expect("an entry");
+        let target = to.join(entry.file_name());
+        match entry.path() {
+            path if path.is_dir() => copy(&path, &target),
+            path => drop(fs::copy(path, target).expect("a copy")),
+        }
+    }
+}
+
+fn bytes(path: &Path) -> Vec<u8> {
+    fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}
+
+/// The names in a directory, sorted.
+fn names(directory: &Path) -> Vec<String> {
+    let entries = fs::read_dir(directory).expect("a list");
+    let mut names: Vec<String> =
+        entries.map(|entry| entry.expect("an entry").file_name().into_string().expect("a name")).collect();
+    names.sort();
+    names
+}
+
+/// The cells of a log from its header on, without those of times.
+fn cells(run: &Path, name: &str) -> Vec<Vec<String>> {
+    let text = read(run, name);
+    let mut lines = text.lines().filter(|line| !line.starts_with('#')).map(|line| line.split(','));
+    let header: Vec<&str> = lines.next().expect("a header").collect();
+    let counts = ["time/iterations", "time/total_timesteps"];
+    let kept: Vec<bool> = header
+        .iter()
+        .map(|column| *column != "t" && (!column.starts_with("time/") || counts.contains(column)))
+        .collect();
+    assert!(kept.iter().filter(|kept| !**kept).count() <= 5, "most columns are compared");
+    let keep = |line: std::str::Split<'_, char>| {
+        let cells: Vec<&str> = line.collect();
+        assert_eq!(cells.len(), header.len(), "a whole line of {name}: {cells:?}");
+        cells.iter().zip(&kept).filter(|(_, kept)| **kept).map(|(cell, _)| (*cell).to_owned()).collect()
+    };
+    lines.map(keep).collect()
+}
+
+fn events(run: &Path) -> PathBuf {
+    let name = names(run).into_iter().find(|name| name.starts_with("events.out")).expect("TensorBoard events");
+    run.join(name)
+}
+
+/// Whether two runs came to the same bytes.
+#[track_caller]
+fn assert_same(got: &Path, expected: &Path) {
+    assert_eq!(Checkpoint::load(got).expect("a checkpoint"), Checkpoint::load(expected).expect("a checkpoint"));
+    let (folder, expected_folder) = (got.join("checkpoint"), expected.join("checkpoint"));
+    let files = names(&expected_folder);
+    assert_eq!(names(&folder), files, "weights and state with their checksums, nothing else");
+    assert_eq!(files.len(), 3);
+    for file in &files[1..] {
+        assert!(bytes(&folder.join(file)) == bytes(&expected_folder.join(file)), "{file}");
+    }
+    for name in ["monitor.csv", "progress.csv"] {
+        let (got, expected) = (cells(got, name), cells(expected, name));
+        assert_eq!(got.len(), expected.len(), "lines of {name}");
+        got.iter().zip(&expected).for_each(|(got, expected)| assert_eq!(got, expected, "{name}"));
+    }
+    assert_eq!(bytes(&events(got)).len(), bytes(&events(expected)).len(), "a time has as many bytes as another");
+}
+
+/// Goes on with the run in `path` to its end.
+fn go_on(servers: &Servers, path: &Path) -> Result<Outcome, String> {
+    let (directory, checkpoint, state) = RunDirectory::resume(path).map_err(|error| format!("{error:#}"))?;
+    let config = checkpoint.config().expect("a configuration");
+    let outcome = resume(servers, &config, &directory, (checkpoint, state), &StopFlag::default(), |_| {});
+    outcome.map_err(|error| format!("{error:#}"))
+}
+
+fn servers_of(number: usize) -> (Vec<perturb_learner::client::PrivateServer>, Servers) {
+    let local: Vec<_> = (0..number).map(|i| server(1 + i % 2)).collect();
+    let servers = Servers::connect(&addresses(&local)).expect("connections");
+    (local, servers)
+}
+
+/// A run in mid-training, as a kill would leave it.
+fn broken_off() -> TempDir {
+    let (_server, servers) = servers_of(1);
+    let (out, copied) = (tempfile::tempdir().expect("a directory"), tempfile::tempdir().expect("a directory"));
+    let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
+    let mut done = false;
+    train(&servers, &config(RUNS[1]), &directory, &StopFlag::default(), |progress| {
+        if progress.episodes > 30 && !done {
+            copy(out.path(), copied.path());
+            done = true;
+        }
+    })
+    .expect("a training");
+    assert!(done);
+    copied
+}
+
+#[test]
+fn snapshots_bring_a_batch_back_on_any_number_of_servers() {
+    let ((_one, one), (_two, two)) = (servers_of(1), servers_of(2));
+    for (environment, width) in [("CartPole", 0), ("Hopper", 3)] {
+        let n = 5;
+        let options = OpenOptions {
+            environment: environment.into(),
+            version: proto::Version::Extreme,
+            num_envs: n,
+            seed: 3,
+            episodes_per_trial: 1,
+        };
+        let open = |servers| {
+            let mut observations = Vec::new();
+            (Session::open(servers, &options, &mut observations).expect("a session"), observations)
+        };
+        let actions = |step: usize| -> Vec<u8> {
+            match width {
+                0 => (0..n).flat_map(|i| ((step * i) as i32 % 2).to_le_bytes()).collect(),
+                _ => (0..n * width).flat_map(|i| ((step * 7 + i) as f32).sin().to_le_bytes()).collect(),
+            }
+        };
+        let steps = |session: &mut Session<'_>, range: std::ops::Range<usize>| {
+            let step = |step| {
+                let mut reply = StepReply::default();
+                session.step(&actions(step), &mut reply).expect("a step");
+                (reply.observations, reply.rewards, reply.terminated, reply.ended)
+            };
+            range.map(step).collect::<Vec<_>>()
+        };
+        let (mut first, _) = open(&one);
+        let before = steps(&mut first, 0..100);
+        let snapshots = first.snapshot().expect("snapshots");
+        assert_eq!(snapshots.len(), n);
+        let expected = steps(&mut first, 100..300);
+        assert!(expected.iter().any(|(.., ended)| !ended.is_empty()), "{environment}: new episodes are drawn");
+
+        for servers in [&one, &two] {
+            let (mut other, mut observations) = open(servers);
+            other.restore(&snapshots, &mut observations).expect("the environments are back");
+            assert_eq!(observations, before[99].0);
+            assert_eq!(other.snapshot().expect("snapshots"), snapshots);
+            assert_eq!(steps(&mut other, 100..300), expected);
+            let error = other.restore(&snapshots[1..], &mut observations).expect_err("one is missing");
+            assert!(matches!(error, ClientError::Snapshots { got: 4, expected: 5 }), "{error}");
+        }
+        let wrong = OpenOptions { environment: "Pendulum".into(), ..options.clone() };
+        let mut observations = Vec::new();
+        let mut other = Session::open(&two, &wrong, &mut observations).expect("a session");
+        let error = other.restore(&snapshots, &mut observations).expect_err("of another environment").to_string();
+        assert!(error.contains("refused to restore snapshots") && error.contains(environment), "{error}");
+    }
+}
+
+/// Copies of the directory stand for kills: in every iteration of the run before its checkpoint, if there is one.
+#[test]
+fn a_run_goes_on_from_any_iteration_to_the_same_bytes() {
+    let ((_one, one), (_two, two)) = (servers_of(1), servers_of(2));
+    for text in RUNS {
+        let (out, kills) = (tempfile::tempdir().expect("a directory"), tempfile::tempdir().expect("a directory"));
+        let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
+        let outcome = train(&one, &config(text), &directory, &StopFlag::default(), |progress| {
+            copy(out.path(), &kills.path().join(progress.iterations.to_string()));
+        });
+        let iterations = outcome.expect("a training").progress.iterations;
+        assert!(iterations >= 6, "{iterations}: {text}");
+        let error = go_on(&one, &kills.path().join("1")).expect_err("there was no checkpoint yet");
+        assert!(error.contains("ended before its first checkpoint, so there is nothing to resume"), "{error}");
+        assert!(error.contains("--overwrite"), "{error}");
+        // The second, the last, and some between.
+        for iteration in [2, iterations / 3, iterations / 2 + 1, iterations] {
+            let killed = kills.path().join(iteration.to_string());
+            let servers = if iteration.is_multiple_of(2) { &one } else { &two };
+            if killed.join("done").exists() {
+                continue; // two of them are equal
+            }
+            let outcome = go_on(servers, &killed).unwrap_or_else(|error| panic!("{iteration}: {error}"));
+            assert_eq!(outcome.progress.iterations, iterations);
+            assert_same(&killed, out.path());
+            fs::write(killed.join("done"), "").expect("a mark");
+        }
+    }
+}
+
+#[test]
+fn a_run_that_was_stopped_goes_on_to_the_same_bytes() {
+    let (_server, servers) = servers_of(1);
+    let text = RUNS[0];
+    let (whole, _) = run(&servers, text);
+    let out = tempfile::tempdir().expect("a directory");
+    let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
+    let stop = StopFlag::default();
+    let outcome = train(&servers, &config(text), &directory, &stop, |progress| {
+        if progress.iterations == 16 {
+            stop.raise(15); // with a checkpoint, but no line of progress.csv at that iteration
+        }
+    })
+    .expect("a training");
+    assert_eq!((outcome.signal, outcome.progress.iterations), (Some(15), 16));
+    assert_eq!(cells(out.path(), "progress.csv").last().expect("a line")[0], "16", "the last figures are logged");
+    drop(directory);
+    let resumed = go_on(&servers, out.path()).expect("a training");
+    assert_same(out.path(), whole.path());
+    assert_eq!(resumed.checkpoint, Checkpoint::load(whole.path()).expect("a checkpoint"));
+}
+
+/// Episodes in the checkpoint on disk.
+fn episodes(run: &Path) -> u64 {
+    Checkpoint::load(run).map_or(0, |checkpoint| checkpoint.state.counters.episodes)
+}
+
+/// Kills the learner `delay` after it has written a checkpoint of so many episodes.
+fn kill_after(mut child: Child, run: &Path, at_least: u64, delay: Duration) {
+    wait_for("a checkpoint", || episodes(run) >= at_least);
+    std::thread::sleep(delay);
+    child.kill().expect("kill -9");
+    let output = child.wait_with_output().expect("it ends");
+    assert_eq!(output.status.code(), None, "it ended before it was killed: {}", stderr(&output));
+}
+
+#[test]
+fn a_learner_that_is_killed_again_and_again_comes_to_the_same_bytes() {
+    let (local, servers) = servers_of(2);
+    let both = addresses(&local).iter().map(ToString::to_string).collect::<Vec<_>>().join(",");
+    for (text, budget) in RUNS.into_iter().zip([300, 160, 18, 18, 36, 27]) {
+        let common = format!("episodes = {budget}\ncheckpoint_interval = {}\n", budget / 9);
+        let own = text.lines().filter(|line| !line.starts_with("episodes =") && !line.starts_with("checkpoint"));
+        let text = common + &own.collect::<Vec<_>>().join("\n");
+        let (whole, _) = run(&servers, &text);
+        let out = tempfile::tempdir().expect("a directory");
+        let settings = out.path().join("settings.toml");
+        fs::write(&settings, &text).expect("a file");
+        let path = out.path().join("run");
+        let (path_text, settings) = (path.to_str().expect("a path"), settings.to_str().expect("a path"));
+
+        let child = perturb(&["train", "--config", settings, "--out", path_text]).spawn().expect("perturb");
+        kill_after(child, &path, budget / 6, Duration::ZERO);
+        // What a kill between the files of a checkpoint would leave.
+        for stray in
+            [".tmp-checkpoint.json", "resume-00999999-0badf00d.safetensors", "weights-00999999-0badf00d.safetensors"]
+        {
+            fs::write(path.join("checkpoint").join(stray), "half a file").expect("a file");
+        }
+        let resume = ["train", "--resume", path_text];
+        let child = perturb(&[&resume[..], &["--server", &both]].concat()).spawn().expect("perturb");
+        kill_after(child, &path, budget / 3, Duration::from_millis(7));
+        let output = perturb(&[&resume[..], &["--workers", "2"]].concat()).output().expect("perturb runs");
+        assert!(output.status.success(), "{}", stderr(&output));
+        assert!(stderr(&output).contains(&format!("of {budget} episodes")), "{}", stderr(&output));
+        assert_same(&path, whole.path());
+    }
+}
+
+#[test]
+fn a_training_that_lost_its_server_says_how_to_go_on() {
+    let out = tempfile::tempdir().expect("a directory");
+    let path = out.path().to_str().expect("a path");
+    let settings = ["--set", "checkpoint_interval=20", "--set", "episodes=400", "--set", "n_epochs=2"];
+    let child =
+        perturb(&[&["train", "--env", "CartPole", "--out", path][..], &settings].concat()).spawn().expect("perturb");
+    wait_for("a checkpoint", || episodes(out.path()) >= 40);
+    kill("-KILL", child_server(child.id()).expect("a private server"));
+    let output = child.wait_with_output().expect("perturb ends");
+    assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
+    let kept = episodes(out.path());
+    let expected = format!(
+        "the checkpoint after {kept} episodes is kept in {path}; go on from there: perturb train --resume {path}"
+    );
+    assert!(stderr(&output).contains(&expected), "{}", stderr(&output));
+
+    let output = perturb(&["train", "--resume", path]).output().expect("perturb runs");
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert!(stderr(&output).contains(&format!("going on after {kept} of 400 episodes")), "{}", stderr(&output));
+    let (_servers, servers) = servers_of(1);
+    let text = "environment = 'CartPole'\ncheckpoint_interval = 20\nepisodes = 400\nn_epochs = 2";
+    assert_same(out.path(), run(&servers, text).0.path());
+}
+
+#[test]
+fn numbers_that_are_not_finite_leave_the_last_checkpoint() {
+    let (_server, servers) = servers_of(1);
+    let out = tempfile::tempdir().expect("a directory");
+    let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
+    let text = "environment = 'Pendulum'\nepisodes = 400\nnum_envs = 2\nlearning_rate = 1e30\nn_epochs = 1\n\
+                max_grad_norm = 1e30\nnormalize_advantage = false";
+    let error = train(&servers, &config(text), &directory, &StopFlag::default(), |_| {}).expect_err("NaN");
+    let error = format!("{error:#}");
+    assert!(error.contains("training failed; the checkpoint after 0 episodes is kept in"), "{error}");
+    assert!(error.contains("resumed, it would come to the same numbers"), "{error}");
+    let saved = Checkpoint::load(out.path()).expect("a checkpoint");
+    assert_eq!(saved.state.counters.iterations, 1, "the one that was there before");
+}
+
+#[test]
+fn a_run_that_cannot_be_resumed_says_why() {
+    let (_server, servers) = servers_of(1);
+    let base = broken_off();
+    let refused = |change: &dyn Fn(&Path), parts: &[&str]| {
+        let out = tempfile::tempdir().expect("a directory");
+        copy(base.path(), out.path());
+        change(out.path());
+        let monitor = fs::read(out.path().join("monitor.csv")).unwrap_or_default();
+        let error = go_on(&servers, out.path()).expect_err("it cannot be resumed");
+        for part in parts {
+            assert!(error.contains(part), "{part}: {error}");
+        }
+        assert_eq!(fs::read(out.path().join("monitor.csv")).unwrap_or_default(), monitor, "nothing was changed");
+    };
+    let edit = |run: &Path, pointer: &str, value: serde_json::Value| {
+        let path = run.join("checkpoint/checkpoint.json");
+        let mut document: serde_json::Value = serde_json::from_slice(&bytes(&path)).expect("JSON");
+        *document.pointer_mut(pointer).expect("a value") = value;
+        fs::write(path, document.to_string()).expect("a file");
+    };
+    let folder_file = |run: &Path, prefix: &str| {
+        let folder = run.join("checkpoint");
+        folder.join(names(&folder).into_iter().find(|name| name.starts_with(prefix)).expect("a file"))
+    };
+
+    refused(
+        &|run| edit(run, "/environment_spec/revision", 77.into()),
+        &["trained in CartPole with revision 77", "version of perturb-server"],
+    );
+    refused(
+        &|run| edit(run, "/environment_spec/model_hash", "abc".into()),
+        &["trained in CartPole with model \"abc\", the server's has \"\""],
+    );
+    refused(
+        &|run| edit(run, "/config/num_envs", 6.into()),
+        &["checkpoint.json", "config: reward_normaliser: returns has 4 numbers, expected 6"],
+    );
+    refused(&|run| edit(run, "/config/seed", 9.into()), &["config: seed is 9, but the training began with 1"]);
+    refused(&|run| edit(run, "/config/gamma", 0.5.into()), &["reward_normaliser: gamma is 0.99, but 0.5 in the"]);
+    refused(&|run| edit(run, "/config/num_envs", 0.into()), &["checkpoint.json", "config: num_envs is 0, but must be"]);
+    refused(&|run| edit(run, "/episodes_per_trial", 0.into()), &["episodes_per_trial is 0, which"]);
+    refused(&|run| edit(run, "/algorithm", "rl2-ppo".into()), &["policy: observation_size is 4, expected 8"]);
+    refused(&|run| edit(run, "/resume/algorithm/rng", serde_json::Value::Null), &["cannot bring the optimiser back"]);
+    refused(&|run| edit(run, "/resume/history", 5.into()), &["checkpoint.json", "resume is not understood"]);
+    let without_state = |run: &Path| {
+        edit(run, "/resume", serde_json::Value::Null);
+        Checkpoint::load(run).expect("it can be tested");
+    };
+    refused(&without_state, &["can be tested but not resumed"]);
+    for prefix in ["resume-", "weights-"] {
+        let flip = |run: &Path| {
+            let path = folder_file(run, prefix);
+            let mut content = bytes(&path);
+            let middle = content.len() / 2;
+            content[middle] ^= 1;
+            fs::write(path, content).expect("a file");
+        };
+        refused(&flip, &[prefix, "is not a usable checkpoint", "another checksum"]);
+        refused(&|run| fs::remove_file(folder_file(run, prefix)).expect("a file"), &["cannot read", prefix]);
+    }
+    let shorten = |run: &Path| {
+        let path = run.join("monitor.csv");
+        fs::write(&path, &bytes(&path)[..200]).expect("a file");
+    };
+    refused(&shorten, &["monitor.csv has changed since the checkpoint was written: it has 200 bytes, but had"]);
+    refused(&|run| fs::remove_file(run.join("progress.csv")).expect("a file"), &["progress.csv", "it is gone"]);
+    refused(&|run| fs::remove_dir_all(run.join("checkpoint")).expect("a folder"), &["there is nothing to resume"]);
+    refused(
+        &|run| {
+            names(run)
+                .iter()
+                .for_each(|name| drop(fs::remove_file(run.join(name)).or_else(|_| fs::remove_dir_all(run.join(name)))))
+        },
+        &["holds no run"],
+    );
+    let error = |path: &Path| format!("{:#}", RunDirectory::resume(path).expect_err("no run"));
+    assert!(error(&base.path().join("checkpoint")).contains("is the checkpoint in a run"));
+    assert!(error(&base.path().join("nowhere")).contains("there is no such directory"));
+    go_on(&servers, base.path()).expect("untouched, it goes on");
+}
+
+#[test]
+fn the_program_resumes_what_is_left_to_do_and_nobody_else_does() {
+    let base = broken_off();
+    let run = base.path().to_str().expect("a path");
+    let refused = |arguments: &[&str], status: i32, part: &str| {
+        let output = perturb(arguments).output().expect("perturb runs");
+        assert_eq!(output.status.code(), Some(status), "{arguments:?}: {}", stderr(&output));
+        assert!(stderr(&output).contains(part), "{arguments:?}: {}", stderr(&output));
+    };
+    refused(&["train", "--resume", run, "--out", run], 2, "cannot be used with");
+    refused(&["train", "--resume", run, "--set", "seed=2"], 2, "cannot be used with");
+    refused(&["train", "--env", "CartPole"], 2, "--out <DIR>");
+    refused(&["train", "--resume", run, "--server", "unix:/tmp/x", "--workers", "1"], 2, "--workers is for the server");
+
+    let held = RunDirectory::resume(base.path()).expect("a run");
+    refused(&["train", "--resume", run], 1, &format!("another process trains in {run}"));
+    let overwrite = ["train", "--env", "CartPole", "--out", run, "--overwrite"];
+    refused(&overwrite, 1, &format!("another process trains in {run}"));
+    drop(held);
+
+    for finished in [false, true] {
+        let output = perturb(&["train", "--resume", run]).output().expect("perturb runs");
+        assert!(output.status.success(), "{}", stderr(&output));
+        assert_eq!(stderr(&output).contains("is finished"), finished, "{}", stderr(&output));
+        let expected = format!("trained policy: {run}/checkpoint\ntest it: perturb evaluate --checkpoint {run}\n");
+        assert_eq!(String::from_utf8_lossy(&output.stdout), expected);
+    }
+}

@@ -1,0 +1,194 @@
+//! Runs over several servers. Needs the program `perturb-server`: run `cargo build --release` first.
+
+mod common;
+
+use std::collections::BTreeMap;
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::process::Child;
+use std::time::{Duration, Instant};
+
+use common::{addresses, kill, perturb, server, stderr};
+use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers, Session};
+use perturb_learner::proto;
+use perturb_study::{Folder, Plan};
+
+/// Four cells of some seconds.
+const PLAN: &str = "
+environments = ['CartPole', 'Pendulum']
+versions = ['E']
+test_versions = ['D', 'E']
+test_episodes = 12
+settings = { episodes = 100, num_envs = 8, checkpoint_interval = 5 }
+
+[[algorithm]]
+name = 'a2c'
+architectures = ['ff']
+grid = { learning_rate = [7e-3, 7e-4] }
+";
+
+/// How long anything may take that must not hang.
+const LIMIT: Duration = Duration::from_secs(300);
+
+fn wait_for(what: &str, mut condition: impl FnMut() -> bool) {
+    let start = Instant::now();
+    while !condition() {
+        assert!(start.elapsed() < LIMIT, "{what} did not happen within {LIMIT:?}");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// One folder with runs of [`PLAN`].
+struct Runs {
+    directory: tempfile::TempDir,
+    plan: Plan,
+}
+
+impl Runs {
+    fn new() -> Self {
+        let directory = tempfile::tempdir().expect("a directory");
+        std::fs::write(directory.path().join("plan.toml"), PLAN).expect("written");
+        Self { directory, plan: Plan::parse("plan.toml", PLAN.into()).unwrap_or_else(|error| panic!("{error}")) }
+    }
+
+    fn out(&self, name: &str) -> PathBuf {
+        self.directory.path().join(name)
+    }
+
+    fn start(&self, name: &str, servers: &[Address]) -> Child {
+        let list = servers.iter().map(ToString::to_string).collect::<Vec<_>>().join(",");
+        let mut command = perturb(&["run", "--jobs", "2", "--server", &list]);
+        command.arg(self.directory.path().join("plan.toml")).arg("--out").arg(self.out(name)).spawn().expect("started")
+    }
+
+    /// A file of every cell, by id; `None` where there is none.
+    fn files(&self, name: &str, file: &str) -> BTreeMap<String, Option<String>> {
+        let folder = Folder::new(&self.out(name));
+        let read = |id: &str| std::fs::read_to_string(folder.cell(id).path().join(file)).ok();
+        self.plan.cells.iter().map(|cell| (cell.id.clone(), read(&cell.id))).collect()
+    }
+}
+
+#[track_caller]
+fn succeeded(run: Child) {
+    let output = run.wait_with_output().expect("ended");
+    assert!(output.status.success(), "{}: {}", output.status, stderr(&output));
+}
+
+fn options() -> OpenOptions {
+    OpenOptions {
+        environment: "CartPole".into(),
+        version: proto::Version::Default,
+        num_envs: 2,
+        seed: 1,
+        episodes_per_trial: 1,
+    }
+}
+
+fn first(servers: &Servers) -> &Address {
+    servers.addresses().next().expect("a connection")
+}
+
+/// A machine that accepts connections and never answers.
+fn silent() -> (TcpListener, Address) {
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
+    let address = listener.local_addr().expect("an address").to_string().parse().expect("an address");
+    (listener, address)
+}
+
+/// A server with a session that keeps it from ending, which it has been asked to do.
+fn shutting_down(with_session: impl FnOnce(&PrivateServer)) {
+    let server = server(1);
+    let servers = Servers::connect(&addresses(std::slice::from_ref(&server))).expect("a connection");
+    let session = Session::open(&servers, &options(), &mut Vec::new()).expect("a session");
+    kill("-TERM", server.process_id());
+    wait_for("the beginning of the end", || Servers::connect(&[server.address().clone()]).is_err());
+    with_session(&server);
+    drop(session);
+}
+
+#[test]
+fn a_run_spreads_its_cells_and_survives_the_death_of_a_server() {
+    let runs = Runs::new();
+    let mut servers = vec![server(1), server(1)];
+    let both = addresses(&servers);
+    succeeded(runs.start("whole", &both[..1]));
+    let whole = runs.files("whole", "result.json");
+    assert!(whole.values().all(Option::is_some));
+
+    let run = runs.start("broken", &both);
+    // Cells 0 and 1 are begun first, 0 on the first server.
+    let id = &runs.plan.cells[0].id;
+    wait_for("a training on each server", || {
+        let logs: Vec<String> = runs.files("broken", "log.txt").into_values().flatten().collect();
+        let training = runs.files("broken", "training/progress.csv")[id].is_some();
+        training && both.iter().all(|address| logs.iter().any(|log| log.contains(&format!("on {address}\n"))))
+    });
+    kill("-KILL", servers[0].process_id());
+    drop(servers.remove(0));
+    succeeded(run);
+    assert_eq!(runs.files("broken", "result.json"), whole);
+    let log = runs.files("broken", "log.txt")[id].clone().expect("a log");
+    let after_the_loss = log.split("lost the server").nth(1).unwrap_or_else(|| panic!("nothing was lost: {log}"));
+    assert!(after_the_loss.contains(&format!("on {}\n", both[1])), "{log}");
+
+    let again = runs.start("broken", &both).wait_with_output().expect("ended");
+    let words = stderr(&again);
+    assert!(again.status.success(), "{words}");
+    assert!(words.contains(&format!("no server answers at {}", both[0])), "the other server is enough: {words}");
+    assert!(words.contains("going on with the other servers"), "{words}");
+}
+
+#[test]
+fn turns_go_around_the_servers_and_pass_over_those_that_take_no_sessions() {
+    let servers = [server(1), server(1)];
+    let both = addresses(&servers);
+    for turn in 0..4 {
+        let one = Servers::connect_to_one(&both, turn).expect("a connection");
+        assert_eq!(one.addresses().collect::<Vec<_>>(), [&both[turn % 2]]);
+    }
+    let (_listener, silent) = silent();
+    let gone: Address = "unix:/nowhere/perturb.sock".parse().expect("an address");
+    shutting_down(|ending| {
+        let ending = ending.address().clone();
+        let three = [ending.clone(), silent.clone(), both[0].clone()];
+        let (some, troubles) = Servers::connect_to_some(&three).expect("a connection");
+        assert_eq!(some.addresses().collect::<Vec<_>>(), [&both[0]]);
+        let words: Vec<String> = troubles.iter().map(ToString::to_string).collect();
+        assert!(words[0].contains(&format!("{ending}: it is shutting down")), "{words:?}");
+        assert!(words[1].contains(&format!("{silent}: it accepted the connection, but did not answer")), "{words:?}");
+        for turn in 0..3 {
+            let three = [ending.clone(), gone.clone(), both[0].clone()];
+            assert_eq!(first(&Servers::connect_to_one(&three, turn).expect("a connection")), &both[0]);
+        }
+        let error = Servers::connect_to_one(&[ending.clone(), gone.clone()], 0).expect_err("none").to_string();
+        assert!(error.contains("it is shutting down; unix:/nowhere/perturb.sock: "), "{error}");
+        let error = Servers::connect_to_one(&[ending], 0).expect_err("one").to_string();
+        assert!(error.starts_with("no server answers at unix:"), "{error}");
+    });
+}
+
+#[test]
+fn a_name_is_one_server_however_many_addresses_it_has() {
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
+    let port = listener.local_addr().expect("an address").port();
+    drop(listener);
+    let directory = tempfile::tempdir().expect("a directory");
+    let program = Path::new(env!("CARGO_BIN_EXE_perturb")).with_file_name("perturb-server");
+    let mut child = std::process::Command::new(program)
+        .args(["--listen", &format!("tcp://127.0.0.1:{port}"), "--exit-with-stdin", "--log", "error"])
+        .stdin(std::process::Stdio::piped())
+        .stdout(std::fs::File::create(directory.path().join("out")).expect("a file"))
+        .spawn()
+        .expect("perturb-server");
+    wait_for("the server", || std::fs::read(directory.path().join("out")).is_ok_and(|text| !text.is_empty()));
+    // Where localhost is ::1 too, nobody listens there.
+    let name: Address = format!("localhost:{port}").parse().expect("an address");
+    for turn in 0..3 {
+        let one = Servers::connect_to_one(std::slice::from_ref(&name), turn).expect("a connection");
+        Session::open(&one, &options(), &mut Vec::new()).expect("a session");
+    }
+    assert_eq!(Servers::connect(&[name.clone(), name]).expect("connections").addresses().count(), 2);
+    drop(child.stdin.take());
+    child.wait().expect("it ends");
+}

@@ -1,0 +1,269 @@
+//! A plan done by a real Slurm of two nodes, one of which dies. Needs Debian's packages slurmctld, slurmd, slurm-client
+//! and munge, and the program `perturb-server`; `make slurm-test` sees to both.
+
+mod cluster;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::Write;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use perturb_learner::client::{PrivateServer, PrivateServerOptions};
+use perturb_study::{Folder, Plan};
+use tempfile::TempDir;
+
+use cluster::{Cluster, wait_for};
+
+/// Set to 1, Slurm must be there.
+const REQUIRED: &str = "PERTURB_SLURM_REQUIRED";
+/// Names another experiment file than the one below, e.g. experiments/quick.toml.
+const PLAN_FILE: &str = "PERTURB_SLURM_PLAN";
+/// How long anything may take that must not hang.
+const LIMIT: Duration = Duration::from_secs(1800);
+
+/// Eight cells of a few seconds on a free core, with a checkpoint several times a second.
+const PLAN: &str = "
+environments = ['CartPole', 'MountainCar']
+versions = ['D', 'E']
+test_episodes = 30
+settings = { episodes = 400, checkpoint_interval = 10 }
+
+[[algorithm]]
+name = 'a2c'
+architectures = ['ff']
+
+[[algorithm]]
+name = 'ppo'
+architectures = ['ff']
+";
+
+struct Experiment {
+    directory: TempDir,
+    file: PathBuf,
+    plan: Plan,
+}
+
+impl Experiment {
+    fn new() -> Self {
+        let directory = tempfile::tempdir().expect("a directory");
+        let file = directory.path().join("file.toml");
+        match std::env::var_os(PLAN_FILE) {
+            Some(path) => drop(fs::copy(&path, &file).unwrap_or_else(|error| panic!("{path:?}: {error}"))),
+            None => fs::write(&file, PLAN).expect("written"),
+        }
+        let plan = Plan::load(&file).unwrap_or_else(|error| panic!("{error}"));
+        Self { directory, file, plan }
+    }
+
+    fn out(&self, name: &str) -> PathBuf {
+        self.directory.path().join(name)
+    }
+
+    fn run(&self, name: &str, arguments: &[&str]) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_perturb"));
+        command.arg("run").arg(&self.file).arg("--out").arg(self.out(name)).args(arguments);
+        // Whether a training begins or goes on stands in its log then.
+        command.env("RUST_LOG", "warn,perturb_learner::training=debug");
+        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        command
+    }
+
+    fn on(&self, cluster: &Cluster, name: &str, arguments: &[&str]) -> Command {
+        let mut command = self.run(name, &[&["--engine", "slurm"], arguments].concat());
+        command.env("SLURM_CONF", cluster.configuration());
+        command
+    }
+
+    fn cell(&self, name: &str, id: &str) -> PathBuf {
+        Folder::new(&self.out(name)).cell(id).path().to_owned()
+    }
+
+    /// The bytes of all results.
+    fn results(&self, name: &str) -> BTreeMap<&str, Vec<u8>> {
+        let read = |id| fs::read(self.cell(name, id).join("result.json")).ok();
+        self.plan.cells.iter().filter_map(|cell| Some((&*cell.id, read(&cell.id)?))).collect()
+    }
+
+    /// How often a cell's log has a line with these words.
+    fn said(&self, name: &str, id: &str, words: &str) -> usize {
+        let log = fs::read_to_string(self.cell(name, id).join("log.txt")).unwrap_or_default();
+        log.lines().filter(|line| line.contains(words)).count()
+    }
+
+    /// What `perturb report` prints and writes.
+    fn report(&self, name: &str) -> BTreeMap<String, Vec<u8>> {
+        let page = self.out("page.html");
+        let mut command = Command::new(env!("CARGO_BIN_EXE_perturb"));
+        let output = command.arg("report").arg(self.out(name)).arg("--html").arg(&page).output().expect("ended");
+        assert!(output.status.success(), "{}", stderr(&output));
+        let mut files =
+            BTreeMap::from([("text".into(), output.stdout), ("page".into(), fs::read(page).expect("read"))]);
+        for entry in fs::read_dir(self.out(name).join("report")).expect("a folder").flatten() {
+            files.insert(entry.file_name().to_string_lossy().into_owned(), fs::read(entry.path()).expect("read"));
+        }
+        files
+    }
+
+    /// The cells of the jobs of the only array.
+    fn jobs(&self, name: &str) -> Vec<Vec<String>> {
+        let text = fs::read_to_string(self.out(name).join("slurm/1/cells.txt")).expect("a list");
+        text.lines().map(|line| line.split(',').map(str::to_owned).collect()).collect()
+    }
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+fn end(child: Child) -> Output {
+    child.wait_with_output().expect("ended")
+}
+
+/// Which file it is, and when it was written: another one would differ.
+fn identity(path: &Path) -> Option<(u64, i64, i64)> {
+    fs::metadata(path).ok().map(|data| (data.ino(), data.mtime(), data.mtime_nsec()))
+}
+
+/// The test's sentences, which cargo does not hide as it hides those of `println!`.
+fn say(sentence: &str) {
+    let _ = writeln!(std::io::stderr(), "{sentence}");
+}
+
+#[test]
+fn a_plan_survives_the_loss_of_a_node() {
+    if let Some(missing) = Cluster::missing() {
+        assert!(std::env::var_os(REQUIRED).is_none(), "{missing}, but {REQUIRED} is set: use `make slurm-test`");
+        say(&format!("the test with a real Slurm is skipped: {missing}; `make slurm-test` installs it"));
+        return;
+    }
+    let experiment = Experiment::new();
+    let start = Instant::now();
+    let whole = end(experiment.run("whole", &["--jobs", "2"]).spawn().expect("started"));
+    assert!(whole.status.success(), "{}", stderr(&whole));
+    let local_seconds = start.elapsed().as_secs();
+
+    let mut cluster = Cluster::start();
+    refusals(&experiment, &cluster);
+
+    // Ctrl-C leaves the jobs alone, and the same command finds them again.
+    let start = Instant::now();
+    let arguments = ["--cells-per-job", "2", "--time", "2:00:00"];
+    let first = experiment.on(&cluster, "slurm", &arguments).spawn().expect("started");
+    wait_for("jobs on both nodes", LIMIT, || ["n1", "n2"].iter().all(|node| !cluster.running_on(node).is_empty()));
+    assert!(Command::new("kill").args(["-INT", &first.id().to_string()]).status().expect("kill").success());
+    let first = end(first);
+    assert_eq!(first.status.code(), Some(130), "{}", stderr(&first));
+    assert!(stderr(&first).contains("goes on: the same command watches it again, scancel "), "{}", stderr(&first));
+    let mut second = experiment.on(&cluster, "slurm", &arguments).spawn().expect("started");
+
+    // A node dies in the middle of a training.
+    let jobs = experiment.jobs("slurm");
+    let in_work = |id: &String| {
+        let cell = experiment.cell("slurm", id);
+        let budget = experiment.plan.find(id).map_or(0, |cell| cell.config.common.episodes as usize);
+        let log = fs::read_to_string(cell.join("training/monitor.csv"));
+        let trained = log.map_or(0, |text| text.lines().count());
+        // Not so far that it may end before it is killed.
+        (3..budget / 2).contains(&trained) && cell.join("training/checkpoint/checkpoint.json").exists()
+    };
+    let mut victim = None;
+    wait_for("a training on n1", LIMIT, || {
+        let cells = cluster.running_on("n1").into_iter().flat_map(|job| jobs[job].clone());
+        victim = cells.into_iter().find(in_work);
+        let ended = second.try_wait().expect("its status");
+        assert!(
+            victim.is_some() || ended.is_none(),
+            "no training on n1 was seen in its first half before all had ended"
+        );
+        victim.is_some()
+    });
+    cluster.kill_node(1);
+    let killed_after = start.elapsed().as_secs();
+    let victim = victim.expect("a cell");
+    let file = |id: &str| experiment.cell("slurm", id).join("result.json");
+    let done: Vec<_> = experiment.results("slurm").into_keys().map(|id| (id, identity(&file(id)))).collect();
+    assert!(!done.iter().any(|(id, _)| *id == victim), "{victim} was done before the node died");
+
+    let output = end(second);
+    let said = stderr(&output);
+    assert!(output.status.success(), "{said}\n{}", cluster.logs());
+    assert!(said.contains("is in the queue, with ") && said.contains(" cells are done"), "{said}");
+    let seconds = start.elapsed().as_secs();
+
+    // The same results, byte for byte, and the same report.
+    let cells = experiment.plan.cells.len();
+    assert_eq!(experiment.results("whole").len(), cells);
+    assert!(experiment.results("slurm") == experiment.results("whole"), "results differ");
+    let (whole, slurm) = (experiment.report("whole"), experiment.report("slurm"));
+    assert!(whole.keys().eq(slurm.keys()));
+    for (name, content) in &whole {
+        assert!(*content == slurm[name], "{name} differs");
+    }
+    // Nothing was submitted twice: Slurm gave the lost job to the other node.
+    assert!(!experiment.out("slurm/slurm/2").exists(), "{said}");
+    let restarted: Vec<usize> = (0..jobs.len())
+        .filter(|job| {
+            let log = fs::read_to_string(experiment.out(&format!("slurm/slurm/1/{job}.log"))).expect("a log");
+            log.contains("on n1, restarted 0 times") && log.contains("on n2, restarted 1 times")
+        })
+        .collect();
+    assert_eq!(restarted.len(), 1);
+    assert!(jobs[restarted[0]].contains(&victim));
+    // No cell was done twice: what was done stayed, and the training that was broken off went on from its checkpoint.
+    for (id, before) in done {
+        assert_eq!(identity(&file(id)), before, "{id} was written again");
+    }
+    for cell in &experiment.plan.cells {
+        assert_eq!(experiment.said("slurm", &cell.id, "training begins"), 1, "{}", cell.id);
+        assert_eq!(
+            experiment.said("slurm", &cell.id, "training goes on"),
+            usize::from(cell.id == victim),
+            "{}",
+            cell.id
+        );
+        for version in &cell.tests.versions {
+            assert_eq!(experiment.said("slurm", &cell.id, &format!("testing on {version}")), 1, "{}", cell.id);
+        }
+    }
+    say(&format!(
+        "{cells} cells in {} jobs: {seconds} s on two nodes, n1 killed after {killed_after} s, job {} went to n2, \
+         where {victim} went on from its checkpoint; {local_seconds} s locally, and the report is the same",
+        jobs.len(),
+        restarted[0]
+    ));
+    shared_server(&experiment, &cluster);
+}
+
+/// What Slurm refuses is said in its words, and leaves nothing behind.
+fn refusals(experiment: &Experiment, cluster: &Cluster) {
+    for (option, value, words) in
+        [("--partition", "nowhere", "invalid partition"), ("--array-limit", "0", "0 is not in")]
+    {
+        let arguments = ["--cells-per-job", "2", option, value];
+        let output = end(experiment.on(cluster, "refused", &arguments).spawn().expect("started"));
+        assert!(!output.status.success());
+        assert!(stderr(&output).contains(words), "{}", stderr(&output));
+    }
+    assert!(!experiment.out("refused/slurm/1").exists());
+}
+
+/// Jobs use one server together, on the node that is left; how many cells a job does is estimated.
+fn shared_server(experiment: &Experiment, cluster: &Cluster) {
+    let server = PrivateServer::start(PrivateServerOptions::default()).unwrap_or_else(|error| panic!("{error}"));
+    let id = &experiment.plan.cells[0].id;
+    // The other cells have a result already.
+    for cell in &experiment.plan.cells[1..] {
+        let (from, to) = (experiment.cell("slurm", &cell.id), experiment.cell("shared", &cell.id));
+        fs::create_dir_all(&to).expect("a folder");
+        fs::copy(from.join("result.json"), to.join("result.json")).expect("copied");
+    }
+    let mut command = experiment.on(cluster, "shared", &["--server", &server.address().to_string()]);
+    // A job that started a server of its own would fail.
+    let output = end(command.env("SBATCH_EXPORT", "ALL,PERTURB_SERVER=/nowhere").spawn().expect("started"));
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert_eq!(experiment.jobs("shared"), [vec![id.clone()]]);
+    assert!(experiment.results("shared") == experiment.results("whole"), "results differ");
+}

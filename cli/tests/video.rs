@@ -1,0 +1,331 @@
+//! Videos of trained policies. Needs the program `perturb-server`: run `cargo build --release` first.
+
+mod common;
+
+use std::collections::HashSet;
+use std::fs::File;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use common::{addresses, child_server, kill, perturb, run, server, stderr, wait_for};
+use gif::{ColorOutput, DecodeOptions};
+use perturb_cli::video::{Summary, VideoFile, VideoOptions, film};
+use perturb_learner::checkpoint::Checkpoint;
+use perturb_learner::client::{PrivateServer, Servers};
+use perturb_learner::evaluation::test;
+use perturb_study::Version;
+use perturb_study::interrupt::StopFlag;
+use tempfile::TempDir;
+
+/// A policy that was trained for a moment.
+fn trained(server: &PrivateServer, text: &str) -> (TempDir, Checkpoint) {
+    let servers = Servers::connect(std::slice::from_ref(server.address())).expect("a connection");
+    let (out, outcome) = run(&servers, text);
+    (out, outcome.checkpoint)
+}
+
+const CART_POLE: &str = "environment = 'CartPole'\nepisodes = 5\nnum_envs = 2\nn_steps = 32";
+const PENDULUM: &str = "environment = 'Pendulum'\nepisodes = 2\nnum_envs = 2\nn_steps = 64";
+
+/// `perturb video` of the checkpoint in `out`, small.
+fn video(out: &TempDir, file: &Path, more: &[&str]) -> Command {
+    let [out, file] = [out.path(), file].map(|path| path.to_str().expect("UTF-8"));
+    let mut command = perturb(&["video", "--checkpoint", out, "--out", file, "--width", "240", "--height", "240"]);
+    command.args(more);
+    command
+}
+
+fn done(mut command: Command) -> String {
+    let output = command.output().expect("perturb");
+    assert!(output.status.success(), "{}", stderr(&output));
+    String::from_utf8(output.stdout).expect("UTF-8")
+}
+
+/// Steps of each episode, from the table that is printed.
+fn lengths(stdout: &str) -> Vec<u64> {
+    let rows = stdout.lines().skip(1).take_while(|line| line.starts_with(' '));
+    rows.map(|row| row.split_whitespace().nth(2).and_then(|steps| steps.parse().ok()).expect("a number")).collect()
+}
+
+/// Size, delays in hundredths of a second, and the decoded pixels of each frame.
+fn decoded(path: &Path) -> ((u16, u16), Vec<u16>, Vec<Vec<u8>>) {
+    let mut options = DecodeOptions::new();
+    options.set_color_output(ColorOutput::RGBA);
+    let mut decoder = options.read_info(File::open(path).expect("a file")).expect("a GIF");
+    let size = (decoder.width(), decoder.height());
+    let (mut delays, mut frames) = (Vec::new(), Vec::new());
+    while let Some(frame) = decoder.read_next_frame().expect("a whole GIF") {
+        assert_eq!((frame.width, frame.height), size);
+        delays.push(frame.delay);
+        frames.push(frame.buffer.to_vec());
+    }
+    (size, delays, frames)
+}
+
+fn names(folder: &TempDir) -> Vec<PathBuf> {
+    std::fs::read_dir(folder.path()).expect("a folder").map(|entry| entry.expect("an entry").path()).collect()
+}
+
+#[test]
+fn a_gif_has_a_frame_for_each_start_and_each_step() {
+    let server = server(1);
+    let address = server.address().to_string();
+    for (text, delay) in [(CART_POLE, 2), (PENDULUM, 5)] {
+        let (out, _) = trained(&server, text);
+        let folder = tempfile::tempdir().expect("a folder");
+        let file = folder.path().join("a.gif");
+        let more = ["--server", &address, "--version", "E", "--episodes", "2"];
+        let stdout = done(video(&out, &file, &more));
+        assert_eq!(names(&folder), std::slice::from_ref(&file));
+
+        let lengths = lengths(&stdout);
+        assert_eq!(lengths.len(), 2, "{stdout}");
+        let (size, delays, frames) = decoded(&file);
+        let expected: Vec<u16> = lengths
+            .iter()
+            .flat_map(|&steps| (0..=steps).map(move |step| if step == steps { 100 } else { delay }))
+            .collect();
+        assert_eq!(delays, expected, "real time, and a second at the end of each episode");
+        assert!(stdout.contains(&format!("{} frames of {} × {} pixels at 1.00 ×", frames.len(), size.0, size.1)));
+        assert!(size.0 == 240 && size.1 > 240 && size.1 % 2 == 0, "{size:?}");
+
+        let pixels = |frames: &[Vec<u8>], rows: std::ops::Range<usize>| {
+            let bytes = rows.start * 240 * 4..rows.end * 240 * 4;
+            frames.iter().map(|frame| frame[bytes.clone()].to_vec()).collect::<HashSet<_>>().len()
+        };
+        let distinct = pixels(&frames, 0..240) as u64;
+        // A pendulum that hangs still for a moment may look the same in two frames.
+        assert!(distinct * 10 >= frames.len() as u64 * 9, "{distinct} of {} pictures differ", frames.len());
+        assert_eq!(pixels(&frames, 240..usize::from(size.1)), frames.len(), "the text below differs in every frame");
+
+        let again = folder.path().join("b.gif");
+        done(video(&out, &again, &more));
+        let other = folder.path().join("c.gif");
+        done(video(&out, &other, &[&more[..], &["--seed", "2"]].concat()));
+        let bytes = |path: &Path| std::fs::read(path).expect("a file");
+        assert!(bytes(&again) == bytes(&file), "the same seed gives the same bytes");
+        assert!(bytes(&other) != bytes(&file), "another seed another video");
+    }
+}
+
+#[test]
+fn a_gif_is_shown_as_fast_as_was_asked_for() {
+    let server = server(1);
+    let (out, _) = trained(&server, CART_POLE);
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("a.gif");
+    let stdout = done(video(&out, &file, &["--episodes", "1", "--fps", "12.5", "--workers", "1"]));
+    assert!(stdout.contains("at 0.25 × real time"), "{stdout}");
+    let (_, delays, _) = decoded(&file);
+    assert_eq!((delays[0], delays.last()), (8, Some(&100)));
+}
+
+/// Plays with the library, into a file that is thrown away.
+fn filmed(servers: &Servers, checkpoint: &Checkpoint, version: Version, episodes: u64) -> Summary {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = VideoFile::create(&folder.path().join("a.gif")).expect("a file");
+    let options = VideoOptions { version, episodes, seed: 5, size: (240, 240), fps: None };
+    film(servers, checkpoint, &options, file, &StopFlag::default(), &mut |_| {})
+        .unwrap_or_else(|error| panic!("{error}"))
+}
+
+#[test]
+fn what_is_filmed_is_what_is_tested() {
+    let server = [server(1)];
+    let servers = Servers::connect(&addresses(&server)).expect("a connection");
+    for (policy, episodes) in [
+        ("algorithm = 'ppo'\narchitecture = 'ff'", 1),
+        ("algorithm = 'a2c'\narchitecture = 'rc'", 1),
+        ("algorithm = 'rl2-ppo'\nepisodes_per_trial = 3", 3),
+    ] {
+        let text =
+            format!("environment = 'CartPole'\nversion = 'R'\nepisodes = 6\nnum_envs = 2\nn_steps = 32\n{policy}");
+        let (_out, checkpoint) = trained(&server[0], &text);
+        for version in [Version::R, Version::E] {
+            let result = test(&servers, &checkpoint, version, 1, 5, &StopFlag::default(), |_| {}).expect("a test");
+            let summary = filmed(&servers, &checkpoint, version, episodes);
+            let last = summary.episodes.last().expect("an episode");
+            assert_eq!(summary.episodes.len() as u64, episodes);
+            assert_eq!(last.episode_return, result.mean_return, "{policy}");
+            assert_eq!(f64::from(last.length), result.mean_length, "{policy}");
+            assert_eq!(last.success, result.success_percent == 100.0);
+            let parameters: HashSet<String> =
+                summary.episodes.iter().map(|episode| format!("{:?}", episode.parameters)).collect();
+            assert_eq!(parameters.len(), 1, "the parameters of a trial stay");
+        }
+    }
+}
+
+#[test]
+fn each_episode_has_its_own_parameters() {
+    let server = [server(1)];
+    let servers = Servers::connect(&addresses(&server)).expect("a connection");
+    let (_out, checkpoint) = trained(&server[0], CART_POLE);
+    let summary = filmed(&servers, &checkpoint, Version::E, 3);
+    let steps: u64 = summary.episodes.iter().map(|episode| u64::from(episode.length)).sum();
+    assert_eq!(summary.frames, steps + 3);
+    let forces: Vec<f64> = summary.episodes.iter().map(|episode| episode.parameters[0].1).collect();
+    assert!(forces[0] != forces[1] && forces[1] != forces[2], "{forces:?}");
+    let extreme = |force: &f64| (1.0..=5.0).contains(force) || (15.0..=20.0).contains(force);
+    assert!(forces.iter().all(extreme), "{forces:?}");
+    assert_eq!(summary.episodes[0].parameters[0].0, "force");
+}
+
+/// What ffprobe says of a video's stream.
+fn probed(path: &Path) -> String {
+    let entries = "stream=codec_name,pix_fmt,width,height,r_frame_rate,color_space,nb_read_frames";
+    let output = Command::new("ffprobe")
+        .args(["-v", "error", "-count_frames", "-show_entries", entries, "-of", "default=noprint_wrappers=1"])
+        .arg(path)
+        .output()
+        .expect("ffprobe");
+    assert!(output.status.success(), "{}", stderr(&output));
+    String::from_utf8(output.stdout).expect("UTF-8")
+}
+
+#[test]
+fn an_mp4_is_what_every_player_shows() {
+    if Command::new("ffmpeg").arg("-version").output().is_err() {
+        eprintln!("skipped: ffmpeg is not installed");
+        return;
+    }
+    let server = server(1);
+    let (out, _) = trained(&server, PENDULUM);
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("a.mp4");
+    let address = server.address().to_string();
+    let more = ["--server", &address, "--version", "R", "--episodes", "1", "--width", "301"];
+    let mut command = perturb(&["video", "--out", file.to_str().expect("UTF-8"), "--height", "255", "--checkpoint"]);
+    command.arg(out.path()).args(more);
+    let stdout = done(command);
+    assert_eq!(names(&folder), std::slice::from_ref(&file));
+    assert!(stdout.contains("at 1.00 × real time"), "{stdout}");
+
+    let probed = probed(&file);
+    // 201 frames, the last one for a second of 20.
+    for expected in [
+        "codec_name=h264",
+        "pix_fmt=yuv420p",
+        "width=302",
+        "r_frame_rate=20/1",
+        "color_space=bt709",
+        "nb_read_frames=220",
+    ] {
+        assert!(probed.lines().any(|line| line == expected), "{expected}: {probed}");
+    }
+    let bytes = std::fs::read(&file).expect("a file");
+    let place = |name: &[u8]| bytes.windows(4).position(|window| window == name).expect("an atom");
+    assert!(place(b"moov") < place(b"mdat"), "the index comes first");
+}
+
+#[test]
+fn without_ffmpeg_an_mp4_is_refused_before_anything_is_played() {
+    let server = server(1);
+    let (out, _) = trained(&server, CART_POLE);
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut command = video(&out, &folder.path().join("a.mp4"), &["--server", &server.address().to_string()]);
+    let output = command.env("PATH", "/nowhere").output().expect("perturb");
+    assert_eq!(output.status.code(), Some(1));
+    let words = stderr(&output);
+    assert!(words.contains("apt-get install ffmpeg") && words.contains(".gif, which needs nothing"), "{words}");
+    assert!(names(&folder).is_empty());
+    let gif = folder.path().join("a.gif");
+    let mut command = video(&out, &gif, &["--server", &server.address().to_string(), "--episodes", "1"]);
+    command.env("PATH", "/nowhere");
+    done(command);
+    assert!(gif.is_file());
+}
+
+#[test]
+fn what_cannot_be_filmed_is_refused_in_words() {
+    let server = server(1);
+    let (out, _) = trained(&server, CART_POLE);
+    let folder = tempfile::tempdir().expect("a folder");
+    let [good, no_video, blocked, unnamed] = ["a.gif", "a.avi", "file/a.gif", "a"].map(|name| folder.path().join(name));
+    std::fs::write(folder.path().join("file"), "").expect("a file");
+    let refused = |file: &Path, more: &[&str], code: i32, part: &str| {
+        let output = video(&out, file, more).output().expect("perturb");
+        assert_eq!(output.status.code(), Some(code), "{more:?}: {}", stderr(&output));
+        assert!(stderr(&output).contains(part), "{more:?}: {}", stderr(&output));
+    };
+    refused(&no_video, &[], 2, "ends in .mp4 or .gif");
+    refused(&unnamed, &[], 2, "ends in .mp4 or .gif");
+    refused(&blocked, &[], 1, "file");
+    refused(&good, &["--episodes", "0"], 2, "--episodes");
+    refused(&good, &["--version", "X"], 2, "possible values: D, R, E");
+    refused(&good, &["--fps", "0"], 2, "0.1 to 1000");
+    refused(&good, &["--seed=-1"], 2, "--seed");
+    refused(&good, &["--server", "unix:/nowhere.sock"], 1, "no server answers");
+    refused(&good, &["--server", &server.address().to_string(), "--workers", "2"], 2, "--workers");
+    for (side, size) in [("--width", "239"), ("--height", "2049")] {
+        let mut command = perturb(&["video", "--out", good.to_str().expect("UTF-8"), side, size, "--checkpoint"]);
+        let output = command.arg(out.path()).output().expect("perturb");
+        assert_eq!(output.status.code(), Some(2));
+        assert!(stderr(&output).contains("expected 240 to 2048"), "{}", stderr(&output));
+    }
+    let empty = tempfile::tempdir().expect("a folder");
+    let output = video(&empty, &good, &[]).output().expect("perturb");
+    assert!(stderr(&output).contains("holds no checkpoint"), "{}", stderr(&output));
+    assert_eq!(names(&folder), [folder.path().join("file")], "nothing was written");
+}
+
+#[test]
+fn a_server_that_cannot_draw_says_why() {
+    let server = server(1);
+    let (out, _) = trained(&server, "environment = 'Hopper'\nepisodes = 2\nnum_envs = 2\nn_steps = 32");
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut command = video(&out, &folder.path().join("a.gif"), &["--workers", "1"]);
+    // No driver, for the private server, which inherits it.
+    let output = command.env("__EGL_VENDOR_LIBRARY_FILENAMES", "/nowhere.json").output().expect("perturb");
+    assert_eq!(output.status.code(), Some(1));
+    let words = stderr(&output);
+    assert!(words.contains("refused a picture: this server cannot draw Hopper"), "{words}");
+    assert!(names(&folder).is_empty());
+}
+
+/// Begins a long video, calls `end` when some of it is written, and returns what `perturb` says then.
+fn broken_off(ending: &str, server: Option<&str>, end: impl FnOnce(u32)) -> (Output, Vec<PathBuf>) {
+    let training = common::server(1);
+    let (out, _) = trained(&training, PENDULUM);
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join(format!("a.{ending}"));
+    let mut command = video(&out, &file, &["--episodes", "10000"]);
+    if let Some(address) = server {
+        command.args(["--server", address]);
+    }
+    let child = command.spawn().expect("perturb");
+    let written = || names(&folder).iter().any(|path| path.metadata().is_ok_and(|file| file.len() > 0));
+    wait_for("the first frames", written);
+    end(child.id());
+    (child.wait_with_output().expect("perturb"), names(&folder))
+}
+
+#[test]
+fn a_server_killed_while_it_is_filmed_leaves_no_file() {
+    let server = server(1);
+    let address = server.address().to_string();
+    let (output, names) = broken_off("gif", Some(&address), |_| kill("-KILL", server.process_id()));
+    assert_eq!(output.status.code(), Some(1));
+    assert!(stderr(&output).contains("lost the server at"), "{}", stderr(&output));
+    assert!(names.is_empty(), "{names:?}");
+
+    let private = |parent| kill("-KILL", child_server(parent).expect("a private server"));
+    let (output, names) = broken_off("gif", None, private);
+    assert!(stderr(&output).contains("the private server ended with signal: 9"), "{}", stderr(&output));
+    assert!(names.is_empty(), "{names:?}");
+}
+
+#[test]
+fn a_signal_ends_a_video_and_leaves_no_file() {
+    let mut endings = vec!["gif"];
+    if Command::new("ffmpeg").arg("-version").output().is_ok() {
+        endings.push("mp4");
+    } else {
+        eprintln!("skipped for .mp4: ffmpeg is not installed");
+    }
+    for ending in endings {
+        let (output, names) = broken_off(ending, None, |id| kill("-TERM", id));
+        assert_eq!(output.status.code(), Some(128 + 15), "{}", stderr(&output));
+        assert!(names.is_empty(), "{names:?}");
+    }
+}

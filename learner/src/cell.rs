@@ -1,0 +1,313 @@
+//! Doing one cell: train, test, write the result.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::path::Path;
+use std::time::Instant;
+
+use anyhow::Result;
+
+use crate::checkpoint::{Checkpoint, CheckpointError, ResumeState};
+use crate::client::{ClientError, Servers};
+use crate::evaluation::{TestError, test};
+use crate::logging::Progress;
+use crate::rollout::CollectError;
+use crate::training::{RunDirectory, resume, train};
+use perturb_study::interrupt::StopFlag;
+use perturb_study::{Cell, CellFolder, CellResult, CellState, Failure, FailureMark, FolderError, Timing, Training, io};
+
+/// Stands for the program that began a training whose checkpoint does not say.
+const UNKNOWN: &str = "unknown";
+/// What a stop without a signal counts as.
+const SIGTERM: i32 = 15;
+
+/// How doing a cell ended.
+#[derive(Debug)]
+pub enum CellEnd {
+    /// There is a result, of now or of earlier.
+    Done,
+    /// It failed, now or earlier, and the reason is recorded.
+    Failed(Failure),
+    /// Somebody else works on it.
+    Busy,
+    /// This signal asked to end. What was trained is kept.
+    Stopped(i32),
+    /// The servers are gone, which is not the cell's failure.
+    NoServer(anyhow::Error),
+}
+
+/// Trains and tests `cell` in `folder`, unless that is done, or has failed otherwise than `retry` says. Calls `report`
+/// with what is being done and the number of episodes.
+///
+/// # Errors
+/// [`FolderError`]: the folder cannot be read or written. Whatever else goes wrong is recorded in it.
+pub fn run_cell(
+    servers: &Servers,
+    cell: &Cell,
+    folder: &CellFolder,
+    retry: Option<FailureMark>,
+    stop: &StopFlag,
+    report: &mut dyn FnMut(&str, u64),
+) -> Result<CellEnd, FolderError> {
+    let Some(_lock) = folder.try_lock()? else { return Ok(CellEnd::Busy) };
+    match folder.state()? {
+        CellState::Done(_) => return Ok(CellEnd::Done),
+        CellState::Failed(failure) if folder.failure_mark() != retry => return Ok(CellEnd::Failed(failure)),
+        CellState::Failed(_) => {
+            // What was trained so far led to the failure.
+            remove(&folder.training())?;
+            folder.forget_failure()?;
+        }
+        CellState::Missing => {}
+    }
+    let start = Instant::now();
+    let ended = train_and_test(servers, cell, folder, stop, report);
+    match (ended, stop.signal()) {
+        (Ok(Some(result)), _) => {
+            folder.write_timing(&Timing { seconds: start.elapsed().as_secs_f64() })?;
+            folder.write_result(&result)?; // last: whoever sees it may read everything else
+            Ok(CellEnd::Done)
+        }
+        (Ok(None), signal) => Ok(CellEnd::Stopped(signal.unwrap_or(SIGTERM))),
+        // Whoever stops a run may end its servers too.
+        (Err(_), Some(signal)) => Ok(CellEnd::Stopped(signal)),
+        (Err(error), None) if lost_server(&error) => Ok(CellEnd::NoServer(error)),
+        (Err(error), None) => {
+            // Without the folder's place: wherever the same happens, the same is recorded.
+            let reason = format!("{error:#}").replace(&format!("{}/", folder.path().display()), "");
+            let failure = Failure { id: cell.id.clone(), reason, commit: perturb_study::VERSION.into() };
+            folder.write_failure(&failure)?;
+            Ok(CellEnd::Failed(failure))
+        }
+    }
+}
+
+/// Deletes a folder, if it is there.
+fn remove(path: &Path) -> Result<(), FolderError> {
+    match std::fs::remove_dir_all(path) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(io("delete", path)(error)),
+        _ => Ok(()),
+    }
+}
+
+/// `None` if the stop flag was raised.
+fn train_and_test(
+    servers: &Servers,
+    cell: &Cell,
+    folder: &CellFolder,
+    stop: &StopFlag,
+    report: &mut dyn FnMut(&str, u64),
+) -> Result<Option<CellResult>> {
+    let Some(checkpoint) = trained(servers, cell, &folder.training(), stop, report)? else { return Ok(None) };
+    let mut results = BTreeMap::new();
+    for &version in &cell.tests.versions {
+        let what = format!("testing on {version}");
+        let seed = cell.config.common.seed;
+        let progress = |episodes| report(&what, episodes);
+        match test(servers, &checkpoint, version, cell.tests.episodes, seed, stop, progress) {
+            Ok(result) => results.insert(version, result),
+            Err(TestError::Stopped { .. }) => return Ok(None),
+            Err(error) => return Err(anyhow::Error::new(error).context(what)),
+        };
+    }
+    let state = checkpoint.state;
+    Ok(Some(CellResult {
+        format_version: CellResult::FORMAT_VERSION,
+        id: cell.id.clone(),
+        training: Training {
+            environment: state.environment,
+            environment_revision: state.environment_spec.revision,
+            model_hash: state.environment_spec.model_hash,
+            version: state.train_version,
+            method: cell.method(),
+            configuration: cell.configuration.clone(),
+            run: cell.run,
+            seed: state.seed,
+            counters: state.counters,
+            settings: state.config,
+        },
+        results,
+        commit: perturb_study::VERSION.into(),
+        earlier_commits: earlier_commits(state.commits),
+        command: command(cell),
+    }))
+}
+
+/// Of the programs that trained, those that are not this one.
+fn earlier_commits(mut commits: Vec<String>) -> Vec<String> {
+    if commits.is_empty() {
+        return vec![UNKNOWN.into()];
+    }
+    commits.retain(|commit| commit != perturb_study::VERSION);
+    commits
+}
+
+/// The trained policy of a cell; `None` if the stop flag was raised.
+///
+/// This alone decides what becomes of a training that was broken off: one that had finished is taken as it is, another
+/// goes on from its last checkpoint, to the same bytes as without the break, and one without a usable checkpoint begins
+/// again.
+fn trained(
+    servers: &Servers,
+    cell: &Cell,
+    directory: &Path,
+    stop: &StopFlag,
+    report: &mut dyn FnMut(&str, u64),
+) -> Result<Option<Checkpoint>> {
+    let config = &cell.config;
+    let progress = |progress: &Progress| report("training", progress.episodes);
+    let earlier = earlier(directory)?;
+    let outcome = match earlier.filter(|(_, checkpoint, _)| checkpoint.state.config == config.table()) {
+        Some((_, checkpoint, _)) if checkpoint.state.counters.episodes >= config.common.episodes => {
+            return Ok(Some(checkpoint));
+        }
+        Some((directory, checkpoint, state)) => {
+            resume(servers, config, &directory, (checkpoint, state), stop, progress)?
+        }
+        None => train(servers, config, &RunDirectory::choose(directory, true)?, stop, progress)?,
+    };
+    Ok(outcome.signal.is_none().then_some(outcome.checkpoint))
+}
+
+/// What is left of a training that was broken off; `None` if there is nothing that could go on.
+///
+/// # Errors
+/// Whatever else keeps it from being read, a lock for instance: then it may still go on later, and is left as it is.
+fn earlier(directory: &Path) -> Result<Option<(RunDirectory, Checkpoint, ResumeState)>> {
+    if !directory.try_exists()? {
+        return Ok(None);
+    }
+    let error = match RunDirectory::resume(directory) {
+        Ok(earlier) => return Ok(Some(earlier)),
+        Err(error) => error,
+    };
+    let useless = match error.downcast_ref() {
+        Some(CheckpointError::Damaged { .. } | CheckpointError::NotResumable { .. }) => true,
+        Some(_) => false,
+        None => !directory.join("checkpoint").join("checkpoint.json").try_exists()?,
+    };
+    if !useless {
+        return Err(error);
+    }
+    tracing::warn!("the training begins again: {error:#}");
+    Ok(None)
+}
+
+/// Whether an error came from the servers or the way to them, not from what was trained.
+fn lost_server(error: &anyhow::Error) -> bool {
+    let client = error.chain().find_map(|cause| {
+        let direct = cause.downcast_ref::<ClientError>();
+        let collecting = cause.downcast_ref::<CollectError>().and_then(|error| match error {
+            CollectError::Client(error) => Some(error),
+            _ => None,
+        });
+        let testing = cause.downcast_ref::<TestError>().and_then(|error| match error {
+            TestError::Client(error) => Some(error),
+            _ => None,
+        });
+        direct.or(collecting).or(testing)
+    });
+    client.is_some_and(ClientError::can_be_retried)
+}
+
+/// What gives a cell's numbers again without the plan.
+fn command(cell: &Cell) -> String {
+    let common = &cell.config.common;
+    let mut text = format!(
+        "perturb train --out RUN --env {} --version {} --algorithm {} --architecture {} --episodes {} --seed {}",
+        common.environment, common.version, common.algorithm, common.architecture, common.episodes, common.seed
+    );
+    let flags = ["environment", "version", "algorithm", "architecture", "episodes", "seed"];
+    for (key, value) in cell.config.table().iter().filter(|(key, _)| !flags.contains(&key.as_str())) {
+        let value = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+        let _ = write!(text, " --set {key}={value}"); // writing to a String cannot fail
+    }
+    let versions: Vec<String> = cell.tests.versions.iter().map(ToString::to_string).collect();
+    let _ = write!(
+        text,
+        " && perturb evaluate --checkpoint RUN --versions {} --episodes {}",
+        versions.join(","),
+        cell.tests.episodes
+    );
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use perturb_study::Plan;
+
+    fn cell() -> Cell {
+        let text = "environments = ['Pendulum']\nversions = ['E']\ntest_versions = ['D', 'E']\ntest_episodes = 9
+            [[algorithm]]\nname = 'a2c'\narchitectures = ['rc']\nsettings = { ent_coef = 1e-4, episodes = 3 }";
+        Plan::parse("test", text.into()).unwrap().cells.remove(0)
+    }
+
+    #[test]
+    fn the_command_has_every_setting() {
+        let cell = cell();
+        let command = command(&cell);
+        let expected = "perturb train --out RUN --env Pendulum --version E --algorithm a2c --architecture rc --episodes 3 \
+                        --seed 1 --set ";
+        assert!(command.starts_with(expected), "{command}");
+        assert!(command.ends_with(" && perturb evaluate --checkpoint RUN --versions D,E --episodes 9"), "{command}");
+        let mut table: toml::Table =
+            "environment = 'Pendulum'\nversion = 'E'\narchitecture = 'rc'\nepisodes = 3\nseed = 1".parse().unwrap();
+        let sets: Vec<&str> = command.split(" --set ").skip(1).map(|part| part.split(' ').next().unwrap()).collect();
+        for set in sets {
+            let (key, value) = set.split_once('=').unwrap();
+            let parsed = format!("v = {value}").parse::<toml::Table>().map_or(value.into(), |table| table["v"].clone());
+            table.insert(key.into(), parsed);
+        }
+        table.insert("algorithm".into(), "a2c".into());
+        assert_eq!(table, cell.config.table());
+    }
+
+    #[test]
+    fn only_programs_that_differ_are_named_beside_the_one_that_finished() {
+        let of = |commits: &[&str]| earlier_commits(commits.iter().map(|&commit| commit.to_owned()).collect());
+        assert!(of(&[perturb_study::VERSION]).is_empty(), "as if it had not been broken off");
+        assert_eq!(of(&["a", perturb_study::VERSION, "b"]), ["a", "b"]);
+        assert_eq!(of(&[]), [UNKNOWN], "a checkpoint of a program that did not say");
+    }
+
+    #[test]
+    fn a_training_that_cannot_be_read_now_is_not_begun_again() {
+        let directory = tempfile::tempdir().unwrap();
+        let training = directory.path().join("training");
+        assert!(earlier(&training).unwrap().is_none(), "nothing there");
+        let checkpoint = training.join("checkpoint");
+        std::fs::create_dir_all(&checkpoint).unwrap();
+        assert!(earlier(&training).unwrap().is_none(), "broken off before the first checkpoint");
+        std::fs::write(checkpoint.join("checkpoint.json"), "{").unwrap();
+        assert!(earlier(&training).unwrap().is_none(), "damaged");
+        let lock = std::fs::File::open(&training).unwrap();
+        lock.try_lock().unwrap();
+        let Err(error) = earlier(&training) else { panic!("it is locked") };
+        assert!(error.to_string().contains("another process trains in"), "{error:#}");
+    }
+
+    #[test]
+    fn a_lost_server_is_told_from_a_failure() {
+        let address: crate::client::Address = "unix:/x".parse().unwrap();
+        let lost = || ClientError::Lost {
+            address: address.clone(),
+            request: "a step",
+            code: tonic::Code::Unavailable,
+            reason: "gone".into(),
+        };
+        let refused_with =
+            |code| ClientError::Refused { address: address.clone(), request: "open", code, message: "no".into() };
+        let refused = || refused_with(tonic::Code::NotFound);
+        assert!(lost_server(&anyhow::Error::new(refused_with(tonic::Code::ResourceExhausted))), "the server is full");
+        assert!(lost_server(&anyhow::Error::new(lost())));
+        assert!(lost_server(&anyhow::Error::new(CollectError::Client(lost())).context("training failed")));
+        assert!(lost_server(&anyhow::Error::new(TestError::Client(lost())).context("testing")));
+        let environment = "Hopper".to_owned();
+        let disagreement = ClientError::Disagreement { first: address.clone(), other: address.clone(), environment };
+        assert!(lost_server(&anyhow::Error::new(disagreement)), "servers of two versions");
+        assert!(!lost_server(&anyhow::Error::new(refused())));
+        assert!(!lost_server(&anyhow::Error::new(CollectError::Client(refused())).context("training")));
+        assert!(!lost_server(&anyhow::anyhow!("NaN")));
+    }
+}

@@ -1,8 +1,0 @@
-//! The program `perturb`.
-#![forbid(unsafe_code)]
-
-use std::process::ExitCode;
-
-fn main() -> ExitCode {
-    perturb_learner::cli::main()
-}

@@ -1,0 +1,229 @@
+//! What a plan costs, from short measurements.
+//!
+//! A step costs what its environment costs plus what its method costs. So each environment is measured with one
+//! method, and each method in one environment; the other pairs follow.
+
+use std::collections::HashMap;
+
+use super::plan::{Cell, Method, Plan, distinct};
+use crate::settings::{TrainConfig, WrapperSettings};
+
+/// Seconds that a step of one environment takes, with all that belongs to it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Speed {
+    /// In training.
+    pub training: f64,
+    /// In testing: without the updates.
+    pub testing: f64,
+}
+
+/// A training that was measured.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Measurement {
+    /// Its environment.
+    pub environment: String,
+    /// What learned.
+    pub method: Method,
+    /// How fast it was.
+    pub speed: Speed,
+}
+
+/// The most that cells can ask for: that every episode goes on to the step limit.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Work {
+    /// Steps of trainings.
+    pub training_steps: f64,
+    /// Steps of tests.
+    pub testing_steps: f64,
+}
+
+/// What a plan costs at most, on one core.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Estimate {
+    /// Steps.
+    pub work: Work,
+    /// Seconds of trainings.
+    pub training_seconds: f64,
+    /// Seconds of tests.
+    pub testing_seconds: f64,
+}
+
+/// The trainings to measure: of each environment with its first method, and of each method in its first environment,
+/// the one in the middle of the grid.
+pub fn representatives(plan: &Plan) -> Vec<&Cell> {
+    let pairs = distinct(plan.cells.iter().map(pair));
+    let mut chosen: Vec<(&str, Method)> = Vec::new();
+    for pair in pairs {
+        if chosen.iter().all(|known| known.0 != pair.0) || chosen.iter().all(|known| known.1 != pair.1) {
+            chosen.push(pair);
+        }
+    }
+    let middle = |wanted: &(&str, Method)| {
+        let cells: Vec<&Cell> = plan.cells.iter().filter(|cell| cell.run == 1 && pair(cell) == *wanted).collect();
+        cells.get(cells.len() / 2).copied()
+    };
+    chosen.iter().filter_map(middle).collect()
+}
+
+fn pair(cell: &Cell) -> (&str, Method) {
+    (&cell.config.common.environment, cell.method())
+}
+
+/// What `plan` costs at most, given measurements of its [`representatives`] and the step limit of each environment.
+pub fn estimate(plan: &Plan, measurements: &[Measurement], step_limit: impl Fn(&str) -> u32) -> Estimate {
+    cell_estimates(plan, measurements, step_limit).fold(Estimate::default(), |sum, cell| Estimate {
+        work: Work {
+            training_steps: sum.work.training_steps + cell.work.training_steps,
+            testing_steps: sum.work.testing_steps + cell.work.testing_steps,
+        },
+        training_seconds: sum.training_seconds + cell.training_seconds,
+        testing_seconds: sum.testing_seconds + cell.testing_seconds,
+    })
+}
+
+/// The seconds that each cell of `plan` takes at most, in its order; otherwise as [`estimate`].
+pub fn cell_seconds(plan: &Plan, measurements: &[Measurement], step_limit: impl Fn(&str) -> u32) -> Vec<f64> {
+    let estimates = cell_estimates(plan, measurements, step_limit);
+    estimates.map(|cell| cell.training_seconds + cell.testing_seconds).collect()
+}
+
+fn cell_estimates(
+    plan: &Plan,
+    measurements: &[Measurement],
+    step_limit: impl Fn(&str) -> u32,
+) -> impl Iterator<Item = Estimate> {
+    let mut speeds: HashMap<(&str, Method), Speed> = HashMap::new();
+    plan.cells.iter().map(move |cell| {
+        let pair = pair(cell);
+        let speed = *speeds.entry(pair.clone()).or_insert_with(|| speed_of(&pair, measurements));
+        let limit = f64::from(step_limit(pair.0));
+        let work = Work {
+            training_steps: generated_episodes(&cell.config) * limit,
+            testing_steps: (cell.tests.episodes * u64::from(cell.config.settings.episodes_per_trial())) as f64
+                * cell.tests.versions.len() as f64
+                * limit,
+        };
+        Estimate {
+            work,
+            training_seconds: work.training_steps * speed.training,
+            testing_seconds: work.testing_steps * speed.testing,
+        }
+    })
+}
+
+/// How many episodes a training has: more than its budget if it learns from the worst of them only.
+fn generated_episodes(config: &TrainConfig) -> f64 {
+    let budget = config.common.episodes as f64;
+    let WrapperSettings::Epopt(epopt) = &config.settings.wrapper else { return budget };
+    let full = (epopt.full_iterations as f64 * epopt.episodes_per_iteration as f64).min(budget);
+    full + (budget - full) / epopt.epsilon
+}
+
+/// A pair's speed: measured, or the method's in another environment plus what this environment takes more.
+fn speed_of((environment, method): &(&str, Method), measurements: &[Measurement]) -> Speed {
+    let find = |environment: &str, method: &Method| {
+        measurements.iter().find(|known| known.environment == environment && known.method == *method)
+    };
+    if let Some(known) = find(environment, method) {
+        return known.speed;
+    }
+    let nothing = Speed { training: 0.0, testing: 0.0 };
+    let of_environment = measurements.iter().find(|known| known.environment == *environment);
+    let of_method = measurements.iter().find(|known| known.method == *method);
+    let (Some(of_environment), Some(of_method)) = (of_environment, of_method) else {
+        return of_environment.or(of_method).map_or(nothing, |known| known.speed);
+    };
+    let common = find(&of_method.environment, &of_environment.method).map_or(nothing, |known| known.speed);
+    let combine = |of: fn(&Speed) -> f64| {
+        let (environment, method) = (of(&of_environment.speed), of(&of_method.speed));
+        (environment + method - of(&common)).max(environment).max(method)
+    };
+    Speed { training: combine(|speed| speed.training), testing: combine(|speed| speed.testing) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn plan() -> Plan {
+        let text = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 3\ntest_episodes = 10
+            settings = { episodes = 100 }\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff', 'rc']
+            grid = { n_steps = [5, 10, 15] }\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+        Plan::parse("test", text.into()).unwrap()
+    }
+
+    fn measured(environment: &str, method: &Method, training: f64) -> Measurement {
+        let speed = Speed { training, testing: training / 4.0 };
+        Measurement { environment: environment.into(), method: method.clone(), speed }
+    }
+
+    #[test]
+    fn each_environment_and_each_method_is_measured_once() {
+        let plan = plan();
+        let chosen: Vec<String> = representatives(&plan)
+            .iter()
+            .map(|cell| format!("{} {}", cell.config.common.environment, cell.method()))
+            .collect();
+        assert_eq!(chosen, ["CartPole a2c ff", "CartPole a2c rc", "CartPole ppo ff", "Hopper a2c ff"]);
+        assert_eq!(
+            representatives(&plan)[0].config.table()["n_steps"].as_integer(),
+            Some(10),
+            "the middle of the grid"
+        );
+    }
+
+    #[test]
+    fn costs_of_environments_and_methods_add_up() {
+        let plan = plan();
+        let methods = plan.methods();
+        let [a2c, rc, ppo] = &methods[..] else { panic!() };
+        let measurements = [
+            measured("CartPole", a2c, 3.0),
+            measured("CartPole", rc, 11.0),
+            measured("CartPole", ppo, 4.0),
+            measured("Hopper", a2c, 8.0),
+        ];
+        let of = |environment: &str, method: &Method| speed_of(&(environment, method.clone()), &measurements).training;
+        assert_eq!((of("Hopper", a2c), of("Hopper", rc), of("Hopper", ppo)), (8.0, 16.0, 9.0));
+        let total = estimate(&plan, &measurements, |environment| if environment == "Hopper" { 1000 } else { 200 });
+        // 3 runs of 3, 3 and 1 configurations; 100 training episodes each.
+        let steps = 3.0 * 7.0 * 100.0 * (200.0 + 1000.0);
+        assert_eq!(total.work, Work { training_steps: steps, testing_steps: steps * 0.3 });
+        let cart_pole = 3.0 * 100.0 * 200.0 * (3.0 * 3.0 + 3.0 * 11.0 + 4.0);
+        let hopper = 3.0 * 100.0 * 1000.0 * (3.0 * 8.0 + 3.0 * 16.0 + 9.0);
+        assert!((total.training_seconds - cart_pole - hopper).abs() < 1e-6 * total.training_seconds);
+        assert!((total.testing_seconds - total.training_seconds * 0.3 / 4.0).abs() < 1e-6 * total.testing_seconds);
+        let cells = cell_seconds(&plan, &measurements, |environment| if environment == "Hopper" { 1000 } else { 200 });
+        // The first is CartPole with A2C: 3 s a step, and a quarter of that in a test.
+        assert!((cells[0] - 100.0 * 200.0 * (3.0 + 0.3 * 3.0 / 4.0)).abs() < 1e-6 * cells[0], "{}", cells[0]);
+        let sum: f64 = cells.iter().sum();
+        assert!(cells.len() == 2 * 21 && (sum - total.training_seconds - total.testing_seconds).abs() < 1e-6 * sum);
+    }
+
+    #[test]
+    fn episodes_that_are_not_learned_from_and_episodes_of_a_trial_cost_too() {
+        let text = "environments = ['CartPole']\nversions = ['D']\ntest_versions = ['R']\ntest_episodes = 10
+            settings = { episodes = 15000 }
+            [[algorithm]]\nname = 'epopt-ppo'\narchitectures = ['ff']\nsettings = { epsilon = 0.1 }
+            [[algorithm]]\nname = 'rl2-ppo'\narchitectures = ['rc']\nsettings = { episodes_per_trial = 5 }";
+        let plan = Plan::parse("test", text.into()).unwrap();
+        let work = |cell: &Cell| {
+            let alone = Plan { cells: vec![cell.clone()], ..plan.clone() };
+            estimate(&alone, &[], |_| 1).work
+        };
+        // 100 iterations of 100 episodes, and a tenth of each that follows.
+        assert_eq!(work(&plan.cells[0]), Work { training_steps: 10_000.0 + 50_000.0, testing_steps: 10.0 });
+        assert_eq!(work(&plan.cells[1]), Work { training_steps: 15_000.0, testing_steps: 50.0 });
+    }
+
+    #[test]
+    fn a_slower_environment_is_never_estimated_faster() {
+        let plan = plan();
+        let methods = plan.methods();
+        let [a2c, rc, ppo] = &methods[..] else { panic!() };
+        let measurements =
+            [measured("CartPole", a2c, 3.0), measured("CartPole", rc, 2.0), measured("Hopper", a2c, 8.0)];
+        assert_eq!(speed_of(&("Hopper", rc.clone()), &measurements).training, 8.0);
+        assert_eq!(speed_of(&("Hopper", ppo.clone()), &measurements).training, 8.0, "not measured at all");
+    }
+}

@@ -1,0 +1,517 @@
+//! Where an experiment is kept.
+//!
+//! ```text
+//! DIR/plan.toml              the experiment file
+//! DIR/cells/ID/result.json   appears complete, when all is done
+//! DIR/cells/ID/failure.json  why it failed
+//! DIR/cells/ID/timing.json   how long it took; everything that differs from run to run
+//! DIR/cells/ID/training/     what `perturb train --out` writes
+//! DIR/cells/ID/log.txt       what a worker process said
+//! DIR/cells/ID/lock          locked while someone works on the cell
+//! DIR/heatmaps/              what `perturb heatmap DIR` writes
+//! DIR/report/                what `perturb report` writes
+//! ```
+//!
+//! Locks are advisory locks of the operating system: they end with the process that holds them, however it ends.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File, TryLockError};
+use std::io::{ErrorKind, Write};
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+
+use super::plan::{Cell, Method};
+use crate::results::Counters;
+use crate::{TestResult, Version};
+
+/// Of `result.json`; raised when older programs could misread it.
+const FORMAT_VERSION: u32 = 1;
+
+/// The folder of an experiment.
+#[derive(Clone, Debug)]
+pub struct Folder {
+    path: PathBuf,
+}
+
+/// The folder of a cell.
+#[derive(Clone, Debug)]
+pub struct CellFolder {
+    path: PathBuf,
+}
+
+/// Whoever has it may work on the cell.
+#[derive(Debug)]
+pub struct CellLock {
+    _file: File,
+}
+
+/// Tells one record of a failure from the next, even if both say the same.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FailureMark {
+    /// The file's number, which another file may get when this one is deleted …
+    inode: u64,
+    /// … and when it was written, s and ns.
+    written: (i64, i64),
+}
+
+/// How far a cell is.
+#[derive(Clone, Debug, PartialEq)]
+pub enum CellState {
+    /// There is a result.
+    Done(Box<CellResult>),
+    /// It failed.
+    Failed(Failure),
+    /// Neither.
+    Missing,
+}
+
+/// `result.json`: depends on the plan and the program alone.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CellResult {
+    /// Of this layout.
+    pub format_version: u32,
+    /// The cell.
+    pub id: String,
+    /// What was trained.
+    pub training: Training,
+    /// Success, return and length, by the tested version.
+    pub results: BTreeMap<Version, TestResult>,
+    /// The program's version and the commit that it was built from.
+    pub commit: String,
+    /// Other programs that did a part of the training before it was broken off, in order.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub earlier_commits: Vec<String>,
+    /// What gives the same numbers again without the plan.
+    pub command: String,
+}
+
+/// What was trained.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Training {
+    /// The environment.
+    pub environment: String,
+    /// Its revision.
+    pub environment_revision: u32,
+    /// SHA-256 of its model; empty without one.
+    pub model_hash: String,
+    /// The training version.
+    pub version: Version,
+    /// What learned.
+    #[serde(flatten)]
+    pub method: Method,
+    /// Names the settings.
+    pub configuration: String,
+    /// The run, from 1.
+    pub run: u32,
+    /// Of the training and of the tests.
+    pub seed: u64,
+    /// How long it became.
+    pub counters: Counters,
+    /// All settings, as in `config.toml`.
+    pub settings: toml::Table,
+}
+
+/// `failure.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Failure {
+    /// The cell.
+    pub id: String,
+    /// The error with its causes.
+    pub reason: String,
+    /// The program's version and the commit that it was built from.
+    pub commit: String,
+}
+
+/// `timing.json`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Timing {
+    /// Seconds from the beginning to the result, without what an attempt took that was broken off.
+    pub seconds: f64,
+}
+
+/// Why an experiment's folder cannot be read or written.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum FolderError {
+    /// The operating system refused a file.
+    #[error("cannot {action} {}: {source}", path.display())]
+    Io {
+        /// What was tried.
+        action: &'static str,
+        /// On what.
+        path: PathBuf,
+        /// Its answer.
+        source: std::io::Error,
+    },
+    /// A file is damaged, or of a program that is too different.
+    #[error("{} is not understood: {reason}; delete it to have the cell done again", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// There is no experiment.
+    #[error("{} holds no experiment: expected plan.toml in it; give the --out of `perturb run`", path.display())]
+    NoPlan {
+        /// What was given.
+        path: PathBuf,
+    },
+}
+
+type Result<T> = std::result::Result<T, FolderError>;
+
+impl Folder {
+    /// The folder at `path`, which need not exist.
+    pub fn new(path: &Path) -> Self {
+        Self { path: path.to_owned() }
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The folder of a cell.
+    pub fn cell(&self, id: &str) -> CellFolder {
+        CellFolder { path: self.path.join("cells").join(id) }
+    }
+
+    /// The copy of the experiment file.
+    pub fn plan_path(&self) -> PathBuf {
+        self.path.join("plan.toml")
+    }
+
+    /// The copy of the experiment file, which must be there.
+    ///
+    /// # Errors
+    /// [`FolderError::NoPlan`].
+    pub fn require_plan(&self) -> Result<PathBuf> {
+        let plan = self.plan_path();
+        if plan.is_file() { Ok(plan) } else { Err(FolderError::NoPlan { path: self.path.clone() }) }
+    }
+
+    /// Keeps a copy of the experiment file; says whether there was another one.
+    ///
+    /// # Errors
+    /// [`FolderError::Io`].
+    pub fn keep_plan(&self, text: &str) -> Result<bool> {
+        let path = self.plan_path();
+        let earlier = match fs::read_to_string(&path) {
+            Ok(earlier) => Some(earlier),
+            Err(error) if error.kind() == ErrorKind::NotFound => None,
+            Err(source) => return Err(FolderError::Io { action: "read", path, source }),
+        };
+        if earlier.as_deref() == Some(text) {
+            return Ok(false);
+        }
+        write_atomically(&path, text.as_bytes())?;
+        Ok(earlier.is_some())
+    }
+
+    /// How far `cell` is.
+    ///
+    /// # Errors
+    /// [`FolderError`] if a file is there that cannot be read.
+    pub fn state(&self, cell: &Cell) -> Result<CellState> {
+        self.cell(&cell.id).state()
+    }
+}
+
+impl CellFolder {
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// What `perturb train --out` writes.
+    pub fn training(&self) -> PathBuf {
+        self.path.join("training")
+    }
+
+    /// What a worker process said.
+    pub fn log(&self) -> PathBuf {
+        self.path.join("log.txt")
+    }
+
+    /// How far the cell is.
+    ///
+    /// # Errors
+    /// [`FolderError`] if a file is there that cannot be read.
+    pub fn state(&self) -> Result<CellState> {
+        if let Some(result) = read::<CellResult>(&self.path.join("result.json"))? {
+            if result.format_version != FORMAT_VERSION {
+                let reason = format!("it has format {}, this program reads {FORMAT_VERSION}", result.format_version);
+                return Err(FolderError::Damaged { path: self.path.join("result.json"), reason });
+            }
+            return Ok(CellState::Done(Box::new(result)));
+        }
+        Ok(read(&self.path.join("failure.json"))?.map_or(CellState::Missing, CellState::Failed))
+    }
+
+    /// Whether there is a result or, unless `failed_too` is off, a failure. Reads neither.
+    pub fn is_settled(&self, failed_too: bool) -> bool {
+        self.path.join("result.json").exists() || (failed_too && self.path.join("failure.json").exists())
+    }
+
+    /// Which record of a failure there is; `None` if there is none.
+    pub fn failure_mark(&self) -> Option<FailureMark> {
+        let file = fs::metadata(self.path.join("failure.json")).ok()?;
+        Some(FailureMark { inode: file.ino(), written: (file.mtime(), file.mtime_nsec()) })
+    }
+
+    /// Tries to become the one who works on the cell; `None` while somebody else does.
+    ///
+    /// # Errors
+    /// [`FolderError::Io`].
+    pub fn try_lock(&self) -> Result<Option<CellLock>> {
+        fs::create_dir_all(&self.path).map_err(io("create", &self.path))?;
+        let path = self.path.join("lock");
+        let file = File::options().create(true).truncate(false).write(true).open(&path).map_err(io("open", &path))?;
+        match file.try_lock() {
+            Ok(()) => Ok(Some(CellLock { _file: file })),
+            Err(TryLockError::WouldBlock) => Ok(None),
+            Err(TryLockError::Error(source)) => Err(FolderError::Io { action: "lock", path, source }),
+        }
+    }
+
+    /// Makes the result appear, complete.
+    ///
+    /// # Errors
+    /// [`FolderError::Io`].
+    pub fn write_result(&self, result: &CellResult) -> Result<()> {
+        self.write("result.json", result)
+    }
+
+    /// Records a failure.
+    ///
+    /// # Errors
+    /// [`FolderError::Io`].
+    pub fn write_failure(&self, failure: &Failure) -> Result<()> {
+        self.write("failure.json", failure)
+    }
+
+    /// Forgets a failure.
+    ///
+    /// # Errors
+    /// [`FolderError::Io`].
+    pub fn forget_failure(&self) -> Result<()> {
+        let path = self.path.join("failure.json");
+        match fs::remove_file(&path) {
+            Err(error) if error.kind() != ErrorKind::NotFound => Err(io("delete", &path)(error)),
+            _ => Ok(()),
+        }
+    }
+
+    /// Records how long the cell took.
+    ///
+    /// # Errors
+    /// [`FolderError::Io`].
+    pub fn write_timing(&self, timing: &Timing) -> Result<()> {
+        self.write("timing.json", timing)
+    }
+
+    /// How long the cell took; `None` if that is not known.
+    pub fn timing(&self) -> Option<Timing> {
+        read(&self.path.join("timing.json")).ok().flatten()
+    }
+
+    fn write(&self, name: &str, document: &impl Serialize) -> Result<()> {
+        let path = self.path.join(name);
+        let mut text = serde_json::to_vec_pretty(document)
+            .map_err(|error| FolderError::Damaged { path: path.clone(), reason: error.to_string() })?;
+        text.push(b'\n');
+        write_atomically(&path, &text)
+    }
+}
+
+impl std::fmt::Display for FailureMark {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { inode, written: (seconds, nanoseconds) } = self;
+        write!(f, "{inode}.{seconds}.{nanoseconds}")
+    }
+}
+
+impl std::str::FromStr for FailureMark {
+    type Err = String;
+
+    /// What `Display` writes.
+    fn from_str(text: &str) -> std::result::Result<Self, String> {
+        let wrong = || format!("expected three whole numbers with points between them, got `{text}`");
+        let mut parts = text.split('.');
+        let mut next = || parts.next().ok_or_else(wrong);
+        let (inode, seconds, nanoseconds) = (next()?, next()?, next()?);
+        let number = |text: &str| text.parse().map_err(|_| wrong());
+        Ok(Self { inode: inode.parse().map_err(|_| wrong())?, written: (number(seconds)?, number(nanoseconds)?) })
+    }
+}
+
+impl CellResult {
+    /// The layout that this program writes.
+    pub const FORMAT_VERSION: u32 = FORMAT_VERSION;
+
+    /// All programs that it comes from, in order.
+    pub fn commits(&self) -> impl Iterator<Item = &str> {
+        self.earlier_commits.iter().chain([&self.commit]).map(String::as_str)
+    }
+}
+
+/// A file's content; `None` if it is not there.
+pub(super) fn read_bytes(path: &Path) -> Result<Option<Vec<u8>>> {
+    match fs::read(path) {
+        Ok(content) => Ok(Some(content)),
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(io("read", path)(error)),
+    }
+}
+
+/// A JSON file; `None` if it is not there.
+fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
+    let Some(text) = read_bytes(path)? else { return Ok(None) };
+    let damaged = |error: serde_json::Error| FolderError::Damaged { path: path.to_owned(), reason: error.to_string() };
+    serde_json::from_slice(&text).map(Some).map_err(damaged)
+}
+
+/// Writes a file in one piece: it appears complete, and on the disk, or not at all. Folders are created.
+///
+/// # Errors
+/// [`FolderError::Io`].
+pub fn write_atomically(path: &Path, content: &[u8]) -> Result<()> {
+    let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    fs::create_dir_all(directory).map_err(io("create", directory))?;
+    // As readable as any other file that is created here; temporary files are otherwise their owner's alone.
+    let mode = <fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666);
+    let mut builder = tempfile::Builder::new();
+    let mut file =
+        builder.prefix(".tmp-").permissions(mode).tempfile_in(directory).map_err(io("write in", directory))?;
+    file.write_all(content).and_then(|()| file.as_file().sync_all()).map_err(io("write", path))?;
+    file.persist(path).map_err(|error| io("rename a file to", path)(error.error))?;
+    File::open(directory).and_then(|directory| directory.sync_all()).map_err(io("sync", directory))
+}
+
+/// Names the file in the operating system's error.
+pub fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> FolderError {
+    let path = path.to_owned();
+    move |source| FolderError::Io { action, path, source }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn result() -> CellResult {
+        let test = TestResult {
+            episodes: 10,
+            success_percent: 100.0 / 3.0,
+            success_percent_95: [0.1, 0.2],
+            mean_return: -1.0 / 3.0,
+            mean_length: 2.0,
+        };
+        CellResult {
+            format_version: FORMAT_VERSION,
+            id: "a".into(),
+            training: Training {
+                environment: "CartPole".into(),
+                environment_revision: 1,
+                model_hash: String::new(),
+                version: Version::R,
+                method: Method { algorithm: "ppo".into(), architecture: "ff".into(), episodes_per_trial: None },
+                configuration: "00000000".into(),
+                run: 2,
+                seed: 8,
+                counters: Counters { iterations: 1, timesteps: 2, episodes: 3, ..Counters::default() },
+                settings: "learning_rate = 3e-4".parse().unwrap(),
+            },
+            results: BTreeMap::from([(Version::D, test)]),
+            commit: "x".into(),
+            earlier_commits: Vec::new(),
+            command: "y".into(),
+        }
+    }
+
+    #[test]
+    fn a_result_reads_back_and_beats_a_failure() {
+        let directory = tempfile::tempdir().unwrap();
+        let cell = Folder::new(directory.path()).cell("a");
+        assert_eq!(cell.state().unwrap(), CellState::Missing);
+        let failure = Failure { id: "a".into(), reason: "NaN".into(), commit: "x".into() };
+        cell.write_failure(&failure).unwrap();
+        assert_eq!(cell.state().unwrap(), CellState::Failed(failure));
+        assert!(cell.is_settled(true) && !cell.is_settled(false));
+        cell.write_result(&result()).unwrap();
+        assert_eq!(cell.state().unwrap(), CellState::Done(Box::new(result())));
+        cell.forget_failure().unwrap();
+        cell.forget_failure().unwrap();
+        let names: Vec<_> = fs::read_dir(cell.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+        assert_eq!(names, ["result.json"], "nothing temporary stays");
+    }
+
+    #[test]
+    fn a_failure_recorded_again_is_another_one() {
+        let directory = tempfile::tempdir().unwrap();
+        let cell = Folder::new(directory.path()).cell("a");
+        let failure = Failure { id: "a".into(), reason: "NaN".into(), commit: "x".into() };
+        assert_eq!(cell.failure_mark(), None);
+        cell.write_failure(&failure).unwrap();
+        let first = cell.failure_mark().unwrap();
+        assert_eq!(cell.failure_mark(), Some(first));
+        assert_eq!(first.to_string().parse(), Ok(first));
+        cell.write_failure(&failure).unwrap();
+        assert_ne!(cell.failure_mark(), Some(first));
+        for wrong in ["", "1.2", "1.2.x", "-1.2.3"] {
+            assert!(wrong.parse::<FailureMark>().unwrap_err().contains(wrong));
+        }
+    }
+
+    #[test]
+    fn a_cell_is_locked_by_one_at_a_time() {
+        let directory = tempfile::tempdir().unwrap();
+        let cell = Folder::new(directory.path()).cell("a");
+        let lock = cell.try_lock().unwrap();
+        assert!(lock.is_some());
+        assert!(cell.try_lock().unwrap().is_none());
+        drop(lock);
+        assert!(cell.try_lock().unwrap().is_some());
+    }
+
+    #[test]
+    fn a_damaged_result_is_named_not_taken_for_missing() {
+        let directory = tempfile::tempdir().unwrap();
+        let cell = Folder::new(directory.path()).cell("a");
+        for (text, part) in [("{", "EOF"), ("{}", "missing field"), ("[]", "invalid")] {
+            write_atomically(&cell.path().join("result.json"), text.as_bytes()).unwrap();
+            let message = cell.state().unwrap_err().to_string();
+            assert!(message.contains("a/result.json is not understood") && message.contains(part), "{message}");
+        }
+        cell.write_result(&CellResult { format_version: 9, ..result() }).unwrap();
+        assert!(cell.state().unwrap_err().to_string().contains("it has format 9, this program reads 1"));
+    }
+
+    #[test]
+    fn a_result_is_as_readable_as_other_files() {
+        use std::os::unix::fs::PermissionsExt;
+        let directory = tempfile::tempdir().unwrap();
+        let [plain, whole] = ["plain", "whole"].map(|name| directory.path().join(name));
+        fs::write(&plain, "x").unwrap();
+        write_atomically(&whole, b"x").unwrap();
+        let [plain, whole] = [plain, whole].map(|path| fs::metadata(path).unwrap().permissions().mode());
+        assert_eq!(plain, whole);
+    }
+
+    #[test]
+    fn the_plan_is_kept_and_its_change_noticed() {
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(&directory.path().join("new"));
+        assert!(folder.require_plan().unwrap_err().to_string().contains("holds no experiment"));
+        assert!(!folder.keep_plan("one").unwrap());
+        assert!(!folder.keep_plan("one").unwrap());
+        assert!(folder.keep_plan("two").unwrap());
+        assert_eq!(fs::read_to_string(folder.require_plan().unwrap()).unwrap(), "two");
+    }
+}

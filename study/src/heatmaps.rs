@@ -1,0 +1,296 @@
+//! The heatmaps of an experiment: one for each training that was selected in the first run.
+//!
+//! ```text
+//! DIR/heatmaps/ID.csv .svg .png  of the cell ID
+//! DIR/heatmaps/ID.json           what they show; written last
+//! ```
+//!
+//! The record holds checksums of the pictures and of the cell's result. Pictures of two records, or of a result that
+//! has been replaced since, are therefore never taken for current ones.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use super::folder::{Folder, FolderError, read_bytes, write_atomically};
+use super::heatmap::{Heatmap, HeatmapOptions, default_axes, heatmap_csv};
+use super::plan::{Cell, Method};
+use super::plot::{self, PlotError};
+use super::selection::{Group, Results};
+use crate::Version;
+
+/// Of the records; raised when older programs could misread them.
+const FORMAT_VERSION: u32 = 1;
+
+/// A heatmap that an experiment has room for.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HeatmapPlace<'a> {
+    /// The environment.
+    pub environment: &'a str,
+    /// What learned.
+    pub method: &'a Method,
+    /// Where it was trained.
+    pub version: Version,
+    /// The cell that was selected in the first run; `None` if none has a result.
+    pub cell: Option<&'a Cell>,
+}
+
+/// `ID.json`: what a heatmap shows. It depends on nothing but the results, the program and the settings.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HeatmapRecord {
+    /// Of this layout.
+    format_version: u32,
+    /// The cell.
+    pub cell: String,
+    /// CRC-32C of its `result.json`.
+    result: String,
+    /// What the checkpoint's weights are called, see the learner's `Checkpoint::id`.
+    pub checkpoint: String,
+    /// Of the training.
+    pub train_seed: u64,
+    /// How it was tested.
+    #[serde(flatten)]
+    pub options: HeatmapOptions,
+    /// The program's version and the commit that it was built from.
+    pub commit: String,
+    /// CRC-32C of the files, by their endings.
+    files: BTreeMap<String, String>,
+}
+
+/// A heatmap that belongs to the current results.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StoredHeatmap {
+    /// What it shows.
+    pub record: HeatmapRecord,
+    /// The picture.
+    pub png: Vec<u8>,
+}
+
+/// Why there is no heatmap at a place.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum NoHeatmap {
+    /// The training has no result yet.
+    NoResult,
+    /// It was not made, or not completely.
+    NotMade,
+    /// It shows a result that has been replaced.
+    Outdated,
+    /// It is not said which parameters to show, see [`default_axes`].
+    NoAxes,
+}
+
+/// All heatmaps that a plan has room for, in the order of `groups` and of the versions.
+pub fn heatmap_places<'a>(results: &Results<'a>, groups: &'a [Group]) -> Vec<HeatmapPlace<'a>> {
+    let plan = results.plan;
+    let mut places = Vec::new();
+    for group in groups {
+        let of_group =
+            |cell: &&Cell| cell.config.common.environment == group.environment && cell.method() == group.method;
+        let first = group.runs.values().next();
+        for version in Version::ALL {
+            if plan.cells.iter().filter(of_group).any(|cell| cell.config.common.version == version) {
+                let cell = first.and_then(|run| run.cells[version as usize]).map(|index| &plan.cells[index]);
+                places.push(HeatmapPlace { environment: &group.environment, method: &group.method, version, cell });
+            }
+        }
+    }
+    places
+}
+
+impl HeatmapPlace<'_> {
+    /// The heatmap that is there, or why there is none.
+    ///
+    /// # Errors
+    /// [`FolderError`] if a file is there that cannot be read.
+    pub fn read(&self, folder: &Folder) -> Result<Result<StoredHeatmap, NoHeatmap>, FolderError> {
+        let Some(cell) = self.cell else { return Ok(Err(NoHeatmap::NoResult)) };
+        if default_axes(self.environment).is_none() {
+            return Ok(Err(NoHeatmap::NoAxes));
+        }
+        let Some(text) = read_bytes(&file(folder, &cell.id, "json"))? else { return Ok(Err(NoHeatmap::NotMade)) };
+        // One that is not understood is made again like one that is not there.
+        let Ok(record) = serde_json::from_slice::<HeatmapRecord>(&text) else { return Ok(Err(NoHeatmap::NotMade)) };
+        if record.format_version != FORMAT_VERSION || record.cell != cell.id {
+            return Ok(Err(NoHeatmap::NotMade));
+        }
+        if Some(&record.result) != result_checksum(folder, cell)?.as_ref() {
+            return Ok(Err(NoHeatmap::Outdated));
+        }
+        let mut png = Vec::new();
+        for (ending, expected) in &record.files {
+            match read_bytes(&file(folder, &cell.id, ending))? {
+                Some(content) if checksum(&content) == *expected => {
+                    if ending == "png" {
+                        png = content;
+                    }
+                }
+                _ => return Ok(Err(NoHeatmap::NotMade)),
+            }
+        }
+        Ok(if png.is_empty() { Err(NoHeatmap::NotMade) } else { Ok(StoredHeatmap { record, png }) })
+    }
+}
+
+impl std::fmt::Display for HeatmapPlace<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}, {} trained on {}", self.environment, self.method, self.version)
+    }
+}
+
+/// Keeps `heatmap` of the policy called `checkpoint` as that of `cell`; gives the path without endings.
+///
+/// # Errors
+/// [`PlotError`]; then there is none.
+pub fn store_heatmap(
+    folder: &Folder,
+    cell: &Cell,
+    checkpoint: String,
+    options: HeatmapOptions,
+    heatmap: &Heatmap,
+) -> Result<PathBuf, PlotError> {
+    let record_path = file(folder, &cell.id, "json");
+    let failed = |error: FolderError| PlotError::file(&record_path, &error);
+    let result = result_checksum(folder, cell).map_err(failed)?;
+    match std::fs::remove_file(&record_path) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            return Err(PlotError::file(&record_path, &error));
+        }
+        _ => {}
+    }
+    let mut files = BTreeMap::new();
+    for (ending, content) in heatmap_files(heatmap)? {
+        let path = file(folder, &cell.id, ending);
+        write_atomically(&path, &content).map_err(|error| PlotError::file(&path, &error))?;
+        files.insert(ending.to_owned(), checksum(&content));
+    }
+    let record = HeatmapRecord {
+        format_version: FORMAT_VERSION,
+        cell: cell.id.clone(),
+        result: result.unwrap_or_default(),
+        checkpoint,
+        train_seed: cell.config.common.seed,
+        options,
+        commit: crate::VERSION.into(),
+        files,
+    };
+    let mut text = serde_json::to_vec_pretty(&record).map_err(|error| PlotError::file(&record_path, &error))?;
+    text.push(b'\n');
+    write_atomically(&record_path, &text).map_err(failed)?;
+    Ok(record_path.with_extension(""))
+}
+
+/// The files of a heatmap with their endings: csv, svg and png.
+///
+/// # Errors
+/// [`PlotError`].
+pub fn heatmap_files(heatmap: &Heatmap) -> Result<[(&'static str, Vec<u8>); 3], PlotError> {
+    let table = heatmap_csv(heatmap).map_err(|error| PlotError::Draw(error.to_string()))?;
+    let picture = plot::draw_heatmap(heatmap);
+    Ok([("csv", table), ("svg", plot::svg(&picture)?.into_bytes()), ("png", plot::png(&picture)?)])
+}
+
+fn file(folder: &Folder, id: &str, ending: &str) -> PathBuf {
+    folder.path().join("heatmaps").join(format!("{id}.{ending}"))
+}
+
+/// Of a cell's result as it is on the disk.
+fn result_checksum(folder: &Folder, cell: &Cell) -> Result<Option<String>, FolderError> {
+    Ok(read_bytes(&folder.cell(&cell.id).path().join("result.json"))?.map(|content| checksum(&content)))
+}
+
+fn checksum(content: &[u8]) -> String {
+    format!("{:08x}", crc32c::crc32c(content))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Axis, CellState, Plan};
+
+    const PLAN: &str = "environments = ['Pendulum', 'Elsewhere']\nversions = ['D', 'E']\nruns = 2
+        [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
+
+    fn heatmap() -> Heatmap {
+        let axis = |name: &str| Axis {
+            name: name.into(),
+            unit: "1".into(),
+            low: 0.0,
+            high: 1.0,
+            random: vec![(0.4, 0.6)],
+            extreme: vec![(0.0, 0.4), (0.6, 1.0)],
+        };
+        Heatmap {
+            environment: "Pendulum".into(),
+            policy: "a2c ff".into(),
+            axes: ["mass", "length"].map(axis),
+            grid: 2,
+            episodes: 1,
+            returns: vec![1.0, 2.0, 3.0, 4.0],
+            success: vec![0.0, 0.0, 50.0, 100.0],
+        }
+    }
+
+    fn options() -> HeatmapOptions {
+        HeatmapOptions { parameters: ["mass", "length"].map(str::to_owned), grid: 2, episodes: 1, seed: 1 }
+    }
+
+    #[test]
+    fn a_heatmap_is_current_only_while_it_and_its_result_are_whole() {
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(directory.path());
+        let cell = &plan.cells[0];
+        let result = folder.cell(&cell.id).path().join("result.json");
+        write_atomically(&result, b"{}").unwrap();
+        let method = cell.method();
+        let place = HeatmapPlace { environment: "Pendulum", method: &method, version: Version::D, cell: Some(cell) };
+        assert_eq!(place.read(&folder).unwrap(), Err(NoHeatmap::NotMade));
+        let nobody = HeatmapPlace { cell: None, ..place.clone() };
+        assert_eq!(nobody.read(&folder).unwrap(), Err(NoHeatmap::NoResult));
+        let elsewhere = HeatmapPlace { environment: "Elsewhere", ..place.clone() };
+        assert_eq!(elsewhere.read(&folder).unwrap(), Err(NoHeatmap::NoAxes));
+
+        let store = || store_heatmap(&folder, cell, "00000001-0a".into(), options(), &heatmap()).unwrap();
+        let path = store();
+        assert_eq!(path, directory.path().join("heatmaps").join(&cell.id));
+        let stored = place.read(&folder).unwrap().unwrap();
+        assert!(stored.png.starts_with(b"\x89PNG"));
+        assert_eq!((&stored.record.cell, &stored.record.options), (&cell.id, &options()));
+
+        for ending in ["png", "svg", "csv", "json"] {
+            let damaged = path.with_extension(ending);
+            let content = std::fs::read(&damaged).unwrap();
+            std::fs::write(&damaged, &content[..content.len() / 2]).unwrap();
+            assert_eq!(place.read(&folder).unwrap(), Err(NoHeatmap::NotMade), "half a {ending}");
+            store();
+            assert_eq!(std::fs::read(&damaged).unwrap(), content, "the same bytes again");
+        }
+        write_atomically(&result, b"{ }").unwrap();
+        assert_eq!(place.read(&folder).unwrap(), Err(NoHeatmap::Outdated));
+        store();
+        assert!(place.read(&folder).unwrap().is_ok());
+        std::fs::remove_file(path.with_extension("svg")).unwrap();
+        assert_eq!(place.read(&folder).unwrap(), Err(NoHeatmap::NotMade));
+        let left: Vec<_> = std::fs::read_dir(directory.path().join("heatmaps")).unwrap().collect();
+        assert_eq!(left.len(), 3, "nothing temporary");
+    }
+
+    #[test]
+    fn there_is_room_for_what_the_plan_trains_and_the_first_run_selects() {
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        let results = Results { plan: &plan, states: vec![CellState::Missing; plan.cells.len()] };
+        let mut groups = results.select();
+        let index = |run: u32| plan.cells.iter().position(|cell| cell.run == run).unwrap();
+        for run in [1, 2] {
+            groups[0].runs.get_mut(&run).unwrap().cells[0] = Some(index(run));
+        }
+        let places = heatmap_places(&results, &groups);
+        let shown: Vec<String> = places.iter().map(ToString::to_string).collect();
+        let expected = ["Pendulum, a2c ff trained on D", "Pendulum, a2c ff trained on E"];
+        assert_eq!((shown[..2] == expected, shown.len()), (true, 4), "none on R");
+        let cells: Vec<_> = places.iter().map(|place| place.cell.map(|cell| cell.run)).collect();
+        assert_eq!(cells, [Some(1), None, None, None]);
+    }
+}

@@ -1,0 +1,50 @@
+//! perturb's studies: what is asked for, and what came of it, as plain data. Without libtorch.
+//!
+//! - [`settings`]: of a training.
+//! - [`Plan`] expands an experiment file to cells, [`Folder`] is where they are kept, [`run()`] has worker processes do
+//!   them, [`slurm`] a cluster.
+//! - [`Results`] reads them back and selects; [`paper`] is what was published.
+//! - [`report`] makes tables of them, [`plot`] pictures.
+#![forbid(unsafe_code)]
+
+mod cost;
+mod curves;
+mod folder;
+mod heatmap;
+mod heatmaps;
+pub mod interrupt;
+mod means;
+pub mod paper;
+mod plan;
+pub mod plot;
+pub mod random;
+pub mod report;
+mod results;
+mod run;
+mod scenarios;
+mod selection;
+pub mod settings;
+pub mod slurm;
+mod statistics;
+
+pub use cost::{Estimate, Measurement, Speed, Work, cell_seconds, estimate, representatives};
+pub use curves::{Curve, EnvironmentCurves, Point, curves_csv, read_curves};
+pub use folder::{
+    CellFolder, CellLock, CellResult, CellState, Failure, FailureMark, Folder, FolderError, Timing, Training, io,
+    write_atomically,
+};
+pub use heatmap::{Axis, Heatmap, HeatmapOptions, MOST_POINTS, default_axes, heatmap_csv};
+pub use heatmaps::{
+    HeatmapPlace, HeatmapRecord, NoHeatmap, StoredHeatmap, heatmap_files, heatmap_places, store_heatmap,
+};
+pub use means::{geometric_mean, mean, wilson};
+pub use plan::{Cell, Counts, Method, Plan, PlanError, Tests};
+pub use results::{Counters, TestResult};
+pub use run::{Attempt, BUSY, NO_SERVER, ON, RunEnd, RunError, RunOptions, RunStatus, run};
+pub use scenarios::{Metrics, Rates, Scenario, Version};
+pub use selection::{Group, Metric, Results, Selected, average, interquartile};
+pub use statistics::{Iqm, Summary, interquartile_mean};
+
+/// The version, and the commit that was built, e.g. "0.1.0 (1a2b3c4d5e6f)"; "-dirty" follows a commit whose files were
+/// changed.
+pub const VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), " (", env!("PERTURB_COMMIT"), ")");

@@ -1,0 +1,194 @@
+//! Training curves: three panels, D, R and E, side by side.
+
+use plotters::coord::Shift;
+use plotters::element::DashedPathElement;
+use plotters::prelude::*;
+
+use super::super::curves::{Curve, EnvironmentCurves, Point};
+use super::super::plan::Method;
+use super::super::plan::distinct;
+use super::super::statistics::Summary;
+use super::{Picture, PlotError, drawing, font, line_style};
+use crate::Version;
+
+const PANEL: (u32, u32) = (320, 260);
+const TITLE: u32 = 34;
+const LEGEND_LINE: u32 = 22;
+const LEGEND_COLUMNS: usize = 4;
+
+/// What a picture shows over episodes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Quantity {
+    /// The mean undiscounted return.
+    Return,
+    /// The success rate, %.
+    Success,
+}
+
+impl Quantity {
+    /// Both.
+    pub const ALL: [Quantity; 2] = [Quantity::Return, Quantity::Success];
+
+    fn of(self, point: &Point) -> Summary {
+        match self {
+            Quantity::Return => point.episode_return,
+            Quantity::Success => point.success,
+        }
+    }
+}
+
+impl std::fmt::Display for Quantity {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.pad(match self {
+            Quantity::Return => "return",
+            Quantity::Success => "success",
+        })
+    }
+}
+
+/// The picture of `curves`.
+pub fn draw_curves(curves: &EnvironmentCurves, quantity: Quantity) -> impl Picture + '_ {
+    let methods = distinct(curves.curves.iter().map(|curve| curve.method.clone()));
+    CurvesPicture { curves, quantity, methods }
+}
+
+struct CurvesPicture<'a> {
+    curves: &'a EnvironmentCurves,
+    quantity: Quantity,
+    methods: Vec<Method>,
+}
+
+impl Picture for CurvesPicture<'_> {
+    fn size(&self) -> (u32, u32) {
+        let lines = self.methods.len().div_ceil(LEGEND_COLUMNS) as u32;
+        (3 * PANEL.0, TITLE + PANEL.1 + LEGEND_LINE * lines + 10)
+    }
+
+    fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError> {
+        area.fill(&WHITE).map_err(drawing)?;
+        let (title, rest) = area.split_vertically(TITLE * scale);
+        let (panels, legend) = rest.split_vertically(PANEL.1 * scale);
+        let what = match self.quantity {
+            Quantity::Return => "mean return",
+            Quantity::Success => "success rate, %",
+        };
+        let text = format!("{}: {what} while training, mean and deviation over runs", self.curves.environment);
+        title.draw_text(&text, &font(15, scale), (12 * scale as i32, 10 * scale as i32)).map_err(drawing)?;
+        for (version, panel) in Version::ALL.into_iter().zip(panels.split_evenly((1, 3))) {
+            self.panel(&panel, version, scale)?;
+        }
+        self.legend(&legend, scale)
+    }
+}
+
+impl CurvesPicture<'_> {
+    fn panel<DB: DrawingBackend>(
+        &self,
+        area: &DrawingArea<DB, Shift>,
+        version: Version,
+        scale: u32,
+    ) -> Result<(), PlotError> {
+        let (episodes, range) = self.ranges();
+        let mut chart = ChartBuilder::on(area)
+            .margin(8 * scale)
+            .margin_right(16 * scale)
+            .x_label_area_size(34 * scale)
+            .y_label_area_size(50 * scale)
+            .caption(format!("trained on {version}"), font(13, scale))
+            .build_cartesian_2d(0.0..episodes, range)
+            .map_err(drawing)?;
+        chart
+            .configure_mesh()
+            .x_labels(4)
+            .y_labels(6)
+            .label_style(font(11, scale))
+            .axis_desc_style(font(12, scale))
+            .x_desc("episodes")
+            .x_label_formatter(&|x| tick(*x))
+            .y_label_formatter(&|y| tick(*y))
+            .light_line_style(TRANSPARENT)
+            .bold_line_style(RGBColor(225, 225, 225).stroke_width(scale))
+            .axis_style(RGBColor(120, 120, 120).stroke_width(scale))
+            .set_all_tick_mark_size(3 * scale)
+            .draw()
+            .map_err(drawing)?;
+        for Curve { method, points, .. } in self.curves.curves.iter().filter(|curve| curve.version == version) {
+            let index = self.methods.iter().position(|known| known == method).unwrap_or_default();
+            let (colour, dashes) = line_style(index);
+            let at = |point: &Point, sign: f64| {
+                let summary = self.quantity.of(point);
+                (point.episodes, summary.mean + sign * summary.std)
+            };
+            let there = points.iter().map(|point| at(point, 1.0));
+            let back = points.iter().rev().map(|point| at(point, -1.0));
+            let band: Vec<(f64, f64)> = there.chain(back).collect();
+            chart.draw_series([Polygon::new(band, colour.mix(0.16).filled())]).map_err(drawing)?;
+            let line: Vec<(f64, f64)> = points.iter().map(|point| at(point, 0.0)).collect();
+            let style = colour.stroke_width(2 * scale);
+            match dashes {
+                None => chart.draw_series(LineSeries::new(line, style)).map_err(drawing)?,
+                Some((dash, gap)) => {
+                    chart.draw_series(DashedLineSeries::new(line, dash * scale, gap * scale, style)).map_err(drawing)?
+                }
+            };
+        }
+        Ok(())
+    }
+
+    /// The last episode, and the values that all panels share.
+    fn ranges(&self) -> (f64, std::ops::Range<f64>) {
+        let points = || self.curves.curves.iter().flat_map(|curve| &curve.points);
+        let spacing = points().map(|point| point.episodes).fold(f64::INFINITY, f64::min);
+        let last = points().map(|point| point.episodes).fold(0.0, f64::max);
+        let end = if spacing.is_finite() { last + spacing } else { 1.0 };
+        if self.quantity == Quantity::Success {
+            return (end, -2.0..102.0);
+        }
+        let values = points().map(|point| self.quantity.of(point));
+        let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), summary| {
+            (low.min(summary.mean - summary.std), high.max(summary.mean + summary.std))
+        });
+        if low > high {
+            return (end, 0.0..1.0);
+        }
+        let margin = 0.04 * (high - low).max(1e-3 * high.abs()).max(1e-9);
+        (end, low - margin..high + margin)
+    }
+
+    fn legend<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError> {
+        let (width, unit) = ((3 * PANEL.0 - 50) as i32 / LEGEND_COLUMNS as i32, scale as i32);
+        for (index, method) in self.methods.iter().enumerate() {
+            let (colour, dashes) = line_style(index);
+            let (column, line) = ((index % LEGEND_COLUMNS) as i32, (index / LEGEND_COLUMNS) as i32);
+            let (x, y) = ((50 + column * width) * unit, (line * LEGEND_LINE as i32 + 11) * unit);
+            let ends = [(x, y), (x + 34 * unit, y)];
+            let style = colour.stroke_width(2 * scale);
+            match dashes {
+                None => area.draw(&PathElement::new(ends, style)).map_err(drawing)?,
+                Some((dash, gap)) => {
+                    area.draw(&DashedPathElement::new(ends, dash * scale, gap * scale, style)).map_err(drawing)?;
+                }
+            }
+            area.draw_text(&method.to_string(), &font(12, scale), (x + 42 * unit, y - 6 * unit)).map_err(drawing)?;
+        }
+        Ok(())
+    }
+}
+
+/// A number at an axis: short, and without the noise of binary fractions.
+pub(super) fn tick(number: f64) -> String {
+    let magnitude = number.abs();
+    if magnitude >= 10_000.0 {
+        return format!("{}k", (number / 100.0).round() / 10.0);
+    }
+    let digits = if magnitude >= 100.0 {
+        0
+    } else if magnitude >= 10.0 {
+        1
+    } else {
+        3
+    };
+    let text = format!("{number:.digits$}");
+    let text = if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text };
+    if text == "-0" { "0".into() } else { text }
+}

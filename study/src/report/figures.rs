@@ -1,0 +1,161 @@
+//! The pictures of a report, and what is said of those that are missing.
+
+use super::super::curves::read_curves;
+use super::super::folder::{Folder, FolderError};
+use super::super::heatmap::HeatmapOptions;
+use super::super::heatmaps::{HeatmapRecord, NoHeatmap, heatmap_places};
+use super::super::plot::{PlotError, Quantity, draw_curves, svg};
+use super::super::selection::{Group, Results};
+
+/// All pictures of a report.
+#[derive(Clone, Debug, Default)]
+pub struct Figures {
+    /// Training curves.
+    pub curves: Vec<Figure>,
+    /// What is said of curves that are missing.
+    pub no_curves: Vec<String>,
+    /// Heatmaps in rows, one of a method's trainings.
+    pub heatmaps: Vec<Vec<Figure>>,
+    /// What to do about heatmaps that are missing.
+    pub no_heatmaps: Vec<String>,
+}
+
+/// A picture.
+#[derive(Clone, Debug)]
+pub struct Figure {
+    /// Of which environment.
+    pub environment: String,
+    /// What it shows, in a few words.
+    pub name: String,
+    /// What it shows.
+    pub caption: String,
+    /// The picture itself.
+    pub picture: FigureData,
+}
+
+/// A picture's data.
+#[derive(Clone, Debug)]
+pub enum FigureData {
+    /// An SVG element.
+    Svg(String),
+    /// A PNG file.
+    Png(Vec<u8>),
+    /// There is none; the caption says why.
+    Missing,
+}
+
+/// Why there are no pictures.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum FigureError {
+    /// The folder cannot be read.
+    #[error(transparent)]
+    Folder(#[from] FolderError),
+    /// A picture cannot be drawn.
+    #[error(transparent)]
+    Plot(#[from] PlotError),
+}
+
+impl Figures {
+    /// Draws the training curves of `results` in `folder`, of which `groups` were selected, and reads their heatmaps.
+    ///
+    /// # Errors
+    /// [`FigureError`].
+    pub fn read(results: &Results<'_>, groups: &[Group], folder: &Folder) -> Result<Self, FigureError> {
+        let mut figures = Self::default();
+        figures.add_curves(results, groups, folder)?;
+        figures.add_heatmaps(results, groups, folder)?;
+        Ok(figures)
+    }
+
+    fn add_curves(&mut self, results: &Results<'_>, groups: &[Group], folder: &Folder) -> Result<(), FigureError> {
+        for curves in read_curves(results, groups, folder)? {
+            let environment = &curves.environment;
+            if curves.curves.is_empty() {
+                self.no_curves.push(format!("{environment}: no training with a result has its monitor.csv."));
+                continue;
+            }
+            for quantity in Quantity::ALL {
+                self.curves.push(Figure {
+                    environment: environment.clone(),
+                    name: format!("{environment}: {quantity} while training"),
+                    caption: format!(
+                        "{environment}: {quantity} while training, of the selected configurations. Lines are means over \
+                         runs, bands their standard deviation."
+                    ),
+                    picture: FigureData::Svg(svg(&draw_curves(&curves, quantity))?),
+                });
+            }
+        }
+        Ok(())
+    }
+
+    fn add_heatmaps(&mut self, results: &Results<'_>, groups: &[Group], folder: &Folder) -> Result<(), FigureError> {
+        let places = heatmap_places(results, groups);
+        let mut missing = [0; 4];
+        for row in places.chunk_by(|a, b| (a.environment, a.method) == (b.environment, b.method)) {
+            let mut figures = Vec::new();
+            for place in row {
+                let (caption, picture) = match place.read(folder)? {
+                    Ok(heatmap) => (format!("{place}{}", details(&heatmap.record)), FigureData::Png(heatmap.png)),
+                    Err(why) => {
+                        missing[why as usize] += 1;
+                        (format!("{place}: {}.", reason(why)), FigureData::Missing)
+                    }
+                };
+                figures.push(Figure {
+                    environment: place.environment.to_owned(),
+                    name: format!("{place}: mean return and success over two parameters"),
+                    caption,
+                    picture,
+                });
+            }
+            self.heatmaps.push(figures);
+        }
+        self.no_heatmaps = advice(missing, places.len());
+        Ok(())
+    }
+}
+
+/// Why there is no picture, at its place.
+fn reason(why: NoHeatmap) -> &'static str {
+    match why {
+        NoHeatmap::NoResult => "no heatmap, since this training has no result yet",
+        NoHeatmap::NotMade => "the heatmap has not been made",
+        NoHeatmap::Outdated => "the heatmap is of an earlier result",
+        NoHeatmap::NoAxes => "no heatmap, since it is not known which two parameters to show",
+    }
+}
+
+/// What to do about the heatmaps that are missing, counted by [`NoHeatmap`], of so many.
+fn advice(missing: [usize; 4], all: usize) -> Vec<String> {
+    let makeable = missing[NoHeatmap::NotMade as usize] + missing[NoHeatmap::Outdated as usize];
+    let (waiting, unknown) = (missing[NoHeatmap::NoResult as usize], missing[NoHeatmap::NoAxes as usize]);
+    let mut advice = Vec::new();
+    if makeable > 0 {
+        advice.push(format!(
+            "Heatmaps that are not there: {makeable} of {all}. `perturb heatmap DIR` makes them, where DIR is the folder \
+             of these results."
+        ));
+    }
+    if waiting > 0 {
+        advice.push(format!("Heatmaps that wait for the results of their trainings: {waiting} of {all}."));
+    }
+    if unknown > 0 {
+        advice.push(format!(
+            "Heatmaps without usual parameters: {unknown} of {all}. `perturb heatmap --checkpoint` takes any two."
+        ));
+    }
+    advice
+}
+
+/// What a heatmap's caption says after who was tested.
+fn details(record: &HeatmapRecord) -> String {
+    let HeatmapOptions { parameters: [x, y], grid, episodes, seed } = &record.options;
+    let episodes = if *episodes == 1 { "1 episode".into() } else { format!("{episodes} episodes") };
+    format!(
+        " with seed {}: {x} and {y}, {grid} × {grid} points of {episodes}, test seed {seed}. Cell {}, checkpoint {}, \
+         perturb {}.",
+        record.train_seed, record.cell, record.checkpoint, record.commit
+    )
+}

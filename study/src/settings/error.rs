@@ -1,0 +1,79 @@
+//! Why a configuration is refused.
+
+use super::AlgorithmName;
+
+/// Why a configuration was refused.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ConfigError {
+    /// A file cannot be read.
+    #[error("cannot read {path}: {source}")]
+    File {
+        /// Its path.
+        path: String,
+        /// The operating system's answer.
+        source: std::io::Error,
+    },
+    /// A file is not TOML, or a `--set` is not `key=value`.
+    #[error("{origin}: {reason}")]
+    Syntax {
+        /// Where it stands.
+        origin: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A key does not exist.
+    #[error("{origin}: unknown key `{key}`; {algorithm}'s keys are {keys}")]
+    UnknownKey {
+        /// Where it stands.
+        origin: String,
+        /// The key.
+        key: String,
+        /// Whose keys were looked through.
+        algorithm: AlgorithmName,
+        /// All valid keys.
+        keys: String,
+    },
+    /// A value has the wrong type or lies outside its range.
+    #[error("{key} is {got}, but must be {expected}")]
+    Value {
+        /// The key.
+        key: String,
+        /// What was given.
+        got: String,
+        /// What is accepted.
+        expected: String,
+    },
+    /// No environment was named.
+    #[error(
+        "no environment was named: give --env NAME, or `environment` in the configuration file; `perturb envs` lists them"
+    )]
+    NoEnvironment,
+    /// RL² with a policy that remembers nothing.
+    #[error(
+        "{algorithm} cannot train the architecture ff: RL² learns by what a recurrent policy remembers of a trial; give \
+         --architecture rc, or another algorithm"
+    )]
+    NeedsMemory {
+        /// The algorithm.
+        algorithm: AlgorithmName,
+    },
+    /// The layers cannot be merged.
+    #[error("cannot merge the configuration: {0}")]
+    Merge(#[from] config::ConfigError),
+    /// The algorithm refuses its settings.
+    #[error(transparent)]
+    Setting(#[from] SettingError),
+}
+
+/// A setting is outside its range.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{name} is {got}, but must be {expected}")]
+pub struct SettingError {
+    /// The setting, as written in the configuration file.
+    pub name: &'static str,
+    /// The value that was given.
+    pub got: String,
+    /// What is accepted.
+    pub expected: &'static str,
+}

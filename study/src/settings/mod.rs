@@ -1,0 +1,256 @@
+//! The configuration of a training: flat, by the field's names.
+//!
+//! Layers, each over the one before: the algorithm's defaults, `--config FILE.toml`, `--set key=value`, flags. The
+//! result is written to `config.toml` of the run; given back with `--config` it repeats the run.
+
+mod algorithms;
+mod defaults;
+mod error;
+mod names;
+mod settings;
+
+pub use algorithms::{A2cConfig, EpoptConfig, PpoConfig, Rl2Config, Schedule};
+pub use error::{ConfigError, SettingError};
+pub use names::{AlgorithmName, Architecture, Base, Wrapper};
+pub use settings::{BaseSettings, Settings, WrapperSettings};
+
+use std::path::Path;
+
+use config::{Config, File, FileFormat};
+use serde::{Deserialize, Serialize};
+use toml::{Table, Value};
+
+use perturb_protocol::Version;
+
+/// The most environments of one training.
+const MOST_ENVS: usize = 65_536;
+/// As they are typed.
+const ARCHITECTURES: &[&str] = &["ff", "rc"];
+
+/// Everything that decides what a training does. Two trainings with equal configurations give equal bytes.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TrainConfig {
+    /// What every training has.
+    pub common: Common,
+    /// What the algorithm has.
+    pub settings: Settings,
+}
+
+/// Settings that every training has.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Common {
+    /// The environment's name in the catalogue. Has no default.
+    pub environment: String,
+    /// Where its parameters come from while training.
+    pub version: Version,
+    /// What learns.
+    pub algorithm: AlgorithmName,
+    /// What acts.
+    pub architecture: Architecture,
+    /// Training ends after the iteration in which this many episodes have ended, at least 1 (default: `15000`). EPOpt
+    /// counts those that it learned from.
+    pub episodes: u64,
+    /// Fixes all randomness, 0 … 2⁶³-1 (default: `1`).
+    pub seed: u64,
+    /// N: environments that are stepped together, 1 … 65536 (default: `16`, `8` with PPO FF, `25` with EPOpt).
+    /// More makes a step cheaper and updates rarer.
+    pub num_envs: usize,
+    /// Whether observations are normalised by their running mean and variance (default: `true`).
+    pub normalize_observations: bool,
+    /// Whether rewards are divided by the running deviation of the discounted return (default: `true`).
+    pub normalize_rewards: bool,
+    /// Iterations between two lines of progress.csv, at least 1 (default: `100` with A2C and RL²-A2C, else `1`). A line has the
+    /// figures of the last update, and means over the last 100 ended episodes.
+    pub log_interval: u64,
+    /// Ended episodes between two checkpoints, at least 1 (default: `500`). The first iteration and the last always
+    /// write one.
+    pub checkpoint_interval: u64,
+}
+
+/// Where a training's settings come from, weakest first.
+#[derive(Clone, Debug, Default)]
+pub struct Sources<'a> {
+    /// A TOML file.
+    pub file: Option<&'a Path>,
+    /// `key=value` pairs, later ones over earlier ones.
+    pub sets: &'a [String],
+    /// Flags.
+    pub flags: Table,
+}
+
+impl TrainConfig {
+    /// Merges and checks all layers.
+    ///
+    /// # Errors
+    /// [`ConfigError`], which names the key and what is accepted.
+    pub fn load(sources: &Sources<'_>) -> Result<Self, ConfigError> {
+        let mut layers: Vec<(String, Table)> = Vec::new();
+        if let Some(path) = sources.file {
+            let shown = path.display().to_string();
+            let text =
+                std::fs::read_to_string(path).map_err(|source| ConfigError::File { path: shown.clone(), source })?;
+            let table = text
+                .parse::<Table>()
+                .map_err(|error| ConfigError::Syntax { origin: shown.clone(), reason: error.to_string() })?;
+            layers.push((shown, table));
+        }
+        for set in sources.sets {
+            layers.push((format!("--set {set}"), parse_set(set)?));
+        }
+        layers.push(("the command line".into(), sources.flags.clone()));
+        resolve(&layers)
+    }
+
+    /// The configuration as TOML.
+    pub fn to_toml(&self) -> String {
+        // Serialisation of plain numbers, booleans and names cannot fail.
+        toml::to_string(&self.table()).unwrap_or_default()
+    }
+
+    /// The configuration as a flat table, which [`TrainConfig::from_table`] reads back.
+    pub fn table(&self) -> Table {
+        let mut table = Table::try_from(&self.common).unwrap_or_default();
+        table.extend(self.settings.table());
+        table
+    }
+
+    /// Reads a flat table; defaults stand for what it lacks.
+    ///
+    /// # Errors
+    /// [`ConfigError`], which names the key and what is accepted.
+    pub fn from_table(origin: &str, table: Table) -> Result<Self, ConfigError> {
+        resolve(&[(origin.to_owned(), table)])
+    }
+
+    /// The defaults of an algorithm with an architecture, without an environment.
+    pub fn defaults(algorithm: AlgorithmName, architecture: Architecture) -> Self {
+        let common = defaults::common(algorithm, architecture);
+        Self { common, settings: defaults::settings(algorithm, architecture) }
+    }
+
+    fn validate(&self) -> Result<(), ConfigError> {
+        let Common { episodes, num_envs, log_interval, checkpoint_interval, .. } = self.common;
+        if self.common.environment.is_empty() {
+            return Err(ConfigError::NoEnvironment);
+        }
+        for (key, value, most) in [
+            ("episodes", episodes, u64::MAX),
+            ("num_envs", num_envs as u64, MOST_ENVS as u64),
+            ("log_interval", log_interval, u64::MAX),
+            ("checkpoint_interval", checkpoint_interval, u64::MAX),
+        ] {
+            if value == 0 || value > most {
+                let expected = if most == u64::MAX { "at least 1".to_owned() } else { format!("between 1 and {most}") };
+                return Err(ConfigError::Value { key: key.into(), got: value.to_string(), expected });
+            }
+        }
+        let Common { algorithm, architecture, .. } = self.common;
+        if (algorithm.wrapper(), architecture) == (Wrapper::Rl2, Architecture::Ff) {
+            return Err(ConfigError::NeedsMemory { algorithm });
+        }
+        self.settings.validate(architecture, num_envs)
+    }
+}
+
+/// Lays `layers` over the defaults of the algorithm that they name.
+fn resolve(layers: &[(String, Table)]) -> Result<TrainConfig, ConfigError> {
+    let named = |key: &str| layers.iter().rev().find_map(|(_, table)| table.get(key));
+    let algorithm = match named("algorithm") {
+        None => AlgorithmName::Ppo,
+        Some(value) => choice("algorithm", value, &AlgorithmName::ALL.map(AlgorithmName::as_str))?,
+    };
+    let architecture = match named("architecture") {
+        None => algorithm.default_architecture(),
+        Some(value) => choice("architecture", value, ARCHITECTURES)?,
+    };
+    let defaults = TrainConfig::defaults(algorithm, architecture).table();
+    for (origin, table) in layers {
+        for (key, value) in table {
+            check(origin, key, value, &defaults, algorithm)?;
+        }
+    }
+    let mut builder = Config::builder().add_source(source(&defaults));
+    for (_, table) in layers {
+        builder = builder.add_source(source(table));
+    }
+    let mut merged: Table = builder.build()?.try_deserialize()?;
+    let wrong = |error: toml::de::Error| ConfigError::Syntax {
+        origin: "the configuration".into(),
+        reason: error.to_string().trim().replace('\n', ", "),
+    };
+    let settings = Settings::take(algorithm, architecture, &mut merged).map_err(wrong)?;
+    let config = TrainConfig { common: merged.try_into().map_err(wrong)?, settings };
+    config.validate()?;
+    Ok(config)
+}
+
+/// `key=value`, with the value in TOML; a value that is not TOML is a text.
+fn parse_set(set: &str) -> Result<Table, ConfigError> {
+    let Some((key, value)) = set.split_once('=') else {
+        let reason = "expected key=value, e.g. --set learning_rate=3e-4".into();
+        return Err(ConfigError::Syntax { origin: format!("--set {set}"), reason });
+    };
+    let (key, value) = (key.trim(), value.trim());
+    let parsed = format!("value = {value}").parse::<Table>().ok().filter(|table| table.len() == 1);
+    let value = parsed.and_then(|mut table| table.remove("value")).unwrap_or_else(|| Value::String(value.to_owned()));
+    Ok(Table::from_iter([(key.to_owned(), value)]))
+}
+
+/// A layer for the `config` crate.
+fn source(table: &Table) -> File<config::FileSourceString, FileFormat> {
+    File::from_str(&toml::to_string(table).unwrap_or_default(), FileFormat::Toml)
+}
+
+/// Whether `key` exists and `value` has the type of its default.
+fn check(
+    origin: &str,
+    key: &str,
+    value: &Value,
+    defaults: &Table,
+    algorithm: AlgorithmName,
+) -> Result<(), ConfigError> {
+    let Some(default) = defaults.get(key) else {
+        let keys = defaults.keys().map(String::as_str).collect::<Vec<_>>().join(", ");
+        return Err(ConfigError::UnknownKey { origin: origin.to_owned(), key: key.to_owned(), algorithm, keys });
+    };
+    let algorithms = AlgorithmName::ALL.map(AlgorithmName::as_str);
+    let choices: Option<&[&str]> = match key {
+        "algorithm" => Some(&algorithms),
+        "version" => Some(&["D", "R", "E"]),
+        "architecture" => Some(ARCHITECTURES),
+        "learning_rate_schedule" => Some(&["constant", "linear"]),
+        _ => None,
+    };
+    let expected = match (default, value) {
+        _ if choices.is_some() => return choice::<Value>(key, value, choices.unwrap_or_default()).map(|_| ()),
+        (Value::Float(_), Value::Float(_) | Value::Integer(_)) => return Ok(()),
+        (Value::Integer(_), Value::Integer(0..)) => return Ok(()),
+        (Value::Boolean(_), Value::Boolean(_)) | (Value::String(_), Value::String(_)) => return Ok(()),
+        (Value::Float(_), _) => "a number",
+        (Value::Integer(_), _) => "a whole number that is not negative",
+        (Value::Boolean(_), _) => "true or false",
+        _ => "a text",
+    };
+    Err(ConfigError::Value { key: key.to_owned(), got: show(value), expected: expected.to_owned() })
+}
+
+/// One of a few names.
+fn choice<T: serde::de::DeserializeOwned>(key: &str, value: &Value, names: &[&str]) -> Result<T, ConfigError> {
+    let refuse = || ConfigError::Value {
+        key: key.to_owned(),
+        got: show(value),
+        expected: format!("one of {}", names.iter().map(|name| format!("\"{name}\"")).collect::<Vec<_>>().join(", ")),
+    };
+    match value {
+        Value::String(name) if names.contains(&name.as_str()) => value.clone().try_into().map_err(|_| refuse()),
+        _ => Err(refuse()),
+    }
+}
+
+/// A value as its writer would recognise it.
+fn show(value: &Value) -> String {
+    value.to_string()
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,162 @@
+use super::*;
+
+fn load(file: Option<&str>, sets: &[&str], flags: &str) -> Result<TrainConfig, ConfigError> {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("config.toml");
+    std::fs::write(&path, file.unwrap_or_default()).unwrap();
+    let sets: Vec<String> = sets.iter().map(|&set| set.to_owned()).collect();
+    let flags = flags.parse().unwrap();
+    TrainConfig::load(&Sources { file: file.map(|_| path.as_path()), sets: &sets, flags })
+}
+
+fn refusal(file: Option<&str>, sets: &[&str]) -> String {
+    load(file, sets, "environment = 'CartPole'").unwrap_err().to_string()
+}
+
+fn ppo(config: &TrainConfig) -> &PpoConfig {
+    match &config.settings.base {
+        BaseSettings::Ppo(settings) => settings,
+        BaseSettings::A2c(_) => panic!("not PPO"),
+    }
+}
+
+#[test]
+fn a_flag_beats_a_set_beats_the_file_beats_the_default() {
+    let file = "environment = 'CartPole'\nseed = 2\nn_steps = 256\ngamma = 0.9";
+    let config = load(Some(file), &["seed=3", "n_steps=512", "n_steps=64"], "seed = 4").unwrap();
+    assert_eq!(config.common.seed, 4);
+    assert_eq!(ppo(&config).n_steps, 64, "the later --set");
+    assert_eq!(ppo(&config).gamma, 0.9);
+    assert_eq!(ppo(&config).gae_lambda, PpoConfig::default().gae_lambda);
+}
+
+#[test]
+fn an_algorithm_brings_its_own_defaults_and_keys() {
+    let config = load(None, &["algorithm=a2c", "rms_alpha=0.9"], "environment = 'Pendulum'").unwrap();
+    let own = A2cConfig { learning_rate: 7e-3, n_steps: 15, ent_coef: 1e-3, ..A2cConfig::default() };
+    let base = BaseSettings::A2c(A2cConfig { rms_alpha: 0.9, ..own });
+    assert_eq!(config.settings, Settings { base, wrapper: WrapperSettings::Plain });
+    assert!(refusal(None, &["rms_alpha=0.9"]).contains("unknown key `rms_alpha`; ppo's keys are"));
+}
+
+#[test]
+fn the_written_configuration_gives_the_same_again() {
+    let sets = ["learning_rate=1e-3", "normalize_rewards=false", "learning_rate_schedule=linear", "ent_coef=1"];
+    for (algorithm, architecture) in pairs() {
+        let flags = format!(
+            "environment = 'Hopper'\nversion = 'E'\nalgorithm = '{algorithm}'\narchitecture = '{architecture}'\n\
+             episodes = 7"
+        );
+        let config = load(None, &sets, &flags).unwrap();
+        assert_eq!((config.common.algorithm, config.common.architecture), (algorithm, architecture));
+        assert_eq!(load(Some(&config.to_toml()), &[], "").unwrap(), config);
+    }
+}
+
+/// The paper's ten pairs.
+fn pairs() -> impl Iterator<Item = (AlgorithmName, Architecture)> {
+    let all = AlgorithmName::ALL.into_iter().flat_map(|name| [(name, Architecture::Ff), (name, Architecture::Rc)]);
+    all.filter(|(name, architecture)| (name.wrapper(), *architecture) != (Wrapper::Rl2, Architecture::Ff))
+}
+
+#[test]
+fn there_are_ten_pairs_of_algorithm_and_architecture_and_no_others() {
+    assert_eq!(pairs().count(), 10);
+    for algorithm in ["rl2-a2c", "rl2-ppo"] {
+        let message = refusal(None, &[&format!("algorithm={algorithm}"), "architecture=ff"]);
+        assert!(message.starts_with(&format!("{algorithm} cannot train the architecture ff")), "{message}");
+        let config = load(None, &[&format!("algorithm={algorithm}")], "environment = 'CartPole'").unwrap();
+        assert_eq!(config.common.architecture, Architecture::Rc, "the only one it has");
+    }
+}
+
+#[test]
+fn names_are_typed_as_they_are_written() {
+    for name in AlgorithmName::ALL {
+        assert_eq!(serde_json::to_value(name).unwrap(), name.as_str());
+        assert_eq!(name.as_str().parse(), Ok(name));
+    }
+}
+
+#[test]
+fn a_wrapper_brings_its_keys_and_takes_away_those_that_it_has_no_use_for() {
+    let config = load(None, &["algorithm=epopt-ppo", "epsilon=0.2"], "environment = 'CartPole'").unwrap();
+    let expected = EpoptConfig { epsilon: 0.2, ..EpoptConfig::default() };
+    assert_eq!(config.settings.wrapper, WrapperSettings::Epopt(expected));
+    for key in ["n_steps", "n_minibatches", "episodes_per_trial"] {
+        let message = refusal(None, &["algorithm=epopt-ppo", &format!("{key}=2")]);
+        assert!(message.contains(&format!("unknown key `{key}`; epopt-ppo's keys are")), "{message}");
+    }
+    let config = load(None, &["algorithm=rl2-ppo", "episodes_per_trial=5"], "environment = 'CartPole'").unwrap();
+    assert_eq!(config.settings.episodes_per_trial(), 5);
+    assert!(refusal(None, &["algorithm=ppo", "episodes_per_trial=5"]).contains("unknown key"));
+}
+
+#[test]
+fn an_unknown_key_is_refused_with_all_valid_ones() {
+    let message = refusal(Some("learning_rat = 0.1"), &[]);
+    assert!(message.contains("config.toml: unknown key `learning_rat`"), "{message}");
+    for key in ["learning_rate,", "n_steps", "num_envs", "normalize_observations", "checkpoint_interval"] {
+        assert!(message.contains(key), "{key}: {message}");
+    }
+    assert!(refusal(Some("[nested]\nkey = 1"), &[]).contains("unknown key `nested`"));
+}
+
+#[test]
+fn a_wrong_type_is_refused_with_the_right_one() {
+    for (set, part) in [
+        ("learning_rate=fast", "learning_rate is \"fast\", but must be a number"),
+        ("n_steps=12.5", "n_steps is 12.5, but must be a whole number"),
+        ("n_steps=-1", "n_steps is -1, but must be a whole number that is not negative"),
+        ("normalize_rewards=1", "normalize_rewards is 1, but must be true or false"),
+        ("environment=3", "environment is 3, but must be a text"),
+        ("version=X", "version is \"X\", but must be one of \"D\", \"R\", \"E\""),
+        ("algorithm=dqn", "algorithm is \"dqn\", but must be one of \"a2c\", \"ppo\", \"epopt-a2c\", "),
+        ("architecture=mlp", "architecture is \"mlp\", but must be one of \"ff\", \"rc\""),
+        ("learning_rate_schedule=cosine", "must be one of \"constant\", \"linear\""),
+        ("num_envs=0", "num_envs is 0, but must be between 1 and 65536"),
+        ("episodes=0", "episodes is 0, but must be at least 1"),
+        ("gamma=2", "gamma is 2, but must be between 0 and 1"),
+        ("learning_rate=nan", "learning_rate is NaN"),
+        ("n_steps", "expected key=value"),
+    ] {
+        let message = refusal(None, &[set]);
+        assert!(message.contains(part), "{set}: {message}");
+    }
+    for (sets, part) in [
+        (["algorithm=epopt-a2c", "epsilon=0"], "epsilon is 0, but must be above 0 and at most 1"),
+        (
+            ["algorithm=epopt-a2c", "episodes_per_iteration=0"],
+            "episodes_per_iteration is 0, but must be between 1 and 1000000",
+        ),
+        (["algorithm=epopt-a2c", "num_envs=101"], "num_envs is 101, but must be at most episodes_per_iteration, 100"),
+        (["algorithm=epopt-ppo", "episodes_per_iteration=10000000"], "must be between 1 and 1000000"),
+        (["algorithm=rl2-a2c", "episodes_per_trial=0"], "episodes_per_trial is 0, but must be between 1 and 1000000"),
+        (["algorithm=rl2-a2c", "episodes_per_trial=4000000000"], "must be between 1 and 1000000"),
+        (["algorithm=ppo", "n_steps=1000000000000000000"], "but must be at most 8388608 with 8 environments"),
+        (["algorithm=rl2-ppo", "kl_coef=-1"], "kl_coef is -1, but must be a number that is not negative"),
+    ] {
+        let message = refusal(None, &sets);
+        assert!(message.contains(part), "{sets:?}: {message}");
+    }
+}
+
+#[test]
+fn minibatches_must_part_a_rollout_evenly() {
+    assert!(load(None, &["n_steps=5", "num_envs=6", "n_minibatches=10"], "environment = 'CartPole'").is_ok());
+    let message = refusal(None, &["n_steps=5", "num_envs=6", "n_minibatches=4"]);
+    assert_eq!(message, "n_minibatches is 4, but must be a divisor of n_steps · num_envs, which is 30");
+    let recurrent = ["architecture=rc", "n_steps=5", "num_envs=6"];
+    assert!(load(None, &[&recurrent[..], &["n_minibatches=3"]].concat(), "environment = 'CartPole'").is_ok());
+    let message = refusal(None, &[&recurrent[..], &["n_minibatches=10"]].concat());
+    assert!(message.starts_with("n_minibatches is 10, but must be a divisor of num_envs, "), "{message}");
+    assert!(message.ends_with(" which is 6"), "{message}");
+}
+
+#[test]
+fn what_is_missing_or_not_toml_is_named() {
+    assert!(matches!(load(None, &[], ""), Err(ConfigError::NoEnvironment)));
+    assert!(refusal(Some("= 1"), &[]).contains("config.toml"));
+    let sources = Sources { file: Some(Path::new("/nonexistent.toml")), ..Sources::default() };
+    assert!(TrainConfig::load(&sources).unwrap_err().to_string().contains("cannot read /nonexistent.toml"));
+}
