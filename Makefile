@@ -91,7 +91,7 @@ test: deps opengl $(DM_ENV_RPC)/installed ## run all tests, then those of the se
 
 slurm-test: build ## do a plan on a real Slurm of two nodes, started for it, one of which dies
 	@$(call install,$(SLURM_PACKAGES))
-	PERTURB_SLURM_REQUIRED=1 cargo test $(ALL) --test slurm
+	PERTURB_SLURM_REQUIRED=1 cargo test $(ALL) --test cli slurm::
 
 slurm-acceptance: ## the same with experiments/quick.toml
 	PERTURB_SLURM_PLAN=$(CURDIR)/experiments/quick.toml $(MAKE) slurm-test

@@ -1,4 +1,4 @@
-//! Watching, with commands that only look like Slurm's. A real Slurm is in `learner/tests/slurm`.
+//! Watching, with commands that only look like Slurm's. A real Slurm is in `cli/tests/cli/slurm`.
 
 use std::cell::Cell;
 use std::fs;

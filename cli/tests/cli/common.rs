@@ -1,5 +1,4 @@
-//! What several tests need to run the programs. Each test uses a part of it.
-#![allow(dead_code)]
+//! What several tests need to run the programs.
 
 use std::path::Path;
 use std::process::{Command, Output, Stdio};

@@ -1,14 +1,11 @@
-//! Trainings that are broken off go on to the same bytes. Needs the program `perturb-server`: run `cargo build
-//! --release` first.
-
-mod common;
+//! Trainings that are broken off go on to the same bytes.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Child;
 use std::time::Duration;
 
-use common::{addresses, child_server, config, kill, perturb, read, run, server, stderr, wait_for};
+use crate::common::{addresses, child_server, config, kill, perturb, read, run, server, stderr, wait_for};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{ClientError, OpenOptions, Servers, Session, StepReply};
 use perturb_learner::proto;

@@ -1,6 +1,4 @@
-//! Runs over several servers. Needs the program `perturb-server`: run `cargo build --release` first.
-
-mod common;
+//! Runs over several servers.
 
 use std::collections::BTreeMap;
 use std::net::TcpListener;
@@ -8,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Child;
 use std::time::{Duration, Instant};
 
-use common::{addresses, kill, perturb, server, stderr};
+use crate::common::{addresses, kill, perturb, server, stderr};
 use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers, Session};
 use perturb_learner::proto;
 use perturb_study::{Folder, Plan};

@@ -1,13 +1,11 @@
-//! Videos of trained policies. Needs the program `perturb-server`: run `cargo build --release` first.
-
-mod common;
+//! Videos of trained policies.
 
 use std::collections::HashSet;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use common::{addresses, child_server, kill, perturb, run, server, stderr, wait_for};
+use crate::common::{addresses, child_server, kill, perturb, run, server, stderr, wait_for};
 use gif::{ColorOutput, DecodeOptions};
 use perturb_cli::video::{Summary, VideoFile, VideoOptions, film};
 use perturb_learner::checkpoint::Checkpoint;
@@ -285,7 +283,7 @@ fn a_server_that_cannot_draw_says_why() {
 
 /// Begins a long video, calls `end` when some of it is written, and returns what `perturb` says then.
 fn broken_off(ending: &str, server: Option<&str>, end: impl FnOnce(u32)) -> (Output, Vec<PathBuf>) {
-    let training = common::server(1);
+    let training = crate::common::server(1);
     let (out, _) = trained(&training, PENDULUM);
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join(format!("a.{ending}"));

@@ -15,7 +15,7 @@ use perturb_learner::client::{PrivateServer, PrivateServerOptions};
 use perturb_study::{Folder, Plan};
 use tempfile::TempDir;
 
-use cluster::{Cluster, wait_for};
+use self::cluster::{Cluster, wait_for};
 
 /// Set to 1, Slurm must be there.
 const REQUIRED: &str = "PERTURB_SLURM_REQUIRED";

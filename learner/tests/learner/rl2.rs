@@ -1,10 +1,7 @@
 //! RL²: what the policy sees and remembers of a trial, what the update sees of it, what a test counts, and that it learns to
-//! learn. Needs the program `perturb-server`: run `cargo build --release` first.
+//! learn.
 
-#[path = "common/rollouts.rs"]
-mod common;
-
-use common::{bases, connect, contents, moved, options, server};
+use crate::common::{bases, connect, contents, moved, options, server};
 use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{EndedEpisode, OpenOptions, Servers, Session, StepReply};

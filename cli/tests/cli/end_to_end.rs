@@ -1,12 +1,10 @@
-//! The learner against real servers. Needs the program `perturb-server`: run `cargo build --release` first.
-
-mod common;
+//! The learner against real servers.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use common::{
+use crate::common::{
     SECONDS, addresses, child_server, config, is_running, kill, perturb, read, run, server, stderr, wait_for,
 };
 use perturb_learner::checkpoint::Checkpoint;

@@ -9,7 +9,7 @@ use tch::{Kind, Tensor};
 const TOLERANCE: f64 = 2e-6;
 
 fn fixture(case: &str, name: &str) -> Vec<f32> {
-    let cases: serde_json::Value = serde_json::from_str(include_str!("fixtures/losses.json")).expect("JSON");
+    let cases: serde_json::Value = serde_json::from_str(include_str!("../fixtures/losses.json")).expect("JSON");
     let numbers = cases[case][name].as_array().unwrap_or_else(|| panic!("no {case}.{name}"));
     numbers.iter().map(|x| x.as_f64().expect("a number") as f32).collect()
 }

@@ -1,5 +1,4 @@
-//! Experiments with real worker processes and servers. Needs the program `perturb-server`: run `cargo build --release`
-//! first.
+//! Experiments with real worker processes and servers.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};

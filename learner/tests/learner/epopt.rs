@@ -1,12 +1,8 @@
 //! EPOpt: complete episodes are collected without bias, packed without loss, and the worst of them are learned from.
-//! Needs the program `perturb-server`: run `cargo build --release` first.
-
-#[path = "common/rollouts.rs"]
-mod common;
 
 use std::collections::{BTreeMap, HashSet};
 
-use common::{bases, connect, contents, moved, options, server};
+use crate::common::{bases, connect, contents, moved, options, server};
 use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Epopt, Ppo, Selection, UpdateStats};
 use perturb_learner::client::{EndedEpisode, PrivateServer, Session};
 use perturb_learner::error::Error;

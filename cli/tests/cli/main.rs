@@ -1,0 +1,11 @@
+//! The tests of the program `perturb`, one program, so that libtorch is linked once. They need the program
+//! `perturb-server`: run `cargo build --release` first.
+
+mod common;
+
+mod end_to_end;
+mod experiments;
+mod resume;
+mod servers;
+mod slurm;
+mod video;
