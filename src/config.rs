@@ -86,6 +86,11 @@ pub struct Arguments {
     #[arg(long)]
     #[serde(skip)]
     pub health: bool,
+    /// Start no server, but print what it would serve, as JSON: the environments with their spaces, parameters and rules
+    /// of success, and the limits that clients keep to.
+    #[arg(long, conflicts_with = "health")]
+    #[serde(skip)]
+    pub catalogue: bool,
 }
 
 /// The configuration in force, validated.

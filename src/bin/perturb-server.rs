@@ -31,7 +31,13 @@ fn main() -> ExitCode {
         .with_ansi(io::stderr().is_terminal())
         .with_env_filter(tracing_subscriber::EnvFilter::new(&config.log))
         .init();
-    let done = if arguments.health { health(&config) } else { run(&config) };
+    let done = if arguments.health {
+        health(&config)
+    } else if arguments.catalogue {
+        catalogue(&config)
+    } else {
+        run(&config)
+    };
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
@@ -60,6 +66,13 @@ fn run(config: &Config) -> Result<(), Box<dyn Error>> {
     // Connections that did not close by themselves must not keep the program.
     runtime.shutdown_background();
     result
+}
+
+/// Prints what would be served.
+fn catalogue(config: &Config) -> Result<(), Box<dyn Error>> {
+    let listing = server::listing(&tasks::catalogue(), config)?;
+    writeln!(io::stdout(), "{:#}", perturb_protocol::catalogue::to_json(&listing))?;
+    Ok(())
 }
 
 /// Asks the server that runs with the same settings.

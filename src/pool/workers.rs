@@ -56,11 +56,6 @@ impl Pool {
         self.threads.len()
     }
 
-    /// The most environments there may be.
-    pub fn max_environments(&self) -> usize {
-        self.shared.max_environments
-    }
-
     /// Environments in use.
     pub fn environments(&self) -> usize {
         self.shared.used.load(Ordering::Relaxed)

@@ -69,7 +69,7 @@ pub async fn run(
     catalogue: Catalogue,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Error> {
-    let entries = entries(&catalogue)?;
+    let listing = Arc::new(listing(&catalogue, config)?);
     let catalogue = Arc::new(catalogue);
     let pool = Arc::new(Pool::new(config.workers, config.max_envs)?);
     let (controller, drain) = Controller::new();
@@ -79,7 +79,7 @@ pub async fn run(
     let worlds = EnvironmentServer::new(worlds)
         .max_decoding_message_size(config.max_message_bytes)
         .max_encoding_message_size(usize::MAX);
-    let service = Service::new(pool, catalogue, entries, sessions);
+    let service = Service::new(pool, catalogue, listing, sessions);
     let service = PerturbServer::new(service)
         .max_decoding_message_size(config.max_message_bytes)
         .max_encoding_message_size(usize::MAX);
@@ -140,8 +140,16 @@ pub async fn run(
     Ok(())
 }
 
-/// The catalogue as the protocol tells it. Builds each environment once, so that a model that cannot be loaded is known
-/// before anything is served.
-fn entries(catalogue: &Catalogue) -> Result<Arc<[proto::Environment]>, env::Error> {
-    catalogue.specs().map(|spec| Ok(convert::environment(spec, (spec.make)()?.model_hash()))).collect()
+/// The catalogue as the protocol tells it, of a server with these settings. Builds each environment once, so that a
+/// model that cannot be loaded is known before anything is served.
+///
+/// # Errors
+/// [`env::Error`].
+pub fn listing(catalogue: &Catalogue, config: &Config) -> Result<proto::ListEnvironmentsResponse, env::Error> {
+    let environments = catalogue.specs().map(|spec| Ok(convert::environment(spec, (spec.make)()?.model_hash())));
+    Ok(proto::ListEnvironmentsResponse {
+        environments: environments.collect::<Result<_, env::Error>>()?,
+        server_version: env!("CARGO_PKG_VERSION").into(),
+        max_batch_size: u32::try_from(config.max_envs).unwrap_or(u32::MAX),
+    })
 }

@@ -18,8 +18,7 @@ use tonic::{Request, Response, Status, Streaming};
 pub struct Service {
     pool: Arc<Pool>,
     catalogue: Arc<Catalogue>,
-    /// The catalogue as the protocol tells it.
-    entries: Arc<[proto::Environment]>,
+    listing: Arc<proto::ListEnvironmentsResponse>,
     renderer: Arc<Renderer>,
     sessions: Sessions,
 }
@@ -29,10 +28,10 @@ impl Service {
     pub fn new(
         pool: Arc<Pool>,
         catalogue: Arc<Catalogue>,
-        entries: Arc<[proto::Environment]>,
+        listing: Arc<proto::ListEnvironmentsResponse>,
         sessions: Sessions,
     ) -> Self {
-        Self { pool, catalogue, entries, renderer: Arc::default(), sessions }
+        Self { pool, catalogue, listing, renderer: Arc::default(), sessions }
     }
 }
 
@@ -44,19 +43,15 @@ impl Perturb for Service {
         &self,
         _: Request<proto::ListEnvironmentsRequest>,
     ) -> Result<Response<proto::ListEnvironmentsResponse>, Status> {
-        Ok(Response::new(proto::ListEnvironmentsResponse {
-            environments: self.entries.to_vec(),
-            server_version: env!("CARGO_PKG_VERSION").into(),
-            max_batch_size: u32::try_from(self.pool.max_environments()).unwrap_or(u32::MAX),
-        }))
+        Ok(Response::new(self.listing.as_ref().clone()))
     }
 
     async fn session(
         &self,
         requests: Request<Streaming<proto::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        let Self { pool, catalogue, entries, renderer, .. } = self.clone();
-        let session = Session::new(pool, catalogue, entries, renderer);
+        let Self { pool, catalogue, listing, renderer, .. } = self.clone();
+        let session = Session::new(pool, catalogue, listing, renderer);
         Ok(Response::new(self.sessions.begin(requests.into_inner(), session)?))
     }
 }

@@ -13,7 +13,7 @@ use std::sync::Arc;
 pub struct Session {
     pool: Arc<Pool>,
     catalogue: Arc<Catalogue>,
-    entries: Arc<[proto::Environment]>,
+    listing: Arc<proto::ListEnvironmentsResponse>,
     renderer: Arc<Renderer>,
     batch: Option<Batch>,
 }
@@ -23,10 +23,10 @@ impl Session {
     pub fn new(
         pool: Arc<Pool>,
         catalogue: Arc<Catalogue>,
-        entries: Arc<[proto::Environment]>,
+        listing: Arc<proto::ListEnvironmentsResponse>,
         renderer: Arc<Renderer>,
     ) -> Self {
-        Self { pool, catalogue, entries, renderer, batch: None }
+        Self { pool, catalogue, listing, renderer, batch: None }
     }
 
     /// Whether it owns environments.
@@ -59,7 +59,7 @@ impl Session {
         let autoreset_mode = request.autoreset_mode;
         let settings = convert::open(&self.catalogue, request)?;
         tracing::debug!(environment = settings.spec.name, batch_size = settings.size, "opening a session");
-        let environment = self.entries.iter().find(|entry| entry.name == settings.spec.name).cloned();
+        let environment = self.listing.environments.iter().find(|entry| entry.name == settings.spec.name).cloned();
         let (batch, observations, started) = Batch::open(&self.pool, settings).await?;
         self.batch = Some(batch);
         Ok(proto::Opened { environment, observations, started: convert::started(started), autoreset_mode })

@@ -233,6 +233,17 @@ async fn a_private_server_ends_with_its_input_has_room_for_all_and_heeds_flags_a
 }
 
 #[tokio::test]
+async fn the_catalogue_is_printed_as_a_server_would_tell_it() {
+    let printed = command().arg("--catalogue").output().unwrap();
+    assert!(printed.status.success(), "{printed:?}");
+    let server = Server::start(&[]);
+    let mut client = server::client(server.tcp()).await;
+    let told = within(client.list_environments(perturb::proto::ListEnvironmentsRequest {})).await.unwrap();
+    let told = format!("{:#}\n", perturb_protocol::catalogue::to_json(told.get_ref()));
+    assert!(String::from_utf8(printed.stdout).unwrap() == told);
+}
+
+#[tokio::test]
 async fn a_stale_socket_is_replaced_a_live_one_and_a_file_are_not() {
     let directory = tempfile::tempdir().unwrap();
     let socket = directory.path().join("perturb.sock");
