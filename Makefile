@@ -56,7 +56,7 @@ endef
 .DEFAULT_GOAL := help
 .PHONY: help deps opengl toolchain build demo all-pairs report-check test slurm-test slurm-acceptance lint bench audit \
 	cargo-deny python-test python-wheel python-acceptance \
-	python-server python-venv docker docker-base docker-test
+	python-venv docker docker-base docker-test
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -115,28 +115,31 @@ cargo-deny: toolchain
 		cargo install --locked --version $(CARGO_DENY_VERSION) cargo-deny; \
 	}
 
-python-test: $(VENV)/installed python-server opengl ## lint, type-check and test the Python package
+python-test python-wheel python-acceptance: export PERTURB_SERVER := $(abspath $(PROGRAMS))/perturb-server
+
+python-test: $(VENV)/installed opengl ## lint, type-check and test the Python package
 	cd python && $(abspath $(VENV))/bin/ruff check . && $(abspath $(VENV))/bin/ruff format --check .
 	cd python && $(abspath $(VENV))/bin/mypy
-	cd python && PERTURB_SERVER=$(abspath $(PROGRAMS))/perturb-server $(abspath $(VENV))/bin/pytest -q
+	cd python && $(abspath $(VENV))/bin/pytest -q
 
-python-wheel: $(VENV)/installed python-server ## build the Python package, install it in an empty environment, run its loop
+python-wheel: $(VENV)/installed ## build the Python package, install it in an empty environment, run its loop
 	rm -rf python/dist $(VENV)-empty
 	$(VENV)/bin/python -m build --outdir python/dist python
 	python3 -m venv $(VENV)-empty
 	$(VENV)-empty/bin/pip install -q --disable-pip-version-check python/dist/*.whl
-	PERTURB_SERVER=$(abspath $(PROGRAMS))/perturb-server $(VENV)-empty/bin/python python/examples/ten_lines.py
+	$(VENV)-empty/bin/python python/examples/ten_lines.py
 
-python-acceptance: $(VENV)/installed python-server ## train with stable-baselines3, measure beside EnvPool; gigabytes, minutes
+python-acceptance: $(VENV)/installed ## train with stable-baselines3, measure beside EnvPool; gigabytes, minutes
 	$(VENV)/bin/pip install -q --disable-pip-version-check -r python/requirements-acceptance.txt
-	cd python && PERTURB_SERVER=$(abspath $(PROGRAMS))/perturb-server $(abspath $(VENV))/bin/pytest -q -m slow
-	PERTURB_SERVER=$(abspath $(PROGRAMS))/perturb-server $(VENV)/bin/python python/benchmarks/throughput.py
+	cd python && $(abspath $(VENV))/bin/pytest -q -m slow
+	$(VENV)/bin/python python/benchmarks/throughput.py
 
-python-server: deps
+$(PROGRAMS)/perturb-server: deps
 	cargo build --package perturb --release --locked
 
-# The protocol's messages are generated when the package is installed.
-$(VENV)/installed: python/requirements-dev.txt python/pyproject.toml python/hatch_build.py proto/perturb/v1/perturb.proto | python-venv
+# The protocol's messages are generated when the package is installed, and the server is asked for its catalogue.
+$(VENV)/installed: python/requirements-dev.txt python/pyproject.toml python/hatch_build.py proto/perturb/v1/perturb.proto \
+		$(PROGRAMS)/perturb-server | python-venv
 	python3 -m venv $(VENV)
 	$(VENV)/bin/pip install -q --disable-pip-version-check -r python/requirements-dev.txt
 	$(VENV)/bin/pip install -q --disable-pip-version-check --no-deps --editable python

@@ -14,7 +14,8 @@ from gymnasium.vector import AutoresetMode
 import perturb
 from perturb import session
 from perturb._proto import perturb_pb2 as pb
-from perturb.catalogue import CATALOGUE
+from perturb.catalogue import CATALOGUE, Description
+from perturb.registration import register_all
 
 from .conftest import ROOT
 
@@ -54,6 +55,27 @@ def test_the_catalogue_is_the_servers(server: str) -> None:
         environment.observation[0].low = -7
         with pytest.raises(perturb.ProtocolError, match=r"-7\.0"):
             CATALOGUE[environment.name].require_equal(environment)
+
+
+def test_an_environment_that_is_new_to_the_server_needs_nothing_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    success = {"description": "", "quantity": "steps", "unit": "1", "comparison": "at_most", "threshold": 9.0}
+    toy = {
+        "name": "Toy",
+        "revision": 3,
+        "observation": [{"low": None, "high": 2.0}, {"low": -1.0, "high": None}],
+        "action": {"continuous": [{"low": -0.5, "high": 0.5}]},
+        "control_timestep": 0.25,
+        "success": success,
+    }
+    monkeypatch.setitem(CATALOGUE, "Toy", Description.read(toy))
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", {})
+    monkeypatch.setattr(gymnasium, "registry", gymnasium.envs.registration.registry)
+    register_all()
+    env = gymnasium.make("perturb/Toy-v3", server="unix:/nowhere")
+    low, high = np.array([[-np.inf, -1], [2, np.inf]], np.float32)
+    assert env.observation_space == gymnasium.spaces.Box(low, high)
+    assert env.action_space == gymnasium.spaces.Box(-0.5, 0.5, (1,))
+    assert env.metadata == {"render_modes": ["rgb_array"], "render_fps": 4, "success": success}
 
 
 @pytest.mark.parametrize("kind", [np.int64, np.uint8, np.array])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from concurrent import futures
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import grpc
 import pytest
@@ -60,6 +60,18 @@ def stepped() -> pb.Stepped:
     return pb.Stepped(observations=bytes(16), rewards=bytes(4), terminated=bytes(1), truncated=bytes(1))
 
 
+def ended(**outcome: Any) -> pb.Stepped:
+    end = pb.EpisodeEnd(**outcome)
+    return pb.Stepped(
+        observations=bytes(16),
+        rewards=bytes(4),
+        terminated=b"\1",
+        truncated=bytes(1),
+        final_observations=bytes(16),
+        ended=[end],
+    )
+
+
 @pytest.fixture
 def fake() -> Iterator[FakeServer]:
     server = FakeServer()
@@ -74,6 +86,19 @@ def test_a_server_that_keeps_to_the_protocol_is_understood(fake: FakeServer) -> 
     env.reset()
     assert env.step(0)[1:] == (0.0, False, False, {})
     env.close()
+
+
+@pytest.mark.parametrize(("outcome", "told"), [({"achieved": 0.0}, {"achieved": 0.0}), ({}, {})])
+def test_what_an_episode_achieved_is_told_where_there_is_anything(
+    outcome: dict[str, float], told: dict[str, float], fake: FakeServer
+) -> None:
+    fake.answers = [Answer(opened=opened()), Answer(stepped=ended(**outcome))] * 2
+    env = perturb.PerturbEnv("CartPole", server=fake.address)
+    env.reset()
+    assert env.step(0)[-1] == {"is_success": False, "diverged": False, **told}
+    envs = perturb.PerturbVectorEnv("CartPole", server=fake.address)
+    envs.reset()
+    assert ("achieved" in envs.step([0])[-1]) == bool(told)
 
 
 def test_another_revision_is_refused(fake: FakeServer) -> None:

@@ -1,12 +1,15 @@
-"""The environments that this package knows, so that one can be made without a server, and before a fork.
+"""The environments and limits, so that one can be made without a server, and before a fork.
 
-The server has the same in its catalogue. The two are compared whenever a session opens; a difference is an error.
+The build asked a server for them: catalogue.json. They are compared with those of the server in use whenever a session
+opens; a difference is an error.
 """
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
+from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,10 +18,24 @@ from gymnasium import spaces
 from .errors import InvalidArgumentError, ProtocolError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
     from ._proto import perturb_pb2 as pb
 
 Range = tuple[float, float]
-ANY: Range = (-math.inf, math.inf)
+
+
+@dataclass(frozen=True)
+class Success:
+    """When an episode is a success: how what it achieved compares with a threshold."""
+
+    description: str
+    # What is compared, e.g. "steps", and its unit.
+    quantity: str
+    unit: str
+    # "at_least" or "at_most".
+    comparison: str
+    threshold: float
 
 
 @dataclass(frozen=True)
@@ -33,6 +50,26 @@ class Description:
     observation: tuple[Range, ...]
     actions: int | tuple[Range, ...]
     control_timestep: float
+    # The rule of this package's version; the server's, whose word is `is_success`, may be another.
+    success: Success | None = field(default=None, compare=False)
+
+    @classmethod
+    def read(cls, entry: Mapping[str, Any]) -> Description:
+        """Understand an environment of catalogue.json, where an open end of a range is null."""
+
+        def ranges(channels: Iterable[Mapping[str, float | None]]) -> tuple[Range, ...]:
+            ends = ((channel["low"], channel["high"]) for channel in channels)
+            return tuple((-math.inf if low is None else low, math.inf if high is None else high) for low, high in ends)
+
+        action = entry["action"]
+        return cls(
+            name=entry["name"],
+            revision=entry["revision"],
+            observation=ranges(entry["observation"]),
+            actions=len(action["discrete"]) if "discrete" in action else ranges(action["continuous"]),
+            control_timestep=entry["control_timestep"],
+            success=Success(**entry["success"]),
+        )
 
     @property
     def discrete(self) -> bool:
@@ -40,8 +77,9 @@ class Description:
         return isinstance(self.actions, int)
 
     def metadata(self) -> dict[str, Any]:
-        """What Gymnasium wants to know of pictures; as many in a second as show real time."""
-        return {"render_modes": ["rgb_array"], "render_fps": 1 / self.control_timestep}
+        """What Gymnasium wants to know of pictures, as many in a second as show real time; and the rule of success."""
+        pictures = {"render_modes": ["rgb_array"], "render_fps": 1 / self.control_timestep}
+        return pictures if self.success is None else {**pictures, "success": asdict(self.success)}
 
     def observation_space(self) -> spaces.Box:
         """A float32 Box [O]."""
@@ -77,25 +115,17 @@ def _box(ranges: tuple[Range, ...]) -> spaces.Box:
     return spaces.Box(low, high, dtype=np.float32)
 
 
-def _robot(name: str, joints: int, contacts: int) -> Description:
-    torso: tuple[Range, ...] = ((-5, 5), (-1, 1), (-1, 1), *[(-5.0, 5.0)] * 5)
-    observation = (*torso, *[(-5.0, 5.0)] * (2 * joints), *[(0.0, 1.0)] * contacts)
-    return Description(name, 0, observation, ((-1.0, 1.0),) * joints, 0.0165)
-
-
-_UNIT: Range = (-1.0, 1.0)
+_WRITTEN: Mapping[str, Any] = json.loads(resources.files(__package__).joinpath("catalogue.json").read_text("utf-8"))
+_LIMITS: Mapping[str, Any] = _WRITTEN["limits"]
 
 CATALOGUE: dict[str, Description] = {
-    description.name: description
-    for description in (
-        Description("CartPole", 0, (ANY,) * 4, 2, 0.02),
-        Description("MountainCar", 0, ((-1.2, 0.6), (-0.07, 0.07)), 3, 1.0),
-        Description("Acrobot", 0, (*[_UNIT] * 4, (-4 * math.pi, 4 * math.pi), (-9 * math.pi, 9 * math.pi)), 3, 0.2),
-        Description("Pendulum", 0, (_UNIT, _UNIT, (-8.0, 8.0)), ((-2.0, 2.0),), 0.05),
-        _robot("HalfCheetah", joints=6, contacts=6),
-        _robot("Hopper", joints=3, contacts=1),
-    )
+    description.name: description for description in map(Description.read, _WRITTEN["environments"])
 }
+# Width and height of a picture: the least and the most, and unless told otherwise.
+LEAST_PIXELS, MOST_PIXELS = _LIMITS["picture_pixels"]
+USUAL_PIXELS: int = _LIMITS["usual_picture_pixels"]
+# The longest path that a Unix socket can have, in bytes.
+LONGEST_SOCKET_PATH: int = _LIMITS["longest_socket_path"]
 
 
 def find(name: str) -> Description:

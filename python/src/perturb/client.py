@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 # How long a reply may take unless told otherwise, s.
 TIMEOUT = 60.0
-# The width and the height of pictures unless told otherwise, in pixels.
-PICTURE = 480
 
 
 class Client:

@@ -10,7 +10,8 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from . import requests
-from .client import PICTURE, TIMEOUT, Client
+from .catalogue import USUAL_PIXELS
+from .client import TIMEOUT, Client
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -24,7 +25,7 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
     """One environment of a perturb-server.
 
     Args:
-        environment: `CartPole`, `MountainCar`, `Acrobot`, `Pendulum`, `HalfCheetah` or `Hopper`.
+        environment: a name of docs/environments.md, such as `CartPole`.
         version: where parameters come from: `D` their defaults, `R` random, `E` extreme.
         server: `unix:/path` or `host:port`; None starts a server of this process's own.
         parameters: replaces the version's set of the named parameters: a value, an interval `(low, high)`, or several
@@ -36,7 +37,7 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
         reward_terms: whether every step's info has the terms of the reward.
         timeout: how long a reply may take, s.
         render_mode: `rgb_array` lets `render` draw; None.
-        width: of pictures, in pixels, 16 … 2048.
+        width: of pictures, in pixels.
         height: likewise.
 
     The connection is made by the first `reset`. Observations, float32 [O], and pictures are the caller's own to
@@ -59,8 +60,8 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
         reward_terms: bool = False,
         timeout: float = TIMEOUT,
         render_mode: str | None = None,
-        width: int = PICTURE,
-        height: int = PICTURE,
+        width: int = USUAL_PIXELS,
+        height: int = USUAL_PIXELS,
     ) -> None:
         self._client = Client(
             environment=environment,

@@ -7,8 +7,9 @@ A reset's info has, if receipts were asked for:
   back from the physics, by name, and `model_hash`;
 - `context_id`: the trial's index, which counts the draws of parameters.
 
-The info of an episode's last step has these too, and `is_success` and `diverged`. Every step's has `reward_terms`, if
-they were asked for. Nothing in them depends on the clock.
+The info of an episode's last step has these too, `is_success` and `diverged`, and `achieved` unless there is nothing:
+the value of the quantity that the rule of success compares. Every step's has `reward_terms`, if they were asked for.
+Nothing in them depends on the clock.
 
 Of a batch, each key holds an array [N], and the key with an underscore before it a mask of the environments that have
 it, as `VectorEnv._add_info` of Gymnasium makes them.
@@ -42,8 +43,9 @@ class Names:
 
     def ended(self, end: pb.EpisodeEnd) -> dict[str, Any]:
         """Info of one environment's ended episode."""
-        receipt = self._receipt(end) if end.HasField("receipt") else {}
-        return {"is_success": end.success, "diverged": end.diverged, **receipt}
+        info = {"is_success": end.success, "diverged": end.diverged}
+        achieved = {"achieved": end.achieved} if end.HasField("achieved") else {}
+        return {**info, **achieved, **(self._receipt(end) if end.HasField("receipt") else {})}
 
     def terms(self, terms: NDArray[np.float32]) -> dict[str, Any]:
         """Info of one environment's reward terms [terms]."""
@@ -78,6 +80,10 @@ class BatchInfos:
             slots = [end.slot for end in ends]
             self._put(self.infos, "is_success", slots, np.array([end.success for end in ends]))
             self._put(self.infos, "diverged", slots, np.array([end.diverged for end in ends]))
+        reached = [end for end in ends if end.HasField("achieved")]
+        if reached:
+            slots = [end.slot for end in reached]
+            self._put(self.infos, "achieved", slots, np.array([end.achieved for end in reached]))
         begun_or_ended: list[pb.EpisodeStart | pb.EpisodeEnd] = [*starts]
         if ends and ends[0].HasField("receipt"):
             begun_or_ended += ends

@@ -29,8 +29,6 @@ VARIABLE = "PERTURB_SERVER"
 START_LIMIT = 20.0
 # How long a server may take to end before it is killed, s.
 END_LIMIT = 5.0
-# The limits guard shared servers. This one's only client is this process, whose memory is its own affair.
-LIMITS = ["--max-envs", "16777216", "--max-sessions", "65536", "--max-message-bytes", str(1 << 30)]
 
 
 def find_program() -> Path:
@@ -110,16 +108,11 @@ class LocalServer:
 
 
 def _spawn(program: Path, address: Address) -> subprocess.Popen[bytes]:
-    # Settings for servers that people run themselves do not reach this one.
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PERTURB_SERVER_")}
-    # Between two steps a learner may compute for long; its death closes the socket and the pipe anyway.
-    flags = ["--exit-with-stdin", "--log", "error", "--grace-seconds", "1", "--keepalive-seconds", "3600", *LIMITS]
     return subprocess.Popen(
-        [program, "--listen", str(address), *flags],
+        [program, "--private", "--log", "error", "--listen", str(address)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         bufsize=0,
-        env=environment,
         start_new_session=True,  # Ctrl-C is for the learner, which may still want its environments
     )
 

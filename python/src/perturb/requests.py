@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from ._proto import perturb_pb2 as pb
+from .catalogue import LEAST_PIXELS, MOST_PIXELS
 from .errors import InvalidArgumentError
 
 if TYPE_CHECKING:
@@ -127,8 +128,8 @@ def pixels(value: Any, name: str) -> int:
         number = operator.index(value)
     except TypeError:
         number = 0
-    if not 16 <= number <= 2048:
-        raise InvalidArgumentError(f"{name}={value!r}; expected an integer from 16 to 2048")
+    if not LEAST_PIXELS <= number <= MOST_PIXELS:
+        raise InvalidArgumentError(f"{name}={value!r}; expected an integer from {LEAST_PIXELS} to {MOST_PIXELS}")
     return number
 
 

@@ -11,7 +11,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from . import requests
-from .client import PICTURE, TIMEOUT, Client
+from .catalogue import USUAL_PIXELS
+from .client import TIMEOUT, Client
 from .errors import InvalidArgumentError
 from .infos import BatchInfos
 
@@ -25,7 +26,7 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
     """N environments of a perturb-server.
 
     Args:
-        environment: `CartPole`, `MountainCar`, `Acrobot`, `Pendulum`, `HalfCheetah` or `Hopper`.
+        environment: a name of docs/environments.md, such as `CartPole`.
         num_envs: N.
         version: where parameters come from: `D` their defaults, `R` random, `E` extreme.
         server: `unix:/path` or `host:port`; None starts a server of this process's own.
@@ -42,7 +43,7 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
             as they are.
         timeout: how long a reply may take, s.
         render_mode: `rgb_array` lets `render` draw; None.
-        width: of pictures, in pixels, 16 … 2048.
+        width: of pictures, in pixels.
         height: likewise.
 
     The connection is made by the first `reset`. Rewards are float32 [N], flags bool [N].
@@ -64,8 +65,8 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         copy: bool = False,
         timeout: float = TIMEOUT,
         render_mode: str | None = None,
-        width: int = PICTURE,
-        height: int = PICTURE,
+        width: int = USUAL_PIXELS,
+        height: int = USUAL_PIXELS,
     ) -> None:
         self._mode = requests.autoreset_mode(autoreset_mode)
         self._client = Client(
