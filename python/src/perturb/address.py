@@ -6,10 +6,8 @@ import ipaddress
 import re
 from dataclasses import dataclass
 
+from .catalogue import LONGEST_SOCKET_PATH
 from .errors import InvalidArgumentError
-
-# The longest path that a Unix socket can have on Linux, in bytes.
-LONGEST_SOCKET_PATH = 107
 
 
 @dataclass(frozen=True)
@@ -55,13 +53,18 @@ def parse_address(text: str) -> Address:
     if not re.fullmatch(r"[0-9]{1,5}", port) or not 1 <= int(port) <= 65535:
         raise refuse(f"{port!r} is not a port (1 to 65535)")
     if host.startswith("[") and host.endswith("]"):
-        try:
-            ipaddress.IPv6Address(host[1:-1])
-        except ValueError as error:
-            raise refuse(f"{host[1:-1]!r} is not an IPv6 address") from error
+        if not _is_ipv6(host[1:-1]):
+            raise refuse(f"{host[1:-1]!r} is not an IPv6 address")
     elif not re.fullmatch(r"[A-Za-z0-9._-]+", host):
         raise refuse(f"{host!r} is not a host name; an IPv6 address must stand in brackets")
     return Address(f"{host}:{port}", local=_is_loopback(host.strip("[]")))
+
+
+def _is_ipv6(host: str) -> bool:
+    try:
+        return ipaddress.IPv6Address(host).scope_id is None  # a scope is not for URLs
+    except ValueError:
+        return False
 
 
 def _is_loopback(host: str) -> bool:
