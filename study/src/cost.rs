@@ -5,7 +5,8 @@
 
 use std::collections::HashMap;
 
-use super::plan::{Cell, Method, Plan, distinct};
+use super::plan::{Cell, Plan, distinct};
+use crate::Method;
 use crate::settings::{TrainConfig, WrapperSettings};
 
 /// Seconds that a step of one environment takes, with all that belongs to it.

@@ -23,9 +23,9 @@ use std::path::{Path, PathBuf};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use super::plan::{Cell, Method};
+use super::plan::Cell;
 use crate::results::Counters;
-use crate::{TestResult, Version};
+use crate::{Method, TestResult, Version};
 
 /// Of `result.json`; raised when older programs could misread it.
 const FORMAT_VERSION: u32 = 1;

@@ -15,10 +15,10 @@ use serde::{Deserialize, Serialize};
 
 use super::folder::{Folder, FolderError, read_bytes, write_atomically};
 use super::heatmap::{Heatmap, HeatmapOptions, default_axes, heatmap_csv};
-use super::plan::{Cell, Method};
+use super::plan::Cell;
 use super::plot::{self, PlotError};
-use super::selection::{Group, Results};
-use crate::Version;
+use super::selection::{Selected, Selection};
+use crate::{Method, Version};
 
 /// Of the records; raised when older programs could misread them.
 const FORMAT_VERSION: u32 = 1;
@@ -26,14 +26,14 @@ const FORMAT_VERSION: u32 = 1;
 /// A heatmap that an experiment has room for.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeatmapPlace<'a> {
-    /// The environment.
+    /// The environment's name.
     pub environment: &'a str,
-    /// What learned.
+    /// What was trained.
     pub method: &'a Method,
     /// Where it was trained.
     pub version: Version,
-    /// The cell that was selected in the first run; `None` if none has a result.
-    pub cell: Option<&'a Cell>,
+    /// What was selected in the first run; `None` if nothing has a result.
+    pub selected: Option<Selected<'a>>,
 }
 
 /// `ID.json`: what a heatmap shows. It depends on nothing but the results, the program and the settings.
@@ -81,22 +81,14 @@ pub enum NoHeatmap {
     NoAxes,
 }
 
-/// All heatmaps that a plan has room for, in the order of `groups` and of the versions.
-pub fn heatmap_places<'a>(results: &Results<'a>, groups: &'a [Group]) -> Vec<HeatmapPlace<'a>> {
-    let plan = results.plan;
-    let mut places = Vec::new();
-    for group in groups {
-        let of_group =
-            |cell: &&Cell| cell.config.common.environment == group.environment && cell.method() == group.method;
-        let first = group.runs.values().next();
-        for version in Version::ALL {
-            if plan.cells.iter().filter(of_group).any(|cell| cell.config.common.version == version) {
-                let cell = first.and_then(|run| run.cells[version as usize]).map(|index| &plan.cells[index]);
-                places.push(HeatmapPlace { environment: &group.environment, method: &group.method, version, cell });
-            }
-        }
-    }
-    places
+/// All heatmaps that a plan has room for, in the order of `selections` and of the versions that it trains on.
+pub fn heatmap_places<'a>(selections: &'a [Selection<'a>]) -> Vec<HeatmapPlace<'a>> {
+    let of_selection = |selection: &'a Selection<'a>| {
+        let Selection { environment, method, runs, .. } = selection;
+        let first = runs.values().next().into_iter().flat_map(|run| &run.0);
+        first.map(move |(&version, &selected)| HeatmapPlace { environment, method, version, selected })
+    };
+    selections.iter().flat_map(of_selection).collect()
 }
 
 impl HeatmapPlace<'_> {
@@ -105,7 +97,7 @@ impl HeatmapPlace<'_> {
     /// # Errors
     /// [`FolderError`] if a file is there that cannot be read.
     pub fn read(&self, folder: &Folder) -> Result<Result<StoredHeatmap, NoHeatmap>, FolderError> {
-        let Some(cell) = self.cell else { return Ok(Err(NoHeatmap::NoResult)) };
+        let Some(Selected { cell, .. }) = self.selected else { return Ok(Err(NoHeatmap::NoResult)) };
         if default_axes(self.environment).is_none() {
             return Ok(Err(NoHeatmap::NoAxes));
         }
@@ -207,7 +199,7 @@ fn checksum(content: &[u8]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Axis, CellState, Plan};
+    use crate::{Axis, Plan, fixture};
 
     const PLAN: &str = "environments = ['Pendulum', 'Elsewhere']\nversions = ['D', 'E']\nruns = 2
         [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
@@ -244,10 +236,11 @@ mod tests {
         let cell = &plan.cells[0];
         let result = folder.cell(&cell.id).path().join("result.json");
         write_atomically(&result, b"{}").unwrap();
-        let method = cell.method();
-        let place = HeatmapPlace { environment: "Pendulum", method: &method, version: Version::D, cell: Some(cell) };
+        let (method, done) = (cell.method(), fixture::result(cell, [0.0; 3], 0.0));
+        let selected = Some(Selected { cell, result: &done });
+        let place = HeatmapPlace { environment: "Pendulum", method: &method, version: Version::D, selected };
         assert_eq!(place.read(&folder).unwrap(), Err(NoHeatmap::NotMade));
-        let nobody = HeatmapPlace { cell: None, ..place.clone() };
+        let nobody = HeatmapPlace { selected: None, ..place.clone() };
         assert_eq!(nobody.read(&folder).unwrap(), Err(NoHeatmap::NoResult));
         let elsewhere = HeatmapPlace { environment: "Elsewhere", ..place.clone() };
         assert_eq!(elsewhere.read(&folder).unwrap(), Err(NoHeatmap::NoAxes));
@@ -280,17 +273,14 @@ mod tests {
     #[test]
     fn there_is_room_for_what_the_plan_trains_and_the_first_run_selects() {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
-        let results = Results { plan: &plan, states: vec![CellState::Missing; plan.cells.len()] };
-        let mut groups = results.select();
-        let index = |run: u32| plan.cells.iter().position(|cell| cell.run == run).unwrap();
-        for run in [1, 2] {
-            groups[0].runs.get_mut(&run).unwrap().cells[0] = Some(index(run));
-        }
-        let places = heatmap_places(&results, &groups);
+        let done = |cell: &Cell| cell.id.starts_with("Pendulum-a2c-ff-D").then_some(([0.0; 3], 0.0));
+        let results = fixture::results(&plan, done);
+        let selections = results.select();
+        let places = heatmap_places(&selections);
         let shown: Vec<String> = places.iter().map(ToString::to_string).collect();
         let expected = ["Pendulum, a2c ff trained on D", "Pendulum, a2c ff trained on E"];
         assert_eq!((shown[..2] == expected, shown.len()), (true, 4), "none on R");
-        let cells: Vec<_> = places.iter().map(|place| place.cell.map(|cell| cell.run)).collect();
-        assert_eq!(cells, [Some(1), None, None, None]);
+        let runs: Vec<_> = places.iter().map(|place| place.selected.map(|selected| selected.cell.run)).collect();
+        assert_eq!(runs, [Some(1), None, None, None]);
     }
 }

@@ -4,11 +4,13 @@
 //! - [`Plan`] expands an experiment file to cells, [`Folder`] is where they are kept, [`run()`] has worker processes do
 //!   them, [`slurm`] a cluster.
 //! - [`Results`] reads them back and selects; [`paper`] is what was published.
-//! - [`report`] makes tables of them, [`plot`] pictures.
+//! - [`report`] compares them, in [`table::Table`]s and on a page; [`plot`] draws.
 #![forbid(unsafe_code)]
 
 mod cost;
 mod curves;
+#[cfg(test)]
+mod fixture;
 mod folder;
 mod heatmap;
 mod heatmaps;
@@ -26,9 +28,10 @@ mod selection;
 pub mod settings;
 pub mod slurm;
 mod statistics;
+pub mod table;
 
 pub use cost::{Estimate, Measurement, Speed, Work, cell_seconds, estimate, representatives};
-pub use curves::{Curve, EnvironmentCurves, Point, curves_csv, read_curves};
+pub use curves::{Curve, EnvironmentCurves, Point, curves_table, read_curves};
 pub use folder::{
     CellFolder, CellLock, CellResult, CellState, Failure, FailureMark, Folder, FolderError, Timing, Training, io,
     write_atomically,
@@ -38,11 +41,12 @@ pub use heatmaps::{
     HeatmapPlace, HeatmapRecord, NoHeatmap, StoredHeatmap, heatmap_files, heatmap_places, store_heatmap,
 };
 pub use means::{geometric_mean, mean, wilson};
-pub use plan::{Cell, Counts, Method, Plan, PlanError, Tests};
+pub use paper::Method;
+pub use plan::{Cell, Counts, Plan, PlanError, Tests};
 pub use results::{Counters, TestResult};
 pub use run::{Attempt, BUSY, NO_SERVER, ON, RunEnd, RunError, RunOptions, RunStatus, run};
-pub use scenarios::{Metrics, Rates, Scenario, Version};
-pub use selection::{Group, Metric, Results, Selected, average, interquartile};
+pub use scenarios::{Metric, Scenario, Version};
+pub use selection::{Results, Selected, SelectedRun, Selection, average, interquartile};
 pub use statistics::{Iqm, Summary, interquartile_mean};
 
 /// The version, and the commit that was built, e.g. "0.1.0 (1a2b3c4d5e6f)"; "-dirty" follows a commit whose files were

@@ -1,36 +1,48 @@
-//! What the paper reports.
+//! What the paper reports: Packer et al. (2018), arXiv:1810.12282.
 
 use std::fmt;
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
-/// Every published cell of Packer et al. (2018), arXiv:1810.12282.
+use super::scenarios::Metric;
+
+/// Every number of its tables.
 const TABLE: &str = include_str!("../data/paper_results.csv");
+/// What it averages over.
+const ENVIRONMENTS: usize = 6;
 
-/// Mean and standard deviation over the paper's five runs, %.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Cell {
-    /// Mean, %.
-    pub mean: f64,
-    /// Standard deviation, %.
-    pub std: f64,
+/// An algorithm with its architecture and, of RL², the episodes in a trial: a row of the paper's tables.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct Method {
+    /// E.g. "ppo".
+    pub algorithm: String,
+    /// "ff" or "rc".
+    pub architecture: String,
+    /// `None` of algorithms without trials.
+    pub episodes_per_trial: Option<u32>,
 }
 
-impl fmt::Display for Cell {
+impl fmt::Display for Method {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(&format!("{:.1} ± {:.1}", self.mean, self.std))
+        write!(f, "{} {}", self.algorithm, self.architecture)?;
+        self.episodes_per_trial.map_or(Ok(()), |episodes| write!(f, " N={episodes}"))
     }
 }
 
-/// A row of the paper's tables: one environment, one algorithm, one architecture.
+/// Mean and standard deviation over the paper's five runs, %.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Row {
-    /// Trained and tested on D.
-    pub default: Cell,
-    /// Trained and tested on R.
-    pub interpolation: Cell,
-    /// The geometric mean of DR, DE and RE.
-    pub extrapolation: Cell,
+pub struct PaperNumber {
+    /// Mean, %.
+    pub mean: f64,
+    /// Standard deviation, %; not known for averages over other environments than all of the paper's.
+    pub std: Option<f64>,
+}
+
+impl fmt::Display for PaperNumber {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:.1}", self.mean)?;
+        self.std.map_or(Ok(()), |std| write!(f, " ± {std:.1}"))
+    }
 }
 
 #[derive(Deserialize)]
@@ -39,51 +51,34 @@ struct Record {
     algorithm: String,
     architecture: String,
     episodes_per_trial: Option<u32>,
-    metric: String,
+    metric: Metric,
     mean_percent: f64,
     std_percent: f64,
 }
 
-/// The row of `environment` (e.g. "CartPole"), `algorithm` and `architecture` (e.g. "ppo", "ff"; upper or lower case);
-/// `None` if the paper has none. Only algorithms without trials are looked up.
-pub fn row(environment: &str, algorithm: &str, architecture: &str) -> Option<Row> {
-    row_with_trials(environment, algorithm, architecture, None)
+impl Record {
+    fn is_of(&self, environment: &str, method: &Method) -> bool {
+        self.environment == environment
+            && self.algorithm.eq_ignore_ascii_case(&method.algorithm)
+            && self.architecture.eq_ignore_ascii_case(&method.architecture)
+            && self.episodes_per_trial == method.episodes_per_trial
+    }
 }
 
-/// The same for algorithms whose trials have so many episodes. The environment "Average" is the mean of all six.
-pub fn row_with_trials(
-    environment: &str,
-    algorithm: &str,
-    architecture: &str,
-    episodes_per_trial: Option<u32>,
-) -> Option<Row> {
-    let records: Vec<Record> = records()
-        .filter(|record| {
-            record.environment == environment
-                && record.algorithm.eq_ignore_ascii_case(algorithm)
-                && record.architecture.eq_ignore_ascii_case(architecture)
-                && record.episodes_per_trial == episodes_per_trial
-        })
-        .collect();
-    let cell = |metric: &str| {
-        let record = records.iter().find(|record| record.metric == metric)?;
-        Some(Cell { mean: record.mean_percent, std: record.std_percent })
-    };
-    Some(Row {
-        default: cell("default")?,
-        interpolation: cell("interpolation")?,
-        extrapolation: cell("extrapolation")?,
-    })
+/// The paper's number for a method in an environment; `None` if it has none. The environment "Average" is all six.
+pub fn number(environment: &str, method: &Method, metric: Metric) -> Option<PaperNumber> {
+    let record = records().find(|record| record.metric == metric && record.is_of(environment, method))?;
+    Some(PaperNumber { mean: record.mean_percent, std: Some(record.std_percent) })
 }
 
-/// Algorithm, architecture and episodes in a trial of each row of `environment`.
-pub fn rows_of(environment: &str) -> Vec<(String, String, Option<u32>)> {
-    let mut rows: Vec<_> = records()
-        .filter(|record| record.environment == environment)
-        .map(|record| (record.algorithm, record.architecture, record.episodes_per_trial))
-        .collect();
-    rows.dedup(); // a row's metrics stand together
-    rows
+/// The paper's average over `environments`: the published one if they are all six, otherwise the mean of theirs.
+pub fn average(environments: &[&str], method: &Method, metric: Metric) -> Option<PaperNumber> {
+    let means: Option<Vec<f64>> = environments.iter().map(|name| Some(number(name, method, metric)?.mean)).collect();
+    let means = means?;
+    if means.len() == ENVIRONMENTS {
+        return number("Average", method, metric);
+    }
+    Some(PaperNumber { mean: means.iter().sum::<f64>() / means.len() as f64, std: None })
 }
 
 fn records() -> impl Iterator<Item = Record> {
@@ -94,6 +89,12 @@ fn records() -> impl Iterator<Item = Record> {
 mod tests {
     use super::*;
 
+    const ALL: [&str; ENVIRONMENTS] = ["Acrobot", "CartPole", "MountainCar", "Pendulum", "HalfCheetah", "Hopper"];
+
+    fn method(algorithm: &str, architecture: &str, episodes_per_trial: Option<u32>) -> Method {
+        Method { algorithm: algorithm.into(), architecture: architecture.into(), episodes_per_trial }
+    }
+
     #[test]
     fn every_line_is_read() {
         let records: Result<Vec<Record>, _> = csv::Reader::from_reader(TABLE.as_bytes()).deserialize().collect();
@@ -101,14 +102,36 @@ mod tests {
     }
 
     #[test]
-    fn a_row_is_found_by_its_names() {
-        let row = row("CartPole", "ppo", "ff").unwrap();
-        assert_eq!(row.default, Cell { mean: 100.0, std: 0.0 });
-        assert_eq!(row.extrapolation.to_string(), "86.2 ± 12.6");
-        assert_eq!(super::row("CartPole", "ppo", "transformer"), None);
-        assert_eq!(super::row("Pendulum", "rl2-a2c", "rc"), None, "it has trials");
-        let with = |trials| row_with_trials("Average", "rl2-a2c", "rc", Some(trials)).unwrap().default.mean;
+    fn a_number_is_found_by_environment_method_and_metric() {
+        let ppo = method("ppo", "ff", None);
+        let shown = |metric| number("CartPole", &ppo, metric).unwrap().to_string();
+        assert_eq!(Metric::ALL.map(shown), ["100.0 ± 0.0", "100.0 ± 0.0", "86.2 ± 12.6"]);
+        assert_eq!(number("CartPole", &method("ppo", "transformer", None), Metric::Default), None);
+        assert_eq!(number("Pendulum", &method("rl2-a2c", "rc", None), Metric::Default), None, "it has trials");
+        let with = |trials| number("Average", &method("rl2-a2c", "rc", Some(trials)), Metric::Default).unwrap().mean;
         assert_eq!([1, 2, 5].map(with), [66.83, 45.79, 41.08]);
-        assert_eq!(rows_of("Hopper").len(), 14);
+    }
+
+    #[test]
+    fn an_average_is_over_the_same_environments() {
+        let a2c = method("a2c", "ff", None);
+        let two = average(&["CartPole", "MountainCar"], &a2c, Metric::Default).unwrap();
+        assert!((two.mean - (100.0 + 79.78) / 2.0).abs() < 1e-9 && two.std.is_none());
+        assert_eq!(average(&ALL, &a2c, Metric::Default), number("Average", &a2c, Metric::Default));
+        assert_eq!(average(&["CartPole", "Ant"], &a2c, Metric::Default), None);
+    }
+
+    /// The paper's averages follow from its tables of the environments, to the two digits that they are rounded to.
+    #[test]
+    fn the_published_averages_are_those_of_the_environments() {
+        let averages: Vec<Record> = records().filter(|record| record.environment == "Average").collect();
+        assert_eq!(averages.len(), 42);
+        for Record { algorithm, architecture, episodes_per_trial, metric, mean_percent, .. } in averages {
+            let method = Method { algorithm, architecture, episodes_per_trial };
+            let means = ALL.map(|environment| number(environment, &method, metric).unwrap().mean);
+            let mean = means.iter().sum::<f64>() / means.len() as f64;
+            // Either is rounded to 0.01: half of that each, and some for the binary fractions.
+            assert!((mean - mean_percent).abs() < 0.0101, "{method} {metric}: {mean} is not {mean_percent}");
+        }
     }
 }

@@ -10,8 +10,8 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use crate::Version;
 use crate::settings::{ConfigError, TrainConfig, WrapperSettings};
+use crate::{Method, Version};
 
 /// Settings that the plan itself decides for each cell.
 const OWN_KEYS: [&str; 5] = ["environment", "version", "algorithm", "architecture", "seed"];
@@ -52,24 +52,6 @@ pub struct Tests {
     pub episodes: u64,
     /// On which versions, in the order D, R, E.
     pub versions: Vec<Version>,
-}
-
-/// An algorithm with its architecture and, of RL², the episodes in a trial: a row of the paper's tables.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-pub struct Method {
-    /// The algorithm, e.g. "ppo".
-    pub algorithm: String,
-    /// The architecture, "ff" or "rc".
-    pub architecture: String,
-    /// Episodes in a trial, if the algorithm has trials.
-    pub episodes_per_trial: Option<u32>,
-}
-
-impl std::fmt::Display for Method {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let trials = self.episodes_per_trial.map(|episodes| format!(" N={episodes}")).unwrap_or_default();
-        f.pad(&format!("{} {}{trials}", self.algorithm, self.architecture))
-    }
 }
 
 /// How much a plan asks for.

@@ -9,7 +9,8 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
 use super::folder::{Failure, FailureMark, Folder, FolderError};
-use super::plan::{Cell, Method, Plan};
+use super::plan::{Cell, Plan};
+use crate::Method;
 use crate::interrupt::StopFlag;
 
 /// A worker's exit status if somebody else works on its cell (EX_TEMPFAIL of sysexits.h).

@@ -2,12 +2,14 @@
 
 use std::fmt;
 
+use serde::Deserialize;
+
 use super::means::geometric_mean;
 
 pub use perturb_protocol::Version;
 
 /// Training on one version and testing on another, e.g. "DR".
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Scenario {
     /// Where the policy was trained.
     pub train: Version,
@@ -28,37 +30,38 @@ impl fmt::Display for Scenario {
     }
 }
 
-/// Success rates of the nine scenarios, in percent, by training and testing version.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Rates(pub [[f64; 3]; 3]);
+/// One of the paper's three numbers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Metric {
+    /// The success rate of DD.
+    Default,
+    /// The success rate of RR.
+    Interpolation,
+    /// The geometric mean of the success rates of DR, DE and RE.
+    Extrapolation,
+}
 
-impl Rates {
-    /// The rate of a scenario, %.
-    pub fn of(&self, scenario: Scenario) -> f64 {
-        self.0[scenario.train as usize][scenario.test as usize]
-    }
+impl Metric {
+    /// All, in the paper's order.
+    pub const ALL: [Metric; 3] = [Metric::Default, Metric::Interpolation, Metric::Extrapolation];
 
-    /// The paper's three metrics.
-    pub fn metrics(&self) -> Metrics {
+    /// The metric from the success rates of scenarios; `None` if one that it needs has none.
+    pub fn of(self, rate: impl Fn(Scenario) -> Option<f64>) -> Option<f64> {
         use Version::{D, E, R};
-        let rate = |train, test| self.of(Scenario { train, test });
-        Metrics {
-            default: rate(D, D),
-            interpolation: rate(R, R),
-            extrapolation: geometric_mean(&[rate(D, R), rate(D, E), rate(R, E)]),
+        let rate = |train, test| rate(Scenario { train, test });
+        match self {
+            Metric::Default => rate(D, D),
+            Metric::Interpolation => rate(R, R),
+            Metric::Extrapolation => Some(geometric_mean(&[rate(D, R)?, rate(D, E)?, rate(R, E)?])),
         }
     }
 }
 
-/// The paper's metrics, %.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Metrics {
-    /// DD.
-    pub default: f64,
-    /// RR.
-    pub interpolation: f64,
-    /// The geometric mean of DR, DE and RE.
-    pub extrapolation: f64,
+impl fmt::Display for Metric {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Debug::fmt(self, f)
+    }
 }
 
 #[cfg(test)]
@@ -73,10 +76,19 @@ mod tests {
 
     #[test]
     fn metrics_take_their_scenarios() {
-        // DD, RR and the three of extrapolation are all different, the unused four would spoil any of them.
-        let rates = Rates([[90.0, 20.0, 40.0], [-1.0, 70.0, 10.0], [-2.0, -3.0, -4.0]]);
-        let metrics = rates.metrics();
-        assert_eq!((metrics.default, metrics.interpolation), (90.0, 70.0));
-        assert!((metrics.extrapolation - 20.0).abs() < 1e-12, "the third root of 20 · 40 · 10");
+        let rate = |scenario: Scenario| match scenario.to_string().as_str() {
+            "DD" => Some(90.0),
+            "RR" => Some(70.0),
+            "DR" => Some(20.0),
+            "DE" => Some(40.0),
+            "RE" => Some(10.0),
+            _ => None,
+        };
+        assert_eq!((Metric::Default.of(rate), Metric::Interpolation.of(rate)), (Some(90.0), Some(70.0)));
+        let extrapolation = Metric::Extrapolation.of(rate).unwrap();
+        assert!((extrapolation - 20.0).abs() < 1e-12, "the third root of 20 · 40 · 10");
+        for needed in ["DR", "DE", "RE"] {
+            assert_eq!(Metric::Extrapolation.of(|s| rate(s).filter(|_| s.to_string() != needed)), None, "{needed}");
+        }
     }
 }

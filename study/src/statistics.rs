@@ -37,10 +37,8 @@ impl Summary {
 
 impl std::fmt::Display for Summary {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self.deviation() {
-            Some(std) => f.pad(&format!("{:.1} ± {std:.1}", self.mean)),
-            None => f.pad(&format!("{:.1}", self.mean)),
-        }
+        write!(f, "{:.1}", self.mean)?;
+        self.deviation().map_or(Ok(()), |std| write!(f, " ± {std:.1}"))
     }
 }
 
@@ -51,14 +49,14 @@ pub struct Iqm {
     pub iqm: f64,
     /// 2.5th and 97.5th percentile of the bootstrap; `None` if no environment has a second run.
     pub interval_95: Option<[f64; 2]>,
+    /// Runs of each environment; of the one that has fewest, if they differ.
+    pub runs: usize,
 }
 
 impl std::fmt::Display for Iqm {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self.interval_95 {
-            Some([low, high]) => f.pad(&format!("{:.1} [{low:.1}, {high:.1}]", self.iqm)),
-            None => f.pad(&format!("{:.1}", self.iqm)),
-        }
+        write!(f, "{:.1}", self.iqm)?;
+        self.interval_95.map_or(Ok(()), |[low, high]| write!(f, " [{low:.1}, {high:.1}]"))
     }
 }
 
@@ -67,13 +65,11 @@ impl Iqm {
     /// arXiv:2108.13264, and rliable). The bootstrap draws runs anew within each environment, `resamples` times. `None`
     /// if there is no environment, or one without runs.
     pub fn of(strata: &[Vec<f64>], resamples: usize, seed: u64) -> Option<Self> {
-        if strata.is_empty() || strata.iter().any(Vec::is_empty) {
-            return None;
-        }
+        let runs = strata.iter().map(Vec::len).min().filter(|runs| *runs > 0)?;
         let mut scores: Vec<f64> = strata.concat();
         let iqm = interquartile_mean(&mut scores);
         if strata.iter().all(|runs| runs.len() == 1) {
-            return Some(Self { iqm, interval_95: None });
+            return Some(Self { iqm, interval_95: None, runs });
         }
         let mut rng = stream(seed, Purpose::Bootstrap);
         let mut means = Vec::with_capacity(resamples);
@@ -83,7 +79,7 @@ impl Iqm {
             means.push(interquartile_mean(&mut scores));
         }
         means.sort_unstable_by(f64::total_cmp);
-        Some(Self { iqm, interval_95: Some([percentile(&means, 2.5), percentile(&means, 97.5)]) })
+        Some(Self { iqm, interval_95: Some([percentile(&means, 2.5), percentile(&means, 97.5)]), runs })
     }
 }
 

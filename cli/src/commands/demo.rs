@@ -1,11 +1,11 @@
 //! `perturb demo`: the paper's protocol on CartPole, small.
 
+use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::Path;
 use std::time::Instant;
 
 use anyhow::{Context, Result};
-use toml::Table;
 
 use super::args::DemoArgs;
 use super::bar::Bar;
@@ -17,7 +17,8 @@ use perturb_learner::evaluation::test;
 use perturb_learner::training::{Outcome, RunDirectory, train};
 use perturb_study::interrupt::StopFlag;
 use perturb_study::settings::{AlgorithmName, Architecture, TrainConfig};
-use perturb_study::{Metrics, Rates, Version, paper};
+use perturb_study::table::Table;
+use perturb_study::{Method, Metric, Scenario, Version, paper};
 
 /// Episodes of each training, unless told otherwise.
 pub(super) const EPISODES: u64 = 2000;
@@ -39,19 +40,20 @@ pub(super) fn run(args: &DemoArgs) -> Result<Ending> {
     writeln!(out, "PPO with feed-forward networks on {ENVIRONMENT}: three trainings, nine tests.")?;
     budget(&mut out, "training", args.episodes, PAPER_EPISODES)?;
     budget(&mut out, "test", args.test_episodes, PAPER_TEST_EPISODES)?;
-    let mut rates = Rates([[0.0; 3]; 3]);
+    let mut rates = BTreeMap::new();
     for version in Version::ALL {
         let outcome = train_on(&servers, args, version, &directory.join(version.to_string()), &stop)?;
         if let Some(number) = outcome.signal {
             eprintln!("stopped by signal {number}");
             return Ok(Ending::Signal(number));
         }
-        rates.0[version as usize] = test_on_all(&servers, args, &outcome.checkpoint, &stop)?;
+        for test in Version::ALL {
+            let rate = success_percent(&servers, args, &outcome.checkpoint, test, &stop)?;
+            rates.insert(Scenario { train: version, test }, rate);
+        }
     }
-    writeln!(out)?;
-    print_rates(&mut out, &rates)?;
-    writeln!(out)?;
-    print_metrics(&mut out, &rates.metrics())?;
+    writeln!(out, "\n{}", rates_table(&rates).to_text())?;
+    writeln!(out, "\n{}", metrics_table(&rates).to_text())?;
     writeln!(out, "\n{:.0} s in all, seed {}", start.elapsed().as_secs_f64(), args.seed)?;
     if let Some(kept) = &args.out {
         writeln!(out, "the runs are kept in {}", kept.display())?;
@@ -80,7 +82,7 @@ fn train_on(
     config.common.version = version;
     config.common.episodes = args.episodes;
     config.common.seed = args.seed;
-    let config = TrainConfig::from_table("the demo", Table::clone(&config.table()))?;
+    let config = TrainConfig::from_table("the demo", config.table())?;
     let directory = RunDirectory::choose(directory, false)?;
     let start = Instant::now();
     let mut bar = Bar::new(describe(&config), args.episodes);
@@ -96,36 +98,40 @@ fn train_on(
     Ok(outcome)
 }
 
-/// Success rates on D, R and E, %.
-fn test_on_all(servers: &Servers, args: &DemoArgs, checkpoint: &Checkpoint, stop: &StopFlag) -> Result<[f64; 3]> {
-    let mut percent = [0.0; 3];
-    for version in Version::ALL {
-        let mut bar = Bar::new(format!("testing on {version}"), args.test_episodes);
-        let report = |episodes| bar.testing(episodes);
-        let result = test(servers, checkpoint, version, args.test_episodes, args.seed, stop, report)?;
-        percent[version as usize] = result.success_percent;
-    }
-    Ok(percent)
+fn success_percent(
+    servers: &Servers,
+    args: &DemoArgs,
+    checkpoint: &Checkpoint,
+    version: Version,
+    stop: &StopFlag,
+) -> Result<f64> {
+    let mut bar = Bar::new(format!("testing on {version}"), args.test_episodes);
+    let report = |episodes| bar.testing(episodes);
+    Ok(test(servers, checkpoint, version, args.test_episodes, args.seed, stop, report)?.success_percent)
 }
 
-fn print_rates(out: &mut impl Write, rates: &Rates) -> std::io::Result<()> {
-    writeln!(out, "success, %    test D   test R   test E")?;
-    for (train, row) in Version::ALL.into_iter().zip(rates.0) {
-        writeln!(out, "train {train}      {:>8.1} {:>8.1} {:>8.1}", row[0], row[1], row[2])?;
+fn rates_table(rates: &BTreeMap<Scenario, f64>) -> Table {
+    let mut table = Table::of("", &Version::ALL).text("success, %", |train| format!("train {train}"));
+    for test in Version::ALL {
+        let shown = |&train| rates.get(&Scenario { train, test }).map_or_else(String::new, |rate| format!("{rate:.1}"));
+        table = table.number(format!("test {test}"), shown);
     }
-    Ok(())
+    table.build()
 }
 
-fn print_metrics(out: &mut impl Write, metrics: &Metrics) -> std::io::Result<()> {
-    let row = paper::row(ENVIRONMENT, "PPO", "FF");
-    let paper = |cell: Option<paper::Cell>| cell.map_or_else(|| "not given".to_owned(), |cell| cell.to_string());
-    writeln!(out, "                              here   paper (mean ± std of 5 runs)")?;
-    for (name, here, cell) in [
-        ("Default (DD)", metrics.default, row.map(|row| row.default)),
-        ("Interpolation (RR)", metrics.interpolation, row.map(|row| row.interpolation)),
-        ("Extrapolation (DR, DE, RE)", metrics.extrapolation, row.map(|row| row.extrapolation)),
-    ] {
-        writeln!(out, "{name:<26} {here:>7.1}   {}", paper(cell))?;
-    }
-    Ok(())
+fn metrics_table(rates: &BTreeMap<Scenario, f64>) -> Table {
+    let method = Method { algorithm: "ppo".into(), architecture: "ff".into(), episodes_per_trial: None };
+    let here = |metric: Metric| metric.of(|scenario| rates.get(&scenario).copied());
+    let paper = |metric| paper::number(ENVIRONMENT, &method, metric);
+    Table::of("", &Metric::ALL)
+        .text("", |metric| match metric {
+            Metric::Default => "Default (DD)",
+            Metric::Interpolation => "Interpolation (RR)",
+            Metric::Extrapolation => "Extrapolation (DR, DE, RE)",
+        })
+        .number("here", |&metric| here(metric).map_or_else(String::new, |percent| format!("{percent:.1}")))
+        .text("paper (mean ± std of 5 runs)", |&metric| {
+            paper(metric).map_or_else(|| "not given".into(), |number| number.to_string())
+        })
+        .build()
 }

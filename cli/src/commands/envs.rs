@@ -8,6 +8,7 @@ use perturb_protocol::catalogue;
 use super::args::EnvsArgs;
 use super::{Ending, servers};
 use perturb_learner::proto::{Channel, Distribution, Environment, action_space::Kind};
+use perturb_study::table::Table;
 
 pub(super) fn run(args: &EnvsArgs) -> Result<Ending> {
     let catalogue = servers(&args.server, 0)?.catalogue()?;
@@ -37,19 +38,13 @@ fn print(out: &mut impl Write, environment: &Environment) -> std::io::Result<()>
     if let Some(success) = &environment.success {
         writeln!(out, "  success      {}", success.description)?;
     }
-    writeln!(out, "  {:<18} {:<8} {:>8}  {:<20} E", "parameter", "unit", "D", "R")?;
-    for parameter in &environment.parameters {
-        writeln!(
-            out,
-            "  {:<18} {:<8} {:>8}  {:<20} {}",
-            parameter.name,
-            parameter.unit,
-            parameter.default_value,
-            show(parameter.random.as_ref()),
-            show(parameter.extreme.as_ref())
-        )?;
-    }
-    writeln!(out)
+    let parameters = Table::of("", &environment.parameters)
+        .text("parameter", |parameter| &parameter.name)
+        .text("unit", |parameter| &parameter.unit)
+        .number("D", |parameter| parameter.default_value)
+        .text("R", |parameter| show(parameter.random.as_ref()))
+        .text("E", |parameter| show(parameter.extreme.as_ref()));
+    writeln!(out, "{}\n", parameters.build().to_text())
 }
 
 /// Intervals as mathematicians write them.

@@ -1,6 +1,6 @@
 //! `perturb evaluate`.
 
-use std::io::{ErrorKind, Write};
+use std::io::Write;
 use std::path::Path;
 
 use anyhow::{Context, Result};
@@ -12,6 +12,7 @@ use super::{Ending, servers};
 use perturb_learner::checkpoint::{Checkpoint, State};
 use perturb_learner::evaluation::test;
 use perturb_study::interrupt::StopFlag;
+use perturb_study::table::Table;
 use perturb_study::{TestResult, Version};
 
 pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
@@ -23,33 +24,35 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
     let stop = StopFlag::on_signals().context("cannot wait for signals")?;
     let servers = servers(&args.server, 0)?;
     let state = &checkpoint.state;
-    let mut out = std::io::stdout();
-    let mut print = |line: String| match writeln!(out, "{line}") {
-        // Whoever has read enough still gets the file that was asked for.
-        Err(error) if error.kind() == ErrorKind::BrokenPipe && args.json.is_some() => Ok(()),
-        printed => printed,
-    };
-    print(format!(
-        "{} {} {}, trained on {} with seed {}, {} test episodes each",
-        state.environment, state.algorithm, state.architecture, state.train_version, state.seed, args.episodes
-    ))?;
-    print("version  success   95 % interval   mean return  mean length".into())?;
     let mut results = Vec::new();
     for version in versions {
         let mut bar = Bar::new(format!("testing on {version}"), args.episodes);
-        let result =
-            test(&servers, &checkpoint, version, args.episodes, seed, &stop, |episodes| bar.testing(episodes))?;
-        drop(bar);
-        let [low, high] = result.success_percent_95;
-        print(format!(
-            "{version:<7} {:>7.1} %  {low:>5.1} … {high:>5.1} %  {:>12.2} {:>12.2}",
-            result.success_percent, result.mean_return, result.mean_length
-        ))?;
-        results.push((version, result));
+        let report = |episodes| bar.testing(episodes);
+        results.push((version, test(&servers, &checkpoint, version, args.episodes, seed, &stop, report)?));
     }
     if let Some(path) = &args.json {
         write_json(path, state, seed, &results)?;
     }
+    let table = Table::of("", &results)
+        .text("version", |(version, _)| version)
+        .number("success, %", |(_, result)| format!("{:.1}", result.success_percent))
+        .number("95 % interval", |(_, result)| {
+            let [low, high] = result.success_percent_95;
+            format!("{low:.1} … {high:.1}")
+        })
+        .number("mean return", |(_, result)| format!("{:.2}", result.mean_return))
+        .number("mean length", |(_, result)| format!("{:.2}", result.mean_length));
+    writeln!(
+        std::io::stdout(),
+        "{} {} {}, trained on {} with seed {}, {} test episodes each\n{}",
+        state.environment,
+        state.algorithm,
+        state.architecture,
+        state.train_version,
+        state.seed,
+        args.episodes,
+        table.build().to_text()
+    )?;
     Ok(Ending::Done)
 }
 

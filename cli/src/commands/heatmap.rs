@@ -14,8 +14,8 @@ use perturb_learner::client::Servers;
 use perturb_learner::evaluation::heatmap;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::{
-    Cell, Folder, Heatmap, HeatmapOptions, HeatmapPlace, Plan, Results, default_axes, heatmap_files, heatmap_places,
-    store_heatmap,
+    Folder, Heatmap, HeatmapOptions, HeatmapPlace, Plan, Results, Selected, default_axes, heatmap_files,
+    heatmap_places, store_heatmap,
 };
 
 pub(super) fn run(args: &HeatmapArgs) -> Result<Ending> {
@@ -63,20 +63,20 @@ fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<Ending> {
     let folder = Folder::new(directory);
     let plan = Plan::load(&folder.require_plan()?)?;
     let results = Results::read(&plan, &folder)?;
-    let groups = results.select();
-    let places = heatmap_places(&results, &groups);
+    let selections = results.select();
+    let places = heatmap_places(&selections);
     let stop = StopFlag::on_signals().context("cannot wait for signals")?;
     let mut servers_of_all = None;
     let mut out = std::io::stdout();
     let mut failed = 0;
     for place in &places {
-        let (Some(cell), Some(parameters)) = (place.cell, default_axes(place.environment)) else {
+        let (Some(selected), Some(parameters)) = (place.selected, default_axes(place.environment)) else {
             let reason =
-                if place.cell.is_none() { "no result yet" } else { "it is not known which parameters to show" };
+                if place.selected.is_none() { "no result yet" } else { "it is not known which parameters to show" };
             eprintln!("{place}: {reason}");
             continue;
         };
-        let checkpoint = match checkpoint_of(&folder, cell, &results) {
+        let checkpoint = match checkpoint_of(&folder, selected) {
             Ok(checkpoint) => checkpoint,
             Err(error) => {
                 eprintln!("{place}: {error:#}");
@@ -95,7 +95,7 @@ fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<Ending> {
         };
         let heatmap = test(servers, &checkpoint, &options, &stop).with_context(|| place.to_string())?;
         let id = checkpoint.id().map_err(|reason| anyhow::anyhow!("{place}: {reason}"))?;
-        let path = store_heatmap(&folder, cell, id, options, &heatmap)?;
+        let path = store_heatmap(&folder, selected.cell, id, options, &heatmap)?;
         writeln!(out, "{}.png, .svg and .csv", path.display())?;
     }
     if failed > 0 {
@@ -104,15 +104,11 @@ fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<Ending> {
     Ok(Ending::Done)
 }
 
-/// The checkpoint that a cell's result comes from.
-fn checkpoint_of(folder: &Folder, cell: &Cell, results: &Results<'_>) -> Result<Checkpoint> {
+/// The checkpoint that a result comes from.
+fn checkpoint_of(folder: &Folder, Selected { cell, result }: Selected<'_>) -> Result<Checkpoint> {
     let checkpoint = Checkpoint::load(&folder.cell(&cell.id).training())?;
-    let state = &checkpoint.state;
-    let same = results.result(cell.index).is_some_and(|result| {
-        let training = &result.training;
-        training.settings == state.config && training.counters == state.counters
-    });
-    if !same {
+    let (state, training) = (&checkpoint.state, &result.training);
+    if training.settings != state.config || training.counters != state.counters {
         bail!("the checkpoint of {} is not the one that its result.json came from", cell.id);
     }
     Ok(checkpoint)

@@ -11,6 +11,7 @@ use super::args::PlanArgs;
 use super::{Ending, UsageError, servers};
 use perturb_learner::client::Servers;
 use perturb_learner::measure::measure;
+use perturb_study::table::Table;
 use perturb_study::{Cell, Estimate, Folder, Measurement, Plan, estimate, representatives};
 
 pub(super) fn run(args: &PlanArgs) -> Result<Ending> {
@@ -59,13 +60,9 @@ pub(super) fn run(args: &PlanArgs) -> Result<Ending> {
         representatives.len(),
         args.measure
     )?;
-    writeln!(out, "environment   method              steps/s training   steps/s testing")?;
-    let mut measurements = Vec::new();
-    for cell in representatives {
-        let measurement = measure(&servers, cell, Duration::from_secs(args.measure))?;
-        print_measurement(&mut out, &measurement)?;
-        measurements.push(measurement);
-    }
+    let measure_one = |cell| measure(&servers, cell, Duration::from_secs(args.measure));
+    let measurements: Vec<Measurement> = representatives.into_iter().map(measure_one).collect::<Result<_>>()?;
+    writeln!(out, "{}", speeds(&measurements).to_text())?;
     let estimate = estimate(&plan, &measurements, |environment| limits.get(environment).copied().unwrap_or_default());
     print_estimate(&mut out, &plan, &estimate)?;
     Ok(Ending::Done)
@@ -77,11 +74,14 @@ pub(super) fn step_limits<'a>(servers: &Servers, plan: &'a Plan) -> Result<HashM
     plan.environments().into_iter().map(limit).collect()
 }
 
-fn print_measurement(out: &mut impl Write, measurement: &Measurement) -> std::io::Result<()> {
-    let Measurement { environment, method, speed } = measurement;
+fn speeds(measurements: &[Measurement]) -> Table {
     let per_second = |seconds: f64| grouped((1.0 / seconds.max(1e-9)).round() as usize);
-    let (training, testing) = (per_second(speed.training), per_second(speed.testing));
-    writeln!(out, "{environment:<13} {method:<20} {training:>16} {testing:>17}")
+    Table::of("", measurements)
+        .text("environment", |measured| &measured.environment)
+        .text("method", |measured| &measured.method)
+        .number("steps/s training", |measured| per_second(measured.speed.training))
+        .number("steps/s testing", |measured| per_second(measured.speed.testing))
+        .build()
 }
 
 fn print_estimate(out: &mut impl Write, plan: &Plan, estimate: &Estimate) -> std::io::Result<()> {

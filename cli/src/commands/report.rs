@@ -8,8 +8,8 @@ use anyhow::{Context, Result};
 use super::Ending;
 use super::args::{CurvesArgs, ReportArgs};
 use perturb_study::plot::{Quantity, draw_curves, save};
-use perturb_study::report::{Figures, Report, csv_files, html, markdown, text};
-use perturb_study::{EnvironmentCurves, Folder, Plan, Results, curves_csv, read_curves, write_atomically};
+use perturb_study::report::{Figures, Report, html};
+use perturb_study::{Folder, Plan, Results, curves_table, read_curves, write_atomically};
 
 pub(super) fn run(args: &ReportArgs) -> Result<Ending> {
     let folder = Folder::new(&args.dir);
@@ -23,28 +23,28 @@ pub(super) fn run(args: &ReportArgs) -> Result<Ending> {
 pub(super) fn write(folder: &Folder, page: Option<&Path>) -> Result<String> {
     let plan = Plan::load(&folder.require_plan()?)?;
     let results = Results::read(&plan, folder)?;
-    let groups = results.select();
-    let report = Report::new(&results, &groups);
+    let selections = results.select();
+    let report = Report::new(&results, &selections);
 
     let out = folder.path().join("report");
-    write_file(&out.join("report.md"), markdown(&report).as_bytes())?;
-    for (name, content) in csv_files(&results, &groups)? {
-        write_file(&out.join(name), &content)?;
+    write_file(&out.join("report.md"), report.markdown().as_bytes())?;
+    for table in report.files() {
+        write_file(&out.join(&table.title), &table.to_csv()?)?;
     }
     if let Some(path) = page {
-        let figures = Figures::read(&results, &groups, folder)?;
+        let figures = Figures::read(&selections, folder)?;
         write_file(path, html(&report, &figures).as_bytes())?;
     }
-    Ok(text(&report))
+    Ok(report.text())
 }
 
 pub(super) fn curves(args: &CurvesArgs) -> Result<Ending> {
     let folder = Folder::new(&args.dir);
     let plan = Plan::load(&folder.require_plan()?)?;
     let results = Results::read(&plan, &folder)?;
-    let all: Vec<EnvironmentCurves> = read_curves(&results, &results.select(), &folder)?;
+    let all = read_curves(&results.select(), &folder)?;
     let out = args.out.clone().unwrap_or_else(|| args.dir.join("report"));
-    write_file(&out.join("curves.csv"), &curves_csv(&all)?)?;
+    write_file(&out.join("curves.csv"), &curves_table(&all).to_csv()?)?;
     let mut stdout = std::io::stdout();
     for curves in &all {
         if curves.curves.is_empty() {

@@ -10,6 +10,7 @@ use super::{Ending, servers};
 use crate::video::{Summary, VideoFile, VideoOptions, film};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_study::interrupt::StopFlag;
+use perturb_study::table::Table;
 
 pub(super) fn run(args: &VideoArgs) -> Result<Ending> {
     let file = VideoFile::create(&args.out)?;
@@ -27,18 +28,17 @@ pub(super) fn run(args: &VideoArgs) -> Result<Ending> {
     let summary = film(&servers, &checkpoint, &options, file, &stop, &mut |episodes| bar.testing(episodes))?;
     drop(bar);
     let mut out = std::io::stdout();
-    writeln!(out, "episode     return  steps  success  parameters")?;
-    for (number, episode) in summary.episodes.iter().enumerate() {
-        let parameters: Vec<String> =
-            episode.parameters.iter().map(|(name, value)| format!("{name}={value}")).collect();
-        let success = if episode.success { "yes" } else { "no" };
-        let (number, parameters) = (number + 1, parameters.join(" "));
-        writeln!(
-            out,
-            "{number:>7} {:>10.2} {:>6}  {success:<7}  {parameters}",
-            episode.episode_return, episode.length
-        )?;
-    }
+    let episodes: Vec<_> = summary.episodes.iter().enumerate().collect();
+    let table = Table::of("", &episodes)
+        .number("episode", |(index, _)| index + 1)
+        .number("return", |(_, episode)| format!("{:.2}", episode.episode_return))
+        .number("steps", |(_, episode)| episode.length)
+        .text("success", |(_, episode)| if episode.success { "yes" } else { "no" })
+        .text("parameters", |(_, episode)| {
+            let parameters = episode.parameters.iter().map(|(name, value)| format!("{name}={value}"));
+            parameters.collect::<Vec<_>>().join(" ")
+        });
+    writeln!(out, "{}", table.build().to_text())?;
     writeln!(out, "{}: {}", args.out.display(), figures(&summary))?;
     Ok(Ending::Done)
 }

@@ -38,7 +38,7 @@ LOOK = """
     without_heatmap: [...document.querySelectorAll('#heatmaps figure.missing')].filter(seen).length,
     without_curves: document.querySelectorAll('#curves li').length,
     unnamed: [...document.querySelectorAll('svg, img')]
-      .filter(picture => !(picture.alt || picture.getAttribute('aria-label'))).length,
+      .filter(picture => !(picture.alt || picture.closest('[aria-label]'))).length,
     dangling: [...document.querySelectorAll('nav a')].map(link => link.getAttribute('href'))
       .filter(link => !document.querySelector(link)),
     links: document.querySelectorAll('nav a').length,

@@ -4,12 +4,11 @@ use plotters::coord::Shift;
 use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 
-use super::super::curves::{Curve, EnvironmentCurves, Point};
-use super::super::plan::Method;
 use super::super::plan::distinct;
 use super::super::statistics::Summary;
 use super::{Picture, PlotError, drawing, font, line_style};
-use crate::Version;
+use crate::curves::{Curve, EnvironmentCurves, Point};
+use crate::{Method, Version};
 
 const PANEL: (u32, u32) = (320, 260);
 const TITLE: u32 = 34;

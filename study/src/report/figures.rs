@@ -1,11 +1,11 @@
 //! The pictures of a report, and what is said of those that are missing.
 
-use super::super::curves::read_curves;
-use super::super::folder::{Folder, FolderError};
-use super::super::heatmap::HeatmapOptions;
-use super::super::heatmaps::{HeatmapRecord, NoHeatmap, heatmap_places};
-use super::super::plot::{PlotError, Quantity, draw_curves, svg};
-use super::super::selection::{Group, Results};
+use crate::curves::read_curves;
+use crate::folder::{Folder, FolderError};
+use crate::heatmap::HeatmapOptions;
+use crate::heatmaps::{HeatmapRecord, NoHeatmap, heatmap_places};
+use crate::plot::{PlotError, Quantity, draw_curves, svg};
+use crate::selection::Selection;
 
 /// All pictures of a report.
 #[derive(Clone, Debug, Default)]
@@ -57,19 +57,19 @@ pub enum FigureError {
 }
 
 impl Figures {
-    /// Draws the training curves of `results` in `folder`, of which `groups` were selected, and reads their heatmaps.
+    /// Draws the training curves of `selections` and reads their heatmaps, both from `folder`.
     ///
     /// # Errors
     /// [`FigureError`].
-    pub fn read(results: &Results<'_>, groups: &[Group], folder: &Folder) -> Result<Self, FigureError> {
+    pub fn read(selections: &[Selection<'_>], folder: &Folder) -> Result<Self, FigureError> {
         let mut figures = Self::default();
-        figures.add_curves(results, groups, folder)?;
-        figures.add_heatmaps(results, groups, folder)?;
+        figures.add_curves(selections, folder)?;
+        figures.add_heatmaps(selections, folder)?;
         Ok(figures)
     }
 
-    fn add_curves(&mut self, results: &Results<'_>, groups: &[Group], folder: &Folder) -> Result<(), FigureError> {
-        for curves in read_curves(results, groups, folder)? {
+    fn add_curves(&mut self, selections: &[Selection<'_>], folder: &Folder) -> Result<(), FigureError> {
+        for curves in read_curves(selections, folder)? {
             let environment = &curves.environment;
             if curves.curves.is_empty() {
                 self.no_curves.push(format!("{environment}: no training with a result has its monitor.csv."));
@@ -90,16 +90,16 @@ impl Figures {
         Ok(())
     }
 
-    fn add_heatmaps(&mut self, results: &Results<'_>, groups: &[Group], folder: &Folder) -> Result<(), FigureError> {
-        let places = heatmap_places(results, groups);
-        let mut missing = [0; 4];
+    fn add_heatmaps(&mut self, selections: &[Selection<'_>], folder: &Folder) -> Result<(), FigureError> {
+        let places = heatmap_places(selections);
+        let mut missing = Vec::new();
         for row in places.chunk_by(|a, b| (a.environment, a.method) == (b.environment, b.method)) {
             let mut figures = Vec::new();
             for place in row {
                 let (caption, picture) = match place.read(folder)? {
                     Ok(heatmap) => (format!("{place}{}", details(&heatmap.record)), FigureData::Png(heatmap.png)),
                     Err(why) => {
-                        missing[why as usize] += 1;
+                        missing.push(why);
                         (format!("{place}: {}.", reason(why)), FigureData::Missing)
                     }
                 };
@@ -112,7 +112,7 @@ impl Figures {
             }
             self.heatmaps.push(figures);
         }
-        self.no_heatmaps = advice(missing, places.len());
+        self.no_heatmaps = advice(&missing, places.len());
         Ok(())
     }
 }
@@ -127,10 +127,11 @@ fn reason(why: NoHeatmap) -> &'static str {
     }
 }
 
-/// What to do about the heatmaps that are missing, counted by [`NoHeatmap`], of so many.
-fn advice(missing: [usize; 4], all: usize) -> Vec<String> {
-    let makeable = missing[NoHeatmap::NotMade as usize] + missing[NoHeatmap::Outdated as usize];
-    let (waiting, unknown) = (missing[NoHeatmap::NoResult as usize], missing[NoHeatmap::NoAxes as usize]);
+/// What to do about the heatmaps that are missing, of so many.
+fn advice(missing: &[NoHeatmap], all: usize) -> Vec<String> {
+    let count = |of: &[NoHeatmap]| missing.iter().filter(|why| of.contains(why)).count();
+    let makeable = count(&[NoHeatmap::NotMade, NoHeatmap::Outdated]);
+    let (waiting, unknown) = (count(&[NoHeatmap::NoResult]), count(&[NoHeatmap::NoAxes]));
     let mut advice = Vec::new();
     if makeable > 0 {
         advice.push(format!(

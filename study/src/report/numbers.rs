@@ -1,0 +1,104 @@
+//! The numbers of a report, beside the paper's.
+
+use std::collections::BTreeMap;
+
+use crate::paper::{self, PaperNumber};
+use crate::plan::Plan;
+use crate::selection::{Selection, average, interquartile};
+use crate::statistics::{Iqm, Summary};
+use crate::{Method, Metric};
+
+/// Resamples of each bootstrap, as many as rliable takes.
+const RESAMPLES: usize = 50_000;
+/// What stands for all environments together, here and in the paper.
+const AVERAGE: &str = "Average";
+
+/// A method's metrics in an environment, or averaged over all; a metric that is not known is not there.
+pub(super) struct MethodMetrics<'a> {
+    pub(super) environment: &'a str,
+    pub(super) method: Method,
+    pub(super) ours: BTreeMap<Metric, Summary>,
+    pub(super) papers: BTreeMap<Metric, PaperNumber>,
+    pub(super) done: usize,
+    pub(super) cells: usize,
+}
+
+/// A method's interquartile means over all environments.
+pub(super) struct MethodIqms {
+    pub(super) method: Method,
+    pub(super) iqms: BTreeMap<Metric, Iqm>,
+}
+
+impl MethodMetrics<'_> {
+    /// Ours less the paper's.
+    pub(super) fn difference(&self, metric: Metric) -> Option<f64> {
+        Some(self.ours.get(&metric)?.mean - self.papers.get(&metric)?.mean)
+    }
+
+    /// How many runs all metrics have.
+    pub(super) fn runs(&self) -> usize {
+        least(|metric| self.ours.get(&metric).map(|summary| summary.runs))
+    }
+}
+
+impl MethodIqms {
+    /// How many runs all metrics have.
+    pub(super) fn runs(&self) -> usize {
+        least(|metric| self.iqms.get(&metric).map(|iqm| iqm.runs))
+    }
+}
+
+/// Of each selection.
+pub(super) fn metrics<'a>(selections: &[Selection<'a>]) -> Vec<MethodMetrics<'a>> {
+    let of_selection = |selection: &Selection<'a>| MethodMetrics {
+        environment: selection.environment,
+        method: selection.method.clone(),
+        ours: known(|metric| selection.summary(metric)),
+        papers: known(|metric| paper::number(selection.environment, &selection.method, metric)),
+        done: selection.done,
+        cells: selection.cells,
+    };
+    selections.iter().map(of_selection).collect()
+}
+
+/// Averaged over the plan's environments.
+pub(super) fn averages(plan: &Plan, selections: &[Selection<'_>]) -> Vec<MethodMetrics<'static>> {
+    let environments = plan.environments();
+    let of_method = |method: Method| {
+        let found = of_method(selections, &method);
+        let everywhere = found.len() == environments.len();
+        MethodMetrics {
+            environment: AVERAGE,
+            ours: known(|metric| average(&found, metric).filter(|_| everywhere)),
+            papers: known(|metric| paper::average(&environments, &method, metric)),
+            done: found.iter().map(|selection| selection.done).sum(),
+            cells: found.iter().map(|selection| selection.cells).sum(),
+            method,
+        }
+    };
+    plan.methods().into_iter().map(of_method).collect()
+}
+
+/// Over the plan's environments.
+pub(super) fn iqms(plan: &Plan, selections: &[Selection<'_>]) -> Vec<MethodIqms> {
+    let environments = plan.environments().len();
+    let of_method = |method: Method| {
+        let found = of_method(selections, &method);
+        let everywhere = found.len() == environments;
+        MethodIqms { iqms: known(|metric| interquartile(&found, metric, RESAMPLES).filter(|_| everywhere)), method }
+    };
+    plan.methods().into_iter().map(of_method).collect()
+}
+
+/// In the order of the environments.
+fn of_method<'s, 'a>(selections: &'s [Selection<'a>], method: &Method) -> Vec<&'s Selection<'a>> {
+    selections.iter().filter(|selection| selection.method == *method).collect()
+}
+
+fn known<T>(of: impl Fn(Metric) -> Option<T>) -> BTreeMap<Metric, T> {
+    Metric::ALL.into_iter().filter_map(|metric| Some((metric, of(metric)?))).collect()
+}
+
+fn least(runs: impl Fn(Metric) -> Option<usize>) -> usize {
+    Metric::ALL.into_iter().map(|metric| runs(metric).unwrap_or(0)).min().unwrap_or(0)
+}

@@ -1,0 +1,107 @@
+//! The numbers of a report as tables for reading.
+
+use super::numbers::MethodMetrics;
+use super::{MISSING, Report};
+use crate::statistics::Summary;
+use crate::table::{Column, Entry, Table};
+use crate::{Metric, Scenario, Version};
+
+/// What stands for a number that the paper does not have.
+const NOT_GIVEN: &str = "–";
+
+impl Report<'_> {
+    /// The three metrics, averaged where there are several environments, and of each.
+    pub(super) fn metrics_tables(&self) -> Vec<Table> {
+        let environments = self.plan.environments();
+        let averages = (environments.len() > 1)
+            .then(|| self.metrics_table(format!("Average over {}", environments.join(", ")), &self.averages));
+        let of_environments = self.metrics.chunk_by(|a, b| a.environment == b.environment);
+        averages
+            .into_iter()
+            .chain(of_environments.map(|rows| self.metrics_table(rows[0].environment.into(), rows)))
+            .collect()
+    }
+
+    fn metrics_table(&self, title: String, rows: &[MethodMetrics<'_>]) -> Table {
+        let mut table = Table::of(title, rows).text("method", |row| &row.method);
+        for metric in Metric::ALL {
+            let column = |name: &str| Column { name: name.into(), group: Some(metric.to_string()), is_number: true };
+            table = table
+                .column(column(&metric.to_string()), |row| rate(row.ours.get(&metric).copied()))
+                .column(column("paper"), |row| or(NOT_GIVEN, row.papers.get(&metric)))
+                .column(column("difference"), |row| {
+                    or(NOT_GIVEN, row.difference(metric).map(|points| format!("{points:+.1}")))
+                });
+        }
+        table
+            .number("runs", |row| self.runs(row.runs()))
+            .number("cells", |row| format!("{}/{}", row.done, row.cells))
+            .build()
+    }
+
+    pub(super) fn iqm_table(&self) -> Table {
+        let title = "Interquartile mean over all environments and the runs that all of them have, with its 95 % stratified \
+                     bootstrap interval";
+        let mut table = Table::of(title, &self.iqms).text("method", |row| &row.method);
+        for metric in Metric::ALL {
+            table = table.number(metric.to_string(), |row| or(MISSING, row.iqms.get(&metric)));
+        }
+        table.number("runs", |row| self.runs(row.runs())).build()
+    }
+
+    /// The nine scenarios of each environment.
+    pub(super) fn scenario_tables(&self) -> Vec<Table> {
+        let of_environments = self.selections.chunk_by(|a, b| a.environment == b.environment);
+        let table = |selections: &[_]| {
+            let trained = |selection| Version::ALL.map(|train| (selection, train));
+            let rows: Vec<(&super::Selection<'_>, Version)> = selections.iter().flat_map(trained).collect();
+            let mut table = Table::of(format!("{}: the nine scenarios", rows[0].0.environment), &rows)
+                .text("method", |(selection, _)| &selection.method)
+                .text("trained on", |(_, train)| train);
+            for test in Version::ALL {
+                let name = if test == Version::D { format!("tested on {test}") } else { format!("on {test}") };
+                table = table.number(name, |&(selection, train)| rate(selection.scenario(Scenario { train, test })));
+            }
+            table.build()
+        };
+        of_environments.map(table).collect()
+    }
+
+    pub(super) fn selected_table(&self) -> Table {
+        let title =
+            "Where the numbers come from: the selected cell of each run (selected.csv has its settings and command)";
+        Table::of(title, &self.selected())
+            .text("environment", |selected| &selected.result.training.environment)
+            .text("method", |selected| &selected.result.training.method)
+            .text("trained on", |selected| selected.result.training.version)
+            .text("run", |selected| selected.cell.run)
+            .text("seed", |selected| selected.result.training.seed)
+            .text("cell", |selected| &selected.cell.id)
+            .number("success on it", |selected| {
+                or(MISSING, selected.rate(selected.result.training.version).map(|rate| format!("{rate:.1}")))
+            })
+            .build()
+    }
+
+    /// `None` if no cell failed.
+    pub(super) fn failure_table(&self) -> Option<Table> {
+        let table = Table::of("Failed cells", &self.failures)
+            .text("cell", |failure| &failure.id)
+            .text("reason", |failure| &failure.reason)
+            .build();
+        (!table.rows.is_empty()).then_some(table)
+    }
+
+    fn runs(&self, runs: usize) -> String {
+        let all = self.plan.runs;
+        if runs == all as usize { all.to_string() } else { format!("{runs} of {all}") }
+    }
+}
+
+fn rate(summary: Option<Summary>) -> Entry {
+    Entry { heat: summary.map(|summary| summary.mean), ..or(MISSING, summary) }
+}
+
+fn or(otherwise: &str, shown: Option<impl ToString>) -> Entry {
+    shown.map_or_else(|| otherwise.to_owned(), |shown| shown.to_string()).into()
+}

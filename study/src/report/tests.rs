@@ -1,0 +1,98 @@
+use rstest::rstest;
+
+use super::*;
+use crate::Version;
+use crate::fixture;
+use crate::folder::{CellState, Failure};
+
+const PLAN: &str = "
+environments = ['CartPole', 'Pendulum']
+runs = 2
+test_episodes = 50
+settings = { episodes = 300 }
+[[algorithm]]
+name = 'a2c'
+architectures = ['ff']
+[[algorithm]]
+name = 'rl2-ppo'
+architectures = ['rc']
+versions = ['D', 'R']
+";
+
+/// The first run of A2C on D failed; RL²-PPO has nothing on Pendulum, nor a second run.
+fn results(plan: &Plan) -> Results<'_> {
+    let mut results = fixture::results(plan, |cell| {
+        let common = &cell.config.common;
+        let known = common.algorithm.to_string() == "a2c" || (common.environment == "CartPole" && cell.run == 1);
+        let easier = match common.version {
+            Version::D => [90.0, 40.0, 20.0],
+            Version::R => [80.0, 70.0, 30.0],
+            Version::E => [33.3, 50.0, 60.0],
+        };
+        known.then(|| (easier.map(|rate| rate + f64::from(cell.run)), 1.0))
+    });
+    let (id, commit) = (plan.cells[0].id.clone(), String::new());
+    results.states[0] = CellState::Failed(Failure { id, reason: "NaN in <loss> | after\n9 updates".into(), commit });
+    results
+}
+
+fn figures() -> Figures {
+    let figure = |environment: &str, picture: FigureData| Figure {
+        environment: environment.into(),
+        name: format!("{environment}: return"),
+        caption: "Mean & deviation".into(),
+        picture,
+    };
+    let png = [&[0; 16][..], &800_u32.to_be_bytes(), &600_u32.to_be_bytes()].concat();
+    Figures {
+        curves: vec![figure("CartPole", FigureData::Svg("<svg></svg>".into()))],
+        no_curves: vec!["Pendulum: no training with a result has its monitor.csv.".into()],
+        heatmaps: vec![vec![figure("CartPole", FigureData::Png(png)), figure("CartPole", FigureData::Missing)]],
+        no_heatmaps: vec!["1 of 2. `perturb heatmap DIR` makes them.".into()],
+    }
+}
+
+/// The name of a snapshot is that of its file, so that files can move with the module.
+#[rstest]
+#[case("text", |report: &Report<'_>| report.text())]
+#[case("markdown", |report: &Report<'_>| report.markdown())]
+#[case("csv", |report: &Report<'_>| {
+    let lines = |table: Table| format!("{}\n{}", table.title, String::from_utf8(table.to_csv().unwrap()).unwrap());
+    report.files().map(lines).join("\n")
+})]
+#[case("html", |report: &Report<'_>| html(report, &figures()).replace(html::STYLE, "").replace("><", ">\n<"))]
+fn a_report_has_all_its_numbers(#[case] name: &str, #[case] document: fn(&Report<'_>) -> String) {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let results = results(&plan);
+    let selections = results.select();
+    let report = Report::new(&results, &selections);
+    insta::with_settings!({ prepend_module_to_snapshot => false, omit_expression => true }, {
+        insta::assert_snapshot!(name, document(&report));
+    });
+}
+
+#[rstest]
+#[case("", None)]
+#[case(
+    "settings = { episodes = 300 }\ntest_episodes = 50",
+    Some("300 episodes in a training, where the paper has 15000, and 50 in a test")
+)]
+#[case("test_episodes = 999", Some("999 in a test, where it has 1000"))]
+fn other_budgets_than_the_papers_are_told(#[case] given: &str, #[case] told: Option<&str>) {
+    let text = format!("environments = ['CartPole']\n{given}\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']");
+    let budgets = budgets(&Plan::parse("test", text).unwrap());
+    assert_eq!(budgets.is_some(), told.is_some());
+    assert!(budgets.unwrap_or_default().contains(told.unwrap_or_default()));
+}
+
+#[test]
+fn what_is_not_done_is_missing_and_has_no_colour() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let results = fixture::results(&plan, |_| None);
+    let selections = results.select();
+    let report = Report::new(&results, &selections);
+    let tables = report.number_tables().filter(|table| table.columns.len() > 4);
+    let entries: Vec<_> = tables.flat_map(|table| table.rows.into_iter().flatten()).collect();
+    assert!(entries.iter().all(|entry| entry.heat.is_none()));
+    assert_eq!(entries.iter().filter(|entry| entry.text == MISSING).count(), 3 * (4 + 2 + 2) + 9 * 4);
+}

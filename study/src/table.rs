@@ -1,0 +1,157 @@
+//! Tables, and what becomes of them: text for a terminal, Markdown, CSV. The same table gives the same bytes everywhere.
+
+use comfy_table::presets::{ASCII_MARKDOWN, NOTHING};
+use comfy_table::{CellAlignment, TableStyle};
+
+/// A table for reading, or the lines of a file.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Table {
+    /// What it shows, or the name of its file.
+    pub title: String,
+    /// From left to right.
+    pub columns: Vec<Column>,
+    /// Each with an entry for each column.
+    pub rows: Vec<Vec<Entry>>,
+}
+
+/// The head of a column.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Column {
+    /// What stands in it.
+    pub name: String,
+    /// What neighbouring columns have in common, where one name is not enough.
+    pub group: Option<String>,
+    /// Texts stand on the left, numbers on the right.
+    pub is_number: bool,
+}
+
+/// What stands in a row and a column.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Entry {
+    /// As it is shown.
+    pub text: String,
+    /// A share, %, that may be shown by a colour.
+    pub heat: Option<f64>,
+}
+
+impl<T: std::fmt::Display> From<T> for Entry {
+    fn from(shown: T) -> Self {
+        Self { text: shown.to_string(), heat: None }
+    }
+}
+
+/// A table that gets its columns, one after the other, from the `R`s that its rows are of.
+pub struct TableBuilder<'r, R> {
+    sources: &'r [R],
+    table: Table,
+}
+
+impl Table {
+    /// A table with a row for each of `sources`, and no columns yet.
+    pub fn of<R>(title: impl Into<String>, sources: &[R]) -> TableBuilder<'_, R> {
+        let rows = vec![Vec::new(); sources.len()];
+        TableBuilder { sources, table: Table { title: title.into(), columns: Vec::new(), rows } }
+    }
+
+    /// Columns under each other, without the title.
+    pub fn to_text(&self) -> String {
+        self.drawn(NOTHING, str::to_owned).trim_fmt()
+    }
+
+    /// For GitHub and the like, without the title.
+    pub fn to_markdown(&self) -> String {
+        self.drawn(ASCII_MARKDOWN, |text| text.replace('|', "\\|").replace('\n', " ")).to_string()
+    }
+
+    /// A line of names and a line for each row.
+    ///
+    /// # Errors
+    /// [`csv::Error`], which writing to memory does not give.
+    pub fn to_csv(&self) -> Result<Vec<u8>, csv::Error> {
+        let mut writer = csv::Writer::from_writer(Vec::new());
+        writer.write_record(self.columns.iter().map(|column| &column.name))?;
+        for row in &self.rows {
+            writer.write_record(row.iter().map(|entry| &entry.text))?;
+        }
+        writer.into_inner().map_err(|error| error.into_error().into())
+    }
+
+    fn drawn(&self, style: TableStyle, shown: impl Fn(&str) -> String) -> comfy_table::Table {
+        let mut drawn = comfy_table::Table::new();
+        drawn.load_style(style).set_header(self.columns.iter().map(|column| &column.name));
+        drawn.add_rows(self.rows.iter().map(|row| row.iter().map(|entry| shown(&entry.text))));
+        let numbers = drawn.column_iter_mut().zip(&self.columns).filter(|(_, column)| column.is_number);
+        numbers.for_each(|(drawn, _)| drawn.set_cell_alignment(CellAlignment::Right));
+        drawn
+    }
+}
+
+impl<'r, R> TableBuilder<'r, R> {
+    /// A column of texts.
+    pub fn text<E: Into<Entry>>(self, name: impl Into<String>, entry: impl Fn(&'r R) -> E) -> Self {
+        self.column(Column { name: name.into(), group: None, is_number: false }, entry)
+    }
+
+    /// A column of numbers.
+    pub fn number<E: Into<Entry>>(self, name: impl Into<String>, entry: impl Fn(&'r R) -> E) -> Self {
+        self.column(Column { name: name.into(), group: None, is_number: true }, entry)
+    }
+
+    /// Any column.
+    pub fn column<E: Into<Entry>>(mut self, column: Column, entry: impl Fn(&'r R) -> E) -> Self {
+        self.table.columns.push(column);
+        for (row, source) in self.table.rows.iter_mut().zip(self.sources) {
+            row.push(entry(source).into());
+        }
+        self
+    }
+
+    /// The table.
+    pub fn build(self) -> Table {
+        self.table
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn table() -> Table {
+        let sources = [("ppo ff", Some(93.25)), ("a|b\nc", None)];
+        let number = |number: Option<f64>| number.map_or_else(String::new, |number| number.to_string());
+        Table::of("A title", &sources)
+            .text("method", |(method, _)| method)
+            .number("success, %", |(_, success)| number(*success))
+            .build()
+    }
+
+    #[test]
+    fn numbers_stand_on_the_right() {
+        insta::assert_snapshot!(table().to_text(), @r"
+         method  success, %
+         ppo ff       93.25
+         a|b
+         c
+        ");
+    }
+
+    #[test]
+    fn markdown_keeps_a_row_on_a_line_and_its_bars_apart() {
+        insta::assert_snapshot!(table().to_markdown(), @r"
+        | method | success, % |
+        |--------|------------|
+        | ppo ff |      93.25 |
+        | a\|b c |            |
+        ");
+    }
+
+    #[test]
+    fn csv_quotes_what_is_more_than_a_word_and_leaves_out_what_is_not_known() {
+        insta::assert_snapshot!(String::from_utf8(table().to_csv().unwrap()).unwrap(), @r#"
+        method,"success, %"
+        ppo ff,93.25
+        "a|b
+        c",
+        "#);
+    }
+}
