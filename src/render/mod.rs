@@ -30,19 +30,10 @@ const FAREWELL: Duration = Duration::from_secs(1);
 /// A picture's size in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Size {
-    /// From left to right, in [`Size::LEAST`] … [`Size::MOST`].
+    /// From left to right, within [`PICTURE_PIXELS`](perturb_protocol::limits::PICTURE_PIXELS).
     pub width: u16,
-    /// From top to bottom, in [`Size::LEAST`] … [`Size::MOST`].
+    /// From top to bottom, within [`PICTURE_PIXELS`](perturb_protocol::limits::PICTURE_PIXELS).
     pub height: u16,
-}
-
-impl Size {
-    /// The least width or height.
-    pub const LEAST: u16 = 16;
-    /// The largest width or height.
-    pub const MOST: u16 = 2048;
-    /// The width or height of those who do not care.
-    pub const USUAL: u16 = 480;
 }
 
 /// Why there is no picture.

@@ -11,6 +11,7 @@ use crate::{
     render::Size,
 };
 use bytes::Bytes;
+use perturb_protocol::limits::{PICTURE_PIXELS, USUAL_PICTURE_PIXELS};
 use std::{collections::HashMap, sync::Arc};
 
 /// Checks an `open`.
@@ -192,10 +193,11 @@ pub fn render(n: usize, request: proto::Render) -> Result<(usize, Size), Refusal
         return Err(Refusal::value("render.slot", request.slot, format!("a slot of the batch, 0 … {}", n - 1)));
     }
     let pixels = |field, value| match u16::try_from(value) {
-        Ok(0) => Ok(Size::USUAL),
-        Ok(pixels @ Size::LEAST..=Size::MOST) => Ok(pixels),
+        Ok(0) => Ok(USUAL_PICTURE_PIXELS),
+        Ok(pixels) if PICTURE_PIXELS.contains(&pixels) => Ok(pixels),
         _ => {
-            let expected = format!("{} … {} pixels, or 0 for {}", Size::LEAST, Size::MOST, Size::USUAL);
+            let (least, most) = (PICTURE_PIXELS.start(), PICTURE_PIXELS.end());
+            let expected = format!("{least} … {most} pixels, or 0 for {USUAL_PICTURE_PIXELS}");
             Err(Refusal::value(field, value, expected))
         }
     };

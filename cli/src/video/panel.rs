@@ -5,12 +5,13 @@ use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::VideoError;
 use perturb_learner::client::Picture;
+use perturb_protocol::limits::PICTURE_PIXELS;
 use perturb_study::plot::{FAMILY, PlotError, is_dark, load_font};
 
 /// The narrowest and lowest picture, in pixels: below it nothing could be read.
 pub const SMALLEST: u32 = 240;
 /// The widest and highest picture that a server draws, in pixels.
-pub const LARGEST: u32 = 2048;
+pub const LARGEST: u32 = *PICTURE_PIXELS.end() as u32;
 
 /// A letter is so many times smaller than a picture is wide.
 const LETTERS: u32 = 30;
