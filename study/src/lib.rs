@@ -20,14 +20,17 @@ pub mod paper;
 mod plan;
 pub mod plot;
 pub mod random;
+pub mod records;
 pub mod report;
 mod results;
 mod run;
 mod scenarios;
 mod selection;
+pub mod sets;
 pub mod settings;
 pub mod slurm;
 mod statistics;
+pub mod success;
 pub mod table;
 
 pub use cost::{Estimate, Measurement, Speed, Work, cell_seconds, estimate, representatives};

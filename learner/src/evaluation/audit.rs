@@ -1,0 +1,158 @@
+//! Playing recorded episodes again.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use perturb_protocol::Version;
+use perturb_study::interrupt::StopFlag;
+use perturb_study::records::{EpisodeRecord, Records};
+
+use super::agent::Agent;
+use super::test::{TestError, Trials, check_unchanged, ending};
+use crate::checkpoint::{Checkpoint, EnvironmentSummary};
+use crate::client::{EndedEpisode, OpenOptions, Servers, Session};
+
+/// What came of playing recorded episodes again.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Audit {
+    /// Episodes that were played again.
+    pub episodes: u64,
+    /// Those that came out otherwise, each in a sentence.
+    pub different: Vec<String>,
+}
+
+/// Why recorded episodes could not be played again.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum AuditError {
+    /// They are of another policy.
+    #[error("the episodes were recorded of the policy {recorded}, the checkpoint is {got}: give the checkpoint that was tested")]
+    Policy {
+        /// The recorded policy.
+        recorded: String,
+        /// The checkpoint's.
+        got: String,
+    },
+    /// They cannot be played.
+    #[error(transparent)]
+    Test(#[from] TestError),
+}
+
+/// Plays at most `most` of the recorded episodes again, evenly spread over them, each from its address alone: its seed,
+/// its indices and the parameters that were requested. Calls `report` with the number of episodes done.
+///
+/// # Errors
+/// [`AuditError`].
+pub fn audit(
+    servers: &Servers,
+    checkpoint: &Checkpoint,
+    records: &Records,
+    most: usize,
+    stop: &StopFlag,
+    report: &mut dyn FnMut(u64),
+) -> Result<Audit, AuditError> {
+    let got = checkpoint.id().map_err(TestError::Unnamed)?;
+    if got != records.about.policy {
+        return Err(AuditError::Policy { recorded: records.about.policy.clone(), got });
+    }
+    let mut queues: BTreeMap<usize, VecDeque<&EpisodeRecord>> = BTreeMap::new();
+    let chosen = spread(&records.episodes, most);
+    for episode in chosen {
+        queues.entry(episode.environment_index as usize).or_default().push_back(episode);
+    }
+    let Some(last) = queues.keys().next_back() else { return Ok(Audit::default()) };
+    let mut replay = Replay::open(servers, checkpoint, records, last + 1)?;
+    let mut audit = Audit::default();
+    let mut running = BTreeMap::new();
+    loop {
+        let idle: Vec<usize> = queues.keys().copied().filter(|slot| !running.contains_key(slot)).collect();
+        for slot in idle {
+            if let Some(episode) = queues.get_mut(&slot).and_then(VecDeque::pop_front) {
+                replay.begin(slot, episode)?;
+                running.insert(slot, episode);
+            }
+        }
+        if running.is_empty() {
+            return Ok(audit);
+        }
+        for end in replay.trials.step(stop)? {
+            let Some(recorded) = running.remove(&end.slot) else { continue };
+            audit.episodes += 1;
+            audit.different.extend(difference(recorded, &end));
+        }
+        report(audit.episodes);
+    }
+}
+
+/// At most `most` of `episodes`, evenly spread.
+fn spread(episodes: &[EpisodeRecord], most: usize) -> impl Iterator<Item = &EpisodeRecord> {
+    let count = most.min(episodes.len());
+    (0..count).map(move |i| &episodes[i * episodes.len() / count])
+}
+
+/// Environments in which recorded episodes are played.
+struct Replay<'a> {
+    trials: Trials<'a>,
+    names: Vec<String>,
+    episodes_per_trial: u64,
+}
+
+impl<'a> Replay<'a> {
+    fn open(
+        servers: &'a Servers,
+        checkpoint: &'a Checkpoint,
+        records: &Records,
+        num_envs: usize,
+    ) -> Result<Self, TestError> {
+        let about = &records.about;
+        let options = OpenOptions {
+            environment: about.environment.clone(),
+            version: Version::D,
+            parameters: Default::default(),
+            num_envs,
+            seed: 0,
+            episodes_per_trial: about.episodes_per_trial,
+        };
+        let mut observations = Vec::new();
+        let session = Session::open(servers, &options, &mut observations)?;
+        check_unchanged(checkpoint, EnvironmentSummary::of(session.environment()))?;
+        let agent = Agent::new(checkpoint, num_envs, 0)?;
+        Ok(Self {
+            trials: Trials::new(session, agent, observations, about.episodes_per_trial),
+            names: about.parameters.iter().map(|parameter| parameter.name.clone()).collect(),
+            episodes_per_trial: about.episodes_per_trial.into(),
+        })
+    }
+
+    /// Brings the environment of `slot` to the start of the trial that `episode` is the last one of.
+    fn begin(&mut self, slot: usize, episode: &EpisodeRecord) -> Result<(), TestError> {
+        let Trials { session, agent, reply, .. } = &mut self.trials;
+        let values = self.names.iter().map(String::as_str).zip(episode.requested.iter().copied());
+        session.reset_with(slot, &values.collect::<Vec<_>>(), episode.seed, &mut reply.observations)?;
+        let trial = episode.episode_index / self.episodes_per_trial;
+        for _ in 0..trial * self.episodes_per_trial {
+            session.reset_one(slot, &mut reply.observations)?;
+        }
+        agent.begin_trial_of(slot, episode.seed, trial);
+        Ok(())
+    }
+}
+
+/// In what an episode differs from its record; `None` if in nothing.
+fn difference(recorded: &EpisodeRecord, end: &EndedEpisode) -> Option<String> {
+    let place = format!(
+        "{}, environment {}, episode {}",
+        recorded.set, recorded.environment_index, recorded.episode_index
+    );
+    let parts = [
+        ("episode", recorded.episode_index.to_string(), end.episode_index.to_string()),
+        ("requested", format!("{:?}", recorded.requested), format!("{:?}", end.receipt.requested)),
+        ("applied", format!("{:?}", recorded.applied), format!("{:?}", end.receipt.applied)),
+        ("model", recorded.model_hash.clone(), end.receipt.model_hash.clone()),
+        ("length", recorded.length.to_string(), end.length.to_string()),
+        ("return", format!("{:?}", recorded.episode_return), format!("{:?}", end.episode_return)),
+        ("ending", format!("{:?}", recorded.ending), format!("{:?}", ending(end))),
+        ("achieved", format!("{:?}", recorded.achieved), format!("{:?}", end.achieved)),
+    ];
+    let (what, recorded, got) = parts.into_iter().find(|(_, recorded, got)| recorded != got)?;
+    Some(format!("{place}: {what} was {recorded}, is {got}"))
+}

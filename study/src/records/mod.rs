@@ -1,0 +1,229 @@
+//! Recorded test episodes: what each was asked to run with, what it ran with, and what came of it.
+//!
+//! One Parquet file holds the tests of one policy. Every figure of a result follows from it, at any threshold of success,
+//! and each episode can be played again from its address: seed, environment index and episode index.
+
+mod parquet;
+
+pub use parquet::{FILE, RecordsError};
+
+use perturb_protocol::proto;
+use serde::{Deserialize, Serialize};
+
+use crate::means::{mean, wilson};
+use crate::results::TestResult;
+use crate::sets::TestSet;
+use crate::success::Criterion;
+
+/// Requested and applied values may differ by this share of the requested one: physics rounds what it derives.
+pub const ROUNDING: f64 = 1e-9;
+
+/// The recorded tests of a policy.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Records {
+    /// What they have in common.
+    pub about: About,
+    /// In the order of the tests, within one in that of environment and episode indices.
+    pub episodes: Vec<EpisodeRecord>,
+}
+
+/// What the recorded episodes of a policy have in common.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct About {
+    /// The environment's name.
+    pub environment: String,
+    /// Its revision.
+    pub revision: u32,
+    /// Its parameters, in the order of the requested values.
+    pub parameters: Vec<RecordedParameter>,
+    /// The names of the quantities that were read back, in the order of the applied values.
+    pub applied: Vec<String>,
+    /// Names the policy: its checkpoint's id.
+    pub policy: String,
+    /// Episodes in a trial, of which the last is recorded; 1 without trials.
+    pub episodes_per_trial: u32,
+    /// What counted as a success; `None` if the server's word was taken, which did not say what it compares.
+    pub success: Option<Criterion>,
+    /// The tests, in order.
+    pub tests: Vec<RecordedTest>,
+}
+
+/// A parameter of recorded episodes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RecordedParameter {
+    /// Its name.
+    pub name: String,
+    /// Its unit; "1" if dimensionless.
+    pub unit: String,
+    /// The quantity that reads it back; empty if its server did not say.
+    pub applied: String,
+}
+
+/// A test.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RecordedTest {
+    /// What the policy was tested on.
+    pub set: TestSet,
+    /// Of its environments and actions.
+    pub seed: u64,
+}
+
+/// How an episode ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Ending {
+    /// The task ended it.
+    Terminated,
+    /// The step limit ended it.
+    Truncated,
+    /// The physics diverged.
+    Diverged,
+}
+
+/// An episode of a test.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EpisodeRecord {
+    /// The name of the set that it was a test on.
+    pub set: String,
+    /// With the two indices that follow its address.
+    pub seed: u64,
+    /// The environment's index.
+    pub environment_index: u32,
+    /// Counts the environment's episodes from 0.
+    pub episode_index: u64,
+    /// The parameters that were drawn or given, in the order of [`About::parameters`].
+    pub requested: Vec<f64>,
+    /// What was read back from the physics, in the order of [`About::applied`].
+    pub applied: Vec<f64>,
+    /// SHA-256 of the model; empty without one.
+    pub model_hash: String,
+    /// The undiscounted sum of its rewards.
+    pub episode_return: f64,
+    /// Its number of steps.
+    pub length: u32,
+    /// Whether it was a success.
+    pub success: bool,
+    /// How it ended.
+    pub ending: Ending,
+    /// What it achieved of what the criterion compares; `None` if nothing.
+    pub achieved: Option<f64>,
+}
+
+/// How far requested and applied parameters agree.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Agreement {
+    /// Episodes in which all parameters were compared.
+    pub episodes: u64,
+    /// The largest difference; `None` if nothing was compared.
+    pub largest: Option<Difference>,
+}
+
+/// A parameter that was asked for, and what the physics had instead.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Difference {
+    /// The parameter.
+    pub parameter: String,
+    /// What was asked for.
+    pub requested: f64,
+    /// What was read back.
+    pub applied: f64,
+    /// The difference as a share of the requested value; of a requested 0, itself.
+    pub relative: f64,
+}
+
+impl About {
+    /// Of a policy in `environment`, without tests so far.
+    pub fn new(environment: &proto::Environment, policy: String, episodes_per_trial: u32) -> Self {
+        let parameter = |parameter: &proto::Parameter| RecordedParameter {
+            name: parameter.name.clone(),
+            unit: parameter.unit.clone(),
+            applied: parameter.applied.clone(),
+        };
+        Self {
+            environment: environment.name.clone(),
+            revision: environment.revision,
+            parameters: environment.parameters.iter().map(parameter).collect(),
+            applied: environment.applied.iter().map(|quantity| quantity.name.clone()).collect(),
+            policy,
+            episodes_per_trial,
+            success: Criterion::of(environment),
+            tests: Vec::new(),
+        }
+    }
+}
+
+impl Records {
+    /// Nothing recorded so far.
+    pub fn new(about: About) -> Self {
+        Self { about, episodes: Vec::new() }
+    }
+
+    /// Adds a test.
+    pub fn add(&mut self, test: RecordedTest, episodes: Vec<EpisodeRecord>) {
+        self.about.tests.push(test);
+        self.episodes.extend(episodes);
+    }
+
+    /// The episodes of the test on the set called `name`.
+    pub fn of<'a>(&'a self, name: &'a str) -> impl Iterator<Item = &'a EpisodeRecord> + Clone {
+        self.episodes.iter().filter(move |episode| episode.set == name)
+    }
+
+    /// The figures of the test on the set called `name`; with `criterion`, which must be of the recorded quantity,
+    /// successes are judged anew.
+    pub fn result(&self, name: &str, criterion: Option<&Criterion>) -> TestResult {
+        let success = |episode: &EpisodeRecord| criterion.map_or(episode.success, |c| c.holds(episode.achieved));
+        let episodes: Vec<&EpisodeRecord> = self.of(name).collect();
+        let n = episodes.len() as u64;
+        let successes = episodes.iter().filter(|episode| success(episode)).count() as u64;
+        let (low, high) = wilson(successes, n);
+        TestResult {
+            episodes: n,
+            success_percent: 100.0 * successes as f64 / n as f64,
+            success_percent_95: [100.0 * low, 100.0 * high],
+            mean_return: mean(episodes.iter().map(|episode| episode.episode_return)),
+            mean_length: mean(episodes.iter().map(|episode| f64::from(episode.length))),
+        }
+    }
+
+    /// Compares what every episode was asked to run with and what it ran with.
+    pub fn agreement(&self) -> Agreement {
+        let place =
+            |parameter: &RecordedParameter| self.about.applied.iter().position(|name| *name == parameter.applied);
+        let Some(places) = self.about.parameters.iter().map(place).collect::<Option<Vec<usize>>>() else {
+            return Agreement { episodes: 0, largest: None };
+        };
+        let differences = self.episodes.iter().flat_map(|episode| {
+            let pairs = places.iter().zip(&episode.requested).zip(&self.about.parameters);
+            pairs.map(|((&place, &requested), parameter)| {
+                let applied = episode.applied.get(place).copied().unwrap_or(f64::NAN);
+                Difference::new(&parameter.name, requested, applied)
+            })
+        });
+        let largest = differences.max_by(|a, b| a.relative.total_cmp(&b.relative));
+        Agreement { episodes: self.episodes.len() as u64, largest }
+    }
+}
+
+impl Difference {
+    fn new(parameter: &str, requested: f64, applied: f64) -> Self {
+        let difference = (applied - requested).abs();
+        let relative = if requested == 0.0 { difference } else { difference / requested.abs() };
+        Self { parameter: parameter.to_owned(), requested, applied, relative }
+    }
+
+    /// Whether it is more than rounding. NaN is.
+    pub fn is_real(&self) -> bool {
+        !(self.relative <= ROUNDING)
+    }
+}
+
+impl std::fmt::Display for Difference {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { parameter, requested, applied, .. } = self;
+        write!(f, "the parameter {parameter} was requested as {requested}, but the physics ran with {applied}")
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,96 @@
+use perturb_protocol::Version;
+
+use super::*;
+use crate::success::Side;
+
+fn records() -> Records {
+    let success = Criterion { quantity: "steps".into(), unit: "1".into(), side: Side::AtMost, threshold: 80.0 };
+    let parameter =
+        |name: &str, applied: &str| RecordedParameter { name: name.into(), unit: "kg".into(), applied: applied.into() };
+    let about = About {
+        environment: "Acrobot".into(),
+        revision: 0,
+        parameters: vec![parameter("mass", "mass"), parameter("length", "rod")],
+        applied: vec!["rod".into(), "mass".into(), "total".into()],
+        policy: "00000001-0a".into(),
+        episodes_per_trial: 1,
+        success: Some(success),
+        tests: Vec::new(),
+    };
+    let mut records = Records::new(about);
+    for version in [Version::D, Version::E] {
+        let episodes = (0..5).map(|index| episode(version, index)).collect();
+        records.add(RecordedTest { set: version.into(), seed: u64::MAX }, episodes);
+    }
+    records
+}
+
+fn episode(version: Version, index: u64) -> EpisodeRecord {
+    let steps = 70 + 10 * index as u32;
+    EpisodeRecord {
+        set: version.to_string(),
+        seed: u64::MAX,
+        environment_index: u32::MAX,
+        episode_index: index,
+        requested: vec![0.1, 2.0 / 3.0],
+        applied: vec![2.0 / 3.0, 0.1, 1.1],
+        model_hash: String::new(),
+        episode_return: -1.0 / 3.0,
+        length: steps,
+        success: steps <= 80,
+        ending: [Ending::Terminated, Ending::Truncated, Ending::Diverged][index as usize % 3],
+        achieved: (index < 4).then_some(f64::from(steps)),
+    }
+}
+
+#[test]
+fn records_read_back_bit_for_bit_and_always_have_the_same_bytes() {
+    let directory = tempfile::tempdir().unwrap();
+    let [one, other] = ["one", "other"].map(|name| directory.path().join(name));
+    records().write(&one).unwrap();
+    records().write(&other).unwrap();
+    assert_eq!(std::fs::read(&one).unwrap(), std::fs::read(&other).unwrap());
+    assert_eq!(Records::read(&one).unwrap(), records());
+}
+
+#[test]
+fn a_file_of_something_else_is_refused() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join(FILE);
+    assert!(matches!(Records::read(&path), Err(RecordsError::Missing { .. })));
+    records().write(&path).unwrap();
+    let whole = std::fs::read(&path).unwrap();
+    for damaged in [&b"PAR1"[..], b"", &whole[..whole.len() / 2], &whole[1..]] {
+        std::fs::write(&path, damaged).unwrap();
+        let error = Records::read(&path).unwrap_err().to_string();
+        assert!(error.contains("does not hold recorded episodes"), "{error}");
+    }
+}
+
+#[test]
+fn figures_follow_from_episodes_at_any_threshold() {
+    let records = records();
+    let result = records.result("D", None);
+    assert_eq!((result.episodes, result.success_percent, result.mean_length), (5, 40.0, 90.0));
+    let criterion = |value| records.about.success.clone().map(|criterion| Criterion { threshold: value, ..criterion });
+    for (threshold, percent) in [(69.0, 0.0), (80.0, 40.0), (90.0, 60.0), (1000.0, 80.0)] {
+        assert_eq!(records.result("D", criterion(threshold).as_ref()).success_percent, percent, "{threshold}");
+    }
+}
+
+#[test]
+fn a_value_that_the_physics_did_not_take_is_named() {
+    let mut records = records();
+    let agreement = records.agreement();
+    assert_eq!((agreement.episodes, agreement.largest.unwrap().relative), (10, 0.0));
+    records.episodes[3].applied[1] = 0.1 * (1.0 + 1e-12);
+    assert!(!records.agreement().largest.unwrap().is_real(), "rounding");
+    records.episodes[3].applied[1] = 0.2;
+    let largest = records.agreement().largest.unwrap();
+    assert!(largest.is_real());
+    assert_eq!(largest.to_string(), "the parameter mass was requested as 0.1, but the physics ran with 0.2");
+    records.episodes[3].applied[1] = f64::NAN;
+    assert!(records.agreement().largest.unwrap().is_real());
+    records.about.parameters[0].applied = String::new();
+    assert_eq!(records.agreement(), Agreement { episodes: 0, largest: None }, "a server that does not say");
+}

@@ -1,0 +1,350 @@
+//! What a policy is tested on: a version of its environment, or parameters of one's own.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::str::FromStr;
+
+use perturb_protocol::limits::DEFAULT_MAX_ENVS;
+use perturb_protocol::{Distribution, Version, proto};
+use serde::{Deserialize, Serialize};
+
+/// The values that named parameters may take; the others keep their version's.
+pub type Parameters = BTreeMap<String, Distribution>;
+/// One value for each of some parameters; the others keep their version's.
+pub type Context = BTreeMap<String, f64>;
+
+/// The most contexts of a set: all of them run together.
+const MOST_CONTEXTS: usize = DEFAULT_MAX_ENVS;
+
+/// What a policy is tested on.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TestSet {
+    /// What results call it.
+    pub name: String,
+    /// Where the parameters come from of which nothing else is said.
+    pub version: Version,
+    /// What else is said of them.
+    pub contexts: Contexts,
+}
+
+/// How the parameters of a set's episodes are chosen.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Contexts {
+    /// Drawn anew for each episode (RL²: each trial).
+    Drawn(Parameters),
+    /// Each of these for equally many episodes: a grid, or the rows of a file.
+    Listed(Vec<Context>),
+}
+
+/// Why something is no set.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{what} is {got}, but must be {expected}")]
+pub struct SetError {
+    /// Which part of which set.
+    pub what: String,
+    /// What was given.
+    pub got: String,
+    /// What is accepted.
+    pub expected: String,
+}
+
+impl SetError {
+    fn new(what: impl Into<String>, got: impl fmt::Display, expected: impl Into<String>) -> Self {
+        Self { what: what.into(), got: got.to_string(), expected: expected.into() }
+    }
+}
+
+impl From<Version> for TestSet {
+    fn from(version: Version) -> Self {
+        Self { name: version.to_string(), version, contexts: Contexts::Drawn(Parameters::new()) }
+    }
+}
+
+impl TestSet {
+    /// The version that this is, if nothing was said of its parameters.
+    pub fn plain(&self) -> Option<Version> {
+        match &self.contexts {
+            Contexts::Drawn(parameters) if parameters.is_empty() => Some(self.version),
+            _ => None,
+        }
+    }
+
+    /// The distributions that replace the version's, in every episode.
+    pub fn drawn(&self) -> Parameters {
+        match &self.contexts {
+            Contexts::Drawn(parameters) => parameters.clone(),
+            Contexts::Listed(_) => Parameters::new(),
+        }
+    }
+
+    /// The set's contexts; one empty one if its parameters are drawn.
+    pub fn listed(&self) -> Vec<Context> {
+        match &self.contexts {
+            Contexts::Drawn(_) => vec![Context::new()],
+            Contexts::Listed(contexts) => contexts.clone(),
+        }
+    }
+
+    /// Whether `environment` has its parameters and accepts all of their values.
+    ///
+    /// # Errors
+    /// [`SetError`], which names the parameter and what is accepted.
+    pub fn check(&self, environment: &proto::Environment) -> Result<(), SetError> {
+        match &self.contexts {
+            Contexts::Drawn(parameters) => check(&self.name, parameters, environment),
+            Contexts::Listed(contexts) => contexts.iter().try_for_each(|context| {
+                let fixed = |(name, value): (&String, &f64)| (name.clone(), Distribution::fixed(*value));
+                check(&self.name, &context.iter().map(fixed).collect(), environment)
+            }),
+        }
+    }
+}
+
+/// Whether `environment` has these `parameters` and accepts all of their values; `set` names them in refusals.
+///
+/// # Errors
+/// [`SetError`], which names the parameter and what is accepted.
+pub fn check(set: &str, parameters: &Parameters, environment: &proto::Environment) -> Result<(), SetError> {
+    for (name, distribution) in parameters {
+        let Some(known) = environment.parameters.iter().find(|parameter| parameter.name == *name) else {
+            let names: Vec<&str> = environment.parameters.iter().map(|parameter| parameter.name.as_str()).collect();
+            let what = format!("{set}: a parameter of {}", environment.name);
+            return Err(SetError::new(what, format!("`{name}`"), format!("one of {}", names.join(", "))));
+        };
+        let (low, high) = distribution.range();
+        if low < known.low || high > known.high {
+            let expected = format!("within {} … {} {}", known.low, known.high, known.unit);
+            return Err(SetError::new(format!("{set}: {name} of {}", environment.name), distribution, expected));
+        }
+    }
+    Ok(())
+}
+
+/// A parameter's part of a set, as it is written: `length=0.3..0.4,0.8..0.9`, `mass=0.1`, or the points of a grid,
+/// `length=0.1..1.0/10` or `length=0.1,0.2,0.5`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Assignment {
+    /// The parameter.
+    pub parameter: String,
+    /// Its values.
+    pub values: Values,
+}
+
+/// The values of a parameter in a set.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Values {
+    /// Drawn.
+    Drawn(Distribution),
+    /// Each in turn.
+    Points(Vec<f64>),
+}
+
+impl FromStr for Assignment {
+    type Err = SetError;
+
+    fn from_str(text: &str) -> Result<Self, SetError> {
+        let expected = "PARAMETER=VALUES, e.g. length=0.3..0.4,0.8..0.9, mass=0.1 or length=0.1..1.0/10";
+        let wrong = || SetError::new("a set of parameters", format!("`{text}`"), expected);
+        let (parameter, values) = text.split_once('=').ok_or_else(wrong)?;
+        Ok(Self { parameter: parameter.trim().into(), values: Values::of(parameter.trim(), values.trim())? })
+    }
+}
+
+impl Values {
+    /// What `text` says of `parameter`.
+    fn of(parameter: &str, text: &str) -> Result<Self, SetError> {
+        if let Some((range, count)) = text.split_once('/') {
+            return grid_points(parameter, text, range, count);
+        }
+        let points: Option<Vec<f64>> = text.split(',').map(|value| value.trim().parse().ok()).collect();
+        match points {
+            Some(points) if points.len() > 1 => finite(parameter, text, points).map(Self::Points),
+            _ => match text.parse() {
+                Ok(distribution) => Ok(Self::Drawn(distribution)),
+                Err(perturb_protocol::DistributionError { got, expected }) => {
+                    Err(SetError::new(parameter, got, expected))
+                }
+            },
+        }
+    }
+}
+
+/// `low..high/count`: so many points from `low` to `high`, both included.
+fn grid_points(parameter: &str, text: &str, range: &str, count: &str) -> Result<Values, SetError> {
+    let wrong = || SetError::new(parameter, format!("`{text}`"), "a grid such as 0.1..1.0/10, of at least 1 point");
+    let (low, high) = range.split_once("..").ok_or_else(wrong)?;
+    let number = |text: &str| text.trim().parse::<f64>().ok().filter(|number| number.is_finite()).ok_or_else(wrong);
+    let (low, high) = (number(low)?, number(high)?);
+    let count: usize =
+        count.trim().parse().ok().filter(|count| (1..=MOST_CONTEXTS).contains(count)).ok_or_else(wrong)?;
+    let step = |index: usize| if count == 1 { 0.0 } else { index as f64 / (count - 1) as f64 };
+    Ok(Values::Points((0..count).map(|index| low + (high - low) * step(index)).collect()))
+}
+
+fn finite(parameter: &str, text: &str, points: Vec<f64>) -> Result<Vec<f64>, SetError> {
+    if points.iter().all(|point| point.is_finite()) {
+        return Ok(points);
+    }
+    Err(SetError::new(parameter, format!("`{text}`"), "finite numbers"))
+}
+
+/// A set called `name` of what `assignments` say over `version`. With points, it is the grid of all their combinations,
+/// the first parameter varying fastest, and the other parameters of the set must have a single value.
+///
+/// # Errors
+/// [`SetError`] for a parameter that is named twice, a grid with drawn parameters, or more contexts than one server
+/// takes.
+pub fn set_of(name: &str, version: Version, assignments: Vec<Assignment>) -> Result<TestSet, SetError> {
+    let is_grid = assignments.iter().any(|assignment| matches!(assignment.values, Values::Points(_)));
+    let mut drawn = Parameters::new();
+    let mut contexts = vec![Context::new()];
+    for Assignment { parameter, values } in assignments {
+        if drawn.contains_key(&parameter) || contexts[0].contains_key(&parameter) {
+            return Err(SetError::new(format!("{name}: {parameter}"), "given twice", "given once"));
+        }
+        let points = match values {
+            Values::Drawn(distribution) if !is_grid => {
+                drawn.insert(parameter, distribution);
+                continue;
+            }
+            Values::Drawn(distribution) => match distribution.range() {
+                (low, high) if low == high => vec![low],
+                _ => {
+                    let expected = "a value or points, like the grid's other parameters";
+                    return Err(SetError::new(format!("{name}: {parameter}"), distribution, expected));
+                }
+            },
+            Values::Points(points) => points,
+        };
+        let count = contexts.len().saturating_mul(points.len());
+        if count > MOST_CONTEXTS {
+            let expected = format!("a grid of at most {MOST_CONTEXTS} points");
+            return Err(SetError::new(name, format!("{count} points"), expected));
+        }
+        let with = |point: &f64| {
+            let add = |context: &Context| {
+                let mut context = context.clone();
+                context.insert(parameter.clone(), *point);
+                context
+            };
+            contexts.iter().map(add).collect::<Vec<_>>()
+        };
+        contexts = points.iter().flat_map(with).collect();
+    }
+    let contexts = if is_grid { Contexts::Listed(contexts) } else { Contexts::Drawn(drawn) };
+    Ok(TestSet { name: name.into(), version, contexts })
+}
+
+/// A set called `name` of the rows of a CSV file: a header of parameters, then a row for each context.
+///
+/// # Errors
+/// [`SetError`], which names the line.
+pub fn set_of_csv(name: &str, version: Version, text: &[u8]) -> Result<TestSet, SetError> {
+    let mut reader = csv::Reader::from_reader(text);
+    let wrong = |error: csv::Error| SetError::new(name, error, "CSV: a header of parameters, then a row a context");
+    let header = reader.headers().map_err(wrong)?.clone();
+    let mut contexts = Vec::new();
+    for (row, record) in reader.records().enumerate() {
+        let record = record.map_err(wrong)?;
+        let mut context = Context::new();
+        for (parameter, value) in header.iter().zip(&record) {
+            let number = value.trim().parse::<f64>().ok().filter(|number| number.is_finite());
+            let refuse =
+                || SetError::new(format!("{name}: {parameter} in line {}", row + 2), format!("`{value}`"), "a number");
+            if context.insert(parameter.trim().into(), number.ok_or_else(refuse)?).is_some() {
+                return Err(SetError::new(format!("{name}: the column {parameter}"), "there twice", "there once"));
+            }
+        }
+        contexts.push(context);
+    }
+    if !(1..=MOST_CONTEXTS).contains(&contexts.len()) {
+        let expected = format!("1 to {MOST_CONTEXTS} rows of parameters");
+        return Err(SetError::new(name, format!("{} rows", contexts.len()), expected));
+    }
+    Ok(TestSet { name: name.into(), version, contexts: Contexts::Listed(contexts) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn set(texts: &[&str]) -> Result<TestSet, SetError> {
+        let assignments = texts.iter().map(|text| text.parse()).collect::<Result<_, _>>()?;
+        set_of("mine", Version::D, assignments)
+    }
+
+    fn context(pairs: &[(&str, f64)]) -> Context {
+        pairs.iter().map(|&(name, value)| (name.to_owned(), value)).collect()
+    }
+
+    #[test]
+    fn intervals_are_drawn_from() {
+        let set = set(&["length=0.3..0.4,0.8..0.9", "mass=0.1"]).unwrap();
+        let Contexts::Drawn(parameters) = &set.contexts else { panic!("{set:?}") };
+        assert_eq!(parameters["length"].intervals().len(), 2);
+        assert_eq!(parameters["mass"], Distribution::fixed(0.1));
+        assert_eq!(set.plain(), None);
+        assert_eq!(TestSet::from(Version::E).plain(), Some(Version::E));
+    }
+
+    #[test]
+    fn points_make_a_grid_of_all_combinations() {
+        let set = set(&["length=0.5..1.0/2", "mass=0.1,0.2", "force=7"]).unwrap();
+        let expected: Vec<Context> = [(0.5, 0.1), (1.0, 0.1), (0.5, 0.2), (1.0, 0.2)]
+            .iter()
+            .map(|&(length, mass)| context(&[("length", length), ("mass", mass), ("force", 7.0)]))
+            .collect();
+        assert_eq!(set.listed(), expected);
+        assert_eq!(super::tests::set(&["length=0.5..1.0/1"]).unwrap().listed(), [context(&[("length", 0.5)])]);
+    }
+
+    #[test]
+    fn what_is_no_set_is_refused_with_what_would_be() {
+        for (texts, part) in [
+            (&["length"][..], "PARAMETER=VALUES"),
+            (&["length=x"], "a value, an interval"),
+            (&["length=1..2/0"], "a grid such as"),
+            (&["length=1/3"], "a grid such as"),
+            (&["length=1", "length=2"], "given twice"),
+            (&["length=1..2/3", "mass=1..2"], "like the grid's other"),
+            (&["length=1..2/200", "mass=1..2/200"], "at most 16384 points"),
+            (&["length=1,inf"], "finite"),
+        ] {
+            let error = set(texts).unwrap_err().to_string();
+            assert!(error.contains(part), "{texts:?}: {error}");
+        }
+    }
+
+    #[test]
+    fn rows_of_a_file_are_contexts() {
+        let set = set_of_csv("rows", Version::R, b"length,mass\n0.5, 0.1\n1,0.2\n").unwrap();
+        assert_eq!(
+            set.listed(),
+            [context(&[("length", 0.5), ("mass", 0.1)]), context(&[("length", 1.0), ("mass", 0.2)])]
+        );
+        for (text, part) in
+            [("length\n", "0 rows"), ("length\nx\n", "length in line 2"), ("a,a\n1,2\n", "twice"), ("a,b\n1\n", "CSV")]
+        {
+            let error = set_of_csv("rows", Version::R, text.as_bytes()).unwrap_err().to_string();
+            assert!(error.contains(part), "{text}: {error}");
+        }
+    }
+
+    #[test]
+    fn names_and_bounds_are_the_catalogues() {
+        let length =
+            proto::Parameter { name: "length".into(), low: 0.1, high: 2.0, unit: "m".into(), ..Default::default() };
+        let environment =
+            proto::Environment { name: "CartPole".into(), parameters: vec![length], ..Default::default() };
+        assert_eq!(set(&["length=0.1..2"]).unwrap().check(&environment), Ok(()));
+        for (text, part) in [
+            ("size=1", "`size`, but must be one of length"),
+            ("length=1..3", "within 0.1 … 2 m"),
+            ("length=1,3", "is 3, but"),
+        ] {
+            let error = set(&[text]).unwrap().check(&environment).unwrap_err().to_string();
+            assert!(error.contains(part), "{text}: {error}");
+        }
+    }
+}

@@ -1,0 +1,158 @@
+//! When an episode counts as a success.
+
+use std::fmt;
+use std::str::FromStr;
+
+use perturb_protocol::proto;
+use serde::{Deserialize, Serialize};
+
+/// A success achieved the threshold, or was better than it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Criterion {
+    /// What an episode achieves, e.g. "steps" or "distance".
+    pub quantity: String,
+    /// Its unit; "1" for steps.
+    pub unit: String,
+    /// On which side of the threshold successes are.
+    pub side: Side,
+    /// In the quantity's unit.
+    pub threshold: f64,
+}
+
+/// A side of a threshold, which itself belongs to it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Side {
+    /// The threshold or more.
+    AtLeast,
+    /// The threshold or less.
+    AtMost,
+}
+
+/// A threshold of one's own, written `steps=90`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct Threshold {
+    /// What is compared with it.
+    pub quantity: String,
+    /// In the quantity's unit.
+    pub value: f64,
+}
+
+/// Why a threshold was refused.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("the success threshold is {got}, but must be {expected}")]
+pub struct ThresholdError {
+    /// What was given.
+    pub got: String,
+    /// What is accepted.
+    pub expected: String,
+}
+
+impl Criterion {
+    /// That of `environment`; `None` if its server does not say.
+    pub fn of(environment: &proto::Environment) -> Option<Self> {
+        let success = environment.success.as_ref()?;
+        let side = match success.comparison() {
+            proto::Comparison::Unspecified => return None,
+            proto::Comparison::AtLeast => Side::AtLeast,
+            proto::Comparison::AtMost => Side::AtMost,
+        };
+        let (quantity, unit) = (success.quantity.clone(), success.unit.clone());
+        Some(Self { quantity, unit, side, threshold: success.threshold })
+    }
+
+    /// The same with another threshold.
+    ///
+    /// # Errors
+    /// [`ThresholdError`] if that is one of another quantity.
+    pub fn with(&self, threshold: &Threshold) -> Result<Self, ThresholdError> {
+        if threshold.quantity != self.quantity {
+            let expected = format!("one of {}, e.g. {}={}", self.quantity, self.quantity, self.threshold);
+            return Err(ThresholdError { got: threshold.to_string(), expected });
+        }
+        Ok(Self { threshold: threshold.value, ..self.clone() })
+    }
+
+    /// Whether an episode that achieved this is a success; one that achieved nothing is none.
+    pub fn holds(&self, achieved: Option<f64>) -> bool {
+        achieved.is_some_and(|achieved| match self.side {
+            Side::AtLeast => achieved >= self.threshold,
+            Side::AtMost => achieved <= self.threshold,
+        })
+    }
+}
+
+impl fmt::Display for Criterion {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let side = match self.side {
+            Side::AtLeast => "at least",
+            Side::AtMost => "at most",
+        };
+        let unit = if self.unit == "1" { String::new() } else { format!(" {}", self.unit) };
+        write!(f, "{} {side} {}{unit}", self.quantity, self.threshold)
+    }
+}
+
+impl fmt::Display for Threshold {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}={}", self.quantity, self.value)
+    }
+}
+
+impl FromStr for Threshold {
+    type Err = ThresholdError;
+
+    fn from_str(text: &str) -> Result<Self, ThresholdError> {
+        let wrong = || ThresholdError { got: format!("`{text}`"), expected: "QUANTITY=NUMBER, e.g. steps=90".into() };
+        let (quantity, value) = text.split_once('=').ok_or_else(wrong)?;
+        let value = value.trim().parse::<f64>().ok().filter(|value| value.is_finite()).ok_or_else(wrong)?;
+        Ok(Self { quantity: quantity.trim().to_owned(), value })
+    }
+}
+
+impl TryFrom<String> for Threshold {
+    type Error = ThresholdError;
+
+    fn try_from(text: String) -> Result<Self, ThresholdError> {
+        text.parse()
+    }
+}
+
+impl From<Threshold> for String {
+    fn from(threshold: Threshold) -> Self {
+        threshold.to_string()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn steps(side: Side, threshold: f64) -> Criterion {
+        Criterion { quantity: "steps".into(), unit: "1".into(), side, threshold }
+    }
+
+    #[test]
+    fn a_threshold_belongs_to_its_side() {
+        let (most, least) = (steps(Side::AtMost, 80.0), steps(Side::AtLeast, 80.0));
+        for (achieved, at_most, at_least) in
+            [(Some(79.0), true, false), (Some(80.0), true, true), (Some(81.0), false, true), (None, false, false)]
+        {
+            assert_eq!((most.holds(achieved), least.holds(achieved)), (at_most, at_least), "{achieved:?}");
+        }
+        assert_eq!(most.to_string(), "steps at most 80");
+    }
+
+    #[test]
+    fn another_threshold_must_be_of_the_same_quantity() {
+        let criterion = steps(Side::AtMost, 80.0);
+        assert_eq!(criterion.with(&"steps=90".parse().unwrap()).unwrap().threshold, 90.0);
+        let error = criterion.with(&"distance=90".parse().unwrap()).unwrap_err().to_string();
+        assert_eq!(error, "the success threshold is distance=90, but must be one of steps, e.g. steps=80");
+        for text in ["90", "steps=", "steps=x", "steps=nan"] {
+            assert!(text.parse::<Threshold>().unwrap_err().to_string().contains("QUANTITY=NUMBER"), "{text}");
+        }
+    }
+}
