@@ -207,7 +207,7 @@ async fn bare_loop(name: &'static str, steps: usize) -> Result<f64, Failure> {
 
 fn bare_loop_here(name: &str, steps: usize) -> Result<f64, Failure> {
     let spec = tasks::catalogue().find(name)?;
-    let distributions = spec.parameters.iter().map(|p| p.distribution(Version::Default)).collect();
+    let distributions = spec.distributions(Version::D);
     let settings = Settings { seed: 1, environment_index: 0, distributions, episodes_per_trial: 1 };
     let mut episodes = Episodes::new(tasks::catalogue().find(name).and_then(|spec| (spec.make)())?, settings);
     let (mut terms, mut observation) = (vec![0.0; spec.reward_terms.len()], vec![0.0; spec.observation.len()]);

@@ -1,6 +1,6 @@
 //! One environment and its episodes: trials, step limit, success, receipts, snapshots.
 
-use super::{Action, Distribution, Environment, EnvironmentSpec, Purpose, Stream, SuccessRule};
+use super::{Achievement, Action, Distribution, Environment, EnvironmentSpec, Purpose, Stream};
 use crate::scene::Scene;
 
 /// What fixes an environment's episodes.
@@ -58,7 +58,9 @@ pub struct EpisodeEnd {
     pub total_reward: f64,
     /// Steps.
     pub length: u32,
-    /// Whether the spec's rule holds.
+    /// What the spec's success rule compares, if there is any.
+    pub achieved: Option<f64>,
+    /// Whether the rule holds.
     pub success: bool,
     /// Whether the physics diverged.
     pub diverged: bool,
@@ -231,16 +233,20 @@ impl Episodes {
 
     /// The current episode as one that ended.
     pub fn finished(&self, receipt: bool) -> EpisodeEnd {
-        let progress = &self.progress;
+        let Progress { reached_at, held_for, .. } = self.progress;
+        let (progress, success) = (&self.progress, &self.spec().success);
+        let achieved = match success.achievement {
+            Achievement::Length => Some(progress.length.into()),
+            Achievement::FirstGoal => (reached_at > 0).then_some(reached_at.into()),
+            Achievement::LastGoals => Some(held_for.into()),
+            Achievement::Own(_) => self.environment.achieved(),
+        };
         EpisodeEnd {
             id: self.id(),
             total_reward: progress.total_reward,
             length: progress.length,
-            success: match self.spec().success {
-                SuccessRule::Lasted(steps) => progress.length >= steps,
-                SuccessRule::ReachedWithin(steps) => (1..=steps).contains(&progress.reached_at),
-                SuccessRule::HeldForLast(steps) => progress.held_for >= steps,
-            },
+            success: success.holds(achieved),
+            achieved,
             diverged: progress.diverged,
             receipt: receipt.then(|| self.receipt()),
         }

@@ -1,5 +1,7 @@
 //! What can be wrong with a request about environments.
 
+use super::DistributionError;
+
 /// The most characters of a client's text that a refusal repeats.
 const MOST_SHOWN: usize = 100;
 
@@ -34,14 +36,12 @@ pub enum Error {
         known: String,
     },
     /// A distribution is not a union of intervals.
-    #[error("the distribution of {parameter:?} is {got}; expected {expected}")]
+    #[error("the distribution of {parameter:?} is {}; expected {}", source.got, source.expected)]
     Distribution {
         /// The parameter.
         parameter: String,
-        /// What came.
-        got: String,
-        /// What would be right.
-        expected: &'static str,
+        /// What is wrong with it.
+        source: DistributionError,
     },
     /// A parameter leaves its physical range.
     #[error("parameter {parameter:?} of {environment} may reach {got} {unit}; give values within [{low}, {high}]")]
@@ -73,4 +73,11 @@ pub enum Error {
         /// Why.
         reason: String,
     },
+}
+
+impl Error {
+    /// The error for a parameter's distribution.
+    pub(crate) fn of(parameter: &str) -> impl FnOnce(DistributionError) -> Self {
+        move |source| Self::Distribution { parameter: shorten(parameter), source }
+    }
 }

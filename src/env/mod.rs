@@ -1,7 +1,6 @@
 //! Environments: the trait that each implements, what they declare of themselves, and the episodes they run.
 
 mod catalogue;
-mod distribution;
 mod episode;
 mod error;
 mod parameter;
@@ -10,13 +9,15 @@ mod snapshot;
 mod spaces;
 
 pub use catalogue::Catalogue;
-pub use distribution::{Distribution, Interval};
 pub use episode::{EpisodeEnd, EpisodeId, EpisodeStart, Episodes, Outcome, Receipt, Settings};
 pub use error::Error;
 pub(crate) use error::shorten;
-pub use parameter::{Parameter, Version, check_bounds, resolve};
+pub use parameter::{Parameter, check_bounds, resolve};
+pub use perturb_protocol::{Distribution, DistributionError, Interval, Version};
 pub use seeding::{Purpose, Stream};
-pub use spaces::{Action, ActionSpace, Channel, EnvironmentSpec, Quantity, RewardTerm, SuccessRule};
+pub use spaces::{
+    Achievement, Action, ActionSpace, Channel, Comparison, EnvironmentSpec, Quantity, RewardTerm, Success,
+};
 
 use crate::scene::Scene;
 
@@ -25,7 +26,7 @@ use crate::scene::Scene;
 pub struct Transition {
     /// The task ended the episode. The step limit is not the environment's business.
     pub terminated: bool,
-    /// The predicate of the environment's [`SuccessRule`] holds after this step.
+    /// The goal that [`Achievement::FirstGoal`] and [`Achievement::LastGoals`] count holds after this step.
     pub goal: bool,
     /// The physics diverged: the state is not finite. Implies `terminated`.
     pub diverged: bool,
@@ -49,6 +50,11 @@ pub trait Environment: Send {
     /// The SHA-256 of the model in hexadecimal, or `""` without one.
     fn model_hash(&self) -> &str {
         ""
+    }
+
+    /// What the episode achieved so far, where the spec's [`Achievement`] is the environment's own.
+    fn achieved(&self) -> Option<f64> {
+        None
     }
 
     /// Draws an initial state.

@@ -1,17 +1,6 @@
-//! A physical parameter, and the three versions of an environment.
+//! The physical parameters of an environment: what can be changed, within which bounds, and the sets of its versions.
 
-use super::{Distribution, EnvironmentSpec, Error, Interval, shorten};
-
-/// Where parameters come from: the three versions of every environment.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Version {
-    /// D: the defaults.
-    Default,
-    /// R: drawn from the R interval.
-    Random,
-    /// E: drawn from the E set, two intervals around R.
-    Extreme,
-}
+use super::{Distribution, EnvironmentSpec, Error, Interval, Version, shorten};
 
 /// A physical parameter with its bounds and the sets of its versions (the paper, table of parameter ranges).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -30,13 +19,16 @@ pub struct Parameter {
     pub extreme: [Interval; 2],
     /// The physical range: nothing outside is accepted.
     pub bounds: Interval,
+    /// The quantity of [`EnvironmentSpec::applied`] that reads it back, in the same unit.
+    pub applied: &'static str,
 }
 
 impl Parameter {
-    /// A parameter with physical bounds, whose sets are given by [`Parameter::versions`].
+    /// A parameter with physical bounds, which the quantity of the same name reads back, and whose sets are given by
+    /// [`Parameter::versions`].
     pub const fn new(name: &'static str, unit: &'static str, description: &'static str, bounds: (f64, f64)) -> Self {
         let (bounds, none) = (Interval::new(bounds.0, bounds.1), Interval::new(0.0, 0.0));
-        Self { name, unit, description, default: 0.0, random: none, extreme: [none; 2], bounds }
+        Self { name, unit, description, default: 0.0, random: none, extreme: [none; 2], bounds, applied: name }
     }
 
     /// The same with the sets of its versions: the value of D, the interval of R, and the interval that E fills up around
@@ -48,14 +40,20 @@ impl Parameter {
         self
     }
 
+    /// The same, read back by another quantity.
+    pub const fn read_back_by(mut self, applied: &'static str) -> Self {
+        self.applied = applied;
+        self
+    }
+
     /// The distribution of a version.
     pub fn distribution(&self, version: Version) -> Distribution {
         let intervals: &[Interval] = match version {
-            Version::Default => return Distribution::fixed(self.default),
-            Version::Random => &[self.random],
-            Version::Extreme => &self.extreme,
+            Version::D => return Distribution::fixed(self.default),
+            Version::R => &[self.random],
+            Version::E => &self.extreme,
         };
-        Distribution::union(self.name, intervals).expect("the table holds valid sets; a test checks each")
+        Distribution::union(intervals).expect("the table holds valid sets; a test checks each")
     }
 }
 

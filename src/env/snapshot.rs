@@ -122,7 +122,7 @@ impl Episodes {
         let each = spec.parameters.iter().zip(&saved.distributions).zip(&saved.values);
         each.map(|((parameter, pairs), &value)| {
             let intervals: Vec<Interval> = pairs.iter().map(|&(low, high)| Interval { low, high }).collect();
-            let distribution = Distribution::union(parameter.name, &intervals).map_err(bad)?;
+            let distribution = Distribution::union(&intervals).map_err(Error::of(parameter.name)).map_err(bad)?;
             check_bounds(spec, parameter, distribution.range()).map_err(bad)?;
             check_bounds(spec, parameter, (value, value)).map_err(bad)?;
             Ok(distribution)

@@ -1,6 +1,6 @@
 //! What an environment looks like from outside: observations, actions, rewards, success.
 
-use super::{Environment, Error, Parameter};
+use super::{Distribution, Environment, Error, Parameter, Version};
 
 /// A named entry of a vector, with its unit and range.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -54,7 +54,7 @@ pub struct RewardTerm {
     pub description: &'static str,
 }
 
-/// A quantity that receipts report as read back from the physics.
+/// A quantity that is read back from the physics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Quantity {
     /// Unique within its environment.
@@ -63,23 +63,57 @@ pub struct Quantity {
     pub unit: &'static str,
 }
 
-/// When an episode counts as a success (the paper, section "Experimental methodology").
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum SuccessRule {
-    /// The episode lasted at least this many steps.
-    Lasted(u32),
-    /// The goal held after some step up to and including this one.
-    ReachedWithin(u32),
-    /// The goal held after each of the episode's last steps, this many.
-    HeldForLast(u32),
+/// When an episode is a success (the paper, section "Experimental methodology"): when it achieved something, and that
+/// compares with the threshold.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Success {
+    /// The rule, as a sentence.
+    pub description: &'static str,
+    /// What is compared.
+    pub achievement: Achievement,
+    /// How it is compared.
+    pub comparison: Comparison,
+    /// With what.
+    pub threshold: f64,
 }
 
-impl SuccessRule {
-    /// The number of steps that the rule speaks of.
-    pub const fn steps(self) -> u32 {
-        match self {
-            Self::Lasted(n) | Self::ReachedWithin(n) | Self::HeldForLast(n) => n,
+/// What an episode can achieve.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Achievement {
+    /// Its number of steps.
+    Length,
+    /// The first step after which the goal held, counted from 1; nothing if it never did.
+    FirstGoal,
+    /// The number of last steps after all of which the goal held.
+    LastGoals,
+    /// What the environment says: [`Environment::achieved`].
+    Own(Quantity),
+}
+
+/// How what was achieved compares with the threshold in a success.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Comparison {
+    /// It is the threshold or more.
+    AtLeast,
+    /// It is the threshold or less.
+    AtMost,
+}
+
+impl Success {
+    /// What is compared.
+    pub const fn quantity(&self) -> Quantity {
+        match self.achievement {
+            Achievement::Own(quantity) => quantity,
+            _ => Quantity { name: "steps", unit: "1" },
         }
+    }
+
+    /// Whether an episode that achieved this is a success.
+    pub fn holds(&self, achieved: Option<f64>) -> bool {
+        achieved.is_some_and(|achieved| match self.comparison {
+            Comparison::AtLeast => achieved >= self.threshold,
+            Comparison::AtMost => achieved <= self.threshold,
+        })
     }
 }
 
@@ -113,7 +147,14 @@ pub struct EnvironmentSpec {
     /// What a step costs on one core, in µs, roughly: the pool cuts batches by it. Results never depend on it.
     pub step_cost: f64,
     /// When an episode is a success.
-    pub success: SuccessRule,
-    /// The same, as a sentence.
-    pub success_description: &'static str,
+    pub success: Success,
+    /// The two parameters, along x and along y, that show best where a policy works.
+    pub heatmap_axes: Option<[&'static str; 2]>,
+}
+
+impl EnvironmentSpec {
+    /// The distributions of a version, one for each parameter.
+    pub fn distributions(&self, version: Version) -> Vec<Distribution> {
+        self.parameters.iter().map(|parameter| parameter.distribution(version)).collect()
+    }
 }

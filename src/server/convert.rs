@@ -3,8 +3,8 @@
 use super::status::Refusal;
 use crate::{
     env::{
-        self, ActionSpace, Catalogue, Channel, Distribution, EnvironmentSpec, EpisodeEnd, EpisodeId, EpisodeStart,
-        Interval, Parameter, Receipt, Settings, Version, resolve,
+        self, Achievement, ActionSpace, Catalogue, Channel, Comparison, Distribution, EnvironmentSpec, EpisodeEnd,
+        EpisodeId, EpisodeStart, Parameter, Receipt, Settings, Success, Version, resolve,
     },
     pool::{Autoreset, BatchSettings, ResetEntry, Stepped},
     proto,
@@ -17,15 +17,10 @@ use std::{collections::HashMap, sync::Arc};
 /// Checks an `open`.
 pub fn open(catalogue: &Catalogue, request: proto::Open) -> Result<BatchSettings, Refusal> {
     let spec = catalogue.find(&request.environment)?;
-    let version = match request.version() {
-        proto::Version::Default => Version::Default,
-        proto::Version::Random => Version::Random,
-        proto::Version::Extreme => Version::Extreme,
-        proto::Version::Unspecified => {
-            let expected = "VERSION_DEFAULT (1), VERSION_RANDOM (2) or VERSION_EXTREME (3)";
-            return Err(Refusal::value("open.version", request.version, expected));
-        }
-    };
+    let version = Version::from_proto(request.version()).ok_or_else(|| {
+        let expected = "VERSION_DEFAULT (1), VERSION_RANDOM (2) or VERSION_EXTREME (3)";
+        Refusal::value("open.version", request.version, expected)
+    })?;
     let autoreset = match request.autoreset_mode() {
         proto::AutoresetMode::NextStep => Autoreset::NextStep,
         proto::AutoresetMode::SameStep => Autoreset::SameStep,
@@ -43,7 +38,7 @@ pub fn open(catalogue: &Catalogue, request: proto::Open) -> Result<BatchSettings
         let got = format!("{first} for a batch of {}", request.batch_size);
         return Err(Refusal::value("open.first_environment_index", got, "the last environment's index below 2^32"));
     }
-    let mut distributions: Vec<_> = spec.parameters.iter().map(|p| p.distribution(version)).collect();
+    let mut distributions = spec.distributions(version);
     override_parameters(spec, &mut distributions, &request.parameters)?;
     Ok(BatchSettings {
         spec,
@@ -61,7 +56,7 @@ pub fn open(catalogue: &Catalogue, request: proto::Open) -> Result<BatchSettings
 }
 
 /// Replaces the distributions of the parameters that are named.
-pub fn override_parameters(
+fn override_parameters(
     spec: &'static EnvironmentSpec,
     base: &mut [Distribution],
     parameters: &HashMap<String, proto::Distribution>,
@@ -71,8 +66,7 @@ pub fn override_parameters(
     parameters.sort_by_key(|(name, _)| *name);
     let mut overrides = Vec::with_capacity(parameters.len());
     for (name, distribution) in parameters {
-        let intervals: Vec<_> = distribution.intervals.iter().map(|i| Interval::new(i.low, i.high)).collect();
-        overrides.push((name.as_str(), Distribution::union(name, &intervals)?));
+        overrides.push((name.as_str(), Distribution::try_from(distribution).map_err(env::Error::of(name))?));
     }
     Ok(resolve(spec, base, overrides)?)
 }
@@ -221,13 +215,26 @@ pub fn environment(spec: &EnvironmentSpec, model_hash: &str) -> proto::Environme
         applied: spec.applied.iter().map(quantity).collect(),
         step_limit: spec.step_limit,
         control_timestep: spec.control_timestep,
-        success: Some(proto::Success {
-            description: spec.success_description.into(),
-            steps: spec.success.steps(),
-            ..proto::Success::default()
-        }),
+        success: Some(success(spec)),
         model_hash: model_hash.into(),
-        ..proto::Environment::default()
+        heatmap_axes: spec.heatmap_axes.iter().flatten().map(|name| (*name).into()).collect(),
+    }
+}
+
+fn success(spec: &EnvironmentSpec) -> proto::Success {
+    let Success { description, achievement, comparison, threshold } = spec.success;
+    let env::Quantity { name, unit } = spec.success.quantity();
+    let comparison = match comparison {
+        Comparison::AtLeast => proto::Comparison::AtLeast,
+        Comparison::AtMost => proto::Comparison::AtMost,
+    };
+    proto::Success {
+        description: description.into(),
+        steps: if let Achievement::Own(_) = achievement { spec.step_limit } else { threshold as u32 },
+        quantity: name.into(),
+        unit: unit.into(),
+        comparison: comparison.into(),
+        threshold,
     }
 }
 
@@ -237,11 +244,6 @@ fn channels(channels: &[Channel]) -> Vec<proto::Channel> {
 }
 
 fn parameter(p: &Parameter) -> proto::Parameter {
-    let set = |version| {
-        let distribution = p.distribution(version);
-        let interval = |i: &Interval| proto::Interval { low: i.low, high: i.high };
-        Some(proto::Distribution { intervals: distribution.intervals().iter().map(interval).collect() })
-    };
     proto::Parameter {
         name: p.name.into(),
         unit: p.unit.into(),
@@ -249,9 +251,9 @@ fn parameter(p: &Parameter) -> proto::Parameter {
         default_value: p.default,
         low: p.bounds.low,
         high: p.bounds.high,
-        random: set(Version::Random),
-        extreme: set(Version::Extreme),
-        ..proto::Parameter::default()
+        random: Some((&p.distribution(Version::R)).into()),
+        extreme: Some((&p.distribution(Version::E)).into()),
+        applied: p.applied.into(),
     }
 }
 
@@ -299,7 +301,7 @@ fn ended((slot, end): (u32, EpisodeEnd)) -> proto::EpisodeEnd {
         success: end.success,
         diverged: end.diverged,
         receipt: end.receipt.map(receipt),
-        ..proto::EpisodeEnd::default()
+        achieved: end.achieved,
     }
 }
 

@@ -2,12 +2,15 @@
 
 use crate::common::{action_bytes, episodes, observe, play, settings, start_line, step};
 use perturb::{
-    env::{self, ActionSpace, Channel, Distribution, EnvironmentSpec, Episodes, Error, Purpose, Stream, Version},
+    env::{
+        self, ActionSpace, Channel, Comparison, Distribution, EnvironmentSpec, Episodes, Error, Parameter, Purpose,
+        Stream, Success, Version,
+    },
     tasks,
 };
 use std::{collections::HashSet, ptr};
 
-const VERSIONS: [Version; 3] = [Version::Default, Version::Random, Version::Extreme];
+const VERSIONS: [Version; 3] = [Version::D, Version::R, Version::E];
 
 fn unique<'a>(names: impl Iterator<Item = &'a str>) -> bool {
     let mut seen = HashSet::new();
@@ -67,24 +70,82 @@ fn specs_are_complete_and_consistent() {
         assert!(channels.clone().all(|c| !c.unit.is_empty()), "{name}: units");
         assert!(spec.parameters.iter().all(|p| !p.unit.is_empty() && !p.description.is_empty()), "{name}: units");
         assert!(spec.control_timestep > 0.0 && spec.step_cost > 0.0, "{name}");
-        assert!((1..=spec.step_limit).contains(&spec.success.steps()), "{name}: the success rule fits the limit");
+        if spec.success.quantity().name == "steps" {
+            assert!(
+                (1..=spec.step_limit).contains(&(spec.success.threshold as u32)),
+                "{name}: the rule fits the limit"
+            );
+        }
+        for axis in spec.heatmap_axes.iter().flatten() {
+            assert!(spec.parameters.iter().any(|p| p.name == *axis), "{name}: {axis}");
+        }
     }
 }
 
 #[test]
 fn limits_and_success_rules_are_the_documents() {
-    use env::SuccessRule::{HeldForLast, Lasted, ReachedWithin};
     let document = [
-        ("CartPole", 200, Lasted(195)),
-        ("MountainCar", 200, ReachedWithin(110)),
-        ("Acrobot", 500, ReachedWithin(80)),
-        ("Pendulum", 200, HeldForLast(100)),
-        ("HalfCheetah", 1000, ReachedWithin(1000)),
-        ("Hopper", 1000, ReachedWithin(1000)),
+        ("CartPole", 200, "steps", Comparison::AtLeast, 195.0),
+        ("MountainCar", 200, "steps", Comparison::AtMost, 110.0),
+        ("Acrobot", 500, "steps", Comparison::AtMost, 80.0),
+        ("Pendulum", 200, "steps", Comparison::AtLeast, 100.0),
+        ("HalfCheetah", 1000, "distance", Comparison::AtLeast, 20.0),
+        ("Hopper", 1000, "distance", Comparison::AtLeast, 20.0),
     ];
     for spec in tasks::catalogue().specs() {
         let row = document.iter().find(|row| row.0 == spec.name).unwrap();
-        assert_eq!((spec.name, spec.step_limit, spec.success), *row);
+        let Success { comparison, threshold, .. } = spec.success;
+        assert_eq!((spec.name, spec.step_limit, spec.success.quantity().name, comparison, threshold), *row);
+    }
+}
+
+#[test]
+fn success_is_what_was_achieved_compared_with_the_threshold() {
+    for spec in tasks::catalogue().specs() {
+        for index in 0..20 {
+            let mut e = episodes(spec, Version::E, 6, index, 1);
+            for t in 0.. {
+                if e.ended() {
+                    break;
+                }
+                step(&mut e, &action_bytes(spec, index.into(), t));
+                let end = e.finished(false);
+                let success = end.achieved.is_some_and(|achieved| match spec.success.comparison {
+                    Comparison::AtLeast => achieved >= spec.success.threshold,
+                    Comparison::AtMost => achieved <= spec.success.threshold,
+                });
+                assert_eq!(end.success, success, "{}: {end:?}", spec.name);
+            }
+        }
+    }
+}
+
+/// The rounding of a few operations of double precision; an edit that did not take effect differs by percents.
+const ROUNDING: f64 = 1e-9;
+
+#[test]
+fn every_parameter_is_read_back_from_the_physics() {
+    for spec in tasks::catalogue().specs() {
+        let quantities: Vec<_> = (spec.parameters.iter())
+            .map(|p| spec.applied.iter().position(|q| (q.name, q.unit) == (p.applied, p.unit)).expect(p.name))
+            .collect();
+        let mut environment = (spec.make)().unwrap();
+        let mut stream = Stream::new(3, 0, Purpose::Parameters, 0);
+        let mut applied = vec![f64::NAN; spec.applied.len()];
+        for i in 0..300 {
+            let mut draw = |p: &Parameter| match i % 3 {
+                0 => p.distribution(VERSIONS[i / 3 % 3]).at(stream.unit()),
+                1 => stream.uniform(p.bounds.low, p.bounds.high),
+                _ => [p.bounds.low, p.bounds.high, p.default][(4.0 * stream.unit()) as usize % 3],
+            };
+            let requested: Vec<f64> = spec.parameters.iter().map(&mut draw).collect();
+            environment.set_parameters(&requested);
+            environment.applied(&mut applied);
+            for ((p, requested), &quantity) in spec.parameters.iter().zip(&requested).zip(&quantities) {
+                let difference = (applied[quantity] - requested).abs();
+                assert!(difference <= ROUNDING * requested.abs(), "{} {}: {requested}, {applied:?}", spec.name, p.name);
+            }
+        }
     }
 }
 
@@ -116,7 +177,7 @@ fn observations_and_rewards_keep_to_the_spec() {
 #[test]
 fn the_reward_is_the_sum_of_its_terms_and_the_return_that_of_the_rewards() {
     for spec in tasks::catalogue().specs() {
-        let mut e = episodes(spec, Version::Random, 3, 0, 1);
+        let mut e = episodes(spec, Version::R, 3, 0, 1);
         let mut total = 0.0;
         for t in 0..1500 {
             let (outcome, terms) = step(&mut e, &action_bytes(spec, 1, t));
@@ -156,7 +217,7 @@ fn another_seed_index_or_episode_gives_another_start() {
         let mut parameters = Vec::new();
         for seed in [0, 1, u64::MAX] {
             for index in [0, 1, u32::MAX] {
-                let mut e = episodes(spec, Version::Random, seed, index, 1);
+                let mut e = episodes(spec, Version::R, seed, index, 1);
                 for _ in 0..3 {
                     observations.push(format!("{:?}", observe(&e)));
                     parameters.push(format!("{:?}", e.receipt().requested));
@@ -198,7 +259,7 @@ fn a_reset_after_use_equals_a_fresh_environment() {
     for spec in tasks::catalogue().specs() {
         for version in VERSIONS {
             let mut fresh = episodes(spec, version, 77, 2, 3);
-            let mut used = episodes(spec, Version::Extreme, 1, 2, 3);
+            let mut used = episodes(spec, Version::E, 1, 2, 3);
             play(&mut used, 5, 0, 333);
             let distributions = fresh.settings().distributions.clone();
             used.begin_trial(Some(77), Some(&distributions), None);
@@ -212,8 +273,8 @@ fn a_reset_after_use_equals_a_fresh_environment() {
 fn an_exact_state_gives_the_same_bytes_whatever_ran_before() {
     for spec in tasks::catalogue().specs() {
         let state = some_state(spec, 1);
-        let mut fresh = episodes(spec, Version::Random, 4, 0, 10);
-        let mut used = episodes(spec, Version::Random, 4, 0, 10);
+        let mut fresh = episodes(spec, Version::R, 4, 0, 10);
+        let mut used = episodes(spec, Version::R, 4, 0, 10);
         play(&mut used, 1, 0, 10);
         // The same counts for both: a trial's second episode.
         used.begin_trial(Some(4), None, None);
@@ -222,7 +283,7 @@ fn an_exact_state_gives_the_same_bytes_whatever_ran_before() {
         assert_eq!(start_line(&used), start_line(&fresh), "{}", spec.name);
         assert_eq!(play(&mut used, 2, 0, 50), play(&mut fresh, 2, 0, 50), "{}", spec.name);
 
-        let mut other = episodes(spec, Version::Random, 4, 0, 10);
+        let mut other = episodes(spec, Version::R, 4, 0, 10);
         other.begin(Some(&some_state(spec, 2)));
         fresh.begin_trial(Some(4), None, None);
         fresh.begin(Some(&state));
@@ -233,8 +294,8 @@ fn an_exact_state_gives_the_same_bytes_whatever_ran_before() {
 #[test]
 fn an_exact_state_spends_no_draw_of_later_episodes() {
     for spec in tasks::catalogue().specs() {
-        let mut drawn = episodes(spec, Version::Random, 4, 0, 1);
-        let mut exact = episodes(spec, Version::Random, 4, 0, 1);
+        let mut drawn = episodes(spec, Version::R, 4, 0, 1);
+        let mut exact = episodes(spec, Version::R, 4, 0, 1);
         drawn.begin(None);
         exact.begin(Some(&some_state(spec, 1)));
         assert_eq!(drawn.receipt(), exact.receipt());
@@ -250,7 +311,7 @@ fn an_exact_state_spends_no_draw_of_later_episodes() {
 fn parameters_stay_within_a_trial_and_are_drawn_anew_after_it() {
     for spec in tasks::catalogue().specs() {
         for n in [1, 2, 5] {
-            let mut e = episodes(spec, Version::Random, 8, 1, n);
+            let mut e = episodes(spec, Version::R, 8, 1, n);
             let mut trials: Vec<Vec<f64>> = Vec::new();
             for episode in 0..4 * n {
                 let id = e.id();
@@ -284,7 +345,7 @@ fn play_to_its_end(e: &mut Episodes, steps: u64) {
 fn the_trial_alone_fixes_the_parameters() {
     for spec in tasks::catalogue().specs() {
         let parameters = |n: u32| {
-            let mut e = episodes(spec, Version::Extreme, 8, 1, n);
+            let mut e = episodes(spec, Version::E, 8, 1, n);
             (0..3 * n).for_each(|_| e.begin(None));
             assert_eq!(e.id().trial_index, 3);
             e.receipt().requested
@@ -296,7 +357,7 @@ fn the_trial_alone_fixes_the_parameters() {
 #[test]
 fn new_distributions_or_seeds_begin_a_trial() {
     for spec in tasks::catalogue().specs() {
-        let mut e = episodes(spec, Version::Random, 8, 1, 3);
+        let mut e = episodes(spec, Version::R, 8, 1, 3);
         e.begin(None);
         assert_eq!((e.id().trial_index, e.id().episode_index, e.id().episode_in_trial), (0, 1, 1));
         let fixed: Vec<_> = spec.parameters.iter().map(|p| Distribution::fixed(p.extreme[0].low)).collect();
@@ -313,16 +374,15 @@ fn new_distributions_or_seeds_begin_a_trial() {
 #[test]
 fn receipts_read_back_what_was_requested() {
     for spec in tasks::catalogue().specs() {
-        let mut e = episodes(spec, Version::Extreme, 13, 0, 1);
+        let mut e = episodes(spec, Version::E, 13, 0, 1);
         for _ in 0..50 {
             let receipt = e.receipt();
             assert_eq!(receipt.applied.len(), spec.applied.len());
             assert!(receipt.applied.iter().all(|value| value.is_finite()));
             for (parameter, requested) in spec.parameters.iter().zip(&receipt.requested) {
-                let position = spec.applied.iter().position(|quantity| quantity.name == parameter.name);
-                if let Some(position) = position {
-                    assert_eq!(receipt.applied[position], *requested, "{} {}", spec.name, parameter.name);
-                }
+                let position = spec.applied.iter().position(|quantity| quantity.name == parameter.applied).unwrap();
+                let difference = (receipt.applied[position] - requested).abs();
+                assert!(difference <= ROUNDING * requested.abs(), "{} {}", spec.name, parameter.name);
             }
             e.begin(None);
         }
@@ -331,7 +391,7 @@ fn receipts_read_back_what_was_requested() {
 
 #[test]
 fn derived_quantities_follow_every_edit() {
-    let mut e = episodes(tasks::catalogue().find("CartPole").unwrap(), Version::Extreme, 13, 0, 1);
+    let mut e = episodes(tasks::catalogue().find("CartPole").unwrap(), Version::E, 13, 0, 1);
     for _ in 0..50 {
         let [_, length, mass] = e.receipt().requested[..] else { panic!("three parameters") };
         // 1 kg is the cart's mass.
@@ -349,7 +409,7 @@ fn every_parameter_changes_the_receipt_and_the_physics() {
                 Distribution::fixed(if edited == Some(i) { p.extreme[1].high } else { p.default })
             };
             let distributions = (0..spec.parameters.len()).map(value).collect();
-            let settings = env::Settings { distributions, ..settings(spec, Version::Default, 1, 0, 1) };
+            let settings = env::Settings { distributions, ..settings(spec, Version::D, 1, 0, 1) };
             let mut e = Episodes::new((spec.make)().unwrap(), settings);
             let applied = e.receipt().applied;
             // Steps until every parameter had its effect, contacts with the floor included.
@@ -375,8 +435,8 @@ fn every_parameter_changes_the_receipt_and_the_physics() {
 #[test]
 fn edits_do_not_accumulate() {
     for spec in tasks::catalogue().specs() {
-        let mut fresh = episodes(spec, Version::Default, 1, 0, 1);
-        let mut edited = episodes(spec, Version::Extreme, 1, 0, 1);
+        let mut fresh = episodes(spec, Version::D, 1, 0, 1);
+        let mut edited = episodes(spec, Version::E, 1, 0, 1);
         (0..100).for_each(|_| edited.begin(None));
         let defaults = fresh.settings().distributions.clone();
         edited.begin_trial(Some(1), Some(&defaults), None);
@@ -390,7 +450,7 @@ fn edits_do_not_accumulate() {
 #[test]
 fn an_episode_is_truncated_exactly_at_the_step_limit() {
     for spec in tasks::catalogue().specs() {
-        let mut e = episodes(spec, Version::Default, 2, 0, 1);
+        let mut e = episodes(spec, Version::D, 2, 0, 1);
         let (mut length, mut truncations) = (0, 0);
         for t in 0..u64::from(6 * spec.step_limit) {
             let (outcome, _) = step(&mut e, &action_bytes(spec, 3, t));
@@ -419,7 +479,7 @@ fn everything_stays_finite_at_the_corners_of_the_bounds() {
                 Distribution::fixed(if ends >> i & 1 == 1 { bounds.high } else { bounds.low })
             };
             let distributions = (0..spec.parameters.len()).map(corner).collect();
-            let settings = env::Settings { distributions, ..settings(spec, Version::Default, 1, 0, 1) };
+            let settings = env::Settings { distributions, ..settings(spec, Version::D, 1, 0, 1) };
             let mut e = Episodes::new((spec.make)().unwrap(), settings);
             for t in 0..600 {
                 let (outcome, terms) = step(&mut e, &action_bytes(spec, 2, t));

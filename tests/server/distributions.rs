@@ -92,7 +92,7 @@ fn defaults_lie_in_r_and_r_between_the_two_halves_of_e_and_all_within_bounds() {
         assert_eq!((p.extreme[0].high, p.extreme[1].low), (p.random.low, p.random.high), "{place}");
         assert!(p.extreme[0].low < p.extreme[0].high && p.extreme[1].low < p.extreme[1].high, "{place}");
         // `distribution` says that these unions are valid.
-        for version in [Version::Default, Version::Random, Version::Extreme] {
+        for version in [Version::D, Version::R, Version::E] {
             p.distribution(version);
         }
     }
@@ -102,7 +102,7 @@ fn defaults_lie_in_r_and_r_between_the_two_halves_of_e_and_all_within_bounds() {
 fn d_is_always_the_default() {
     for spec in tasks::catalogue().specs() {
         let defaults: Vec<f64> = spec.parameters.iter().map(|p| p.default).collect();
-        let mut episodes = common::episodes(spec, Version::Default, 1, 0, 1);
+        let mut episodes = common::episodes(spec, Version::D, 1, 0, 1);
         for _ in 0..20 {
             assert_eq!(episodes.receipt().requested, defaults, "{}", spec.name);
             episodes.begin(None);
@@ -113,7 +113,7 @@ fn d_is_always_the_default() {
 #[test]
 fn r_is_uniform_on_its_interval() {
     for spec in tasks::catalogue().specs() {
-        let rows = drawn(spec, Version::Random);
+        let rows = drawn(spec, Version::R);
         for (i, p) in spec.parameters.iter().enumerate() {
             let values = column(&rows, i);
             assert!(values.iter().all(|v| (p.random.low..=p.random.high).contains(v)), "{} {}", spec.name, p.name);
@@ -126,7 +126,7 @@ fn r_is_uniform_on_its_interval() {
 #[test]
 fn e_draws_each_interval_in_proportion_to_its_length_and_nothing_inside_r() {
     for spec in tasks::catalogue().specs() {
-        let rows = drawn(spec, Version::Extreme);
+        let rows = drawn(spec, Version::E);
         for (i, p) in spec.parameters.iter().enumerate() {
             let place = format!("{} {}", spec.name, p.name);
             let [lower, upper] = p.extreme;
@@ -150,7 +150,7 @@ fn e_draws_each_interval_in_proportion_to_its_length_and_nothing_inside_r() {
 #[test]
 fn parameters_are_drawn_independently() {
     for spec in tasks::catalogue().specs() {
-        let rows = drawn(spec, Version::Random);
+        let rows = drawn(spec, Version::R);
         let scaled = |i: usize| {
             let interval = spec.parameters[i].random;
             column(&rows, i).into_iter().map(move |v| (v - interval.low) / (interval.high - interval.low) - 0.5)
@@ -169,7 +169,7 @@ fn parameters_are_drawn_independently() {
 #[test]
 fn a_union_of_three_draws_each_in_proportion() {
     let intervals = [Interval::new(-1.0, 0.0), Interval::new(2.0, 5.0), Interval::new(5.0, 11.0)];
-    let distribution = Distribution::union("x", &intervals).unwrap();
+    let distribution = Distribution::union(&intervals).unwrap();
     let mut stream = Stream::new(7, 0, Purpose::Parameters, 0);
     let n = 20_000;
     let values: Vec<f64> = (0..n).map(|_| distribution.at(stream.unit())).collect();
@@ -183,13 +183,13 @@ fn a_union_of_three_draws_each_in_proportion() {
 #[test]
 fn overrides_replace_only_what_they_name() {
     let spec = tasks::catalogue().find("CartPole").unwrap();
-    let mut distributions: Vec<_> = spec.parameters.iter().map(|p| p.distribution(Version::Random)).collect();
-    let union = Distribution::union("mass", &[Interval::new(0.2, 0.3), Interval::new(2.0, 2.1)]).unwrap();
+    let mut distributions: Vec<_> = spec.distributions(Version::R);
+    let union = Distribution::union(&[Interval::new(0.2, 0.3), Interval::new(2.0, 2.1)]).unwrap();
     let overrides = [("mass", union.clone()), ("force", Distribution::fixed(7.0))];
     resolve(spec, &mut distributions, overrides).unwrap();
-    assert_eq!(distributions, [Distribution::fixed(7.0), spec.parameters[1].distribution(Version::Random), union]);
+    assert_eq!(distributions, [Distribution::fixed(7.0), spec.parameters[1].distribution(Version::R), union]);
 
-    let settings = env::Settings { distributions, ..common::settings(spec, Version::Random, 5, 0, 1) };
+    let settings = env::Settings { distributions, ..common::settings(spec, Version::R, 5, 0, 1) };
     let mut episodes = env::Episodes::new((spec.make)().unwrap(), settings);
     let mut lengths = Vec::new();
     for _ in 0..50 {
@@ -207,7 +207,7 @@ fn overrides_replace_only_what_they_name() {
 #[test]
 fn an_override_does_not_move_the_other_parameters_draws() {
     let spec = tasks::catalogue().find("CartPole").unwrap();
-    let base = common::settings(spec, Version::Extreme, 9, 2, 1);
+    let base = common::settings(spec, Version::E, 9, 2, 1);
     let mut changed = base.clone();
     resolve(spec, &mut changed.distributions, [("force", Distribution::fixed(7.0))]).unwrap();
     let receipt = |settings| env::Episodes::new((spec.make)().unwrap(), settings).receipt().requested;
@@ -230,39 +230,37 @@ fn an_override_does_not_move_the_other_parameters_draws() {
 #[case::twice(&[(0.0, 1.0), (0.0, 1.0)], "ascending intervals that do not overlap")]
 fn a_union_that_is_none_is_refused(#[case] pairs: &[(f64, f64)], #[case] reason: &str) {
     let intervals: Vec<_> = pairs.iter().map(|&(low, high)| Interval::new(low, high)).collect();
-    match Distribution::union("mass", &intervals) {
-        Err(Error::Distribution { parameter, expected, .. }) => assert_eq!((&*parameter, expected), ("mass", reason)),
-        other => panic!("{other:?}"),
-    }
+    assert_eq!(Distribution::union(&intervals).unwrap_err().expected, reason);
 }
 
 #[test]
 fn a_distribution_has_at_most_64_intervals_and_refusals_stay_short() {
     let intervals = |n: u32| (0..n).map(|i| Interval::new(i.into(), f64::from(i) + 0.5)).collect::<Vec<_>>();
-    assert!(Distribution::union("mass", &intervals(64)).is_ok());
+    assert!(Distribution::union(&intervals(64)).is_ok());
     let long = "m".repeat(1_000_000);
     let refusals = [
-        Distribution::union("mass", &intervals(65)).unwrap_err(),
-        Distribution::union(&long, &intervals(100_000)).unwrap_err(),
-        tasks::catalogue().find(&long).unwrap_err(),
+        Distribution::union(&intervals(65)).unwrap_err().to_string(),
+        Distribution::union(&intervals(100_000)).unwrap_err().to_string(),
+        tasks::catalogue().find(&long).unwrap_err().to_string(),
         resolve(tasks::catalogue().find("Pendulum").unwrap(), &mut [], [(long.as_str(), Distribution::fixed(1.0))])
-            .unwrap_err(),
+            .unwrap_err()
+            .to_string(),
     ];
     for refusal in refusals {
-        assert!(refusal.to_string().len() < 600, "{} bytes", refusal.to_string().len());
+        assert!(refusal.len() < 600, "{} bytes", refusal.len());
     }
 }
 
 #[test]
 fn intervals_may_touch_and_a_single_one_may_be_a_point() {
-    assert!(Distribution::union("x", &[Interval::new(0.0, 1.0), Interval::new(1.0, 2.0)]).is_ok());
-    assert_eq!(Distribution::union("x", &[Interval::new(3.0, 3.0)]).unwrap(), Distribution::fixed(3.0));
+    assert!(Distribution::union(&[Interval::new(0.0, 1.0), Interval::new(1.0, 2.0)]).is_ok());
+    assert_eq!(Distribution::union(&[Interval::new(3.0, 3.0)]).unwrap(), Distribution::fixed(3.0));
 }
 
 #[test]
 fn overrides_that_are_wrong_change_nothing() {
     for spec in tasks::catalogue().specs() {
-        let base: Vec<_> = spec.parameters.iter().map(|p| p.distribution(Version::Random)).collect();
+        let base: Vec<_> = spec.distributions(Version::R);
         for parameter in spec.parameters {
             let Interval { low, high } = parameter.bounds;
             let beyond = [Interval::new(low.next_down(), high), Interval::new(low, high.next_up())];
@@ -270,14 +268,14 @@ fn overrides_that_are_wrong_change_nothing() {
                 let mut distributions = base.clone();
                 // A right one stands before the wrong one.
                 let right = (spec.parameters[0].name, Distribution::fixed(spec.parameters[0].default));
-                let wrong = (parameter.name, Distribution::union(parameter.name, &[interval]).unwrap());
+                let wrong = (parameter.name, Distribution::union(&[interval]).unwrap());
                 let refused = resolve(spec, &mut distributions, [right, wrong]).unwrap_err();
                 assert!(matches!(refused, Error::OutOfRange { .. }), "{refused}");
                 assert!(refused.to_string().contains(parameter.name), "{refused}");
                 assert_eq!(distributions, base);
             }
             let mut distributions = base.clone();
-            let whole = Distribution::union(parameter.name, &[parameter.bounds]).unwrap();
+            let whole = Distribution::union(&[parameter.bounds]).unwrap();
             resolve(spec, &mut distributions, [(parameter.name, whole)]).unwrap();
             assert!(check_bounds(spec, parameter, (f64::NAN, high)).is_err(), "NaN is in no range");
             assert!(check_bounds(spec, parameter, (low, f64::NAN)).is_err(), "NaN is in no range");
@@ -314,7 +312,7 @@ proptest! {
     fn a_draw_lies_in_the_union_and_grows_with_the_fraction(
         intervals in unions(), u in fractions(), v in fractions()
     ) {
-        let distribution = Distribution::union("x", &intervals).unwrap();
+        let distribution = Distribution::union(&intervals).unwrap();
         let (u, v) = (u.min(v), u.max(v));
         let (at_u, at_v) = (distribution.at(u), distribution.at(v));
         for value in [at_u, at_v] {
@@ -335,7 +333,7 @@ proptest! {
         pairs in prop::collection::vec((any::<f64>(), any::<f64>()), 0..4), u in fractions()
     ) {
         let intervals: Vec<_> = pairs.iter().map(|&(low, high)| Interval::new(low, high)).collect();
-        if let Ok(distribution) = Distribution::union("x", &intervals) {
+        if let Ok(distribution) = Distribution::union(&intervals) {
             let value = distribution.at(u);
             prop_assert!(intervals.iter().any(|i| (i.low..=i.high).contains(&value)), "{value} in {intervals:?}");
         }

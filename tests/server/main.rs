@@ -13,9 +13,11 @@ mod faults;
 mod lifecycle;
 #[cfg(feature = "mujoco")]
 mod locomotion;
+mod old_snapshots;
 mod pool;
 mod reference;
 mod rendering;
 mod restoring;
 mod streams;
 mod success;
+mod toy;

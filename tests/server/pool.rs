@@ -19,7 +19,7 @@ use std::{
 const MODES: [Autoreset; 3] = [Autoreset::NextStep, Autoreset::SameStep, Autoreset::Disabled];
 
 fn batch_settings(spec: &'static EnvironmentSpec, size: usize, autoreset: Autoreset) -> BatchSettings {
-    let episodes = common::settings(spec, Version::Random, 17, 100, 2);
+    let episodes = common::settings(spec, Version::R, 17, 100, 2);
     BatchSettings { spec, size, episodes, autoreset, receipts: true, reward_terms: true }
 }
 

@@ -60,7 +60,7 @@ fn uniform_spends_one_number_and_scales_it() {
 #[test]
 fn parameters_are_the_trials_numbers_in_the_catalogues_order() {
     for spec in tasks::catalogue().specs() {
-        let mut e = common::episodes(spec, Version::Random, 12, 34, 2);
+        let mut e = common::episodes(spec, Version::R, 12, 34, 2);
         for trial in 0..3 {
             for _ in 0..2 {
                 let mut stream = Stream::new(12, 34, Purpose::Parameters, trial);
@@ -99,7 +99,7 @@ fn initial_states_are_the_episodes_numbers_in_the_states_order(
     assert_eq!(state, ranges.iter().map(draw).collect::<Vec<_>>());
 
     // And the episodes use this stream.
-    let mut episodes = common::episodes(tasks::catalogue().find(name).unwrap(), Version::Default, 12, 34, 1);
+    let mut episodes = common::episodes(tasks::catalogue().find(name).unwrap(), Version::D, 12, 34, 1);
     (0..episode).for_each(|_| episodes.begin(None));
     let mut observation = vec![0.0; environment.spec().observation.len()];
     environment.observe(&mut observation);

@@ -3,8 +3,8 @@
 use crate::common::{episodes, observe, settings, step};
 use perturb::{
     env::{
-        Action, ActionSpace, Channel, Environment, EnvironmentSpec, EpisodeEnd, Episodes, Error, Outcome, Purpose,
-        RewardTerm, Stream, SuccessRule, Transition, Version,
+        Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, EpisodeEnd, Episodes,
+        Error, Outcome, Purpose, RewardTerm, Stream, Success, Transition, Version,
     },
     scene::Scene,
     tasks,
@@ -14,7 +14,7 @@ use rstest::rstest;
 const LIMIT: u32 = 8;
 const TIME: &[Channel] = &[Channel::unbounded("time", "1")];
 
-const fn scripted_spec(success: SuccessRule) -> EnvironmentSpec {
+const fn scripted_spec(achievement: Achievement, comparison: Comparison, threshold: f64) -> EnvironmentSpec {
     EnvironmentSpec {
         name: "Scripted",
         revision: 0,
@@ -29,14 +29,14 @@ const fn scripted_spec(success: SuccessRule) -> EnvironmentSpec {
         step_limit: LIMIT,
         control_timestep: 1.0,
         step_cost: 0.1,
-        success,
-        success_description: "",
+        success: Success { description: "", achievement, comparison, threshold },
+        heatmap_axes: None,
     }
 }
 
-static LASTED_5: EnvironmentSpec = scripted_spec(SuccessRule::Lasted(5));
-static REACHED_WITHIN_5: EnvironmentSpec = scripted_spec(SuccessRule::ReachedWithin(5));
-static HELD_FOR_LAST_3: EnvironmentSpec = scripted_spec(SuccessRule::HeldForLast(3));
+static LASTED_5: EnvironmentSpec = scripted_spec(Achievement::Length, Comparison::AtLeast, 5.0);
+static REACHED_WITHIN_5: EnvironmentSpec = scripted_spec(Achievement::FirstGoal, Comparison::AtMost, 5.0);
+static HELD_FOR_LAST_3: EnvironmentSpec = scripted_spec(Achievement::LastGoals, Comparison::AtLeast, 3.0);
 
 /// One character a step: `.` nothing, `g` the goal holds, `T` terminated, `G` both, `D` diverged.
 struct Scripted {
@@ -87,7 +87,7 @@ impl Environment for Scripted {
 /// Plays the script, which must end the episode with its last mark; returns the last outcome and the ended episode.
 fn run(spec: &'static EnvironmentSpec, script: &'static str) -> (Outcome, EpisodeEnd) {
     let scripted = Scripted { spec, script: script.as_bytes(), time: 0 };
-    let mut e = Episodes::new(Box::new(scripted), settings(spec, Version::Default, 0, 0, 1));
+    let mut e = Episodes::new(Box::new(scripted), settings(spec, Version::D, 0, 0, 1));
     for t in 1..=script.len() {
         let (outcome, _) = step(&mut e, &[0; 4]);
         assert_eq!(e.ended(), t == script.len(), "{script} at step {t}");
@@ -166,7 +166,7 @@ fn a_state_beyond_f32_ends_the_episode_with_the_last_one_that_was_not(#[case] na
 #[test]
 fn counts_start_anew_with_every_episode() {
     let scripted = Scripted { spec: &HELD_FOR_LAST_3, script: b"gg......", time: 0 };
-    let mut e = Episodes::new(Box::new(scripted), settings(&HELD_FOR_LAST_3, Version::Default, 0, 0, 1));
+    let mut e = Episodes::new(Box::new(scripted), settings(&HELD_FOR_LAST_3, Version::D, 0, 0, 1));
     for _ in 0..3 {
         step(&mut e, &[0; 4]);
         step(&mut e, &[0; 4]);
@@ -180,7 +180,7 @@ fn counts_start_anew_with_every_episode() {
 
 /// The discrete environment from this state, acting by `policy` (of the time and the observation) until the end.
 fn drive(name: &str, state: &[f64], policy: impl Fn(u32, &[f32]) -> i32) -> (Outcome, EpisodeEnd) {
-    let mut e = episodes(tasks::catalogue().find(name).unwrap(), Version::Default, 0, 0, 1);
+    let mut e = episodes(tasks::catalogue().find(name).unwrap(), Version::D, 0, 0, 1);
     e.begin(Some(state));
     for t in 0.. {
         let action = policy(t, &observe(&e)).to_le_bytes();
@@ -264,7 +264,7 @@ fn pendulum_succeeds_if_the_last_100_steps_were_near_upright() {
     let spec = tasks::catalogue().find("Pendulum").unwrap();
     // A rod so light that the torque can hold it anywhere.
     let light = [("length", 1.0), ("mass", 0.1)].map(|(name, value)| (name, perturb::env::Distribution::fixed(value)));
-    let mut settings = settings(spec, Version::Default, 0, 0, 1);
+    let mut settings = settings(spec, Version::D, 0, 0, 1);
     perturb::env::resolve(spec, &mut settings.distributions, light).unwrap();
     let mut entries = Vec::new();
     for release in 80..110 {

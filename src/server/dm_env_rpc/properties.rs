@@ -7,7 +7,7 @@ use super::{
     tensors,
 };
 use crate::{
-    env::{Catalogue, EpisodeId, Receipt, shorten},
+    env::{Catalogue, Distribution, EpisodeId, Receipt, shorten},
     proto::dm_env_rpc::v1::{
         DataType, Tensor, TensorSpec,
         extensions::properties::{
@@ -105,12 +105,8 @@ fn of_world(joined: &Joined, episode: EpisodeId, receipt: Option<&Receipt>) -> V
         new("env_id", spec.description, Value::Text(spec.name.into())),
         new("revision", "raised by every change of the environment", Value::Small(spec.revision)),
         new("model_hash", "SHA-256 of the model's MJCF; empty without a model", Value::Text(hash)),
-        new(
-            VERSION,
-            "D, R or E; writing it gives all parameters its sets",
-            Value::Text(settings::letter(runner.version()).into()),
-        )
-        .writable(),
+        new(VERSION, "D, R or E; writing it gives all parameters its sets", Value::Text(runner.version().to_string()))
+            .writable(),
         new(SEED, "fixes all randomness; writing it restarts the counts", Value::Large(runner.seed())).writable(),
         new("environment_index", "fixes randomness together with the seed", Value::Small(episode.environment_index)),
         new("trial_index", "counts trials from 0", Value::Large(episode.trial_index)),
@@ -172,7 +168,9 @@ fn write(joined: Option<&Joined>, property: &Property, request: &WritePropertyRe
         SEED => change.seed = Some(tensors::integer(&field, value, 0, u64::MAX)?),
         key => {
             let name = key.rsplit('.').next().unwrap_or_default();
-            change.parameters.insert(name.into(), settings::fixed(tensors::number(&field, value)?));
+            let parameter = joined.world.spec().parameters.iter().find(|parameter| parameter.name == name);
+            let number = tensors::number(&field, value)?;
+            change.parameters.extend(parameter.map(|parameter| (parameter.name, Distribution::fixed(number))));
         }
     }
     joined.world.change(change)

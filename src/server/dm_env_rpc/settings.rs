@@ -1,13 +1,13 @@
-//! Settings to the domain. Names and types are checked here, values by the checks that `perturb.v1` has.
+//! Settings to the domain. Names and types are checked here, values by the domain.
 
 use super::tensors;
 use crate::{
-    env::{Catalogue, EnvironmentSpec, Version, shorten},
-    pool::BatchSettings,
-    proto::{self, dm_env_rpc::v1::Tensor},
-    server::{convert, status::Refusal},
+    env::{self, Catalogue, Distribution, EnvironmentSpec, Version, resolve, shorten},
+    pool::{Autoreset, BatchSettings},
+    proto::dm_env_rpc::v1::Tensor,
+    server::status::Refusal,
 };
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 
 const ENV_ID: &str = "env_id";
 const VERSION: &str = "version";
@@ -24,8 +24,8 @@ pub(super) struct Change {
     pub(super) version: Option<Version>,
     /// Restarts the counts of episodes and trials.
     pub(super) seed: Option<u64>,
-    /// Fixed values, as distributions.
-    pub(super) parameters: HashMap<String, proto::Distribution>,
+    /// New distributions by parameters' names.
+    pub(super) parameters: Vec<(&'static str, Distribution)>,
 }
 
 /// Checks the settings of `create_world`. Returns the version beside what the batch needs to know.
@@ -46,28 +46,18 @@ pub(super) fn create(catalogue: &Catalogue, settings: &Settings) -> Result<(Batc
     };
     let small =
         |name, default, low| integer(name, default, low, u32::MAX.into()).map(|n| u32::try_from(n).unwrap_or(u32::MAX));
-    let version = version(settings)?.unwrap_or(Version::Default);
-    let batch = convert::open(
-        catalogue,
-        proto::Open {
-            environment: spec.name.into(),
-            version: match version {
-                Version::Default => proto::Version::Default,
-                Version::Random => proto::Version::Random,
-                Version::Extreme => proto::Version::Extreme,
-            }
-            .into(),
-            parameters: parameters(spec, settings)?,
-            batch_size: 1,
-            seed: integer(SEED, 0, 0, u64::MAX)?,
-            first_environment_index: small(ENVIRONMENT_INDEX, 0, 0)?,
-            episodes_per_trial: small(EPISODES_PER_TRIAL, 1, 1)?,
-            // An agent's step after the end begins the next episode by a reset.
-            autoreset_mode: proto::AutoresetMode::Disabled.into(),
-            receipts: true,
-            reward_terms: false,
-        },
-    )?;
+    let version = version(settings)?.unwrap_or(Version::D);
+    let mut distributions = spec.distributions(version);
+    resolve(spec, &mut distributions, parameters(spec, settings)?)?;
+    let episodes = env::Settings {
+        seed: integer(SEED, 0, 0, u64::MAX)?,
+        environment_index: small(ENVIRONMENT_INDEX, 0, 0)?,
+        distributions,
+        episodes_per_trial: small(EPISODES_PER_TRIAL, 1, 1)?,
+    };
+    // An agent's step after the end begins the next episode by a reset.
+    let autoreset = Autoreset::Disabled;
+    let batch = BatchSettings { spec, size: 1, episodes, autoreset, receipts: true, reward_terms: false };
     Ok((batch, version))
 }
 
@@ -104,26 +94,8 @@ pub(super) fn none(request: &'static str, settings: &Settings) -> Result<(), Ref
 /// # Errors
 /// If it is another letter.
 pub(super) fn version_of(field: String, letter: &str) -> Result<Version, Refusal> {
-    match letter {
-        "D" => Ok(Version::Default),
-        "R" => Ok(Version::Random),
-        "E" => Ok(Version::Extreme),
-        _ => Err(Refusal::value(field, format!("{:?}", shorten(letter)), "\"D\", \"R\" or \"E\"")),
-    }
-}
-
-/// A version's letter.
-pub(super) fn letter(version: Version) -> &'static str {
-    match version {
-        Version::Default => "D",
-        Version::Random => "R",
-        Version::Extreme => "E",
-    }
-}
-
-/// Always this value.
-pub(super) fn fixed(value: f64) -> proto::Distribution {
-    proto::Distribution { intervals: vec![proto::Interval { low: value, high: value }] }
+    let found = Version::ALL.into_iter().find(|version| version.to_string() == letter);
+    found.ok_or_else(|| Refusal::value(field, format!("{:?}", shorten(letter)), "\"D\", \"R\" or \"E\""))
 }
 
 /// By the catalogue's name, or the id that Gymnasium knows it by.
@@ -138,12 +110,9 @@ fn version(settings: &Settings) -> Result<Option<Version>, Refusal> {
 }
 
 /// Those of the settings that are the environment's parameters.
-fn parameters(
-    spec: &'static EnvironmentSpec,
-    settings: &Settings,
-) -> Result<HashMap<String, proto::Distribution>, Refusal> {
+fn parameters(spec: &EnvironmentSpec, settings: &Settings) -> Result<Vec<(&'static str, Distribution)>, Refusal> {
     let given = spec.parameters.iter().filter_map(|p| Some((p.name, settings.get(p.name)?)));
-    given.map(|(name, tensor)| Ok((name.into(), fixed(tensors::number(&field(name), tensor)?)))).collect()
+    given.map(|(name, tensor)| Ok((name, Distribution::fixed(tensors::number(&field(name), tensor)?)))).collect()
 }
 
 fn check_names(

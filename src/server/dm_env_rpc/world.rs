@@ -2,8 +2,8 @@
 
 use super::{runner::Runner, settings::Change};
 use crate::{
-    env::{Distribution, EnvironmentSpec, Version},
-    server::{convert, status::Refusal},
+    env::{Distribution, EnvironmentSpec, Version, resolve},
+    server::status::Refusal,
 };
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -68,10 +68,10 @@ impl World {
         let version = change.version.unwrap_or(wanted.version);
         if change.version.is_some() || !change.parameters.is_empty() {
             let mut distributions = match change.version {
-                Some(version) => self.spec.parameters.iter().map(|p| p.distribution(version)).collect(),
+                Some(version) => self.spec.distributions(version),
                 None => wanted.distributions.clone(),
             };
-            convert::override_parameters(self.spec, &mut distributions, &change.parameters)?;
+            resolve(self.spec, &mut distributions, change.parameters)?;
             (wanted.distributions, wanted.new_distributions) = (distributions, true);
         }
         wanted.version = version;

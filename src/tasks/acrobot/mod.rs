@@ -8,8 +8,8 @@ mod drawing;
 use super::analytic;
 use crate::{
     env::{
-        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Parameter, Quantity, RewardTerm, Stream,
-        SuccessRule, Transition,
+        Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, Error, Parameter,
+        Quantity, RewardTerm, Stream, Success, Transition,
     },
     scene::Scene,
 };
@@ -54,8 +54,13 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     step_limit: 500,
     control_timestep: DT,
     step_cost: 0.3,
-    success: SuccessRule::ReachedWithin(80),
-    success_description: "the height was reached within 80 steps",
+    success: Success {
+        description: "the height was reached within 80 steps",
+        achievement: Achievement::FirstGoal,
+        comparison: Comparison::AtMost,
+        threshold: 80.0,
+    },
+    heatmap_axes: Some(["length", "mass"]),
 };
 
 const DT: f64 = 0.2;

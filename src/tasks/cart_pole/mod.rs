@@ -7,8 +7,8 @@ mod drawing;
 use super::analytic;
 use crate::{
     env::{
-        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Parameter, Quantity, RewardTerm, Stream,
-        SuccessRule, Transition,
+        Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, Error, Parameter,
+        Quantity, RewardTerm, Stream, Success, Transition,
     },
     scene::Scene,
 };
@@ -53,8 +53,13 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     step_limit: 200,
     control_timestep: TAU,
     step_cost: 0.04,
-    success: SuccessRule::Lasted(195),
-    success_description: "the episode lasted at least 195 steps",
+    success: Success {
+        description: "the episode lasted at least 195 steps",
+        achievement: Achievement::Length,
+        comparison: Comparison::AtLeast,
+        threshold: 195.0,
+    },
+    heatmap_axes: Some(["length", "mass"]),
 };
 
 const GRAVITY: f64 = 9.8;

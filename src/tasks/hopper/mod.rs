@@ -3,13 +3,13 @@
 use super::locomotion::{
     Posture, SCENERY, Task, Walker,
     channels::{
-        APPLIED, CONTROL_TIMESTEP, DENSITY, FRICTION, REWARD_TERMS, joint_state, position, power, root_state, speed,
-        torso, velocity,
+        APPLIED, CONTROL_TIMESTEP, DENSITY, FRICTION, REWARD_TERMS, SUCCESS, joint_state, position, power, root_state,
+        speed, torso, velocity,
     },
     colours::*,
 };
 use crate::{
-    env::{ActionSpace, Channel, EnvironmentSpec, Error, SuccessRule},
+    env::{ActionSpace, Channel, EnvironmentSpec, Error},
     scene::Look,
 };
 use std::sync::OnceLock;
@@ -77,8 +77,8 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     step_limit: 1000,
     control_timestep: CONTROL_TIMESTEP,
     step_cost: 20.0,
-    success: SuccessRule::ReachedWithin(1000),
-    success_description: "the torso's x reached 20 m at any step, the last one included",
+    success: SUCCESS,
+    heatmap_axes: Some(["density", "friction"]),
 };
 
 static TASK: Task = Task {

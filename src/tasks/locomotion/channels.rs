@@ -1,6 +1,6 @@
 //! The parts that the specs of Hopper and HalfCheetah share: channels, reward terms, quantities.
 
-use crate::env::{Channel, Parameter, Quantity, RewardTerm};
+use crate::env::{Achievement, Channel, Comparison, Parameter, Quantity, RewardTerm, Success};
 
 /// Observations are clipped to ± this.
 pub const CLIP: f64 = 5.0;
@@ -67,7 +67,9 @@ pub const REWARD_TERMS: &[RewardTerm] = &[
 
 /// The power of the motors, with the sets of its versions: see [`Parameter::versions`].
 pub const fn power(default: f64, random: (f64, f64), around: (f64, f64)) -> Parameter {
-    Parameter::new("power", "1", "factor on every motor's control", (0.0, 10.0)).versions(default, random, around)
+    Parameter::new("power", "1", "factor on every motor's control", (0.0, 10.0))
+        .versions(default, random, around)
+        .read_back_by("control_factor")
 }
 
 /// The torso's density.
@@ -82,4 +84,13 @@ pub const APPLIED: &[Quantity] = &[
     Quantity { name: "torso_mass", unit: "kg" },
     Quantity { name: "friction", unit: "1" },
     Quantity { name: "control_factor", unit: "1" },
+    Quantity { name: "density", unit: "kg/m³" },
 ];
+
+/// The same goal for both.
+pub const SUCCESS: Success = Success {
+    description: "the torso's x reached 20 m at any step, the last one included",
+    achievement: Achievement::Own(Quantity { name: "distance", unit: "m" }),
+    comparison: Comparison::AtLeast,
+    threshold: 20.0,
+};

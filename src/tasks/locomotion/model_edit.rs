@@ -56,6 +56,11 @@ impl Targets {
         model.body_mass()[self.torso_body]
     }
 
+    /// The torso's density in kg/m³, as its mass tells.
+    pub(super) fn density(self, model: &Model, pristine: &Model) -> f64 {
+        self.torso_mass(model) / (self.torso_mass(pristine) / COMPILED_DENSITY)
+    }
+
     /// The robot's sliding friction, the same for all of its geoms.
     pub(super) fn friction(self, model: &Model) -> f64 {
         model.geom_friction()[3 * self.torso_geom]

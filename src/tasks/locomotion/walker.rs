@@ -14,7 +14,6 @@ use std::{fmt::Write, sync::OnceLock};
 
 const TIMESTEP: f64 = 0.004125;
 const N_SUBSTEPS: usize = 4;
-const GOAL_X: f64 = 20.0;
 const RESET_RANGE: f64 = 0.1;
 const ELECTRICITY_COST: f64 = 2.0;
 const STALL_TORQUE_COST: f64 = 0.1;
@@ -137,6 +136,8 @@ pub struct Walker {
     initial_height: f64,
     /// The robot's place along the track, m.
     x: f64,
+    /// The torso's greatest x in the episode, m.
+    greatest_x: f64,
     /// Until the next reset.
     diverged: bool,
 }
@@ -155,6 +156,7 @@ impl Walker {
             observation: [0.0; MOST_OBSERVATION],
             initial_height: 0.0,
             x: 0.0,
+            greatest_x: 0.0,
             diverged: false,
         };
         walker.set_parameters(&std::array::from_fn::<f64, 3, _>(|i| task.spec.parameters[i].default));
@@ -188,9 +190,11 @@ impl Walker {
     fn start(&mut self) {
         self.contacts = [false; MOST_JOINTS];
         self.observation = [0.0; MOST_OBSERVATION];
+        self.greatest_x = 0.0;
         self.diverged = self.simulation.step1().is_err();
         if !self.diverged {
             self.x = self.track_position();
+            self.greatest_x = self.torso_x();
             self.initial_height = self.simulation.xipos(self.pristine.torso)[2];
             self.diverged = self.perceive().is_none();
         }
@@ -211,6 +215,10 @@ impl Walker {
     fn track_position(&self) -> f64 {
         let n_body = self.simulation.model().n_body();
         (1..n_body).map(|body| self.simulation.xipos(body)[0]).sum::<f64>() / (n_body - 1) as f64
+    }
+
+    fn torso_x(&self) -> f64 {
+        self.simulation.xipos(self.pristine.torso)[0]
     }
 
     fn touching(&self) -> [bool; MOST_JOINTS] {
@@ -285,7 +293,7 @@ impl Walker {
     fn n_saved(&self) -> usize {
         let model = self.simulation.model();
         let physics = 1 + model.n_q() + 2 * model.n_v() + model.n_act() + model.n_u();
-        1 + physics + 1 + self.task.contacts.len() + self.task.spec.observation.len()
+        1 + physics + 1 + self.task.contacts.len() + self.task.spec.observation.len() + 1
     }
 }
 
@@ -307,8 +315,13 @@ impl Environment for Walker {
     }
 
     fn applied(&self, out: &mut [f64]) {
-        let (targets, model) = (self.pristine.targets, self.simulation.model());
-        out.copy_from_slice(&[targets.torso_mass(model), targets.friction(model), self.power]);
+        let (Pristine { targets, model: pristine, .. }, model) = (self.pristine, self.simulation.model());
+        let density = targets.density(model, pristine);
+        out.copy_from_slice(&[targets.torso_mass(model), targets.friction(model), self.power, density]);
+    }
+
+    fn achieved(&self) -> Option<f64> {
+        Some(self.greatest_x)
     }
 
     fn model_hash(&self) -> &str {
@@ -363,8 +376,8 @@ impl Environment for Walker {
         let [electricity, stall_torque, joint_limits] = self.costs(action);
         let alive_bonus = if alive { 1.0 } else { -1.0 };
         reward_terms.copy_from_slice(&[alive_bonus, progress, electricity, stall_torque, joint_limits]);
-        let goal = self.simulation.xipos(self.pristine.torso)[0] >= GOAL_X;
-        Transition { terminated: !alive, goal, diverged: false }
+        self.greatest_x = self.greatest_x.max(self.torso_x());
+        Transition { terminated: !alive, goal: self.task.spec.success.holds(self.achieved()), diverged: false }
     }
 
     fn save(&self, out: &mut Vec<f64>) {
@@ -384,11 +397,14 @@ impl Environment for Walker {
         out.extend(self.contacts[..self.task.contacts.len()].iter().map(|&flag| f64::from(u8::from(flag))));
         // It holds the flags of the step before, which nothing else remembers.
         out.extend(self.observation[..self.task.spec.observation.len()].iter().map(|&value| f64::from(value)));
+        out.push(self.greatest_x);
     }
 
     fn load(&mut self, state: &[f64]) -> Result<(), Error> {
         let refuse = |reason: String| Err(Error::Snapshot { reason });
-        if state.len() != self.n_saved() {
+        // States that were saved before it ended with the observation.
+        let has_greatest_x = state.len() == self.n_saved();
+        if !has_greatest_x && state.len() + 1 != self.n_saved() {
             return refuse(format!("its state has {} numbers, expected {}", state.len(), self.n_saved()));
         }
         if !state.iter().all(|value| value.is_finite()) {
@@ -422,9 +438,10 @@ impl Environment for Walker {
             *flag = saved != 0.0;
         }
         self.observation = [0.0; MOST_OBSERVATION];
-        for (value, &saved) in self.observation.iter_mut().zip(rest) {
+        for (value, &saved) in self.observation.iter_mut().zip(take(self.task.spec.observation.len())) {
             *value = saved.clamp(-CLIP, CLIP) as f32;
         }
+        self.greatest_x = if has_greatest_x { take(1)[0] } else { self.torso_x() };
         Ok(())
     }
 }

@@ -7,8 +7,8 @@ mod drawing;
 use super::analytic;
 use crate::{
     env::{
-        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Parameter, Quantity, RewardTerm, Stream,
-        SuccessRule, Transition,
+        Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, Error, Parameter,
+        Quantity, RewardTerm, Stream, Success, Transition,
     },
     scene::Scene,
 };
@@ -44,8 +44,13 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     step_limit: 200,
     control_timestep: 1.0,
     step_cost: 0.04,
-    success: SuccessRule::ReachedWithin(110),
-    success_description: "the goal was reached within 110 steps",
+    success: Success {
+        description: "the goal was reached within 110 steps",
+        achievement: Achievement::FirstGoal,
+        comparison: Comparison::AtMost,
+        threshold: 110.0,
+    },
+    heatmap_axes: Some(["force", "mass"]),
 };
 
 const MIN_POSITION: f64 = -1.2;

@@ -8,8 +8,8 @@ mod drawing;
 use super::analytic;
 use crate::{
     env::{
-        Action, ActionSpace, Channel, Environment, EnvironmentSpec, Error, Parameter, Quantity, RewardTerm, Stream,
-        SuccessRule, Transition,
+        Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, Error, Parameter,
+        Quantity, RewardTerm, Stream, Success, Transition,
     },
     scene::Scene,
 };
@@ -44,8 +44,13 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     step_limit: 200,
     control_timestep: DT,
     step_cost: 0.05,
-    success: SuccessRule::HeldForLast(100),
-    success_description: "the angle was within π/3 of vertical after each of the last 100 steps",
+    success: Success {
+        description: "the angle was within π/3 of vertical after each of the last 100 steps",
+        achievement: Achievement::LastGoals,
+        comparison: Comparison::AtLeast,
+        threshold: 100.0,
+    },
+    heatmap_axes: Some(["mass", "length"]),
 };
 
 const DT: f64 = 0.05;

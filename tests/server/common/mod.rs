@@ -9,7 +9,7 @@ pub fn settings(spec: &EnvironmentSpec, version: Version, seed: u64, index: u32,
     Settings {
         seed,
         environment_index: index,
-        distributions: spec.parameters.iter().map(|p| p.distribution(version)).collect(),
+        distributions: spec.distributions(version),
         episodes_per_trial: per_trial,
     }
 }

@@ -1,5 +1,5 @@
 //! The server's other protocol.
 
-mod client;
+pub mod client;
 mod protocol;
 mod worlds;
