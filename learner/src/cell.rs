@@ -1,6 +1,5 @@
 //! Doing one cell: train, test, write the result.
 
-use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::Path;
 use std::time::Instant;
@@ -9,12 +8,17 @@ use anyhow::Result;
 
 use crate::checkpoint::{Checkpoint, CheckpointError, ResumeState};
 use crate::client::{ClientError, Servers};
-use crate::evaluation::{TestError, test};
+use crate::evaluation::{TestError, TestOptions, Tester};
 use crate::logging::Progress;
 use crate::rollout::CollectError;
 use crate::training::{RunDirectory, resume, train};
+use perturb_protocol::Distribution;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::{Cell, CellFolder, CellResult, CellState, Failure, FailureMark, FolderError, Timing, Training, io};
+use perturb_study::records;
+use perturb_study::sets::{Parameters, TestSet};
+use perturb_study::{
+    Cell, CellFolder, CellResult, CellState, Failure, FailureMark, FolderError, Tests, Timing, Training, io,
+};
 
 /// Stands for the program that began a training whose checkpoint does not say.
 const UNKNOWN: &str = "unknown";
@@ -99,17 +103,16 @@ fn train_and_test(
     report: &mut dyn FnMut(&str, u64),
 ) -> Result<Option<CellResult>> {
     let Some(checkpoint) = trained(servers, cell, &folder.training(), stop, report)? else { return Ok(None) };
-    let mut results = BTreeMap::new();
-    for &version in &cell.tests.versions {
-        let what = format!("testing on {version}");
-        let seed = cell.config.common.seed;
-        let progress = |episodes| report(&what, episodes);
-        match test(servers, &checkpoint, version, cell.tests.episodes, seed, stop, progress) {
-            Ok(result) => results.insert(version, result),
-            Err(TestError::Stopped { .. }) => return Ok(None),
-            Err(error) => return Err(anyhow::Error::new(error).context(what)),
-        };
-    }
+    let Tests { episodes, ref sets, ref success } = cell.tests;
+    let options = TestOptions { episodes, seed: cell.config.common.seed, success: success.clone() };
+    let tester = Tester::new(servers, &checkpoint, options)?;
+    let mut testing = |set: &TestSet, episodes| report(&format!("testing on {}", set.name), episodes);
+    let records = match tester.test(sets, stop, &mut testing) {
+        Err(TestError::Stopped { .. }) => return Ok(None),
+        records => records?,
+    };
+    records.write(&folder.path().join(records::FILE))?;
+    let results = sets.iter().map(|set| (set.name.clone(), records.result(&set.name, None))).collect();
     let state = checkpoint.state;
     Ok(Some(CellResult {
         format_version: CellResult::FORMAT_VERSION,
@@ -119,6 +122,7 @@ fn train_and_test(
             environment_revision: state.environment_spec.revision,
             model_hash: state.environment_spec.model_hash,
             version: state.train_version,
+            set: cell.set.clone(),
             method: cell.method(),
             configuration: cell.configuration.clone(),
             run: cell.run,
@@ -127,6 +131,7 @@ fn train_and_test(
             settings: state.config,
         },
         results,
+        agreement: Some(records.agreement()),
         commit: perturb_study::VERSION.into(),
         earlier_commits: earlier_commits(state.commits),
         command: command(cell),
@@ -210,6 +215,16 @@ fn lost_server(error: &anyhow::Error) -> bool {
     client.is_some_and(ClientError::can_be_retried)
 }
 
+/// Parameters as they are typed.
+fn parameters(parameters: &Parameters) -> String {
+    let written = |values: &Distribution| match serde_json::to_value(values) {
+        Ok(serde_json::Value::String(text)) => text,
+        other => other.map(|value| value.to_string()).unwrap_or_default(),
+    };
+    let texts = parameters.iter().map(|(name, values)| format!("{name}={}", written(values)));
+    texts.collect::<Vec<_>>().join(" ")
+}
+
 /// What gives a cell's numbers again without the plan.
 fn command(cell: &Cell) -> String {
     let common = &cell.config.common;
@@ -217,18 +232,27 @@ fn command(cell: &Cell) -> String {
         "perturb train --out RUN --env {} --version {} --algorithm {} --architecture {} --episodes {} --seed {}",
         common.environment, common.version, common.algorithm, common.architecture, common.episodes, common.seed
     );
-    let flags = ["environment", "version", "algorithm", "architecture", "episodes", "seed"];
+    if !common.parameters.is_empty() {
+        let _ = write!(text, " --parameters {}", parameters(&common.parameters));
+    }
+    let flags = ["environment", "version", "parameters", "algorithm", "architecture", "episodes", "seed"];
     for (key, value) in cell.config.table().iter().filter(|(key, _)| !flags.contains(&key.as_str())) {
         let value = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
         let _ = write!(text, " --set {key}={value}"); // writing to a String cannot fail
     }
-    let versions: Vec<String> = cell.tests.versions.iter().map(ToString::to_string).collect();
-    let _ = write!(
-        text,
-        " && perturb evaluate --checkpoint RUN --versions {} --episodes {}",
-        versions.join(","),
-        cell.tests.episodes
-    );
+    let Tests { episodes, sets, success } = &cell.tests;
+    let success = success.as_ref().map(|threshold| format!(" --success {threshold}")).unwrap_or_default();
+    let mut evaluate = |how: String| {
+        let _ = write!(text, " && perturb evaluate --checkpoint RUN {how} --episodes {episodes}{success}");
+    };
+    let versions: Vec<String> = sets.iter().filter_map(TestSet::plain).map(|version| version.to_string()).collect();
+    if !versions.is_empty() {
+        evaluate(format!("--versions {}", versions.join(",")));
+    }
+    // What a set of contexts is stands in the recorded episodes alone.
+    for set in sets.iter().filter(|set| set.plain().is_none() && !set.drawn().is_empty()) {
+        evaluate(format!("--parameters {} --base {}", parameters(&set.drawn()), set.version));
+    }
     text
 }
 

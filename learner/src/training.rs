@@ -53,7 +53,7 @@ pub fn train(
     directory.prepare()?; // from here on an earlier run is gone
     tracing::debug!(directory = %directory.path().display(), "training begins");
     let Common { environment, .. } = &config.common;
-    let mut logs = Logs::create(directory.path(), environment, &training.summary.parameters, training.clock)?;
+    let mut logs = Logs::create(directory.path(), environment, &training.summary, training.clock)?;
     fs::write(directory.path().join("config.toml"), config.to_toml()).context("cannot write config.toml")?;
     training.run(&mut logs, directory, stop, report)
 }
@@ -366,7 +366,8 @@ fn open<'a>(
     let common = &config.common;
     let options = OpenOptions {
         environment: common.environment.clone(),
-        version: common.version.to_proto(),
+        version: common.version,
+        parameters: common.parameters.clone(),
         num_envs: common.num_envs,
         seed: common.seed,
         episodes_per_trial: config.settings.episodes_per_trial(),

@@ -101,7 +101,7 @@ fn cell_estimates(
         let work = Work {
             training_steps: generated_episodes(&cell.config) * limit,
             testing_steps: (cell.tests.episodes * u64::from(cell.config.settings.episodes_per_trial())) as f64
-                * cell.tests.versions.len() as f64
+                * cell.tests.sets.len() as f64
                 * limit,
         };
         Estimate {

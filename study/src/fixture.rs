@@ -3,8 +3,8 @@
 use super::folder::{CellResult, CellState, Training};
 use super::plan::{Cell, Plan};
 use super::selection::Results;
+use crate::TestResult;
 use crate::results::Counters;
-use crate::{TestResult, Version};
 
 /// A result with success rates, %, on D, R and E, and the same mean return on all.
 pub fn result(cell: &Cell, [d, r, e]: [f64; 3], mean_return: f64) -> CellResult {
@@ -24,6 +24,7 @@ pub fn result(cell: &Cell, [d, r, e]: [f64; 3], mean_return: f64) -> CellResult 
             environment_revision: 1,
             model_hash: String::new(),
             version: common.version,
+            set: None,
             method: cell.method(),
             configuration: cell.configuration.clone(),
             run: cell.run,
@@ -31,7 +32,8 @@ pub fn result(cell: &Cell, [d, r, e]: [f64; 3], mean_return: f64) -> CellResult 
             counters: Counters::default(),
             settings: cell.config.table(),
         },
-        results: [(Version::D, test(d)), (Version::R, test(r)), (Version::E, test(e))].into(),
+        results: [("D".into(), test(d)), ("R".into(), test(r)), ("E".into(), test(e))].into(),
+        agreement: None,
         commit: "0.1.0 (0123456789ab)".into(),
         earlier_commits: Vec::new(),
         command: "perturb train …".into(),

@@ -23,7 +23,8 @@ use std::path::{Path, PathBuf};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use super::plan::Cell;
+use super::plan::{Cell, Plan};
+use crate::records::Agreement;
 use crate::results::Counters;
 use crate::{Method, TestResult, Version};
 
@@ -78,8 +79,11 @@ pub struct CellResult {
     pub id: String,
     /// What was trained.
     pub training: Training,
-    /// Success, return and length, by the tested version.
-    pub results: BTreeMap<Version, TestResult>,
+    /// Success, return and length, by the name of the set that was tested: "D", "R", "E" or one of the plan's own.
+    pub results: BTreeMap<String, TestResult>,
+    /// How far requested and applied parameters agreed in the tests; `None` in results of earlier programs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub agreement: Option<Agreement>,
     /// The program's version and the commit that it was built from.
     pub commit: String,
     /// Other programs that did a part of the training before it was broken off, in order.
@@ -100,6 +104,9 @@ pub struct Training {
     pub model_hash: String,
     /// The training version.
     pub version: Version,
+    /// The name of the plan's own set of parameters, if it was trained on one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub set: Option<String>,
     /// What learned.
     #[serde(flatten)]
     pub method: Method,
@@ -197,22 +204,25 @@ impl Folder {
         if plan.is_file() { Ok(plan) } else { Err(FolderError::NoPlan { path: self.path.clone() }) }
     }
 
-    /// Keeps a copy of the experiment file; says whether there was another one.
+    /// Keeps a copy of the experiment file, with the files that it names; says whether there was another one.
     ///
     /// # Errors
     /// [`FolderError::Io`].
-    pub fn keep_plan(&self, text: &str) -> Result<bool> {
+    pub fn keep_plan(&self, plan: &Plan) -> Result<bool> {
         let path = self.plan_path();
         let earlier = match fs::read_to_string(&path) {
             Ok(earlier) => Some(earlier),
             Err(error) if error.kind() == ErrorKind::NotFound => None,
             Err(source) => return Err(FolderError::Io { action: "read", path, source }),
         };
-        if earlier.as_deref() == Some(text) {
-            return Ok(false);
+        let same = earlier.as_deref() == Some(&plan.text);
+        for (name, content) in plan.files() {
+            let path = self.path.join(name);
+            if read_bytes(&path)?.as_deref() != Some(content) {
+                write_atomically(&path, content)?;
+            }
         }
-        write_atomically(&path, text.as_bytes())?;
-        Ok(earlier.is_some())
+        Ok(earlier.is_some() && !same)
     }
 
     /// How far `cell` is.
@@ -421,6 +431,7 @@ mod tests {
                 environment_revision: 1,
                 model_hash: String::new(),
                 version: Version::R,
+                set: None,
                 method: Method { algorithm: "ppo".into(), architecture: "ff".into(), episodes_per_trial: None },
                 configuration: "00000000".into(),
                 run: 2,
@@ -428,7 +439,8 @@ mod tests {
                 counters: Counters { iterations: 1, timesteps: 2, episodes: 3, ..Counters::default() },
                 settings: "learning_rate = 3e-4".parse().unwrap(),
             },
-            results: BTreeMap::from([(Version::D, test)]),
+            results: BTreeMap::from([("D".to_owned(), test)]),
+            agreement: None,
             commit: "x".into(),
             earlier_commits: Vec::new(),
             command: "y".into(),
@@ -509,9 +521,13 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let folder = Folder::new(&directory.path().join("new"));
         assert!(folder.require_plan().unwrap_err().to_string().contains("holds no experiment"));
-        assert!(!folder.keep_plan("one").unwrap());
-        assert!(!folder.keep_plan("one").unwrap());
-        assert!(folder.keep_plan("two").unwrap());
-        assert_eq!(fs::read_to_string(folder.require_plan().unwrap()).unwrap(), "two");
+        let plan = |environment: &str| {
+            let text = format!("environments = ['{environment}']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']");
+            Plan::parse("test", text).unwrap()
+        };
+        assert!(!folder.keep_plan(&plan("One")).unwrap());
+        assert!(!folder.keep_plan(&plan("One")).unwrap());
+        assert!(folder.keep_plan(&plan("Two")).unwrap());
+        assert_eq!(fs::read_to_string(folder.require_plan().unwrap()).unwrap(), plan("Two").text);
     }
 }

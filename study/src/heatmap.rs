@@ -4,6 +4,10 @@ use serde::{Deserialize, Serialize};
 
 use perturb_protocol::proto::{self, Interval};
 
+use crate::means::mean;
+use crate::records::{EpisodeRecord, Records};
+use crate::sets::Context;
+
 /// The most points along an axis: all environments run together.
 pub const MOST_POINTS: usize = 100;
 
@@ -18,6 +22,9 @@ pub struct HeatmapOptions {
     pub episodes: u64,
     /// Fixes all randomness.
     pub seed: u64,
+    /// Values of other parameters; the rest have those of version D.
+    #[serde(default, skip_serializing_if = "Context::is_empty")]
+    pub fixed: Context,
 }
 
 /// A parameter as an axis.
@@ -37,7 +44,7 @@ pub struct Axis {
     pub extreme: Vec<(f64, f64)>,
 }
 
-/// A policy's figures over two parameters; the others have their defaults.
+/// A policy's figures over two parameters.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Heatmap {
     /// The environment.
@@ -54,21 +61,6 @@ pub struct Heatmap {
     pub returns: Vec<f64>,
     /// `[G, G]` success rates, %.
     pub success: Vec<f64>,
-}
-
-/// The two parameters, along x and along y, over which an environment's heatmaps are unless others are asked for; `None`
-/// for an environment that is not known here.
-///
-/// Those of MountainCar and Pendulum are the paper's; of CartPole it says that a light and long pole would be the
-/// difficult one. Those of the robots are a heavier torso on a more slippery floor.
-pub fn default_axes(environment: &str) -> Option<[&'static str; 2]> {
-    Some(match environment {
-        "CartPole" | "Acrobot" => ["length", "mass"],
-        "MountainCar" => ["force", "mass"],
-        "Pendulum" => ["mass", "length"],
-        "HalfCheetah" | "Hopper" => ["density", "friction"],
-        _ => return None,
-    })
 }
 
 impl Axis {
@@ -93,6 +85,41 @@ impl Axis {
             random,
             extreme,
         }
+    }
+}
+
+impl Heatmap {
+    /// What the set of a heatmap's recorded test is called.
+    pub const SET: &str = "heatmap";
+
+    /// From the recorded episodes of a test over `axes`, whose contexts are the points, by y, then x; `None` if they are
+    /// those of something else.
+    pub fn of(records: &Records, policy: String, axes: [Axis; 2]) -> Option<Self> {
+        let test = records.about.tests.iter().find(|test| test.set.name == Self::SET)?;
+        let contexts = test.set.listed();
+        let (points, grid) = (contexts.len(), contexts.len().isqrt());
+        let fits = |(point, context): (usize, &Context)| {
+            let [x, y] = &axes;
+            context.get(&x.name) == Some(&x.value(point % grid, grid))
+                && context.get(&y.name) == Some(&y.value(point / grid, grid))
+        };
+        if grid * grid != points || !contexts.iter().enumerate().all(fits) {
+            return None;
+        }
+        let mut by_point: Vec<Vec<&EpisodeRecord>> = vec![Vec::new(); points];
+        records.of(Self::SET).for_each(|episode| by_point[episode.environment_index as usize % points].push(episode));
+        let means = |of: fn(&EpisodeRecord) -> f64| {
+            by_point.iter().map(|episodes| mean(episodes.iter().map(|episode| of(episode)))).collect()
+        };
+        Some(Self {
+            environment: records.about.environment.clone(),
+            policy,
+            axes,
+            grid,
+            episodes: by_point.first()?.len() as u64,
+            returns: means(|episode| episode.episode_return),
+            success: means(|episode| if episode.success { 100.0 } else { 0.0 }),
+        })
     }
 }
 

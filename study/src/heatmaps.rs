@@ -14,7 +14,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::folder::{Folder, FolderError, read_bytes, write_atomically};
-use super::heatmap::{Heatmap, HeatmapOptions, default_axes, heatmap_csv};
+use super::heatmap::{Heatmap, HeatmapOptions, heatmap_csv};
 use super::plan::Cell;
 use super::plot::{self, PlotError};
 use super::selection::{Selected, Selection};
@@ -77,8 +77,6 @@ pub enum NoHeatmap {
     NotMade,
     /// It shows a result that has been replaced.
     Outdated,
-    /// It is not said which parameters to show, see [`default_axes`].
-    NoAxes,
 }
 
 /// All heatmaps that a plan has room for, in the order of `selections` and of the versions that it trains on.
@@ -98,9 +96,6 @@ impl HeatmapPlace<'_> {
     /// [`FolderError`] if a file is there that cannot be read.
     pub fn read(&self, folder: &Folder) -> Result<Result<StoredHeatmap, NoHeatmap>, FolderError> {
         let Some(Selected { cell, .. }) = self.selected else { return Ok(Err(NoHeatmap::NoResult)) };
-        if default_axes(self.environment).is_none() {
-            return Ok(Err(NoHeatmap::NoAxes));
-        }
         let Some(text) = read_bytes(&file(folder, &cell.id, "json"))? else { return Ok(Err(NoHeatmap::NotMade)) };
         // One that is not understood is made again like one that is not there.
         let Ok(record) = serde_json::from_slice::<HeatmapRecord>(&text) else { return Ok(Err(NoHeatmap::NotMade)) };
@@ -225,7 +220,13 @@ mod tests {
     }
 
     fn options() -> HeatmapOptions {
-        HeatmapOptions { parameters: ["mass", "length"].map(str::to_owned), grid: 2, episodes: 1, seed: 1 }
+        HeatmapOptions {
+            parameters: ["mass", "length"].map(str::to_owned),
+            grid: 2,
+            episodes: 1,
+            seed: 1,
+            fixed: Default::default(),
+        }
     }
 
     #[test]
@@ -242,8 +243,6 @@ mod tests {
         assert_eq!(place.read(&folder).unwrap(), Err(NoHeatmap::NotMade));
         let nobody = HeatmapPlace { selected: None, ..place.clone() };
         assert_eq!(nobody.read(&folder).unwrap(), Err(NoHeatmap::NoResult));
-        let elsewhere = HeatmapPlace { environment: "Elsewhere", ..place.clone() };
-        assert_eq!(elsewhere.read(&folder).unwrap(), Err(NoHeatmap::NoAxes));
 
         let store = || store_heatmap(&folder, cell, "00000001-0a".into(), options(), &heatmap()).unwrap();
         let path = store();

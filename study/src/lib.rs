@@ -39,13 +39,13 @@ pub use folder::{
     CellFolder, CellLock, CellResult, CellState, Failure, FailureMark, Folder, FolderError, Timing, Training, io,
     write_atomically,
 };
-pub use heatmap::{Axis, Heatmap, HeatmapOptions, MOST_POINTS, default_axes, heatmap_csv};
+pub use heatmap::{Axis, Heatmap, HeatmapOptions, MOST_POINTS, heatmap_csv};
 pub use heatmaps::{
     HeatmapPlace, HeatmapRecord, NoHeatmap, StoredHeatmap, heatmap_files, heatmap_places, store_heatmap,
 };
 pub use means::{geometric_mean, mean, wilson};
 pub use paper::Method;
-pub use plan::{Cell, Counts, Plan, PlanError, Tests};
+pub use plan::{Cell, Counts, Plan, PlanCheckError, PlanError, Tests};
 pub use results::{Counters, TestResult};
 pub use run::{Attempt, BUSY, NO_SERVER, ON, RunEnd, RunError, RunOptions, RunStatus, run};
 pub use scenarios::{Metric, Scenario, Version};

@@ -4,23 +4,28 @@
 //! training versions and runs, in this order, the last one varying fastest. All cells of a run have the same seed, so
 //! that two of them differ in nothing but what the file says.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::Path;
 
+use perturb_protocol::proto;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
+use crate::sets::{self, Assignment, Contexts, SetError, TestSet, set_of, set_of_csv};
 use crate::settings::{ConfigError, TrainConfig, WrapperSettings};
+use crate::success::{Criterion, Threshold, ThresholdError};
 use crate::{Method, Version};
 
 /// Settings that the plan itself decides for each cell.
-const OWN_KEYS: [&str; 5] = ["environment", "version", "algorithm", "architecture", "seed"];
+const OWN_KEYS: [&str; 6] = ["environment", "version", "parameters", "algorithm", "architecture", "seed"];
 
 /// Everything that an experiment file asks for.
 #[derive(Clone, Debug)]
 pub struct Plan {
     /// The file, as it was written.
     pub text: String,
+    /// The files beside it that its sets name, with their content.
+    pub beside: BTreeMap<String, Vec<u8>>,
     /// How often the whole is repeated, each time with another seed.
     pub runs: u32,
     /// All cells; a cell's index is its place here.
@@ -39,6 +44,8 @@ pub struct Cell {
     pub configuration: String,
     /// Which run it belongs to, from 1.
     pub run: u32,
+    /// The name of the plan's own set of parameters, if it is trained on one.
+    pub set: Option<String>,
     /// What is trained.
     pub config: TrainConfig,
     /// How it is tested.
@@ -46,12 +53,15 @@ pub struct Cell {
 }
 
 /// How a trained policy is tested.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Tests {
     /// Episodes of each test.
     pub episodes: u64,
-    /// On which versions, in the order D, R, E.
-    pub versions: Vec<Version>,
+    /// On what: versions in the order D, R, E, then the plan's own sets in theirs.
+    pub sets: Vec<TestSet>,
+    /// The threshold of success; `None` for the environment's own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub success: Option<Threshold>,
 }
 
 /// How much a plan asks for.
@@ -69,6 +79,21 @@ pub struct Counts {
     pub runs: u32,
 }
 
+/// Why a plan does not fit the environments that are served.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum PlanCheckError {
+    /// A set has parameters or values that an environment does not take.
+    #[error(transparent)]
+    Set(#[from] SetError),
+    /// A threshold is of something else than what an environment's success rule compares.
+    #[error(transparent)]
+    Threshold(#[from] ThresholdError),
+}
+
+/// What a set's table may name beside parameters.
+const VERSION: &str = "version";
+const FILE: &str = "file";
 /// The most cells of a plan.
 const MOST_CELLS: usize = 1_000_000;
 
@@ -134,7 +159,7 @@ pub enum PlanError {
 struct File {
     environments: Vec<String>,
     #[serde(default = "all_versions")]
-    versions: Vec<Version>,
+    versions: Vec<String>,
     #[serde(default = "one")]
     runs: u32,
     #[serde(default = "one")]
@@ -142,7 +167,11 @@ struct File {
     #[serde(default = "a_thousand")]
     test_episodes: u64,
     #[serde(default = "all_versions")]
-    test_versions: Vec<Version>,
+    test_versions: Vec<String>,
+    #[serde(default)]
+    sets: BTreeMap<String, Table>,
+    #[serde(default)]
+    success: BTreeMap<String, Threshold>,
     #[serde(default)]
     settings: Table,
     algorithm: Vec<Block>,
@@ -155,15 +184,15 @@ struct Block {
     name: String,
     architectures: Vec<String>,
     environments: Option<Vec<String>>,
-    versions: Option<Vec<Version>>,
+    versions: Option<Vec<String>>,
     #[serde(default)]
     settings: Table,
     #[serde(default)]
     grid: Table,
 }
 
-fn all_versions() -> Vec<Version> {
-    Version::ALL.to_vec()
+fn all_versions() -> Vec<String> {
+    Version::ALL.map(|version| version.to_string()).to_vec()
 }
 
 fn one<T: From<u8>>() -> T {
@@ -185,6 +214,40 @@ impl Plan {
         Self::parse(&shown, text)
     }
 
+    /// The files that it consists of, by their names: `plan.toml` and those that its sets name.
+    pub fn files(&self) -> impl Iterator<Item = (&str, &[u8])> {
+        let beside = self.beside.iter().map(|(name, content)| (name.as_str(), content.as_slice()));
+        beside.chain([("plan.toml", self.text.as_bytes())]) // last: it names the others
+    }
+
+    /// Whether the environments are there and have the parameters and thresholds that the plan names. `environment` looks
+    /// one up.
+    ///
+    /// # Errors
+    /// [`PlanCheckError`], or what `environment` says.
+    pub fn check<E: From<PlanCheckError>>(
+        &self,
+        mut environment: impl FnMut(&str) -> Result<proto::Environment, E>,
+    ) -> Result<(), E> {
+        for name in self.environments() {
+            let served = environment(name)?;
+            let criterion = Criterion::of(&served);
+            for cell in self.cells.iter().filter(|cell| cell.config.common.environment == name) {
+                let check = || -> Result<(), PlanCheckError> {
+                    let trained = cell.set.as_deref().unwrap_or_default();
+                    sets::check(trained, &cell.config.common.parameters, &served)?;
+                    cell.tests.sets.iter().try_for_each(|set| set.check(&served))?;
+                    if let (Some(threshold), Some(criterion)) = (&cell.tests.success, &criterion) {
+                        criterion.with(threshold)?;
+                    }
+                    Ok(())
+                };
+                check()?;
+            }
+        }
+        Ok(())
+    }
+
     /// Expands `text`, which `path` names in errors.
     ///
     /// # Errors
@@ -194,13 +257,21 @@ impl Plan {
             path: path.to_owned(),
             reason: error.to_string().trim().to_owned(),
         })?;
-        let mut expansion = Expansion { path, file: &file, cells: Vec::new(), places: HashMap::new() };
+        let mut expansion = Expansion {
+            path,
+            file: &file,
+            sets: Version::ALL.map(|version| (version.to_string(), version.into())).into(),
+            beside: BTreeMap::new(),
+            cells: Vec::new(),
+            places: HashMap::new(),
+        };
         expansion.check_plan()?;
+        expansion.add_sets()?;
         for (number, block) in file.algorithm.iter().enumerate() {
             expansion.add_block(number, block)?;
         }
         let cells = in_order(expansion.cells, &file);
-        Ok(Self { runs: file.runs, cells, text })
+        Ok(Self { runs: file.runs, cells, beside: expansion.beside, text })
     }
 
     /// How much it asks for.
@@ -210,8 +281,8 @@ impl Plan {
         Counts {
             configurations: configurations.len(),
             trainings: first.clone().count(),
-            pairs: first.map(|cell| cell.tests.versions.len()).sum(),
-            all_pairs: self.cells.iter().map(|cell| cell.tests.versions.len()).sum(),
+            pairs: first.map(|cell| cell.tests.sets.len()).sum(),
+            all_pairs: self.cells.iter().map(|cell| cell.tests.sets.len()).sum(),
             runs: self.runs,
         }
     }
@@ -266,6 +337,9 @@ fn in_order(mut cells: Vec<Cell>, file: &File) -> Vec<Cell> {
 struct Expansion<'a> {
     path: &'a str,
     file: &'a File,
+    /// By their names.
+    sets: BTreeMap<String, TestSet>,
+    beside: BTreeMap<String, Vec<u8>>,
     cells: Vec<Cell>,
     /// Which table asked for a cell.
     places: HashMap<String, String>,
@@ -299,6 +373,79 @@ impl Expansion<'_> {
         self.check_list("environments", &self.file.environments)?;
         self.check_list("versions", &self.file.versions)?;
         self.check_list("test_versions", test_versions)
+    }
+
+    /// The set of that name.
+    fn set(&self, name: &str) -> Result<&TestSet, PlanError> {
+        self.sets.get(name).ok_or_else(|| {
+            let known: Vec<&str> = self.sets.keys().map(String::as_str).collect();
+            self.value("a version", format!("`{name}`"), format!("one of {}, or a set [sets.{name}]", known.join(", ")))
+        })
+    }
+
+    /// Reads the tables `[sets.NAME]`.
+    fn add_sets(&mut self) -> Result<(), PlanError> {
+        for (name, table) in &self.file.sets {
+            let key = format!("[sets.{name}]");
+            if name.is_empty() || !name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_') {
+                return Err(self.value(key, format!("`{name}`"), "a name of letters, digits and _"));
+            }
+            if self.sets.contains_key(name) {
+                return Err(self.value(key, "there already", "another name than D, R and E"));
+            }
+            let set = self.read_set(name, table).map_err(|error| {
+                let SetError { what, got, expected } = error;
+                self.value(format!("{key}: {what}"), got, expected)
+            })?;
+            if let Some(Value::String(file)) = table.get(FILE) {
+                self.beside.insert(file.clone(), self.content(file).unwrap_or_default());
+            }
+            self.sets.insert(name.clone(), set);
+        }
+        Ok(())
+    }
+
+    fn read_set(&self, name: &str, table: &Table) -> Result<TestSet, SetError> {
+        let wrong = |what: &str, got: &dyn ToString, expected: &str| SetError {
+            what: what.into(),
+            got: got.to_string(),
+            expected: expected.into(),
+        };
+        let mut version = Version::D;
+        let mut file = None;
+        let mut assignments: Vec<Assignment> = Vec::new();
+        for (key, value) in table {
+            match (key.as_str(), value) {
+                (VERSION, Value::String(text)) => {
+                    version = text.parse().map_err(|_| wrong(key, value, "\"D\", \"R\" or \"E\""))?;
+                }
+                (FILE, Value::String(name)) => file = Some(name),
+                (VERSION | FILE, _) => return Err(wrong(key, value, "a text")),
+                (_, Value::String(text)) => assignments.push(format!("{key}={text}").parse()?),
+                (_, Value::Integer(_) | Value::Float(_)) => assignments.push(format!("{key}={value}").parse()?),
+                _ => return Err(wrong(key, value, "a value, or a text such as \"0.3..0.4\" or \"0.1..1.0/10\"")),
+            }
+        }
+        match file {
+            None => set_of(name, version, assignments),
+            Some(_) if !assignments.is_empty() => {
+                Err(wrong(FILE, &"beside parameters", "alone: the file's header names the parameters"))
+            }
+            Some(file) => {
+                let content =
+                    self.content(file).map_err(|reason| wrong(FILE, &reason, "a CSV file beside the plan"))?;
+                set_of_csv(name, version, &content)
+            }
+        }
+    }
+
+    /// A file beside the plan.
+    fn content(&self, file: &str) -> Result<Vec<u8>, String> {
+        if Path::new(file).components().count() != 1 || file.starts_with('.') {
+            return Err(format!("`{file}`, which is not the name of a file"));
+        }
+        let path = Path::new(self.path).parent().unwrap_or(Path::new("")).join(file);
+        std::fs::read(&path).map_err(|error| format!("`{}`, which cannot be read ({error})", path.display()))
     }
 
     /// A list must name something, and nothing twice.
@@ -350,7 +497,7 @@ impl Expansion<'_> {
         for environment in environments {
             for architecture in &block.architectures {
                 for point in &points {
-                    for &version in versions {
+                    for version in versions {
                         self.add_runs(&name, block, environment, architecture, point, version)?;
                     }
                 }
@@ -369,7 +516,7 @@ impl Expansion<'_> {
         for (table, settings) in &tables {
             if let Some(key) = settings.keys().find(|key| OWN_KEYS.contains(&key.as_str())) {
                 let expected =
-                    "left out: the plan's own keys decide it (environments, versions, name, architectures, seed)";
+                    "left out: the plan's own keys decide it (environments, versions, sets, name, architectures, seed)";
                 return Err(self.value(format!("{table} {key}"), &settings[key], expected));
             }
         }
@@ -409,42 +556,54 @@ impl Expansion<'_> {
         environment: &str,
         architecture: &str,
         point: &Table,
-        version: Version,
+        trained_on: &str,
     ) -> Result<(), PlanError> {
+        let set = self.set(trained_on)?.clone();
+        if let Contexts::Listed(_) = set.contexts {
+            let expected = "a version or a set whose parameters are drawn: a training draws them";
+            return Err(self.value(format!("{name}: versions"), format!("`{trained_on}`"), expected));
+        }
         let mut table = self.file.settings.clone();
         for layer in [&block.settings, point] {
             table.extend(layer.clone());
         }
         for (key, value) in [
             ("environment", environment),
-            ("version", &version.to_string()),
+            ("version", &set.version.to_string()),
             ("algorithm", &block.name),
             ("architecture", architecture),
         ] {
             table.insert(key.to_owned(), Value::String(value.to_owned()));
+        }
+        if set.plain().is_none() {
+            let parameters = Table::try_from(set.drawn()).unwrap_or_default();
+            table.insert("parameters".into(), Value::Table(parameters));
         }
         let config = TrainConfig::from_table("the cell", table).map_err(|source| PlanError::Cell {
             path: self.path.to_owned(),
             table: place_of(&source, name, block, &self.file.settings),
             source: Box::new(source),
         })?;
-        let mut versions = self.file.test_versions.clone();
-        versions.sort_unstable();
-        let tests = Tests { episodes: self.file.test_episodes, versions };
+        let mut sets =
+            self.file.test_versions.iter().map(|name| self.set(name).cloned()).collect::<Result<Vec<_>, _>>()?;
+        sets.sort_by_key(|set| set.plain().map_or(Version::ALL.len(), |version| version as usize));
+        let success = self.file.success.get(environment).cloned();
+        let tests = Tests { episodes: self.file.test_episodes, sets, success };
         let configuration = fingerprint(&config, &tests);
         for run in 1..=self.file.runs {
             let mut config = config.clone();
             config.common.seed = self.file.seed + u64::from(run - 1);
             let common = &config.common;
             let id = format!(
-                "{environment}-{}-{}-{version}-{configuration}-s{}",
+                "{environment}-{}-{}-{trained_on}-{configuration}-s{}",
                 common.algorithm, common.architecture, common.seed
             );
             if let Some(first) = self.places.insert(id.clone(), name.to_owned()) {
                 return Err(PlanError::Twice { path: self.path.to_owned(), first, second: name.to_owned(), id });
             }
             let (configuration, tests) = (configuration.clone(), tests.clone());
-            self.cells.push(Cell { index: 0, id, configuration, run, config, tests });
+            let set = set.plain().is_none().then(|| trained_on.to_owned());
+            self.cells.push(Cell { index: 0, id, configuration, run, set, config, tests });
         }
         Ok(())
     }
@@ -475,7 +634,13 @@ fn fingerprint(config: &TrainConfig, tests: &Tests) -> String {
         table.remove(key);
     }
     // Sorted keys, and numbers in one form only: toml's table is a sorted map, whatever the order of the file.
-    let text = format!("{table}\n{} {:?}", tests.episodes, tests.versions);
+    let shown = |set: &TestSet| match set.plain() {
+        Some(version) => version.to_string(),
+        None => serde_json::to_string(set).unwrap_or_default(),
+    };
+    let sets: Vec<String> = tests.sets.iter().map(shown).collect();
+    let success = tests.success.as_ref().map(|threshold| format!(" {threshold}")).unwrap_or_default();
+    let text = format!("{table}\n{} [{}]{success}", tests.episodes, sets.join(", "));
     format!("{:08x}", crc32c::crc32c(text.as_bytes()))
 }
 

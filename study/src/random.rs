@@ -31,6 +31,16 @@ pub fn stream(seed: u64, purpose: Purpose) -> ChaCha8Rng {
     rng
 }
 
+/// The stream of `seed` for `purpose` in one trial of one environment: a trial can be played again without those before it.
+pub fn trial_stream(seed: u64, purpose: Purpose, environment_index: u32, trial_index: u64) -> ChaCha8Rng {
+    let mut key = [0; 32];
+    key[..8].copy_from_slice(&seed.to_le_bytes());
+    key[8..16].copy_from_slice(&(purpose as u64).to_le_bytes());
+    key[16..20].copy_from_slice(&environment_index.to_le_bytes());
+    key[24..].copy_from_slice(&trial_index.to_le_bytes());
+    ChaCha8Rng::from_seed(key)
+}
+
 /// A number drawn uniformly from [0, 1), in steps of 2⁻⁵³.
 pub fn uniform(rng: &mut ChaCha8Rng) -> f64 {
     (rng.next_u64() >> 11) as f64 * (1.0 / (1u64 << 53) as f64)

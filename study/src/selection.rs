@@ -79,7 +79,8 @@ impl<'a> Results<'a> {
     /// Selects for each environment and method of the plan, in its order.
     pub fn select(&self) -> Vec<Selection<'_>> {
         let mut selections: Vec<Selection<'_>> = Vec::new();
-        for (cell, state) in self.plan.cells.iter().zip(&self.states) {
+        let of_paper = |(cell, _): &(&Cell, &CellState)| cell.set.is_none();
+        for (cell, state) in self.plan.cells.iter().zip(&self.states).filter(of_paper) {
             let (environment, method) = (cell.config.common.environment.as_str(), cell.method());
             let known = selections.iter().position(|known| known.environment == environment && known.method == method);
             let place = known.unwrap_or_else(|| {
@@ -138,12 +139,12 @@ impl<'a> SelectedRun<'a> {
 impl Selected<'_> {
     /// The success rate on `version`, %; `None` if it was not tested there.
     pub fn rate(&self, version: Version) -> Option<f64> {
-        Some(self.result.results.get(&version)?.success_percent)
+        Some(self.result.results.get(&version.to_string())?.success_percent)
     }
 
     /// The highest is selected.
     fn rank(&self) -> Option<(f64, f64)> {
-        let test = self.result.results.get(&self.cell.config.common.version)?;
+        let test = self.result.results.get(&self.cell.config.common.version.to_string())?;
         Some((test.success_percent, test.mean_return))
     }
 }

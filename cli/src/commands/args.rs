@@ -7,8 +7,10 @@ use clap::{Args, Parser, Subcommand};
 use perturb_learner::client::Address;
 use perturb_study::FailureMark;
 use perturb_study::Version;
+use perturb_study::sets::Assignment;
 use perturb_study::settings::{AlgorithmName, Architecture};
 use perturb_study::slurm::TimeLimit;
+use perturb_study::success::Threshold;
 
 /// Trains policies over environment servers and tests whether they still work when the physics changes.
 #[derive(Debug, Parser)]
@@ -40,6 +42,10 @@ pub(super) enum Command {
     Heatmap(HeatmapArgs),
     /// Film a trained policy.
     Video(VideoArgs),
+    /// Play recorded test episodes again and compare every byte of what came of them.
+    Audit(AuditArgs),
+    /// Success rates of recorded test episodes at any threshold, without playing them again.
+    Rates(RatesArgs),
 }
 
 /// Where environments run.
@@ -70,8 +76,11 @@ pub(super) struct TrainArgs {
     #[arg(long, value_name = "NAME")]
     pub(super) env: Option<String>,
     /// Where its parameters come from [default: D].
-    #[arg(long, ignore_case = true)]
+    #[arg(long)]
     pub(super) version: Option<Version>,
+    /// Parameters in place of the version's: a value, or intervals to draw from, e.g. length=0.3..0.4,0.8..0.9 mass=0.1.
+    #[arg(long, value_name = "PARAMETER=VALUES", num_args = 1..)]
+    pub(super) parameters: Vec<Assignment>,
     /// What learns [default: ppo].
     #[arg(long)]
     pub(super) algorithm: Option<AlgorithmName>,
@@ -105,7 +114,7 @@ pub(super) struct TrainArgs {
         long,
         value_name = "DIR",
         conflicts_with_all = [
-            "env", "version", "algorithm", "architecture", "episodes_per_trial", "episodes", "seed", "out",
+            "env", "version", "parameters", "algorithm", "architecture", "episodes_per_trial", "episodes", "seed", "out",
             "overwrite", "config", "set"
         ]
     )]
@@ -119,10 +128,19 @@ pub(super) struct EvaluateArgs {
     /// The --out of a training, or the checkpoint folder in it.
     #[arg(long, value_name = "DIR")]
     pub(super) checkpoint: PathBuf,
-    /// Versions to test on, separated by commas.
-    #[arg(long, value_delimiter = ',', default_value = "D,R,E", ignore_case = true)]
+    /// Versions to test on, separated by commas [default: D,R,E; none with --parameters or --contexts].
+    #[arg(long, value_delimiter = ',')]
     pub(super) versions: Vec<Version>,
-    /// Episodes to test on each version; of a policy trained with RL² trials, of each of which the last episode counts.
+    #[command(flatten)]
+    pub(super) set: SetArgs,
+    /// The threshold of success in place of the environment's own, e.g. steps=90; `perturb envs` tells what is compared.
+    #[arg(long, value_name = "QUANTITY=NUMBER")]
+    pub(super) success: Option<Threshold>,
+    /// Keep every test episode in this file, as Parquet: `perturb audit` plays them again, `perturb rates` judges them by
+    /// other thresholds, pandas and polars read it.
+    #[arg(long, value_name = "FILE")]
+    pub(super) records: Option<PathBuf>,
+    /// Episodes to test on each version or set; a grid or a list has at least one in each of its contexts. Of a policy trained with RL² trials, of each of which the last episode counts.
     #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u64).range(1..))]
     pub(super) episodes: u64,
     /// Fixes the tests' randomness; its environments differ from those of any training, also with the same number
@@ -134,6 +152,50 @@ pub(super) struct EvaluateArgs {
     pub(super) json: Option<PathBuf>,
     #[command(flatten)]
     pub(super) server: ServerArgs,
+}
+
+/// Parameters beside those of the versions.
+#[derive(Args, Clone, Debug)]
+pub(super) struct SetArgs {
+    /// Parameters of your own: a value, intervals to draw from, or the points of a grid, of which all combinations are
+    /// taken; e.g. length=0.3..0.4,0.8..0.9 mass=0.1, or length=0.1..1.0/10 mass=0.1,0.2.
+    #[arg(long, value_name = "PARAMETER=VALUES", num_args = 1..)]
+    pub(super) parameters: Vec<Assignment>,
+    /// A list of parameters of your own: a CSV file whose header names them, a row for each context.
+    #[arg(long, value_name = "FILE", conflicts_with = "parameters")]
+    pub(super) contexts: Option<PathBuf>,
+    /// The version that parameters come from which these do not name.
+    #[arg(long, value_name = "VERSION", default_value = "D")]
+    pub(super) base: Version,
+}
+
+#[derive(Args, Debug)]
+pub(super) struct AuditArgs {
+    /// The --out of `perturb run`, the folder of one of its cells, or the --records of `perturb evaluate`.
+    #[arg(value_name = "DIR")]
+    pub(super) path: PathBuf,
+    /// The checkpoint that was tested, for a file of records: the --out of its training, or the checkpoint folder in it.
+    #[arg(long, value_name = "DIR")]
+    pub(super) checkpoint: Option<PathBuf>,
+    /// Episodes to play again of each policy, evenly spread over those that are recorded.
+    #[arg(long, value_name = "N", default_value_t = 30, value_parser = at_least_one)]
+    pub(super) episodes: usize,
+    /// Play all recorded episodes again.
+    #[arg(long, conflicts_with = "episodes")]
+    pub(super) all: bool,
+    #[command(flatten)]
+    pub(super) server: ServerArgs,
+}
+
+#[derive(Args, Debug)]
+pub(super) struct RatesArgs {
+    /// The folder of a cell of `perturb run`, or the --records of `perturb evaluate`.
+    #[arg(value_name = "FILE")]
+    pub(super) path: PathBuf,
+    /// Thresholds of success to judge the recorded episodes by, e.g. --success steps=80 steps=90 [default: the one that
+    /// they were tested with].
+    #[arg(long, value_name = "QUANTITY=NUMBER", num_args = 1..)]
+    pub(super) success: Vec<Threshold>,
 }
 
 #[derive(Args, Debug)]
@@ -282,6 +344,12 @@ pub(super) struct HeatmapArgs {
     /// The parameter along y, e.g. mass.
     #[arg(long, value_name = "PARAMETER", requires = "x")]
     pub(super) y: Option<String>,
+    /// Values of other parameters, e.g. force=7 [default: those of version D].
+    #[arg(long, value_name = "PARAMETER=VALUE", num_args = 1.., requires = "checkpoint")]
+    pub(super) parameters: Vec<Assignment>,
+    /// Make the heatmap again from the file .parquet that an earlier one left, without playing.
+    #[arg(long, value_name = "FILE", requires = "checkpoint")]
+    pub(super) records: Option<PathBuf>,
     /// Points along each axis, at most 100.
     #[arg(long, value_name = "N", default_value_t = 40, value_parser = points)]
     pub(super) grid: usize,
@@ -305,8 +373,11 @@ pub(super) struct VideoArgs {
     #[arg(long, value_name = "DIR")]
     pub(super) checkpoint: PathBuf,
     /// Where the environment's parameters come from.
-    #[arg(long, default_value = "D", ignore_case = true)]
+    #[arg(long, default_value = "D")]
     pub(super) version: Version,
+    /// Parameters in place of the version's: a value, or intervals to draw from, e.g. length=0.8..0.9 mass=0.1.
+    #[arg(long, value_name = "PARAMETER=VALUES", num_args = 1..)]
+    pub(super) parameters: Vec<Assignment>,
     /// Episodes to play; of a policy trained with RL² all episodes of a trial are shown, one after the other.
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..))]
     pub(super) episodes: u64,

@@ -8,33 +8,44 @@ use serde_json::{Map, Value, json};
 
 use super::args::EvaluateArgs;
 use super::bar::Bar;
-use super::{Ending, servers};
+use super::{Ending, servers, sets};
 use perturb_learner::checkpoint::{Checkpoint, State};
-use perturb_learner::evaluation::test;
+use perturb_learner::evaluation::{TestOptions, Tester};
+use perturb_study::TestResult;
 use perturb_study::interrupt::StopFlag;
+use perturb_study::sets::TestSet;
 use perturb_study::table::Table;
-use perturb_study::{TestResult, Version};
 
 pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
     let checkpoint = Checkpoint::load(&args.checkpoint)?;
-    let mut versions = args.versions.clone();
-    versions.sort_unstable();
-    versions.dedup();
+    let sets = sets::tested(&args.versions, &args.set)?;
     let seed = args.seed.unwrap_or(checkpoint.state.seed);
     let stop = StopFlag::on_signals().context("cannot wait for signals")?;
-    let servers = servers(&args.server, 0)?;
+    let servers = servers(&args.server, sets.iter().map(|set| set.listed().len()).max().unwrap_or_default())?;
     let state = &checkpoint.state;
-    let mut results = Vec::new();
-    for version in versions {
-        let mut bar = Bar::new(format!("testing on {version}"), args.episodes);
-        let report = |episodes| bar.testing(episodes);
-        results.push((version, test(&servers, &checkpoint, version, args.episodes, seed, &stop, report)?));
+    let options = TestOptions { episodes: args.episodes, seed, success: args.success.clone() };
+    let tester = Tester::new(&servers, &checkpoint, options)?;
+    let mut bar: Option<(String, Bar)> = None;
+    let mut report = |set: &TestSet, episodes| {
+        if bar.as_ref().is_none_or(|(name, _)| *name != set.name) {
+            bar = Some((set.name.clone(), Bar::new(format!("testing on {}", set.name), args.episodes)));
+        }
+        if let Some((_, bar)) = &mut bar {
+            bar.testing(episodes);
+        }
+    };
+    let records = tester.test(&sets, &stop, &mut report)?;
+    drop(bar);
+    if let Some(path) = &args.records {
+        records.write(path)?;
     }
+    let results: Vec<(String, TestResult)> =
+        sets.iter().map(|set| (set.name.clone(), records.result(&set.name, None))).collect();
     if let Some(path) = &args.json {
         write_json(path, state, seed, &results)?;
     }
     let table = Table::of("", &results)
-        .text("version", |(version, _)| version)
+        .text("tested on", |(set, _)| set)
         .number("success, %", |(_, result)| format!("{:.1}", result.success_percent))
         .number("95 % interval", |(_, result)| {
             let [low, high] = result.success_percent_95;
@@ -42,9 +53,11 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
         })
         .number("mean return", |(_, result)| format!("{:.2}", result.mean_return))
         .number("mean length", |(_, result)| format!("{:.2}", result.mean_length));
+    let criterion = records.about.success.as_ref();
+    let success = criterion.map(|criterion| format!(", success: {criterion}")).unwrap_or_default();
     writeln!(
         std::io::stdout(),
-        "{} {} {}, trained on {} with seed {}, {} test episodes each\n{}",
+        "{} {} {}, trained on {} with seed {}, {} test episodes each{success}\n{}",
         state.environment,
         state.algorithm,
         state.architecture,
@@ -56,12 +69,10 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
     Ok(Ending::Done)
 }
 
-/// The result as JSON: who was tested, and the figures of each version.
-fn document(state: &State, evaluation_seed: u64, results: &[(Version, TestResult)]) -> Result<Value> {
-    let results: Map<String, Value> = results
-        .iter()
-        .map(|(version, result)| Ok((version.to_string(), serde_json::to_value(result)?)))
-        .collect::<Result<_>>()?;
+/// The result as JSON: who was tested, and the figures of each set.
+fn document(state: &State, evaluation_seed: u64, results: &[(String, TestResult)]) -> Result<Value> {
+    let results: Map<String, Value> =
+        results.iter().map(|(set, result)| Ok((set.clone(), serde_json::to_value(result)?))).collect::<Result<_>>()?;
     Ok(json!({
         "environment": state.environment,
         "algorithm": state.algorithm,
@@ -75,7 +86,7 @@ fn document(state: &State, evaluation_seed: u64, results: &[(Version, TestResult
     }))
 }
 
-fn write_json(path: &Path, state: &State, seed: u64, results: &[(Version, TestResult)]) -> Result<()> {
+fn write_json(path: &Path, state: &State, seed: u64, results: &[(String, TestResult)]) -> Result<()> {
     let mut text = serde_json::to_string_pretty(&document(state, seed, results)?)?;
     text.push('\n');
     std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))

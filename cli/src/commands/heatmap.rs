@@ -8,14 +8,17 @@ use anyhow::{Context, Result, bail};
 use super::args::HeatmapArgs;
 use super::bar::Bar;
 use super::report::write_file;
-use super::{Ending, UsageError, servers};
+use super::{Ending, UsageError, servers, sets};
 use perturb_learner::checkpoint::{Checkpoint, State};
 use perturb_learner::client::Servers;
-use perturb_learner::evaluation::heatmap;
+use perturb_learner::evaluation::{heatmap, heatmap_again};
+use perturb_learner::proto;
+use perturb_protocol::{Distribution, Version};
 use perturb_study::interrupt::StopFlag;
+use perturb_study::records::Records;
 use perturb_study::{
-    Folder, Heatmap, HeatmapOptions, HeatmapPlace, Plan, Results, Selected, default_axes, heatmap_files,
-    heatmap_places, store_heatmap,
+    Folder, Heatmap, HeatmapOptions, HeatmapPlace, Plan, Results, Selected, heatmap_files, heatmap_places,
+    store_heatmap,
 };
 
 pub(super) fn run(args: &HeatmapArgs) -> Result<Ending> {
@@ -30,19 +33,32 @@ pub(super) fn run(args: &HeatmapArgs) -> Result<Ending> {
 fn of_checkpoint(args: &HeatmapArgs, path: &Path) -> Result<Ending> {
     let checkpoint = Checkpoint::load(path)?;
     let state = &checkpoint.state;
+    let stop = StopFlag::on_signals().context("cannot wait for signals")?;
+    let servers = servers(&args.server, args.grid * args.grid)?;
+    let environment = servers.environment(&state.environment)?;
     let parameters = match (&args.x, &args.y) {
         (Some(x), Some(y)) => [x.clone(), y.clone()],
-        _ => default_axes(&state.environment).map(|names| names.map(str::to_owned)).ok_or_else(|| {
+        _ => usual_axes(&environment).ok_or_else(|| {
             let message = format!("give --x and --y: it is not known which of {}'s to show", state.environment);
             UsageError(message)
         })?,
     };
-    let options = options(args, parameters, state);
-    let stop = StopFlag::on_signals().context("cannot wait for signals")?;
-    let servers = servers(&args.server, args.grid * args.grid)?;
-    let heatmap = test(&servers, &checkpoint, &options, &stop)?;
+    let options = HeatmapOptions { fixed: fixed(args)?, ..options(args, parameters, state) };
+    let (heatmap, records) = match &args.records {
+        None => {
+            let (heatmap, records) = test(&servers, &checkpoint, &options, &stop)?;
+            (heatmap, Some(records))
+        }
+        Some(path) => (heatmap_again(&environment, &checkpoint, &Records::read(path)?, &options.parameters)?, None),
+    };
     let path = args.out.clone().unwrap_or_else(|| default_path(state, &options.parameters));
     let mut out = std::io::stdout();
+    if let Some(records) = records {
+        let mut name = path.clone().into_os_string();
+        name.push(".parquet");
+        records.write(Path::new(&name))?;
+        writeln!(out, "{}", Path::new(&name).display())?;
+    }
     for (ending, content) in heatmap_files(&heatmap)? {
         let mut name = path.clone().into_os_string();
         name.push(format!(".{ending}"));
@@ -50,6 +66,20 @@ fn of_checkpoint(args: &HeatmapArgs, path: &Path) -> Result<Ending> {
         writeln!(out, "{}", Path::new(&name).display())?;
     }
     Ok(Ending::Done)
+}
+
+/// The two parameters over which an environment's heatmaps are unless others are asked for.
+fn usual_axes(environment: &proto::Environment) -> Option<[String; 2]> {
+    environment.heatmap_axes.clone().try_into().ok()
+}
+
+/// The values of other parameters.
+fn fixed(args: &HeatmapArgs) -> Result<sets::Fixed, UsageError> {
+    let value = |(name, values): (String, Distribution)| match values.range() {
+        (low, high) if low == high => Ok((name, low)),
+        _ => Err(UsageError(format!("--parameters {name} has more than one value; --x and --y are what varies"))),
+    };
+    sets::drawn(Version::D, &args.parameters)?.drawn().into_iter().map(value).collect()
 }
 
 /// In the working directory: a training's folder has nothing in it that its training did not write.
@@ -70,10 +100,16 @@ fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<Ending> {
     let mut out = std::io::stdout();
     let mut failed = 0;
     for place in &places {
-        let (Some(selected), Some(parameters)) = (place.selected, default_axes(place.environment)) else {
-            let reason =
-                if place.selected.is_none() { "no result yet" } else { "it is not known which parameters to show" };
-            eprintln!("{place}: {reason}");
+        let Some(selected) = place.selected else {
+            eprintln!("{place}: no result yet");
+            continue;
+        };
+        let servers = match &mut servers_of_all {
+            Some(servers) => servers,
+            none => none.insert(servers(&args.server, args.grid * args.grid)?),
+        };
+        let Some(parameters) = usual_axes(&servers.environment(place.environment)?) else {
+            eprintln!("{place}: it is not known which parameters to show");
             continue;
         };
         let checkpoint = match checkpoint_of(&folder, selected) {
@@ -84,18 +120,15 @@ fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<Ending> {
                 continue;
             }
         };
-        let options = options(args, parameters.map(str::to_owned), &checkpoint.state);
+        let options = options(args, parameters, &checkpoint.state);
         if is_there(place, &folder, &options)? {
             eprintln!("{place}: is there already");
             continue;
         }
-        let servers = match &mut servers_of_all {
-            Some(servers) => servers,
-            none => none.insert(servers(&args.server, args.grid * args.grid)?),
-        };
-        let heatmap = test(servers, &checkpoint, &options, &stop).with_context(|| place.to_string())?;
+        let (heatmap, records) = test(servers, &checkpoint, &options, &stop).with_context(|| place.to_string())?;
         let id = checkpoint.id().map_err(|reason| anyhow::anyhow!("{place}: {reason}"))?;
         let path = store_heatmap(&folder, selected.cell, id, options, &heatmap)?;
+        records.write(&path.with_extension("parquet"))?;
         writeln!(out, "{}.png, .svg and .csv", path.display())?;
     }
     if failed > 0 {
@@ -120,10 +153,21 @@ fn is_there(place: &HeatmapPlace<'_>, folder: &Folder, options: &HeatmapOptions)
 }
 
 fn options(args: &HeatmapArgs, parameters: [String; 2], state: &State) -> HeatmapOptions {
-    HeatmapOptions { parameters, grid: args.grid, episodes: args.episodes, seed: args.seed.unwrap_or(state.seed) }
+    HeatmapOptions {
+        parameters,
+        grid: args.grid,
+        episodes: args.episodes,
+        seed: args.seed.unwrap_or(state.seed),
+        fixed: sets::Fixed::new(),
+    }
 }
 
-fn test(servers: &Servers, checkpoint: &Checkpoint, options: &HeatmapOptions, stop: &StopFlag) -> Result<Heatmap> {
+fn test(
+    servers: &Servers,
+    checkpoint: &Checkpoint,
+    options: &HeatmapOptions,
+    stop: &StopFlag,
+) -> Result<(Heatmap, Records)> {
     let HeatmapOptions { parameters: [x, y], grid, episodes, .. } = options;
     let mut bar = Bar::new(format!("testing over {x} and {y}"), (grid * grid) as u64 * episodes);
     Ok(heatmap(servers, checkpoint, options, stop, &mut |episodes| bar.testing(episodes))?)

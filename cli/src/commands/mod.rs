@@ -6,14 +6,17 @@
 //! process works on the cell.
 
 mod args;
+mod audit;
 mod bar;
 mod demo;
 mod envs;
 mod evaluate;
 mod heatmap;
 mod plan;
+mod rates;
 mod report;
 mod run;
+mod sets;
 mod single_thread;
 mod slurm;
 mod train;
@@ -71,6 +74,8 @@ pub fn main() -> ExitCode {
         Command::Curves(args) => report::curves(&args),
         Command::Heatmap(args) => heatmap::run(&args),
         Command::Video(args) => video::run(&args),
+        Command::Audit(args) => audit::run(&args),
+        Command::Rates(args) => rates::run(&args),
     };
     match result {
         Ok(Ending::Done) => ExitCode::SUCCESS,

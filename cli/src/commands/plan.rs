@@ -68,8 +68,9 @@ pub(super) fn run(args: &PlanArgs) -> Result<Ending> {
     Ok(Ending::Done)
 }
 
-/// The step limits of the plan's environments.
+/// The step limits of the plan's environments. Refuses plans that do not fit them.
 pub(super) fn step_limits<'a>(servers: &Servers, plan: &'a Plan) -> Result<HashMap<&'a str, u32>> {
+    plan.check(|name| Ok::<_, anyhow::Error>(servers.environment(name)?))?;
     let limit = |name: &'a str| Ok((name, servers.environment(name)?.step_limit));
     plan.environments().into_iter().map(limit).collect()
 }

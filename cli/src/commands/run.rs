@@ -180,7 +180,7 @@ pub(super) fn keep_plan(args: &RunArgs, plan: &Plan, folder: &Folder) -> Result<
     if args.leave_plan && folder.plan_path().exists() {
         return Ok(());
     }
-    if folder.keep_plan(&plan.text)? {
+    if folder.keep_plan(plan)? {
         eprintln!(
             "{} was another plan; it is replaced, and cells that both have are kept",
             folder.plan_path().display()

@@ -8,9 +8,10 @@ use toml::{Table, Value};
 
 use super::args::TrainArgs;
 use super::bar::Bar;
-use super::{Ending, UsageError, servers};
+use super::{Ending, UsageError, servers, sets};
 use perturb_learner::logging::Progress;
 use perturb_learner::training::{Outcome, RunDirectory, resume, train};
+use perturb_study::Version;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::settings::{Sources, TrainConfig};
 
@@ -29,7 +30,8 @@ fn begin(args: &TrainArgs, out: &Path) -> Result<Ending> {
     let stop = StopFlag::on_signals().context("cannot wait for signals")?;
     let directory = RunDirectory::choose(out, args.overwrite)?;
     let servers = servers(&args.server, config.common.num_envs)?;
-    servers.environment(&config.common.environment)?; // its refusal lists the names
+    let environment = servers.environment(&config.common.environment)?; // its refusal lists the names
+    perturb_study::sets::check("--parameters", &config.common.parameters, &environment).map_err(sets::usage)?;
     let mut bar = Bar::new(describe(&config), config.common.episodes);
     let outcome = train(&servers, &config, &directory, &stop, |progress| bar.training(progress))?;
     bar.finish();
@@ -118,6 +120,11 @@ fn flags(args: &TrainArgs) -> Result<Table, UsageError> {
     text("version", args.version.map(|version| version.to_string()));
     text("algorithm", args.algorithm.map(|algorithm| algorithm.to_string()));
     text("architecture", args.architecture.map(|architecture| architecture.to_string()));
+    if !args.parameters.is_empty() {
+        let set = sets::drawn(args.version.unwrap_or(Version::D), &args.parameters)?;
+        let parameters = Table::try_from(set.drawn()).map_err(|error| UsageError(error.to_string()))?;
+        table.insert("parameters".into(), Value::Table(parameters));
+    }
     for (flag, value) in
         [("episodes", args.episodes), ("seed", args.seed), ("episodes-per-trial", args.episodes_per_trial)]
     {

@@ -6,7 +6,7 @@ use anyhow::{Context, Result};
 
 use super::args::VideoArgs;
 use super::bar::Bar;
-use super::{Ending, servers};
+use super::{Ending, servers, sets};
 use crate::video::{Summary, VideoFile, VideoOptions, film};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_study::interrupt::StopFlag;
@@ -18,13 +18,13 @@ pub(super) fn run(args: &VideoArgs) -> Result<Ending> {
     let stop = StopFlag::on_signals().context("cannot wait for signals")?;
     let servers = servers(&args.server, 0)?;
     let options = VideoOptions {
-        version: args.version,
+        set: sets::drawn(args.version, &args.parameters)?,
         episodes: args.episodes,
         seed: args.seed.unwrap_or(checkpoint.state.seed),
         size: (args.width, args.height),
         fps: args.fps,
     };
-    let mut bar = Bar::new(format!("filming on {}", args.version), args.episodes);
+    let mut bar = Bar::new(format!("filming on {}", options.set.name), args.episodes);
     let summary = film(&servers, &checkpoint, &options, file, &stop, &mut |episodes| bar.testing(episodes))?;
     drop(bar);
     let mut out = std::io::stdout();

@@ -8,8 +8,8 @@ use perturb_learner::checkpoint::{Checkpoint, EnvironmentSummary, State};
 use perturb_learner::client::{BegunEpisode, ClientError, OpenOptions, Picture, Servers, Single, StepReply};
 use perturb_learner::evaluation::{Agent, TestError, check_unchanged, open_options};
 use perturb_learner::proto;
-use perturb_study::Version;
 use perturb_study::interrupt::StopFlag;
+use perturb_study::sets::TestSet;
 
 /// The end of an episode stays for so many seconds.
 const HOLD: f64 = 1.0;
@@ -17,8 +17,8 @@ const HOLD: f64 = 1.0;
 /// What to film.
 #[derive(Clone, Debug)]
 pub struct VideoOptions {
-    /// Where parameters come from.
-    pub version: Version,
+    /// Where parameters come from: a version, or a set whose parameters are drawn.
+    pub set: TestSet,
     /// How many episodes, at least 1.
     pub episodes: u64,
     /// Fixes all randomness.
@@ -134,14 +134,15 @@ impl<'a> Film<'a> {
         let state = &checkpoint.state;
         let open = OpenOptions {
             episodes_per_trial: state.episodes_per_trial,
-            ..open_options(&state.environment, options.version, 1, options.seed)
+            ..open_options(&state.environment, &options.set, options.seed)
         };
         let mut reply = StepReply::default();
         let (single, begun) = Single::open(servers, &open, &mut reply.observations)?;
         check_unchanged(checkpoint, EnvironmentSummary::of(single.environment()))?;
         let environment = single.environment().clone();
+        options.set.check(&environment).map_err(TestError::Set)?;
         let title = (
-            format!("{} {}", environment.name, options.version),
+            format!("{} {}", environment.name, options.set.name),
             format!("{} {}, trained on {}", state.algorithm, state.architecture, state.train_version),
         );
         let panel = Panel::new(options.size, title, environment.parameters.len())?;
@@ -149,7 +150,7 @@ impl<'a> Film<'a> {
             options,
             state,
             single,
-            agent: Agent::new(checkpoint, 1, options.seed).map_err(TestError::Numbers)?,
+            agent: Agent::new(checkpoint, 1, open.seed).map_err(TestError::Numbers)?,
             reply,
             shown: Shown::default(),
             last: None,
@@ -221,7 +222,7 @@ impl<'a> Film<'a> {
         self.agent.remember(&mut reply.rewards, &[end.is_some()]).map_err(TestError::Numbers)?;
         let Some(end) = end else { return Ok(()) };
         if end.episode_in_trial + 1 == self.state.episodes_per_trial {
-            self.agent.forget(0);
+            self.agent.begin_trial(0, self.begun.trial_index);
         }
         shown.episode_return = end.episode_return;
         let truncated = reply.truncated[0];

@@ -11,7 +11,6 @@ use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers, Session, StepReply};
 use perturb_learner::evaluation::test;
 use perturb_learner::policy::{ActionKind, Inputs, Policy, PolicySpec, Sequences};
-use perturb_learner::proto;
 use perturb_learner::rollout::{Collector, Normalisers, Rollout};
 use perturb_study::Version;
 use perturb_study::interrupt::StopFlag;
@@ -117,7 +116,8 @@ fn rollouts_keep_what_a_recurrent_policy_remembers() {
     let (n_envs, n_steps) = (2, 150);
     let options = OpenOptions {
         environment: "Pendulum".into(),
-        version: proto::Version::Random,
+        version: Version::R,
+        parameters: Default::default(),
         num_envs: n_envs,
         seed: 3,
         episodes_per_trial: 1,
@@ -227,7 +227,8 @@ fn a_refused_request_is_told_in_the_servers_words_and_the_session_lives_on() {
     let servers = Servers::connect(&addresses(&server)).expect("a connection");
     let options = OpenOptions {
         environment: "CartPole".into(),
-        version: proto::Version::Default,
+        version: Version::D,
+        parameters: Default::default(),
         num_envs: 2,
         seed: 1,
         episodes_per_trial: 1,
@@ -421,7 +422,8 @@ fn a_server_keeps_a_learner_that_computes_for_long() {
     let servers = Servers::connect(&[address]).expect("a connection");
     let options = OpenOptions {
         environment: "CartPole".into(),
-        version: proto::Version::Default,
+        version: Version::D,
+        parameters: Default::default(),
         num_envs: 1,
         seed: 1,
         episodes_per_trial: 1,

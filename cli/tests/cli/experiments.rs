@@ -6,7 +6,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use perturb_learner::client::{PrivateServer, PrivateServerOptions};
-use perturb_study::{CellResult, CellState, Counts, Folder, Plan, default_axes};
+use perturb_study::{CellResult, CellState, Counts, Folder, Plan};
 use tempfile::TempDir;
 
 /// How long anything may take that must not hang.
@@ -530,26 +530,6 @@ fn a_heatmap_is_drawn_of_two_parameters_and_others_are_refused() {
     let table = std::fs::read_to_string(elsewhere.path().join("usual.csv")).expect("a table");
     assert!(table.starts_with("length,mass,"), "CartPole's usual parameters: {table}");
     assert_eq!(draw(&["--x", "force"]).status.code(), Some(2), "one parameter is not enough");
-}
-
-#[test]
-fn every_environment_has_two_parameters_for_its_heatmaps() {
-    let output = Command::new(env!("CARGO_BIN_EXE_perturb")).args(["envs", "--json"]).output().expect("ended");
-    succeeded(&output);
-    let catalogue: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
-    let environments = catalogue["environments"].as_array().expect("a list");
-    assert_eq!(environments.len(), 6);
-    for environment in environments {
-        let name = environment["name"].as_str().expect("a name");
-        let known: Vec<&str> = environment["parameters"]
-            .as_array()
-            .expect("a list")
-            .iter()
-            .filter_map(|parameter| parameter["name"].as_str())
-            .collect();
-        let [x, y] = default_axes(name).unwrap_or_else(|| panic!("{name} has none"));
-        assert!(x != y && known.contains(&x) && known.contains(&y), "{name}: {x}, {y} of {known:?}");
-    }
 }
 
 #[test]

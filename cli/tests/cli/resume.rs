@@ -8,8 +8,8 @@ use std::time::Duration;
 use crate::common::{addresses, child_server, config, kill, perturb, read, run, server, stderr, wait_for};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{ClientError, OpenOptions, Servers, Session, StepReply};
-use perturb_learner::proto;
 use perturb_learner::training::{Outcome, RunDirectory, resume, train};
+use perturb_study::Version;
 use perturb_study::interrupt::StopFlag;
 use tempfile::TempDir;
 
@@ -144,7 +144,8 @@ fn snapshots_bring_a_batch_back_on_any_number_of_servers() {
         let n = 5;
         let options = OpenOptions {
             environment: environment.into(),
-            version: proto::Version::Extreme,
+            version: Version::E,
+            parameters: Default::default(),
             num_envs: n,
             seed: 3,
             episodes_per_trial: 1,

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use crate::common::{addresses, kill, perturb, server, stderr};
 use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers, Session};
-use perturb_learner::proto;
+use perturb_study::Version;
 use perturb_study::{Folder, Plan};
 
 /// Four cells of some seconds.
@@ -76,7 +76,8 @@ fn succeeded(run: Child) {
 fn options() -> OpenOptions {
     OpenOptions {
         environment: "CartPole".into(),
-        version: proto::Version::Default,
+        version: Version::D,
+        parameters: Default::default(),
         num_envs: 2,
         seed: 1,
         episodes_per_trial: 1,

@@ -122,7 +122,7 @@ fn a_gif_is_shown_as_fast_as_was_asked_for() {
 fn filmed(servers: &Servers, checkpoint: &Checkpoint, version: Version, episodes: u64) -> Summary {
     let folder = tempfile::tempdir().expect("a folder");
     let file = VideoFile::create(&folder.path().join("a.gif")).expect("a file");
-    let options = VideoOptions { version, episodes, seed: 5, size: (240, 240), fps: None };
+    let options = VideoOptions { set: version.into(), episodes, seed: 5, size: (240, 240), fps: None };
     film(servers, checkpoint, &options, file, &StopFlag::default(), &mut |_| {})
         .unwrap_or_else(|error| panic!("{error}"))
 }

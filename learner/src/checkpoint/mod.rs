@@ -91,6 +91,9 @@ pub struct EnvironmentSummary {
     pub action: ActionKind,
     /// Names of the parameters.
     pub parameters: Vec<String>,
+    /// Names of the quantities that receipts read back; empty in checkpoints of programs that did not keep them.
+    #[serde(default)]
+    pub applied: Vec<String>,
     /// SHA-256 of the model; empty without one.
     pub model_hash: String,
 }
@@ -330,6 +333,7 @@ impl EnvironmentSummary {
             observation: names(&environment.observation),
             action,
             parameters: environment.parameters.iter().map(|parameter| parameter.name.clone()).collect(),
+            applied: environment.applied.iter().map(|quantity| quantity.name.clone()).collect(),
             model_hash: environment.model_hash.clone(),
         })
     }

@@ -27,6 +27,7 @@ fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
             observation: vec!["x".into(), "y".into(), "z".into()],
             action: policy.action,
             parameters: vec!["mass".into()],
+            applied: Vec::new(),
             model_hash: String::new(),
         },
         algorithm: AlgorithmName::Ppo,

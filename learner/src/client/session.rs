@@ -3,7 +3,8 @@
 use std::ops::Range;
 
 use bytes::{Bytes, BytesMut};
-use perturb_protocol::{Ask, ClientError, Connection, Stream};
+use perturb_protocol::{Ask, ClientError, Connection, Distribution, Stream, Version};
+use perturb_study::sets::Parameters;
 
 use super::servers::Servers;
 use crate::proto::{self, AutoresetMode};
@@ -14,7 +15,9 @@ pub struct OpenOptions {
     /// A name from the catalogue.
     pub environment: String,
     /// Where parameters come from.
-    pub version: proto::Version,
+    pub version: Version,
+    /// What replaces the version's distributions of some parameters.
+    pub parameters: Parameters,
     /// N, at least 1.
     pub num_envs: usize,
     /// Fixes all randomness of the environments.
@@ -44,8 +47,12 @@ pub struct EndedEpisode {
     pub success: bool,
     /// Whether the task ended it, as opposed to the step limit alone.
     pub terminated: bool,
-    /// The parameters, in the catalogue's order.
-    pub parameters: Vec<f64>,
+    /// Whether the physics diverged.
+    pub diverged: bool,
+    /// What it achieved of what the environment's success rule compares; `None` if nothing.
+    pub achieved: Option<f64>,
+    /// The parameters that were drawn or given and what the physics had, in the catalogue's order.
+    pub receipt: proto::Receipt,
 }
 
 /// The outcome of a step, in buffers that are used again.
@@ -181,15 +188,29 @@ impl<'a> Session<'a> {
         seed: u64,
         observations: &mut [f32],
     ) -> Result<(), ClientError> {
-        let fixed = |value: f64| proto::Distribution { intervals: vec![proto::Interval { low: value, high: value }] };
-        let Self { servers, parts, observation_size: size, .. } = self;
-        let Some(part) = parts.iter_mut().find(|part| part.range.contains(&slot)) else { return Ok(()) };
+        let fixed = |value: f64| proto::Distribution::from(&Distribution::fixed(value));
         let request = proto::Reset {
-            mask: part.range.clone().map(|other| u8::from(other == slot)).collect(),
             seeds: vec![seed],
             parameters: parameters.iter().map(|(name, value)| ((*name).to_owned(), fixed(*value))).collect(),
             ..proto::Reset::default()
         };
+        self.reset_slot(slot, request, observations)
+    }
+
+    /// Begins the next episode in the environment of `slot`, whether or not the present one has ended, and writes its first
+    /// observation `[O]` to its place in `observations` `[N, O]`.
+    ///
+    /// # Errors
+    /// The failures of a connection.
+    pub fn reset_one(&mut self, slot: usize, observations: &mut [f32]) -> Result<(), ClientError> {
+        self.reset_slot(slot, proto::Reset::default(), observations)
+    }
+
+    fn reset_slot(&mut self, slot: usize, request: proto::Reset, observations: &mut [f32]) -> Result<(), ClientError> {
+        let Self { servers, parts, observation_size: size, .. } = self;
+        let Some(part) = parts.iter_mut().find(|part| part.range.contains(&slot)) else { return Ok(()) };
+        let mask = part.range.clone().map(|other| u8::from(other == slot)).collect();
+        let request = proto::Reset { mask, ..request };
         let done = servers.runtime().block_on(part.stream.ask(request)).map_err(|error| servers.explain(error))?;
         let first = &mut observations[slot * *size..][..*size];
         part.stream.decode::<proto::Reset>("observations", &done.observations, first)
@@ -319,7 +340,9 @@ impl Part {
                 length: end.length,
                 success: end.success,
                 terminated: reply.terminated[slot],
-                parameters: end.receipt.map(|receipt| receipt.requested).unwrap_or_default(),
+                diverged: end.diverged,
+                achieved: end.achieved,
+                receipt: end.receipt.unwrap_or_default(),
             });
         }
         Ok(())
@@ -358,7 +381,8 @@ pub(super) async fn open_part(
     };
     let open = proto::Open {
         environment: options.environment.clone(),
-        version: options.version.into(),
+        version: options.version.to_proto().into(),
+        parameters: options.parameters.iter().map(|(name, values)| (name.clone(), values.into())).collect(),
         batch_size: index(range.len())?,
         seed: options.seed,
         first_environment_index: index(range.start)?,

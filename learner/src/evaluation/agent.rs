@@ -1,24 +1,28 @@
 //! A trained policy as it acts in tests: sampled actions, frozen statistics.
 
+use perturb_study::random::{Purpose, trial_stream};
 use rand_chacha::ChaCha8Rng;
 
 use crate::checkpoint::{Checkpoint, State};
 use crate::error::Result;
 use crate::policy::{Actor, Acts, Inputs};
-use perturb_study::random::{Purpose, stream};
 
 /// The policy of a checkpoint in N environments, with what it remembers of each.
 pub struct Agent<'a> {
     state: &'a State,
     actor: Actor,
     inputs: Inputs,
-    rng: ChaCha8Rng,
+    /// Of its actions' randomness.
+    seed: u64,
+    /// One for each environment, of its present trial.
+    streams: Vec<ChaCha8Rng>,
     acts: Acts,
     bytes: Vec<u8>,
 }
 
 impl<'a> Agent<'a> {
-    /// At the start of a trial in each of N = `n_envs` environments. `seed` fixes the actions that are sampled.
+    /// At the start of the first trial in each of N = `n_envs` environments, whose indices are 0 … N-1. `seed` fixes the
+    /// actions that are sampled.
     ///
     /// # Errors
     /// Weights that do not fit.
@@ -26,11 +30,13 @@ impl<'a> Agent<'a> {
         let state = &checkpoint.state;
         let mut actor = Actor::new(&state.policy, n_envs);
         actor.load(&checkpoint.weights)?;
+        let first = |environment: usize| trial_stream(seed, Purpose::TestActions, environment as u32, 0);
         Ok(Self {
             state,
             actor,
             inputs: state.inputs(n_envs),
-            rng: stream(seed, Purpose::TestActions),
+            seed,
+            streams: (0..n_envs).map(first).collect(),
             acts: Acts::new(state.policy.action, n_envs),
             bytes: Vec::new(),
         })
@@ -44,7 +50,7 @@ impl<'a> Agent<'a> {
         if let Some(normaliser) = &self.state.observation_normaliser {
             normaliser.normalise(observations)?;
         }
-        self.actor.act(self.inputs.of(observations), &mut self.rng, &mut self.acts)?;
+        self.actor.act(self.inputs.of(observations), &mut self.streams, &mut self.acts)?;
         self.acts.write_bytes(&mut self.bytes);
         Ok(&self.bytes)
     }
@@ -61,9 +67,16 @@ impl<'a> Agent<'a> {
         self.inputs.remember(&self.acts, rewards, done)
     }
 
-    /// A new trial begins in `environment`.
-    pub fn forget(&mut self, environment: usize) {
+    /// Trial `trial_index` begins in `environment`: nothing before it is remembered, and its address alone says which
+    /// actions are sampled.
+    pub fn begin_trial(&mut self, environment: usize, trial_index: u64) {
+        self.begin_trial_of(environment, self.seed, trial_index);
+    }
+
+    /// The same of a trial that belongs to another seed.
+    pub fn begin_trial_of(&mut self, environment: usize, seed: u64, trial_index: u64) {
         self.actor.forget(environment);
         self.inputs.forget(environment);
+        self.streams[environment] = trial_stream(seed, Purpose::TestActions, environment as u32, trial_index);
     }
 }

@@ -25,7 +25,9 @@ pub struct Audit {
 #[non_exhaustive]
 pub enum AuditError {
     /// They are of another policy.
-    #[error("the episodes were recorded of the policy {recorded}, the checkpoint is {got}: give the checkpoint that was tested")]
+    #[error(
+        "the episodes were recorded of the policy {recorded}, the checkpoint is {got}: give the checkpoint that was tested"
+    )]
     Policy {
         /// The recorded policy.
         recorded: String,
@@ -139,10 +141,8 @@ impl<'a> Replay<'a> {
 
 /// In what an episode differs from its record; `None` if in nothing.
 fn difference(recorded: &EpisodeRecord, end: &EndedEpisode) -> Option<String> {
-    let place = format!(
-        "{}, environment {}, episode {}",
-        recorded.set, recorded.environment_index, recorded.episode_index
-    );
+    let place =
+        format!("{}, environment {}, episode {}", recorded.set, recorded.environment_index, recorded.episode_index);
     let parts = [
         ("episode", recorded.episode_index.to_string(), end.episode_index.to_string()),
         ("requested", format!("{:?}", recorded.requested), format!("{:?}", end.receipt.requested)),

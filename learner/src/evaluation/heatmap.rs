@@ -2,12 +2,14 @@
 
 use perturb_protocol::{Version, proto};
 use perturb_study::interrupt::StopFlag;
+use perturb_study::records::Records;
+use perturb_study::sets::{Context, Contexts, TestSet};
 use perturb_study::settings::Wrapper;
-use perturb_study::{Axis, Heatmap, HeatmapOptions, MOST_POINTS, mean};
+use perturb_study::{Axis, Heatmap, HeatmapOptions, MOST_POINTS};
 
-use super::test::{TestError, check_unchanged, environment_seed, play};
-use crate::checkpoint::{Checkpoint, EnvironmentSummary, State};
-use crate::client::{OpenOptions, Servers, Session};
+use super::test::{TestError, TestOptions, Tester};
+use crate::checkpoint::{Checkpoint, State};
+use crate::client::Servers;
 
 /// Why there is no heatmap.
 #[derive(Debug, thiserror::Error)]
@@ -23,6 +25,9 @@ pub enum HeatmapError {
         /// Its parameters.
         parameters: Vec<String>,
     },
+    /// Recorded episodes are of something else.
+    #[error("the recorded episodes are not those of a heatmap over these two parameters: give the --x and --y of then")]
+    NotOfAxes,
     /// The policy cannot be tested.
     #[error(transparent)]
     Test(#[from] TestError),
@@ -30,7 +35,7 @@ pub enum HeatmapError {
 
 /// Tests `checkpoint` at every point of a grid over two parameters, whose range is that of R and E together. Each
 /// point is an environment with random numbers of its own, so that points differ by their parameters and by chance.
-/// Calls `report` with the number of episodes.
+/// Calls `report` with the number of episodes; gives the recorded episodes, too.
 ///
 /// # Errors
 /// [`HeatmapError`].
@@ -40,41 +45,37 @@ pub fn heatmap(
     options: &HeatmapOptions,
     stop: &StopFlag,
     report: &mut dyn FnMut(u64),
-) -> Result<Heatmap, HeatmapError> {
+) -> Result<(Heatmap, Records), HeatmapError> {
     let state = &checkpoint.state;
     let grid = options.grid.clamp(1, MOST_POINTS);
-    let seed = environment_seed(options.seed, Version::D);
-    let open = OpenOptions {
-        environment: state.environment.clone(),
-        version: Version::D.to_proto(),
-        num_envs: grid * grid,
-        seed,
-        episodes_per_trial: state.episodes_per_trial,
+    let points = (grid * grid) as u64;
+    let test = TestOptions { episodes: options.episodes * points, seed: options.seed, success: None };
+    let tester = Tester::new(servers, checkpoint, test)?;
+    let axes = axes(tester.environment(), &options.parameters)?;
+    let context = |point: usize| {
+        let places = [point % grid, point / grid];
+        let value = |i: usize| (axes[i].name.clone(), axes[i].value(places[i], grid));
+        options.fixed.clone().into_iter().chain([value(0), value(1)]).collect::<Context>()
     };
-    let mut observations = Vec::new();
-    let mut session = Session::open(servers, &open, &mut observations).map_err(TestError::Client)?;
-    check_unchanged(checkpoint, EnvironmentSummary::of(session.environment()))?;
-    let axes = axes(session.environment(), &options.parameters)?;
-    for slot in 0..grid * grid {
-        let values = [slot % grid, slot / grid];
-        let values: [(&str, f64); 2] = std::array::from_fn(|i| (axes[i].name.as_str(), axes[i].value(values[i], grid)));
-        session.reset_with(slot, &values, seed, &mut observations).map_err(TestError::Client)?;
-    }
-    let quotas = vec![options.episodes; grid * grid];
-    let mut by_slot: Vec<Vec<[f64; 2]>> = vec![Vec::new(); grid * grid];
-    for end in play(&mut session, observations, checkpoint, &quotas, options.seed, stop, report)? {
-        by_slot[end.slot].push([end.episode_return, if end.success { 100.0 } else { 0.0 }]);
-    }
-    let means = |column: usize| by_slot.iter().map(|ends| mean(ends.iter().map(|end| end[column]))).collect();
-    Ok(Heatmap {
-        environment: state.environment.clone(),
-        policy: policy(state),
-        axes,
-        grid,
-        episodes: options.episodes,
-        returns: means(0),
-        success: means(1),
-    })
+    let contexts = Contexts::Listed((0..grid * grid).map(context).collect());
+    let set = TestSet { name: Heatmap::SET.into(), version: Version::D, contexts };
+    let records = tester.test(&[set], stop, &mut |_, done| report(done))?;
+    let heatmap = Heatmap::of(&records, policy(state), axes).ok_or(HeatmapError::NotOfAxes)?;
+    Ok((heatmap, records))
+}
+
+/// The heatmap of a test that was recorded, without playing it again. `environment` says what the parameters' axes are.
+///
+/// # Errors
+/// [`HeatmapError`] if the episodes are not those of a heatmap over these parameters.
+pub fn heatmap_again(
+    environment: &proto::Environment,
+    checkpoint: &Checkpoint,
+    records: &Records,
+    parameters: &[String; 2],
+) -> Result<Heatmap, HeatmapError> {
+    let axes = axes(environment, parameters)?;
+    Heatmap::of(records, policy(&checkpoint.state), axes).ok_or(HeatmapError::NotOfAxes)
 }
 
 /// Who is tested.

@@ -1,16 +1,20 @@
-//! Testing a checkpoint on a version of its environment.
+//! Testing a checkpoint on a set of its environment's parameters, and recording every episode.
 
-use perturb_study::{TestResult, Version, mean, wilson};
+use perturb_protocol::{Version, proto};
+use perturb_study::TestResult;
+use perturb_study::interrupt::StopFlag;
+use perturb_study::random::{Purpose, stream};
+use perturb_study::records::{About, Difference, Ending, EpisodeRecord, RecordedTest, Records};
+use perturb_study::sets::{SetError, TestSet};
+use perturb_study::success::{Threshold, ThresholdError};
 use rand::Rng;
 
 use super::agent::Agent;
 use crate::checkpoint::{Checkpoint, EnvironmentSummary};
 use crate::client::{ClientError, EndedEpisode, OpenOptions, Servers, Session, StepReply};
-use perturb_study::interrupt::StopFlag;
-use perturb_study::random::{Purpose, stream};
 
-/// The most environments that are tested together.
-const MOST_ENVS: u64 = 100;
+/// The most environments that are tested together, unless a set has more contexts.
+const MOST_ENVS: usize = 100;
 
 /// Why a checkpoint could not be tested.
 #[derive(Debug, thiserror::Error)]
@@ -22,6 +26,23 @@ pub enum TestError {
     /// The policy gives numbers that are not finite, or does not fit.
     #[error(transparent)]
     Numbers(#[from] crate::error::Error),
+    /// The environment does not have the set's parameters, or refuses their values.
+    #[error(transparent)]
+    Set(#[from] SetError),
+    /// The threshold is of something else than what the environment's success rule compares.
+    #[error(transparent)]
+    Threshold(#[from] ThresholdError),
+    /// The checkpoint cannot be named.
+    #[error("the checkpoint cannot be named: {0}")]
+    Unnamed(String),
+    /// Episodes did not run with the parameters that they were to run with.
+    #[error("testing on {set}: {difference}; its results would be of another environment: mend the server")]
+    NotApplied {
+        /// The set's name.
+        set: String,
+        /// The largest difference.
+        difference: Difference,
+    },
     /// The environment is no longer what the policy was trained in.
     #[error("the checkpoint was trained in {environment} with {what} {trained}, the server's has {served}: {advice}")]
     Changed {
@@ -44,6 +65,26 @@ pub enum TestError {
     },
 }
 
+/// How to test.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TestOptions {
+    /// Episodes on each set, at least 1; a set of contexts has at least one in each.
+    pub episodes: u64,
+    /// Fixes all randomness.
+    pub seed: u64,
+    /// The threshold of success; `None` for the environment's own.
+    pub success: Option<Threshold>,
+}
+
+/// Tests a checkpoint.
+pub struct Tester<'a> {
+    servers: &'a Servers,
+    checkpoint: &'a Checkpoint,
+    options: TestOptions,
+    about: About,
+    environment: proto::Environment,
+}
+
 /// The seed of the test environments on `version`.
 ///
 /// It is the first, second or third number (D, R, E) of the stream of `seed` for [`Purpose::TestEnvironments`], so that
@@ -54,13 +95,118 @@ pub fn environment_seed(seed: u64, version: Version) -> u64 {
     drawn[version as usize]
 }
 
-/// Tests `checkpoint` on `version`: `episodes` episodes with sampled actions and frozen statistics. Calls `report` with
-/// the number of episodes done. Of a policy that was trained in trials of several episodes the last one of each of
-/// `episodes` trials counts.
-///
-/// Which episodes count is fixed beforehand: the first ones of each of at most 100 environments, as evenly as possible.
-/// Counting the first to end instead would favour short ones. The result depends on the checkpoint, the version, the
-/// number of episodes and the seed alone.
+impl<'a> Tester<'a> {
+    /// Checks that the served environment is the one that the policy was trained in, and that it knows the threshold.
+    ///
+    /// # Errors
+    /// [`TestError`].
+    pub fn new(servers: &'a Servers, checkpoint: &'a Checkpoint, options: TestOptions) -> Result<Self, TestError> {
+        let state = &checkpoint.state;
+        let environment = servers.environment(&state.environment)?;
+        check_unchanged(checkpoint, EnvironmentSummary::of(&environment))?;
+        let id = checkpoint.id().map_err(TestError::Unnamed)?;
+        let mut about = About::new(&environment, id, state.episodes_per_trial);
+        if let Some(threshold) = &options.success {
+            about.success = about.success.map(|criterion| criterion.with(threshold)).transpose()?;
+        }
+        Ok(Self { servers, checkpoint, options, about, environment })
+    }
+
+    /// The environment, as it is served.
+    pub fn environment(&self) -> &proto::Environment {
+        &self.environment
+    }
+
+    /// Tests on each of `sets` and records every episode. Calls `report` with the set and its number of episodes done.
+    /// The sets are checked before anything is played.
+    ///
+    /// # Errors
+    /// [`TestError`]. Episodes that did not run with what was requested end everything.
+    pub fn test(
+        &self,
+        sets: &[TestSet],
+        stop: &StopFlag,
+        report: &mut dyn FnMut(&TestSet, u64),
+    ) -> Result<Records, TestError> {
+        sets.iter().try_for_each(|set| set.check(&self.environment))?;
+        let mut records = Records::new(self.about.clone());
+        for set in sets {
+            let test = RecordedTest { set: set.clone(), seed: environment_seed(self.options.seed, set.version) };
+            let episodes = self.play(&test, stop, &mut |done| report(set, done))?;
+            records.add(test, episodes);
+            let largest = records.agreement().largest;
+            if let Some(difference) = largest.filter(Difference::is_real) {
+                return Err(TestError::NotApplied { set: set.name.clone(), difference });
+            }
+        }
+        Ok(records)
+    }
+
+    /// Plays the episodes of a test, with sampled actions and frozen statistics. Of a policy that was trained in trials
+    /// of several episodes the last one of each trial counts.
+    ///
+    /// Which episodes count is fixed beforehand: the first ones of each environment, as evenly as possible. Counting the
+    /// first to end instead would favour short ones. The result depends on the checkpoint, the set, the number of
+    /// episodes and the seed alone.
+    fn play(
+        &self,
+        test: &RecordedTest,
+        stop: &StopFlag,
+        report: &mut dyn FnMut(u64),
+    ) -> Result<Vec<EpisodeRecord>, TestError> {
+        let contexts = test.set.listed();
+        let quotas = quotas(self.options.episodes, contexts.len());
+        let options = OpenOptions {
+            environment: self.about.environment.clone(),
+            version: test.set.version,
+            parameters: test.set.drawn(),
+            num_envs: quotas.len(),
+            seed: test.seed,
+            episodes_per_trial: self.about.episodes_per_trial,
+        };
+        let mut observations = Vec::new();
+        let mut session = Session::open(self.servers, &options, &mut observations)?;
+        for slot in 0..quotas.len() {
+            let context: Vec<(&str, f64)> =
+                contexts[slot % contexts.len()].iter().map(|(name, value)| (name.as_str(), *value)).collect();
+            if !context.is_empty() {
+                session.reset_with(slot, &context, test.seed, &mut observations)?;
+            }
+        }
+        let agent = Agent::new(self.checkpoint, quotas.len(), test.seed)?;
+        let mut trials = Trials::new(session, agent, observations, self.about.episodes_per_trial);
+        let mut counted: Vec<EndedEpisode> = Vec::new();
+        let episodes: u64 = quotas.iter().sum();
+        while (counted.len() as u64) < episodes {
+            // Environments that are done go on, unseen: they cost less than a smaller batch would save.
+            let ended = trials.step(stop)?;
+            counted.extend(ended.into_iter().filter(|end| end.trial_index < quotas[end.slot]));
+            report(counted.len() as u64);
+        }
+        counted.sort_by_key(|end| (end.environment_index, end.episode_index));
+        Ok(counted.into_iter().map(|end| self.record(test, end)).collect())
+    }
+
+    fn record(&self, test: &RecordedTest, end: EndedEpisode) -> EpisodeRecord {
+        let success = self.about.success.as_ref().map_or(end.success, |criterion| criterion.holds(end.achieved));
+        EpisodeRecord {
+            set: test.set.name.clone(),
+            seed: test.seed,
+            environment_index: end.environment_index,
+            episode_index: end.episode_index,
+            ending: ending(&end),
+            requested: end.receipt.requested,
+            applied: end.receipt.applied,
+            model_hash: end.receipt.model_hash,
+            episode_return: end.episode_return,
+            length: end.length,
+            success,
+            achieved: end.achieved,
+        }
+    }
+}
+
+/// The figures of a test on one version, see [`Tester::test`].
 ///
 /// # Errors
 /// [`TestError`].
@@ -73,89 +219,74 @@ pub fn test(
     stop: &StopFlag,
     mut report: impl FnMut(u64),
 ) -> Result<TestResult, TestError> {
-    let state = &checkpoint.state;
-    let quotas = quotas(episodes);
-    let options = OpenOptions {
-        episodes_per_trial: state.episodes_per_trial,
-        ..open_options(&state.environment, version, quotas.len(), seed)
-    };
-    let mut reply = StepReply::default();
-    let mut session = Session::open(servers, &options, &mut reply.observations)?;
-    check_unchanged(checkpoint, EnvironmentSummary::of(session.environment()))?;
-    let episodes = play(&mut session, reply.observations, checkpoint, &quotas, seed, stop, &mut report)?;
-    Ok(summarise(&episodes))
+    let tester = Tester::new(servers, checkpoint, TestOptions { episodes, seed, success: None })?;
+    let records = tester.test(&[version.into()], stop, &mut |_, done| report(done))?;
+    Ok(records.result(&version.to_string(), None))
 }
 
-/// Lets the policy act in the environments of `session`, which are at their first `observations` `[N, O]`, until each has
-/// ended as many episodes as `quotas` `[N]` says, and returns these. Calls `report` with their number.
-///
-/// # Errors
-/// [`TestError`].
-pub fn play(
-    session: &mut Session<'_>,
-    observations: Vec<f32>,
-    checkpoint: &Checkpoint,
-    quotas: &[u64],
-    seed: u64,
-    stop: &StopFlag,
-    report: &mut dyn FnMut(u64),
-) -> Result<Vec<EndedEpisode>, TestError> {
-    let state = &checkpoint.state;
-    let mut reply = StepReply { observations, ..StepReply::default() };
-    let mut agent = Agent::new(checkpoint, quotas.len(), seed)?;
-    let mut done = vec![false; quotas.len()];
-    let mut counted: Vec<EndedEpisode> = Vec::new();
-    let episodes: u64 = quotas.iter().sum();
-    while (counted.len() as u64) < episodes {
+/// How an episode ended.
+pub(super) fn ending(end: &EndedEpisode) -> Ending {
+    match (end.diverged, end.terminated) {
+        (true, _) => Ending::Diverged,
+        (false, true) => Ending::Terminated,
+        (false, false) => Ending::Truncated,
+    }
+}
+
+/// A policy that plays trials in the environments of a session.
+pub(super) struct Trials<'a> {
+    pub(super) session: Session<'a>,
+    pub(super) agent: Agent<'a>,
+    pub(super) reply: StepReply,
+    /// `[N]` where an episode has just ended.
+    done: Vec<bool>,
+    episodes_per_trial: u32,
+}
+
+impl<'a> Trials<'a> {
+    /// In the environments of `session`, which are at their first `observations` `[N, O]`.
+    pub(super) fn new(session: Session<'a>, agent: Agent<'a>, observations: Vec<f32>, episodes_per_trial: u32) -> Self {
+        let done = vec![false; session.num_envs()];
+        let reply = StepReply { observations, ..StepReply::default() };
+        Self { session, agent, reply, done, episodes_per_trial }
+    }
+
+    /// A step in all environments; gives the episodes that ended a trial in it.
+    pub(super) fn step(&mut self, stop: &StopFlag) -> Result<Vec<EndedEpisode>, TestError> {
         if let Some(signal) = stop.signal() {
             return Err(TestError::Stopped { signal });
         }
-        session.step(agent.act(&mut reply.observations)?, &mut reply)?;
+        let Self { session, agent, reply, done, episodes_per_trial } = self;
+        session.step(agent.act(&mut reply.observations)?, reply)?;
         done.fill(false);
         reply.ended.iter().for_each(|end| done[end.slot] = true);
-        agent.remember(&mut reply.rewards, &done)?;
-        reply.ended.retain(|end| end.episode_in_trial + 1 == state.episodes_per_trial);
-        reply.ended.iter().for_each(|end| agent.forget(end.slot));
-        // Environments that are done go on, unseen: they cost less than a smaller batch would save.
-        count(reply.ended.drain(..), quotas, &mut counted);
-        report(counted.len() as u64);
+        agent.remember(&mut reply.rewards, done)?;
+        let ended: Vec<EndedEpisode> =
+            reply.ended.drain(..).filter(|end| end.episode_in_trial + 1 == *episodes_per_trial).collect();
+        ended.iter().for_each(|end| agent.begin_trial(end.slot, end.trial_index + 1));
+        Ok(ended)
     }
-    Ok(counted)
 }
 
-/// What a test opens of a policy without trials.
-pub fn open_options(environment: &str, version: Version, num_envs: usize, seed: u64) -> OpenOptions {
+/// What a test of one environment opens of a policy without trials.
+pub fn open_options(environment: &str, set: &TestSet, seed: u64) -> OpenOptions {
     OpenOptions {
         environment: environment.to_owned(),
-        version: version.to_proto(),
-        num_envs,
-        seed: environment_seed(seed, version),
+        version: set.version,
+        parameters: set.drawn(),
+        num_envs: 1,
+        seed: environment_seed(seed, set.version),
         episodes_per_trial: 1,
     }
 }
 
-/// How many trials each environment is tested for.
-fn quotas(episodes: u64) -> Vec<u64> {
-    let n = episodes.clamp(1, MOST_ENVS);
-    (0..n).map(|i| episodes / n + u64::from(i < episodes % n)).collect()
-}
-
-/// Adds those of the `ended` episodes, each its trial's last, that were to be counted from the start.
-fn count(ended: impl Iterator<Item = EndedEpisode>, quotas: &[u64], counted: &mut Vec<EndedEpisode>) {
-    counted.extend(ended.filter(|end| end.trial_index < quotas[end.slot]));
-}
-
-fn summarise(episodes: &[EndedEpisode]) -> TestResult {
-    let n = episodes.len() as u64;
-    let successes = episodes.iter().filter(|episode| episode.success).count() as u64;
-    let (low, high) = wilson(successes, n);
-    TestResult {
-        episodes: n,
-        success_percent: 100.0 * successes as f64 / n as f64,
-        success_percent_95: [100.0 * low, 100.0 * high],
-        mean_return: mean(episodes.iter().map(|episode| episode.episode_return)),
-        mean_length: mean(episodes.iter().map(|episode| f64::from(episode.length))),
-    }
+/// How many trials each environment is tested for. Environment i has context i modulo their number, and every context
+/// equally many episodes, at least 1.
+fn quotas(episodes: u64, contexts: usize) -> Vec<u64> {
+    let each = episodes.div_ceil(contexts as u64).max(1);
+    // One context has as many environments as it can use, each of several its share.
+    let copies = ((MOST_ENVS / contexts) as u64).clamp(1, each);
+    (0..copies).flat_map(|i| vec![each / copies + u64::from(i < each % copies); contexts]).collect()
 }
 
 /// Whether the served environment is the one that the policy was trained in.
@@ -181,11 +312,25 @@ mod tests {
 
     #[test]
     fn every_environment_gets_its_share_beforehand() {
-        assert_eq!(quotas(3), [1, 1, 1]);
-        assert_eq!(quotas(1000), vec![10; 100]);
-        let uneven = quotas(250);
+        assert_eq!(quotas(3, 1), [1, 1, 1]);
+        assert_eq!(quotas(1000, 1), vec![10; 100]);
+        let uneven = quotas(250, 1);
         assert_eq!((uneven.len(), uneven.iter().sum::<u64>()), (100, 250));
         assert_eq!((uneven[0], uneven[49], uneven[50], uneven[99]), (3, 3, 2, 2));
+    }
+
+    #[test]
+    fn every_context_gets_equally_many_episodes() {
+        for (episodes, contexts, each) in
+            [(10, 5, 2), (11, 5, 3), (1, 5, 1), (1000, 1600, 1), (1000, 3, 334), (7, 100, 1)]
+        {
+            let quotas = quotas(episodes, contexts);
+            for context in 0..contexts {
+                let own: u64 = quotas.iter().skip(context).step_by(contexts).sum();
+                assert_eq!(own, each, "{episodes} episodes in {contexts} contexts");
+            }
+            assert!(quotas.len() <= MOST_ENVS.max(contexts) && quotas.iter().all(|&quota| quota > 0));
+        }
     }
 
     #[test]
@@ -196,61 +341,8 @@ mod tests {
         assert_eq!(distinct.len(), 300);
         assert!(seeds.iter().all(|&seed| seed > 1000), "none is a seed that people train with");
         for version in Version::ALL {
-            let options = open_options("CartPole", version, 3, 5);
-            assert_eq!(options.seed, environment_seed(5, version));
-            assert_eq!(options.version, version.to_proto());
+            let options = open_options("CartPole", &version.into(), 5);
+            assert_eq!((options.seed, options.version), (environment_seed(5, version), version));
         }
-    }
-
-    fn episode(success: bool, episode_return: f64, length: u32) -> EndedEpisode {
-        EndedEpisode {
-            slot: 0,
-            environment_index: 0,
-            episode_index: 0,
-            trial_index: 0,
-            episode_in_trial: 0,
-            episode_return,
-            length,
-            success,
-            terminated: false,
-            parameters: Vec::new(),
-        }
-    }
-
-    /// Environment 0 has short episodes: the first three to end are all its own.
-    #[test]
-    fn the_first_episodes_of_each_environment_count_not_the_first_to_end() {
-        let of = |slot: usize, trial_index: u64| EndedEpisode {
-            slot,
-            environment_index: slot as u32,
-            trial_index,
-            ..episode(true, 1.0, 1)
-        };
-        let quotas = quotas(3);
-        let mut counted = Vec::new();
-        for ended in [vec![of(0, 0)], vec![of(0, 1)], vec![of(0, 2), of(2, 0)], vec![of(0, 3), of(1, 0)]] {
-            count(ended.into_iter(), &quotas, &mut counted);
-        }
-        let counted: Vec<_> = counted.iter().map(|episode| (episode.slot, episode.trial_index)).collect();
-        assert_eq!(counted, [(0, 0), (2, 0), (1, 0)]);
-
-        let mut counted = Vec::new();
-        count([of(0, 0), of(0, 1), of(0, 2), of(1, 0), of(1, 1)].into_iter(), &[2, 1], &mut counted);
-        let counted: Vec<_> = counted.iter().map(|episode| (episode.slot, episode.trial_index)).collect();
-        assert_eq!(counted, [(0, 0), (0, 1), (1, 0)]);
-    }
-
-    #[test]
-    fn figures_are_means_over_the_episodes() {
-        let result = summarise(&[
-            episode(true, 4.0, 10),
-            episode(false, -2.0, 20),
-            episode(true, 1.0, 60),
-            episode(true, 1.0, 10),
-        ]);
-        assert_eq!((result.episodes, result.success_percent), (4, 75.0));
-        assert_eq!((result.mean_return, result.mean_length), (1.0, 25.0));
-        let [low, high] = result.success_percent_95;
-        assert!((low - 30.064).abs() < 1e-3 && (high - 95.441).abs() < 1e-3, "{low} {high}");
     }
 }

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::{Clock, Monitor, Progress, ProgressLog};
+use crate::checkpoint::EnvironmentSummary;
 use crate::client::EndedEpisode;
 
 const MONITOR: &str = "monitor.csv";
@@ -70,9 +71,9 @@ impl Logs {
     ///
     /// # Errors
     /// [`LogError::Io`].
-    pub fn create(directory: &Path, environment: &str, parameters: &[String], clock: Clock) -> Result<Self> {
+    pub fn create(directory: &Path, environment: &str, spec: &EnvironmentSummary, clock: Clock) -> Result<Self> {
         let path = directory.join(MONITOR);
-        let monitor = Monitor::create(&path, environment, parameters, clock).map_err(io("create", &path))?;
+        let monitor = Monitor::create(&path, environment, spec, clock).map_err(io("create", &path))?;
         let progress = ProgressLog::create(directory, clock.t_start()).map_err(io("create the logs in", directory))?;
         // Their names must be on the disk before a checkpoint counts on them.
         File::open(directory).and_then(|directory| directory.sync_all()).map_err(io("sync", directory))?;
@@ -162,6 +163,7 @@ mod tests {
     use std::fs;
 
     use super::*;
+    use crate::policy::ActionKind;
 
     fn episode(length: u32) -> EndedEpisode {
         EndedEpisode {
@@ -174,12 +176,23 @@ mod tests {
             length,
             success: true,
             terminated: true,
-            parameters: vec![],
+            diverged: false,
+            achieved: None,
+            receipt: Default::default(),
         }
     }
 
     fn start(directory: &Path) -> Logs {
-        Logs::create(directory, "CartPole", &[], Clock::new(100.0, 0.0)).unwrap()
+        let spec = EnvironmentSummary {
+            revision: 0,
+            step_limit: 200,
+            observation: Vec::new(),
+            action: ActionKind::Discrete { n: 2 },
+            parameters: Vec::new(),
+            applied: Vec::new(),
+            model_hash: String::new(),
+        };
+        Logs::create(directory, "CartPole", &spec, Clock::new(100.0, 0.0)).unwrap()
     }
 
     fn read(directory: &Path, name: &str) -> String {

@@ -6,11 +6,13 @@ use std::path::Path;
 
 use super::Clock;
 use super::logs::sync;
+use crate::checkpoint::EnvironmentSummary;
 use crate::client::EndedEpisode;
 
 /// Writes stable-baselines3's Monitor format: a line of JSON after `#`, a header, and a line an episode with its return
 /// `r`, its length `l` and the seconds `t` since the start; then `success`, `terminated` (0 or 1), `episode_index`,
-/// `environment_index`, `trial_index`, `episode_in_trial`, and a column for each parameter.
+/// `environment_index`, `trial_index`, `episode_in_trial`, a column for each parameter as it was requested, and
+/// `applied_…` for each quantity that was read back from the physics.
 #[derive(Debug)]
 pub struct Monitor {
     writer: csv::Writer<BufWriter<File>>,
@@ -22,7 +24,7 @@ impl Monitor {
     ///
     /// # Errors
     /// The operating system's.
-    pub fn create(path: &Path, environment: &str, parameters: &[String], clock: Clock) -> std::io::Result<Self> {
+    pub fn create(path: &Path, environment: &str, spec: &EnvironmentSummary, clock: Clock) -> std::io::Result<Self> {
         let mut file = BufWriter::new(File::create(path)?);
         writeln!(file, "#{}", serde_json::json!({ "t_start": clock.t_start(), "env_id": environment }))?;
         let mut writer = csv::Writer::from_writer(file);
@@ -37,7 +39,9 @@ impl Monitor {
             "trial_index",
             "episode_in_trial",
         ];
-        writer.write_record(columns.into_iter().chain(parameters.iter().map(String::as_str)))?;
+        let applied = spec.applied.iter().map(|name| format!("applied_{name}"));
+        let of_environment = spec.parameters.iter().cloned().chain(applied);
+        writer.write_record(columns.into_iter().map(str::to_owned).chain(of_environment))?;
         Ok(Self { writer, clock })
     }
 
@@ -63,8 +67,8 @@ impl Monitor {
             episode.trial_index.to_string(),
             episode.episode_in_trial.to_string(),
         ];
-        let parameters = episode.parameters.iter().map(f64::to_string);
-        Ok(self.writer.write_record(fixed.into_iter().chain(parameters))?)
+        let values = episode.receipt.requested.iter().chain(&episode.receipt.applied).map(f64::to_string);
+        Ok(self.writer.write_record(fixed.into_iter().chain(values))?)
     }
 
     /// Hands what was written to the operating system.
@@ -85,13 +89,23 @@ impl Monitor {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::policy::ActionKind;
+    use crate::proto::Receipt;
 
     #[test]
     fn the_file_is_one_that_stable_baselines3_reads() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("monitor.csv");
-        let parameters = ["mass".to_owned(), "length".to_owned()];
-        let mut monitor = Monitor::create(&path, "CartPole", &parameters, Clock::new(12.5, 3.0)).unwrap();
+        let spec = EnvironmentSummary {
+            revision: 0,
+            step_limit: 200,
+            observation: Vec::new(),
+            action: ActionKind::Discrete { n: 2 },
+            parameters: vec!["mass".into(), "length".into()],
+            applied: vec!["length".into()],
+            model_hash: String::new(),
+        };
+        let mut monitor = Monitor::create(&path, "CartPole", &spec, Clock::new(12.5, 3.0)).unwrap();
         let episode = EndedEpisode {
             slot: 1,
             environment_index: 3,
@@ -102,7 +116,9 @@ mod tests {
             length: 18,
             success: false,
             terminated: true,
-            parameters: vec![0.1, 0.25],
+            diverged: false,
+            achieved: None,
+            receipt: Receipt { requested: vec![0.1, 0.25], applied: vec![0.25], model_hash: String::new() },
         };
         monitor.write(&episode).unwrap();
         monitor.flush().unwrap();
@@ -112,12 +128,12 @@ mod tests {
         assert_eq!(first, serde_json::json!({ "t_start": 12.5, "env_id": "CartPole" }));
         assert_eq!(
             lines[1],
-            "r,l,t,success,terminated,episode_index,environment_index,trial_index,episode_in_trial,mass,length"
+            "r,l,t,success,terminated,episode_index,environment_index,trial_index,episode_in_trial,mass,length,applied_length"
         );
         let fields: Vec<&str> = lines[2].split(',').collect();
         assert_eq!(fields[..2], ["17.500000", "18"]);
         assert!(fields[2].parse::<f64>().unwrap() >= 3.0);
-        assert_eq!(fields[3..], ["0", "1", "4", "3", "4", "0", "0.1", "0.25"]);
+        assert_eq!(fields[3..], ["0", "1", "4", "3", "4", "0", "0.1", "0.25", "0.25"]);
         assert_eq!(lines.len(), 3);
     }
 }

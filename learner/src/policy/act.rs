@@ -44,6 +44,26 @@ pub struct Acts {
     pub values: Vec<f32>,
 }
 
+/// Where the random numbers of each environment's actions come from.
+pub trait Streams {
+    /// The stream of `environment`, one of 0 … N-1.
+    fn of(&mut self, environment: usize) -> &mut ChaCha8Rng;
+}
+
+/// One for all, in their order.
+impl Streams for ChaCha8Rng {
+    fn of(&mut self, _: usize) -> &mut ChaCha8Rng {
+        self
+    }
+}
+
+/// One for each.
+impl Streams for Vec<ChaCha8Rng> {
+    fn of(&mut self, environment: usize) -> &mut ChaCha8Rng {
+        &mut self[environment]
+    }
+}
+
 impl Actor {
     /// An actor for at most `max_batch` observations at a time, with all weights 0 until [`Actor::load`].
     pub fn new(spec: &PolicySpec, max_batch: usize) -> Self {
@@ -82,11 +102,11 @@ impl Actor {
         Ok(())
     }
 
-    /// Samples an action for each normalised observation of `observations` `[N, O]`, in order of n; draws from `rng` once
-    /// per discrete action and twice per element of a continuous one. Replaces what is in `out`.
+    /// Samples an action for each normalised observation of `observations` `[N, O]`, in order of n; draws from `streams`
+    /// once per discrete action and twice per element of a continuous one. Replaces what is in `out`.
     ///
     /// Row n is environment n: a recurrent policy remembers the observation.
-    pub fn act(&mut self, observations: &[f32], rng: &mut ChaCha8Rng, out: &mut Acts) -> Result<()> {
+    pub fn act(&mut self, observations: &[f32], streams: &mut impl Streams, out: &mut Acts) -> Result<()> {
         let n_envs = self.count(observations)?;
         let (width, outputs) = (self.spec.action.width(), self.spec.action.outputs());
         let (heads, values) = match &mut self.networks {
@@ -101,6 +121,7 @@ impl Actor {
         replace_by_first_column(&mut out.values, values);
         for (n, head) in heads.chunks_exact(padded(outputs)).enumerate() {
             let (head, action) = (&head[..outputs], &mut out.actions[n * width..][..width]);
+            let rng = streams.of(n);
             let log_prob = match self.spec.action {
                 ActionKind::Discrete { .. } => {
                     let (choice, log_prob) = sample_categorical(head, rng);

@@ -14,7 +14,7 @@ mod rc;
 mod sequences;
 mod tanh;
 
-pub use act::{Actor, Acts};
+pub use act::{Actor, Acts, Streams};
 pub use distribution::Distributions;
 pub use inputs::Inputs;
 pub use learn::{Evaluated, Policy};

@@ -3,8 +3,8 @@
 use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
 use perturb_learner::client::{Address, OpenOptions, PrivateServer, PrivateServerOptions, Servers};
 use perturb_learner::policy::{Policy, PolicySpec};
-use perturb_learner::proto;
 use perturb_learner::rollout::Rollout;
+use perturb_study::Version;
 use perturb_study::random::{Purpose, normal, stream};
 use perturb_study::settings::{A2cConfig, PpoConfig};
 
@@ -24,7 +24,8 @@ pub fn connect(servers: &[PrivateServer]) -> Servers {
 pub fn options(environment: &str, num_envs: usize, episodes_per_trial: u32) -> OpenOptions {
     OpenOptions {
         environment: environment.into(),
-        version: proto::Version::Random,
+        version: Version::R,
+        parameters: Default::default(),
         num_envs,
         seed: 3,
         episodes_per_trial,

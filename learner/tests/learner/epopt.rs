@@ -520,7 +520,7 @@ fn which_episodes_are_collected_is_fixed_beforehand() {
         let last = rollout.episodes().iter().map(|span| span.start + span.length).max();
         assert_eq!(last, Some(rollout.n_steps()), "it ends with the last episode");
         assert!(ended.iter().any(|e| e.length != ended[0].length), "lengths differ");
-        parameters.extend(ended.iter().map(|episode| format!("{:?}", episode.parameters)));
+        parameters.extend(ended.iter().map(|episode| format!("{:?}", episode.receipt.requested)));
     }
     assert_eq!(parameters.len(), 2 * COUNT, "every episode is in an environment of its own");
 }

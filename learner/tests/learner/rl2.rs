@@ -202,7 +202,7 @@ fn a_trial_is_in_one_environment_and_the_next_in_another() {
         let own: Vec<&EndedEpisode> = ended.iter().map(|(_, e)| e).filter(|episode| episode.slot == n).collect();
         for pair in own.windows(2) {
             let same = pair[0].trial_index == pair[1].trial_index;
-            assert_eq!(pair[0].parameters == pair[1].parameters, same, "{pair:?}");
+            assert_eq!(pair[0].receipt == pair[1].receipt, same, "{pair:?}");
             compared[usize::from(same)] += 1;
         }
     }

@@ -110,7 +110,7 @@ pub struct EpisodeRecord {
 }
 
 /// How far requested and applied parameters agree.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Agreement {
     /// Episodes in which all parameters were compared.
     pub episodes: u64,
@@ -119,7 +119,7 @@ pub struct Agreement {
 }
 
 /// A parameter that was asked for, and what the physics had instead.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Difference {
     /// The parameter.
     pub parameter: String,

@@ -123,7 +123,6 @@ fn reason(why: NoHeatmap) -> &'static str {
         NoHeatmap::NoResult => "no heatmap, since this training has no result yet",
         NoHeatmap::NotMade => "the heatmap has not been made",
         NoHeatmap::Outdated => "the heatmap is of an earlier result",
-        NoHeatmap::NoAxes => "no heatmap, since it is not known which two parameters to show",
     }
 }
 
@@ -131,7 +130,7 @@ fn reason(why: NoHeatmap) -> &'static str {
 fn advice(missing: &[NoHeatmap], all: usize) -> Vec<String> {
     let count = |of: &[NoHeatmap]| missing.iter().filter(|why| of.contains(why)).count();
     let makeable = count(&[NoHeatmap::NotMade, NoHeatmap::Outdated]);
-    let (waiting, unknown) = (count(&[NoHeatmap::NoResult]), count(&[NoHeatmap::NoAxes]));
+    let waiting = count(&[NoHeatmap::NoResult]);
     let mut advice = Vec::new();
     if makeable > 0 {
         advice.push(format!(
@@ -142,17 +141,12 @@ fn advice(missing: &[NoHeatmap], all: usize) -> Vec<String> {
     if waiting > 0 {
         advice.push(format!("Heatmaps that wait for the results of their trainings: {waiting} of {all}."));
     }
-    if unknown > 0 {
-        advice.push(format!(
-            "Heatmaps without usual parameters: {unknown} of {all}. `perturb heatmap --checkpoint` takes any two."
-        ));
-    }
     advice
 }
 
 /// What a heatmap's caption says after who was tested.
 fn details(record: &HeatmapRecord) -> String {
-    let HeatmapOptions { parameters: [x, y], grid, episodes, seed } = &record.options;
+    let HeatmapOptions { parameters: [x, y], grid, episodes, seed, .. } = &record.options;
     let episodes = if *episodes == 1 { "1 episode".into() } else { format!("{episodes} episodes") };
     format!(
         " with seed {}: {x} and {y}, {grid} × {grid} points of {episodes}, test seed {seed}. Cell {}, checkpoint {}, \

@@ -18,6 +18,7 @@ pub(super) fn common(algorithm: AlgorithmName, architecture: Architecture) -> Co
     Common {
         environment: String::new(),
         version: Version::D,
+        parameters: Default::default(),
         algorithm,
         architecture,
         episodes: 15_000,

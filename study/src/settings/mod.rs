@@ -20,10 +20,14 @@ use config::{Config, File, FileFormat};
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use perturb_protocol::Version;
+use perturb_protocol::{Distribution, Version};
+
+use crate::sets::Parameters;
 
 /// The most environments of one training.
 const MOST_ENVS: usize = 65_536;
+/// The key of [`Common::parameters`].
+const PARAMETERS: &str = "parameters";
 /// As they are typed.
 const ARCHITECTURES: &[&str] = &["ff", "rc"];
 
@@ -43,6 +47,10 @@ pub struct Common {
     pub environment: String,
     /// Where its parameters come from while training.
     pub version: Version,
+    /// What replaces the version's distributions of some parameters while training, e.g. `length = "0.8..1.0"` in the
+    /// table `[parameters]` (default: nothing).
+    #[serde(default, skip_serializing_if = "Parameters::is_empty")]
+    pub parameters: Parameters,
     /// What learns.
     pub algorithm: AlgorithmName,
     /// What acts.
@@ -163,7 +171,8 @@ fn resolve(layers: &[(String, Table)]) -> Result<TrainConfig, ConfigError> {
         None => algorithm.default_architecture(),
         Some(value) => choice("architecture", value, ARCHITECTURES)?,
     };
-    let defaults = TrainConfig::defaults(algorithm, architecture).table();
+    let mut defaults = TrainConfig::defaults(algorithm, architecture).table();
+    defaults.insert(PARAMETERS.into(), Value::Table(Table::new())); // empty, it is not written
     for (origin, table) in layers {
         for (key, value) in table {
             check(origin, key, value, &defaults, algorithm)?;
@@ -226,12 +235,26 @@ fn check(
         (Value::Float(_), Value::Float(_) | Value::Integer(_)) => return Ok(()),
         (Value::Integer(_), Value::Integer(0..)) => return Ok(()),
         (Value::Boolean(_), Value::Boolean(_)) | (Value::String(_), Value::String(_)) => return Ok(()),
+        (Value::Table(_), Value::Table(parameters)) => return check_parameters(parameters),
+        (Value::Table(_), _) => "a table of parameters and their values",
         (Value::Float(_), _) => "a number",
         (Value::Integer(_), _) => "a whole number that is not negative",
         (Value::Boolean(_), _) => "true or false",
         _ => "a text",
     };
     Err(ConfigError::Value { key: key.to_owned(), got: show(value), expected: expected.to_owned() })
+}
+
+/// Whether every value of the table `[parameters]` is a distribution.
+fn check_parameters(parameters: &Table) -> Result<(), ConfigError> {
+    for (name, value) in parameters {
+        value.clone().try_into::<Distribution>().map_err(|_| ConfigError::Value {
+            key: format!("{PARAMETERS}.{name}"),
+            got: show(value),
+            expected: "a value, or a text such as \"0.3..0.4\" or \"0.3..0.4,0.8..0.9\"".into(),
+        })?;
+    }
+    Ok(())
 }
 
 /// One of a few names.

@@ -224,7 +224,7 @@ fn a_plan_survives_the_loss_of_a_node() {
             "{}",
             cell.id
         );
-        for version in &cell.tests.versions {
+        for version in cell.tests.sets.iter().filter_map(|set| set.plain()) {
             assert_eq!(experiment.said("slurm", &cell.id, &format!("testing on {version}")), 1, "{}", cell.id);
         }
     }

@@ -1,0 +1,80 @@
+//! `perturb audit`.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+use perturb_learner::checkpoint::Checkpoint;
+use perturb_learner::evaluation::{Audit, audit};
+use perturb_study::Folder;
+use perturb_study::interrupt::StopFlag;
+use perturb_study::records::{FILE, Records};
+
+use super::args::AuditArgs;
+use super::bar::Bar;
+use super::rates::file_in;
+use super::{Ending, UsageError, servers};
+
+/// So many differences are told of each policy.
+const SHOWN: usize = 3;
+
+/// Recorded episodes and the policy that they are of.
+struct Tested {
+    name: String,
+    records: PathBuf,
+    checkpoint: PathBuf,
+}
+
+pub(super) fn run(args: &AuditArgs) -> Result<Ending> {
+    let tested = tested(args)?;
+    let stop = StopFlag::on_signals().context("cannot wait for signals")?;
+    let servers = servers(&args.server, 0)?;
+    let mut out = std::io::stdout();
+    let (mut played, mut different) = (0, 0);
+    for one in &tested {
+        let records = Records::read(&one.records)?;
+        let checkpoint = Checkpoint::load(&one.checkpoint)?;
+        let most = if args.all { usize::MAX } else { args.episodes };
+        let mut bar = Bar::new(format!("playing {} again", one.name), most.min(records.episodes.len()) as u64);
+        let done = audit(&servers, &checkpoint, &records, most, &stop, &mut |episodes| bar.testing(episodes))?;
+        drop(bar);
+        let Audit { episodes, different: of_policy } = done;
+        for line in of_policy.iter().take(SHOWN) {
+            writeln!(out, "{}: {line}", one.name)?;
+        }
+        played += episodes;
+        different += of_policy.len() as u64;
+    }
+    let recorded = if tested.len() == 1 { "1 policy".to_owned() } else { format!("{} policies", tested.len()) };
+    writeln!(out, "{} of {played} episodes of {recorded} have the same bytes", played - different)?;
+    Ok(if different == 0 { Ending::Done } else { Ending::Status(1) })
+}
+
+/// Whatever `args` names.
+fn tested(args: &AuditArgs) -> Result<Vec<Tested>> {
+    let path = &args.path;
+    let cell = |path: &Path| Tested {
+        name: path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+        records: path.join(FILE),
+        checkpoint: path.join("training"),
+    };
+    if let Some(checkpoint) = &args.checkpoint {
+        let name = path.display().to_string();
+        return Ok(vec![Tested { name, records: file_in(path), checkpoint: checkpoint.clone() }]);
+    }
+    if path.join(FILE).is_file() {
+        return Ok(vec![cell(path)]);
+    }
+    if !path.is_dir() {
+        let message = format!("{} is a file of records: give --checkpoint, the policy that was tested", path.display());
+        return Err(UsageError(message).into());
+    }
+    let folder = Folder::new(path);
+    let plan = perturb_study::Plan::load(&folder.require_plan()?)?;
+    let cells = plan.cells.iter().map(|found| folder.cell(&found.id).path().to_owned());
+    let tested: Vec<Tested> = cells.filter(|path| path.join(FILE).is_file()).map(|path| cell(&path)).collect();
+    if tested.is_empty() {
+        bail!("no cell of {} has recorded episodes", path.display());
+    }
+    Ok(tested)
+}

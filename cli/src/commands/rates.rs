@@ -1,0 +1,49 @@
+//! `perturb rates`.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Result, bail};
+use perturb_study::TestResult;
+use perturb_study::records::{FILE, Records};
+use perturb_study::success::Criterion;
+use perturb_study::table::Table;
+
+use super::args::RatesArgs;
+use super::{Ending, UsageError};
+
+pub(super) fn run(args: &RatesArgs) -> Result<Ending> {
+    let records = Records::read(&file_in(&args.path))?;
+    let about = &records.about;
+    let Some(own) = &about.success else {
+        bail!("{} does not say what its episodes achieved: test again", args.path.display());
+    };
+    let criteria: Vec<Criterion> = match &args.success[..] {
+        [] => vec![own.clone()],
+        thresholds => {
+            let with = |threshold| own.with(threshold).map_err(|error| UsageError(error.to_string()));
+            thresholds.iter().map(with).collect::<Result<_, _>>()?
+        }
+    };
+    let mut rows: Vec<(&str, &Criterion, TestResult)> = Vec::new();
+    for test in &about.tests {
+        let name = test.set.name.as_str();
+        rows.extend(criteria.iter().map(|criterion| (name, criterion, records.result(name, Some(criterion)))));
+    }
+    let table = Table::of("", &rows)
+        .text("tested on", |(set, ..)| set)
+        .text("success", |(_, criterion, _)| criterion)
+        .number("episodes", |(.., result)| result.episodes)
+        .number("success, %", |(.., result)| format!("{:.1}", result.success_percent))
+        .number("95 % interval", |(.., result)| {
+            let [low, high] = result.success_percent_95;
+            format!("{low:.1} … {high:.1}")
+        });
+    writeln!(std::io::stdout(), "{}, policy {}\n{}", about.environment, about.policy, table.build().to_text())?;
+    Ok(Ending::Done)
+}
+
+/// The recorded episodes in `path`, which may be the folder that holds them.
+pub(super) fn file_in(path: &Path) -> PathBuf {
+    if path.is_dir() { path.join(FILE) } else { path.to_owned() }
+}

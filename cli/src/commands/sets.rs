@@ -1,0 +1,55 @@
+//! The sets of parameters that are typed.
+
+use std::path::Path;
+
+use perturb_study::Version;
+pub(super) use perturb_study::sets::Context as Fixed;
+use perturb_study::sets::{Assignment, Contexts, SetError, TestSet, set_of, set_of_csv};
+
+use super::UsageError;
+
+use super::args::SetArgs;
+
+/// What a set that is typed is called.
+const NAME: &str = "parameters";
+
+/// A refusal of what was typed.
+pub(super) fn usage(error: SetError) -> UsageError {
+    UsageError(error.to_string())
+}
+
+/// What to test on: `versions`, and the set that is typed; without either, all versions.
+pub(super) fn tested(versions: &[Version], args: &SetArgs) -> Result<Vec<TestSet>, UsageError> {
+    let mut versions = versions.to_vec();
+    versions.sort_unstable();
+    versions.dedup();
+    let mut sets: Vec<TestSet> = versions.into_iter().map(TestSet::from).collect();
+    if !args.parameters.is_empty() {
+        sets.push(set_of(NAME, args.base, args.parameters.clone()).map_err(usage)?);
+    }
+    if let Some(path) = &args.contexts {
+        let text =
+            std::fs::read(path).map_err(|error| UsageError(format!("cannot read {}: {error}", path.display())))?;
+        sets.push(set_of_csv(&stem(path), args.base, &text).map_err(usage)?);
+    }
+    Ok(if sets.is_empty() { Version::ALL.map(TestSet::from).to_vec() } else { sets })
+}
+
+/// The set of `version` in which the parameters that are typed are drawn.
+pub(super) fn drawn(version: Version, parameters: &[Assignment]) -> Result<TestSet, UsageError> {
+    if parameters.is_empty() {
+        return Ok(version.into());
+    }
+    let set = set_of(NAME, version, parameters.to_vec()).map_err(usage)?;
+    match set.contexts {
+        Contexts::Drawn(_) => Ok(set),
+        Contexts::Listed(_) => Err(UsageError(
+            "--parameters has the points of a grid here; give values or intervals, as length=0.8..0.9".into(),
+        )),
+    }
+}
+
+/// A file's name without its folder and ending.
+fn stem(path: &Path) -> String {
+    path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+}
