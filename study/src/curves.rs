@@ -5,7 +5,7 @@ use std::path::Path;
 use serde::Deserialize;
 
 use super::folder::{Folder, FolderError, io};
-use super::selection::Selection;
+use super::selection::MethodResults;
 use super::statistics::Summary;
 use super::table::Table;
 use crate::{Method, Version, mean};
@@ -15,10 +15,10 @@ const LEAST_EPISODES: usize = 20;
 /// … and a curve has at most so many points.
 const MOST_POINTS: usize = 100;
 
-/// The curves of an environment.
+/// The curves of all methods in an environment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EnvironmentCurves {
-    /// The environment.
+    /// Its name.
     pub environment: String,
     /// For each method and training version that has a finished training.
     pub curves: Vec<Curve>,
@@ -27,7 +27,7 @@ pub struct EnvironmentCurves {
 /// A method's curve on a training version.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Curve {
-    /// What learned.
+    /// What was trained.
     pub method: Method,
     /// Where it was trained.
     pub version: Version,
@@ -59,7 +59,7 @@ struct Episode {
 ///
 /// # Errors
 /// [`FolderError`] if a file is there that cannot be read.
-pub fn read_curves(selections: &[Selection<'_>], folder: &Folder) -> Result<Vec<EnvironmentCurves>, FolderError> {
+pub fn read_curves(selections: &[MethodResults<'_>], folder: &Folder) -> Result<Vec<EnvironmentCurves>, FolderError> {
     let mut all = Vec::new();
     for of_environment in selections.chunk_by(|a, b| a.environment == b.environment) {
         let mut curves = Vec::new();
@@ -79,7 +79,7 @@ pub fn read_curves(selections: &[Selection<'_>], folder: &Folder) -> Result<Vec<
 /// A training's budget and the episodes that it became.
 type Run = (u64, Vec<Episode>);
 
-fn read_runs(selection: &Selection<'_>, version: Version, folder: &Folder) -> Result<Vec<Run>, FolderError> {
+fn read_runs(selection: &MethodResults<'_>, version: Version, folder: &Folder) -> Result<Vec<Run>, FolderError> {
     let mut runs = Vec::new();
     for selected in selection.runs.values().filter_map(|run| run.trained_on(version)) {
         let episodes = read_monitor(&folder.cell(&selected.cell.id).training().join("monitor.csv"))?;

@@ -333,11 +333,7 @@ impl CellFolder {
     }
 
     fn write(&self, name: &str, document: &impl Serialize) -> Result<()> {
-        let path = self.path.join(name);
-        let mut text = serde_json::to_vec_pretty(document)
-            .map_err(|error| FolderError::Damaged { path: path.clone(), reason: error.to_string() })?;
-        text.push(b'\n');
-        write_atomically(&path, &text)
+        write_json(&self.path.join(name), document)
     }
 }
 
@@ -386,6 +382,14 @@ fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
     let Some(text) = read_bytes(path)? else { return Ok(None) };
     let damaged = |error: serde_json::Error| FolderError::Damaged { path: path.to_owned(), reason: error.to_string() };
     serde_json::from_slice(&text).map(Some).map_err(damaged)
+}
+
+/// Writes a JSON file in one piece.
+pub(super) fn write_json(path: &Path, document: &impl Serialize) -> Result<()> {
+    let mut text = serde_json::to_vec_pretty(document)
+        .map_err(|error| FolderError::Damaged { path: path.to_owned(), reason: error.to_string() })?;
+    text.push(b'\n');
+    write_atomically(path, &text)
 }
 
 /// Writes a file in one piece: it appears complete, and on the disk, or not at all. Folders are created.

@@ -7,6 +7,7 @@ use perturb_protocol::proto::{self, Interval};
 use crate::means::mean;
 use crate::records::{EpisodeRecord, Records};
 use crate::sets::Context;
+use crate::table::Table;
 
 /// The most points along an axis: all environments run together.
 pub const MOST_POINTS: usize = 100;
@@ -57,10 +58,21 @@ pub struct Heatmap {
     pub grid: usize,
     /// Episodes at each point.
     pub episodes: u64,
-    /// `[G, G]` mean undiscounted returns, by y, then x, in ascending order.
-    pub returns: Vec<f64>,
-    /// `[G, G]` success rates, %.
-    pub success: Vec<f64>,
+    /// `[G, G]`, by y, then x, in ascending order.
+    pub points: Vec<HeatmapPoint>,
+}
+
+/// A policy's figures where the two parameters have these values.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct HeatmapPoint {
+    /// The value of the parameter along x.
+    pub x: f64,
+    /// The value of the parameter along y.
+    pub y: f64,
+    /// Undiscounted.
+    pub mean_return: f64,
+    /// Successes, %.
+    pub success_percent: f64,
 }
 
 impl Axis {
@@ -98,43 +110,40 @@ impl Heatmap {
         let test = records.about.tests.iter().find(|test| test.set.name == Self::SET)?;
         let contexts = test.set.listed();
         let (points, grid) = (contexts.len(), contexts.len().isqrt());
+        let [x, y] = &axes;
+        let place = |point: usize| (x.value(point % grid, grid), y.value(point / grid, grid));
         let fits = |(point, context): (usize, &Context)| {
-            let [x, y] = &axes;
-            context.get(&x.name) == Some(&x.value(point % grid, grid))
-                && context.get(&y.name) == Some(&y.value(point / grid, grid))
+            (context.get(&x.name), context.get(&y.name)) == (Some(&place(point).0), Some(&place(point).1))
         };
         if grid * grid != points || !contexts.iter().enumerate().all(fits) {
             return None;
         }
         let mut by_point: Vec<Vec<&EpisodeRecord>> = vec![Vec::new(); points];
         records.of(Self::SET).for_each(|episode| by_point[episode.environment_index as usize % points].push(episode));
-        let means = |of: fn(&EpisodeRecord) -> f64| {
-            by_point.iter().map(|episodes| mean(episodes.iter().map(|episode| of(episode)))).collect()
+        let figures = |(point, episodes): (usize, &Vec<&EpisodeRecord>)| HeatmapPoint {
+            x: place(point).0,
+            y: place(point).1,
+            mean_return: mean(episodes.iter().map(|episode| episode.episode_return)),
+            success_percent: mean(episodes.iter().map(|episode| if episode.success { 100.0 } else { 0.0 })),
         };
         Some(Self {
             environment: records.about.environment.clone(),
             policy,
-            axes,
             grid,
             episodes: by_point.first()?.len() as u64,
-            returns: means(|episode| episode.episode_return),
-            success: means(|episode| if episode.success { 100.0 } else { 0.0 }),
+            points: by_point.iter().enumerate().map(figures).collect(),
+            axes,
         })
     }
 }
 
-/// The figures as CSV: a line a point.
-///
-/// # Errors
-/// [`csv::Error`], which writing to memory does not give.
-pub fn heatmap_csv(heatmap: &Heatmap) -> Result<Vec<u8>, csv::Error> {
-    let mut writer = csv::Writer::from_writer(Vec::new());
+/// A line for each point.
+pub fn heatmap_table(heatmap: &Heatmap) -> Table {
     let [x, y] = &heatmap.axes;
-    writer.write_record([x.name.as_str(), y.name.as_str(), "mean_return", "success_percent"])?;
-    for (slot, (episode_return, success)) in heatmap.returns.iter().zip(&heatmap.success).enumerate() {
-        let (column, row) = (slot % heatmap.grid, slot / heatmap.grid);
-        let point = [x.value(column, heatmap.grid), y.value(row, heatmap.grid), *episode_return, *success];
-        writer.write_record(point.map(|number| number.to_string()))?;
-    }
-    writer.into_inner().map_err(|error| error.into_error().into())
+    Table::of("", &heatmap.points)
+        .number(&x.name, |point| point.x)
+        .number(&y.name, |point| point.y)
+        .number("mean_return", |point| point.mean_return)
+        .number("success_percent", |point| point.success_percent)
+        .build()
 }

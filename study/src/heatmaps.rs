@@ -13,11 +13,11 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::folder::{Folder, FolderError, read_bytes, write_atomically};
-use super::heatmap::{Heatmap, HeatmapOptions, heatmap_csv};
+use super::folder::{Folder, FolderError, io, read_bytes, write_atomically, write_json};
+use super::heatmap::{Heatmap, HeatmapOptions, heatmap_table};
 use super::plan::Cell;
 use super::plot::{self, PlotError};
-use super::selection::{Selected, Selection};
+use super::selection::{MethodResults, Selected};
 use crate::{Method, Version};
 
 /// Of the records; raised when older programs could misread them.
@@ -69,20 +69,23 @@ pub struct StoredHeatmap {
 }
 
 /// Why there is no heatmap at a place.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum NoHeatmap {
-    /// The training has no result yet.
+    /// The training was not done yet.
+    #[error("no heatmap, since this training has no result yet")]
     NoResult,
-    /// It was not made, or not completely.
+    /// Nor is one that was not made completely.
+    #[error("the heatmap has not been made")]
     NotMade,
-    /// It shows a result that has been replaced.
+    /// The result has been replaced.
+    #[error("the heatmap is of an earlier result")]
     Outdated,
 }
 
 /// All heatmaps that a plan has room for, in the order of `selections` and of the versions that it trains on.
-pub fn heatmap_places<'a>(selections: &'a [Selection<'a>]) -> Vec<HeatmapPlace<'a>> {
-    let of_selection = |selection: &'a Selection<'a>| {
-        let Selection { environment, method, runs, .. } = selection;
+pub fn heatmap_places<'a>(selections: &'a [MethodResults<'a>]) -> Vec<HeatmapPlace<'a>> {
+    let of_selection = |selection: &'a MethodResults<'a>| {
+        let MethodResults { environment, method, runs, .. } = selection;
         let first = runs.values().next().into_iter().flat_map(|run| &run.0);
         first.map(move |(&version, &selected)| HeatmapPlace { environment, method, version, selected })
     };
@@ -138,18 +141,14 @@ pub fn store_heatmap(
     heatmap: &Heatmap,
 ) -> Result<PathBuf, PlotError> {
     let record_path = file(folder, &cell.id, "json");
-    let failed = |error: FolderError| PlotError::file(&record_path, &error);
-    let result = result_checksum(folder, cell).map_err(failed)?;
+    let result = result_checksum(folder, cell)?;
     match std::fs::remove_file(&record_path) {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-            return Err(PlotError::file(&record_path, &error));
-        }
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(io("delete", &record_path)(error))?,
         _ => {}
     }
     let mut files = BTreeMap::new();
     for (ending, content) in heatmap_files(heatmap)? {
-        let path = file(folder, &cell.id, ending);
-        write_atomically(&path, &content).map_err(|error| PlotError::file(&path, &error))?;
+        write_atomically(&file(folder, &cell.id, ending), &content)?;
         files.insert(ending.to_owned(), checksum(&content));
     }
     let record = HeatmapRecord {
@@ -162,9 +161,7 @@ pub fn store_heatmap(
         commit: crate::VERSION.into(),
         files,
     };
-    let mut text = serde_json::to_vec_pretty(&record).map_err(|error| PlotError::file(&record_path, &error))?;
-    text.push(b'\n');
-    write_atomically(&record_path, &text).map_err(failed)?;
+    write_json(&record_path, &record)?;
     Ok(record_path.with_extension(""))
 }
 
@@ -173,9 +170,12 @@ pub fn store_heatmap(
 /// # Errors
 /// [`PlotError`].
 pub fn heatmap_files(heatmap: &Heatmap) -> Result<[(&'static str, Vec<u8>); 3], PlotError> {
-    let table = heatmap_csv(heatmap).map_err(|error| PlotError::Draw(error.to_string()))?;
     let picture = plot::draw_heatmap(heatmap);
-    Ok([("csv", table), ("svg", plot::svg(&picture)?.into_bytes()), ("png", plot::png(&picture)?)])
+    Ok([
+        ("csv", heatmap_table(heatmap).to_csv()),
+        ("svg", plot::svg(&picture)?.into_bytes()),
+        ("png", plot::png(&picture)?),
+    ])
 }
 
 fn file(folder: &Folder, id: &str, ending: &str) -> PathBuf {
@@ -194,7 +194,7 @@ fn checksum(content: &[u8]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Axis, Plan, fixture};
+    use crate::{Axis, HeatmapPoint, Plan, fixture};
 
     const PLAN: &str = "environments = ['Pendulum', 'Elsewhere']\nversions = ['D', 'E']\nruns = 2
         [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
@@ -214,8 +214,9 @@ mod tests {
             axes: ["mass", "length"].map(axis),
             grid: 2,
             episodes: 1,
-            returns: vec![1.0, 2.0, 3.0, 4.0],
-            success: vec![0.0, 0.0, 50.0, 100.0],
+            points: [(1.0, 0.0), (2.0, 0.0), (3.0, 50.0), (4.0, 100.0)]
+                .map(|(mean_return, success_percent)| HeatmapPoint { x: 0.0, y: 0.0, mean_return, success_percent })
+                .into(),
         }
     }
 

@@ -39,7 +39,7 @@ pub use folder::{
     CellFolder, CellLock, CellResult, CellState, Failure, FailureMark, Folder, FolderError, Timing, Training, io,
     write_atomically,
 };
-pub use heatmap::{Axis, Heatmap, HeatmapOptions, MOST_POINTS, heatmap_csv};
+pub use heatmap::{Axis, Heatmap, HeatmapOptions, HeatmapPoint, MOST_POINTS, heatmap_table};
 pub use heatmaps::{
     HeatmapPlace, HeatmapRecord, NoHeatmap, StoredHeatmap, heatmap_files, heatmap_places, store_heatmap,
 };
@@ -49,7 +49,7 @@ pub use plan::{Cell, Counts, Plan, PlanCheckError, PlanError, Tests};
 pub use results::{Counters, TestResult};
 pub use run::{Attempt, BUSY, NO_SERVER, ON, RunEnd, RunError, RunOptions, RunStatus, run};
 pub use scenarios::{Metric, Scenario, Version};
-pub use selection::{Results, Selected, SelectedRun, Selection, average, interquartile};
+pub use selection::{MethodResults, Results, Selected, SelectedRun, average, interquartile};
 pub use statistics::{Iqm, Summary, interquartile_mean};
 
 /// The version, and the commit that was built, e.g. "0.1.0 (1a2b3c4d5e6f)"; "-dirty" follows a commit whose files were

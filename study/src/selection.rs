@@ -24,7 +24,7 @@ pub struct Results<'a> {
 
 /// What was selected for a row of the paper's tables, which is a method in an environment.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Selection<'a> {
+pub struct MethodResults<'a> {
     /// The environment's name.
     pub environment: &'a str,
     /// What was trained.
@@ -77,14 +77,14 @@ impl<'a> Results<'a> {
     }
 
     /// Selects for each environment and method of the plan, in its order.
-    pub fn select(&self) -> Vec<Selection<'_>> {
-        let mut selections: Vec<Selection<'_>> = Vec::new();
+    pub fn select(&self) -> Vec<MethodResults<'_>> {
+        let mut selections: Vec<MethodResults<'_>> = Vec::new();
         let of_paper = |(cell, _): &(&Cell, &CellState)| cell.set.is_none();
         for (cell, state) in self.plan.cells.iter().zip(&self.states).filter(of_paper) {
             let (environment, method) = (cell.config.common.environment.as_str(), cell.method());
             let known = selections.iter().position(|known| known.environment == environment && known.method == method);
             let place = known.unwrap_or_else(|| {
-                selections.push(Selection { environment, method, cells: 0, done: 0, runs: BTreeMap::new() });
+                selections.push(MethodResults { environment, method, cells: 0, done: 0, runs: BTreeMap::new() });
                 selections.len() - 1
             });
             selections[place].consider(cell, state);
@@ -93,7 +93,7 @@ impl<'a> Results<'a> {
     }
 }
 
-impl<'a> Selection<'a> {
+impl<'a> MethodResults<'a> {
     /// Takes `cell` into account, which comes after all cells that the plan lists before it.
     fn consider(&mut self, cell: &'a Cell, state: &'a CellState) {
         self.cells += 1;
@@ -151,14 +151,14 @@ impl Selected<'_> {
 
 /// A metric averaged over the environments of `selections`, in each run that all of them have; mean and deviation over
 /// these runs.
-pub fn average(selections: &[&Selection<'_>], metric: Metric) -> Option<Summary> {
+pub fn average(selections: &[&MethodResults<'_>], metric: Metric) -> Option<Summary> {
     let runs = common_runs(selections, metric);
     Summary::of(&runs.into_iter().map(|numbers| mean(numbers.into_iter())).collect::<Vec<_>>())
 }
 
 /// The interquartile mean of a metric over the environments of `selections` and the runs that all of them have, with
 /// its bootstrap interval.
-pub fn interquartile(selections: &[&Selection<'_>], metric: Metric, resamples: usize) -> Option<Iqm> {
+pub fn interquartile(selections: &[&MethodResults<'_>], metric: Metric, resamples: usize) -> Option<Iqm> {
     let runs = common_runs(selections, metric);
     let strata: Vec<Vec<f64>> =
         (0..selections.len()).map(|i| runs.iter().map(|numbers| numbers[i]).collect()).collect();
@@ -166,7 +166,7 @@ pub fn interquartile(selections: &[&Selection<'_>], metric: Metric, resamples: u
 }
 
 /// For each run that all `selections` have, the metric in each of them.
-fn common_runs(selections: &[&Selection<'_>], metric: Metric) -> Vec<Vec<f64>> {
+fn common_runs(selections: &[&MethodResults<'_>], metric: Metric) -> Vec<Vec<f64>> {
     let by_environment: Vec<BTreeMap<u32, f64>> = selections.iter().map(|selection| selection.metric(metric)).collect();
     let of_run = |run: &u32| by_environment.iter().map(|runs| runs.get(run).copied()).collect();
     by_environment.first().map_or_else(Vec::new, |first| first.keys().filter_map(of_run).collect())

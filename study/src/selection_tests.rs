@@ -102,7 +102,7 @@ fn metrics_are_those_computed_by_hand() {
     let second = 100_000.0_f64.cbrt();
     assert_summary(pendulum.summary(Metric::Extrapolation), second / 2.0, second / 2.0, 2);
 
-    let both: Vec<&Selection<'_>> = selections.iter().collect();
+    let both: Vec<&MethodResults<'_>> = selections.iter().collect();
     // Run 1: (90 + 50) / 2 = 70, run 2: (80 + 60) / 2 = 70. Deviations of environments do not add up.
     assert_summary(average(&both, Metric::Default), 70.0, 0.0, 2);
     assert_summary(average(&both, Metric::Interpolation), 52.5, 7.5, 2);
@@ -149,7 +149,7 @@ fn what_is_missing_is_missing_and_never_zero() {
     assert_summary(cart_pole.summary(Metric::Interpolation), 60.0, 0.0, 1);
     assert_summary(pendulum.summary(Metric::Default), 55.0, 5.0, 2);
     assert_summary(pendulum.summary(Metric::Extrapolation), 0.0, 0.0, 1);
-    let both: Vec<&Selection<'_>> = selections.iter().collect();
+    let both: Vec<&MethodResults<'_>> = selections.iter().collect();
     assert_eq!(average(&both, Metric::Default), None);
     assert_eq!(interquartile(&both, Metric::Default, 10), None);
     assert_summary(average(&both, Metric::Interpolation), 45.0, 0.0, 1);

@@ -17,7 +17,7 @@ use perturb_protocol::{Distribution, Version};
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::Records;
 use perturb_study::{
-    Folder, Heatmap, HeatmapOptions, HeatmapPlace, Plan, Results, Selected, heatmap_files, heatmap_places,
+    Folder, Heatmap, HeatmapOptions, HeatmapPlace, NoHeatmap, Plan, Results, Selected, heatmap_files, heatmap_places,
     store_heatmap,
 };
 
@@ -101,7 +101,7 @@ fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<Ending> {
     let mut failed = 0;
     for place in &places {
         let Some(selected) = place.selected else {
-            eprintln!("{place}: no result yet");
+            eprintln!("{place}: {}", NoHeatmap::NoResult);
             continue;
         };
         let servers = match &mut servers_of_all {

@@ -29,7 +29,7 @@ pub(super) fn write(folder: &Folder, page: Option<&Path>) -> Result<String> {
     let out = folder.path().join("report");
     write_file(&out.join("report.md"), report.markdown().as_bytes())?;
     for table in report.files() {
-        write_file(&out.join(&table.title), &table.to_csv()?)?;
+        write_file(&out.join(&table.title), &table.to_csv())?;
     }
     if let Some(path) = page {
         let figures = Figures::read(&selections, folder)?;
@@ -44,7 +44,7 @@ pub(super) fn curves(args: &CurvesArgs) -> Result<Ending> {
     let results = Results::read(&plan, &folder)?;
     let all = read_curves(&results.select(), &folder)?;
     let out = args.out.clone().unwrap_or_else(|| args.dir.join("report"));
-    write_file(&out.join("curves.csv"), &curves_table(&all).to_csv()?)?;
+    write_file(&out.join("curves.csv"), &curves_table(&all).to_csv())?;
     let mut stdout = std::io::stdout();
     for curves in &all {
         if curves.curves.is_empty() {

@@ -7,7 +7,7 @@ use anyhow::{Context, Result};
 use super::args::VideoArgs;
 use super::bar::Bar;
 use super::{Ending, servers, sets};
-use crate::video::{Summary, VideoFile, VideoOptions, film};
+use crate::video::{Footage, VideoFile, VideoOptions, film};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::table::Table;
@@ -25,10 +25,10 @@ pub(super) fn run(args: &VideoArgs) -> Result<Ending> {
         fps: args.fps,
     };
     let mut bar = Bar::new(format!("filming on {}", options.set.name), args.episodes);
-    let summary = film(&servers, &checkpoint, &options, file, &stop, &mut |episodes| bar.testing(episodes))?;
+    let footage = film(&servers, &checkpoint, &options, file, &stop, &mut |episodes| bar.testing(episodes))?;
     drop(bar);
     let mut out = std::io::stdout();
-    let episodes: Vec<_> = summary.episodes.iter().enumerate().collect();
+    let episodes: Vec<_> = footage.episodes.iter().enumerate().collect();
     let table = Table::of("", &episodes)
         .number("episode", |(index, _)| index + 1)
         .number("return", |(_, episode)| format!("{:.2}", episode.episode_return))
@@ -39,13 +39,13 @@ pub(super) fn run(args: &VideoArgs) -> Result<Ending> {
             parameters.collect::<Vec<_>>().join(" ")
         });
     writeln!(out, "{}", table.build().to_text())?;
-    writeln!(out, "{}: {}", args.out.display(), figures(&summary))?;
+    writeln!(out, "{}: {}", args.out.display(), figures(&footage))?;
     Ok(Ending::Done)
 }
 
 /// How many frames there are, how fast they are shown, and how fast they were made.
-fn figures(summary: &Summary) -> String {
-    let Summary { frames, size: (width, height), speed, total, waiting, writing, .. } = summary;
+fn figures(footage: &Footage) -> String {
+    let Footage { frames, size: (width, height), speed, total, waiting, writing, .. } = footage;
     let milliseconds = |time: &std::time::Duration| 1e3 * time.as_secs_f64() / *frames as f64;
     format!(
         "{frames} frames of {width} × {height} pixels at {speed:.2} × real time; rendered and written at {:.0} frames/s: \

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::panel::{Ending, Panel, Shown, parameter};
+use super::panel::{EpisodeEnding, Panel, Shown, parameter};
 use super::{VideoError, VideoFile, VideoWriter};
 use perturb_learner::checkpoint::{Checkpoint, EnvironmentSummary, State};
 use perturb_learner::client::{BegunEpisode, ClientError, OpenOptions, Picture, Servers, Single, StepReply};
@@ -44,7 +44,7 @@ pub struct Filmed {
 
 /// What was filmed, and how fast.
 #[derive(Clone, Debug, Default)]
-pub struct Summary {
+pub struct Footage {
     /// In order.
     pub episodes: Vec<Filmed>,
     /// One for each step and one for each episode's start.
@@ -77,11 +77,11 @@ pub fn film(
     file: VideoFile,
     stop: &StopFlag,
     report: &mut dyn FnMut(u64),
-) -> Result<Summary, VideoError> {
+) -> Result<Footage, VideoError> {
     let start = Instant::now();
     let mut film = Film::open(servers, checkpoint, options)?;
-    film.summary.speed = film.environment.control_timestep / file.frame_seconds(film.fps);
-    let mut writer = file.begin(film.summary.size, film.fps)?;
+    film.footage.speed = film.environment.control_timestep / file.frame_seconds(film.fps);
+    let mut writer = file.begin(film.footage.size, film.fps)?;
     loop {
         if let Some(signal) = stop.signal() {
             return Err(TestError::Stopped { signal }.into());
@@ -94,13 +94,13 @@ pub fn film(
             Next::Episode => film.begin()?,
             Next::Nothing => break,
         }
-        report(film.summary.episodes.len() as u64);
+        report(film.footage.episodes.len() as u64);
     }
     let completing = Instant::now();
     writer.finish()?;
-    film.summary.writing += completing.elapsed();
-    film.summary.total = start.elapsed();
-    Ok(film.summary)
+    film.footage.writing += completing.elapsed();
+    film.footage.total = start.elapsed();
+    Ok(film.footage)
 }
 
 /// What follows a state.
@@ -125,7 +125,7 @@ struct Film<'a> {
     last: Option<Picture>,
     frame: Vec<u8>,
     fps: f64,
-    summary: Summary,
+    footage: Footage,
 }
 
 impl<'a> Film<'a> {
@@ -156,7 +156,7 @@ impl<'a> Film<'a> {
             last: None,
             frame: Vec::new(),
             fps: options.fps.unwrap_or(1.0 / environment.control_timestep),
-            summary: Summary { size: panel.size(), ..Summary::default() },
+            footage: Footage { size: panel.size(), ..Footage::default() },
             begun,
             panel,
             environment,
@@ -172,7 +172,7 @@ impl<'a> Film<'a> {
             let action = self.agent.act(&mut self.reply.observations).map_err(TestError::Numbers)?;
             self.single.request_step(action)?;
             Next::Step
-        } else if (self.summary.episodes.len() as u64) < self.options.episodes {
+        } else if (self.footage.episodes.len() as u64) < self.options.episodes {
             self.single.request_reset()?;
             Next::Episode
         } else {
@@ -202,10 +202,10 @@ impl<'a> Film<'a> {
         let came = Instant::now();
         self.panel.compose(&picture, &self.shown, &mut self.frame)?;
         writer.write(&self.frame, if self.shown.ending.is_some() { HOLD } else { 0.0 })?;
-        self.summary.frames += 1;
+        self.footage.frames += 1;
         self.last = Some(picture);
-        self.summary.waiting += came - asked;
-        self.summary.writing += came.elapsed();
+        self.footage.waiting += came - asked;
+        self.footage.writing += came.elapsed();
         Ok(())
     }
 
@@ -213,7 +213,7 @@ impl<'a> Film<'a> {
     fn step(&mut self) -> Result<(), VideoError> {
         let asked = Instant::now();
         self.single.stepped(&mut self.reply)?;
-        self.summary.waiting += asked.elapsed();
+        self.footage.waiting += asked.elapsed();
         let Self { reply, shown, .. } = self;
         shown.step += 1;
         shown.time = f64::from(shown.step) * self.environment.control_timestep;
@@ -226,9 +226,9 @@ impl<'a> Film<'a> {
         }
         shown.episode_return = end.episode_return;
         let truncated = reply.truncated[0];
-        shown.ending = Some(Ending { success: end.success, terminated: end.terminated, truncated });
+        shown.ending = Some(EpisodeEnding { success: end.success, terminated: end.terminated, truncated });
         let names = self.environment.parameters.iter().map(|parameter| parameter.name.clone());
-        self.summary.episodes.push(Filmed {
+        self.footage.episodes.push(Filmed {
             parameters: names.zip(self.begun.parameters.iter().copied()).collect(),
             episode_return: end.episode_return,
             length: end.length,
@@ -241,14 +241,14 @@ impl<'a> Film<'a> {
     fn begin(&mut self) -> Result<(), VideoError> {
         let asked = Instant::now();
         self.begun = self.single.begun(&mut self.reply.observations)?;
-        self.summary.waiting += asked.elapsed();
+        self.footage.waiting += asked.elapsed();
         self.announce();
         Ok(())
     }
 
     /// Shows the episode that has begun.
     fn announce(&mut self) {
-        let (number, episodes) = (self.summary.episodes.len() + 1, self.options.episodes);
+        let (number, episodes) = (self.footage.episodes.len() + 1, self.options.episodes);
         let trial = match self.state.episodes_per_trial {
             1 => String::new(),
             _ => format!(", trial {}", self.begun.trial_index + 1),

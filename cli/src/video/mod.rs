@@ -12,7 +12,7 @@ mod panel;
 use std::path::{Path, PathBuf};
 
 pub use file::{VideoFile, VideoWriter};
-pub use film::{Summary, VideoOptions, film};
+pub use film::{Footage, VideoOptions, film};
 pub use panel::{LARGEST, SMALLEST};
 
 use perturb_learner::evaluation::TestError;

@@ -23,17 +23,17 @@ const SUCCESS: RGBColor = RGBColor(0, 158, 115);
 const NO_SUCCESS: RGBColor = RGBColor(213, 94, 0);
 
 /// A line of text: what stands on its left, and on its right.
-type Line = (String, String);
+type PanelLine = (String, String);
 
 /// How an episode ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Ending {
+pub(super) struct EpisodeEnding {
     pub(super) success: bool,
     pub(super) terminated: bool,
     pub(super) truncated: bool,
 }
 
-impl Ending {
+impl EpisodeEnding {
     fn text(self) -> String {
         let mut words = vec![if self.success { "success" } else { "no success" }];
         words.extend(self.terminated.then_some("terminated"));
@@ -55,7 +55,7 @@ pub(super) struct Shown {
     /// The sum of the rewards so far.
     pub(super) episode_return: f64,
     /// `None` while it goes on.
-    pub(super) ending: Option<Ending>,
+    pub(super) ending: Option<EpisodeEnding>,
 }
 
 /// Makes frames of pictures: the picture, and below it the panel. Both sides of a frame are even, as H.264 wants them.
@@ -64,14 +64,14 @@ pub(super) struct Panel {
     picture: (u32, u32),
     /// Of the frame.
     frame: (u32, u32),
-    title: Line,
+    title: PanelLine,
     letter: u32,
 }
 
 impl Panel {
     /// For pictures of `width` and `height`, with `parameters` lines of parameters. `title` stands above all else, on the
     /// left and on the right.
-    pub(super) fn new((width, height): (u32, u32), title: Line, parameters: usize) -> Result<Self, VideoError> {
+    pub(super) fn new((width, height): (u32, u32), title: PanelLine, parameters: usize) -> Result<Self, VideoError> {
         load_font()?;
         let letter = (width / LETTERS).max(10);
         let lines = 3 + parameters.div_ceil(2) as u32;
@@ -105,7 +105,7 @@ impl Panel {
     fn write(&self, panel: &mut [u8], shown: &Shown) -> Result<(), String> {
         let (width, height) = (self.frame.0 as i32, self.frame.1 - self.picture.1);
         let area = BitMapBackend::with_buffer(panel, (self.frame.0, height)).into_drawing_area();
-        let mut lines: Vec<(Line, RGBColor)> = vec![
+        let mut lines: Vec<(PanelLine, RGBColor)> = vec![
             (self.title.clone(), PALE),
             ((shown.episode.clone(), format!("{:.2} s, step {}", shown.time, shown.step)), INK),
             ((format!("return {:.1}", shown.episode_return), String::new()), INK),
@@ -208,7 +208,7 @@ mod tests {
         let panel = panel((480, 480));
         let plain = frame(&panel, &shown());
         assert_eq!(frame(&panel, &shown()), plain);
-        let ending = |success, terminated, truncated| Some(Ending { success, terminated, truncated });
+        let ending = |success, terminated, truncated| Some(EpisodeEnding { success, terminated, truncated });
         let others = [
             Shown { episode: "episode 2 of 3".into(), ..shown() },
             Shown {

@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 
 use crate::common::{addresses, child_server, kill, perturb, run, server, stderr, wait_for};
 use gif::{ColorOutput, DecodeOptions};
-use perturb_cli::video::{Summary, VideoFile, VideoOptions, film};
+use perturb_cli::video::{Footage, VideoFile, VideoOptions, film};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{PrivateServer, Servers};
 use perturb_learner::evaluation::test;
@@ -119,7 +119,7 @@ fn a_gif_is_shown_as_fast_as_was_asked_for() {
 }
 
 /// Plays with the library, into a file that is thrown away.
-fn filmed(servers: &Servers, checkpoint: &Checkpoint, version: Version, episodes: u64) -> Summary {
+fn filmed(servers: &Servers, checkpoint: &Checkpoint, version: Version, episodes: u64) -> Footage {
     let folder = tempfile::tempdir().expect("a folder");
     let file = VideoFile::create(&folder.path().join("a.gif")).expect("a file");
     let options = VideoOptions { set: version.into(), episodes, seed: 5, size: (240, 240), fps: None };

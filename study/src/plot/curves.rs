@@ -1,12 +1,11 @@
 //! Training curves: three panels, D, R and E, side by side.
 
 use plotters::coord::Shift;
-use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 
 use super::super::plan::distinct;
 use super::super::statistics::Summary;
-use super::{Picture, PlotError, drawing, font, line_style};
+use super::{AxisLook, LineStyle, Plot, PlotError, chart, drawing, font};
 use crate::curves::{Curve, EnvironmentCurves, Point};
 use crate::{Method, Version};
 
@@ -46,18 +45,18 @@ impl std::fmt::Display for Quantity {
 }
 
 /// The picture of `curves`.
-pub fn draw_curves(curves: &EnvironmentCurves, quantity: Quantity) -> impl Picture + '_ {
+pub fn draw_curves(curves: &EnvironmentCurves, quantity: Quantity) -> impl Plot + '_ {
     let methods = distinct(curves.curves.iter().map(|curve| curve.method.clone()));
-    CurvesPicture { curves, quantity, methods }
+    CurvesPlot { curves, quantity, methods }
 }
 
-struct CurvesPicture<'a> {
+struct CurvesPlot<'a> {
     curves: &'a EnvironmentCurves,
     quantity: Quantity,
     methods: Vec<Method>,
 }
 
-impl Picture for CurvesPicture<'_> {
+impl Plot for CurvesPlot<'_> {
     fn size(&self) -> (u32, u32) {
         let lines = self.methods.len().div_ceil(LEGEND_COLUMNS) as u32;
         (3 * PANEL.0, TITLE + PANEL.1 + LEGEND_LINE * lines + 10)
@@ -80,7 +79,7 @@ impl Picture for CurvesPicture<'_> {
     }
 }
 
-impl CurvesPicture<'_> {
+impl CurvesPlot<'_> {
     fn panel<DB: DrawingBackend>(
         &self,
         area: &DrawingArea<DB, Shift>,
@@ -88,32 +87,12 @@ impl CurvesPicture<'_> {
         scale: u32,
     ) -> Result<(), PlotError> {
         let (episodes, range) = self.ranges();
-        let mut chart = ChartBuilder::on(area)
-            .margin(8 * scale)
-            .margin_right(16 * scale)
-            .x_label_area_size(34 * scale)
-            .y_label_area_size(50 * scale)
-            .caption(format!("trained on {version}"), font(13, scale))
-            .build_cartesian_2d(0.0..episodes, range)
-            .map_err(drawing)?;
-        chart
-            .configure_mesh()
-            .x_labels(4)
-            .y_labels(6)
-            .label_style(font(11, scale))
-            .axis_desc_style(font(12, scale))
-            .x_desc("episodes")
-            .x_label_formatter(&|x| tick(*x))
-            .y_label_formatter(&|y| tick(*y))
-            .light_line_style(TRANSPARENT)
-            .bold_line_style(RGBColor(225, 225, 225).stroke_width(scale))
-            .axis_style(RGBColor(120, 120, 120).stroke_width(scale))
-            .set_all_tick_mark_size(3 * scale)
-            .draw()
-            .map_err(drawing)?;
+        let x = AxisLook { name: "episodes".into(), range: 0.0..episodes, ticks: 4 };
+        let y = AxisLook { name: String::new(), range, ticks: 6 };
+        let mut chart = chart(area, &format!("trained on {version}"), x, y, scale)?;
         for Curve { method, points, .. } in self.curves.curves.iter().filter(|curve| curve.version == version) {
             let index = self.methods.iter().position(|known| known == method).unwrap_or_default();
-            let (colour, dashes) = line_style(index);
+            let style = LineStyle::nth(index);
             let at = |point: &Point, sign: f64| {
                 let summary = self.quantity.of(point);
                 (point.episodes, summary.mean + sign * summary.std)
@@ -121,15 +100,9 @@ impl CurvesPicture<'_> {
             let there = points.iter().map(|point| at(point, 1.0));
             let back = points.iter().rev().map(|point| at(point, -1.0));
             let band: Vec<(f64, f64)> = there.chain(back).collect();
-            chart.draw_series([Polygon::new(band, colour.mix(0.16).filled())]).map_err(drawing)?;
-            let line: Vec<(f64, f64)> = points.iter().map(|point| at(point, 0.0)).collect();
-            let style = colour.stroke_width(2 * scale);
-            match dashes {
-                None => chart.draw_series(LineSeries::new(line, style)).map_err(drawing)?,
-                Some((dash, gap)) => {
-                    chart.draw_series(DashedLineSeries::new(line, dash * scale, gap * scale, style)).map_err(drawing)?
-                }
-            };
+            chart.draw_series([Polygon::new(band, style.colour.mix(0.16).filled())]).map_err(drawing)?;
+            let line = points.iter().map(|point| at(point, 0.0)).collect();
+            chart.plotting_area().draw(&style.along(line, scale)).map_err(drawing)?;
         }
         Ok(())
     }
@@ -157,37 +130,12 @@ impl CurvesPicture<'_> {
     fn legend<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError> {
         let (width, unit) = ((3 * PANEL.0 - 50) as i32 / LEGEND_COLUMNS as i32, scale as i32);
         for (index, method) in self.methods.iter().enumerate() {
-            let (colour, dashes) = line_style(index);
             let (column, line) = ((index % LEGEND_COLUMNS) as i32, (index / LEGEND_COLUMNS) as i32);
             let (x, y) = ((50 + column * width) * unit, (line * LEGEND_LINE as i32 + 11) * unit);
-            let ends = [(x, y), (x + 34 * unit, y)];
-            let style = colour.stroke_width(2 * scale);
-            match dashes {
-                None => area.draw(&PathElement::new(ends, style)).map_err(drawing)?,
-                Some((dash, gap)) => {
-                    area.draw(&DashedPathElement::new(ends, dash * scale, gap * scale, style)).map_err(drawing)?;
-                }
-            }
+            let sample = LineStyle::nth(index).along(vec![(x, y), (x + 34 * unit, y)], scale);
+            area.draw(&sample).map_err(drawing)?;
             area.draw_text(&method.to_string(), &font(12, scale), (x + 42 * unit, y - 6 * unit)).map_err(drawing)?;
         }
         Ok(())
     }
-}
-
-/// A number at an axis: short, and without the noise of binary fractions.
-pub(super) fn tick(number: f64) -> String {
-    let magnitude = number.abs();
-    if magnitude >= 10_000.0 {
-        return format!("{}k", (number / 100.0).round() / 10.0);
-    }
-    let digits = if magnitude >= 100.0 {
-        0
-    } else if magnitude >= 10.0 {
-        1
-    } else {
-        3
-    };
-    let text = format!("{number:.digits$}");
-    let text = if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text };
-    if text == "-0" { "0".into() } else { text }
 }

@@ -6,14 +6,17 @@
 mod curves;
 mod heatmap;
 
+use std::ops::Range;
 use std::path::Path;
 use std::sync::OnceLock;
 
 use plotters::coord::Shift;
+use plotters::coord::types::RangedCoordf64;
+use plotters::element::{DashedPathElement, DynElement};
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
 
-use super::folder::write_atomically;
+use super::folder::{FolderError, io, write_atomically};
 pub use curves::{Quantity, draw_curves};
 pub use heatmap::draw_heatmap;
 
@@ -31,25 +34,13 @@ pub enum PlotError {
     /// The plotting library refused.
     #[error("cannot draw: {0}")]
     Draw(String),
-    /// The file cannot be written.
-    #[error("cannot write {path}: {reason}")]
-    File {
-        /// Its path.
-        path: String,
-        /// What the library or the system said.
-        reason: String,
-    },
+    /// A file cannot be written.
+    #[error(transparent)]
+    Folder(#[from] FolderError),
 }
 
-impl PlotError {
-    /// Of a file at `path`.
-    pub(super) fn file(path: &Path, reason: &dyn std::fmt::Display) -> Self {
-        Self::File { path: path.display().to_string(), reason: reason.to_string() }
-    }
-}
-
-/// A picture that can be drawn with any backend. Everything is in units of the SVG times `scale`.
-pub trait Picture {
+/// What any backend can draw. Everything is in units of the SVG times `scale`.
+pub trait Plot {
     /// Width and height.
     fn size(&self) -> (u32, u32);
 
@@ -60,45 +51,44 @@ pub trait Picture {
     fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError>;
 }
 
-/// The picture as SVG.
+/// A picture as SVG.
 ///
 /// # Errors
 /// [`PlotError::Draw`].
-pub fn svg(picture: &impl Picture) -> Result<String, PlotError> {
+pub fn svg(plot: &impl Plot) -> Result<String, PlotError> {
     load_font()?;
     let mut text = String::new();
     {
-        let area = SVGBackend::with_string(&mut text, picture.size()).into_drawing_area();
-        picture.draw(&area, 1)?;
+        let area = SVGBackend::with_string(&mut text, plot.size()).into_drawing_area();
+        plot.draw(&area, 1)?;
         area.present().map_err(drawing)?;
     }
     Ok(text)
 }
 
-/// The picture as PNG, with [`PNG_SCALE`] pixels for each unit.
+/// A picture as PNG, with [`PNG_SCALE`] pixels for each unit.
 ///
 /// # Errors
 /// [`PlotError`].
-pub fn png(picture: &impl Picture) -> Result<Vec<u8>, PlotError> {
+pub fn png(plot: &impl Plot) -> Result<Vec<u8>, PlotError> {
     load_font()?;
     // The library encodes to files only.
-    let scratch = tempfile::tempdir().map_err(|error| PlotError::file(&std::env::temp_dir(), &error))?;
+    let scratch = tempfile::tempdir().map_err(io("create a folder in", &std::env::temp_dir()))?;
     let path = scratch.path().join("picture.png");
-    let (width, height) = picture.size();
+    let (width, height) = plot.size();
     let area = BitMapBackend::new(&path, (width * PNG_SCALE, height * PNG_SCALE)).into_drawing_area();
-    picture.draw(&area, PNG_SCALE)?;
-    area.present().map_err(|error| PlotError::file(&path, &error))?;
-    std::fs::read(&path).map_err(|error| PlotError::file(&path, &error))
+    plot.draw(&area, PNG_SCALE)?;
+    area.present().map_err(drawing)?;
+    Ok(std::fs::read(&path).map_err(io("read", &path))?)
 }
 
-/// Writes the picture as SVG and as PNG, each in one piece: `path` with these endings.
+/// Writes a picture as SVG and as PNG, each in one piece: `path` with these endings.
 ///
 /// # Errors
 /// [`PlotError`].
-pub fn save(picture: &impl Picture, path: &Path) -> Result<(), PlotError> {
-    for (ending, content) in [("svg", svg(picture)?.into_bytes()), ("png", png(picture)?)] {
-        let path = path.with_extension(ending);
-        write_atomically(&path, &content).map_err(|error| PlotError::file(&path, &error))?;
+pub fn save(plot: &impl Plot, path: &Path) -> Result<(), PlotError> {
+    for (ending, content) in [("svg", svg(plot)?.into_bytes()), ("png", png(plot)?)] {
+        write_atomically(&path.with_extension(ending), &content)?;
     }
     Ok(())
 }
@@ -130,12 +120,92 @@ const LINES: [RGBColor; 7] = [
     RGBColor(230, 159, 0),
 ];
 
-/// Dashes and gaps, in units; none is a whole line.
+/// See [`LineStyle::dashes`].
 const DASHES: [Option<(u32, u32)>; 3] = [None, Some((8, 4)), Some((2, 3))];
 
-/// Colour and dashes of the `index`th line.
-fn line_style(index: usize) -> (RGBColor, Option<(u32, u32)>) {
-    (LINES[index % LINES.len()], DASHES[index % DASHES.len()])
+/// How a line looks; widths and lengths are in units.
+#[derive(Clone, Copy)]
+struct LineStyle {
+    colour: RGBColor,
+    width: u32,
+    /// Dash and gap; none of a whole line.
+    dashes: Option<(u32, u32)>,
+}
+
+impl LineStyle {
+    /// Of the `index`th of several lines.
+    fn nth(index: usize) -> Self {
+        Self { colour: LINES[index % LINES.len()], width: 2, dashes: DASHES[index % DASHES.len()] }
+    }
+
+    fn along<'a, DB, C>(self, points: Vec<C>, scale: u32) -> DynElement<'a, DB, C>
+    where
+        DB: DrawingBackend + 'a,
+        C: Clone + 'static,
+    {
+        let style = self.colour.stroke_width(self.width * scale);
+        match self.dashes {
+            None => PathElement::new(points, style).into_dyn(),
+            Some((dash, gap)) => DashedPathElement::new(points, dash * scale, gap * scale, style).into_dyn(),
+        }
+    }
+}
+
+/// An axis of a chart.
+struct AxisLook {
+    name: String,
+    range: Range<f64>,
+    ticks: usize,
+}
+
+type Chart<'a, DB> = ChartContext<'a, DB, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
+
+/// An empty chart that fills `area`.
+fn chart<'a, DB: DrawingBackend>(
+    area: &DrawingArea<DB, Shift>,
+    caption: &str,
+    x: AxisLook,
+    y: AxisLook,
+    scale: u32,
+) -> Result<Chart<'a, DB>, PlotError> {
+    let mut chart = ChartBuilder::on(area)
+        .margin(8 * scale)
+        .margin_right(16 * scale)
+        .x_label_area_size(38 * scale)
+        .y_label_area_size(56 * scale)
+        .caption(caption, font(13, scale))
+        .build_cartesian_2d(x.range, y.range)
+        .map_err(drawing)?;
+    chart
+        .configure_mesh()
+        .x_labels(x.ticks)
+        .y_labels(y.ticks)
+        .label_style(font(11, scale))
+        .axis_desc_style(font(12, scale))
+        .x_desc(x.name)
+        .y_desc(y.name)
+        .x_label_formatter(&|x| tick(*x))
+        .y_label_formatter(&|y| tick(*y))
+        .light_line_style(TRANSPARENT)
+        .bold_line_style(RGBColor(225, 225, 225).stroke_width(scale))
+        .axis_style(RGBColor(120, 120, 120).stroke_width(scale))
+        .set_all_tick_mark_size(3 * scale)
+        .draw()
+        .map_err(drawing)?;
+    Ok(chart)
+}
+
+/// A number at an axis: short, and without the noise of binary fractions.
+fn tick(number: f64) -> String {
+    let digits = match number.abs() {
+        10_000.0.. => return format!("{}k", (number / 100.0).round() / 10.0),
+        100.0.. => 0,
+        10.0.. => 1,
+        _ => 3,
+    };
+    let factor = 10_f64.powi(digits);
+    // Adding 0 makes a negative zero positive.
+    ((number * factor).round() / factor + 0.0).to_string()
 }
 
 /// Anchors of viridis (Smith and van der Walt, 2015) at equal distances.
@@ -191,7 +261,22 @@ fn luminance((r, g, b): (u8, u8, u8)) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use rstest::rstest;
+
     use super::*;
+
+    #[rstest]
+    #[case(0.0, "0")]
+    #[case(-0.0001, "0")]
+    #[case(0.1 + 0.2, "0.3")]
+    #[case(-12.34, "-12.3")]
+    #[case(123.4, "123")]
+    #[case(9999.6, "10000")]
+    #[case(15_000.0, "15k")]
+    #[case(-12_345.0, "-12.3k")]
+    fn numbers_at_an_axis_are_short(#[case] number: f64, #[case] shown: &str) {
+        assert_eq!(tick(number), shown);
+    }
 
     #[test]
     fn lightness_alone_says_how_much() {
@@ -225,12 +310,8 @@ mod tests {
         for colour in LINES {
             assert!((1.05) / (luminance((colour.0, colour.1, colour.2)) + 0.05) > 2.0, "{colour:?}");
         }
-        let styles: std::collections::HashSet<_> = (0..10)
-            .map(|i| {
-                let (c, dash) = line_style(i);
-                ((c.0, c.1, c.2), dash)
-            })
-            .collect();
+        let look = |LineStyle { colour: RGBColor(r, g, b), dashes, .. }| (r, g, b, dashes);
+        let styles: std::collections::HashSet<_> = (0..10).map(|i| look(LineStyle::nth(i))).collect();
         assert_eq!(styles.len(), 10, "as many as the paper has methods");
     }
 }

@@ -1,11 +1,11 @@
 //! The pictures of a report, and what is said of those that are missing.
 
 use crate::curves::read_curves;
-use crate::folder::{Folder, FolderError};
+use crate::folder::Folder;
 use crate::heatmap::HeatmapOptions;
 use crate::heatmaps::{HeatmapRecord, NoHeatmap, heatmap_places};
 use crate::plot::{PlotError, Quantity, draw_curves, svg};
-use crate::selection::Selection;
+use crate::selection::MethodResults;
 
 /// All pictures of a report.
 #[derive(Clone, Debug, Default)]
@@ -20,20 +20,20 @@ pub struct Figures {
     pub no_heatmaps: Vec<String>,
 }
 
-/// A picture.
+/// A picture, or the place of one that is missing.
 #[derive(Clone, Debug)]
 pub struct Figure {
-    /// Of which environment.
+    /// Figures of one environment stand together.
     pub environment: String,
-    /// What it shows, in a few words.
+    /// A few words for those who do not see it.
     pub name: String,
-    /// What it shows.
+    /// What the picture shows, or why it is missing.
     pub caption: String,
-    /// The picture itself.
+    /// SVG and PNG are complete in themselves.
     pub picture: FigureData,
 }
 
-/// A picture's data.
+/// What is shown of a picture.
 #[derive(Clone, Debug)]
 pub enum FigureData {
     /// An SVG element.
@@ -44,31 +44,19 @@ pub enum FigureData {
     Missing,
 }
 
-/// Why there are no pictures.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum FigureError {
-    /// The folder cannot be read.
-    #[error(transparent)]
-    Folder(#[from] FolderError),
-    /// A picture cannot be drawn.
-    #[error(transparent)]
-    Plot(#[from] PlotError),
-}
-
 impl Figures {
     /// Draws the training curves of `selections` and reads their heatmaps, both from `folder`.
     ///
     /// # Errors
-    /// [`FigureError`].
-    pub fn read(selections: &[Selection<'_>], folder: &Folder) -> Result<Self, FigureError> {
+    /// [`PlotError`].
+    pub fn read(selections: &[MethodResults<'_>], folder: &Folder) -> Result<Self, PlotError> {
         let mut figures = Self::default();
         figures.add_curves(selections, folder)?;
         figures.add_heatmaps(selections, folder)?;
         Ok(figures)
     }
 
-    fn add_curves(&mut self, selections: &[Selection<'_>], folder: &Folder) -> Result<(), FigureError> {
+    fn add_curves(&mut self, selections: &[MethodResults<'_>], folder: &Folder) -> Result<(), PlotError> {
         for curves in read_curves(selections, folder)? {
             let environment = &curves.environment;
             if curves.curves.is_empty() {
@@ -90,7 +78,7 @@ impl Figures {
         Ok(())
     }
 
-    fn add_heatmaps(&mut self, selections: &[Selection<'_>], folder: &Folder) -> Result<(), FigureError> {
+    fn add_heatmaps(&mut self, selections: &[MethodResults<'_>], folder: &Folder) -> Result<(), PlotError> {
         let places = heatmap_places(selections);
         let mut missing = Vec::new();
         for row in places.chunk_by(|a, b| (a.environment, a.method) == (b.environment, b.method)) {
@@ -100,7 +88,7 @@ impl Figures {
                     Ok(heatmap) => (format!("{place}{}", details(&heatmap.record)), FigureData::Png(heatmap.png)),
                     Err(why) => {
                         missing.push(why);
-                        (format!("{place}: {}.", reason(why)), FigureData::Missing)
+                        (format!("{place}: {why}."), FigureData::Missing)
                     }
                 };
                 figures.push(Figure {
@@ -117,31 +105,16 @@ impl Figures {
     }
 }
 
-/// Why there is no picture, at its place.
-fn reason(why: NoHeatmap) -> &'static str {
-    match why {
-        NoHeatmap::NoResult => "no heatmap, since this training has no result yet",
-        NoHeatmap::NotMade => "the heatmap has not been made",
-        NoHeatmap::Outdated => "the heatmap is of an earlier result",
-    }
-}
-
 /// What to do about the heatmaps that are missing, of so many.
 fn advice(missing: &[NoHeatmap], all: usize) -> Vec<String> {
-    let count = |of: &[NoHeatmap]| missing.iter().filter(|why| of.contains(why)).count();
-    let makeable = count(&[NoHeatmap::NotMade, NoHeatmap::Outdated]);
-    let waiting = count(&[NoHeatmap::NoResult]);
-    let mut advice = Vec::new();
-    if makeable > 0 {
-        advice.push(format!(
-            "Heatmaps that are not there: {makeable} of {all}. `perturb heatmap DIR` makes them, where DIR is the folder \
-             of these results."
-        ));
-    }
-    if waiting > 0 {
-        advice.push(format!("Heatmaps that wait for the results of their trainings: {waiting} of {all}."));
-    }
-    advice
+    let waiting = missing.iter().filter(|why| **why == NoHeatmap::NoResult).count();
+    let makeable = missing.len() - waiting;
+    let make = format!(
+        "Heatmaps that are not there: {makeable} of {all}. `perturb heatmap DIR` makes them, where DIR is the folder of \
+         these results."
+    );
+    let wait = format!("Heatmaps that wait for the results of their trainings: {waiting} of {all}.");
+    [(makeable, make), (waiting, wait)].into_iter().filter(|(count, _)| *count > 0).map(|(_, advice)| advice).collect()
 }
 
 /// What a heatmap's caption says after who was tested.

@@ -22,22 +22,22 @@ struct Section {
     id: &'static str,
     title: &'static str,
     notes: Markup,
-    parts: Vec<Part>,
+    subsections: Vec<Subsection>,
     /// Parts stand side by side where there is room.
     side_by_side: bool,
 }
 
-struct Part {
+struct Subsection {
     title: String,
     content: Markup,
 }
 
 /// The page.
 pub fn html(report: &Report<'_>, figures: &Figures) -> String {
-    let plain = |table: Table| table_part(&table, false);
-    let section = |id, title, notes, parts| Section { id, title, notes, parts, side_by_side: false };
+    let plain = |table: Table| table_subsection(&table, false);
+    let section = |id, title, notes, subsections| Section { id, title, notes, subsections, side_by_side: false };
     let metrics = report.metrics_tables().into_iter().map(plain).collect();
-    let scenarios = report.scenario_tables().iter().map(|table| table_part(table, true)).collect();
+    let scenarios = report.scenario_tables().iter().map(|table| table_subsection(table, true)).collect();
     let cells = [report.selected_table()].into_iter().chain(report.failure_table()).map(plain).collect();
     let sections = [
         section("metrics", "Default, Interpolation, Extrapolation", html! { p { (METRICS) } }, metrics),
@@ -82,7 +82,7 @@ fn page(report: &Report<'_>, sections: &[Section]) -> Markup {
 }
 
 impl Section {
-    fn part_id(&self, index: usize) -> String {
+    fn subsection_id(&self, index: usize) -> String {
         format!("{}-{}", self.id, index + 1)
     }
 
@@ -90,12 +90,12 @@ impl Section {
         html! {
             li {
                 a href={ "#" (self.id) } { (self.title) }
-                @if self.parts.len() > 1 {
+                @if self.subsections.len() > 1 {
                     " "
                     span {
-                        @for (i, part) in self.parts.iter().enumerate() {
+                        @for (i, subsection) in self.subsections.iter().enumerate() {
                             @if i > 0 { " · " }
-                            a href={ "#" (self.part_id(i)) } { (short(&part.title)) }
+                            a href={ "#" (self.subsection_id(i)) } { (short(&subsection.title)) }
                         }
                     }
                 }
@@ -109,8 +109,8 @@ impl Section {
                 h2 { (self.title) }
                 (self.notes)
                 div class=[self.side_by_side.then_some("columns")] {
-                    @for (i, part) in self.parts.iter().enumerate() {
-                        div id=(self.part_id(i)) { (part.content) }
+                    @for (i, subsection) in self.subsections.iter().enumerate() {
+                        div id=(self.subsection_id(i)) { (subsection.content) }
                     }
                 }
             }
@@ -118,7 +118,7 @@ impl Section {
     }
 }
 
-fn table_part(table: &Table, shaded: bool) -> Part {
+fn table_subsection(table: &Table, shaded: bool) -> Subsection {
     let groups: Vec<&[Column]> = table.columns.chunk_by(|a, b| a.group == b.group).collect();
     // Where each but the first group of columns begins.
     let starts = |column: usize| {
@@ -163,7 +163,7 @@ fn table_part(table: &Table, shaded: bool) -> Part {
             }
         }
     };
-    Part { title: table.title.clone(), content }
+    Subsection { title: table.title.clone(), content }
 }
 
 fn cell(entry: &Entry, column: &Column, starts: bool, shaded: bool) -> Markup {
@@ -187,16 +187,19 @@ fn classes(names: &[(&str, bool)]) -> Option<String> {
     (!applying.is_empty()).then(|| applying.join(" "))
 }
 
-fn curves(figures: &Figures) -> Vec<Part> {
+fn curves(figures: &Figures) -> Vec<Subsection> {
     let of_environments = figures.curves.chunk_by(|a, b| a.environment == b.environment);
     of_environments
-        .map(|of| Part { title: of[0].environment.clone(), content: html! { @for curve in of { (figure(curve)) } } })
+        .map(|of| Subsection {
+            title: of[0].environment.clone(),
+            content: html! { @for curve in of { (figure(curve)) } },
+        })
         .collect()
 }
 
-fn heatmaps(figures: &Figures) -> Vec<Part> {
+fn heatmaps(figures: &Figures) -> Vec<Subsection> {
     let of_environments = figures.heatmaps.chunk_by(|a, b| a[0].environment == b[0].environment);
-    let part = |rows: &[Vec<Figure>]| {
+    let subsection = |rows: &[Vec<Figure>]| {
         let environment = rows[0][0].environment.clone();
         let content = html! {
             h3 { (environment) }
@@ -204,9 +207,9 @@ fn heatmaps(figures: &Figures) -> Vec<Part> {
                 div.row style={ "--columns:" (row.len()) } { @for heatmap in row { (figure(heatmap)) } }
             }
         };
-        Part { title: environment, content }
+        Subsection { title: environment, content }
     };
-    of_environments.map(part).collect()
+    of_environments.map(subsection).collect()
 }
 
 fn figure(Figure { name, caption, picture, .. }: &Figure) -> Markup {

@@ -13,11 +13,11 @@ use std::collections::BTreeSet;
 
 use super::folder::Failure;
 use super::plan::{Cell, Plan};
-use super::selection::{Results, Selected, Selection};
+use super::selection::{MethodResults, Results, Selected};
 use super::table::Table;
 use numbers::{MethodIqms, MethodMetrics};
 
-pub use figures::{Figure, FigureData, FigureError, Figures};
+pub use figures::{Figure, FigureData, Figures};
 pub use html::html;
 
 /// The paper's budgets.
@@ -29,7 +29,7 @@ const MISSING: &str = "missing";
 /// What is reported of an experiment.
 pub struct Report<'a> {
     plan: &'a Plan,
-    selections: &'a [Selection<'a>],
+    selections: &'a [MethodResults<'a>],
     /// Sentences, with `names` between backticks.
     overview: Vec<String>,
     metrics: Vec<MethodMetrics<'a>>,
@@ -40,7 +40,7 @@ pub struct Report<'a> {
 
 impl<'a> Report<'a> {
     /// Of `results`, from which `selections` were made.
-    pub fn new(results: &'a Results<'a>, selections: &'a [Selection<'a>]) -> Self {
+    pub fn new(results: &'a Results<'a>, selections: &'a [MethodResults<'a>]) -> Self {
         Self {
             plan: results.plan,
             selections,
@@ -77,7 +77,7 @@ impl<'a> Report<'a> {
     }
 }
 
-fn overview(results: &Results<'_>, selections: &[Selection<'_>]) -> Vec<String> {
+fn overview(results: &Results<'_>, selections: &[MethodResults<'_>]) -> Vec<String> {
     let (cells, done, failed) = (results.plan.cells.len(), results.done().count(), results.failures().count());
     let mut lines =
         vec![format!("{done} of {cells} cells are done, {failed} failed, {} are missing.", cells - done - failed)];

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use crate::paper::{self, PaperNumber};
 use crate::plan::Plan;
-use crate::selection::{Selection, average, interquartile};
+use crate::selection::{MethodResults, average, interquartile};
 use crate::statistics::{Iqm, Summary};
 use crate::{Method, Metric};
 
@@ -49,8 +49,8 @@ impl MethodIqms {
 }
 
 /// Of each selection.
-pub(super) fn metrics<'a>(selections: &[Selection<'a>]) -> Vec<MethodMetrics<'a>> {
-    let of_selection = |selection: &Selection<'a>| MethodMetrics {
+pub(super) fn metrics<'a>(selections: &[MethodResults<'a>]) -> Vec<MethodMetrics<'a>> {
+    let of_selection = |selection: &MethodResults<'a>| MethodMetrics {
         environment: selection.environment,
         method: selection.method.clone(),
         ours: known(|metric| selection.summary(metric)),
@@ -62,7 +62,7 @@ pub(super) fn metrics<'a>(selections: &[Selection<'a>]) -> Vec<MethodMetrics<'a>
 }
 
 /// Averaged over the plan's environments.
-pub(super) fn averages(plan: &Plan, selections: &[Selection<'_>]) -> Vec<MethodMetrics<'static>> {
+pub(super) fn averages(plan: &Plan, selections: &[MethodResults<'_>]) -> Vec<MethodMetrics<'static>> {
     let environments = plan.environments();
     let of_method = |method: Method| {
         let found = of_method(selections, &method);
@@ -80,7 +80,7 @@ pub(super) fn averages(plan: &Plan, selections: &[Selection<'_>]) -> Vec<MethodM
 }
 
 /// Over the plan's environments.
-pub(super) fn iqms(plan: &Plan, selections: &[Selection<'_>]) -> Vec<MethodIqms> {
+pub(super) fn iqms(plan: &Plan, selections: &[MethodResults<'_>]) -> Vec<MethodIqms> {
     let environments = plan.environments().len();
     let of_method = |method: Method| {
         let found = of_method(selections, &method);
@@ -91,7 +91,7 @@ pub(super) fn iqms(plan: &Plan, selections: &[Selection<'_>]) -> Vec<MethodIqms>
 }
 
 /// In the order of the environments.
-fn of_method<'s, 'a>(selections: &'s [Selection<'a>], method: &Method) -> Vec<&'s Selection<'a>> {
+fn of_method<'s, 'a>(selections: &'s [MethodResults<'a>], method: &Method) -> Vec<&'s MethodResults<'a>> {
     selections.iter().filter(|selection| selection.method == *method).collect()
 }
 

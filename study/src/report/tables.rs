@@ -54,7 +54,7 @@ impl Report<'_> {
         let of_environments = self.selections.chunk_by(|a, b| a.environment == b.environment);
         let table = |selections: &[_]| {
             let trained = |selection| Version::ALL.map(|train| (selection, train));
-            let rows: Vec<(&super::Selection<'_>, Version)> = selections.iter().flat_map(trained).collect();
+            let rows: Vec<(&super::MethodResults<'_>, Version)> = selections.iter().flat_map(trained).collect();
             let mut table = Table::of(format!("{}: the nine scenarios", rows[0].0.environment), &rows)
                 .text("method", |(selection, _)| &selection.method)
                 .text("trained on", |(_, train)| train);

@@ -57,7 +57,7 @@ fn figures() -> Figures {
 #[case("text", |report: &Report<'_>| report.text())]
 #[case("markdown", |report: &Report<'_>| report.markdown())]
 #[case("csv", |report: &Report<'_>| {
-    let lines = |table: Table| format!("{}\n{}", table.title, String::from_utf8(table.to_csv().unwrap()).unwrap());
+    let lines = |table: Table| format!("{}\n{}", table.title, String::from_utf8(table.to_csv()).unwrap());
     report.files().map(lines).join("\n")
 })]
 #[case("html", |report: &Report<'_>| html(report, &figures()).replace(html::STYLE, "").replace("><", ">\n<"))]
