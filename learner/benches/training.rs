@@ -18,7 +18,7 @@ episodes = 1000000
 const ITERATIONS: u64 = 100;
 const SIGNAL: i32 = 15;
 
-fn main() -> anyhow::Result<()> {
+fn main() -> Result<(), Box<dyn std::error::Error>> {
     let servers = Servers::local(PrivateServerOptions::default())?;
     let config = TrainConfig::from_table("the bench", CONFIG.parse()?)?;
     let out = tempfile::tempdir()?;

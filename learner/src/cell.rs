@@ -4,20 +4,18 @@ use std::fmt::Write;
 use std::path::Path;
 use std::time::Instant;
 
-use anyhow::Result;
-
-use crate::checkpoint::{Checkpoint, CheckpointError, ResumeState};
-use crate::client::{ClientError, Servers};
+use crate::checkpoint::{Checkpoint, ResumeState};
+use crate::client::Servers;
 use crate::evaluation::{TestError, TestOptions, Tester};
 use crate::logging::Progress;
-use crate::rollout::CollectError;
-use crate::training::{RunDirectory, resume, train};
+use crate::training::{RunDirectory, RunDirectoryError, TrainError, resume, train};
 use perturb_protocol::Distribution;
+use perturb_study::files::delete;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::records;
+use perturb_study::records::{self, RecordsError};
 use perturb_study::sets::{Parameters, TestSet};
 use perturb_study::{
-    Cell, CellFolder, CellResult, CellState, Failure, FailureMark, FolderError, Tests, Timing, Training, io,
+    Cell, CellFolder, CellResult, CellState, Failure, FailureMark, FolderError, Tests, Timing, Training,
 };
 
 /// Stands for the program that began a training whose checkpoint does not say.
@@ -37,7 +35,33 @@ pub enum CellEnd {
     /// This signal asked to end. What was trained is kept.
     Stopped(i32),
     /// The servers are gone, which is not the cell's failure.
-    NoServer(anyhow::Error),
+    NoServer(CellError),
+}
+
+/// Why a cell has no result.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum CellError {
+    /// It cannot be trained.
+    #[error(transparent)]
+    Train(#[from] TrainError),
+    /// It cannot be tested.
+    #[error(transparent)]
+    Test(#[from] TestError),
+    /// Its episodes cannot be recorded.
+    #[error(transparent)]
+    Records(#[from] RecordsError),
+}
+
+impl CellError {
+    /// Whether the fault is that of the servers or of the way to them, not of what was trained.
+    fn can_be_retried(&self) -> bool {
+        match self {
+            Self::Train(error) => error.can_be_retried(),
+            Self::Test(error) => error.can_be_retried(),
+            Self::Records(_) => false,
+        }
+    }
 }
 
 /// Trains and tests `cell` in `folder`, unless that is done, or has failed otherwise than `retry` says. Calls `report`
@@ -59,7 +83,7 @@ pub fn run_cell(
         CellState::Failed(failure) if folder.failure_mark() != retry => return Ok(CellEnd::Failed(failure)),
         CellState::Failed(_) => {
             // What was trained so far led to the failure.
-            remove(&folder.training())?;
+            delete(&folder.training())?;
             folder.forget_failure()?;
         }
         CellState::Missing => {}
@@ -75,22 +99,14 @@ pub fn run_cell(
         (Ok(None), signal) => Ok(CellEnd::Stopped(signal.unwrap_or(SIGTERM))),
         // Whoever stops a run may end its servers too.
         (Err(_), Some(signal)) => Ok(CellEnd::Stopped(signal)),
-        (Err(error), None) if lost_server(&error) => Ok(CellEnd::NoServer(error)),
+        (Err(error), None) if error.can_be_retried() => Ok(CellEnd::NoServer(error)),
         (Err(error), None) => {
             // Without the folder's place: wherever the same happens, the same is recorded.
-            let reason = format!("{error:#}").replace(&format!("{}/", folder.path().display()), "");
+            let reason = error.to_string().replace(&format!("{}/", folder.path().display()), "");
             let failure = Failure { id: cell.id.clone(), reason, commit: perturb_study::VERSION.into() };
             folder.write_failure(&failure)?;
             Ok(CellEnd::Failed(failure))
         }
-    }
-}
-
-/// Deletes a folder, if it is there.
-fn remove(path: &Path) -> Result<(), FolderError> {
-    match std::fs::remove_dir_all(path) {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(io("delete", path)(error)),
-        _ => Ok(()),
     }
 }
 
@@ -101,7 +117,7 @@ fn train_and_test(
     folder: &CellFolder,
     stop: &StopFlag,
     report: &mut dyn FnMut(&str, u64),
-) -> Result<Option<CellResult>> {
+) -> Result<Option<CellResult>, CellError> {
     let Some(checkpoint) = trained(servers, cell, &folder.training(), stop, report)? else { return Ok(None) };
     let Tests { episodes, ref sets, ref success } = cell.tests;
     let options = TestOptions { episodes, seed: cell.config.common.seed, success: success.clone() };
@@ -158,7 +174,7 @@ fn trained(
     directory: &Path,
     stop: &StopFlag,
     report: &mut dyn FnMut(&str, u64),
-) -> Result<Option<Checkpoint>> {
+) -> Result<Option<Checkpoint>, TrainError> {
     let config = &cell.config;
     let progress = |progress: &Progress| report("training", progress.episodes);
     let earlier = earlier(directory)?;
@@ -178,41 +194,16 @@ fn trained(
 ///
 /// # Errors
 /// Whatever else keeps it from being read, a lock for instance: then it may still go on later, and is left as it is.
-fn earlier(directory: &Path) -> Result<Option<(RunDirectory, Checkpoint, ResumeState)>> {
-    if !directory.try_exists()? {
-        return Ok(None);
+fn earlier(directory: &Path) -> Result<Option<(RunDirectory, Checkpoint, ResumeState)>, RunDirectoryError> {
+    match RunDirectory::resume(directory) {
+        Ok(earlier) => Ok(Some(earlier)),
+        Err(RunDirectoryError::Missing { .. }) => Ok(None),
+        Err(error) if error.is_hopeless() => {
+            tracing::warn!("the training begins again: {error}");
+            Ok(None)
+        }
+        Err(error) => Err(error),
     }
-    let error = match RunDirectory::resume(directory) {
-        Ok(earlier) => return Ok(Some(earlier)),
-        Err(error) => error,
-    };
-    let useless = match error.downcast_ref() {
-        Some(CheckpointError::Damaged { .. } | CheckpointError::NotResumable { .. }) => true,
-        Some(_) => false,
-        None => !directory.join("checkpoint").join("checkpoint.json").try_exists()?,
-    };
-    if !useless {
-        return Err(error);
-    }
-    tracing::warn!("the training begins again: {error:#}");
-    Ok(None)
-}
-
-/// Whether an error came from the servers or the way to them, not from what was trained.
-fn lost_server(error: &anyhow::Error) -> bool {
-    let client = error.chain().find_map(|cause| {
-        let direct = cause.downcast_ref::<ClientError>();
-        let collecting = cause.downcast_ref::<CollectError>().and_then(|error| match error {
-            CollectError::Client(error) => Some(error),
-            _ => None,
-        });
-        let testing = cause.downcast_ref::<TestError>().and_then(|error| match error {
-            TestError::Client(error) => Some(error),
-            _ => None,
-        });
-        direct.or(collecting).or(testing)
-    });
-    client.is_some_and(ClientError::can_be_retried)
 }
 
 /// Parameters as they are typed.
@@ -308,30 +299,6 @@ mod tests {
         let lock = std::fs::File::open(&training).unwrap();
         lock.try_lock().unwrap();
         let Err(error) = earlier(&training) else { panic!("it is locked") };
-        assert!(error.to_string().contains("another process trains in"), "{error:#}");
-    }
-
-    #[test]
-    fn a_lost_server_is_told_from_a_failure() {
-        let address: crate::client::Address = "unix:/x".parse().unwrap();
-        let lost = || ClientError::Lost {
-            address: address.clone(),
-            request: "a step",
-            code: tonic::Code::Unavailable,
-            reason: "gone".into(),
-        };
-        let refused_with =
-            |code| ClientError::Refused { address: address.clone(), request: "open", code, message: "no".into() };
-        let refused = || refused_with(tonic::Code::NotFound);
-        assert!(lost_server(&anyhow::Error::new(refused_with(tonic::Code::ResourceExhausted))), "the server is full");
-        assert!(lost_server(&anyhow::Error::new(lost())));
-        assert!(lost_server(&anyhow::Error::new(CollectError::Client(lost())).context("training failed")));
-        assert!(lost_server(&anyhow::Error::new(TestError::Client(lost())).context("testing")));
-        let environment = "Hopper".to_owned();
-        let disagreement = ClientError::Disagreement { first: address.clone(), other: address.clone(), environment };
-        assert!(lost_server(&anyhow::Error::new(disagreement)), "servers of two versions");
-        assert!(!lost_server(&anyhow::Error::new(refused())));
-        assert!(!lost_server(&anyhow::Error::new(CollectError::Client(refused())).context("training")));
-        assert!(!lost_server(&anyhow::anyhow!("NaN")));
+        assert!(error.to_string().contains("another process trains in"), "{error}");
     }
 }

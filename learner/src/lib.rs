@@ -15,7 +15,6 @@ pub mod loss;
 pub mod measure;
 pub mod policy;
 pub mod rollout;
-mod run_directory;
 pub mod training;
 
 pub use perturb_protocol::proto;

@@ -2,19 +2,19 @@
 
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result};
+use perturb_study::files::io;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::{Cell, Measurement, Speed};
 
 use crate::client::Servers;
-use crate::training::{RunDirectory, train};
+use crate::training::{RunDirectory, TrainError, train};
 
 /// Trains as `cell` does for about `limit`, at least one iteration, and forgets what was learned.
 ///
 /// # Errors
-/// Whatever ends a training.
-pub fn measure(servers: &Servers, cell: &Cell, limit: Duration) -> Result<Measurement> {
-    let scratch = tempfile::tempdir().context("cannot create a temporary directory")?;
+/// [`TrainError`].
+pub fn measure(servers: &Servers, cell: &Cell, limit: Duration) -> Result<Measurement, TrainError> {
+    let scratch = tempfile::tempdir().map_err(io("create a folder in", &std::env::temp_dir()))?;
     let directory = RunDirectory::choose(scratch.path(), true)?;
     let stop = StopFlag::default();
     let start = Instant::now();

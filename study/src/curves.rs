@@ -4,10 +4,11 @@ use std::path::Path;
 
 use serde::Deserialize;
 
-use super::folder::{Folder, FolderError, io};
+use super::folder::{Folder, FolderError};
 use super::selection::MethodResults;
 use super::statistics::Summary;
 use super::table::Table;
+use crate::files::io;
 use crate::{Method, Version, mean};
 
 /// A point is a mean over at least so many episodes of each run …

@@ -12,11 +12,10 @@
 //! DIR/report/                what `perturb report` writes
 //! ```
 //!
-//! Locks are advisory locks of the operating system: they end with the process that holds them, however it ends.
+//! Every file appears complete.
 
 use std::collections::BTreeMap;
-use std::fs::{self, File, TryLockError};
-use std::io::{ErrorKind, Write};
+use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
@@ -24,6 +23,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use super::plan::{Cell, Plan};
+use crate::files::{self, FileError, Lock, write_atomically};
 use crate::records::Agreement;
 use crate::results::Counters;
 use crate::{Method, TestResult, Version};
@@ -41,12 +41,6 @@ pub struct Folder {
 #[derive(Clone, Debug)]
 pub struct CellFolder {
     path: PathBuf,
-}
-
-/// Whoever has it may work on the cell.
-#[derive(Debug)]
-pub struct CellLock {
-    _file: File,
 }
 
 /// Tells one record of a failure from the next, even if both say the same.
@@ -147,15 +141,8 @@ pub struct Timing {
 #[non_exhaustive]
 pub enum FolderError {
     /// The operating system refused a file.
-    #[error("cannot {action} {}: {source}", path.display())]
-    Io {
-        /// What was tried.
-        action: &'static str,
-        /// On what.
-        path: PathBuf,
-        /// Its answer.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    File(#[from] FileError),
     /// A file is damaged, or of a program that is too different.
     #[error("{} is not understood: {reason}; delete it to have the cell done again", path.display())]
     Damaged {
@@ -207,18 +194,13 @@ impl Folder {
     /// Keeps a copy of the experiment file, with the files that it names; says whether there was another one.
     ///
     /// # Errors
-    /// [`FolderError::Io`].
-    pub fn keep_plan(&self, plan: &Plan) -> Result<bool> {
-        let path = self.plan_path();
-        let earlier = match fs::read_to_string(&path) {
-            Ok(earlier) => Some(earlier),
-            Err(error) if error.kind() == ErrorKind::NotFound => None,
-            Err(source) => return Err(FolderError::Io { action: "read", path, source }),
-        };
-        let same = earlier.as_deref() == Some(&plan.text);
+    /// [`FileError`].
+    pub fn keep_plan(&self, plan: &Plan) -> files::Result<bool> {
+        let earlier = files::read_if_there(&self.plan_path())?;
+        let same = earlier.as_deref() == Some(plan.text.as_bytes());
         for (name, content) in plan.files() {
             let path = self.path.join(name);
-            if read_bytes(&path)?.as_deref() != Some(content) {
+            if files::read_if_there(&path)?.as_deref() != Some(content) {
                 write_atomically(&path, content)?;
             }
         }
@@ -279,61 +261,47 @@ impl CellFolder {
     /// Tries to become the one who works on the cell; `None` while somebody else does.
     ///
     /// # Errors
-    /// [`FolderError::Io`].
-    pub fn try_lock(&self) -> Result<Option<CellLock>> {
-        fs::create_dir_all(&self.path).map_err(io("create", &self.path))?;
-        let path = self.path.join("lock");
-        let file = File::options().create(true).truncate(false).write(true).open(&path).map_err(io("open", &path))?;
-        match file.try_lock() {
-            Ok(()) => Ok(Some(CellLock { _file: file })),
-            Err(TryLockError::WouldBlock) => Ok(None),
-            Err(TryLockError::Error(source)) => Err(FolderError::Io { action: "lock", path, source }),
-        }
+    /// [`FileError`].
+    pub fn try_lock(&self) -> files::Result<Option<Lock>> {
+        files::create_folder(&self.path)?;
+        Lock::try_take(&self.path.join("lock"))
     }
 
     /// Makes the result appear, complete.
     ///
     /// # Errors
-    /// [`FolderError::Io`].
-    pub fn write_result(&self, result: &CellResult) -> Result<()> {
-        self.write("result.json", result)
+    /// [`FileError`].
+    pub fn write_result(&self, result: &CellResult) -> files::Result<()> {
+        files::write_json(&self.path.join("result.json"), result)
     }
 
     /// Records a failure.
     ///
     /// # Errors
-    /// [`FolderError::Io`].
-    pub fn write_failure(&self, failure: &Failure) -> Result<()> {
-        self.write("failure.json", failure)
+    /// [`FileError`].
+    pub fn write_failure(&self, failure: &Failure) -> files::Result<()> {
+        files::write_json(&self.path.join("failure.json"), failure)
     }
 
     /// Forgets a failure.
     ///
     /// # Errors
-    /// [`FolderError::Io`].
-    pub fn forget_failure(&self) -> Result<()> {
-        let path = self.path.join("failure.json");
-        match fs::remove_file(&path) {
-            Err(error) if error.kind() != ErrorKind::NotFound => Err(io("delete", &path)(error)),
-            _ => Ok(()),
-        }
+    /// [`FileError`].
+    pub fn forget_failure(&self) -> files::Result<()> {
+        files::delete(&self.path.join("failure.json"))
     }
 
     /// Records how long the cell took.
     ///
     /// # Errors
-    /// [`FolderError::Io`].
-    pub fn write_timing(&self, timing: &Timing) -> Result<()> {
-        self.write("timing.json", timing)
+    /// [`FileError`].
+    pub fn write_timing(&self, timing: &Timing) -> files::Result<()> {
+        files::write_json(&self.path.join("timing.json"), timing)
     }
 
     /// How long the cell took; `None` if that is not known.
     pub fn timing(&self) -> Option<Timing> {
         read(&self.path.join("timing.json")).ok().flatten()
-    }
-
-    fn write(&self, name: &str, document: &impl Serialize) -> Result<()> {
-        write_json(&self.path.join(name), document)
     }
 }
 
@@ -368,51 +336,11 @@ impl CellResult {
     }
 }
 
-/// A file's content; `None` if it is not there.
-pub(super) fn read_bytes(path: &Path) -> Result<Option<Vec<u8>>> {
-    match fs::read(path) {
-        Ok(content) => Ok(Some(content)),
-        Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
-        Err(error) => Err(io("read", path)(error)),
-    }
-}
-
 /// A JSON file; `None` if it is not there.
 fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
-    let Some(text) = read_bytes(path)? else { return Ok(None) };
+    let Some(text) = files::read_if_there(path)? else { return Ok(None) };
     let damaged = |error: serde_json::Error| FolderError::Damaged { path: path.to_owned(), reason: error.to_string() };
     serde_json::from_slice(&text).map(Some).map_err(damaged)
-}
-
-/// Writes a JSON file in one piece.
-pub(super) fn write_json(path: &Path, document: &impl Serialize) -> Result<()> {
-    let mut text = serde_json::to_vec_pretty(document)
-        .map_err(|error| FolderError::Damaged { path: path.to_owned(), reason: error.to_string() })?;
-    text.push(b'\n');
-    write_atomically(path, &text)
-}
-
-/// Writes a file in one piece: it appears complete, and on the disk, or not at all. Folders are created.
-///
-/// # Errors
-/// [`FolderError::Io`].
-pub fn write_atomically(path: &Path, content: &[u8]) -> Result<()> {
-    let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    fs::create_dir_all(directory).map_err(io("create", directory))?;
-    // As readable as any other file that is created here; temporary files are otherwise their owner's alone.
-    let mode = <fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666);
-    let mut builder = tempfile::Builder::new();
-    let mut file =
-        builder.prefix(".tmp-").permissions(mode).tempfile_in(directory).map_err(io("write in", directory))?;
-    file.write_all(content).and_then(|()| file.as_file().sync_all()).map_err(io("write", path))?;
-    file.persist(path).map_err(|error| io("rename a file to", path)(error.error))?;
-    File::open(directory).and_then(|directory| directory.sync_all()).map_err(io("sync", directory))
-}
-
-/// Names the file in the operating system's error.
-pub fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> FolderError {
-    let path = path.to_owned();
-    move |source| FolderError::Io { action, path, source }
 }
 
 #[cfg(test)]
@@ -486,17 +414,6 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_is_locked_by_one_at_a_time() {
-        let directory = tempfile::tempdir().unwrap();
-        let cell = Folder::new(directory.path()).cell("a");
-        let lock = cell.try_lock().unwrap();
-        assert!(lock.is_some());
-        assert!(cell.try_lock().unwrap().is_none());
-        drop(lock);
-        assert!(cell.try_lock().unwrap().is_some());
-    }
-
-    #[test]
     fn a_damaged_result_is_named_not_taken_for_missing() {
         let directory = tempfile::tempdir().unwrap();
         let cell = Folder::new(directory.path()).cell("a");
@@ -507,17 +424,6 @@ mod tests {
         }
         cell.write_result(&CellResult { format_version: 9, ..result() }).unwrap();
         assert!(cell.state().unwrap_err().to_string().contains("it has format 9, this program reads 1"));
-    }
-
-    #[test]
-    fn a_result_is_as_readable_as_other_files() {
-        use std::os::unix::fs::PermissionsExt;
-        let directory = tempfile::tempdir().unwrap();
-        let [plain, whole] = ["plain", "whole"].map(|name| directory.path().join(name));
-        fs::write(&plain, "x").unwrap();
-        write_atomically(&whole, b"x").unwrap();
-        let [plain, whole] = [plain, whole].map(|path| fs::metadata(path).unwrap().permissions().mode());
-        assert_eq!(plain, whole);
     }
 
     #[test]

@@ -13,11 +13,12 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::folder::{Folder, FolderError, io, read_bytes, write_atomically, write_json};
+use super::folder::{Folder, FolderError};
 use super::heatmap::{Heatmap, HeatmapOptions, heatmap_table};
 use super::plan::Cell;
 use super::plot::{self, PlotError};
 use super::selection::{MethodResults, Selected};
+use crate::files::{self, delete, read_if_there, write_atomically, write_json};
 use crate::{Method, Version};
 
 /// Of the records; raised when older programs could misread them.
@@ -99,7 +100,7 @@ impl HeatmapPlace<'_> {
     /// [`FolderError`] if a file is there that cannot be read.
     pub fn read(&self, folder: &Folder) -> Result<Result<StoredHeatmap, NoHeatmap>, FolderError> {
         let Some(Selected { cell, .. }) = self.selected else { return Ok(Err(NoHeatmap::NoResult)) };
-        let Some(text) = read_bytes(&file(folder, &cell.id, "json"))? else { return Ok(Err(NoHeatmap::NotMade)) };
+        let Some(text) = read_if_there(&file(folder, &cell.id, "json"))? else { return Ok(Err(NoHeatmap::NotMade)) };
         // One that is not understood is made again like one that is not there.
         let Ok(record) = serde_json::from_slice::<HeatmapRecord>(&text) else { return Ok(Err(NoHeatmap::NotMade)) };
         if record.format_version != FORMAT_VERSION || record.cell != cell.id {
@@ -110,7 +111,7 @@ impl HeatmapPlace<'_> {
         }
         let mut png = Vec::new();
         for (ending, expected) in &record.files {
-            match read_bytes(&file(folder, &cell.id, ending))? {
+            match read_if_there(&file(folder, &cell.id, ending))? {
                 Some(content) if checksum(&content) == *expected => {
                     if ending == "png" {
                         png = content;
@@ -142,10 +143,7 @@ pub fn store_heatmap(
 ) -> Result<PathBuf, PlotError> {
     let record_path = file(folder, &cell.id, "json");
     let result = result_checksum(folder, cell)?;
-    match std::fs::remove_file(&record_path) {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(io("delete", &record_path)(error))?,
-        _ => {}
-    }
+    delete(&record_path)?;
     let mut files = BTreeMap::new();
     for (ending, content) in heatmap_files(heatmap)? {
         write_atomically(&file(folder, &cell.id, ending), &content)?;
@@ -183,8 +181,8 @@ fn file(folder: &Folder, id: &str, ending: &str) -> PathBuf {
 }
 
 /// Of a cell's result as it is on the disk.
-fn result_checksum(folder: &Folder, cell: &Cell) -> Result<Option<String>, FolderError> {
-    Ok(read_bytes(&folder.cell(&cell.id).path().join("result.json"))?.map(|content| checksum(&content)))
+fn result_checksum(folder: &Folder, cell: &Cell) -> files::Result<Option<String>> {
+    Ok(read_if_there(&folder.cell(&cell.id).path().join("result.json"))?.map(|content| checksum(&content)))
 }
 
 fn checksum(content: &[u8]) -> String {

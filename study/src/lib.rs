@@ -9,6 +9,7 @@
 
 mod cost;
 mod curves;
+pub mod files;
 #[cfg(test)]
 mod fixture;
 mod folder;
@@ -35,10 +36,7 @@ pub mod table;
 
 pub use cost::{Estimate, Measurement, Speed, Work, cell_seconds, estimate, representatives};
 pub use curves::{Curve, EnvironmentCurves, Point, curves_table, read_curves};
-pub use folder::{
-    CellFolder, CellLock, CellResult, CellState, Failure, FailureMark, Folder, FolderError, Timing, Training, io,
-    write_atomically,
-};
+pub use folder::{CellFolder, CellResult, CellState, Failure, FailureMark, Folder, FolderError, Timing, Training};
 pub use heatmap::{Axis, Heatmap, HeatmapOptions, HeatmapPoint, MOST_POINTS, heatmap_table};
 pub use heatmaps::{
     HeatmapPlace, HeatmapRecord, NoHeatmap, StoredHeatmap, heatmap_files, heatmap_places, store_heatmap,

@@ -11,6 +11,7 @@ use perturb_protocol::proto;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
+use crate::files::{self, FileError};
 use crate::sets::{self, Assignment, Contexts, SetError, TestSet, set_of, set_of_csv};
 use crate::settings::{ConfigError, TrainConfig, WrapperSettings};
 use crate::success::{Criterion, Threshold, ThresholdError};
@@ -102,13 +103,8 @@ const MOST_CELLS: usize = 1_000_000;
 #[non_exhaustive]
 pub enum PlanError {
     /// It cannot be read.
-    #[error("cannot read {path}: {source}")]
-    File {
-        /// Its path.
-        path: String,
-        /// The operating system's answer.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    File(#[from] FileError),
     /// It is not TOML, or has other keys than an experiment file.
     #[error("{path}: {reason}")]
     Syntax {
@@ -209,9 +205,7 @@ impl Plan {
     /// # Errors
     /// [`PlanError`], which names the table and the key.
     pub fn load(path: &Path) -> Result<Self, PlanError> {
-        let shown = path.display().to_string();
-        let text = std::fs::read_to_string(path).map_err(|source| PlanError::File { path: shown.clone(), source })?;
-        Self::parse(&shown, text)
+        Self::parse(&path.display().to_string(), files::read_text(path)?)
     }
 
     /// The files that it consists of, by their names: `plan.toml` and those that its sets name.

@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 use super::folder::{Failure, FailureMark, Folder, FolderError};
 use super::plan::{Cell, Plan};
 use crate::Method;
+use crate::files::FileError;
 use crate::interrupt::StopFlag;
 
 /// A worker's exit status if somebody else works on its cell (EX_TEMPFAIL of sysexits.h).
@@ -92,6 +93,9 @@ pub enum RunError {
     /// The folder cannot be read or written.
     #[error(transparent)]
     Folder(#[from] FolderError),
+    /// The operating system refused a file.
+    #[error(transparent)]
+    File(#[from] FileError),
     /// A worker cannot be started.
     #[error("cannot start a worker process: {0}")]
     Spawn(std::io::Error),

@@ -3,7 +3,6 @@
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, bail};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::evaluation::{Audit, audit};
 use perturb_study::Folder;
@@ -12,8 +11,9 @@ use perturb_study::records::{FILE, Records};
 
 use super::args::AuditArgs;
 use super::bar::Bar;
+use super::error::{CommandError, Result, system};
 use super::rates::file_in;
-use super::{Ending, UsageError, servers};
+use super::{Ending, servers};
 
 /// So many differences are told of each policy.
 const SHOWN: usize = 3;
@@ -27,7 +27,7 @@ struct Tested {
 
 pub(super) fn run(args: &AuditArgs) -> Result<Ending> {
     let tested = tested(args)?;
-    let stop = StopFlag::on_signals().context("cannot wait for signals")?;
+    let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = servers(&args.server, 0)?;
     let mut out = std::io::stdout();
     let (mut played, mut different) = (0, 0);
@@ -67,14 +67,14 @@ fn tested(args: &AuditArgs) -> Result<Vec<Tested>> {
     }
     if !path.is_dir() {
         let message = format!("{} is a file of records: give --checkpoint, the policy that was tested", path.display());
-        return Err(UsageError(message).into());
+        return Err(CommandError::Usage(message));
     }
     let folder = Folder::new(path);
     let plan = perturb_study::Plan::load(&folder.require_plan()?)?;
     let cells = plan.cells.iter().map(|found| folder.cell(&found.id).path().to_owned());
     let tested: Vec<Tested> = cells.filter(|path| path.join(FILE).is_file()).map(|path| cell(&path)).collect();
     if tested.is_empty() {
-        bail!("no cell of {} has recorded episodes", path.display());
+        return Err(CommandError::Failed(format!("no cell of {} has recorded episodes", path.display())));
     }
     Ok(tested)
 }

@@ -5,10 +5,9 @@ use std::io::Write;
 use std::path::Path;
 use std::time::Instant;
 
-use anyhow::{Context, Result};
-
 use super::args::DemoArgs;
 use super::bar::Bar;
+use super::error::{Result, system};
 use super::train::describe;
 use super::{Ending, servers};
 use perturb_learner::checkpoint::Checkpoint;
@@ -31,9 +30,9 @@ const ENVIRONMENT: &str = "CartPole";
 
 pub(super) fn run(args: &DemoArgs) -> Result<Ending> {
     let start = Instant::now();
-    let stop = StopFlag::on_signals().context("cannot wait for signals")?;
+    let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = servers(&args.server, 0)?;
-    let scratch = tempfile::tempdir().context("cannot create a temporary directory")?;
+    let scratch = tempfile::tempdir().map_err(system("create a temporary directory"))?;
     let mut out = std::io::stdout();
     let directory = args.out.clone().unwrap_or_else(|| scratch.path().to_owned());
 

@@ -2,10 +2,10 @@
 
 use std::io::Write;
 
-use anyhow::Result;
 use perturb_protocol::catalogue;
 
 use super::args::EnvsArgs;
+use super::error::Result;
 use super::{Ending, servers};
 use perturb_learner::proto::{Channel, Distribution, Environment, action_space::Kind};
 use perturb_study::table::Table;

@@ -1,17 +1,17 @@
 //! `perturb evaluate`.
 
 use std::io::Write;
-use std::path::Path;
 
-use anyhow::{Context, Result};
 use serde_json::{Map, Value, json};
 
 use super::args::EvaluateArgs;
 use super::bar::Bar;
+use super::error::{Result, system};
 use super::{Ending, servers, sets};
 use perturb_learner::checkpoint::{Checkpoint, State};
 use perturb_learner::evaluation::{TestOptions, Tester};
 use perturb_study::TestResult;
+use perturb_study::files::write_json;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::sets::TestSet;
 use perturb_study::table::Table;
@@ -20,7 +20,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
     let checkpoint = Checkpoint::load(&args.checkpoint)?;
     let sets = sets::tested(&args.versions, &args.set)?;
     let seed = args.seed.unwrap_or(checkpoint.state.seed);
-    let stop = StopFlag::on_signals().context("cannot wait for signals")?;
+    let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = servers(&args.server, sets.iter().map(|set| set.listed().len()).max().unwrap_or_default())?;
     let state = &checkpoint.state;
     let options = TestOptions { episodes: args.episodes, seed, success: args.success.clone() };
@@ -42,7 +42,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
     let results: Vec<(String, TestResult)> =
         sets.iter().map(|set| (set.name.clone(), records.result(&set.name, None))).collect();
     if let Some(path) = &args.json {
-        write_json(path, state, seed, &results)?;
+        write_json(path, &document(state, seed, &results))?;
     }
     let table = Table::of("", &results)
         .text("tested on", |(set, _)| set)
@@ -70,10 +70,9 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
 }
 
 /// The result as JSON: who was tested, and the figures of each set.
-fn document(state: &State, evaluation_seed: u64, results: &[(String, TestResult)]) -> Result<Value> {
-    let results: Map<String, Value> =
-        results.iter().map(|(set, result)| Ok((set.clone(), serde_json::to_value(result)?))).collect::<Result<_>>()?;
-    Ok(json!({
+fn document(state: &State, evaluation_seed: u64, results: &[(String, TestResult)]) -> Value {
+    let results: Map<String, Value> = results.iter().map(|(set, result)| (set.clone(), json!(result))).collect();
+    json!({
         "environment": state.environment,
         "algorithm": state.algorithm,
         "architecture": state.architecture,
@@ -83,11 +82,5 @@ fn document(state: &State, evaluation_seed: u64, results: &[(String, TestResult)
         "evaluation_seed": evaluation_seed,
         "training_episodes": state.counters.episodes,
         "results": results,
-    }))
-}
-
-fn write_json(path: &Path, state: &State, seed: u64, results: &[(String, TestResult)]) -> Result<()> {
-    let mut text = serde_json::to_string_pretty(&document(state, seed, results)?)?;
-    text.push('\n');
-    std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
+    })
 }

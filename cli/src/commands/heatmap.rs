@@ -3,17 +3,16 @@
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, bail};
-
 use super::args::HeatmapArgs;
 use super::bar::Bar;
-use super::report::write_file;
-use super::{Ending, UsageError, servers, sets};
+use super::error::{CommandError, Result, system};
+use super::{Ending, servers, sets};
 use perturb_learner::checkpoint::{Checkpoint, State};
 use perturb_learner::client::Servers;
 use perturb_learner::evaluation::{heatmap, heatmap_again};
 use perturb_learner::proto;
 use perturb_protocol::{Distribution, Version};
+use perturb_study::files::write_atomically;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::Records;
 use perturb_study::{
@@ -25,7 +24,7 @@ pub(super) fn run(args: &HeatmapArgs) -> Result<Ending> {
     match (&args.dir, &args.checkpoint) {
         (Some(directory), _) => of_experiment(args, directory),
         (None, Some(checkpoint)) => of_checkpoint(args, checkpoint),
-        (None, None) => Err(UsageError("give the directory of an experiment, or --checkpoint".into()).into()),
+        (None, None) => Err(CommandError::Usage("give the directory of an experiment, or --checkpoint".into())),
     }
 }
 
@@ -33,14 +32,14 @@ pub(super) fn run(args: &HeatmapArgs) -> Result<Ending> {
 fn of_checkpoint(args: &HeatmapArgs, path: &Path) -> Result<Ending> {
     let checkpoint = Checkpoint::load(path)?;
     let state = &checkpoint.state;
-    let stop = StopFlag::on_signals().context("cannot wait for signals")?;
+    let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = servers(&args.server, args.grid * args.grid)?;
     let environment = servers.environment(&state.environment)?;
     let parameters = match (&args.x, &args.y) {
         (Some(x), Some(y)) => [x.clone(), y.clone()],
         _ => usual_axes(&environment).ok_or_else(|| {
             let message = format!("give --x and --y: it is not known which of {}'s to show", state.environment);
-            UsageError(message)
+            CommandError::Usage(message)
         })?,
     };
     let options = HeatmapOptions { fixed: fixed(args)?, ..options(args, parameters, state) };
@@ -62,7 +61,7 @@ fn of_checkpoint(args: &HeatmapArgs, path: &Path) -> Result<Ending> {
     for (ending, content) in heatmap_files(&heatmap)? {
         let mut name = path.clone().into_os_string();
         name.push(format!(".{ending}"));
-        write_file(Path::new(&name), &content)?;
+        write_atomically(Path::new(&name), &content)?;
         writeln!(out, "{}", Path::new(&name).display())?;
     }
     Ok(Ending::Done)
@@ -74,10 +73,12 @@ fn usual_axes(environment: &proto::Environment) -> Option<[String; 2]> {
 }
 
 /// The values of other parameters.
-fn fixed(args: &HeatmapArgs) -> Result<sets::Fixed, UsageError> {
+fn fixed(args: &HeatmapArgs) -> Result<sets::Fixed> {
     let value = |(name, values): (String, Distribution)| match values.range() {
         (low, high) if low == high => Ok((name, low)),
-        _ => Err(UsageError(format!("--parameters {name} has more than one value; --x and --y are what varies"))),
+        _ => Err(CommandError::Usage(format!(
+            "--parameters {name} has more than one value; --x and --y are what varies"
+        ))),
     };
     sets::drawn(Version::D, &args.parameters)?.drawn().into_iter().map(value).collect()
 }
@@ -95,7 +96,7 @@ fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<Ending> {
     let results = Results::read(&plan, &folder)?;
     let selections = results.select();
     let places = heatmap_places(&selections);
-    let stop = StopFlag::on_signals().context("cannot wait for signals")?;
+    let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let mut servers_of_all = None;
     let mut out = std::io::stdout();
     let mut failed = 0;
@@ -115,7 +116,7 @@ fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<Ending> {
         let checkpoint = match checkpoint_of(&folder, selected) {
             Ok(checkpoint) => checkpoint,
             Err(error) => {
-                eprintln!("{place}: {error:#}");
+                eprintln!("{place}: {error}");
                 failed += 1;
                 continue;
             }
@@ -125,14 +126,15 @@ fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<Ending> {
             eprintln!("{place}: is there already");
             continue;
         }
-        let (heatmap, records) = test(servers, &checkpoint, &options, &stop).with_context(|| place.to_string())?;
-        let id = checkpoint.id().map_err(|reason| anyhow::anyhow!("{place}: {reason}"))?;
+        let (heatmap, records) = test(servers, &checkpoint, &options, &stop)
+            .map_err(|error| CommandError::Place { place: place.to_string(), source: Box::new(error) })?;
+        let id = checkpoint.id().map_err(|reason| CommandError::Failed(format!("{place}: {reason}")))?;
         let path = store_heatmap(&folder, selected.cell, id, options, &heatmap)?;
         records.write(&path.with_extension("parquet"))?;
         writeln!(out, "{}.png, .svg and .csv", path.display())?;
     }
     if failed > 0 {
-        bail!("{failed} of {} heatmaps could not be made", places.len());
+        return Err(CommandError::Failed(format!("{failed} of {} heatmaps could not be made", places.len())));
     }
     Ok(Ending::Done)
 }
@@ -142,7 +144,8 @@ fn checkpoint_of(folder: &Folder, Selected { cell, result }: Selected<'_>) -> Re
     let checkpoint = Checkpoint::load(&folder.cell(&cell.id).training())?;
     let (state, training) = (&checkpoint.state, &result.training);
     if training.settings != state.config || training.counters != state.counters {
-        bail!("the checkpoint of {} is not the one that its result.json came from", cell.id);
+        let message = format!("the checkpoint of {} is not the one that its result.json came from", cell.id);
+        return Err(CommandError::Failed(message));
     }
     Ok(checkpoint)
 }

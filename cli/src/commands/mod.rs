@@ -10,6 +10,7 @@ mod audit;
 mod bar;
 mod demo;
 mod envs;
+mod error;
 mod evaluate;
 mod heatmap;
 mod plan;
@@ -25,17 +26,11 @@ mod video;
 use std::io::IsTerminal;
 use std::process::ExitCode;
 
-use anyhow::{Context, Result};
 use clap::Parser;
 
-use crate::video::VideoError;
 use args::{Cli, Command, ServerArgs};
+use error::{CommandError, Result};
 use perturb_learner::client::{PrivateServerOptions, Servers};
-use perturb_learner::evaluation::HeatmapError;
-use perturb_learner::evaluation::TestError;
-use perturb_study::PlanError;
-use perturb_study::settings::ConfigError;
-use perturb_study::slurm::OptionError;
 
 /// How a command ended that did not fail.
 enum Ending {
@@ -46,11 +41,6 @@ enum Ending {
     /// It could not do its work now, for the reason that this exit status stands for.
     Status(u8),
 }
-
-/// A mistake of the person who typed the command.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-struct UsageError(String);
 
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
@@ -85,29 +75,12 @@ pub fn main() -> ExitCode {
     }
 }
 
-fn fail(error: &anyhow::Error) -> ExitCode {
-    let stopped = match (error.downcast_ref(), error.downcast_ref()) {
-        (Some(HeatmapError::Test(error)), _) | (_, Some(VideoError::Test(error))) => Some(error),
-        _ => error.downcast_ref(),
-    };
-    if let Some(TestError::Stopped { signal }) = stopped {
-        eprintln!("perturb: {error:#}");
-        return signal_code(*signal);
-    }
-    // A closed pipe is how `perturb envs | head` ends.
-    let closed = |cause: &(dyn std::error::Error + 'static)| {
-        cause.downcast_ref::<std::io::Error>().is_some_and(|error| error.kind() == std::io::ErrorKind::BrokenPipe)
-    };
-    if error.chain().any(closed) {
+fn fail(error: &CommandError) -> ExitCode {
+    if error.is_closed_pipe() {
         return ExitCode::SUCCESS;
     }
-    eprintln!("perturb: {error:#}");
-    let usage = error.is::<ConfigError>()
-        || error.is::<UsageError>()
-        || error.is::<PlanError>()
-        || error.is::<OptionError>()
-        || matches!(error.downcast_ref(), Some(VideoError::Extension { .. }));
-    ExitCode::from(if usage { 2 } else { 1 })
+    eprintln!("perturb: {error}");
+    error.signal().map_or(ExitCode::from(if error.is_usage() { 2 } else { 1 }), signal_code)
 }
 
 fn signal_code(number: i32) -> ExitCode {
@@ -118,17 +91,17 @@ fn signal_code(number: i32) -> ExitCode {
 fn servers(args: &ServerArgs, num_envs: usize) -> Result<Servers> {
     if args.server.is_empty() {
         let options = PrivateServerOptions { workers: args.workers, num_envs };
-        return Servers::local(options).context("cannot start a server for this run");
+        return Ok(Servers::local(options)?);
     }
     refuse_workers(args)?;
     Ok(Servers::connect(&args.server)?)
 }
 
 /// Servers that were named have their threads already.
-fn refuse_workers(args: &ServerArgs) -> Result<(), UsageError> {
+fn refuse_workers(args: &ServerArgs) -> Result<()> {
     if args.workers.is_some() {
         let message = "--workers is for the server that perturb starts itself; give it to perturb-server instead";
-        return Err(UsageError(message.into()));
+        return Err(CommandError::Usage(message.into()));
     }
     Ok(())
 }

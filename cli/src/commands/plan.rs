@@ -4,11 +4,11 @@ use std::collections::HashMap;
 use std::io::Write;
 use std::time::Duration;
 
-use anyhow::Result;
 use serde_json::json;
 
 use super::args::PlanArgs;
-use super::{Ending, UsageError, servers};
+use super::error::{CommandError, Result};
+use super::{Ending, servers};
 use perturb_learner::client::Servers;
 use perturb_learner::measure::measure;
 use perturb_study::table::Table;
@@ -18,7 +18,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<Ending> {
     let plan = Plan::load(&args.file)?;
     let mut out = std::io::stdout();
     if args.json && !args.cells && args.missing.is_none() {
-        return Err(UsageError("--json lists cells: give --cells or --missing DIR with it".into()).into());
+        return Err(CommandError::Usage("--json lists cells: give --cells or --missing DIR with it".into()));
     }
     let folder = args.missing.as_deref().map(Folder::new);
     let listed: Vec<&Cell> = match &folder {
@@ -28,7 +28,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<Ending> {
     };
     if args.json {
         let listed: Vec<_> = listed.iter().map(|cell| json!({ "index": cell.index, "id": cell.id })).collect();
-        writeln!(out, "{}", serde_json::to_string_pretty(&listed)?)?;
+        writeln!(out, "{:#}", json!(listed))?;
         return Ok(Ending::Done);
     }
     for cell in listed {
@@ -61,7 +61,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<Ending> {
         args.measure
     )?;
     let measure_one = |cell| measure(&servers, cell, Duration::from_secs(args.measure));
-    let measurements: Vec<Measurement> = representatives.into_iter().map(measure_one).collect::<Result<_>>()?;
+    let measurements: Vec<Measurement> = representatives.into_iter().map(measure_one).collect::<Result<_, _>>()?;
     writeln!(out, "{}", speeds(&measurements).to_text())?;
     let estimate = estimate(&plan, &measurements, |environment| limits.get(environment).copied().unwrap_or_default());
     print_estimate(&mut out, &plan, &estimate)?;
@@ -70,7 +70,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<Ending> {
 
 /// The step limits of the plan's environments. Refuses plans that do not fit them.
 pub(super) fn step_limits<'a>(servers: &Servers, plan: &'a Plan) -> Result<HashMap<&'a str, u32>> {
-    plan.check(|name| Ok::<_, anyhow::Error>(servers.environment(name)?))?;
+    plan.check(|name| Ok::<_, CommandError>(servers.environment(name)?))?;
     let limit = |name: &'a str| Ok((name, servers.environment(name)?.step_limit));
     plan.environments().into_iter().map(limit).collect()
 }

@@ -3,27 +3,25 @@
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Result, bail};
 use perturb_study::TestResult;
 use perturb_study::records::{FILE, Records};
 use perturb_study::success::Criterion;
 use perturb_study::table::Table;
 
+use super::Ending;
 use super::args::RatesArgs;
-use super::{Ending, UsageError};
+use super::error::{CommandError, Result};
 
 pub(super) fn run(args: &RatesArgs) -> Result<Ending> {
     let records = Records::read(&file_in(&args.path))?;
     let about = &records.about;
     let Some(own) = &about.success else {
-        bail!("{} does not say what its episodes achieved: test again", args.path.display());
+        let message = format!("{} does not say what its episodes achieved: test again", args.path.display());
+        return Err(CommandError::Failed(message));
     };
     let criteria: Vec<Criterion> = match &args.success[..] {
         [] => vec![own.clone()],
-        thresholds => {
-            let with = |threshold| own.with(threshold).map_err(|error| UsageError(error.to_string()));
-            thresholds.iter().map(with).collect::<Result<_, _>>()?
-        }
+        thresholds => thresholds.iter().map(|threshold| own.with(threshold)).collect::<Result<_, _>>()?,
     };
     let mut rows: Vec<(&str, &Criterion, TestResult)> = Vec::new();
     for test in &about.tests {

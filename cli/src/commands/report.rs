@@ -3,13 +3,13 @@
 use std::io::Write;
 use std::path::Path;
 
-use anyhow::{Context, Result};
-
 use super::Ending;
 use super::args::{CurvesArgs, ReportArgs};
+use super::error::Result;
+use perturb_study::files::write_atomically;
 use perturb_study::plot::{Quantity, draw_curves, save};
 use perturb_study::report::{Figures, Report, html};
-use perturb_study::{Folder, Plan, Results, curves_table, read_curves, write_atomically};
+use perturb_study::{Folder, Plan, Results, curves_table, read_curves};
 
 pub(super) fn run(args: &ReportArgs) -> Result<Ending> {
     let folder = Folder::new(&args.dir);
@@ -27,13 +27,13 @@ pub(super) fn write(folder: &Folder, page: Option<&Path>) -> Result<String> {
     let report = Report::new(&results, &selections);
 
     let out = folder.path().join("report");
-    write_file(&out.join("report.md"), report.markdown().as_bytes())?;
+    write_atomically(&out.join("report.md"), report.markdown().as_bytes())?;
     for table in report.files() {
-        write_file(&out.join(&table.title), &table.to_csv())?;
+        write_atomically(&out.join(&table.title), &table.to_csv())?;
     }
     if let Some(path) = page {
         let figures = Figures::read(&selections, folder)?;
-        write_file(path, html(&report, &figures).as_bytes())?;
+        write_atomically(path, html(&report, &figures).as_bytes())?;
     }
     Ok(report.text())
 }
@@ -44,7 +44,7 @@ pub(super) fn curves(args: &CurvesArgs) -> Result<Ending> {
     let results = Results::read(&plan, &folder)?;
     let all = read_curves(&results.select(), &folder)?;
     let out = args.out.clone().unwrap_or_else(|| args.dir.join("report"));
-    write_file(&out.join("curves.csv"), &curves_table(&all).to_csv())?;
+    write_atomically(&out.join("curves.csv"), &curves_table(&all).to_csv())?;
     let mut stdout = std::io::stdout();
     for curves in &all {
         if curves.curves.is_empty() {
@@ -59,13 +59,4 @@ pub(super) fn curves(args: &CurvesArgs) -> Result<Ending> {
     }
     writeln!(stdout, "{}", out.join("curves.csv").display())?;
     Ok(Ending::Done)
-}
-
-/// Writes a file, and the folders above it if they are not there. A plain file appears complete: several runs that share
-/// a folder write the same report at the same time.
-pub(super) fn write_file(path: &Path, content: &[u8]) -> Result<()> {
-    if path.metadata().is_ok_and(|metadata| !metadata.is_file()) {
-        return std::fs::write(path, content).with_context(|| format!("cannot write {}", path.display()));
-    }
-    Ok(write_atomically(path, content)?)
 }

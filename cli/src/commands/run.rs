@@ -8,15 +8,15 @@ use std::process::{Command, Stdio};
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::args::{Engine, RunArgs};
 use super::bar::Bar;
+use super::error::{CommandError, Result, system};
 use super::plan::{duration, step_limits};
-use super::{Ending, UsageError, report, servers, single_thread, slurm};
+use super::{Ending, report, servers, single_thread, slurm};
 use perturb_learner::cell::{CellEnd, run_cell};
-use perturb_learner::client::{Address, ClientError, PrivateServer, PrivateServerOptions, Servers};
+use perturb_learner::client::{Address, PrivateServer, PrivateServerOptions, Servers};
 use perturb_study::interrupt::StopFlag;
 use perturb_study::{
     Attempt, BUSY, Cell, Folder, NO_SERVER, ON, Plan, RunEnd, RunOptions, RunStatus, run as run_cells,
@@ -30,7 +30,7 @@ const TEST_ENVS: usize = 100;
 pub(super) fn run(args: &RunArgs) -> Result<Ending> {
     let plan = Plan::load(&args.plan)?;
     let folder = Folder::new(&args.out);
-    let stop = StopFlag::on_signals().context("cannot wait for signals")?;
+    let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     if args.engine.engine == Some(Engine::Slurm) {
         return slurm::run(args, &plan, &stop);
     }
@@ -45,9 +45,9 @@ pub(super) fn run(args: &RunArgs) -> Result<Ending> {
 }
 
 /// The cell that --cell names.
-fn find<'a>(args: &RunArgs, plan: &'a Plan, name: &str) -> Result<&'a Cell, UsageError> {
+fn find<'a>(args: &RunArgs, plan: &'a Plan, name: &str) -> Result<&'a Cell> {
     plan.find(name).ok_or_else(|| {
-        UsageError(format!(
+        CommandError::Usage(format!(
             "{} has no cell `{name}`: give an index from 0 to {}, or an id that `perturb plan --cells` prints",
             args.plan.display(),
             plan.cells.len() - 1
@@ -68,7 +68,7 @@ fn one_cell(args: &RunArgs, plan: &Plan, folder: &Folder, cell: &Cell, stop: &St
     }
     let servers = match server_of(args, cell) {
         Ok(servers) => servers,
-        Err(error) if error.chain().any(|cause| cause.is::<ClientError>()) => return no_server(&error),
+        Err(CommandError::Client(error)) => return no_server(&error),
         Err(error) => return Err(error),
     };
     if args.exit_with_stdin {
@@ -86,7 +86,7 @@ fn one_cell(args: &RunArgs, plan: &Plan, folder: &Folder, cell: &Cell, stop: &St
     };
     match run_cell(&servers, cell, &place, retry, stop, &mut report)? {
         CellEnd::Done => Ok(Ending::Done),
-        CellEnd::Failed(failure) => bail!("{} failed: {}", cell.id, failure.reason),
+        CellEnd::Failed(failure) => Err(CommandError::Failed(format!("{} failed: {}", cell.id, failure.reason))),
         CellEnd::Stopped(signal) => Ok(Ending::Signal(signal)),
         CellEnd::Busy => {
             eprintln!("perturb: another process works on {}", cell.id);
@@ -106,8 +106,8 @@ fn server_of(args: &RunArgs, cell: &Cell) -> Result<Servers> {
     Ok(Servers::connect_to_one(named, cell.index + args.losses as usize)?)
 }
 
-fn no_server(error: &anyhow::Error) -> Result<Ending> {
-    eprintln!("perturb: {error:#}");
+fn no_server(error: &dyn std::error::Error) -> Result<Ending> {
+    eprintln!("perturb: {error}");
     Ok(Ending::Status(NO_SERVER))
 }
 
@@ -119,14 +119,14 @@ fn stop_with_input(stop: &StopFlag) -> Result<()> {
         while std::io::stdin().read(&mut buffer).is_ok_and(|count| count > 0) {}
         stop.raise(15); // as SIGTERM would
     };
-    std::thread::Builder::new().name("input".into()).spawn(wait).context("cannot watch standard input")?;
+    std::thread::Builder::new().name("input".into()).spawn(wait).map_err(system("watch standard input"))?;
     Ok(())
 }
 
 /// Does all cells in worker processes.
 fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> Result<Ending> {
     if args.exit_with_stdin {
-        return Err(UsageError("--exit-with-stdin needs a single --cell, and no --jobs".into()).into());
+        return Err(CommandError::Usage("--exit-with-stdin needs a single --cell, and no --jobs".into()));
     }
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let jobs = args.jobs.unwrap_or(cores);
@@ -167,12 +167,12 @@ pub(super) fn finished(args: &RunArgs, plan: &Plan, folder: &Folder, failed: &[S
         eprintln!("all {} cells are done; perturb report {}", plan.cells.len(), folder.path().display());
         return Ok(Ending::Done);
     };
-    bail!(
+    Err(CommandError::Failed(format!(
         "{} of {} cells failed, the first is {first}: see {} for the reason, and use --retry-failed to try again",
         failed.len(),
         plan.cells.len(),
         folder.path().join("cells").join(first).join("failure.json").display()
-    )
+    )))
 }
 
 /// Copies the plan into its folder, and says so if another one was there.
@@ -198,7 +198,7 @@ fn shared_servers(args: &RunArgs, plan: &Plan, jobs: usize) -> Result<(Option<Pr
     }
     let most = plan.cells.iter().map(|cell| cell.config.common.num_envs).max().unwrap_or_default();
     let options = PrivateServerOptions { workers: args.server.workers, num_envs: jobs * most.max(TEST_ENVS) };
-    let server = PrivateServer::start(options).context("cannot start a server for this run")?;
+    let server = PrivateServer::start(options)?;
     let address = server.address().clone();
     Ok((Some(server), vec![address]))
 }

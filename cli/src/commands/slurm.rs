@@ -2,9 +2,8 @@
 
 use std::time::Duration;
 
-use anyhow::{Context, Result, bail};
-
 use super::args::RunArgs;
+use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
 use super::run::{Line, finished, keep_plan};
 use super::{Ending, refuse_workers};
@@ -22,7 +21,7 @@ const QUEUE_INTERVAL: Duration = Duration::from_secs(15);
 const FOLDER_INTERVAL: Duration = Duration::from_secs(2);
 
 pub(super) fn run(args: &RunArgs, plan: &Plan, stop: &StopFlag) -> Result<Ending> {
-    let path = std::path::absolute(&args.out).context("cannot find out where --out is")?;
+    let path = std::path::absolute(&args.out).map_err(system("find out where --out is"))?;
     let folder = Folder::new(&path);
     let options = options(args)?;
     options.check(&path)?;
@@ -31,10 +30,10 @@ pub(super) fn run(args: &RunArgs, plan: &Plan, stop: &StopFlag) -> Result<Ending
     // Which environments there are, and what they cost, is found out here: servers that jobs share may be out of reach.
     let most = plan.cells.iter().map(|cell| cell.config.common.num_envs).max().unwrap_or_default();
     let local = PrivateServerOptions { workers: args.server.workers, num_envs: most };
-    let servers = || Servers::local(local).context("cannot start a server for this run");
+    let servers = || Servers::local(local);
     step_limits(&servers()?, plan)?;
     keep_plan(args, plan, &folder)?;
-    let costs = || costs(&servers()?, plan, stop);
+    let costs = || Ok(costs(&servers()?, plan, stop)?);
     let mut line = Line::new(plan.cells.len());
     let mut report = |event| match event {
         Event::Status(status) => line.show(status.done, status.failed, &doing(&status), status.remaining),
@@ -67,7 +66,7 @@ fn options(args: &RunArgs) -> Result<SlurmOptions> {
     }
     let jobs = args.jobs.unwrap_or(1);
     let task = Task {
-        program: std::env::current_exe().context("cannot find out where this program is")?,
+        program: std::env::current_exe().map_err(system("find out where this program is"))?,
         jobs,
         workers: args.server.workers.unwrap_or(jobs),
         servers: named.iter().map(Address::to_string).collect(),
@@ -92,7 +91,7 @@ fn costs(servers: &Servers, plan: &Plan, stop: &StopFlag) -> Result<Vec<f64>> {
     let mut measurements = Vec::new();
     for cell in representatives {
         if stop.signal().is_some() {
-            bail!("stopped");
+            return Err(CommandError::Failed("stopped".into()));
         }
         measurements.push(measure(servers, cell, MEASURE)?);
     }

@@ -3,12 +3,12 @@
 use std::io::Write;
 use std::path::Path;
 
-use anyhow::{Context, Result};
 use toml::{Table, Value};
 
 use super::args::TrainArgs;
 use super::bar::Bar;
-use super::{Ending, UsageError, servers, sets};
+use super::error::{CommandError, Result, system};
+use super::{Ending, servers, sets};
 use perturb_learner::logging::Progress;
 use perturb_learner::training::{Outcome, RunDirectory, resume, train};
 use perturb_study::Version;
@@ -19,7 +19,7 @@ pub(super) fn run(args: &TrainArgs) -> Result<Ending> {
     match (&args.resume, &args.out) {
         (Some(path), _) => go_on(args, path),
         (None, Some(path)) => begin(args, path),
-        (None, None) => Err(UsageError("give --out DIR for a new run, or --resume DIR".into()).into()),
+        (None, None) => Err(CommandError::Usage("give --out DIR for a new run, or --resume DIR".into())),
     }
 }
 
@@ -27,11 +27,11 @@ pub(super) fn run(args: &TrainArgs) -> Result<Ending> {
 fn begin(args: &TrainArgs, out: &Path) -> Result<Ending> {
     let flags = flags(args)?;
     let config = TrainConfig::load(&Sources { file: args.config.as_deref(), sets: &args.set, flags })?;
-    let stop = StopFlag::on_signals().context("cannot wait for signals")?;
+    let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let directory = RunDirectory::choose(out, args.overwrite)?;
     let servers = servers(&args.server, config.common.num_envs)?;
     let environment = servers.environment(&config.common.environment)?; // its refusal lists the names
-    perturb_study::sets::check("--parameters", &config.common.parameters, &environment).map_err(sets::usage)?;
+    perturb_study::sets::check("--parameters", &config.common.parameters, &environment)?;
     let mut bar = Bar::new(describe(&config), config.common.episodes);
     let outcome = train(&servers, &config, &directory, &stop, |progress| bar.training(progress))?;
     bar.finish();
@@ -40,7 +40,7 @@ fn begin(args: &TrainArgs, out: &Path) -> Result<Ending> {
 
 /// The run in `path`, from its last checkpoint.
 fn go_on(args: &TrainArgs, path: &Path) -> Result<Ending> {
-    let stop = StopFlag::on_signals().context("cannot wait for signals")?;
+    let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let (directory, checkpoint, state) = RunDirectory::resume(path)?;
     let config = checkpoint.config()?;
     let (done, budget) = (checkpoint.state.counters.episodes, config.common.episodes);
@@ -107,9 +107,9 @@ pub(super) fn summarise(progress: &Progress) {
 }
 
 /// The settings among the flags.
-fn flags(args: &TrainArgs) -> Result<Table, UsageError> {
+fn flags(args: &TrainArgs) -> Result<Table> {
     let number = |name: &str, value: u64| {
-        let refuse = |_| UsageError(format!("--{name} {value} is too large: the most is {}", i64::MAX));
+        let refuse = |_| CommandError::Usage(format!("--{name} {value} is too large: the most is {}", i64::MAX));
         i64::try_from(value).map(Value::Integer).map_err(refuse)
     };
     let mut table = Table::new();
@@ -122,7 +122,7 @@ fn flags(args: &TrainArgs) -> Result<Table, UsageError> {
     text("architecture", args.architecture.map(|architecture| architecture.to_string()));
     if !args.parameters.is_empty() {
         let set = sets::drawn(args.version.unwrap_or(Version::D), &args.parameters)?;
-        let parameters = Table::try_from(set.drawn()).map_err(|error| UsageError(error.to_string()))?;
+        let parameters = Table::try_from(set.drawn()).map_err(|error| CommandError::Usage(error.to_string()))?;
         table.insert("parameters".into(), Value::Table(parameters));
     }
     for (flag, value) in

@@ -2,10 +2,9 @@
 
 use std::io::Write;
 
-use anyhow::{Context, Result};
-
 use super::args::VideoArgs;
 use super::bar::Bar;
+use super::error::{Result, system};
 use super::{Ending, servers, sets};
 use crate::video::{Footage, VideoFile, VideoOptions, film};
 use perturb_learner::checkpoint::Checkpoint;
@@ -15,7 +14,7 @@ use perturb_study::table::Table;
 pub(super) fn run(args: &VideoArgs) -> Result<Ending> {
     let file = VideoFile::create(&args.out)?;
     let checkpoint = Checkpoint::load(&args.checkpoint)?;
-    let stop = StopFlag::on_signals().context("cannot wait for signals")?;
+    let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = servers(&args.server, 0)?;
     let options = VideoOptions {
         set: sets::drawn(args.version, &args.parameters)?,

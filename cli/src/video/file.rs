@@ -6,9 +6,10 @@ use std::path::{Path, PathBuf};
 
 use tempfile::NamedTempFile;
 
+use super::VideoError;
 use super::gif::{self, GifEncoder};
 use super::mp4::{self, Mp4Encoder};
-use super::{VideoError, io};
+use perturb_study::files::{create_folder, io};
 
 /// How a video is encoded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -47,17 +48,17 @@ impl VideoFile {
     /// is there is replaced at the end.
     ///
     /// # Errors
-    /// [`VideoError::Extension`], [`VideoError::NoFfmpeg`] and [`VideoError::Io`].
+    /// [`VideoError::Extension`], [`VideoError::NoFfmpeg`] and [`VideoError::File`].
     pub fn create(path: &Path) -> Result<Self, VideoError> {
         let format = Format::of(path)?;
         if path.is_dir() {
-            return Err(io("write", path)(std::io::ErrorKind::IsADirectory.into()));
+            return Err(io("write", path)(std::io::ErrorKind::IsADirectory.into()).into());
         }
         if format == Format::Mp4 {
             mp4::find_ffmpeg()?;
         }
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        fs::create_dir_all(folder).map_err(io("create", folder))?;
+        create_folder(folder)?;
         let temporary = tempfile::Builder::new()
             .prefix(".perturb-video-")
             .permissions(fs::Permissions::from_mode(0o666)) // as any file; the umask takes its part
@@ -118,7 +119,7 @@ impl VideoWriter {
     /// Completes the video and puts it into its place.
     ///
     /// # Errors
-    /// [`VideoError::Encode`] and [`VideoError::Io`]; a video that was there before is then still there.
+    /// [`VideoError::Encode`] and [`VideoError::File`]; a video that was there before is then still there.
     pub fn finish(self) -> Result<(), VideoError> {
         let VideoFile { path, temporary, .. } = self.file;
         self.encoder.finish().map_err(|reason| VideoError::Encode { path: path.clone(), reason })?;

@@ -9,13 +9,14 @@ mod gif;
 mod mp4;
 mod panel;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 pub use file::{VideoFile, VideoWriter};
 pub use film::{Footage, VideoOptions, film};
 pub use panel::{LARGEST, SMALLEST};
 
 use perturb_learner::evaluation::TestError;
+use perturb_study::files::FileError;
 use perturb_study::plot::PlotError;
 
 /// Why there is no video.
@@ -41,15 +42,8 @@ pub enum VideoError {
         reason: String,
     },
     /// The operating system refused a file.
-    #[error("cannot {action} {}: {source}", path.display())]
-    Io {
-        /// What was tried.
-        action: &'static str,
-        /// On what.
-        path: PathBuf,
-        /// Its answer.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    File(#[from] FileError),
     /// A frame could not be encoded.
     #[error("cannot encode {}: {reason}", path.display())]
     Encode {
@@ -67,10 +61,4 @@ impl From<perturb_learner::client::ClientError> for VideoError {
     fn from(error: perturb_learner::client::ClientError) -> Self {
         Self::Test(error.into())
     }
-}
-
-/// Names the file in the operating system's error.
-fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> VideoError {
-    let path = path.to_owned();
-    move |source| VideoError::Io { action, path, source }
 }

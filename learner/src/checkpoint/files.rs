@@ -1,15 +1,12 @@
 //! The files of a checkpoint: written whole or not at all, read only if they are what was written.
 
-use std::fs::{self, File};
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
+use perturb_study::files::{self, TEMPORARY_PREFIX, write_atomically};
 use serde::{Deserialize, Serialize};
 
 use super::{CheckpointError, Result};
 
-/// Files that a write has not finished.
-const TEMPORARY_PREFIX: &str = ".tmp-";
 const ARRAYS_SUFFIX: &str = ".safetensors";
 
 /// Names a file of arrays and says how to tell whether it is whole.
@@ -26,7 +23,7 @@ impl ArraysFile {
         let crc32c = crc32c::crc32c(content);
         // The checksum is part of the name: a file that is in use is never written over by another content.
         let file = format!("{prefix}{iterations:08}-{crc32c:08x}{ARRAYS_SUFFIX}");
-        write_atomically(directory, &file, content)?;
+        write_atomically(&directory.join(&file), content)?;
         Ok(Self { file, bytes: content.len() as u64, crc32c })
     }
 
@@ -38,7 +35,7 @@ impl ArraysFile {
     /// Its content.
     pub(super) fn read(&self, directory: &Path) -> Result<Vec<u8>> {
         let path = self.path(directory);
-        let content = fs::read(&path).map_err(io("read", &path))?;
+        let content = files::read(&path)?;
         if content.len() as u64 != self.bytes || crc32c::crc32c(&content) != self.crc32c {
             let reason = format!("it has {} bytes, expected {} with another checksum", content.len(), self.bytes);
             return Err(damaged(&path, reason));
@@ -47,34 +44,16 @@ impl ArraysFile {
     }
 }
 
-/// Writes `name` in one piece: it appears complete, and on the disk, or not at all.
-pub(super) fn write_atomically(directory: &Path, name: &str, content: &[u8]) -> Result<()> {
-    let temporary = directory.join(format!("{TEMPORARY_PREFIX}{name}"));
-    let mut file = File::create(&temporary).map_err(io("create", &temporary))?;
-    file.write_all(content).and_then(|()| file.sync_all()).map_err(io("write", &temporary))?;
-    let path = directory.join(name);
-    fs::rename(&temporary, &path).map_err(io("rename a file to", &path))?;
-    File::open(directory).and_then(|directory| directory.sync_all()).map_err(io("sync", directory))
-}
-
 /// Deletes files of arrays, beginning with one of `prefixes`, that are not `current`, and what broken-off writes left.
-pub(super) fn remove_others(directory: &Path, prefixes: &[&str], current: &[&str]) -> Result<()> {
-    for entry in fs::read_dir(directory).map_err(io("list", directory))? {
-        let name = entry.map_err(io("list", directory))?.file_name();
-        let name = name.to_string_lossy();
+pub(super) fn remove_others(directory: &Path, prefixes: &[&str], current: &[&str]) -> files::Result<()> {
+    for path in files::list(directory)? {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
         let arrays = prefixes.iter().any(|prefix| name.starts_with(prefix)) && name.ends_with(ARRAYS_SUFFIX);
         if (arrays && !current.contains(&name.as_ref())) || name.starts_with(TEMPORARY_PREFIX) {
-            let path = directory.join(name.as_ref());
-            fs::remove_file(&path).map_err(io("delete", &path))?;
+            files::delete(&path)?;
         }
     }
     Ok(())
-}
-
-/// Names the file in the operating system's error.
-pub(super) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> CheckpointError {
-    let path = path.to_owned();
-    move |source| CheckpointError::Io { action, path, source }
 }
 
 /// Names the file that `reason` makes unusable.

@@ -10,18 +10,18 @@ mod files;
 mod resume;
 
 use std::fmt;
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
 use self::arrays::{decode_weights, encode_weights};
-use self::files::{ArraysFile, damaged, io, remove_others, write_atomically};
+use self::files::{ArraysFile, damaged, remove_others};
 pub use self::resume::{History, ResumeState};
 use crate::policy::{ActionKind, Inputs, ObservationNormaliser, PolicySpec, RewardNormaliser, Weights};
 use crate::proto;
 use perturb_protocol::Version;
 use perturb_study::Counters;
+use perturb_study::files::{FileError, write_atomically};
 use perturb_study::settings::{AlgorithmName, Architecture, ConfigError, TrainConfig, Wrapper};
 
 /// Of the JSON's layout; raised when older programs could misread it.
@@ -115,15 +115,8 @@ struct Document {
 #[non_exhaustive]
 pub enum CheckpointError {
     /// The operating system refused a file.
-    #[error("cannot {action} {}: {source}", path.display())]
-    Io {
-        /// What was tried.
-        action: &'static str,
-        /// On what.
-        path: PathBuf,
-        /// Its answer.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    File(#[from] FileError),
     /// There is no checkpoint.
     #[error(
         "{} holds no checkpoint: expected checkpoint.json there or in its folder checkpoint/; give the --out of a \
@@ -161,9 +154,8 @@ impl Checkpoint {
     /// but its training cannot be resumed.
     ///
     /// # Errors
-    /// [`CheckpointError::Io`]; the earlier checkpoint, if any, is then still there.
+    /// [`CheckpointError::File`]; the earlier checkpoint, if any, is then still there.
     pub fn save(&self, directory: &Path, resume: Option<&ResumeState>) -> Result<()> {
-        fs::create_dir_all(directory).map_err(io("create", directory))?;
         let iterations = self.state.counters.iterations;
         let resume = resume.map(|resume| resume.write(directory, iterations)).transpose()?;
         let (resume_file, resume) = resume.unzip();
@@ -178,9 +170,9 @@ impl Checkpoint {
             rest: serde_json::to_value(&self.state).map_err(|error| damaged(directory, error.to_string()))?,
         };
         let json = serde_json::to_vec_pretty(&document).map_err(|error| damaged(directory, error.to_string()))?;
-        write_atomically(directory, JSON, &json)?;
+        write_atomically(&directory.join(JSON), &json)?;
         let current = [weights_file.as_str(), resume_file.as_deref().unwrap_or_default()];
-        remove_others(directory, &[WEIGHTS_PREFIX, resume::PREFIX], &current)
+        Ok(remove_others(directory, &[WEIGHTS_PREFIX, resume::PREFIX], &current)?)
     }
 
     /// Reads the checkpoint in `path`, or in its folder `checkpoint`.
@@ -308,7 +300,7 @@ impl Document {
             .find(|directory| directory.join(JSON).is_file())
             .ok_or_else(|| CheckpointError::Missing { path: path.to_owned() })?;
         let json = directory.join(JSON);
-        let text = fs::read(&json).map_err(io("read", &json))?;
+        let text = perturb_study::files::read(&json)?;
         let document: Document =
             serde_json::from_slice(&text).map_err(|error| damaged(&json, format!("it is not understood: {error}")))?;
         if document.format_version != FORMAT_VERSION {

@@ -65,6 +65,18 @@ pub enum TestError {
     },
 }
 
+impl TestError {
+    /// Whether the same may go well later or with another server, see [`ClientError::can_be_retried`].
+    pub fn can_be_retried(&self) -> bool {
+        matches!(self, Self::Client(error) if error.can_be_retried())
+    }
+
+    /// The signal that ended the test, if one did.
+    pub fn signal(&self) -> Option<i32> {
+        if let Self::Stopped { signal } = self { Some(*signal) } else { None }
+    }
+}
+
 /// How to test.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TestOptions {

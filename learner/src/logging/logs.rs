@@ -5,6 +5,7 @@ use std::io::ErrorKind;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
+use perturb_study::files::{self, FileError, io, sync_folder};
 use serde::{Deserialize, Serialize};
 
 use super::{Clock, Monitor, Progress, ProgressLog};
@@ -36,20 +37,13 @@ pub struct LogLengths {
     pub events_file: String,
 }
 
-/// Why a log cannot be written or gone on with.
+/// Why a log cannot be gone on with.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum LogError {
     /// The operating system refused a file.
-    #[error("cannot {action} {}: {source}", path.display())]
-    Io {
-        /// What was tried.
-        action: &'static str,
-        /// On what.
-        path: PathBuf,
-        /// Its answer.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    File(#[from] FileError),
     /// A log does not hold what it held when the checkpoint was written.
     #[error(
         "{} has changed since the checkpoint was written: {reason}; put the file back as perturb wrote it, or train \
@@ -64,27 +58,24 @@ pub enum LogError {
     },
 }
 
-type Result<T> = std::result::Result<T, LogError>;
-
 impl Logs {
     /// Creates the files in `directory`.
     ///
     /// # Errors
-    /// [`LogError::Io`].
-    pub fn create(directory: &Path, environment: &str, spec: &EnvironmentSummary, clock: Clock) -> Result<Self> {
+    /// [`FileError`].
+    pub fn create(directory: &Path, environment: &str, spec: &EnvironmentSummary, clock: Clock) -> files::Result<Self> {
         let path = directory.join(MONITOR);
         let monitor = Monitor::create(&path, environment, spec, clock).map_err(io("create", &path))?;
         let progress = ProgressLog::create(directory, clock.t_start()).map_err(io("create the logs in", directory))?;
-        // Their names must be on the disk before a checkpoint counts on them.
-        File::open(directory).and_then(|directory| directory.sync_all()).map_err(io("sync", directory))?;
+        sync_folder(directory)?; // names must be on the disk before a checkpoint counts on them
         Ok(Self { directory: directory.to_owned(), monitor, progress })
     }
 
     /// Goes on with the files in `directory` where they had these `lengths`: what was written later is deleted.
     ///
     /// # Errors
-    /// [`LogError::Changed`] if one is shorter, or does not end a line there; then none was changed. [`LogError::Io`].
-    pub fn resume(directory: &Path, lengths: &LogLengths, clock: Clock) -> Result<Self> {
+    /// [`LogError::Changed`] if one is shorter, or does not end a line there; then none was changed. [`LogError::File`].
+    pub fn resume(directory: &Path, lengths: &LogLengths, clock: Clock) -> Result<Self, LogError> {
         let events = Path::new(&lengths.events_file).file_name().unwrap_or_default();
         let paths = [directory.join(MONITOR), directory.join(PROGRESS), directory.join(events)];
         let monitor = open(&paths[0], lengths.monitor, true)?;
@@ -101,24 +92,24 @@ impl Logs {
     /// Adds an episode to `monitor.csv`.
     ///
     /// # Errors
-    /// [`LogError::Io`].
-    pub fn episode(&mut self, episode: &EndedEpisode) -> Result<()> {
+    /// [`FileError`].
+    pub fn episode(&mut self, episode: &EndedEpisode) -> files::Result<()> {
         self.monitor.write(episode).map_err(io("write", &self.directory.join(MONITOR)))
     }
 
     /// Adds a line to `progress.csv`, and an event.
     ///
     /// # Errors
-    /// [`LogError::Io`].
-    pub fn progress(&mut self, progress: &Progress) -> Result<()> {
+    /// [`FileError`].
+    pub fn progress(&mut self, progress: &Progress) -> files::Result<()> {
         self.progress.write(progress).map_err(io("write", &self.directory.join(PROGRESS)))
     }
 
     /// Brings all that was written to the disk, and says how much it is.
     ///
     /// # Errors
-    /// [`LogError::Io`].
-    pub fn sync(&mut self) -> Result<LogLengths> {
+    /// [`FileError`].
+    pub fn sync(&mut self) -> files::Result<LogLengths> {
         let monitor = self.monitor.sync().map_err(io("write", &self.directory.join(MONITOR)))?;
         let [progress, events] = self.progress.sync().map_err(io("write", &self.directory.join(PROGRESS)))?;
         Ok(LogLengths { monitor, progress, events, events_file: self.progress.events_file().to_owned() })
@@ -132,7 +123,7 @@ pub(super) fn sync(file: &File) -> std::io::Result<u64> {
 }
 
 /// Opens a log for appending that has at least `length` bytes, with the end of a line there if it consists of `lines`.
-fn open(path: &Path, length: u64, lines: bool) -> Result<File> {
+fn open(path: &Path, length: u64, lines: bool) -> Result<File, LogError> {
     let changed = |reason| Err(LogError::Changed { path: path.to_owned(), reason });
     let file = match OpenOptions::new().read(true).append(true).open(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => return changed("it is gone".into()),
@@ -150,12 +141,6 @@ fn open(path: &Path, length: u64, lines: bool) -> Result<File> {
         return changed(format!("its first {length} bytes no longer end with a line"));
     }
     Ok(file)
-}
-
-/// Names the file in the operating system's error.
-fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> LogError {
-    let path = path.to_owned();
-    move |source| LogError::Io { action, path, source }
 }
 
 #[cfg(test)]

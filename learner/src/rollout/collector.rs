@@ -23,6 +23,13 @@ pub enum CollectError {
     Numbers(#[from] crate::error::Error),
 }
 
+impl CollectError {
+    /// Whether the same may go well later or with another server, see [`ClientError::can_be_retried`].
+    pub fn can_be_retried(&self) -> bool {
+        matches!(self, Self::Client(error) if error.can_be_retried())
+    }
+}
+
 /// Steps N environments with a policy and fills rollouts: with T steps of each, where episodes run on from one rollout to
 /// the next, and with them what a recurrent policy remembers ([`Collector::collect`]); or with complete episodes
 /// ([`Collector::collect_episodes`]).

@@ -16,7 +16,8 @@ use plotters::element::{DashedPathElement, DynElement};
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
 
-use super::folder::{FolderError, io, write_atomically};
+use crate::files::{self, FileError, io, write_atomically};
+use crate::folder::FolderError;
 pub use curves::{Quantity, draw_curves};
 pub use heatmap::draw_heatmap;
 
@@ -35,6 +36,9 @@ pub enum PlotError {
     #[error("cannot draw: {0}")]
     Draw(String),
     /// A file cannot be written.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// The folder cannot be read.
     #[error(transparent)]
     Folder(#[from] FolderError),
 }
@@ -79,7 +83,7 @@ pub fn png(plot: &impl Plot) -> Result<Vec<u8>, PlotError> {
     let area = BitMapBackend::new(&path, (width * PNG_SCALE, height * PNG_SCALE)).into_drawing_area();
     plot.draw(&area, PNG_SCALE)?;
     area.present().map_err(drawing)?;
-    Ok(std::fs::read(&path).map_err(io("read", &path))?)
+    Ok(files::read(&path)?)
 }
 
 /// Writes a picture as SVG and as PNG, each in one piece: `path` with these endings.

@@ -19,7 +19,7 @@ use parquet::record::{Field, Row};
 use parquet::schema::parser::parse_message_type;
 
 use super::{About, Ending, EpisodeRecord, Records};
-use crate::folder::{FolderError, read_bytes, write_atomically};
+use crate::files::{FileError, read_if_there, write_atomically};
 
 /// What the file is called beside a result.
 pub const FILE: &str = "episodes.parquet";
@@ -32,7 +32,7 @@ const KEY: &str = "perturb";
 pub enum RecordsError {
     /// The operating system refused the file.
     #[error(transparent)]
-    File(#[from] FolderError),
+    File(#[from] FileError),
     /// There is no such file.
     #[error("there are no recorded episodes in {}", path.display())]
     Missing {
@@ -187,7 +187,7 @@ impl Records {
     /// # Errors
     /// [`RecordsError`].
     pub fn read(path: &Path) -> Result<Self, RecordsError> {
-        let content = read_bytes(path)?.ok_or_else(|| RecordsError::Missing { path: path.to_owned() })?;
+        let content = read_if_there(path)?.ok_or_else(|| RecordsError::Missing { path: path.to_owned() })?;
         Self::decode(content).map_err(|reason| RecordsError::Damaged { path: path.to_owned(), reason })
     }
 

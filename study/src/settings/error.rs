@@ -1,19 +1,15 @@
 //! Why a configuration is refused.
 
 use super::AlgorithmName;
+use crate::files::FileError;
 
 /// Why a configuration was refused.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ConfigError {
     /// A file cannot be read.
-    #[error("cannot read {path}: {source}")]
-    File {
-        /// Its path.
-        path: String,
-        /// The operating system's answer.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    File(#[from] FileError),
     /// A file is not TOML, or a `--set` is not `key=value`.
     #[error("{origin}: {reason}")]
     Syntax {

@@ -22,6 +22,7 @@ use toml::{Table, Value};
 
 use perturb_protocol::{Distribution, Version};
 
+use crate::files;
 use crate::sets::Parameters;
 
 /// The most environments of one training.
@@ -95,9 +96,7 @@ impl TrainConfig {
         let mut layers: Vec<(String, Table)> = Vec::new();
         if let Some(path) = sources.file {
             let shown = path.display().to_string();
-            let text =
-                std::fs::read_to_string(path).map_err(|source| ConfigError::File { path: shown.clone(), source })?;
-            let table = text
+            let table = files::read_text(path)?
                 .parse::<Table>()
                 .map_err(|error| ConfigError::Syntax { origin: shown.clone(), reason: error.to_string() })?;
             layers.push((shown, table));

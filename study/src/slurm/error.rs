@@ -5,6 +5,10 @@ use std::time::Duration;
 use super::super::folder::FolderError;
 use super::options::OptionError;
 use super::watch::{MOST_ATTEMPTS, count};
+use crate::files::FileError;
+
+/// Of whoever finds out what cells cost.
+pub type AnyError = Box<dyn std::error::Error + Send + Sync>;
 
 /// Why cells cannot be done by Slurm.
 #[derive(Debug, thiserror::Error)]
@@ -59,9 +63,12 @@ pub enum SlurmError {
     /// The folder cannot be read or written.
     #[error(transparent)]
     Folder(#[from] FolderError),
+    /// The operating system refused a file.
+    #[error(transparent)]
+    File(#[from] FileError),
     /// It cannot be found out what cells cost.
-    #[error("cannot estimate what cells cost, which says how many a job does: {0:#}; give --cells-per-job instead")]
-    Cost(anyhow::Error),
+    #[error("cannot estimate what cells cost, which says how many a job does: {0}; give --cells-per-job instead")]
+    Cost(AnyError),
     /// Somebody cancelled everything.
     #[error(
         "Slurm job {} was cancelled; the same command submits what has no result again: {}",

@@ -23,7 +23,7 @@ mod submission;
 mod watch;
 
 pub use commands::{QueuedJob, Slurm};
-pub use error::SlurmError;
+pub use error::{AnyError, SlurmError};
 pub use options::{OptionError, SlurmOptions, Task, TimeLimit};
 pub use watch::count;
 pub use watch::{Event, SlurmEnd, SlurmStatus, run_on_slurm};

@@ -1,11 +1,11 @@
 //! What was submitted, as it is kept in the folder.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::super::folder::{Folder, FolderError, io, write_atomically};
+use super::super::folder::{Folder, FolderError};
+use crate::files::{self, write_atomically, write_json};
 
 const CELLS: &str = "cells.txt";
 const DOCUMENT: &str = "submission.json";
@@ -50,16 +50,9 @@ pub(super) fn list(folder: &Folder) -> Result<Vec<Submission>, FolderError> {
 }
 
 /// The numbers of the submissions, also of unfinished ones, in order.
-fn numbers(directory: &Path) -> Result<Vec<u32>, FolderError> {
-    let entries = match fs::read_dir(directory) {
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
-        entries => entries.map_err(io("list", directory))?,
-    };
-    let mut numbers = Vec::new();
-    for entry in entries {
-        let entry = entry.map_err(io("list", directory))?;
-        numbers.extend(entry.file_name().to_str().and_then(|name| name.parse::<u32>().ok()));
-    }
+fn numbers(directory: &Path) -> files::Result<Vec<u32>> {
+    let paths = files::list(directory)?;
+    let mut numbers: Vec<u32> = paths.iter().filter_map(|path| path.file_name()?.to_str()?.parse().ok()).collect();
     numbers.sort_unstable();
     Ok(numbers)
 }
@@ -67,14 +60,10 @@ fn numbers(directory: &Path) -> Result<Vec<u32>, FolderError> {
 /// The submission in `path`; `None` if it was broken off before Slurm could hear of it.
 fn read(path: &Path, number: u32) -> Result<Option<Submission>, FolderError> {
     let document = path.join(DOCUMENT);
-    if !document.exists() {
-        return Ok(None);
-    }
-    let text = fs::read(&document).map_err(io("read", &document))?;
+    let Some(text) = files::read_if_there(&document)? else { return Ok(None) };
     let damaged = |error: serde_json::Error| FolderError::Damaged { path: document, reason: error.to_string() };
     let names = serde_json::from_slice(&text).map_err(damaged)?;
-    let cells = path.join(CELLS);
-    let text = fs::read_to_string(&cells).map_err(io("read", &cells))?;
+    let text = files::read_text(&path.join(CELLS))?;
     let jobs = text.lines().map(|line| line.split(',').map(str::to_owned).collect()).collect();
     Ok(Some(Submission { number, path: path.to_owned(), jobs, names }))
 }
@@ -103,7 +92,7 @@ pub(super) fn create(
 
 impl Submission {
     /// Writes down the number that Slurm gave.
-    pub(super) fn accepted(&mut self, job: &str) -> Result<(), FolderError> {
+    pub(super) fn accepted(&mut self, job: &str) -> files::Result<()> {
         self.names.job = Some(job.to_owned());
         self.write()
     }
@@ -114,20 +103,19 @@ impl Submission {
     }
 
     /// Deletes what Slurm refused.
-    pub(super) fn forget(&self) -> Result<(), FolderError> {
-        fs::remove_dir_all(&self.path).map_err(io("delete", &self.path))
+    pub(super) fn forget(&self) -> files::Result<()> {
+        files::delete(&self.path)
     }
 
-    fn write(&self) -> Result<(), FolderError> {
-        let path = self.path.join(DOCUMENT);
-        let text = serde_json::to_vec_pretty(&self.names)
-            .map_err(|error| FolderError::Damaged { path: path.clone(), reason: error.to_string() })?;
-        write_atomically(&path, &text)
+    fn write(&self) -> files::Result<()> {
+        write_json(&self.path.join(DOCUMENT), &self.names)
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     #[test]

@@ -1,22 +1,22 @@
 //! Submitting what is missing and watching until nothing is.
 
 use std::collections::{HashMap, HashSet};
-use std::fs::File;
 use std::path::PathBuf;
 use std::rc::Rc;
 use std::time::{Duration, Instant};
 
 use serde::Deserialize;
 
-use super::super::folder::{Folder, io};
+use super::super::folder::Folder;
 use super::super::plan::Plan;
 use super::super::run::Times;
 use super::batch::{JOB_SECONDS, Load, Size, batches};
 use super::commands::{QueuedJob, Slurm};
-use super::error::SlurmError;
+use super::error::{AnyError, SlurmError};
 use super::options::SlurmOptions;
 use super::script::script;
 use super::submission::{self, Submission};
+use crate::files::{self, Lock};
 use crate::interrupt::StopFlag;
 
 /// How often a cell may be submitted without getting any further.
@@ -84,7 +84,7 @@ pub fn run_on_slurm(
     folder: &Folder,
     slurm: &Slurm,
     options: &SlurmOptions,
-    costs: &dyn Fn() -> anyhow::Result<Vec<f64>>,
+    costs: &dyn Fn() -> std::result::Result<Vec<f64>, AnyError>,
     stop: &StopFlag,
     report: &mut dyn FnMut(Event),
 ) -> Result<SlurmEnd> {
@@ -135,7 +135,7 @@ struct Watch<'a> {
     folder: &'a Folder,
     slurm: &'a Slurm,
     options: &'a SlurmOptions,
-    costs: &'a dyn Fn() -> anyhow::Result<Vec<f64>>,
+    costs: &'a dyn Fn() -> std::result::Result<Vec<f64>, AnyError>,
     known_costs: Option<Vec<f64>>,
     report: &'a mut dyn FnMut(Event),
     /// Cells that have neither a result nor failed.
@@ -235,13 +235,8 @@ impl Watch<'_> {
                 continue;
             }
             let Some(_lock) = place.try_lock()? else { continue };
-            let training = place.training();
-            match std::fs::remove_dir_all(&training) {
-                Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                    return Err(io("delete", &training)(error).into());
-                }
-                _ => place.forget_failure()?,
-            }
+            files::delete(&place.training())?;
+            place.forget_failure()?;
         }
         Ok(())
     }
@@ -496,16 +491,10 @@ impl Watch<'_> {
     }
 
     /// Only one process decides at a time; `None` while another one does.
-    fn lock(&self) -> Result<Option<File>> {
+    fn lock(&self) -> files::Result<Option<Lock>> {
         let directory = submission::directory(self.folder);
-        std::fs::create_dir_all(&directory).map_err(io("create", &directory))?;
-        let path = directory.join("lock");
-        let file = File::options().create(true).truncate(false).write(true).open(&path).map_err(io("open", &path))?;
-        match file.try_lock() {
-            Ok(()) => Ok(Some(file)),
-            Err(std::fs::TryLockError::WouldBlock) => Ok(None),
-            Err(std::fs::TryLockError::Error(source)) => Err(io("lock", &path)(source).into()),
-        }
+        files::create_folder(&directory)?;
+        Lock::try_take(&directory.join("lock"))
     }
 
     fn live_arrays(&self) -> Vec<String> {

@@ -4,11 +4,11 @@
 //! streams of their own (see [`crate::random`]). One thread computes everything in one order, so that equal
 //! configurations give equal weights, byte for byte, whatever the number of servers and of their workers.
 
-use std::collections::VecDeque;
-use std::fs;
-use std::time::{Duration, Instant};
+mod error;
+mod run_directory;
 
-use anyhow::{Context, Result, bail};
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
 
 use crate::algorithm::{self, Algorithm, Experience, UpdateStats};
 use crate::checkpoint::{Checkpoint, EnvironmentSummary, History, ResumeState, State};
@@ -16,10 +16,14 @@ use crate::client::{EndedEpisode, OpenOptions, Servers, Session};
 use crate::logging::{Clock, Logs, Progress};
 use crate::policy::{Inputs, ObservationNormaliser, Policy, PolicySpec, RewardNormaliser, Weights};
 use crate::rollout::{Collector, Normalisers, Rollout};
-pub use crate::run_directory::RunDirectory;
+pub use error::{LastCheckpoint, TrainError};
 use perturb_study::Counters;
+use perturb_study::files::write_atomically;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::settings::{Common, TrainConfig, Wrapper};
+pub use run_directory::{RunDirectory, RunDirectoryError};
+
+type Result<T> = std::result::Result<T, TrainError>;
 
 /// Means are over so many episodes, as in stable-baselines3.
 const RECENT: usize = 100;
@@ -54,7 +58,7 @@ pub fn train(
     tracing::debug!(directory = %directory.path().display(), "training begins");
     let Common { environment, .. } = &config.common;
     let mut logs = Logs::create(directory.path(), environment, &training.summary, training.clock)?;
-    fs::write(directory.path().join("config.toml"), config.to_toml()).context("cannot write config.toml")?;
+    write_atomically(&directory.path().join("config.toml"), config.to_toml().as_bytes())?;
     training.run(&mut logs, directory, stop, report)
 }
 
@@ -146,11 +150,7 @@ impl<'a> Training<'a> {
         let state = &checkpoint.state;
         let (session, served) = open(servers, config, &mut Vec::new())?;
         if let Some((what, trained, served)) = state.environment_spec.difference(&served) {
-            bail!(
-                "the run was trained in {} with {what} {trained}, the server's has {served}; resume with the version \
-                 of perturb-server that it began with, or train again",
-                state.environment
-            );
+            return Err(TrainError::Changed { environment: state.environment.clone(), what, trained, served });
         }
         let policy = Policy::from_weights(state.policy.clone(), &checkpoint.weights)?;
         let normalisers = Normalisers {
@@ -159,9 +159,12 @@ impl<'a> Training<'a> {
         };
         let inputs = state.inputs(config.common.num_envs);
         let collector = Collector::resume(session, &state.policy, inputs, normalisers, &resume.collector)
-            .context("cannot bring the environments back")?;
+            .map_err(|error| TrainError::Restore { what: "environments", source: Box::new(error.into()) })?;
         let mut training = Self::new(servers, config, policy, collector, checkpoint)?;
-        training.algorithm.load_state(&resume.algorithm).context("cannot bring the optimiser back")?;
+        training
+            .algorithm
+            .load_state(&resume.algorithm)
+            .map_err(|error| TrainError::Restore { what: "optimiser", source: Box::new(error.into()) })?;
         training.saved = Some(training.whole.state.counters.episodes);
         training.recent.extend(&resume.history.recent);
         training.clock = Clock::start(resume.history.elapsed);
@@ -319,19 +322,9 @@ impl<'a> Training<'a> {
     }
 
     /// Says what is left of a training that `error` ended.
-    fn failed(&self, error: anyhow::Error, directory: &RunDirectory) -> anyhow::Error {
-        let Some(episodes) = self.saved else {
-            return error.context("training failed before its first checkpoint");
-        };
-        let run = directory.path().display();
-        let kept = format!("training failed; the checkpoint after {episodes} episodes is kept in {run}");
-        let numbers = error.is::<crate::error::Error>()
-            || matches!(error.downcast_ref(), Some(crate::rollout::CollectError::Numbers(_)));
-        error.context(if numbers {
-            format!("{kept} (resumed, it would come to the same numbers)")
-        } else {
-            format!("{kept}; go on from there: perturb train --resume {run}")
-        })
+    fn failed(&self, error: TrainError, directory: &RunDirectory) -> TrainError {
+        let last = self.saved.map(|episodes| LastCheckpoint { episodes, run: directory.path().to_owned() });
+        TrainError::Failed { last, source: Box::new(error) }
     }
 
     /// Seconds of acting, waiting and updating.
@@ -373,8 +366,7 @@ fn open<'a>(
         episodes_per_trial: config.settings.episodes_per_trial(),
     };
     let session = Session::open(servers, &options, observations)?;
-    let summary = EnvironmentSummary::of(session.environment())
-        .context("the server does not say what actions the environment takes: are both of one version?")?;
+    let summary = EnvironmentSummary::of(session.environment()).ok_or(TrainError::NoActions)?;
     Ok((session, summary))
 }
 

@@ -1,0 +1,149 @@
+//! Why a training cannot begin, go on, or be kept.
+
+use std::path::PathBuf;
+
+use perturb_study::files::FileError;
+
+use super::RunDirectoryError;
+use crate::checkpoint::CheckpointError;
+use crate::client::ClientError;
+use crate::error::Error;
+use crate::logging::LogError;
+use crate::rollout::CollectError;
+
+/// Why a training cannot begin, go on, or be kept.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum TrainError {
+    /// The directory cannot be trained in.
+    #[error(transparent)]
+    Directory(#[from] RunDirectoryError),
+    /// A server or the connection to it failed.
+    #[error(transparent)]
+    Client(#[from] ClientError),
+    /// A number is not finite, or an array has the wrong size.
+    #[error(transparent)]
+    Numbers(#[from] Error),
+    /// The checkpoint cannot be written.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// A log cannot be gone on with.
+    #[error(transparent)]
+    Log(#[from] LogError),
+    /// The operating system refused a file.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// The served environment has no action space.
+    #[error("the server does not say what actions the environment takes: are both of one version?")]
+    NoActions,
+    /// The environment is no longer what the run began in.
+    #[error(
+        "the run was trained in {environment} with {what} {trained}, the server's has {served}; resume with the version \
+         of perturb-server that it began with, or train again"
+    )]
+    Changed {
+        /// The environment.
+        environment: String,
+        /// What differs.
+        what: &'static str,
+        /// In training.
+        trained: String,
+        /// On the server.
+        served: String,
+    },
+    /// What a checkpoint holds does not fit.
+    #[error("cannot bring the {what} back: {source}")]
+    Restore {
+        /// What should go on where it was.
+        what: &'static str,
+        /// Why it cannot.
+        source: Box<TrainError>,
+    },
+    /// A training that had begun ended.
+    #[error("training failed{}: {source}", what_is_left(last.as_ref(), source))]
+    Failed {
+        /// The last checkpoint, if there is one.
+        last: Option<LastCheckpoint>,
+        /// Why.
+        source: Box<TrainError>,
+    },
+}
+
+/// What a failed training leaves.
+#[derive(Debug)]
+pub struct LastCheckpoint {
+    /// Episodes that it was trained for.
+    pub episodes: u64,
+    /// The directory of the run.
+    pub run: PathBuf,
+}
+
+impl TrainError {
+    /// Whether the same may go well later or with another server, see [`ClientError::can_be_retried`].
+    pub fn can_be_retried(&self) -> bool {
+        match self {
+            Self::Client(error) => error.can_be_retried(),
+            Self::Restore { source, .. } | Self::Failed { source, .. } => source.can_be_retried(),
+            _ => false,
+        }
+    }
+}
+
+impl From<CollectError> for TrainError {
+    fn from(error: CollectError) -> Self {
+        match error {
+            CollectError::Client(error) => Self::Client(error),
+            CollectError::Numbers(error) => Self::Numbers(error),
+        }
+    }
+}
+
+fn what_is_left(last: Option<&LastCheckpoint>, error: &TrainError) -> String {
+    let Some(LastCheckpoint { episodes, run }) = last else { return " before its first checkpoint".into() };
+    let run = run.display();
+    let next = match error {
+        TrainError::Numbers(_) => " (resumed, it would come to the same numbers)".into(),
+        _ => format!("; go on from there: perturb train --resume {run}"),
+    };
+    format!("; the checkpoint after {episodes} episodes is kept in {run}{next}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_lost_server_is_told_from_a_failure() {
+        let address: crate::client::Address = "unix:/x".parse().unwrap();
+        let lost = || {
+            let (request, code, reason) = ("a step", tonic::Code::Unavailable, "gone".into());
+            ClientError::Lost { address: address.clone(), request, code, reason }
+        };
+        let refused = |code| {
+            let message = "no".into();
+            CollectError::Client(ClientError::Refused { address: address.clone(), request: "open", code, message })
+        };
+        let failed = |source: TrainError| TrainError::Failed { last: None, source: Box::new(source) };
+        assert!(TrainError::from(lost()).can_be_retried());
+        assert!(failed(lost().into()).can_be_retried());
+        assert!(failed(refused(tonic::Code::ResourceExhausted).into()).can_be_retried(), "the server is full");
+        assert!(!failed(refused(tonic::Code::NotFound).into()).can_be_retried());
+        assert!(!TrainError::NoActions.can_be_retried());
+    }
+
+    #[test]
+    fn a_failure_says_what_is_left_and_what_to_do() {
+        let shown = |saved: bool, source: TrainError| {
+            let last = saved.then(|| LastCheckpoint { episodes: 7, run: "runs/a".into() });
+            TrainError::Failed { last, source: Box::new(source) }.to_string()
+        };
+        let numbers = || TrainError::Numbers(Error::PolicyOutput { environment: 0 });
+        assert!(
+            shown(false, numbers()).starts_with("training failed before its first checkpoint: the policy's output")
+        );
+        let kept = "training failed; the checkpoint after 7 episodes is kept in runs/a";
+        assert!(shown(true, numbers()).starts_with(&format!("{kept} (resumed, it would come to the same numbers): ")));
+        let next = "; go on from there: perturb train --resume runs/a: the server does not";
+        assert!(shown(true, TrainError::NoActions).starts_with(&format!("{kept}{next}")));
+    }
+}

@@ -1,0 +1,199 @@
+//! The directory of a run: for one process at a time.
+
+use std::cell::OnceCell;
+use std::path::{Path, PathBuf};
+
+use perturb_study::files::{self, FileError, Lock};
+
+use crate::checkpoint::{Checkpoint, CheckpointError, ResumeState};
+
+/// The directory of a run. While this value lives, and its process with it, no other process can train in there.
+#[derive(Debug)]
+pub struct RunDirectory {
+    path: PathBuf,
+    overwrite: bool,
+    /// Taken as soon as the directory exists.
+    lock: OnceCell<Lock>,
+}
+
+/// Why a directory cannot be trained in.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum RunDirectoryError {
+    /// A new run cannot have the name of a file.
+    #[error("--out {} is a file; give a directory", path.display())]
+    IsFile {
+        /// What was given.
+        path: PathBuf,
+    },
+    /// Another process trains in it.
+    #[error("another process trains in {}; wait until it ends, or choose another directory", path.display())]
+    Locked {
+        /// The directory.
+        path: PathBuf,
+    },
+    /// A new run would delete an earlier one.
+    #[error(
+        "{path} already holds a run ({file}): choose another --out, give --overwrite to delete that run, or go on with \
+         it: perturb train --resume {path}",
+        path = path.display()
+    )]
+    HoldsRun {
+        /// The directory.
+        path: PathBuf,
+        /// A file of the run.
+        file: String,
+    },
+    /// There is no such directory.
+    #[error("--resume {}: there is no such directory; give the --out of a training", path.display())]
+    Missing {
+        /// What was given.
+        path: PathBuf,
+    },
+    /// A checkpoint was given instead of its run.
+    #[error("{} is the checkpoint in a run; give the run's directory, which holds it", path.display())]
+    IsCheckpoint {
+        /// What was given.
+        path: PathBuf,
+    },
+    /// Nothing was trained in it.
+    #[error("{} holds no run; give the --out of a training", path.display())]
+    NoRun {
+        /// What was given.
+        path: PathBuf,
+    },
+    /// The run was too short.
+    #[error(
+        "the run in {path} ended before its first checkpoint, so there is nothing to resume; start again with perturb \
+         train --out {path} --overwrite and the same settings",
+        path = path.display()
+    )]
+    NoCheckpoint {
+        /// The directory.
+        path: PathBuf,
+    },
+    /// The checkpoint cannot be read or resumed.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// The operating system refused a file.
+    #[error(transparent)]
+    File(#[from] FileError),
+}
+
+type Result<T> = std::result::Result<T, RunDirectoryError>;
+
+impl RunDirectoryError {
+    /// Whether there is nothing that could be resumed, now or later.
+    pub fn is_hopeless(&self) -> bool {
+        match self {
+            Self::Checkpoint(CheckpointError::Damaged { .. } | CheckpointError::NotResumable { .. })
+            | Self::Missing { .. }
+            | Self::NoRun { .. }
+            | Self::NoCheckpoint { .. } => true,
+            Self::Checkpoint(_)
+            | Self::File(_)
+            | Self::IsFile { .. }
+            | Self::Locked { .. }
+            | Self::HoldsRun { .. }
+            | Self::IsCheckpoint { .. } => false,
+        }
+    }
+}
+
+impl RunDirectory {
+    /// Chooses `path` for a new run; if it holds an earlier run, `overwrite` allows its deletion. Changes nothing yet:
+    /// [`train`](crate::training::train) empties the directory when the environments are open and all settings have
+    /// proved to work.
+    ///
+    /// # Errors
+    /// If it holds a run and `overwrite` is off; if another process trains in it; the operating system's.
+    pub fn choose(path: &Path, overwrite: bool) -> Result<Self> {
+        if path.exists() && !path.is_dir() {
+            return Err(RunDirectoryError::IsFile { path: path.to_owned() });
+        }
+        let directory = Self { path: path.to_owned(), overwrite, lock: OnceCell::new() };
+        if path.exists() {
+            directory.lock()?;
+        }
+        directory.earlier_run()?;
+        Ok(directory)
+    }
+
+    /// Opens the run in `path` to go on with it, with the policy and the state of its last checkpoint.
+    ///
+    /// # Errors
+    /// If there is no run, no checkpoint, or one that cannot be resumed; if another process trains in it; the operating
+    /// system's.
+    pub fn resume(path: &Path) -> Result<(Self, Checkpoint, ResumeState)> {
+        if !path.is_dir() {
+            return Err(RunDirectoryError::Missing { path: path.to_owned() });
+        }
+        let directory = Self { path: path.to_owned(), overwrite: false, lock: OnceCell::new() };
+        directory.lock()?;
+        match Checkpoint::load_with_resume(&directory.checkpoint()) {
+            Err(CheckpointError::Missing { .. }) => Err(directory.nothing_to_resume()?),
+            loaded => loaded.map(|(checkpoint, state)| (directory, checkpoint, state)).map_err(Into::into),
+        }
+    }
+
+    /// Why there is no checkpoint.
+    fn nothing_to_resume(&self) -> Result<RunDirectoryError> {
+        let path = self.path.clone();
+        Ok(if path.join("checkpoint.json").is_file() {
+            RunDirectoryError::IsCheckpoint { path }
+        } else if files_of_a_run(&path)?.is_empty() {
+            RunDirectoryError::NoRun { path }
+        } else {
+            RunDirectoryError::NoCheckpoint { path }
+        })
+    }
+
+    /// Keeps other processes out.
+    fn lock(&self) -> Result<()> {
+        let lock = Lock::try_take(&self.path)?.ok_or_else(|| RunDirectoryError::Locked { path: self.path.clone() })?;
+        self.lock.get_or_init(|| lock);
+        Ok(())
+    }
+
+    /// The files of an earlier run, which may be deleted.
+    fn earlier_run(&self) -> Result<Vec<PathBuf>> {
+        let files = files_of_a_run(&self.path)?;
+        match files.first() {
+            Some(file) if !self.overwrite => Err(RunDirectoryError::HoldsRun {
+                path: self.path.clone(),
+                file: file.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+            }),
+            _ => Ok(files),
+        }
+    }
+
+    /// Creates it, or empties it of the earlier run.
+    pub(crate) fn prepare(&self) -> Result<()> {
+        files::create_folder(&self.path)?;
+        if self.lock.get().is_none() {
+            self.lock()?;
+        }
+        Ok(self.earlier_run()?.iter().try_for_each(|file| files::delete(file))?)
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Where its checkpoint is.
+    pub fn checkpoint(&self) -> PathBuf {
+        self.path.join("checkpoint")
+    }
+}
+
+/// What a run has written in `path`; other files are left alone.
+fn files_of_a_run(path: &Path) -> files::Result<Vec<PathBuf>> {
+    let mut paths = files::list(path)?;
+    paths.retain(|path| {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let known = ["config.toml", "progress.csv", "monitor.csv", "checkpoint"].contains(&name.as_ref());
+        known || name.starts_with("events.out.tfevents.")
+    });
+    Ok(paths)
+}

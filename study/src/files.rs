@@ -1,0 +1,193 @@
+//! Files: errors that name them, writing that happens wholly or not at all, locks.
+
+use std::fs::{self, File, TryLockError};
+use std::io::{ErrorKind, Write};
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+/// What files begin with that a write has not finished.
+pub const TEMPORARY_PREFIX: &str = ".tmp-";
+
+/// The operating system refused a file.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot {action} {}: {source}", path.display())]
+pub struct FileError {
+    /// What was tried.
+    pub action: &'static str,
+    /// On what.
+    pub path: PathBuf,
+    /// The operating system's answer.
+    pub source: std::io::Error,
+}
+
+/// A result with a [`FileError`].
+pub type Result<T> = std::result::Result<T, FileError>;
+
+/// Names the file in the operating system's error.
+pub fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> FileError {
+    let path = path.to_owned();
+    move |source| FileError { action, path, source }
+}
+
+/// A file's content.
+///
+/// # Errors
+/// The operating system's.
+pub fn read(path: &Path) -> Result<Vec<u8>> {
+    fs::read(path).map_err(io("read", path))
+}
+
+/// A file's content as text.
+///
+/// # Errors
+/// The operating system's; a file that is not UTF-8.
+pub fn read_text(path: &Path) -> Result<String> {
+    fs::read_to_string(path).map_err(io("read", path))
+}
+
+/// A file's content; `None` if it is not there.
+///
+/// # Errors
+/// The operating system's.
+pub fn read_if_there(path: &Path) -> Result<Option<Vec<u8>>> {
+    if_there(fs::read(path)).map_err(io("read", path))
+}
+
+/// Creates a folder and those above it, unless they are there.
+///
+/// # Errors
+/// The operating system's.
+pub fn create_folder(path: &Path) -> Result<()> {
+    fs::create_dir_all(path).map_err(io("create", path))
+}
+
+/// The paths in a folder, sorted; none if it is not there.
+///
+/// # Errors
+/// The operating system's.
+pub fn list(folder: &Path) -> Result<Vec<PathBuf>> {
+    let list = || fs::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect::<std::io::Result<Vec<PathBuf>>>();
+    let mut paths = if_there(list()).map_err(io("list", folder))?.unwrap_or_default();
+    paths.sort();
+    Ok(paths)
+}
+
+/// Deletes a file, or a folder with everything in it, if it is there.
+///
+/// # Errors
+/// The operating system's.
+pub fn delete(path: &Path) -> Result<()> {
+    let deleted = if path.is_dir() { fs::remove_dir_all(path) } else { fs::remove_file(path) };
+    if_there(deleted).map(drop).map_err(io("delete", path))
+}
+
+/// Writes a file in one piece: it appears complete, and on the disk, or not at all. Folders are created. What is there
+/// and is no plain file, a pipe for instance, is written to.
+///
+/// # Errors
+/// The operating system's; an earlier file is then still there.
+pub fn write_atomically(path: &Path, content: &[u8]) -> Result<()> {
+    if path.metadata().is_ok_and(|metadata| !metadata.is_file()) {
+        return fs::write(path, content).map_err(io("write", path));
+    }
+    let folder = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    create_folder(folder)?;
+    // As readable as any other file that is created here; temporary files are otherwise their owner's alone.
+    let mode = <fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666);
+    let mut builder = tempfile::Builder::new();
+    let mut file =
+        builder.prefix(TEMPORARY_PREFIX).permissions(mode).tempfile_in(folder).map_err(io("write in", folder))?;
+    file.write_all(content).and_then(|()| file.as_file().sync_all()).map_err(io("write", path))?;
+    file.persist(path).map_err(|error| io("rename a file to", path)(error.error))?;
+    sync_folder(folder)
+}
+
+/// Writes a document as JSON, in one piece.
+///
+/// # Errors
+/// The operating system's.
+pub fn write_json(path: &Path, document: &impl Serialize) -> Result<()> {
+    let mut text = serde_json::to_vec_pretty(document).map_err(|error| io("write", path)(error.into()))?;
+    text.push(b'\n');
+    write_atomically(path, &text)
+}
+
+/// Brings the names in a folder to the disk.
+///
+/// # Errors
+/// The operating system's.
+pub fn sync_folder(path: &Path) -> Result<()> {
+    File::open(path).and_then(|folder| folder.sync_all()).map_err(io("sync", path))
+}
+
+/// An advisory lock: it ends with the process that holds it, however it ends.
+#[derive(Debug)]
+pub struct Lock(#[expect(dead_code, reason = "unlocked when it is closed")] File);
+
+impl Lock {
+    /// Takes the lock of the folder at `path`, or of a file, which is created if it is not there; `None` while somebody
+    /// else has it.
+    ///
+    /// # Errors
+    /// The operating system's.
+    pub fn try_take(path: &Path) -> Result<Option<Self>> {
+        let file = if path.is_dir() {
+            File::open(path)
+        } else {
+            File::options().create(true).truncate(false).write(true).open(path)
+        };
+        let file = file.map_err(io("open", path))?;
+        match file.try_lock() {
+            Ok(()) => Ok(Some(Self(file))),
+            Err(TryLockError::WouldBlock) => Ok(None),
+            Err(TryLockError::Error(source)) => Err(io("lock", path)(source)),
+        }
+    }
+}
+
+/// `None` if what was asked for is not there.
+fn if_there<T>(result: std::io::Result<T>) -> std::io::Result<Option<T>> {
+    match result {
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+        result => result.map(Some),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_that_is_written_whole_is_as_readable_as_others() {
+        use std::os::unix::fs::PermissionsExt;
+        let directory = tempfile::tempdir().unwrap();
+        let [plain, whole] = ["plain", "whole"].map(|name| directory.path().join(name));
+        fs::write(&plain, "x").unwrap();
+        write_atomically(&whole, b"x").unwrap();
+        let [plain, whole] = [plain, whole].map(|path| fs::metadata(path).unwrap().permissions().mode());
+        assert_eq!(plain, whole);
+    }
+
+    #[test]
+    fn what_is_not_there_is_no_error_where_that_is_asked() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("nothing");
+        assert_eq!(read_if_there(&path).unwrap(), None);
+        assert!(list(&path).unwrap().is_empty());
+        delete(&path).unwrap();
+        let error = read(&path).unwrap_err().to_string();
+        assert!(error.starts_with("cannot read ") && error.contains("/nothing: No such file"), "{error}");
+    }
+
+    #[test]
+    fn a_lock_is_held_by_one_at_a_time() {
+        let directory = tempfile::tempdir().unwrap();
+        for path in [directory.path(), &directory.path().join("lock")] {
+            let lock = Lock::try_take(path).unwrap();
+            assert!(lock.is_some() && Lock::try_take(path).unwrap().is_none());
+            drop(lock);
+            assert!(Lock::try_take(path).unwrap().is_some());
+        }
+    }
+}
