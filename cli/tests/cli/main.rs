@@ -7,5 +7,6 @@ mod end_to_end;
 mod experiments;
 mod resume;
 mod servers;
+mod sets;
 mod slurm;
 mod video;

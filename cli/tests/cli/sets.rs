@@ -1,0 +1,290 @@
+//! Parameters of one's own from the experiment file to the report, and back to the episodes.
+
+use std::path::Path;
+use std::process::Output;
+use std::sync::OnceLock;
+use std::thread::{self, JoinHandle};
+
+use perturb::config::{Arguments, Config};
+use perturb::env::{Action, Catalogue, Environment, EnvironmentSpec, Error, Stream, Transition};
+use perturb::scene::Scene;
+use perturb::server::listen::Listener;
+use perturb::tasks::cart_pole;
+use perturb_study::records::{FILE, Records};
+use perturb_study::{CellResult, CellState, Folder, Plan};
+use tempfile::TempDir;
+use tokio::sync::oneshot;
+
+use super::common::{addresses, perturb, server, stderr};
+
+const PLAN: &str = "
+environments = ['CartPole']
+versions = ['D', 'long_poles']
+test_versions = ['E', 'long_poles', 'corners', 'rows']
+test_episodes = 12
+settings = { episodes = 30, num_envs = 4 }
+
+[sets.long_poles]
+length = '0.7..0.8,0.9..1.0'
+mass = 0.2
+
+[sets.corners]
+version = 'R'
+length = '0.1..1.0/2'
+mass = '0.05,0.5'
+
+[sets.rows]
+file = 'rows.csv'
+
+[success]
+CartPole = 'steps=15'
+
+[[algorithm]]
+name = 'ppo'
+architectures = ['ff']
+";
+
+/// The experiment in a folder of its own.
+fn experiment() -> TempDir {
+    let directory = tempfile::tempdir().expect("a directory");
+    std::fs::write(directory.path().join("plan.toml"), PLAN).expect("written");
+    std::fs::write(directory.path().join("rows.csv"), "length,force\n0.3,5\n0.6,15\n").expect("written");
+    directory
+}
+
+fn run(directory: &Path, arguments: &[&str]) -> Output {
+    let (plan, out) = (directory.join("plan.toml"), directory.join("out"));
+    let mut command = perturb(&["run"]);
+    command.arg(plan).arg("--out").arg(out).args(arguments);
+    command.output().expect("ended")
+}
+
+fn audit(path: &Path, arguments: &[&str]) -> Output {
+    let mut command = perturb(&["audit"]);
+    command.arg(path).args(arguments);
+    command.output().expect("ended")
+}
+
+#[track_caller]
+fn stdout(output: &Output) -> String {
+    assert!(output.status.success(), "{}: {}", output.status, stderr(output));
+    String::from_utf8(output.stdout.clone()).expect("UTF-8")
+}
+
+fn results(directory: &Path) -> Vec<CellResult> {
+    let folder = Folder::new(&directory.join("out"));
+    let plan = Plan::load(&folder.plan_path()).expect("the folder's copy can be read, with the files that it names");
+    let result = |cell| match folder.state(cell) {
+        Ok(CellState::Done(result)) => *result,
+        other => panic!("{other:?}"),
+    };
+    plan.cells.iter().map(result).collect()
+}
+
+#[test]
+fn an_experiment_on_sets_runs_and_every_episode_can_be_played_again_on_one_and_on_two_servers() {
+    let directory = experiment();
+    stdout(&run(directory.path(), &["--jobs", "2"]));
+    let out = directory.path().join("out");
+    let results = results(directory.path());
+    assert_eq!(
+        results.iter().map(|result| result.training.set.as_deref()).collect::<Vec<_>>(),
+        [None, Some("long_poles")]
+    );
+    for result in &results {
+        let records = Records::read(&out.join("cells").join(&result.id).join(FILE)).expect("recorded");
+        let sets: Vec<&str> = records.about.tests.iter().map(|test| test.set.name.as_str()).collect();
+        assert_eq!(sets, ["E", "long_poles", "corners", "rows"]);
+        for set in sets {
+            assert_eq!(records.result(set, None), result.results[set], "figures follow from the episodes");
+        }
+        assert_eq!(result.agreement, Some(records.agreement()));
+        assert_eq!(records.agreement().episodes, 48);
+        parameters_are_those_of_the_sets(&records);
+    }
+    let same = "96 of 96 episodes of 2 policies have the same bytes\n";
+    assert_eq!(stdout(&audit(&out, &["--all"])), same);
+    let servers = [server(1), server(2)];
+    let two: Vec<String> = addresses(&servers).iter().map(ToString::to_string).collect();
+    assert_eq!(stdout(&audit(&out, &["--all", "--server", &two.join(",")])), same);
+    assert!(stdout(&audit(&out, &["--episodes", "5"])).starts_with("10 of 10 episodes"));
+    assert!(stdout(&perturb(&["report", out.to_str().unwrap()]).output().unwrap()).contains("CartPole"));
+}
+
+fn parameters_are_those_of_the_sets(records: &Records) {
+    let place = |name: &str| records.about.parameters.iter().position(|known| known.name == name).expect("known");
+    let (force, length, mass) = (place("force"), place("length"), place("mass"));
+    for episode in records.of("long_poles") {
+        let value = episode.requested[length];
+        assert!((0.7..=0.8).contains(&value) || (0.9..=1.0).contains(&value), "{value}");
+        assert_eq!((episode.requested[force], episode.requested[mass]), (10.0, 0.2));
+    }
+    for (set, at, expected) in [
+        ("corners", [length, mass], [[0.1, 0.05], [1.0, 0.05], [0.1, 0.5], [1.0, 0.5]].as_slice()),
+        ("rows", [length, force], &[[0.3, 5.0], [0.6, 15.0]]),
+    ] {
+        for context in expected {
+            let count = records.of(set).filter(|episode| at.map(|place| episode.requested[place]) == *context).count();
+            assert_eq!(count, 12 / expected.len(), "{set} {context:?}");
+        }
+    }
+}
+
+#[test]
+fn an_episode_that_comes_out_otherwise_is_told_and_is_a_failure() {
+    let directory = experiment();
+    stdout(&run(directory.path(), &["--cell", "0"]));
+    let folder = Folder::new(&directory.path().join("out"));
+    let plan = Plan::load(&folder.plan_path()).expect("a plan");
+    let cell = folder.cell(&plan.cells[0].id).path().to_owned();
+    let mut records = Records::read(&cell.join(FILE)).expect("recorded");
+    records.episodes[7].episode_return += 1.0;
+    records.write(&cell.join(FILE)).expect("written");
+    let output = audit(&cell, &["--all"]);
+    let said = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{said}{}", stderr(&output));
+    assert!(
+        said.contains("return was") && said.ends_with("47 of 48 episodes of 1 policy have the same bytes\n"),
+        "{said}"
+    );
+}
+
+#[test]
+fn sets_are_typed_judged_by_other_thresholds_and_played_again() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let [training, records] = ["training", "records"].map(|name| directory.path().join(name).display().to_string());
+    let parameters = ["--parameters", "length=0.75..1.25,1.5", "mass=1"];
+    let refused = perturb(&["train", "--env", "Acrobot", "--out", &training]).args(parameters).output().unwrap();
+    assert_eq!(refused.status.code(), Some(2), "a fixed value stands alone: {}", stderr(&refused));
+    let train = ["train", "--env", "Acrobot", "--episodes", "12", "--set", "num_envs=4", "--out", &training];
+    stdout(&perturb(&train).args(["--parameters", "length=0.75..1.25", "mass=1"]).output().unwrap());
+    let evaluate = ["evaluate", "--checkpoint", &training, "--episodes", "12", "--records", &records];
+    stdout(&perturb(&evaluate).args(["--parameters", "length=0.75..1.25"]).output().unwrap());
+    let rates = perturb(&["rates", &records, "--success", "steps=80", "steps=90", "steps=500"]).output().unwrap();
+    let text = stdout(&rates);
+    for line in ["steps at most 80", "steps at most 90", "steps at most 500"] {
+        assert!(text.contains(line), "{text}");
+    }
+    let same = stdout(&audit(records.as_ref(), &["--all", "--checkpoint", &training]));
+    assert_eq!(same, "12 of 12 episodes of 1 policy have the same bytes\n");
+}
+
+#[test]
+fn what_no_environment_has_is_refused_before_anything_begins() {
+    let directory = experiment();
+    for (from, to, part) in [
+        ("mass = 0.2", "size = 0.2", "`size`, but must be one of force, length, mass"),
+        ("mass = 0.2", "mass = -1", "mass of CartPole is -1, but must be within"),
+        ("steps=15", "metres=15", "metres=15, but must be one of steps"),
+        ("test_versions = ['E'", "test_versions = ['X'", "`X`"),
+        ("rows.csv", "../rows.csv", "not the name of a file"),
+    ] {
+        std::fs::write(directory.path().join("plan.toml"), PLAN.replace(from, to)).expect("written");
+        let output = run(directory.path(), &[]);
+        assert!(stderr(&output).contains(part), "{to}: {}", stderr(&output));
+        assert!(!directory.path().join("out").exists(), "{to}: nothing was begun");
+    }
+}
+
+/// CartPole, on which an edit of the mass has no effect.
+struct Stuck(Box<dyn Environment>);
+
+impl Stuck {
+    fn spec() -> &'static EnvironmentSpec {
+        static SPEC: OnceLock<EnvironmentSpec> = OnceLock::new();
+        let make = || Ok(Box::new(Stuck((cart_pole::SPEC.make)()?)) as Box<dyn Environment>);
+        SPEC.get_or_init(|| EnvironmentSpec { make, ..cart_pole::SPEC })
+    }
+}
+
+impl Environment for Stuck {
+    fn spec(&self) -> &'static EnvironmentSpec {
+        Self::spec()
+    }
+
+    fn set_parameters(&mut self, values: &[f64]) {
+        self.0.set_parameters(&[values[0], values[1], 0.1]);
+    }
+
+    fn applied(&self, out: &mut [f64]) {
+        self.0.applied(out);
+    }
+
+    fn reset(&mut self, stream: &mut Stream) {
+        self.0.reset(stream);
+    }
+
+    fn reset_to(&mut self, state: &[f64]) {
+        self.0.reset_to(state);
+    }
+
+    fn observe(&self, out: &mut [f32]) {
+        self.0.observe(out);
+    }
+
+    fn scene(&self) -> Option<Scene> {
+        self.0.scene()
+    }
+
+    fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
+        self.0.step(action, reward_terms)
+    }
+
+    fn save(&self, out: &mut Vec<f64>) {
+        self.0.save(out);
+    }
+
+    fn load(&mut self, state: &[f64]) -> Result<(), Error> {
+        self.0.load(state)
+    }
+}
+
+/// A server in a thread of this process, with a catalogue that no program has.
+struct InThread {
+    address: String,
+    shutdown: Option<oneshot::Sender<()>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl InThread {
+    fn start(catalogue: Catalogue) -> Self {
+        let (tell, address) = oneshot::channel();
+        let (shutdown, end) = oneshot::channel();
+        let thread = thread::spawn(move || {
+            let config = Config { workers: 2, ..Config::load(&Arguments::default()).expect("settings") };
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+            runtime.block_on(async {
+                let any = "tcp://127.0.0.1:0".to_owned().try_into().expect("an address");
+                let listener = Listener::bind(&any).await.expect("a free port");
+                tell.send(listener.address().expect("bound").to_string()).expect("heard");
+                let stop = async { drop(end.await) };
+                perturb::server::run(vec![listener], &config, catalogue, stop).await.expect("served");
+            });
+        });
+        let address = address.blocking_recv().expect("it listens");
+        Self { address, shutdown: Some(shutdown), thread: Some(thread) }
+    }
+}
+
+impl Drop for InThread {
+    fn drop(&mut self) {
+        drop(self.shutdown.take());
+        let _ = self.thread.take().map(JoinHandle::join);
+    }
+}
+
+#[test]
+fn an_edit_that_does_not_take_effect_stops_a_cell() {
+    let directory = experiment();
+    let server = InThread::start(Catalogue::default().with(Stuck::spec()));
+    let output = run(directory.path(), &["--jobs", "1", "--server", &server.address]);
+    assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
+    let folder = Folder::new(&directory.path().join("out"));
+    let plan = Plan::load(&folder.plan_path()).expect("a plan");
+    for cell in &plan.cells {
+        let Ok(CellState::Failed(failure)) = folder.state(cell) else { panic!("{} has not failed", cell.id) };
+        let part = "the parameter mass was requested as ";
+        assert!(failure.reason.contains(part) && failure.reason.contains("the physics ran with 0.1"), "{failure:?}");
+        assert!(!folder.cell(&cell.id).path().join("result.json").exists());
+    }
+}
