@@ -98,7 +98,7 @@ pub struct Arguments {
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
     /// Where to listen, at least one.
-    pub listen: Vec<Address>,
+    pub listen: Vec<ListenAddress>,
     /// Physics threads, 1 … 1024.
     pub workers: usize,
     /// The most environments, over all sessions, 1 … 2^24.
@@ -122,7 +122,7 @@ pub struct Config {
 impl Default for Config {
     fn default() -> Self {
         Self {
-            listen: vec![Address::Tcp(SocketAddr::from(([127, 0, 0, 1], DEFAULT_PORT)))],
+            listen: vec![ListenAddress::Tcp(SocketAddr::from(([127, 0, 0, 1], DEFAULT_PORT)))],
             workers: std::thread::available_parallelism().map_or(1, usize::from),
             max_envs: DEFAULT_MAX_ENVS,
             max_sessions: 1024,
@@ -153,14 +153,14 @@ fn variables() -> Environment {
 /// Where to listen.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Deserialize)]
 #[serde(try_from = "String")]
-pub enum Address {
+pub enum ListenAddress {
     /// A TCP address and port; port 0 = any free one.
     Tcp(SocketAddr),
     /// The path of a Unix socket.
     Unix(PathBuf),
 }
 
-impl TryFrom<String> for Address {
+impl TryFrom<String> for ListenAddress {
     type Error = String;
 
     fn try_from(text: String) -> Result<Self, String> {
@@ -176,7 +176,7 @@ impl TryFrom<String> for Address {
     }
 }
 
-impl fmt::Display for Address {
+impl fmt::Display for ListenAddress {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Tcp(address) => write!(f, "http://{address}"),

@@ -1,6 +1,6 @@
 //! The physical parameters of an environment: what can be changed, within which bounds, and the sets of its versions.
 
-use super::{Distribution, EnvironmentSpec, Error, Interval, Version, shorten};
+use super::{Distribution, Interval, Version};
 
 /// A physical parameter with its bounds and the sets of its versions (the paper, table of parameter ranges).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -19,7 +19,7 @@ pub struct Parameter {
     pub extreme: [Interval; 2],
     /// The physical range: nothing outside is accepted.
     pub bounds: Interval,
-    /// The quantity of [`EnvironmentSpec::applied`] that reads it back, in the same unit.
+    /// The quantity of [`EnvironmentSpec::applied`](super::EnvironmentSpec::applied) that reads it back, in the same unit.
     pub applied: &'static str,
 }
 
@@ -55,49 +55,4 @@ impl Parameter {
         };
         Distribution::union(intervals).expect("the table holds valid sets; a test checks each")
     }
-}
-
-/// Checks that values from `low` to `high` lie within the parameter's physical range. NaN does not.
-///
-/// # Errors
-/// [`Error::OutOfRange`].
-pub fn check_bounds(spec: &EnvironmentSpec, parameter: &Parameter, (low, high): (f64, f64)) -> Result<(), Error> {
-    let bounds = parameter.bounds;
-    if low >= bounds.low && high <= bounds.high {
-        return Ok(());
-    }
-    Err(Error::OutOfRange {
-        environment: spec.name,
-        parameter: parameter.name,
-        got: if low >= bounds.low { high } else { low },
-        unit: parameter.unit,
-        low: bounds.low,
-        high: bounds.high,
-    })
-}
-
-/// Replaces in `base` (one distribution a parameter, in the spec's order) those that `overrides` names.
-///
-/// # Errors
-/// [`Error::UnknownParameter`] and [`Error::OutOfRange`]; `base` is unchanged then.
-pub fn resolve<'a>(
-    spec: &'static EnvironmentSpec,
-    base: &mut [Distribution],
-    overrides: impl IntoIterator<Item = (&'a str, Distribution)>,
-) -> Result<(), Error> {
-    let mut replaced = Vec::new();
-    for (name, distribution) in overrides {
-        let position = spec.parameters.iter().position(|p| p.name == name).ok_or_else(|| Error::UnknownParameter {
-            environment: spec.name,
-            name: shorten(name),
-            known: spec.parameters.iter().map(|p| p.name).collect::<Vec<_>>().join(", "),
-        })?;
-        let parameter = &spec.parameters[position];
-        check_bounds(spec, parameter, distribution.range())?;
-        replaced.push((position, distribution));
-    }
-    for (position, distribution) in replaced {
-        base[position] = distribution;
-    }
-    Ok(())
 }

@@ -98,7 +98,8 @@ impl Canvas {
 
     /// A length in pixels.
     fn pixels(&self, length: f64) -> f32 {
-        (length * self.scale).max(THINNEST).min(FAR) as f32
+        let pixels = length * self.scale;
+        if pixels > THINNEST { pixels.min(FAR) as f32 } else { THINNEST as f32 } // the latter also for NaN
     }
 
     /// The coordinate along an axis, or the picture's edge if it is infinite.

@@ -71,13 +71,13 @@ pub enum Error {
 /// under way, for which it waits a second at most.
 #[derive(Default)]
 pub struct Renderer {
-    studio: Mutex<Option<Studio>>,
+    thread: Mutex<Option<DrawingThread>>,
 }
 
 /// The thread, and the way to it.
-struct Studio {
+struct DrawingThread {
     jobs: mpsc::Sender<Job>,
-    thread: JoinHandle<()>,
+    handle: JoinHandle<()>,
 }
 
 struct Job {
@@ -107,28 +107,28 @@ impl Renderer {
     }
 
     fn jobs(&self) -> Result<mpsc::Sender<Job>, Error> {
-        let mut studio = self.studio.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(studio) = &*studio {
-            return Ok(studio.jobs.clone());
+        let mut running = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(thread) = &*running {
+            return Ok(thread.jobs.clone());
         }
         let (jobs, receiver) = mpsc::channel(QUEUE);
-        let thread = thread::Builder::new()
+        let handle = thread::Builder::new()
             .name("render".into())
             .spawn(move || work(receiver))
             .map_err(|error| Error::NoThread { reason: error.to_string() })?;
-        *studio = Some(Studio { jobs: jobs.clone(), thread });
+        *running = Some(DrawingThread { jobs: jobs.clone(), handle });
         Ok(jobs)
     }
 }
 
 impl Drop for Renderer {
     fn drop(&mut self) {
-        let studio = self.studio.get_mut().unwrap_or_else(PoisonError::into_inner);
-        if let Some(Studio { jobs, thread }) = studio.take() {
+        let running = self.thread.get_mut().unwrap_or_else(PoisonError::into_inner);
+        if let Some(DrawingThread { jobs, handle }) = running.take() {
             drop(jobs);
             // A driver should not be drawing while the process ends; one that hangs must not keep it from ending.
             for _ in 0..FAREWELL.as_millis() {
-                if thread.is_finished() {
+                if handle.is_finished() {
                     break;
                 }
                 thread::sleep(Duration::from_millis(1));
@@ -142,17 +142,17 @@ fn work(mut jobs: mpsc::Receiver<Job>) {
     if let Err(error) = rustix::process::nice(NICENESS) {
         tracing::debug!(%error, "pictures are drawn at the priority of physics");
     }
-    let mut easel = Easel::default();
+    let mut cache = Cache::default();
     while let Some(Job { scene, size, reply }) = jobs.blocking_recv() {
         if reply.is_closed() {
             continue; // its session is gone
         }
-        let drawn = catch_unwind(AssertUnwindSafe(|| easel.draw(&scene, size))).unwrap_or_else(|_| {
+        let drawn = catch_unwind(AssertUnwindSafe(|| cache.draw(&scene, size))).unwrap_or_else(|_| {
             tracing::error!(?scene, "a drawing panicked");
             Err(Error::Defect)
         });
         if matches!(drawn, Err(Error::Failed { .. } | Error::Defect)) {
-            easel = Easel::default(); // what a failed drawing leaves behind is not to be trusted
+            cache = Cache::default(); // what a failed drawing leaves behind is not to be trusted
         }
         let _ = reply.send(drawn); // the session may be gone by now
     }
@@ -160,12 +160,12 @@ fn work(mut jobs: mpsc::Receiver<Job>) {
 
 /// What the thread keeps from one picture to the next.
 #[derive(Default)]
-struct Easel {
+struct Cache {
     #[cfg(feature = "mujoco")]
     models: model::Models,
 }
 
-impl Easel {
+impl Cache {
     fn draw(&mut self, scene: &Scene, size: Size) -> Result<Vec<u8>, Error> {
         match scene {
             Scene::Drawing(drawing) => Ok(canvas::draw(drawing, size)),

@@ -16,13 +16,13 @@ const FREE_RISE: f64 = 0.6;
 /// The models that were drawn so far.
 #[derive(Default)]
 pub(super) struct Models {
-    drawn: Vec<Stage>,
+    drawn: Vec<ShownModel>,
     /// That there is no OpenGL, once that is known: it does not come while the server runs.
     missing: Option<String>,
 }
 
 /// A model with its scenery.
-struct Stage {
+struct ShownModel {
     look: &'static Look,
     renderer: mujoco::Renderer,
     followed: usize,
@@ -46,10 +46,10 @@ impl Models {
     }
 
     fn try_draw(&mut self, model: &PosedModel, size: Size) -> Result<Vec<u8>, mujoco::Error> {
-        let index = match self.drawn.iter().position(|stage| ptr::eq(stage.look, model.look)) {
+        let index = match self.drawn.iter().position(|shown| ptr::eq(shown.look, model.look)) {
             Some(index) => index,
             None => {
-                self.drawn.push(Stage::new(model.look, size)?);
+                self.drawn.push(ShownModel::new(model.look, size)?);
                 self.drawn.len() - 1
             }
         };
@@ -57,7 +57,7 @@ impl Models {
     }
 }
 
-impl Stage {
+impl ShownModel {
     fn new(look: &'static Look, size: Size) -> Result<Self, mujoco::Error> {
         let compile = |reason: String| mujoco::Error::Compile { reason };
         let (own, _) = look.mjcf.rsplit_once(END_OF_MODEL).ok_or_else(|| compile("the model has no end".into()))?;

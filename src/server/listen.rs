@@ -1,6 +1,6 @@
 //! Binding addresses: TCP ports and Unix sockets.
 
-use crate::config::Address;
+use crate::config::ListenAddress;
 use futures_util::{Stream, stream};
 use std::time::Duration;
 use std::{
@@ -68,11 +68,11 @@ impl Listener {
     ///
     /// # Errors
     /// If the address is in use or may not be bound; the message names it.
-    pub async fn bind(address: &Address) -> io::Result<Self> {
+    pub async fn bind(address: &ListenAddress) -> io::Result<Self> {
         let explain = |error: io::Error| io::Error::new(error.kind(), format!("cannot listen at {address}: {error}"));
         match address {
-            Address::Tcp(tcp) => Ok(Self::Tcp(TcpListener::bind(tcp).await.map_err(explain)?)),
-            Address::Unix(path) => {
+            ListenAddress::Tcp(tcp) => Ok(Self::Tcp(TcpListener::bind(tcp).await.map_err(explain)?)),
+            ListenAddress::Unix(path) => {
                 let is_socket = std::fs::symlink_metadata(path).is_ok_and(|m| m.file_type().is_socket());
                 let refused = |e: io::Error| e.kind() == ErrorKind::ConnectionRefused;
                 if is_socket && StdUnixStream::connect(path).is_err_and(refused) {
@@ -88,10 +88,10 @@ impl Listener {
     ///
     /// # Errors
     /// If the operating system does not tell the port.
-    pub fn address(&self) -> io::Result<Address> {
+    pub fn address(&self) -> io::Result<ListenAddress> {
         match self {
-            Self::Tcp(listener) => listener.local_addr().map(Address::Tcp),
-            Self::Unix(_, file) => Ok(Address::Unix(file.0.clone())),
+            Self::Tcp(listener) => listener.local_addr().map(ListenAddress::Tcp),
+            Self::Unix(_, file) => Ok(ListenAddress::Unix(file.0.clone())),
         }
     }
 }

@@ -2,6 +2,7 @@
 //!
 //! - [`service`]: one short method for each call.
 //! - [`conversation`]: the transport of a session.
+//! - [`requests`]: spans and counts of requests, a layer between the two.
 //! - [`session`]: the legal order of a session's requests.
 //! - [`convert`]: the protocol to the domain and back, with all validation.
 //! - [`status`]: every refusal, and its gRPC code.
@@ -15,6 +16,7 @@ pub mod dm_env_rpc;
 pub mod drain;
 pub mod listen;
 pub mod probe;
+pub mod requests;
 pub mod service;
 pub mod session;
 pub mod status;
@@ -24,11 +26,13 @@ use crate::{
     env::{self, Catalogue},
     pool::Pool,
     proto::{self, dm_env_rpc::v1::environment_server::EnvironmentServer, perturb_server::PerturbServer},
+    render::Renderer,
 };
 use conversation::Sessions;
 use drain::{Controller, Phase};
 use listen::Listener;
 use service::Service;
+use session::Shared;
 use std::{future::Future, io, sync::Arc, time::Duration};
 use tonic::transport::Server;
 use tonic_health::ServingStatus;
@@ -69,17 +73,18 @@ pub async fn run(
     catalogue: Catalogue,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Error> {
-    let listing = Arc::new(listing(&catalogue, config)?);
+    let listing = listing(&catalogue, config)?;
     let catalogue = Arc::new(catalogue);
     let pool = Arc::new(Pool::new(config.workers, config.max_envs)?);
     let (controller, drain) = Controller::new();
     let idle = (config.idle_seconds > 0).then(|| Duration::from_secs(config.idle_seconds));
     let sessions = Sessions::new(config.max_sessions, idle, drain.clone());
     let worlds = dm_env_rpc::service::Service::new(Arc::clone(&pool), Arc::clone(&catalogue), sessions.clone());
+    let service = Service::new(Shared { pool, catalogue, listing, renderer: Renderer::new() }, sessions);
+    let counts = [("perturb.v1", service.counts()), ("dm_env_rpc.v1", worlds.counts())];
     let worlds = EnvironmentServer::new(worlds)
         .max_decoding_message_size(config.max_message_bytes)
         .max_encoding_message_size(usize::MAX);
-    let service = Service::new(pool, catalogue, listing, sessions);
     let service = PerturbServer::new(service)
         .max_decoding_message_size(config.max_message_bytes)
         .max_encoding_message_size(usize::MAX);
@@ -133,6 +138,9 @@ pub async fn run(
         tracing::warn!("the grace period is over: ending the sessions that still run");
     }
     controller.set(Phase::Closed);
+    for (protocol, counts) in counts {
+        tracing::info!(protocol, "requests: {counts}");
+    }
     let farewell = async { while servers.join_next().await.is_some() {} };
     if tokio::time::timeout(FAREWELL, farewell).await.is_err() {
         tracing::debug!("some connections did not close by themselves");

@@ -1,12 +1,13 @@
 //! Asking a running server for its health, as container engines do by starting the server's own program.
 
-use crate::config::Address;
+use crate::config::ListenAddress;
+use perturb_protocol::{Address, AddressError, ClientError, Connection};
 use std::{
+    io,
     net::{Ipv4Addr, Ipv6Addr},
+    path,
     time::Duration,
 };
-use tonic::transport::Endpoint;
-use tonic_health::pb::{HealthCheckRequest, health_check_response::ServingStatus, health_client::HealthClient};
 
 /// How long a server may take to answer.
 const LIMIT: Duration = Duration::from_secs(3);
@@ -15,27 +16,19 @@ const LIMIT: Duration = Duration::from_secs(3);
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The address does not say which port was taken.
-    #[error("the server at {address} listens at a port that nobody knows before; give --listen with the real one")]
-    UnknownPort {
-        /// Where it was told to listen.
-        address: Address,
-    },
-    /// Nobody answers, or not as a server does.
+    /// It cannot be reached by the address at which it listens.
+    #[error(transparent)]
+    Address(#[from] AddressError),
+    /// The working directory, which a socket's path begins with, is gone.
+    #[error("a relative path of a socket: {0}")]
+    Directory(#[from] io::Error),
+    /// Nobody answers, or not as a server that takes sessions does.
     #[error("no server answers at {address}: {reason}")]
     NoAnswer {
         /// Where.
         address: Address,
-        /// The transport's words.
+        /// What is wrong.
         reason: String,
-    },
-    /// It says so.
-    #[error("the server at {address} answers {}", status.as_str_name())]
-    NotServing {
-        /// Where.
-        address: Address,
-        /// Its word.
-        status: ServingStatus,
     },
 }
 
@@ -44,35 +37,28 @@ pub enum Error {
 ///
 /// # Errors
 /// [`Error`], after at most 3 s.
-pub async fn probe(listen: &Address) -> Result<(), Error> {
+pub async fn probe(listen: &ListenAddress) -> Result<(), Error> {
     let address = reachable(listen)?;
-    let fail = |reason: String| Error::NoAnswer { address: address.clone(), reason };
-    // "transport error" says less than its cause.
-    let words = |error: tonic::transport::Error| {
-        fail(std::error::Error::source(&error).map_or_else(|| error.to_string(), ToString::to_string))
+    let reason = match tokio::time::timeout(LIMIT, Connection::open(&address)).await {
+        Ok(Ok(_)) => return Ok(()),
+        Ok(Err(ClientError::Connect { reason, .. })) => reason,
+        Ok(Err(error)) => error.to_string(),
+        Err(_) => format!("it took more than {} s", LIMIT.as_secs()),
     };
-    let ask = async {
-        let channel = Endpoint::from_shared(address.to_string()).map_err(words)?.connect().await.map_err(words)?;
-        let reply = HealthClient::new(channel).check(HealthCheckRequest { service: String::new() }).await;
-        match reply.map_err(|status| fail(status.to_string()))?.into_inner().status() {
-            ServingStatus::Serving => Ok(()),
-            status => Err(Error::NotServing { address: address.clone(), status }),
-        }
-    };
-    let late = || fail(format!("it took more than {} s", LIMIT.as_secs()));
-    tokio::time::timeout(LIMIT, ask).await.map_err(|_| late())?
+    Err(Error::NoAnswer { address, reason })
 }
 
 /// Where a server can be reached that listens at `listen`.
-fn reachable(listen: &Address) -> Result<Address, Error> {
-    let &Address::Tcp(mut tcp) = listen else { return Ok(listen.clone()) };
-    if tcp.port() == 0 {
-        return Err(Error::UnknownPort { address: listen.clone() });
+fn reachable(listen: &ListenAddress) -> Result<Address, Error> {
+    match *listen {
+        ListenAddress::Unix(ref path) => Ok(Address::Unix(path::absolute(path)?)),
+        ListenAddress::Tcp(mut tcp) => {
+            if tcp.ip().is_unspecified() {
+                tcp.set_ip(if tcp.is_ipv4() { Ipv4Addr::LOCALHOST.into() } else { Ipv6Addr::LOCALHOST.into() });
+            }
+            Ok(tcp.to_string().parse()?)
+        }
     }
-    if tcp.ip().is_unspecified() {
-        tcp.set_ip(if tcp.is_ipv4() { Ipv4Addr::LOCALHOST.into() } else { Ipv6Addr::LOCALHOST.into() });
-    }
-    Ok(Address::Tcp(tcp))
 }
 
 #[cfg(test)]
@@ -87,10 +73,10 @@ mod tests {
             ("tcp://10.0.0.1:7", "http://10.0.0.1:7"),
             ("unix:/a", "unix:/a"),
         ] {
-            let listen = Address::try_from(listen.to_owned()).unwrap();
+            let listen = ListenAddress::try_from(listen.to_owned()).unwrap();
             assert_eq!(reachable(&listen).unwrap().to_string(), expected);
         }
-        let any = Address::try_from("tcp://0.0.0.0:0".to_owned()).unwrap();
+        let any = ListenAddress::try_from("tcp://0.0.0.0:0".to_owned()).unwrap();
         assert!(reachable(&any).unwrap_err().to_string().contains("the real one"));
     }
 }

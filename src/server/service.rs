@@ -1,37 +1,31 @@
 //! The gRPC service of `perturb.v1`: one short method for each call.
 
 use super::{
-    conversation::{Dialogue, Responses, Sessions},
-    session::Session,
+    conversation::{Responses, Sessions},
+    requests::{Counted, Counts},
+    session::{Session, Shared},
 };
-use crate::{
-    env::Catalogue,
-    pool::Pool,
-    proto::{self, perturb_server::Perturb},
-    render::Renderer,
-};
+use crate::proto::{self, perturb_server::Perturb};
 use std::sync::Arc;
 use tonic::{Request, Response, Status, Streaming};
 
 /// Serves the catalogue and sessions.
 #[derive(Clone)]
 pub struct Service {
-    pool: Arc<Pool>,
-    catalogue: Arc<Catalogue>,
-    listing: Arc<proto::ListEnvironmentsResponse>,
-    renderer: Arc<Renderer>,
+    shared: Arc<Shared>,
     sessions: Sessions,
+    counts: Arc<Counts>,
 }
 
 impl Service {
-    /// A service over a pool.
-    pub fn new(
-        pool: Arc<Pool>,
-        catalogue: Arc<Catalogue>,
-        listing: Arc<proto::ListEnvironmentsResponse>,
-        sessions: Sessions,
-    ) -> Self {
-        Self { pool, catalogue, listing, renderer: Arc::default(), sessions }
+    /// A service of sessions that share this.
+    pub fn new(shared: Shared, sessions: Sessions) -> Self {
+        Self { shared: Arc::new(shared), sessions, counts: Counts::of::<Session>() }
+    }
+
+    /// The requests so far.
+    pub fn counts(&self) -> Arc<Counts> {
+        Arc::clone(&self.counts)
     }
 }
 
@@ -43,28 +37,14 @@ impl Perturb for Service {
         &self,
         _: Request<proto::ListEnvironmentsRequest>,
     ) -> Result<Response<proto::ListEnvironmentsResponse>, Status> {
-        Ok(Response::new(self.listing.as_ref().clone()))
+        Ok(Response::new(self.shared.listing.clone()))
     }
 
     async fn session(
         &self,
         requests: Request<Streaming<proto::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        let Self { pool, catalogue, listing, renderer, .. } = self.clone();
-        let session = Session::new(pool, catalogue, listing, renderer);
-        Ok(Response::new(self.sessions.begin(requests.into_inner(), session)?))
-    }
-}
-
-impl Dialogue for Session {
-    type Request = proto::SessionRequest;
-    type Response = proto::SessionResponse;
-
-    fn is_open(&self) -> bool {
-        Session::is_open(self)
-    }
-
-    fn answer(&mut self, request: Self::Request) -> impl Future<Output = Self::Response> + Send {
-        Session::answer(self, request)
+        let session = Session::new(Arc::clone(&self.shared));
+        Ok(Response::new(self.sessions.begin(requests.into_inner(), Counted::new(session, &self.counts))?))
     }
 }

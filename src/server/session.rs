@@ -1,6 +1,6 @@
 //! One session: the legal order of its requests, each answered once.
 
-use super::{convert, status::Refusal};
+use super::{conversation::Dialogue, convert, requests::Observed, status::Refusal};
 use crate::{
     env::Catalogue,
     pool::{Batch, Pool},
@@ -9,47 +9,28 @@ use crate::{
 };
 use std::sync::Arc;
 
+/// What all sessions of a server share.
+pub struct Shared {
+    /// Where environments run.
+    pub pool: Arc<Pool>,
+    /// Which there are.
+    pub catalogue: Arc<Catalogue>,
+    /// The same, as the protocol tells it.
+    pub listing: proto::ListEnvironmentsResponse,
+    /// What draws them.
+    pub renderer: Renderer,
+}
+
 /// A client's session. Dropping it frees its environments.
 pub struct Session {
-    pool: Arc<Pool>,
-    catalogue: Arc<Catalogue>,
-    listing: Arc<proto::ListEnvironmentsResponse>,
-    renderer: Arc<Renderer>,
+    shared: Arc<Shared>,
     batch: Option<Batch>,
 }
 
 impl Session {
     /// A session that is not open yet.
-    pub fn new(
-        pool: Arc<Pool>,
-        catalogue: Arc<Catalogue>,
-        listing: Arc<proto::ListEnvironmentsResponse>,
-        renderer: Arc<Renderer>,
-    ) -> Self {
-        Self { pool, catalogue, listing, renderer, batch: None }
-    }
-
-    /// Whether it owns environments.
-    pub fn is_open(&self) -> bool {
-        self.batch.is_some()
-    }
-
-    /// Answers a request.
-    pub async fn answer(&mut self, request: proto::SessionRequest) -> proto::SessionResponse {
-        let response = match request.request {
-            Some(Request::Open(open)) => self.open(open).await.map(Response::Opened),
-            Some(Request::Step(step)) => self.step(step).await.map(Response::Stepped),
-            Some(Request::Reset(reset)) => self.reset(reset).await.map(Response::Reset),
-            Some(Request::Snapshot(snapshot)) => self.snapshot(snapshot).await.map(Response::Snapshot),
-            Some(Request::Restore(restore)) => self.restore(restore).await.map(Response::Restore),
-            Some(Request::Render(render)) => self.render(render).await.map(Response::Render),
-            None => Err(Refusal::value("request", "empty or of a kind this server does not know", "open, step, …")),
-        };
-        let response = response.unwrap_or_else(|refusal| {
-            tracing::debug!(%refusal, "refused a request");
-            Response::Error(refusal.into())
-        });
-        proto::SessionResponse { response: Some(response) }
+    pub fn new(shared: Arc<Shared>) -> Self {
+        Self { shared, batch: None }
     }
 
     async fn open(&mut self, request: proto::Open) -> Result<proto::Opened, Refusal> {
@@ -57,10 +38,10 @@ impl Session {
             return Err(Refusal::AlreadyOpen);
         }
         let autoreset_mode = request.autoreset_mode;
-        let settings = convert::open(&self.catalogue, request)?;
-        tracing::debug!(environment = settings.spec.name, batch_size = settings.size, "opening a session");
-        let environment = self.listing.environments.iter().find(|entry| entry.name == settings.spec.name).cloned();
-        let (batch, observations, started) = Batch::open(&self.pool, settings).await?;
+        let settings = convert::open(&self.shared.catalogue, request)?;
+        let environment =
+            self.shared.listing.environments.iter().find(|entry| entry.name == settings.spec.name).cloned();
+        let (batch, observations, started) = Batch::open(&self.shared.pool, settings).await?;
         self.batch = Some(batch);
         Ok(proto::Opened { environment, observations, started: convert::started(started), autoreset_mode })
     }
@@ -94,11 +75,56 @@ impl Session {
         let batch = self.opened("render")?;
         let (slot, size) = convert::render(batch.settings().size, request)?;
         let scene = batch.scene(slot)?.ok_or(Refusal::NothingToDraw { slot })?;
-        let pixels = self.renderer.draw(scene, size).await?;
+        let pixels = self.shared.renderer.draw(scene, size).await?;
         Ok(proto::Rendered { pixels, width: size.width.into(), height: size.height.into() })
     }
 
     fn opened(&mut self, request: &'static str) -> Result<&mut Batch, Refusal> {
         self.batch.as_mut().ok_or(Refusal::NotOpen { request })
+    }
+}
+
+impl Dialogue for Session {
+    type Request = proto::SessionRequest;
+    type Response = proto::SessionResponse;
+
+    fn is_open(&self) -> bool {
+        self.batch.is_some()
+    }
+
+    async fn answer(&mut self, request: Self::Request) -> Self::Response {
+        let response = match request.request {
+            Some(Request::Open(open)) => self.open(open).await.map(Response::Opened),
+            Some(Request::Step(step)) => self.step(step).await.map(Response::Stepped),
+            Some(Request::Reset(reset)) => self.reset(reset).await.map(Response::Reset),
+            Some(Request::Snapshot(snapshot)) => self.snapshot(snapshot).await.map(Response::Snapshot),
+            Some(Request::Restore(restore)) => self.restore(restore).await.map(Response::Restore),
+            Some(Request::Render(render)) => self.render(render).await.map(Response::Render),
+            None => Err(Refusal::value("request", "empty or of a kind this server does not know", "open, step, …")),
+        };
+        proto::SessionResponse { response: Some(response.unwrap_or_else(|refusal| Response::Error(refusal.into()))) }
+    }
+}
+
+impl Observed for Session {
+    const KINDS: &'static [&'static str] = &["open", "step", "reset", "snapshot", "restore", "render", "unknown"];
+
+    fn kind(request: &Self::Request) -> &'static str {
+        match request.request {
+            Some(Request::Open(_)) => "open",
+            Some(Request::Step(_)) => "step",
+            Some(Request::Reset(_)) => "reset",
+            Some(Request::Snapshot(_)) => "snapshot",
+            Some(Request::Restore(_)) => "restore",
+            Some(Request::Render(_)) => "render",
+            None => "unknown",
+        }
+    }
+
+    fn refusal(response: &Self::Response) -> Option<&str> {
+        match &response.response {
+            Some(Response::Error(error)) => Some(&error.message),
+            _ => None,
+        }
     }
 }

@@ -164,7 +164,7 @@ async fn the_program_tells_whether_a_server_takes_sessions() {
     until("the server drains", async || health(server.tcp(), SERVICE).await.unwrap() == ServingStatus::NotServing)
         .await;
     let (code, words) = ask(&tcp);
-    assert!(code == Some(1) && words.contains("answers NOT_SERVING"), "{code:?}: {words}");
+    assert!(code == Some(1) && words.contains("it is shutting down"), "{code:?}: {words}");
     drop(session);
     server.ended().await;
     for address in [&tcp, &unix] {

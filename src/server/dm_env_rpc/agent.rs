@@ -11,7 +11,12 @@ use crate::{
     proto::dm_env_rpc::v1::{
         self as rpc, environment_request::Payload as Request, environment_response::Payload as Response,
     },
-    server::{conversation::Sessions, drain::Phase, status::Refusal},
+    server::{
+        conversation::{Dialogue, Sessions},
+        drain::Phase,
+        requests::Observed,
+        status::Refusal,
+    },
 };
 use std::sync::Arc;
 
@@ -34,39 +39,6 @@ impl Agent {
     pub(super) fn new(worlds: Arc<Worlds>, sessions: Sessions) -> Self {
         let id = worlds.stream();
         Self { worlds, sessions, id, joined: None }
-    }
-
-    /// Whether it keeps a world alive.
-    pub(super) fn is_open(&self) -> bool {
-        self.joined.is_some() || self.worlds.are_made_by(self.id)
-    }
-
-    /// Answers a request.
-    pub(super) async fn answer(&mut self, request: rpc::EnvironmentRequest) -> rpc::EnvironmentResponse {
-        let response = match request.payload {
-            Some(Request::CreateWorld(create)) => self.create_world(create).await.map(Response::CreateWorld),
-            Some(Request::JoinWorld(join)) => self.join_world(join).await.map(Response::JoinWorld),
-            Some(Request::Step(step)) => self.step(step).await.map(Response::Step),
-            Some(Request::Reset(reset)) => self.reset(reset).map(Response::Reset),
-            Some(Request::ResetWorld(reset)) => self.reset_world(reset).map(Response::ResetWorld),
-            Some(Request::LeaveWorld(_)) => {
-                self.leave();
-                Ok(Response::LeaveWorld(rpc::LeaveWorldResponse {}))
-            }
-            Some(Request::DestroyWorld(destroy)) => self.destroy_world(&destroy).map(Response::DestroyWorld),
-            Some(Request::Extension(any)) => {
-                properties::answer(self.worlds.catalogue(), self.joined.as_ref(), &any).map(Response::Extension)
-            }
-            None => {
-                let expected = "create_world, join_world, step, …";
-                Err(Refusal::value("request", "empty or of a kind this server does not know", expected))
-            }
-        };
-        let response = response.unwrap_or_else(|refusal| {
-            tracing::debug!(%refusal, "refused a request of dm_env_rpc");
-            Response::Error(refusal.into())
-        });
-        rpc::EnvironmentResponse { payload: Some(response) }
     }
 
     async fn create_world(&mut self, request: rpc::CreateWorldRequest) -> Result<rpc::CreateWorldResponse, Refusal> {
@@ -140,5 +112,74 @@ impl Drop for Agent {
     fn drop(&mut self) {
         self.leave();
         self.worlds.stream_ended(self.id);
+    }
+}
+
+impl Dialogue for Agent {
+    type Request = rpc::EnvironmentRequest;
+    type Response = rpc::EnvironmentResponse;
+
+    /// Whether it keeps a world alive.
+    fn is_open(&self) -> bool {
+        self.joined.is_some() || self.worlds.are_made_by(self.id)
+    }
+
+    async fn answer(&mut self, request: Self::Request) -> Self::Response {
+        let response = match request.payload {
+            Some(Request::CreateWorld(create)) => self.create_world(create).await.map(Response::CreateWorld),
+            Some(Request::JoinWorld(join)) => self.join_world(join).await.map(Response::JoinWorld),
+            Some(Request::Step(step)) => self.step(step).await.map(Response::Step),
+            Some(Request::Reset(reset)) => self.reset(reset).map(Response::Reset),
+            Some(Request::ResetWorld(reset)) => self.reset_world(reset).map(Response::ResetWorld),
+            Some(Request::LeaveWorld(_)) => {
+                self.leave();
+                Ok(Response::LeaveWorld(rpc::LeaveWorldResponse {}))
+            }
+            Some(Request::DestroyWorld(destroy)) => self.destroy_world(&destroy).map(Response::DestroyWorld),
+            Some(Request::Extension(any)) => {
+                properties::answer(self.worlds.catalogue(), self.joined.as_ref(), &any).map(Response::Extension)
+            }
+            None => {
+                let expected = "create_world, join_world, step, …";
+                Err(Refusal::value("request", "empty or of a kind this server does not know", expected))
+            }
+        };
+        let payload = response.unwrap_or_else(|refusal| Response::Error(refusal.into()));
+        rpc::EnvironmentResponse { payload: Some(payload) }
+    }
+}
+
+impl Observed for Agent {
+    const KINDS: &'static [&'static str] = &[
+        "create_world",
+        "join_world",
+        "step",
+        "reset",
+        "reset_world",
+        "leave_world",
+        "destroy_world",
+        "extension",
+        "unknown",
+    ];
+
+    fn kind(request: &Self::Request) -> &'static str {
+        match request.payload {
+            Some(Request::CreateWorld(_)) => "create_world",
+            Some(Request::JoinWorld(_)) => "join_world",
+            Some(Request::Step(_)) => "step",
+            Some(Request::Reset(_)) => "reset",
+            Some(Request::ResetWorld(_)) => "reset_world",
+            Some(Request::LeaveWorld(_)) => "leave_world",
+            Some(Request::DestroyWorld(_)) => "destroy_world",
+            Some(Request::Extension(_)) => "extension",
+            None => "unknown",
+        }
+    }
+
+    fn refusal(response: &Self::Response) -> Option<&str> {
+        match &response.payload {
+            Some(Response::Error(status)) => Some(&status.message),
+            _ => None,
+        }
     }
 }

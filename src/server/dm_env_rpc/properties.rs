@@ -36,18 +36,10 @@ struct Property {
     key: String,
     description: String,
     /// None if it only holds others.
-    value: Option<Value>,
+    value: Option<Tensor>,
     /// What may be written.
     range: Option<(f64, f64)>,
     is_writable: bool,
-}
-
-enum Value {
-    Text(String),
-    Texts(Vec<String>),
-    Small(u32),
-    Large(u64),
-    Real(f64),
 }
 
 /// Answers an extension's message.
@@ -67,7 +59,7 @@ pub(super) fn answer(catalogue: &Catalogue, joined: Option<&Joined>, request: &A
         Some(Request::ReadProperty(read)) => {
             let property = find(&properties, &read.key)?;
             let value = property.value.as_ref().ok_or_else(|| property.forbidden("read, only listed"))?;
-            Response::ReadProperty(ReadPropertyResponse { value: Some(value.tensor()) })
+            Response::ReadProperty(ReadPropertyResponse { value: Some(value.clone()) })
         }
         Some(Request::WriteProperty(write)) => {
             self::write(joined, find(&properties, &write.key)?, &write)?;
@@ -85,10 +77,15 @@ pub(super) fn answer(catalogue: &Catalogue, joined: Option<&Joined>, request: &A
 
 /// All properties, in a fixed order: the server's, then those of the joined world.
 fn properties(catalogue: &Catalogue, joined: Option<&Joined>) -> Vec<Property> {
-    let names = catalogue.names().map(String::from).collect();
+    let names: Vec<_> = catalogue.names().map(String::from).collect();
+    let n = names.len();
     let mut all = vec![
-        Property::new("server_version", "the server's version", Value::Text(env!("CARGO_PKG_VERSION").into())),
-        Property::new("environments", "what env_id may be in create_world", Value::Texts(names)),
+        Property::new("server_version", "the server's version", text(env!("CARGO_PKG_VERSION"))),
+        Property::new(
+            "environments",
+            "what env_id may be in create_world",
+            tensors::tensor(Payload::Strings(StringArray { array: names }), &[n]),
+        ),
     ];
     // A world's batch is opened with receipts, so that there is always an episode's start.
     if let Some((joined, start)) = joined.and_then(|joined| Some((joined, joined.runner.start()?))) {
@@ -102,35 +99,35 @@ fn of_world(joined: &Joined, episode: EpisodeId, receipt: Option<&Receipt>) -> V
     let new = Property::new;
     let hash = receipt.map(|receipt| receipt.model_hash.clone()).unwrap_or_default();
     let mut all = vec![
-        new("env_id", spec.description, Value::Text(spec.name.into())),
-        new("revision", "raised by every change of the environment", Value::Small(spec.revision)),
-        new("model_hash", "SHA-256 of the model's MJCF; empty without a model", Value::Text(hash)),
-        new(VERSION, "D, R or E; writing it gives all parameters its sets", Value::Text(runner.version().to_string()))
+        new("env_id", spec.description, text(spec.name)),
+        new("revision", "raised by every change of the environment", uint32(spec.revision)),
+        new("model_hash", "SHA-256 of the model's MJCF; empty without a model", text(hash)),
+        new(VERSION, "D, R or E; writing it gives all parameters its sets", text(runner.version().to_string()))
             .writable(),
-        new(SEED, "fixes all randomness; writing it restarts the counts", Value::Large(runner.seed())).writable(),
-        new("environment_index", "fixes randomness together with the seed", Value::Small(episode.environment_index)),
-        new("trial_index", "counts trials from 0", Value::Large(episode.trial_index)),
-        new("episode_index", "counts episodes from 0", Value::Large(episode.episode_index)),
+        new(SEED, "fixes all randomness; writing it restarts the counts", uint64(runner.seed())).writable(),
+        new("environment_index", "fixes randomness together with the seed", uint32(episode.environment_index)),
+        new("trial_index", "counts trials from 0", uint64(episode.trial_index)),
+        new("episode_index", "counts episodes from 0", uint64(episode.episode_index)),
         new(
             "episodes_per_trial",
             "episodes with the same parameters",
-            Value::Small(runner.settings().episodes.episodes_per_trial),
+            uint32(runner.settings().episodes.episodes_per_trial),
         ),
-        new("step_limit", "an episode is INTERRUPTED after so many steps", Value::Small(spec.step_limit)),
-        new("control_timestep", "simulated seconds in a step", Value::Real(spec.control_timestep)),
+        new("step_limit", "an episode is INTERRUPTED after so many steps", uint32(spec.step_limit)),
+        new("control_timestep", "simulated seconds in a step", double(spec.control_timestep)),
         Property::folder(PARAMETERS, "what was drawn or given for the episode; writing a parameter fixes it"),
     ];
     let requested = receipt.map_or(&[][..], |receipt| &receipt.requested);
     for (parameter, value) in spec.parameters.iter().zip(requested) {
         let description = format!("{}, {}", parameter.description, parameter.unit);
-        let mut property = new(&format!("{PARAMETERS}.{}", parameter.name), &description, Value::Real(*value));
+        let mut property = new(&format!("{PARAMETERS}.{}", parameter.name), &description, double(*value));
         property.range = Some((parameter.bounds.low, parameter.bounds.high));
         all.push(property.writable());
     }
     all.push(Property::folder(APPLIED, "what was read back from the physics of the episode"));
     let applied = receipt.map_or(&[][..], |receipt| &receipt.applied);
     for (quantity, value) in spec.applied.iter().zip(applied) {
-        all.push(new(&format!("{APPLIED}.{}", quantity.name), quantity.unit, Value::Real(*value)));
+        all.push(new(&format!("{APPLIED}.{}", quantity.name), quantity.unit, double(*value)));
     }
     all
 }
@@ -177,12 +174,12 @@ fn write(joined: Option<&Joined>, property: &Property, request: &WritePropertyRe
 }
 
 impl Property {
-    fn new(key: &str, description: &str, value: Value) -> Self {
+    fn new(key: &str, description: &str, value: Tensor) -> Self {
         Self { key: key.into(), description: description.into(), value: Some(value), range: None, is_writable: false }
     }
 
     fn folder(key: &str, description: &str) -> Self {
-        Self { value: None, ..Self::new(key, description, Value::Small(0)) }
+        Self { value: None, ..Self::new(key, description, Tensor::default()) }
     }
 
     fn writable(self) -> Self {
@@ -198,10 +195,11 @@ impl Property {
         let bound = |x| tensor_spec::Value {
             payload: Some(tensor_spec::value::Payload::Doubles(DoubleArray { array: vec![x] })),
         };
-        let (dtype, shape) = self.value.as_ref().map_or((DataType::InvalidDataType, Vec::new()), Value::type_and_shape);
+        let value = self.value.as_ref();
+        let dtype = value.and_then(tensors::dtype_and_count).map_or(DataType::InvalidDataType, |(dtype, _)| dtype);
         let spec = TensorSpec {
             name: self.key.clone(),
-            shape,
+            shape: value.map(|value| value.shape.clone()).unwrap_or_default(),
             dtype: dtype.into(),
             min: self.range.map(|(low, _)| bound(low)),
             max: self.range.map(|(_, high)| bound(high)),
@@ -220,25 +218,18 @@ impl Property {
     }
 }
 
-impl Value {
-    fn type_and_shape(&self) -> (DataType, Vec<i32>) {
-        match self {
-            Self::Text(_) => (DataType::String, Vec::new()),
-            Self::Texts(texts) => (DataType::String, vec![texts.len() as i32]),
-            Self::Small(_) => (DataType::Uint32, Vec::new()),
-            Self::Large(_) => (DataType::Uint64, Vec::new()),
-            Self::Real(_) => (DataType::Double, Vec::new()),
-        }
-    }
+fn text(text: impl Into<String>) -> Tensor {
+    tensors::tensor(Payload::Strings(StringArray { array: vec![text.into()] }), &[])
+}
 
-    fn tensor(&self) -> Tensor {
-        let payload = match self {
-            Self::Text(text) => Payload::Strings(StringArray { array: vec![text.clone()] }),
-            Self::Texts(texts) => Payload::Strings(StringArray { array: texts.clone() }),
-            Self::Small(n) => Payload::Uint32s(Uint32Array { array: vec![*n] }),
-            Self::Large(n) => Payload::Uint64s(Uint64Array { array: vec![*n] }),
-            Self::Real(x) => Payload::Doubles(DoubleArray { array: vec![*x] }),
-        };
-        Tensor { payload: Some(payload), shape: self.type_and_shape().1 }
-    }
+fn uint32(n: u32) -> Tensor {
+    tensors::tensor(Payload::Uint32s(Uint32Array { array: vec![n] }), &[])
+}
+
+fn uint64(n: u64) -> Tensor {
+    tensors::tensor(Payload::Uint64s(Uint64Array { array: vec![n] }), &[])
+}
+
+fn double(x: f64) -> Tensor {
+    tensors::tensor(Payload::Doubles(DoubleArray { array: vec![x] }), &[])
 }

@@ -5,7 +5,10 @@ use crate::{
     env::Catalogue,
     pool::Pool,
     proto::dm_env_rpc::v1::{EnvironmentRequest, EnvironmentResponse, environment_server::Environment},
-    server::conversation::{Dialogue, Responses, Sessions},
+    server::{
+        conversation::{Responses, Sessions},
+        requests::{Counted, Counts},
+    },
 };
 use std::sync::Arc;
 use tonic::{Request, Response, Status, Streaming};
@@ -15,12 +18,18 @@ use tonic::{Request, Response, Status, Streaming};
 pub struct Service {
     worlds: Arc<Worlds>,
     sessions: Sessions,
+    counts: Arc<Counts>,
 }
 
 impl Service {
     /// A service over a pool, without worlds.
     pub fn new(pool: Arc<Pool>, catalogue: Arc<Catalogue>, sessions: Sessions) -> Self {
-        Self { worlds: Arc::new(Worlds::new(pool, catalogue)), sessions }
+        Self { worlds: Arc::new(Worlds::new(pool, catalogue)), sessions, counts: Counts::of::<Agent>() }
+    }
+
+    /// The requests so far.
+    pub fn counts(&self) -> Arc<Counts> {
+        Arc::clone(&self.counts)
     }
 }
 
@@ -33,19 +42,6 @@ impl Environment for Service {
         requests: Request<Streaming<EnvironmentRequest>>,
     ) -> Result<Response<Self::ProcessStream>, Status> {
         let agent = Agent::new(Arc::clone(&self.worlds), self.sessions.clone());
-        Ok(Response::new(self.sessions.begin(requests.into_inner(), agent)?))
-    }
-}
-
-impl Dialogue for Agent {
-    type Request = EnvironmentRequest;
-    type Response = EnvironmentResponse;
-
-    fn is_open(&self) -> bool {
-        Agent::is_open(self)
-    }
-
-    fn answer(&mut self, request: Self::Request) -> impl Future<Output = Self::Response> + Send {
-        Agent::answer(self, request)
+        Ok(Response::new(self.sessions.begin(requests.into_inner(), Counted::new(agent, &self.counts))?))
     }
 }

@@ -136,7 +136,8 @@ fn shape_of(shape: &[i32]) -> String {
     }
 }
 
-fn dtype_and_count(tensor: &Tensor) -> Option<(DataType, usize)> {
+/// What its elements are, and how many; none without a payload.
+pub(super) fn dtype_and_count(tensor: &Tensor) -> Option<(DataType, usize)> {
     Some(match tensor.payload.as_ref()? {
         Payload::Floats(x) => (DataType::Float, x.array.len()),
         Payload::Doubles(x) => (DataType::Double, x.array.len()),
@@ -152,7 +153,7 @@ fn dtype_and_count(tensor: &Tensor) -> Option<(DataType, usize)> {
     })
 }
 
-/// A tensor of this shape; none for a scalar.
+/// A tensor of this shape, which is empty for a scalar.
 pub(super) fn tensor(payload: Payload, shape: &[usize]) -> Tensor {
     // Shapes are those of specs, a few dozen elements.
     let shape = shape.iter().map(|&length| i32::try_from(length).unwrap_or(i32::MAX)).collect();

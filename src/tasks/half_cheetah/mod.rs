@@ -2,14 +2,11 @@
 
 use super::locomotion::{
     Posture, SCENERY, Task, Walker,
-    channels::{
-        APPLIED, CONTROL_TIMESTEP, DENSITY, FRICTION, REWARD_TERMS, SUCCESS, joint_state, position, power, root_state,
-        speed, torso, velocity,
-    },
+    channels::{APPLIED, CONTROL_TIMESTEP, DENSITY, FRICTION, Names, REWARD_TERMS, SUCCESS, names, power},
     colours::*,
 };
 use crate::{
-    env::{ActionSpace, Channel, EnvironmentSpec, Error},
+    env::{ActionSpace, EnvironmentSpec, Error},
     scene::Look,
 };
 use std::sync::OnceLock;
@@ -36,62 +33,9 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     description: "Run forward on two legs without falling.",
     make: || Ok(Box::new(half_cheetah()?)),
     parameters: &[power(0.9, (0.7, 1.1), (0.5, 1.3)), DENSITY, FRICTION],
-    observation: &[
-        torso::HEIGHT,
-        torso::TARGET_SIN,
-        torso::TARGET_COS,
-        torso::VELOCITY_X,
-        torso::VELOCITY_Y,
-        torso::VELOCITY_Z,
-        torso::ROLL,
-        torso::PITCH,
-        position("bthigh_position"),
-        speed("bthigh_speed"),
-        position("bshin_position"),
-        speed("bshin_speed"),
-        position("bfoot_position"),
-        speed("bfoot_speed"),
-        position("fthigh_position"),
-        speed("fthigh_speed"),
-        position("fshin_position"),
-        speed("fshin_speed"),
-        position("ffoot_position"),
-        speed("ffoot_speed"),
-        Channel::new("ffoot_contact", "1", 0.0, 1.0),
-        Channel::new("fshin_contact", "1", 0.0, 1.0),
-        Channel::new("fthigh_contact", "1", 0.0, 1.0),
-        Channel::new("bfoot_contact", "1", 0.0, 1.0),
-        Channel::new("bshin_contact", "1", 0.0, 1.0),
-        Channel::new("bthigh_contact", "1", 0.0, 1.0),
-    ],
-    action: ActionSpace::Continuous(&[
-        Channel::new("bthigh", "1", -1.0, 1.0),
-        Channel::new("bshin", "1", -1.0, 1.0),
-        Channel::new("bfoot", "1", -1.0, 1.0),
-        Channel::new("fthigh", "1", -1.0, 1.0),
-        Channel::new("fshin", "1", -1.0, 1.0),
-        Channel::new("ffoot", "1", -1.0, 1.0),
-    ]),
-    state: &[
-        root_state::X,
-        root_state::Z,
-        root_state::PITCH,
-        joint_state("bthigh"),
-        joint_state("bshin"),
-        joint_state("bfoot"),
-        joint_state("fthigh"),
-        joint_state("fshin"),
-        joint_state("ffoot"),
-        root_state::X_VELOCITY,
-        root_state::Z_VELOCITY,
-        root_state::PITCH_VELOCITY,
-        velocity("bthigh_velocity"),
-        velocity("bshin_velocity"),
-        velocity("bfoot_velocity"),
-        velocity("fthigh_velocity"),
-        velocity("fshin_velocity"),
-        velocity("ffoot_velocity"),
-    ],
+    observation: NAMES.observation,
+    action: ActionSpace::Continuous(NAMES.action),
+    state: NAMES.state,
     reward_terms: REWARD_TERMS,
     applied: APPLIED,
     step_limit: 1000,
@@ -100,6 +44,8 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     success: SUCCESS,
     heatmap_axes: Some(["density", "friction"]),
 };
+
+const NAMES: Names = names!(joints: ["bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"], contacts: ["ffoot", "fshin", "fthigh", "bfoot", "bshin", "bthigh"]);
 
 static TASK: Task = Task {
     spec: &SPEC,
@@ -122,8 +68,7 @@ static TASK: Task = Task {
             ("ffoot", ORANGE),
         ],
     },
-    joints: &["bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"],
-    contacts: &["ffoot", "fshin", "fthigh", "bfoot", "bshin", "bthigh"],
+    names: NAMES,
     alive,
     pristine: OnceLock::new(),
 };

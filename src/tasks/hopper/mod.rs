@@ -2,14 +2,11 @@
 
 use super::locomotion::{
     Posture, SCENERY, Task, Walker,
-    channels::{
-        APPLIED, CONTROL_TIMESTEP, DENSITY, FRICTION, REWARD_TERMS, SUCCESS, joint_state, position, power, root_state,
-        speed, torso, velocity,
-    },
+    channels::{APPLIED, CONTROL_TIMESTEP, DENSITY, FRICTION, Names, REWARD_TERMS, SUCCESS, names, power},
     colours::*,
 };
 use crate::{
-    env::{ActionSpace, Channel, EnvironmentSpec, Error},
+    env::{ActionSpace, EnvironmentSpec, Error},
     scene::Look,
 };
 use std::sync::OnceLock;
@@ -36,42 +33,9 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     description: "Hop forward on one leg without falling.",
     make: || Ok(Box::new(hopper()?)),
     parameters: &[power(0.75, (0.6, 0.9), (0.4, 1.1)), DENSITY, FRICTION],
-    observation: &[
-        torso::HEIGHT,
-        torso::TARGET_SIN,
-        torso::TARGET_COS,
-        torso::VELOCITY_X,
-        torso::VELOCITY_Y,
-        torso::VELOCITY_Z,
-        torso::ROLL,
-        torso::PITCH,
-        position("thigh_position"),
-        speed("thigh_speed"),
-        position("leg_position"),
-        speed("leg_speed"),
-        position("foot_position"),
-        speed("foot_speed"),
-        Channel::new("foot_contact", "1", 0.0, 1.0),
-    ],
-    action: ActionSpace::Continuous(&[
-        Channel::new("thigh", "1", -1.0, 1.0),
-        Channel::new("leg", "1", -1.0, 1.0),
-        Channel::new("foot", "1", -1.0, 1.0),
-    ]),
-    state: &[
-        root_state::X,
-        root_state::Z,
-        root_state::PITCH,
-        joint_state("thigh"),
-        joint_state("leg"),
-        joint_state("foot"),
-        root_state::X_VELOCITY,
-        root_state::Z_VELOCITY,
-        root_state::PITCH_VELOCITY,
-        velocity("thigh_velocity"),
-        velocity("leg_velocity"),
-        velocity("foot_velocity"),
-    ],
+    observation: NAMES.observation,
+    action: ActionSpace::Continuous(NAMES.action),
+    state: NAMES.state,
     reward_terms: REWARD_TERMS,
     applied: APPLIED,
     step_limit: 1000,
@@ -80,6 +44,8 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     success: SUCCESS,
     heatmap_axes: Some(["density", "friction"]),
 };
+
+const NAMES: Names = names!(joints: ["thigh", "leg", "foot"], contacts: ["foot"]);
 
 static TASK: Task = Task {
     spec: &SPEC,
@@ -93,8 +59,7 @@ static TASK: Task = Task {
         camera_height: 0.75,
         colours: &[("torso", BLUE), ("thigh", SKY_BLUE), ("leg", ORANGE), ("foot", VERMILLION)],
     },
-    joints: &["thigh", "leg", "foot"],
-    contacts: &["foot"],
+    names: NAMES,
     alive,
     pristine: OnceLock::new(),
 };

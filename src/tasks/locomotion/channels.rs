@@ -7,51 +7,58 @@ pub const CLIP: f64 = 5.0;
 /// Simulated seconds in one step.
 pub const CONTROL_TIMESTEP: f64 = 0.0165;
 
-/// The torso's entries of an observation.
-pub mod torso {
-    use super::{CLIP, Channel};
-
-    pub const HEIGHT: Channel = Channel::new("torso_height", "m", -CLIP, CLIP);
-    pub const TARGET_SIN: Channel = Channel::new("target_sin", "1", -1.0, 1.0);
-    pub const TARGET_COS: Channel = Channel::new("target_cos", "1", -1.0, 1.0);
-    pub const VELOCITY_X: Channel = Channel::new("torso_velocity_x", "1", -CLIP, CLIP);
-    pub const VELOCITY_Y: Channel = Channel::new("torso_velocity_y", "1", -CLIP, CLIP);
-    pub const VELOCITY_Z: Channel = Channel::new("torso_velocity_z", "1", -CLIP, CLIP);
-    pub const ROLL: Channel = Channel::new("roll", "rad", -CLIP, CLIP);
-    pub const PITCH: Channel = Channel::new("pitch", "rad", -CLIP, CLIP);
+/// Everything about a robot that goes by its joints' and geoms' names.
+pub struct Names {
+    /// Joints with motors, in the order of observations and actions.
+    pub joints: &'static [&'static str],
+    /// Geoms whose contacts are observed, in order.
+    pub contacts: &'static [&'static str],
+    /// The entries of an observation: torso, joints, contacts.
+    pub observation: &'static [Channel],
+    /// The entries of an action.
+    pub action: &'static [Channel],
+    /// The entries of an exact state. The bounds are far beyond any episode and keep absurd numbers out.
+    pub state: &'static [Channel],
 }
 
-/// A joint's position, scaled.
-pub const fn position(name: &'static str) -> Channel {
-    Channel::new(name, "1", -CLIP, CLIP)
-}
+/// The [`Names`] of a robot with these joints and observed contacts.
+macro_rules! names {
+    (joints: [$($joint:literal),*], contacts: [$($contact:literal),*]) => {{
+        use crate::{env::Channel, tasks::locomotion::channels::{CLIP, Names}};
 
-/// A joint's speed, scaled.
-pub const fn speed(name: &'static str) -> Channel {
-    Channel::new(name, "1", -CLIP, CLIP)
+        Names {
+            joints: &[$($joint),*],
+            contacts: &[$($contact),*],
+            observation: &[
+                Channel::new("torso_height", "m", -CLIP, CLIP),
+                Channel::new("target_sin", "1", -1.0, 1.0),
+                Channel::new("target_cos", "1", -1.0, 1.0),
+                Channel::new("torso_velocity_x", "1", -CLIP, CLIP),
+                Channel::new("torso_velocity_y", "1", -CLIP, CLIP),
+                Channel::new("torso_velocity_z", "1", -CLIP, CLIP),
+                Channel::new("roll", "rad", -CLIP, CLIP),
+                Channel::new("pitch", "rad", -CLIP, CLIP),
+                $(
+                    Channel::new(concat!($joint, "_position"), "1", -CLIP, CLIP),
+                    Channel::new(concat!($joint, "_speed"), "1", -CLIP, CLIP),
+                )*
+                $(Channel::new(concat!($contact, "_contact"), "1", 0.0, 1.0),)*
+            ],
+            action: &[$(Channel::new($joint, "1", -1.0, 1.0)),*],
+            state: &[
+                Channel::new("root_x", "m", -1e4, 1e4),
+                Channel::new("root_z", "m", -1e2, 1e2),
+                Channel::new("root_pitch", "rad", -1e2, 1e2),
+                $(Channel::new($joint, "rad", -1e2, 1e2),)*
+                Channel::new("root_x_velocity", "m/s", -1e3, 1e3),
+                Channel::new("root_z_velocity", "m/s", -1e3, 1e3),
+                Channel::new("root_pitch_velocity", "rad/s", -1e3, 1e3),
+                $(Channel::new(concat!($joint, "_velocity"), "rad/s", -1e3, 1e3),)*
+            ],
+        }
+    }};
 }
-
-/// The root's entries of an exact state. The bounds are far beyond any episode and keep absurd numbers out.
-pub mod root_state {
-    use super::Channel;
-
-    pub const X: Channel = Channel::new("root_x", "m", -1e4, 1e4);
-    pub const Z: Channel = Channel::new("root_z", "m", -1e2, 1e2);
-    pub const PITCH: Channel = Channel::new("root_pitch", "rad", -1e2, 1e2);
-    pub const X_VELOCITY: Channel = Channel::new("root_x_velocity", "m/s", -1e3, 1e3);
-    pub const Z_VELOCITY: Channel = Channel::new("root_z_velocity", "m/s", -1e3, 1e3);
-    pub const PITCH_VELOCITY: Channel = Channel::new("root_pitch_velocity", "rad/s", -1e3, 1e3);
-}
-
-/// A joint's entry of an exact state.
-pub const fn joint_state(name: &'static str) -> Channel {
-    Channel::new(name, "rad", -1e2, 1e2)
-}
-
-/// A joint's velocity in an exact state.
-pub const fn velocity(name: &'static str) -> Channel {
-    Channel::new(name, "rad/s", -1e3, 1e3)
-}
+pub(in crate::tasks) use names;
 
 /// The reward's terms.
 pub const REWARD_TERMS: &[RewardTerm] = &[

@@ -1,7 +1,7 @@
 //! The task that Hopper and HalfCheetah share: a planar robot runs along +x.
 
 use super::{
-    channels::{CLIP, CONTROL_TIMESTEP},
+    channels::{CLIP, CONTROL_TIMESTEP, Names},
     model_edit::Targets,
 };
 use crate::{
@@ -35,10 +35,7 @@ pub struct Task {
     pub spec: &'static EnvironmentSpec,
     /// The model, and how it is shown.
     pub look: Look,
-    /// Joints with motors, in the order of observations and actions.
-    pub joints: &'static [&'static str],
-    /// Geoms whose contacts are observed, in order.
-    pub contacts: &'static [&'static str],
+    pub names: Names,
     pub alive: fn(&Posture<'_>) -> bool,
     /// Compiled once in the process.
     pub pristine: OnceLock<Result<Pristine, SimulationError>>,
@@ -84,16 +81,21 @@ impl Pristine {
     fn compile(task: &Task) -> Result<Self, SimulationError> {
         let model = Model::from_xml(task.look.mjcf)?;
         assert_eq!(model.timestep(), TIMESTEP, "the control timestep is four of these");
-        assert_eq!((model.n_q(), model.n_act()), (N_ROOT + task.joints.len(), 0), "the model does not fit the task");
+        assert_eq!(
+            (model.n_q(), model.n_act()),
+            (N_ROOT + task.names.joints.len(), 0),
+            "the model does not fit the task"
+        );
         let (qpos, dof) = (model.joint_qpos_address(), model.joint_dof_address());
         let all: Vec<Joint> = qpos
             .zip(dof)
             .zip(model.joint_range())
             .map(|((qpos, dof), (low, high))| Joint { qpos, dof, low, high })
             .collect();
-        let joints = task.joints.iter().map(|name| Ok(all[model.id(Kind::Joint, name)?])).collect::<Result<_, _>>()?;
+        let joints =
+            task.names.joints.iter().map(|name| Ok(all[model.id(Kind::Joint, name)?])).collect::<Result<_, _>>()?;
         let mut flag_of_geom = vec![None; model.n_geom()];
-        for (flag, name) in task.contacts.iter().enumerate() {
+        for (flag, name) in task.names.contacts.iter().enumerate() {
             flag_of_geom[model.id(Kind::Geom, name)?] = Some(flag);
         }
         let hash = Sha256::digest(task.look.mjcf).iter().fold(String::new(), |mut hex, byte| {
@@ -256,7 +258,7 @@ impl Walker {
         for (entry, joint) in joints.chunks_exact_mut(2).zip(&self.pristine.joints) {
             entry.copy_from_slice(&[joint.scaled(qpos[joint.qpos]), 0.1 * qvel[joint.dof]]);
         }
-        for (entry, &touching) in contacts.iter_mut().zip(&self.contacts[..self.task.contacts.len()]) {
+        for (entry, &touching) in contacts.iter_mut().zip(&self.contacts[..self.task.names.contacts.len()]) {
             *entry = f64::from(u8::from(touching));
         }
         if !new.iter().all(|value| value.is_finite()) {
@@ -293,7 +295,7 @@ impl Walker {
     fn n_saved(&self) -> usize {
         let model = self.simulation.model();
         let physics = 1 + model.n_q() + 2 * model.n_v() + model.n_act() + model.n_u();
-        1 + physics + 1 + self.task.contacts.len() + self.task.spec.observation.len() + 1
+        1 + physics + 1 + self.task.names.contacts.len() + self.task.spec.observation.len() + 1
     }
 }
 
@@ -367,7 +369,7 @@ impl Environment for Walker {
         let Some((height, pitch)) = self.perceive() else {
             return self.fail(reward_terms);
         };
-        let contacts = &self.contacts[..self.task.contacts.len()];
+        let contacts = &self.contacts[..self.task.names.contacts.len()];
         let alive = (self.task.alive)(&Posture { height, pitch, contacts });
         let x = self.track_position();
         let progress = (x - self.x) / CONTROL_TIMESTEP;
@@ -394,7 +396,7 @@ impl Environment for Walker {
         if self.diverged {
             out[physics..].fill(0.0); // nothing follows from it any more, and it may not be finite
         }
-        out.extend(self.contacts[..self.task.contacts.len()].iter().map(|&flag| f64::from(u8::from(flag))));
+        out.extend(self.contacts[..self.task.names.contacts.len()].iter().map(|&flag| f64::from(u8::from(flag))));
         // It holds the flags of the step before, which nothing else remembers.
         out.extend(self.observation[..self.task.spec.observation.len()].iter().map(|&value| f64::from(value)));
         out.push(self.greatest_x);
@@ -434,7 +436,7 @@ impl Environment for Walker {
         self.x = self.track_position();
         self.initial_height = take(1)[0];
         self.contacts = [false; MOST_JOINTS];
-        for (flag, &saved) in self.contacts.iter_mut().zip(take(self.task.contacts.len())) {
+        for (flag, &saved) in self.contacts.iter_mut().zip(take(self.task.names.contacts.len())) {
             *flag = saved != 0.0;
         }
         self.observation = [0.0; MOST_OBSERVATION];

@@ -1,0 +1,155 @@
+//! What an environment is: what it declares of itself, and the trait that it implements.
+
+use super::{
+    Action, ActionSpace, Channel, Distribution, Error, Parameter, Quantity, RewardTerm, Stream, Success, Version,
+    shorten,
+};
+use crate::scene::Scene;
+
+/// Everything that is fixed about an environment.
+#[derive(Debug, Clone, Copy)]
+pub struct EnvironmentSpec {
+    /// The name to open it by.
+    pub name: &'static str,
+    /// Raised by every change of dynamics, reward or observation.
+    pub revision: u32,
+    /// One sentence.
+    pub description: &'static str,
+    /// Makes one with default parameters; fails with [`Error::Model`] if its model cannot be loaded.
+    pub make: fn() -> Result<Box<dyn Environment>, Error>,
+    /// The parameters that can be changed.
+    pub parameters: &'static [Parameter],
+    /// The entries of an observation, `[O]`.
+    pub observation: &'static [Channel],
+    /// The actions.
+    pub action: ActionSpace,
+    /// The entries of an exact initial state, `[S]`.
+    pub state: &'static [Channel],
+    /// The reward is the sum of these, in order.
+    pub reward_terms: &'static [RewardTerm],
+    /// What receipts read back from the physics.
+    pub applied: &'static [Quantity],
+    /// An episode is truncated after this many steps.
+    pub step_limit: u32,
+    /// Simulated seconds in one step.
+    pub control_timestep: f64,
+    /// What a step costs on one core, in µs, roughly: the pool cuts batches by it. Results never depend on it.
+    pub step_cost: f64,
+    /// When an episode is a success.
+    pub success: Success,
+    /// The two parameters, along x and along y, that show best where a policy works.
+    pub heatmap_axes: Option<[&'static str; 2]>,
+}
+
+impl EnvironmentSpec {
+    /// The distributions of a version, one for each parameter.
+    pub fn distributions(&self, version: Version) -> Vec<Distribution> {
+        self.parameters.iter().map(|parameter| parameter.distribution(version)).collect()
+    }
+}
+
+/// Checks that values from `low` to `high` lie within the parameter's physical range. NaN does not.
+///
+/// # Errors
+/// [`Error::OutOfRange`].
+pub fn check_bounds(spec: &EnvironmentSpec, parameter: &Parameter, (low, high): (f64, f64)) -> Result<(), Error> {
+    let bounds = parameter.bounds;
+    if low >= bounds.low && high <= bounds.high {
+        return Ok(());
+    }
+    Err(Error::OutOfRange {
+        environment: spec.name,
+        parameter: parameter.name,
+        got: if low >= bounds.low { high } else { low },
+        unit: parameter.unit,
+        low: bounds.low,
+        high: bounds.high,
+    })
+}
+
+/// Replaces in `base` (one distribution a parameter, in the spec's order) those that `overrides` names.
+///
+/// # Errors
+/// [`Error::UnknownParameter`] and [`Error::OutOfRange`]; `base` is unchanged then.
+pub fn resolve<'a>(
+    spec: &'static EnvironmentSpec,
+    base: &mut [Distribution],
+    overrides: impl IntoIterator<Item = (&'a str, Distribution)>,
+) -> Result<(), Error> {
+    let mut replaced = Vec::new();
+    for (name, distribution) in overrides {
+        let position = spec.parameters.iter().position(|p| p.name == name).ok_or_else(|| Error::UnknownParameter {
+            environment: spec.name,
+            name: shorten(name),
+            known: spec.parameters.iter().map(|p| p.name).collect::<Vec<_>>().join(", "),
+        })?;
+        let parameter = &spec.parameters[position];
+        check_bounds(spec, parameter, distribution.range())?;
+        replaced.push((position, distribution));
+    }
+    for (position, distribution) in replaced {
+        base[position] = distribution;
+    }
+    Ok(())
+}
+
+/// What one step did, besides the reward.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Transition {
+    /// The task ended the episode. The step limit is not the environment's business.
+    pub terminated: bool,
+    /// The goal that [`Achievement::FirstGoal`](super::Achievement::FirstGoal) and [`Achievement::LastGoals`](super::Achievement::LastGoals) count holds after this step.
+    pub goal: bool,
+    /// The physics diverged: the state is not finite. Implies `terminated`.
+    pub diverged: bool,
+}
+
+/// The physics and the task of one environment, without episodes, limits or randomness of its own.
+///
+/// After construction the parameters are the defaults and the state is some valid state; callers set parameters and
+/// reset before they step. Every method is deterministic: the same calls give the same bytes.
+pub trait Environment: Send {
+    /// What is fixed about it.
+    fn spec(&self) -> &'static EnvironmentSpec;
+
+    /// Applies parameters, in the spec's order, each within its bounds (the caller's duty), always starting from the
+    /// pristine model. The state is undefined until the next reset.
+    fn set_parameters(&mut self, values: &[f64]);
+
+    /// Reads back from the physics the values of [`EnvironmentSpec::applied`], in order.
+    fn applied(&self, out: &mut [f64]);
+
+    /// The SHA-256 of the model in hexadecimal, or `""` without one.
+    fn model_hash(&self) -> &str {
+        ""
+    }
+
+    /// What the episode achieved so far, where the spec's [`Achievement`](super::Achievement) is the environment's own.
+    fn achieved(&self) -> Option<f64> {
+        None
+    }
+
+    /// Draws an initial state.
+    fn reset(&mut self, stream: &mut Stream);
+
+    /// Starts from an exact state, `[S]`, finite (the caller's duty).
+    fn reset_to(&mut self, state: &[f64]);
+
+    /// Writes the current observation, `[O]`.
+    fn observe(&self, out: &mut [f32]);
+
+    /// What a picture of the current state shows; none where the physics diverged and no state is left to be shown.
+    fn scene(&self) -> Option<Scene>;
+
+    /// Advances by one control step and writes the reward's terms, in the spec's order.
+    fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition;
+
+    /// Appends the complete dynamic state: all that the next step depends on besides the parameters.
+    fn save(&self, out: &mut Vec<f64>);
+
+    /// Takes back what [`Environment::save`] wrote, after the same parameters were set.
+    ///
+    /// # Errors
+    /// [`Error::Snapshot`] if the length or a value is impossible; the state is undefined then.
+    fn load(&mut self, state: &[f64]) -> Result<(), Error>;
+}

@@ -1,0 +1,94 @@
+//! Spans and counts of requests: a layer around the dialogues of both protocols.
+
+use super::conversation::Dialogue;
+use std::{
+    fmt,
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
+};
+use tracing::Instrument;
+
+/// A dialogue that tells its requests and responses apart.
+pub trait Observed: Dialogue {
+    /// What there can be asked.
+    const KINDS: &'static [&'static str];
+
+    /// Which of the kinds it is.
+    fn kind(request: &Self::Request) -> &'static str;
+
+    /// Why the request was refused, if it was.
+    fn refusal(response: &Self::Response) -> Option<&str>;
+}
+
+/// Requests of one kind since the server began.
+#[derive(Default)]
+pub struct Count {
+    /// All of them.
+    pub answered: AtomicU64,
+    /// Those that were answered by a refusal.
+    pub refused: AtomicU64,
+}
+
+/// The requests of a protocol, by kind.
+pub struct Counts(Vec<(&'static str, Count)>);
+
+impl Counts {
+    /// None yet.
+    pub fn of<D: Observed>() -> Arc<Self> {
+        Arc::new(Self(D::KINDS.iter().map(|kind| (*kind, Count::default())).collect()))
+    }
+
+    /// Every kind with its count.
+    pub fn iter(&self) -> impl Iterator<Item = &(&'static str, Count)> {
+        self.0.iter()
+    }
+}
+
+impl fmt::Display for Counts {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (i, (kind, count)) in self.iter().enumerate() {
+            let [answered, refused] = [&count.answered, &count.refused].map(|count| count.load(Ordering::Relaxed));
+            write!(f, "{}{kind} {answered} ({refused} refused)", if i > 0 { ", " } else { "" })?;
+        }
+        Ok(())
+    }
+}
+
+/// A dialogue whose requests are counted, each in a span of its own.
+pub struct Counted<D> {
+    dialogue: D,
+    counts: Arc<Counts>,
+}
+
+impl<D: Observed> Counted<D> {
+    /// Puts the layer around a dialogue.
+    pub fn new(dialogue: D, counts: &Arc<Counts>) -> Self {
+        Self { dialogue, counts: Arc::clone(counts) }
+    }
+}
+
+impl<D: Observed> Dialogue for Counted<D> {
+    type Request = D::Request;
+    type Response = D::Response;
+
+    fn is_open(&self) -> bool {
+        self.dialogue.is_open()
+    }
+
+    async fn answer(&mut self, request: Self::Request) -> Self::Response {
+        let kind = D::kind(&request);
+        let span = tracing::debug_span!("request", kind);
+        let response = self.dialogue.answer(request).instrument(span.clone()).await;
+        let refusal = D::refusal(&response);
+        if let Some(refusal) = refusal {
+            span.in_scope(|| tracing::debug!(refusal, "refused"));
+        }
+        if let Some((_, count)) = self.counts.iter().find(|(known, _)| *known == kind) {
+            count.answered.fetch_add(1, Ordering::Relaxed);
+            count.refused.fetch_add(refusal.is_some().into(), Ordering::Relaxed);
+        }
+        response
+    }
+}
