@@ -62,7 +62,10 @@ def ask_catalogue(server: str, version: str) -> str:
     asked = subprocess.run([server, "--catalogue"], capture_output=True, text=True, check=False)
     if asked.returncode != 0:
         raise RuntimeError(f"{server} --catalogue ended with status {asked.returncode}: {asked.stderr}; {REMEDY}")
-    served = json.loads(asked.stdout)["server_version"]
+    try:
+        served = json.loads(asked.stdout)["server_version"]
+    except (ValueError, KeyError) as error:
+        raise RuntimeError(f"{server} --catalogue printed no catalogue; {REMEDY}") from error
     if served != version:
         raise RuntimeError(f"{server} has the version {served}, this package {version}; {REMEDY}")
     return asked.stdout
