@@ -1,7 +1,7 @@
 //! Training throughput: PPO FF on CartPole D, 8 environments × 128 steps, 10 epochs, one minibatch, over a private
 //! server on a Unix socket. Prints env steps/s and where the time went.
 
-use perturb_learner::client::{PrivateServerOptions, Servers};
+use perturb_learner::client::Servers;
 use perturb_learner::training::{RunDirectory, train};
 use perturb_study::interrupt::StopFlag;
 use perturb_study::settings::TrainConfig;
@@ -19,7 +19,7 @@ const ITERATIONS: u64 = 100;
 const SIGNAL: i32 = 15;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let servers = Servers::local(PrivateServerOptions::default())?;
+    let servers = Servers::local(None)?;
     let config = TrainConfig::from_table("the bench", CONFIG.parse()?)?;
     let out = tempfile::tempdir()?;
     let directory = RunDirectory::choose(out.path(), false)?;

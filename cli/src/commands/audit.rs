@@ -28,7 +28,7 @@ struct Tested {
 pub(super) fn run(args: &AuditArgs) -> Result<Ending> {
     let tested = tested(args)?;
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let servers = servers(&args.server, 0)?;
+    let servers = servers(&args.server)?;
     let mut out = std::io::stdout();
     let (mut played, mut different) = (0, 0);
     for one in &tested {

@@ -31,7 +31,7 @@ const ENVIRONMENT: &str = "CartPole";
 pub(super) fn run(args: &DemoArgs) -> Result<Ending> {
     let start = Instant::now();
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let servers = servers(&args.server, 0)?;
+    let servers = servers(&args.server)?;
     let scratch = tempfile::tempdir().map_err(system("create a temporary directory"))?;
     let mut out = std::io::stdout();
     let directory = args.out.clone().unwrap_or_else(|| scratch.path().to_owned());

@@ -11,7 +11,7 @@ use perturb_learner::proto::{Channel, Distribution, Environment, action_space::K
 use perturb_study::table::Table;
 
 pub(super) fn run(args: &EnvsArgs) -> Result<Ending> {
-    let catalogue = servers(&args.server, 0)?.catalogue()?;
+    let catalogue = servers(&args.server)?.catalogue()?;
     let mut out = std::io::stdout().lock();
     if args.json {
         writeln!(out, "{:#}", catalogue::to_json(&catalogue))?;

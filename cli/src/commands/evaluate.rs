@@ -21,7 +21,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
     let sets = sets::tested(&args.versions, &args.set)?;
     let seed = args.seed.unwrap_or(checkpoint.state.seed);
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let servers = servers(&args.server, sets.iter().map(|set| set.listed().len()).max().unwrap_or_default())?;
+    let servers = servers(&args.server)?;
     let state = &checkpoint.state;
     let options = TestOptions { episodes: args.episodes, seed, success: args.success.clone() };
     let tester = Tester::new(&servers, &checkpoint, options)?;

@@ -33,7 +33,7 @@ fn of_checkpoint(args: &HeatmapArgs, path: &Path) -> Result<Ending> {
     let checkpoint = Checkpoint::load(path)?;
     let state = &checkpoint.state;
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let servers = servers(&args.server, args.grid * args.grid)?;
+    let servers = servers(&args.server)?;
     let environment = servers.environment(&state.environment)?;
     let parameters = match (&args.x, &args.y) {
         (Some(x), Some(y)) => [x.clone(), y.clone()],
@@ -107,7 +107,7 @@ fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<Ending> {
         };
         let servers = match &mut servers_of_all {
             Some(servers) => servers,
-            none => none.insert(servers(&args.server, args.grid * args.grid)?),
+            none => none.insert(servers(&args.server)?),
         };
         let Some(parameters) = usual_axes(&servers.environment(place.environment)?) else {
             eprintln!("{place}: it is not known which parameters to show");

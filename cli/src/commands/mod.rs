@@ -30,7 +30,7 @@ use clap::Parser;
 
 use args::{Cli, Command, ServerArgs};
 use error::{CommandError, Result};
-use perturb_learner::client::{PrivateServerOptions, Servers};
+use perturb_learner::client::Servers;
 
 /// How a command ended that did not fail.
 enum Ending {
@@ -87,11 +87,10 @@ fn signal_code(number: i32) -> ExitCode {
     ExitCode::from(u8::try_from(128 + number).unwrap_or(1))
 }
 
-/// The servers that were named, or one of our own that takes `num_envs` environments.
-fn servers(args: &ServerArgs, num_envs: usize) -> Result<Servers> {
+/// The servers that were named, or one of our own.
+fn servers(args: &ServerArgs) -> Result<Servers> {
     if args.server.is_empty() {
-        let options = PrivateServerOptions { workers: args.workers, num_envs };
-        return Ok(Servers::local(options)?);
+        return Ok(Servers::local(args.workers)?);
     }
     refuse_workers(args)?;
     Ok(Servers::connect(&args.server)?)

@@ -50,8 +50,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<Ending> {
     if args.measure == 0 {
         return Ok(Ending::Done);
     }
-    let most = plan.cells.iter().map(|cell| cell.config.common.num_envs).max().unwrap_or_default();
-    let servers = servers(&args.server, most)?;
+    let servers = servers(&args.server)?;
     let limits = step_limits(&servers, &plan)?;
     let representatives = representatives(&plan);
     writeln!(

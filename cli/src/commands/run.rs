@@ -16,7 +16,7 @@ use super::error::{CommandError, Result, system};
 use super::plan::{duration, step_limits};
 use super::{Ending, report, servers, single_thread, slurm};
 use perturb_learner::cell::{CellEnd, run_cell};
-use perturb_learner::client::{Address, PrivateServer, PrivateServerOptions, Servers};
+use perturb_learner::client::{Address, PrivateServer, Servers};
 use perturb_study::interrupt::StopFlag;
 use perturb_study::{
     Attempt, BUSY, Cell, Folder, NO_SERVER, ON, Plan, RunEnd, RunOptions, RunStatus, run as run_cells,
@@ -24,8 +24,6 @@ use perturb_study::{
 
 /// How often a plain line is printed.
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
-/// A test has so many environments at most.
-const TEST_ENVS: usize = 100;
 
 pub(super) fn run(args: &RunArgs) -> Result<Ending> {
     let plan = Plan::load(&args.plan)?;
@@ -100,7 +98,7 @@ fn one_cell(args: &RunArgs, plan: &Plan, folder: &Folder, cell: &Cell, stop: &St
 fn server_of(args: &RunArgs, cell: &Cell) -> Result<Servers> {
     let named = &args.server.server;
     if named.is_empty() {
-        return servers(&args.server, cell.config.common.num_envs.max(TEST_ENVS));
+        return servers(&args.server);
     }
     super::refuse_workers(&args.server)?;
     Ok(Servers::connect_to_one(named, cell.index + args.losses as usize)?)
@@ -130,7 +128,7 @@ fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> R
     }
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let jobs = args.jobs.unwrap_or(cores);
-    let (local, addresses) = shared_servers(args, plan, jobs)?;
+    let (local, addresses) = shared_servers(args)?;
     let local = local.map(Mutex::new);
     let (servers, troubles) = Servers::connect_to_some(&addresses)?;
     troubles.iter().for_each(|trouble| eprintln!("perturb: {trouble}; going on with the other servers"));
@@ -190,15 +188,13 @@ pub(super) fn keep_plan(args: &RunArgs, plan: &Plan, folder: &Folder) -> Result<
 }
 
 /// The servers that all workers share.
-fn shared_servers(args: &RunArgs, plan: &Plan, jobs: usize) -> Result<(Option<PrivateServer>, Vec<Address>)> {
+fn shared_servers(args: &RunArgs) -> Result<(Option<PrivateServer>, Vec<Address>)> {
     let named = &args.server.server;
     if !named.is_empty() {
         super::refuse_workers(&args.server)?;
         return Ok((None, named.clone()));
     }
-    let most = plan.cells.iter().map(|cell| cell.config.common.num_envs).max().unwrap_or_default();
-    let options = PrivateServerOptions { workers: args.server.workers, num_envs: jobs * most.max(TEST_ENVS) };
-    let server = PrivateServer::start(options)?;
+    let server = PrivateServer::start(args.server.workers)?;
     let address = server.address().clone();
     Ok((Some(server), vec![address]))
 }

@@ -7,7 +7,7 @@ use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
 use super::run::{Line, finished, keep_plan};
 use super::{Ending, refuse_workers};
-use perturb_learner::client::{Address, PrivateServerOptions, Servers};
+use perturb_learner::client::{Address, Servers};
 use perturb_learner::measure::measure;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::slurm::{Event, Slurm, SlurmEnd, SlurmOptions, SlurmStatus, Task, count, run_on_slurm};
@@ -28,9 +28,7 @@ pub(super) fn run(args: &RunArgs, plan: &Plan, stop: &StopFlag) -> Result<Ending
     let slurm = Slurm::default();
     slurm.check(stop)?;
     // Which environments there are, and what they cost, is found out here: servers that jobs share may be out of reach.
-    let most = plan.cells.iter().map(|cell| cell.config.common.num_envs).max().unwrap_or_default();
-    let local = PrivateServerOptions { workers: args.server.workers, num_envs: most };
-    let servers = || Servers::local(local);
+    let servers = || Servers::local(args.server.workers);
     step_limits(&servers()?, plan)?;
     keep_plan(args, plan, &folder)?;
     let costs = || Ok(costs(&servers()?, plan, stop)?);

@@ -29,7 +29,7 @@ fn begin(args: &TrainArgs, out: &Path) -> Result<Ending> {
     let config = TrainConfig::load(&Sources { file: args.config.as_deref(), sets: &args.set, flags })?;
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let directory = RunDirectory::choose(out, args.overwrite)?;
-    let servers = servers(&args.server, config.common.num_envs)?;
+    let servers = servers(&args.server)?;
     let environment = servers.environment(&config.common.environment)?; // its refusal lists the names
     perturb_study::sets::check("--parameters", &config.common.parameters, &environment)?;
     let mut bar = Bar::new(describe(&config), config.common.episodes);
@@ -50,7 +50,7 @@ fn go_on(args: &TrainArgs, path: &Path) -> Result<Ending> {
         return Ok(Ending::Done);
     }
     eprintln!("{}: going on after {done} of {budget} episodes", describe(&config));
-    let servers = servers(&args.server, config.common.num_envs)?;
+    let servers = servers(&args.server)?;
     let mut bar = Bar::new(describe(&config), budget);
     let report = |progress: &Progress| bar.training(progress);
     let outcome = resume(&servers, &config, &directory, (checkpoint, state), &stop, report)?;

@@ -15,7 +15,7 @@ pub(super) fn run(args: &VideoArgs) -> Result<Ending> {
     let file = VideoFile::create(&args.out)?;
     let checkpoint = Checkpoint::load(&args.checkpoint)?;
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let servers = servers(&args.server, 0)?;
+    let servers = servers(&args.server)?;
     let options = VideoOptions {
         set: sets::drawn(args.version, &args.parameters)?,
         episodes: args.episodes,

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-use perturb_learner::client::{Address, PrivateServer, PrivateServerOptions, Servers};
+use perturb_learner::client::{Address, PrivateServer, Servers};
 use perturb_learner::training::{Outcome, RunDirectory, train};
 use perturb_study::interrupt::StopFlag;
 use perturb_study::settings::TrainConfig;
@@ -14,8 +14,7 @@ use tempfile::TempDir;
 pub const SECONDS: Duration = Duration::from_secs(20);
 
 pub fn server(workers: usize) -> PrivateServer {
-    PrivateServer::start(PrivateServerOptions { workers: Some(workers), ..PrivateServerOptions::default() })
-        .unwrap_or_else(|error| panic!("{error}"))
+    PrivateServer::start(Some(workers)).unwrap_or_else(|error| panic!("{error}"))
 }
 
 pub fn addresses(servers: &[PrivateServer]) -> Vec<Address> {

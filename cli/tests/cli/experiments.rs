@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-use perturb_learner::client::{PrivateServer, PrivateServerOptions};
+use perturb_learner::client::PrivateServer;
 use perturb_study::{CellResult, CellState, Counts, Folder, Plan};
 use tempfile::TempDir;
 
@@ -284,7 +284,7 @@ fn a_signal_stops_the_workers_and_the_same_command_goes_on() {
 #[test]
 fn a_lost_server_is_no_cells_failure() {
     let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 100000"));
-    let options = PrivateServerOptions { workers: Some(1), ..PrivateServerOptions::default() };
+    let options = Some(1);
     let server = PrivateServer::start(options).unwrap_or_else(|error| panic!("{error}"));
     let address = server.address().to_string();
     let child = experiment.command("out", &["--jobs", "2", "--server", &address]).spawn().expect("started");

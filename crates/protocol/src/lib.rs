@@ -21,7 +21,7 @@ pub use address::{Address, AddressError};
 pub use connection::{Connection, Machines, first_of, machines};
 pub use distribution::{Distribution, DistributionError, Interval};
 pub use error::ClientError;
-pub use private_server::{PrivateServer, PrivateServerOptions};
+pub use private_server::PrivateServer;
 pub use stream::{Ask, REPLY_LIMIT, Stream};
 pub use version::{UnknownVersion, Version};
 

@@ -14,7 +14,6 @@ use tempfile::TempDir;
 
 use crate::address::Address;
 use crate::error::ClientError;
-use crate::limits::DEFAULT_MAX_ENVS;
 
 const PROGRAM: &str = "perturb-server";
 /// Overrides where the program is looked for.
@@ -23,15 +22,6 @@ const VARIABLE: &str = "PERTURB_SERVER";
 const START_LIMIT: Duration = Duration::from_secs(20);
 /// How long a server may take to end before it is killed.
 const END_LIMIT: Duration = Duration::from_secs(5);
-
-/// How to start a [`PrivateServer`].
-#[derive(Clone, Copy, Debug, Default)]
-pub struct PrivateServerOptions {
-    /// Physics threads; `None` leaves it to the server: one a core.
-    pub workers: Option<usize>,
-    /// How many environments must be able to run at once; more may.
-    pub num_envs: usize,
-}
 
 /// A `perturb-server` that lives no longer than this value, and no longer than this process: it holds the other end of
 /// the server's standard input, whose closing ends the server even if this process is killed.
@@ -46,11 +36,12 @@ pub struct PrivateServer {
 }
 
 impl PrivateServer {
-    /// Starts a server and waits until it listens.
+    /// Starts a server, `perturb-server --private`, with so many physics threads (`None`: one a core), and waits until it
+    /// listens.
     ///
     /// # Errors
     /// [`ClientError::NoServerProgram`] if there is none, [`ClientError::Start`] if it ends or does not listen within 20 s.
-    pub fn start(options: PrivateServerOptions) -> Result<Self, ClientError> {
+    pub fn start(workers: Option<usize>) -> Result<Self, ClientError> {
         let program = find_program()?;
         let system = |action| move |source| ClientError::System { action, source };
         let directory = tempfile::Builder::new()
@@ -64,20 +55,9 @@ impl PrivateServer {
             .map_err(|error| ClientError::Start { program: program.clone(), reason: format!("{error}; set TMPDIR") })?;
 
         let mut command = Command::new(&program);
-        command.arg("--listen").arg(address.to_string()).args(["--exit-with-stdin", "--log", "warn"]);
-        // Between two steps its owner may compute for long, whose death closes the socket and the pipe anyway.
-        command.args(["--keepalive-seconds", "3600"]);
-        if let Some(workers) = options.workers {
+        command.arg("--listen").arg(address.to_string()).args(["--private", "--log", "warn"]);
+        if let Some(workers) = workers {
             command.args(["--workers", &workers.to_string()]);
-        }
-        if options.num_envs > DEFAULT_MAX_ENVS {
-            command.args(["--max-envs", &options.num_envs.to_string()]);
-        }
-        // Settings for servers that people run themselves do not reach this one.
-        for (name, _) in std::env::vars_os() {
-            if name.to_string_lossy().starts_with("PERTURB_SERVER_") {
-                command.env_remove(name);
-            }
         }
         let mut child = command
             .stdin(Stdio::piped())

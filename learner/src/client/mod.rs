@@ -9,7 +9,7 @@ mod servers;
 mod session;
 mod single;
 
-pub use perturb_protocol::{Address, AddressError, ClientError, PrivateServer, PrivateServerOptions};
+pub use perturb_protocol::{Address, AddressError, ClientError, PrivateServer};
 pub use servers::Servers;
 pub use session::{EndedEpisode, OpenOptions, Session, StepReply};
 pub use single::{BegunEpisode, Picture, Single};

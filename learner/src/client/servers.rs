@@ -8,9 +8,7 @@ use std::time::Duration;
 use tokio::runtime::{Builder, Runtime};
 use tokio::sync::oneshot;
 
-use perturb_protocol::{
-    Address, ClientError, Connection, Machines, PrivateServer, PrivateServerOptions, first_of, machines,
-};
+use perturb_protocol::{Address, ClientError, Connection, Machines, PrivateServer, first_of, machines};
 
 use crate::proto;
 
@@ -24,12 +22,12 @@ pub struct Servers {
 }
 
 impl Servers {
-    /// Starts a private server and connects to it.
+    /// Starts a private server with so many physics threads (`None`: one a core), and connects to it.
     ///
     /// # Errors
     /// Those of [`PrivateServer::start`] and of [`Servers::connect`].
-    pub fn local(options: PrivateServerOptions) -> Result<Self, ClientError> {
-        let server = PrivateServer::start(options)?;
+    pub fn local(workers: Option<usize>) -> Result<Self, ClientError> {
+        let server = PrivateServer::start(workers)?;
         let mut servers = Self::connect(std::slice::from_ref(server.address()))?;
         servers.local = Some(Mutex::new(server));
         Ok(servers)

@@ -1,7 +1,7 @@
 //! What the tests of EPOpt and of RL² share.
 
 use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
-use perturb_learner::client::{Address, OpenOptions, PrivateServer, PrivateServerOptions, Servers};
+use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers};
 use perturb_learner::policy::{Policy, PolicySpec};
 use perturb_learner::rollout::Rollout;
 use perturb_study::Version;
@@ -10,8 +10,7 @@ use perturb_study::settings::{A2cConfig, PpoConfig};
 
 /// A server with one physics thread.
 pub fn server() -> PrivateServer {
-    PrivateServer::start(PrivateServerOptions { workers: Some(1), ..PrivateServerOptions::default() })
-        .unwrap_or_else(|error| panic!("{error}"))
+    PrivateServer::start(Some(1)).unwrap_or_else(|error| panic!("{error}"))
 }
 
 /// Connections to all of `servers`.

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-use perturb_learner::client::{PrivateServer, PrivateServerOptions};
+use perturb_learner::client::PrivateServer;
 use perturb_study::{Folder, Plan};
 use tempfile::TempDir;
 
@@ -252,7 +252,7 @@ fn refusals(experiment: &Experiment, cluster: &Cluster) {
 
 /// Jobs use one server together, on the node that is left; how many cells a job does is estimated.
 fn shared_server(experiment: &Experiment, cluster: &Cluster) {
-    let server = PrivateServer::start(PrivateServerOptions::default()).unwrap_or_else(|error| panic!("{error}"));
+    let server = PrivateServer::start(None).unwrap_or_else(|error| panic!("{error}"));
     let id = &experiment.plan.cells[0].id;
     // The other cells have a result already.
     for cell in &experiment.plan.cells[1..] {
