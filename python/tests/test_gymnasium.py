@@ -118,8 +118,11 @@ def test_success_is_told_at_the_end_and_only_there(server: str) -> None:
         action = int(observation[2] + observation[3] > 0)
         observation, _, terminated, truncated, info = env.step(action)
         assert not terminated
-        assert ("is_success" in info) == truncated
+        assert ("is_success" in info) == ("achieved" in info) == truncated
     assert info["is_success"] is True
+    rule = env.metadata["success"]
+    assert (rule["quantity"], rule["comparison"]) == ("steps", "at_least")
+    assert info["achieved"] == 200 >= rule["threshold"]
     env.close()
 
 
