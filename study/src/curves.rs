@@ -5,6 +5,7 @@ use std::path::Path;
 use serde::Deserialize;
 
 use super::folder::{Folder, FolderError};
+use super::plan::TrainedOn;
 use super::selection::MethodResults;
 use super::statistics::Summary;
 use super::table::Table;
@@ -82,7 +83,7 @@ type Run = (u64, Vec<Episode>);
 
 fn read_runs(selection: &MethodResults<'_>, version: Version, folder: &Folder) -> Result<Vec<Run>, FolderError> {
     let mut runs = Vec::new();
-    for selected in selection.runs.values().filter_map(|run| run.trained_on(version)) {
+    for selected in selection.runs.values().filter_map(|run| run.trained_on(TrainedOn::Version(version))) {
         let episodes = read_monitor(&folder.cell(&selected.cell.id).training().join("monitor.csv"))?;
         if !episodes.is_empty() {
             runs.push((selected.cell.config.common.episodes, episodes));

@@ -15,11 +15,11 @@ use serde::{Deserialize, Serialize};
 
 use super::folder::{Folder, FolderError};
 use super::heatmap::{Heatmap, HeatmapOptions, heatmap_table};
-use super::plan::Cell;
+use super::plan::{Cell, TrainedOn};
 use super::plot::{self, PlotError};
 use super::selection::{MethodResults, Selected};
+use crate::Method;
 use crate::files::{self, delete, read_if_there, write_atomically, write_json};
-use crate::{Method, Version};
 
 /// Of the records; raised when older programs could misread them.
 const FORMAT_VERSION: u32 = 1;
@@ -32,7 +32,7 @@ pub struct HeatmapPlace<'a> {
     /// What was trained.
     pub method: &'a Method,
     /// Where it was trained.
-    pub version: Version,
+    pub trained_on: TrainedOn<'a>,
     /// What was selected in the first run; `None` if nothing has a result.
     pub selected: Option<Selected<'a>>,
 }
@@ -83,12 +83,12 @@ pub enum NoHeatmap {
     Outdated,
 }
 
-/// All heatmaps that a plan has room for, in the order of `selections` and of the versions that it trains on.
+/// All heatmaps that a plan has room for, in the order of `selections` and of what it trains on.
 pub fn heatmap_places<'a>(selections: &'a [MethodResults<'a>]) -> Vec<HeatmapPlace<'a>> {
     let of_selection = |selection: &'a MethodResults<'a>| {
         let MethodResults { environment, method, runs, .. } = selection;
         let first = runs.values().next().into_iter().flat_map(|run| &run.0);
-        first.map(move |(&version, &selected)| HeatmapPlace { environment, method, version, selected })
+        first.map(move |(&trained_on, &selected)| HeatmapPlace { environment, method, trained_on, selected })
     };
     selections.iter().flat_map(of_selection).collect()
 }
@@ -126,7 +126,7 @@ impl HeatmapPlace<'_> {
 
 impl std::fmt::Display for HeatmapPlace<'_> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{}, {} trained on {}", self.environment, self.method, self.version)
+        write!(f, "{}, {} trained on {}", self.environment, self.method, self.trained_on)
     }
 }
 
@@ -192,7 +192,7 @@ fn checksum(content: &[u8]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Axis, HeatmapPoint, Plan, fixture};
+    use crate::{Axis, HeatmapPoint, Plan, Version, fixture};
 
     const PLAN: &str = "environments = ['Pendulum', 'Elsewhere']\nversions = ['D', 'E']\nruns = 2
         [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
@@ -238,7 +238,12 @@ mod tests {
         write_atomically(&result, b"{}").unwrap();
         let (method, done) = (cell.method(), fixture::result(cell, [0.0; 3], 0.0));
         let selected = Some(Selected { cell, result: &done });
-        let place = HeatmapPlace { environment: "Pendulum", method: &method, version: Version::D, selected };
+        let place = HeatmapPlace {
+            environment: "Pendulum",
+            method: &method,
+            trained_on: TrainedOn::Version(Version::D),
+            selected,
+        };
         assert_eq!(place.read(&folder).unwrap(), Err(NoHeatmap::NotMade));
         let nobody = HeatmapPlace { selected: None, ..place.clone() };
         assert_eq!(nobody.read(&folder).unwrap(), Err(NoHeatmap::NoResult));

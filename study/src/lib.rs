@@ -33,6 +33,7 @@ pub mod slurm;
 mod statistics;
 pub mod success;
 pub mod table;
+mod verify;
 
 pub use cost::{Estimate, Measurement, Speed, Work, cell_seconds, estimate, representatives};
 pub use curves::{Curve, EnvironmentCurves, Point, curves_table, read_curves};
@@ -43,12 +44,13 @@ pub use heatmaps::{
 };
 pub use means::{geometric_mean, mean, wilson};
 pub use paper::Method;
-pub use plan::{Cell, Counts, Plan, PlanCheckError, PlanError, Tests};
+pub use plan::{Cell, Counts, Plan, PlanCheckError, PlanError, Tests, TrainedOn};
 pub use results::{Counters, TestResult};
 pub use run::{Attempt, BUSY, NO_SERVER, ON, RunEnd, RunError, RunOptions, RunStatus, run};
 pub use scenarios::{Metric, Scenario, Version};
 pub use selection::{MethodResults, Results, Selected, SelectedRun, average, interquartile};
 pub use statistics::{Iqm, Summary, interquartile_mean};
+pub use verify::{VerifyError, verify};
 
 /// The version, and the commit that was built, e.g. "0.1.0 (1a2b3c4d5e6f)"; "-dirty" follows a commit whose files were
 /// changed.

@@ -298,7 +298,30 @@ impl Plan {
     }
 }
 
+/// What a policy is trained on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum TrainedOn<'a> {
+    /// D, R or E.
+    Version(Version),
+    /// The plan's own set of that name.
+    Set(&'a str),
+}
+
+impl std::fmt::Display for TrainedOn<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            TrainedOn::Version(version) => version.fmt(f),
+            TrainedOn::Set(name) => name.fmt(f),
+        }
+    }
+}
+
 impl Cell {
+    /// Its set or version.
+    pub fn trained_on(&self) -> TrainedOn<'_> {
+        self.set.as_deref().map_or(TrainedOn::Version(self.config.common.version), TrainedOn::Set)
+    }
+
     /// What trains.
     pub fn method(&self) -> Method {
         let TrainConfig { common, settings } = &self.config;

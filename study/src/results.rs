@@ -34,3 +34,10 @@ pub struct TestResult {
     /// Mean number of steps.
     pub mean_length: f64,
 }
+
+impl std::fmt::Display for TestResult {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { episodes, success_percent, mean_return, mean_length, .. } = self;
+        write!(f, "{episodes} episodes, success {success_percent} %, return {mean_return}, length {mean_length}")
+    }
+}

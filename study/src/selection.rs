@@ -9,9 +9,9 @@
 use std::collections::BTreeMap;
 
 use super::folder::{CellResult, CellState, Failure, Folder, FolderError};
-use super::plan::{Cell, Plan};
+use super::plan::{Cell, Plan, TrainedOn};
 use super::statistics::{Iqm, Summary};
-use crate::{Method, Metric, Scenario, Version, mean};
+use crate::{Method, Metric, Scenario, TestResult, Version, mean};
 
 /// What is known of a plan's cells.
 #[derive(Debug)]
@@ -29,7 +29,7 @@ pub struct MethodResults<'a> {
     pub environment: &'a str,
     /// What was trained.
     pub method: Method,
-    /// Cells that the plan has for it.
+    /// Cells that the plan has for it, without those that are trained on its own sets.
     pub cells: usize,
     /// Of these, cells with a result. If some are missing, selection was among fewer than the plan asks for.
     pub done: usize,
@@ -37,9 +37,9 @@ pub struct MethodResults<'a> {
     pub runs: BTreeMap<u32, SelectedRun<'a>>,
 }
 
-/// What was selected in a run, by the versions that the plan trains on; `None` for one that has no result yet.
+/// What was selected in a run, by all that the plan trains on; `None` where nothing has a result yet.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct SelectedRun<'a>(pub BTreeMap<Version, Option<Selected<'a>>>);
+pub struct SelectedRun<'a>(pub BTreeMap<TrainedOn<'a>, Option<Selected<'a>>>);
 
 /// A cell that was selected.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -79,8 +79,7 @@ impl<'a> Results<'a> {
     /// Selects for each environment and method of the plan, in its order.
     pub fn select(&self) -> Vec<MethodResults<'_>> {
         let mut selections: Vec<MethodResults<'_>> = Vec::new();
-        let of_paper = |(cell, _): &(&Cell, &CellState)| cell.set.is_none();
-        for (cell, state) in self.plan.cells.iter().zip(&self.states).filter(of_paper) {
+        for (cell, state) in self.plan.cells.iter().zip(&self.states) {
             let (environment, method) = (cell.config.common.environment.as_str(), cell.method());
             let known = selections.iter().position(|known| known.environment == environment && known.method == method);
             let place = known.unwrap_or_else(|| {
@@ -96,10 +95,11 @@ impl<'a> Results<'a> {
 impl<'a> MethodResults<'a> {
     /// Takes `cell` into account, which comes after all cells that the plan lists before it.
     fn consider(&mut self, cell: &'a Cell, state: &'a CellState) {
-        self.cells += 1;
-        let best = self.runs.entry(cell.run).or_default().0.entry(cell.config.common.version).or_default();
+        let is_papers = usize::from(cell.set.is_none());
+        self.cells += is_papers;
+        let best = self.runs.entry(cell.run).or_default().0.entry(cell.trained_on()).or_default();
         let CellState::Done(result) = state else { return };
-        self.done += 1;
+        self.done += is_papers;
         let candidate = Selected { cell, result };
         if best.is_none_or(|best| candidate.rank() > best.rank()) {
             *best = Some(candidate);
@@ -119,33 +119,48 @@ impl<'a> MethodResults<'a> {
     }
 
     /// A scenario's success rate over runs, %.
-    pub fn scenario(&self, scenario: Scenario) -> Option<Summary> {
-        Summary::of(&self.runs.values().filter_map(|run| run.rate(scenario)).collect::<Vec<_>>())
+    pub fn scenario(&self, Scenario { train, test }: Scenario) -> Option<Summary> {
+        self.test(TrainedOn::Version(train), &test.to_string(), |test| test.success_percent)
+    }
+
+    /// A figure of the tests on a set or version, over runs.
+    pub fn test(&self, trained_on: TrainedOn<'_>, tested_on: &str, figure: fn(&TestResult) -> f64) -> Option<Summary> {
+        let of_run = |run: &SelectedRun<'_>| run.trained_on(trained_on)?.test(tested_on).map(figure);
+        Summary::of(&self.runs.values().filter_map(of_run).collect::<Vec<_>>())
     }
 }
 
 impl<'a> SelectedRun<'a> {
-    /// What was trained on `version`.
-    pub fn trained_on(&self, version: Version) -> Option<Selected<'a>> {
-        self.0.get(&version).copied().flatten()
+    /// What was trained on this.
+    pub fn trained_on(&self, trained_on: TrainedOn<'_>) -> Option<Selected<'a>> {
+        self.0.get(&trained_on).copied().flatten()
     }
 
     /// The success rate of a scenario, %; `None` if nothing was tested there.
-    pub fn rate(&self, scenario: Scenario) -> Option<f64> {
-        self.trained_on(scenario.train)?.rate(scenario.test)
+    pub fn rate(&self, Scenario { train, test }: Scenario) -> Option<f64> {
+        self.trained_on(TrainedOn::Version(train))?.rate(test)
     }
 }
 
-impl Selected<'_> {
+impl<'a> Selected<'a> {
+    /// The figures of its test on a set or version; `None` if it was not tested there.
+    pub fn test(&self, tested_on: &str) -> Option<&'a TestResult> {
+        self.result.results.get(tested_on)
+    }
+
     /// The success rate on `version`, %; `None` if it was not tested there.
     pub fn rate(&self, version: Version) -> Option<f64> {
-        Some(self.result.results.get(&version.to_string())?.success_percent)
+        Some(self.test(&version.to_string())?.success_percent)
+    }
+
+    /// The figures of the test that selects.
+    pub fn own_test(&self) -> Option<&'a TestResult> {
+        self.test(&self.cell.trained_on().to_string())
     }
 
     /// The highest is selected.
     fn rank(&self) -> Option<(f64, f64)> {
-        let test = self.result.results.get(&self.cell.config.common.version.to_string())?;
-        Some((test.success_percent, test.mean_return))
+        self.own_test().map(|test| (test.success_percent, test.mean_return))
     }
 }
 

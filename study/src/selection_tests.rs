@@ -75,7 +75,9 @@ fn each_run_and_training_version_has_its_best_configuration() {
     let selections = results.select();
     assert_eq!(selections.len(), 2);
     let chosen = |run: u32| {
-        let trained_on = |version| selections[0].runs[&run].trained_on(version).map(|selected| is_a(selected.cell));
+        let trained_on = |version| {
+            selections[0].runs[&run].trained_on(TrainedOn::Version(version)).map(|selected| is_a(selected.cell))
+        };
         Version::ALL.map(trained_on)
     };
     assert_eq!(chosen(1), [Some(true), Some(false), Some(true)]);

@@ -13,7 +13,7 @@ use perturb_study::sets::SetError;
 use perturb_study::settings::ConfigError;
 use perturb_study::slurm::{OptionError, SlurmError};
 use perturb_study::success::ThresholdError;
-use perturb_study::{FolderError, PlanCheckError, PlanError, RunError};
+use perturb_study::{FolderError, PlanCheckError, PlanError, RunError, VerifyError};
 
 use crate::video::VideoError;
 
@@ -73,6 +73,8 @@ pub(super) enum CommandError {
     Threshold(#[from] ThresholdError),
     #[error(transparent)]
     Train(#[from] TrainError),
+    #[error(transparent)]
+    Verify(#[from] VerifyError),
     #[error(transparent)]
     Video(#[from] VideoError),
 }

@@ -9,7 +9,7 @@ use super::error::Result;
 use perturb_study::files::write_atomically;
 use perturb_study::plot::{Quantity, draw_curves, save};
 use perturb_study::report::{Figures, Report, html};
-use perturb_study::{Folder, Plan, Results, curves_table, read_curves};
+use perturb_study::{Folder, Plan, Results, curves_table, read_curves, verify};
 
 pub(super) fn run(args: &ReportArgs) -> Result<Ending> {
     let folder = Folder::new(&args.dir);
@@ -23,6 +23,7 @@ pub(super) fn run(args: &ReportArgs) -> Result<Ending> {
 pub(super) fn write(folder: &Folder, page: Option<&Path>) -> Result<String> {
     let plan = Plan::load(&folder.require_plan()?)?;
     let results = Results::read(&plan, folder)?;
+    verify(&results, folder)?;
     let selections = results.select();
     let report = Report::new(&results, &selections);
 

@@ -7,8 +7,10 @@ use crate::{Method, Metric, Scenario, Version};
 
 impl Report<'_> {
     /// The files that a report has beside its documents, by their titles.
-    pub fn files(&self) -> [Table; 4] {
-        [self.metrics_file(), self.iqm_file(), self.scenarios_file(), self.selected_file()]
+    pub fn files(&self) -> Vec<Table> {
+        let sets = (!self.set_tests.is_empty()).then(|| self.sets_file());
+        let files = [self.metrics_file(), self.iqm_file(), self.scenarios_file(), self.selected_file()];
+        files.into_iter().chain(sets).collect()
     }
 
     fn metrics_file(&self) -> Table {
@@ -50,11 +52,22 @@ impl Report<'_> {
             .build()
     }
 
+    fn sets_file(&self) -> Table {
+        Table::of("sets.csv", &self.set_tests)
+            .text("environment", |test| test.environment)
+            .method(|test| test.method)
+            .text("train", |test| test.trained_on)
+            .text("test", |test| test.tested_on)
+            .summary(|test| test.success)
+            .number("mean_return", |test| or_empty(test.mean_return.map(|summary| summary.mean)))
+            .build()
+    }
+
     fn selected_file(&self) -> Table {
         Table::of("selected.csv", &self.selected())
             .text("environment", |selected| &selected.result.training.environment)
             .method(|selected| &selected.result.training.method)
-            .text("train", |selected| selected.result.training.version)
+            .text("train", |selected| selected.cell.trained_on())
             .text("run", |selected| selected.cell.run)
             .text("seed", |selected| selected.result.training.seed)
             .text("cell", |selected| &selected.cell.id)

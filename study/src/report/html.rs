@@ -38,6 +38,7 @@ pub fn html(report: &Report<'_>, figures: &Figures) -> String {
     let section = |id, title, notes, subsections| Section { id, title, notes, subsections, side_by_side: false };
     let metrics = report.metrics_tables().into_iter().map(plain).collect();
     let scenarios = report.scenario_tables().iter().map(|table| table_subsection(table, true)).collect();
+    let sets: Vec<Subsection> = report.set_table().into_iter().map(plain).collect();
     let cells = [report.selected_table()].into_iter().chain(report.failure_table()).map(plain).collect();
     let sections = [
         section("metrics", "Default, Interpolation, Extrapolation", html! { p { (METRICS) } }, metrics),
@@ -51,14 +52,17 @@ pub fn html(report: &Report<'_>, figures: &Figures) -> String {
                 scenarios,
             )
         },
+        section("sets", "Own sets of parameters", html! {}, sets),
         section("curves", "Training curves", list(&figures.no_curves), curves(figures)),
         section("heatmaps", "Heatmaps", html! { p { (HEATMAPS) } (list(&figures.no_heatmaps)) }, heatmaps(figures)),
         section("cells", "Cells", html! {}, cells),
     ];
-    page(report, &sections).into_string()
+    let shown: Vec<&Section> =
+        sections.iter().filter(|section| section.id != "sets" || !section.subsections.is_empty()).collect();
+    page(report, &shown).into_string()
 }
 
-fn page(report: &Report<'_>, sections: &[Section]) -> Markup {
+fn page(report: &Report<'_>, sections: &[&Section]) -> Markup {
     html! {
         (DOCTYPE)
         html lang="en" {

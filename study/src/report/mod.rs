@@ -15,7 +15,7 @@ use super::folder::Failure;
 use super::plan::{Cell, Plan};
 use super::selection::{MethodResults, Results, Selected};
 use super::table::Table;
-use numbers::{MethodIqms, MethodMetrics};
+use numbers::{MethodIqms, MethodMetrics, SetTest};
 
 pub use figures::{Figure, FigureData, Figures};
 pub use html::html;
@@ -35,6 +35,7 @@ pub struct Report<'a> {
     metrics: Vec<MethodMetrics<'a>>,
     averages: Vec<MethodMetrics<'a>>,
     iqms: Vec<MethodIqms>,
+    set_tests: Vec<SetTest<'a>>,
     failures: Vec<&'a Failure>,
 }
 
@@ -48,6 +49,7 @@ impl<'a> Report<'a> {
             metrics: numbers::metrics(selections),
             averages: numbers::averages(results.plan, selections),
             iqms: numbers::iqms(results.plan, selections),
+            set_tests: numbers::set_tests(results.plan, selections),
             failures: results.failures().collect(),
         }
     }
@@ -67,7 +69,8 @@ impl<'a> Report<'a> {
     }
 
     fn number_tables(&self) -> impl Iterator<Item = Table> {
-        self.metrics_tables().into_iter().chain([self.iqm_table()]).chain(self.scenario_tables())
+        let papers = self.metrics_tables().into_iter().chain([self.iqm_table()]).chain(self.scenario_tables());
+        papers.chain(self.set_table())
     }
 
     /// All cells that numbers come from.
@@ -94,6 +97,7 @@ fn overview(results: &Results<'_>, selections: &[MethodResults<'_>]) -> Vec<Stri
     if !commits.is_empty() {
         lines.push(format!("Done by perturb {}.", commits.into_iter().collect::<Vec<_>>().join(", ")));
     }
+    lines.extend(agreement(results));
     lines.push(
         "Numbers are success rates in percent: mean ± standard deviation over runs; one run has none. The paper's are \
          those of its five runs; a difference is ours less the paper's. Hopper and HalfCheetah run on another physics \
@@ -101,6 +105,22 @@ fn overview(results: &Results<'_>, selections: &[MethodResults<'_>]) -> Vec<Stri
             .into(),
     );
     lines
+}
+
+/// How far requested and applied parameters agreed in all tests.
+fn agreement(results: &Results<'_>) -> Option<String> {
+    let tested: u64 = results.done().flat_map(|result| result.results.values()).map(|test| test.episodes).sum();
+    let agreements = || results.done().filter_map(|result| result.agreement.as_ref());
+    let compared: u64 = agreements().map(|agreement| agreement.episodes).sum();
+    let differences = agreements().filter_map(|agreement| agreement.largest.as_ref());
+    let largest = differences.max_by(|a, b| a.relative.total_cmp(&b.relative)).map(|largest| match largest.relative {
+        0.0 => "; they were equal".to_owned(),
+        relative => format!("; the largest relative difference is {relative:.1e}, of {}", largest.parameter),
+    });
+    (tested > 0).then(|| {
+        let largest = largest.unwrap_or_default();
+        format!("Requested and applied parameters were compared in {compared} of {tested} test episodes{largest}.")
+    })
 }
 
 /// Budgets that are not the paper's.

@@ -3,10 +3,10 @@
 use std::collections::BTreeMap;
 
 use crate::paper::{self, PaperNumber};
-use crate::plan::Plan;
+use crate::plan::{Plan, TrainedOn};
 use crate::selection::{MethodResults, average, interquartile};
 use crate::statistics::{Iqm, Summary};
-use crate::{Method, Metric};
+use crate::{Method, Metric, Version};
 
 /// Resamples of each bootstrap, as many as rliable takes.
 const RESAMPLES: usize = 50_000;
@@ -27,6 +27,16 @@ pub(super) struct MethodMetrics<'a> {
 pub(super) struct MethodIqms {
     pub(super) method: Method,
     pub(super) iqms: BTreeMap<Metric, Iqm>,
+}
+
+/// A test that the paper has no place for: of a policy that was trained on one of the plan's own sets, or on one.
+pub(super) struct SetTest<'a> {
+    pub(super) environment: &'a str,
+    pub(super) method: &'a Method,
+    pub(super) trained_on: TrainedOn<'a>,
+    pub(super) tested_on: &'a str,
+    pub(super) success: Option<Summary>,
+    pub(super) mean_return: Option<Summary>,
 }
 
 impl MethodMetrics<'_> {
@@ -88,6 +98,27 @@ pub(super) fn iqms(plan: &Plan, selections: &[MethodResults<'_>]) -> Vec<MethodI
         MethodIqms { iqms: known(|metric| interquartile(&found, metric, RESAMPLES).filter(|_| everywhere)), method }
     };
     plan.methods().into_iter().map(of_method).collect()
+}
+
+/// In the order of `selections`, of what they were trained on, and of the plan's tests.
+pub(super) fn set_tests<'a>(plan: &'a Plan, selections: &'a [MethodResults<'a>]) -> Vec<SetTest<'a>> {
+    let is_version = |name: &str| Version::ALL.iter().any(|version| version.to_string() == name);
+    let mut tests = Vec::new();
+    for selection in selections {
+        for &trained_on in selection.runs.values().next().into_iter().flat_map(|run| run.0.keys()) {
+            let names = plan.cells.iter().take(1).flat_map(|cell| &cell.tests.sets).map(|set| set.name.as_str());
+            let is_of_set = matches!(trained_on, TrainedOn::Set(_));
+            tests.extend(names.filter(|name| is_of_set || !is_version(name)).map(|tested_on| SetTest {
+                environment: selection.environment,
+                method: &selection.method,
+                trained_on,
+                tested_on,
+                success: selection.test(trained_on, tested_on, |test| test.success_percent),
+                mean_return: selection.test(trained_on, tested_on, |test| test.mean_return),
+            }));
+        }
+    }
+    tests
 }
 
 /// In the order of the environments.

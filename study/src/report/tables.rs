@@ -67,18 +67,32 @@ impl Report<'_> {
         of_environments.map(table).collect()
     }
 
+    /// `None` if the plan has no sets of its own.
+    pub(super) fn set_table(&self) -> Option<Table> {
+        let table = Table::of("Tests of and on the plan's own sets of parameters", &self.set_tests)
+            .text("environment", |test| test.environment)
+            .text("method", |test| test.method)
+            .text("trained on", |test| test.trained_on)
+            .text("tested on", |test| test.tested_on)
+            .number("success, %", |test| rate(test.success))
+            .number("mean return", |test| or(MISSING, test.mean_return))
+            .number("runs", |test| self.runs(test.success.map_or(0, |summary| summary.runs)))
+            .build();
+        (!table.rows.is_empty()).then_some(table)
+    }
+
     pub(super) fn selected_table(&self) -> Table {
         let title =
             "Where the numbers come from: the selected cell of each run (selected.csv has its settings and command)";
         Table::of(title, &self.selected())
             .text("environment", |selected| &selected.result.training.environment)
             .text("method", |selected| &selected.result.training.method)
-            .text("trained on", |selected| selected.result.training.version)
+            .text("trained on", |selected| selected.cell.trained_on())
             .text("run", |selected| selected.cell.run)
             .text("seed", |selected| selected.result.training.seed)
             .text("cell", |selected| &selected.cell.id)
             .number("success on it", |selected| {
-                or(MISSING, selected.rate(selected.result.training.version).map(|rate| format!("{rate:.1}")))
+                or(MISSING, selected.own_test().map(|test| format!("{:.1}", test.success_percent)))
             })
             .build()
     }

@@ -1,9 +1,10 @@
 use rstest::rstest;
 
 use super::*;
-use crate::Version;
 use crate::fixture;
 use crate::folder::{CellState, Failure};
+use crate::records::{Agreement, Difference};
+use crate::{TestResult, Version};
 
 const PLAN: &str = "
 environments = ['CartPole', 'Pendulum']
@@ -17,6 +18,20 @@ architectures = ['ff']
 name = 'rl2-ppo'
 architectures = ['rc']
 versions = ['D', 'R']
+";
+
+/// One method, which is trained on D and on a set of the plan, and tested on D, R, E and two sets.
+const SETS: &str = "
+environments = ['CartPole']
+versions = ['D', 'long']
+test_versions = ['D', 'R', 'E', 'long', 'corners']
+[sets.long]
+length = '0.7..0.8'
+[sets.corners]
+length = '0.1..1.0/2'
+[[algorithm]]
+name = 'ppo'
+architectures = ['ff']
 ";
 
 /// The first run of A2C on D failed; RL²-PPO has nothing on Pendulum, nor a second run.
@@ -58,7 +73,7 @@ fn figures() -> Figures {
 #[case("markdown", |report: &Report<'_>| report.markdown())]
 #[case("csv", |report: &Report<'_>| {
     let lines = |table: Table| format!("{}\n{}", table.title, String::from_utf8(table.to_csv()).unwrap());
-    report.files().map(lines).join("\n")
+    report.files().into_iter().map(lines).collect::<Vec<_>>().join("\n")
 })]
 #[case("html", |report: &Report<'_>| html(report, &figures()).replace(html::STYLE, "").replace("><", ">\n<"))]
 fn a_report_has_all_its_numbers(#[case] name: &str, #[case] document: fn(&Report<'_>) -> String) {
@@ -69,6 +84,37 @@ fn a_report_has_all_its_numbers(#[case] name: &str, #[case] document: fn(&Report
     insta::with_settings!({ prepend_module_to_snapshot => false, omit_expression => true }, {
         insta::assert_snapshot!(name, document(&report));
     });
+}
+
+#[test]
+fn tests_on_own_sets_have_a_table_and_leave_the_papers_numbers_alone() {
+    let plan = Plan::parse("test", SETS.into()).unwrap();
+    let mut results = fixture::results(&plan, |_| Some(([90.0, 40.0, 20.0], 1.0)));
+    for (state, relative) in results.states.iter_mut().zip([0.0, 2e-16]) {
+        let CellState::Done(result) = state else { unreachable!("all are done") };
+        let test = result.results["D"].clone();
+        for (name, success_percent) in [("long", 75.0), ("corners", 55.0)] {
+            result.results.insert(name.into(), TestResult { success_percent, ..test.clone() });
+        }
+        let largest = Difference { parameter: "length".into(), requested: 0.7, applied: 0.7, relative };
+        result.agreement = Some(Agreement { episodes: 4000, largest: Some(largest) });
+    }
+    let selections = results.select();
+    let report = Report::new(&results, &selections);
+    insta::assert_snapshot!(report.set_table().unwrap().to_text(), @r"
+     environment  method  trained on  tested on  success, %  mean return  runs
+     CartPole     ppo ff  D           long             75.0          1.0     1
+     CartPole     ppo ff  D           corners          55.0          1.0     1
+     CartPole     ppo ff  long        D                90.0          1.0     1
+     CartPole     ppo ff  long        R                40.0          1.0     1
+     CartPole     ppo ff  long        E                20.0          1.0     1
+     CartPole     ppo ff  long        long             75.0          1.0     1
+     CartPole     ppo ff  long        corners          55.0          1.0     1
+    ");
+    assert_eq!((selections.len(), selections[0].cells), (1, 1), "selected among those that are trained on versions");
+    assert_eq!(report.files()[4].title, "sets.csv");
+    let told = "compared in 8000 of 10000 test episodes; the largest relative difference is 2.0e-16, of length.";
+    assert!(report.overview.iter().any(|line| line.contains(told)), "{:?}", report.overview);
 }
 
 #[rstest]

@@ -1,0 +1,143 @@
+//! Whether results follow from the episodes that were recorded with them.
+
+use crate::TestResult;
+use crate::folder::Folder;
+use crate::records::{self, Records, RecordsError};
+use crate::selection::Results;
+
+/// Why results are not trusted.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum VerifyError {
+    /// Recorded episodes cannot be read.
+    #[error(transparent)]
+    Records(#[from] RecordsError),
+    /// A test's figures are others than those of its episodes.
+    #[error(
+        "the result of cell {cell} does not follow from its recorded episodes: its test on {test} has {kept} in \
+         result.json, but {recorded} in {file}; delete result.json to have the tests done again",
+        file = records::FILE
+    )]
+    Test {
+        /// The cell's id.
+        cell: String,
+        /// The name of the set or version.
+        test: String,
+        /// The figures in `result.json`.
+        kept: Box<TestResult>,
+        /// The figures of the episodes.
+        recorded: Box<TestResult>,
+    },
+    /// Requested and applied parameters were compared with another outcome.
+    #[error(
+        "the result of cell {cell} does not follow from its recorded episodes: requested and applied parameters differ \
+         otherwise; delete result.json to have the tests done again"
+    )]
+    Agreement {
+        /// The cell's id.
+        cell: String,
+    },
+}
+
+/// Computes every result again from its recorded episodes, where they are there; gives how many results have them.
+///
+/// # Errors
+/// [`VerifyError`] for the first result that is another one.
+pub fn verify(results: &Results<'_>, folder: &Folder) -> Result<usize, VerifyError> {
+    let mut verified = 0;
+    for result in results.done() {
+        let records = match Records::read(&folder.cell(&result.id).path().join(records::FILE)) {
+            Err(RecordsError::Missing { .. }) => continue,
+            records => records?,
+        };
+        for (test, kept) in &result.results {
+            let recorded = records.result(test, None);
+            if recorded != *kept {
+                let (kept, recorded) = (Box::new(kept.clone()), Box::new(recorded));
+                return Err(VerifyError::Test { cell: result.id.clone(), test: test.clone(), kept, recorded });
+            }
+        }
+        if result.agreement.as_ref().is_some_and(|agreement| *agreement != records.agreement()) {
+            return Err(VerifyError::Agreement { cell: result.id.clone() });
+        }
+        verified += 1;
+    }
+    Ok(verified)
+}
+
+#[cfg(test)]
+mod tests {
+    use rstest::rstest;
+
+    use super::*;
+    use crate::folder::{CellResult, CellState};
+    use crate::plan::Plan;
+    use crate::records::{About, Ending, EpisodeRecord, RecordedTest};
+    use crate::{Version, fixture};
+
+    const PLAN: &str = "environments = ['CartPole']\nversions = ['D']\ntest_versions = ['D']
+        [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
+
+    fn records() -> Records {
+        let episode = |environment_index: u32| EpisodeRecord {
+            set: "D".into(),
+            seed: 7,
+            environment_index,
+            episode_index: 0,
+            requested: Vec::new(),
+            applied: Vec::new(),
+            model_hash: String::new(),
+            episode_return: 0.1 + f64::from(environment_index),
+            length: 10,
+            success: environment_index == 0,
+            ending: Ending::Terminated,
+            achieved: None,
+        };
+        let about = About {
+            environment: "CartPole".into(),
+            revision: 0,
+            parameters: Vec::new(),
+            applied: Vec::new(),
+            policy: String::new(),
+            episodes_per_trial: 1,
+            success: None,
+            tests: Vec::new(),
+        };
+        let mut records = Records::new(about);
+        records.add(RecordedTest { set: Version::D.into(), seed: 7 }, (0..3).map(episode).collect());
+        records
+    }
+
+    #[rstest]
+    #[case(|_: &mut CellResult| (), None)]
+    #[case(|result: &mut CellResult| result.results.get_mut("D").unwrap().mean_return += 1e-9, Some("its test on D has 3 episodes"))]
+    #[case(|result: &mut CellResult| result.agreement.as_mut().unwrap().episodes = 2, Some("parameters differ otherwise"))]
+    fn a_result_is_that_of_its_recorded_episodes(#[case] change: fn(&mut CellResult), #[case] refused: Option<&str>) {
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(directory.path());
+        let records = records();
+        records.write(&folder.cell(&plan.cells[0].id).path().join(records::FILE)).unwrap();
+        let mut results = fixture::results(&plan, |_| Some(([0.0; 3], 0.0)));
+        let CellState::Done(result) = &mut results.states[0] else { unreachable!("it is done") };
+        result.results = [("D".to_owned(), records.result("D", None))].into();
+        result.agreement = Some(records.agreement());
+        change(result);
+        match (verify(&results, &folder), refused) {
+            (Ok(verified), None) => assert_eq!(verified, 1),
+            (Err(error), Some(expected)) => {
+                let message = error.to_string();
+                assert!(message.contains(expected) && message.contains(&plan.cells[0].id), "{message}");
+            }
+            (outcome, _) => panic!("{outcome:?}"),
+        }
+    }
+
+    #[test]
+    fn a_result_of_an_earlier_program_has_no_episodes_to_compare() {
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let results = fixture::results(&plan, |_| Some(([0.0; 3], 0.0)));
+        assert_eq!(verify(&results, &Folder::new(directory.path())).unwrap(), 0);
+    }
+}
