@@ -455,3 +455,22 @@ async fn many_sessions_share_a_connection() {
         sessions.push(session);
     }
 }
+
+#[tokio::test]
+async fn requests_are_counted_by_kind_and_told_at_the_end() {
+    let mut server = Server::start(&["--log", "perturb=debug"]);
+    let (mut session, opened) = Session::open(server.tcp(), open("CartPole", 2, 1)).await;
+    let environment = opened.environment.unwrap();
+    session.play(Actor::new(&environment, 2), 0, 3).await;
+    session.refused(server::step(&b"x"[..])).await;
+    drop(session);
+    server.signal("TERM");
+    server.ended().await;
+    let log = server.log();
+    assert!(log.contains("open 1 (0 refused), step 4 (1 refused), reset 0 (0 refused)"), "{log}");
+    assert!(log.contains("create_world 0 (0 refused)"), "{log}");
+    assert!(
+        log.contains(r#"request{kind="step"}: perturb::server::requests: refused refusal="step.actions is 1 bytes"#),
+        "{log}"
+    );
+}
