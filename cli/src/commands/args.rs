@@ -201,10 +201,10 @@ pub(super) struct RatesArgs {
 #[derive(Args, Debug)]
 pub(super) struct DemoArgs {
     /// Episodes of each of the three trainings.
-    #[arg(long, value_name = "N", default_value_t = super::demo::EPISODES, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, value_name = "N", default_value_t = 2000, value_parser = clap::value_parser!(u64).range(1..))]
     pub(super) episodes: u64,
     /// Episodes of each of the nine tests.
-    #[arg(long, value_name = "N", default_value_t = super::demo::TEST_EPISODES, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u64).range(1..))]
     pub(super) test_episodes: u64,
     /// Fixes all randomness.
     #[arg(long, value_name = "N", default_value_t = 1)]

@@ -19,10 +19,6 @@ use perturb_study::settings::{AlgorithmName, Architecture, TrainConfig};
 use perturb_study::table::Table;
 use perturb_study::{Method, Metric, Scenario, Version, paper};
 
-/// Episodes of each training, unless told otherwise.
-pub(super) const EPISODES: u64 = 2000;
-/// Episodes of each test, unless told otherwise.
-pub(super) const TEST_EPISODES: u64 = 1000;
 /// The paper's budgets.
 const PAPER_EPISODES: u64 = 15_000;
 const PAPER_TEST_EPISODES: u64 = 1000;

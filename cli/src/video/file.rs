@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use tempfile::NamedTempFile;
 
 use super::VideoError;
+use super::encode::Encode;
 use super::gif::{self, GifEncoder};
 use super::mp4::{self, Mp4Encoder};
 use perturb_study::files::{create_folder, io};
@@ -88,15 +89,6 @@ impl VideoFile {
         let encoder = encoder.map_err(|reason| VideoError::Encode { path: self.path.clone(), reason })?;
         Ok(VideoWriter { encoder, file: self })
     }
-}
-
-/// What encodes frames to a file.
-pub(super) trait Encode {
-    /// Adds a frame `[height, width, 3]` that is shown for about so many `seconds`. What went wrong is said in words.
-    fn write(&mut self, frame: &[u8], seconds: f64) -> Result<(), String>;
-
-    /// Completes the file.
-    fn finish(self: Box<Self>) -> Result<(), String>;
 }
 
 /// A video that is being written.

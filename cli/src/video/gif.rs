@@ -6,7 +6,7 @@ use std::path::Path;
 
 use gif::{Encoder, Frame, Repeat};
 
-use super::file::Encode;
+use super::encode::Encode;
 
 /// A shorter delay, in hundredths of a second, is what many programs take for "as slow as they like".
 const SHORTEST: f64 = 2.0;

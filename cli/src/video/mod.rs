@@ -3,6 +3,7 @@
 //! [`film`] plays the episodes and asks the server for a picture of every state; `panel` writes below it which episode
 //! it is and how it goes; [`VideoFile`] is where the frames end up, through `gif` or `mp4`.
 
+mod encode;
 mod file;
 mod film;
 mod gif;

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
 use super::VideoError;
-use super::file::Encode;
+use super::encode::Encode;
 
 const PROGRAM: &str = "ffmpeg";
 /// Constant quality: lower is better and larger; text stays clean at this one.

@@ -11,10 +11,9 @@ use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
 use crate::address::Address;
-use crate::error::{ClientError, causes, describe};
+use crate::error::{ClientError, REPLY_LIMIT, causes, describe, lost, timed_out};
 use crate::limits::SERVICE;
 use crate::proto::{self, perturb_client::PerturbClient};
-use crate::stream::{REPLY_LIMIT, lost, timed_out};
 
 /// How long each part of making a connection may take.
 const CONNECT_LIMIT: Duration = Duration::from_secs(5);

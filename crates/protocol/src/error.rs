@@ -3,9 +3,12 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use tonic::Code;
+use tonic::{Code, Status};
 
 use crate::address::Address;
+
+/// How long a server may take for one reply; also that of a batch of thousands of environments comes much sooner.
+pub const REPLY_LIMIT: Duration = Duration::from_secs(60);
 
 /// A failure of a server, of the connection to it, or of a request.
 #[derive(Debug, thiserror::Error)]
@@ -152,7 +155,7 @@ impl ClientError {
 }
 
 /// A status in words, with the transport's cause.
-pub(crate) fn describe(status: &tonic::Status) -> String {
+pub(crate) fn describe(status: &Status) -> String {
     let mut words = vec![format!("{} ({:?})", status.message(), status.code())];
     if let Some(source) = std::error::Error::source(status) {
         words.extend(causes(source));
@@ -171,4 +174,12 @@ pub(crate) fn causes(error: &dyn std::error::Error) -> Vec<String> {
         }
     }
     words
+}
+
+pub(crate) fn lost(address: &Address, request: &'static str, status: &Status) -> ClientError {
+    ClientError::Lost { address: address.clone(), request, code: status.code(), reason: describe(status) }
+}
+
+pub(crate) fn timed_out(address: &Address, request: &'static str) -> ClientError {
+    ClientError::TimedOut { address: address.clone(), request, limit: REPLY_LIMIT }
 }

@@ -20,9 +20,9 @@ mod version;
 pub use address::{Address, AddressError};
 pub use connection::{Connection, Machines, first_of, machines};
 pub use distribution::{Distribution, DistributionError, Interval};
-pub use error::ClientError;
+pub use error::{ClientError, REPLY_LIMIT};
 pub use private_server::PrivateServer;
-pub use stream::{Ask, REPLY_LIMIT, Stream};
+pub use stream::{Ask, Stream};
 pub use version::{UnknownVersion, Version};
 
 /// The protocols: generated from `proto`, whose comments specify every field. `perturb.v1` is here at the top.

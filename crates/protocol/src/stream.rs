@@ -1,18 +1,14 @@
 //! A session's stream, typed: every request has its reply.
 
-use std::time::Duration;
-
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Status, Streaming};
 
 use crate::address::Address;
 use crate::connection::Connection;
-use crate::error::{ClientError, describe};
+use crate::error::{ClientError, REPLY_LIMIT, lost, timed_out};
 use crate::proto::{self, SessionRequest, SessionResponse, session_request::Request, session_response::Response};
 
-/// How long a server may take for one reply; also that of a batch of thousands of environments comes much sooner.
-pub const REPLY_LIMIT: Duration = Duration::from_secs(60);
 /// Requests that may lie in the channel before they are sent.
 const QUEUE: usize = 4;
 
@@ -169,12 +165,4 @@ impl Stream {
     pub fn mismatch<A: Ask>(&self, got: String, expected: String) -> ClientError {
         ClientError::Protocol { address: self.address.clone(), request: A::NAME, got, expected }
     }
-}
-
-pub(crate) fn lost(address: &Address, request: &'static str, status: &Status) -> ClientError {
-    ClientError::Lost { address: address.clone(), request, code: status.code(), reason: describe(status) }
-}
-
-pub(crate) fn timed_out(address: &Address, request: &'static str) -> ClientError {
-    ClientError::TimedOut { address: address.clone(), request, limit: REPLY_LIMIT }
 }

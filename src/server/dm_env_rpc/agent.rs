@@ -4,7 +4,7 @@ use super::{
     properties,
     runner::Runner,
     settings, specs,
-    world::World,
+    world::Joined,
     worlds::{StreamId, Worlds},
 };
 use crate::{
@@ -26,12 +26,6 @@ pub(super) struct Agent {
     sessions: Sessions,
     id: StreamId,
     joined: Option<Joined>,
-}
-
-/// The world whose agent this is.
-pub(super) struct Joined {
-    pub(super) world: Arc<World>,
-    pub(super) runner: Runner,
 }
 
 impl Agent {

@@ -2,9 +2,9 @@
 //! is written takes effect when the next begins.
 
 use super::{
-    agent::Joined,
     settings::{self, Change},
     tensors,
+    world::Joined,
 };
 use crate::{
     env::{Catalogue, Distribution, EpisodeId, Receipt, shorten},

@@ -1,13 +1,13 @@
 //! A world's episodes, one after the other, on the pool: a batch of one environment.
 
-use super::world::Changes;
 use crate::{
-    env::{EnvironmentSpec, EpisodeStart, Version},
+    env::{Distribution, EnvironmentSpec, EpisodeStart, Version},
     pool::{Batch, BatchSettings, Pool, ResetEntry, Stepped},
     proto::dm_env_rpc::v1::EnvironmentStateType as State,
     server::status::Refusal,
 };
 use bytes::Bytes;
+use std::sync::Arc;
 
 /// An environment and where its episode stands.
 pub(super) struct Runner {
@@ -45,6 +45,16 @@ pub(super) struct Outcome {
     pub(super) success: bool,
     /// The physics diverged.
     pub(super) diverged: bool,
+}
+
+/// What begins with the next episode.
+pub(super) struct Changes {
+    /// The version in force.
+    pub(super) version: Version,
+    /// A new seed.
+    pub(super) seed: Option<u64>,
+    /// New distributions, one for each parameter.
+    pub(super) distributions: Option<Arc<[Distribution]>>,
 }
 
 impl Runner {

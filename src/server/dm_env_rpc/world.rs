@@ -1,6 +1,9 @@
 //! What requests of any stream may change about a world. The physics follows when the next episode begins.
 
-use super::{runner::Runner, settings::Change};
+use super::{
+    runner::{Changes, Runner},
+    settings::Change,
+};
 use crate::{
     env::{Distribution, EnvironmentSpec, Version, resolve},
     server::status::Refusal,
@@ -26,14 +29,10 @@ struct Wanted {
     interruption: bool,
 }
 
-/// What begins with the next episode.
-pub(super) struct Changes {
-    /// The version in force.
-    pub(super) version: Version,
-    /// A new seed.
-    pub(super) seed: Option<u64>,
-    /// New distributions, one for each parameter.
-    pub(super) distributions: Option<Arc<[Distribution]>>,
+/// A world and its agent's episodes in it.
+pub(super) struct Joined {
+    pub(super) world: Arc<World>,
+    pub(super) runner: Runner,
 }
 
 impl World {
