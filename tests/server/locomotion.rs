@@ -5,7 +5,7 @@ use perturb::{
     tasks::{half_cheetah::half_cheetah, hopper::hopper, locomotion::Walker},
 };
 use perturb_mujoco::{Kind, Model, Simulation};
-use std::thread;
+use rstest::rstest;
 
 type Make = fn() -> Walker;
 const ROBOTS: [Make; 2] = [|| hopper().unwrap(), || half_cheetah().unwrap()];
@@ -227,79 +227,97 @@ fn recomputed(walker: &Walker, save: &[f64]) -> Simulation {
     simulation
 }
 
-#[test]
-fn observation_and_reward_follow_from_the_state() {
-    let flags: [&[&str]; 2] = [&["foot"], &["ffoot", "fshin", "fthigh", "bfoot", "bshin", "bthigh"]];
-    for (make, flags) in ROBOTS.into_iter().zip(flags) {
-        let mut walker = make();
-        let n = n_actions(&walker);
-        let model = walker.model().try_clone().unwrap();
-        let torso = model.id(Kind::Body, "torso").unwrap();
-        let ranges: Vec<(f64, f64)> = model.joint_range().skip(3).collect();
-        let flag_values = |simulation: &Simulation| -> Vec<f32> {
-            let touches = |name: &&str| {
-                let geom = model.id(Kind::Geom, name).unwrap();
-                simulation.contacts().any(|(a, b)| a == geom || b == geom)
-            };
-            flags.iter().map(|name| f32::from(u8::from(touches(name)))).collect()
-        };
-        let place = |simulation: &Simulation| {
-            (1..model.n_body()).map(|body| simulation.xipos(body)[0]).sum::<f64>() / (model.n_body() - 1) as f64
-        };
-        // Aslant, so that also the cheetah falls.
-        let mut start = vec![0.0; walker.spec().state.len()];
-        (start[1], start[2]) = (0.3, 0.9);
-        walker.reset_to(&start);
-        let mut before = recomputed(&walker, &saved(&walker));
-        let initial_height = before.xipos(torso)[2];
-        let mut previous_flags = vec![0.0; flags.len()];
-        let (mut draws, mut action, mut terms) = (stream(1), vec![0.0; n], [0.0; 5]);
-        let (mut touched, mut fell) = (false, false);
-        for _ in 0..300 {
-            // Beyond the motors' range, which costs as received.
-            action.fill_with(|| draws.uniform(-2.0, 2.0) as f32);
-            let transition = walker.step(Action::Continuous(&action), &mut terms);
-            let after = recomputed(&walker, &saved(&walker));
-            let seen = observation(&walker);
-            let height = after.xipos(torso)[2];
-            let pitch = (-after.xmat(torso)[6]).asin();
-            let velocity = after.body_velocity(torso);
-            let mut expected = vec![height - initial_height, 0.0, 1.0];
-            expected.extend(velocity[3..].iter().map(|v| 0.3 * v));
-            expected.extend([0.0, pitch]);
-            let (mut electricity, mut torque, mut at_limit) = (0.0, 0.0, 0.0);
-            for (i, &(low, high)) in ranges.iter().enumerate() {
-                let scaled = 2.0 * (after.qpos()[3 + i] - 0.5 * (low + high)) / (high - low);
-                let speed = 0.1 * after.qvel()[3 + i];
-                expected.extend([scaled, speed]);
-                let a = f64::from(action[i]);
-                electricity += (a * speed).abs() / n as f64;
-                torque += a * a / n as f64;
-                at_limit += if scaled.abs() > 0.99 { 1.0 } else { 0.0 };
-            }
-            for (x, y) in seen.iter().zip(&expected) {
-                assert!((f64::from(*x) - y.clamp(-5.0, 5.0)).abs() < 1e-6, "{seen:?} {expected:?}"); // f32
-            }
-            assert_eq!(seen[8 + 2 * n..], previous_flags, "flags are one step late");
-            let safe = match flags.len() {
-                1 => height > 0.8,
-                _ => [1, 2, 4, 5].into_iter().all(|flag| previous_flags[flag] == 0.0),
-            };
-            let alive = safe && pitch.abs() < 1.0;
-            assert_eq!(transition.terminated, !alive);
-            let progress = (place(&after) - place(&before)) / 0.0165;
-            let alive = if alive { 1.0 } else { -1.0 };
-            let expected = [alive, progress, -2.0 * electricity, -0.1 * torque, -0.2 * at_limit];
-            for (x, y) in terms.iter().zip(expected) {
-                assert!((x - y).abs() < 1e-9 * y.abs().max(1.0), "{terms:?} {expected:?}"); // order of sums
-            }
-            previous_flags = flag_values(&after);
-            touched |= previous_flags.contains(&1.0);
-            fell |= transition.terminated;
-            before = after;
+/// The place of the robot's parts, in the mean.
+fn place(simulation: &Simulation) -> f64 {
+    let n_body = simulation.model().n_body();
+    (1..n_body).map(|body| simulation.xipos(body)[0]).sum::<f64>() / (n_body - 1) as f64
+}
+
+/// Which of these geoms touch anything, as 0 and 1.
+fn touching(simulation: &Simulation, geoms: &[&str]) -> Vec<f32> {
+    let touches = |name: &&str| {
+        let geom = simulation.model().id(Kind::Geom, name).unwrap();
+        simulation.contacts().any(|(a, b)| a == geom || b == geom)
+    };
+    geoms.iter().map(|name| f32::from(u8::from(touches(name)))).collect()
+}
+
+/// What the task's definition makes of the states before and after a step.
+#[derive(Debug)]
+struct Defined {
+    /// Without the contact flags, not clamped.
+    observation: Vec<f64>,
+    height: f64,
+    pitch: f64,
+    /// All but the first, which depends on the flags.
+    terms: [f64; 4],
+}
+
+impl Defined {
+    fn of(before: &Simulation, after: &Simulation, initial_height: f64, action: &[f32]) -> Self {
+        let torso = after.model().id(Kind::Body, "torso").unwrap();
+        let (height, pitch) = (after.xipos(torso)[2], (-after.xmat(torso)[6]).asin());
+        let mut observation = vec![height - initial_height, 0.0, 1.0];
+        observation.extend(after.body_velocity(torso)[3..].iter().map(|v| 0.3 * v));
+        observation.extend([0.0, pitch]);
+        let (mut electricity, mut torque, mut at_limit) = (0.0, 0.0, 0.0);
+        for (i, (low, high)) in after.model().joint_range().skip(3).enumerate() {
+            let scaled = 2.0 * (after.qpos()[3 + i] - 0.5 * (low + high)) / (high - low);
+            let speed = 0.1 * after.qvel()[3 + i];
+            observation.extend([scaled, speed]);
+            let (a, n) = (f64::from(action[i]), action.len() as f64);
+            electricity += (a * speed).abs() / n;
+            torque += a * a / n;
+            at_limit += if scaled.abs() > 0.99 { 1.0 } else { 0.0 };
         }
-        assert!(touched && fell, "{touched} {fell}");
+        let progress = (place(after) - place(before)) / 0.0165;
+        Self { observation, height, pitch, terms: [progress, -2.0 * electricity, -0.1 * torque, -0.2 * at_limit] }
     }
+}
+
+const FEET: &[&str] = &["foot"];
+const LEGS: &[&str] = &["ffoot", "fshin", "fthigh", "bfoot", "bshin", "bthigh"];
+
+#[rstest]
+#[case::hopper(ROBOTS[0], FEET, |height, _: &[f32]| height > 0.8)]
+#[case::half_cheetah(ROBOTS[1], LEGS, |_, flags: &[f32]| [1, 2, 4, 5].into_iter().all(|flag| flags[flag] == 0.0))]
+fn observation_and_reward_follow_from_the_state(
+    #[case] make: Make,
+    #[case] flags: &[&str],
+    #[case] safe: fn(f64, &[f32]) -> bool,
+) {
+    let mut walker = make();
+    // Aslant, so that also the cheetah falls.
+    let mut start = vec![0.0; walker.spec().state.len()];
+    (start[1], start[2]) = (0.3, 0.9);
+    walker.reset_to(&start);
+    let mut before = recomputed(&walker, &saved(&walker));
+    let initial_height = before.xipos(before.model().id(Kind::Body, "torso").unwrap())[2];
+    let mut previous_flags = vec![0.0; flags.len()];
+    let (mut draws, mut action, mut terms) = (stream(1), vec![0.0; n_actions(&walker)], [0.0; 5]);
+    let (mut touched, mut fell) = (false, false);
+    for _ in 0..300 {
+        // Beyond the motors' range, which costs as received.
+        action.fill_with(|| draws.uniform(-2.0, 2.0) as f32);
+        let transition = walker.step(Action::Continuous(&action), &mut terms);
+        let after = recomputed(&walker, &saved(&walker));
+        let (seen, defined) = (observation(&walker), Defined::of(&before, &after, initial_height, &action));
+        for (x, y) in seen.iter().zip(&defined.observation) {
+            assert!((f64::from(*x) - y.clamp(-5.0, 5.0)).abs() < 1e-6, "{seen:?} {defined:?}"); // f32
+        }
+        assert_eq!(seen[8 + 2 * action.len()..], previous_flags, "flags are one step late");
+        let alive = safe(defined.height, &previous_flags) && defined.pitch.abs() < 1.0;
+        assert_eq!(transition.terminated, !alive);
+        assert_eq!(terms[0], if alive { 1.0 } else { -1.0 });
+        for (x, y) in terms[1..].iter().zip(defined.terms) {
+            assert!((x - y).abs() < 1e-9 * y.abs().max(1.0), "{terms:?} {defined:?}"); // order of sums
+        }
+        previous_flags = touching(&after, flags);
+        touched |= previous_flags.contains(&1.0);
+        fell |= transition.terminated;
+        before = after;
+    }
+    assert!(touched && fell, "{touched} {fell}");
 }
 
 /// Runs 1000-step episodes whether or not the robot has fallen.
@@ -322,19 +340,15 @@ fn endure(make: Make, corner: [f64; 3], actions: Actions, n_steps: usize) {
     }
 }
 
-#[test]
-fn nothing_diverges_in_the_corners_of_the_extreme_sets() {
-    const STEPS: usize = 100_000;
-    thread::scope(|scope| {
-        for make in ROBOTS {
-            scope.spawn(move || {
-                for corner in corners(&make()) {
-                    endure(make, corner, Actions::Uniform, STEPS);
-                    endure(make, corner, Actions::BangBang, STEPS);
-                }
-            });
-        }
-    });
+/// Twenty episodes in each corner.
+#[rstest]
+fn nothing_diverges_in_the_corners_of_the_extreme_sets(
+    #[values(ROBOTS[0], ROBOTS[1])] make: Make,
+    #[values(Actions::Uniform, Actions::BangBang)] actions: Actions,
+) {
+    for corner in corners(&make()) {
+        endure(make, corner, actions, 20_000);
+    }
 }
 
 #[test]

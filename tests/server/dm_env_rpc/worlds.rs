@@ -5,12 +5,14 @@ use super::client::{
     Agent, Seen, Settings, choice, create, destroy, double, floats, int64, join, list, property, read, settings, step,
     text, uint64, vector, write,
 };
-use crate::common::server::{self, Actor, Server, Session, environment, open, until};
+use crate::common::server::{self, Actor, Server, Session, environment, open, refusal, until};
+use insta::assert_snapshot;
 use perturb::proto::{
     SessionResponse,
     dm_env_rpc::v1::{
         self as rpc, DataType, EnvironmentStateType as State, environment_client::EnvironmentClient,
-        environment_request::Payload as Request, environment_response::Payload as Response, tensor::Payload,
+        environment_request::Payload as Request, environment_response::Payload as Response,
+        extensions::properties::PropertySpec, tensor::Payload,
     },
 };
 use tonic::{Code, transport::Channel};
@@ -262,22 +264,32 @@ async fn a_reset_of_the_world_interrupts_its_agent_once() {
     assert_eq!(until_end[length].state, State::Terminated);
 }
 
+/// Every property of the agent's world, those in folders too.
+async fn properties(agent: &mut Agent) -> Vec<PropertySpec> {
+    let mut listed = agent.list("").await;
+    assert!(listed.len() > 10);
+    for folder in ["parameters", "applied"] {
+        listed.extend(agent.list(folder).await);
+    }
+    listed
+}
+
+#[tokio::test]
+async fn without_a_world_there_are_the_servers_properties() {
+    let server = Server::start(&[]);
+    let mut agent = Agent::connect(server.tcp()).await;
+    let keys: Vec<_> = agent.list("").await.into_iter().map(|p| p.spec.unwrap().name).collect();
+    assert_eq!(keys, ["server_version", "environments"]);
+    assert_eq!(agent.refused(property(read("seed"))).await.0, Code::NotFound);
+}
+
 #[tokio::test]
 async fn properties_are_listed_read_and_written_as_their_specs_say() {
     let server = Server::start(&[]);
     for e in &server::catalogue(server.tcp()).await {
-        let mut agent = Agent::connect(server.tcp()).await;
-        let keys: Vec<_> = agent.list("").await.into_iter().map(|p| p.spec.unwrap().name).collect();
-        assert_eq!(keys, ["server_version", "environments"], "without a world");
-        assert_eq!(agent.refused(property(read("seed"))).await.0, Code::NotFound);
-        let world = agent.create(settings(&e.name, [("version", text("E")), ("seed", uint64(u64::MAX))])).await;
-        agent.join(&world).await;
-        let mut listed = agent.list("").await;
-        assert!(listed.len() > 10);
-        for folder in ["parameters", "applied"] {
-            listed.extend(agent.list(folder).await);
-        }
-        for p in &listed {
+        let given = settings(&e.name, [("version", text("E")), ("seed", uint64(u64::MAX))]);
+        let (mut agent, _) = Agent::in_world(server.tcp(), given).await;
+        for p in properties(&mut agent).await {
             let spec = p.spec.as_ref().unwrap();
             assert!(!p.description.is_empty() && p.is_listable != p.is_readable, "{p:?}");
             if p.is_listable {
@@ -309,23 +321,39 @@ async fn properties_are_listed_read_and_written_as_their_specs_say() {
         agent.step(choice(0)).await;
         assert_eq!(values(&mut agent, e).await, before, "{}", e.name);
         assert_eq!(agent.read("seed").await, uint64(u64::MAX));
-        for p in &e.parameters {
-            let key = format!("parameters.{}", p.name);
-            for (value, words) in
-                [(double(p.high * 2.0), p.name.as_str()), (double(f64::NAN), "NaN"), (int64(1), "INT64")]
-            {
-                let (code, message) = agent.refused(property(write(&key, value))).await;
-                assert!(code == Code::InvalidArgument && message.contains(words), "{message}");
-            }
-        }
-        for (key, value, words) in
-            [("seed", int64(-1), "-1"), ("version", text("Q"), "\"Q\""), ("seed", floats(&[], &[]), "FLOAT")]
-        {
-            let (code, message) = agent.refused(property(write(key, value))).await;
-            assert!(code == Code::InvalidArgument && message.contains(words) && message.contains(key), "{message}");
-        }
-        assert_eq!(agent.refused(property(write("parameters.colour", double(1.0)))).await.0, Code::NotFound);
     }
+}
+
+#[tokio::test]
+async fn a_parameter_beyond_its_bounds_is_refused_in_every_environment() {
+    let server = Server::start(&[]);
+    for e in &server::catalogue(server.tcp()).await {
+        let (mut agent, _) = Agent::in_world(server.tcp(), settings(&e.name, [])).await;
+        for p in &e.parameters {
+            let beyond = write(&format!("parameters.{}", p.name), double(p.high * 2.0));
+            let (code, message) = agent.refused(property(beyond)).await;
+            assert!(code == Code::InvalidArgument && message.contains(&p.name), "{message}");
+        }
+    }
+}
+
+#[tokio::test]
+async fn wrong_properties_are_refused_by_name() {
+    let server = Server::start(&[]);
+    let (mut agent, _) = Agent::in_world(server.tcp(), settings("CartPole", [])).await;
+    let mut refusals = String::new();
+    for (key, value) in [
+        ("parameters.mass", double(2e3)),
+        ("parameters.mass", double(f64::NAN)),
+        ("parameters.mass", int64(1)),
+        ("parameters.colour", double(1.0)),
+        ("seed", int64(-1)),
+        ("seed", floats(&[], &[])),
+        ("version", text("Q")),
+    ] {
+        refusals += &refusal(agent.refused(property(write(key, value))).await);
+    }
+    assert_snapshot!(refusals);
 }
 
 /// The values of all parameters.
