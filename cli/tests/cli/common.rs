@@ -10,8 +10,8 @@ use perturb_study::interrupt::StopFlag;
 use perturb_study::settings::TrainConfig;
 use tempfile::TempDir;
 
-/// How long anything may take that must not hang.
-pub const SECONDS: Duration = Duration::from_secs(20);
+/// How long anything may take that must not hang: much longer than it does, as the machine may be busy.
+pub const LIMIT: Duration = Duration::from_secs(300);
 
 pub fn server(workers: usize) -> PrivateServer {
     PrivateServer::start(Some(workers)).unwrap_or_else(|error| panic!("{error}"))
@@ -39,15 +39,31 @@ pub fn perturb(arguments: &[&str]) -> Command {
     command
 }
 
+/// How `perturb` refuses these arguments, for a snapshot: the status and the words, with names for the texts that differ
+/// from run to run.
+#[track_caller]
+pub fn refusal(arguments: &[&str], names: &[(&str, &str)]) -> String {
+    let output = perturb(arguments).output().expect("perturb runs");
+    let status = output.status.code().expect("it ends by itself");
+    assert_ne!(status, 0, "{arguments:?} was not refused");
+    let text = format!("perturb {}\nstatus {status}\n{}\n", arguments.join(" "), stderr(&output));
+    names.iter().fold(text, |text, (long, name)| text.replace(long, name))
+}
+
 pub fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
 /// Waits until `condition` holds.
-pub fn wait_for(what: &str, mut condition: impl FnMut() -> bool) {
+pub fn wait_for(what: &str, condition: impl FnMut() -> bool) {
+    wait_within(LIMIT, what, condition);
+}
+
+/// Waits until `condition` holds, for so long at most.
+pub fn wait_within(limit: Duration, what: &str, mut condition: impl FnMut() -> bool) {
     let start = Instant::now();
     while !condition() {
-        assert!(start.elapsed() < SECONDS, "{what} did not happen within {SECONDS:?}");
+        assert!(start.elapsed() < limit, "{what} did not happen within {limit:?}");
         std::thread::sleep(Duration::from_millis(20));
     }
 }

@@ -5,8 +5,9 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use crate::common::{
-    SECONDS, addresses, child_server, config, is_running, kill, perturb, read, run, server, stderr, wait_for,
+    addresses, child_server, config, is_running, kill, perturb, read, refusal, run, server, stderr, wait_for,
 };
+use insta::assert_snapshot;
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers, Session, StepReply};
 use perturb_learner::evaluation::test;
@@ -14,7 +15,11 @@ use perturb_learner::policy::{ActionKind, Inputs, Policy, PolicySpec, Sequences}
 use perturb_learner::rollout::{Collector, Normalisers, Rollout};
 use perturb_study::Version;
 use perturb_study::interrupt::StopFlag;
+use rstest::rstest;
 use tch::Tensor;
+
+/// How long a training may go on without its server.
+const SOON: Duration = Duration::from_secs(20);
 
 #[test]
 fn a_policy_is_trained_written_and_tested_with_both_algorithms() {
@@ -108,47 +113,61 @@ fn recurrent_policies_are_trained_and_tested_alike_on_one_server_and_on_two() {
     }
 }
 
-/// Pendulum's episodes have 200 steps, so that two rollouts of 150 hold one end, and begin in the middle of an episode.
-#[test]
-fn rollouts_keep_what_a_recurrent_policy_remembers() {
-    let server = [server(1)];
-    let servers = Servers::connect(&addresses(&server)).expect("a connection");
-    let (n_envs, n_steps) = (2, 150);
-    let options = OpenOptions {
+const N_ENVS: usize = 2;
+const N_STEPS: usize = 150;
+
+fn pendulums() -> OpenOptions {
+    OpenOptions {
         environment: "Pendulum".into(),
         version: Version::R,
         parameters: Default::default(),
-        num_envs: n_envs,
+        num_envs: N_ENVS,
         seed: 3,
         episodes_per_trial: 1,
-    };
+    }
+}
+
+/// Pendulum's episodes have 200 steps, so that two rollouts of 150 hold one end, and begin in the middle of an episode.
+fn two_rollouts(servers: &Servers) -> (Policy, [Rollout; 2]) {
     let mut observations = Vec::new();
-    let session = Session::open(&servers, &options, &mut observations).expect("a session");
+    let session = Session::open(servers, &pendulums(), &mut observations).expect("a session");
     let size = session.observation_size();
     let action = ActionKind::Continuous { size: 1 };
     let spec = PolicySpec { observation_size: size, action, hidden: vec![16], lstm: Some(8) };
     let policy = Policy::new(spec.clone(), 1).expect("a policy");
     let none = Normalisers { observations: None, rewards: None };
-    let mut collector = Collector::new(session, observations, &spec, Inputs::new(size, action, n_envs, false), none, 1)
+    let mut collector = Collector::new(session, observations, &spec, Inputs::new(size, action, N_ENVS, false), none, 1)
         .expect("a collector");
     let rollouts = [(); 2].map(|()| {
-        let mut rollout = Rollout::new(n_steps, n_envs, size, 1);
+        let mut rollout = Rollout::new(N_STEPS, N_ENVS, size, 1);
         collector.collect(&policy.weights(), &mut rollout, |_| {}).expect("a rollout");
         rollout
     });
-    drop(collector);
+    (policy, rollouts)
+}
 
-    let [first, second] = &rollouts;
-    assert_eq!(first.memory(), vec![0.0; n_envs * 16]);
+#[test]
+fn rollouts_keep_what_a_recurrent_policy_remembers() {
+    let server = [server(1)];
+    let servers = Servers::connect(&addresses(&server)).expect("a connection");
+    let (_, [first, second]) = two_rollouts(&servers);
+    assert_eq!(first.memory(), vec![0.0; N_ENVS * 16]);
     assert!(second.memory().iter().all(|&x| x != 0.0), "the episodes go on");
     let starts: Vec<usize> = second.starts().iter().enumerate().filter(|(_, start)| **start).map(|(i, _)| i).collect();
     assert_eq!(starts, [100, 101], "after 200 steps");
     let last_values = first.trajectories().expect("a finished rollout").last_values;
-    assert_eq!(last_values, &second.values()[..n_envs], "looking ahead moves nothing on");
+    assert_eq!(last_values, &second.values()[..N_ENVS], "looking ahead moves nothing on");
+}
 
-    // libtorch sees the same values: in each rollout from its own memory, and at the end of the episode.
+/// In each rollout from its own memory, and at the end of the episode.
+#[test]
+fn libtorch_sees_the_values_that_a_recurrent_policy_saw() {
+    let server = [server(1)];
+    let servers = Servers::connect(&addresses(&server)).expect("a connection");
+    let (policy, rollouts) = two_rollouts(&servers);
+    let spec = policy.spec();
     let values = |n_steps: usize, observations: &[f32], starts: &[bool], memory: &[f32]| {
-        let sequences = Sequences::new(&spec, n_steps, observations, starts, memory).expect("shapes that fit");
+        let sequences = Sequences::new(spec, n_steps, observations, starts, memory).expect("shapes that fit");
         Vec::<f32>::from(policy.evaluate(&sequences, &Tensor::of_slice(&vec![0.0f32; starts.len()])).values)
     };
     // Values of order 1, as in the tests of the policy.
@@ -156,26 +175,23 @@ fn rollouts_keep_what_a_recurrent_policy_remembers() {
         got.len() == expected.len() && got.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-5)
     };
     for rollout in &rollouts {
-        let expected = values(n_steps, rollout.observations(), rollout.starts(), rollout.memory());
+        let expected = values(N_STEPS, rollout.observations(), rollout.starts(), rollout.memory());
         assert!(close(rollout.values(), &expected));
     }
 
-    let mut replayed = Session::open(&servers, &options, &mut Vec::new()).expect("a session");
+    let mut replayed = Session::open(&servers, &pendulums(), &mut Vec::new()).expect("a session");
     let mut reply = StepReply::default();
     let actions: Vec<f32> = rollouts.iter().flat_map(|rollout| rollout.actions().to_vec()).collect();
-    for actions in actions.chunks(n_envs).take(200) {
+    for actions in actions.chunks(N_ENVS).take(200) {
         let bytes: Vec<u8> = actions.iter().flat_map(|action| action.to_le_bytes()).collect();
         replayed.step(&bytes, &mut reply).expect("a step");
     }
-    let mut episode = observations_of(&rollouts)[..200 * n_envs * size].to_vec();
+    let observations: Vec<f32> = rollouts.iter().flat_map(|rollout| rollout.observations().to_vec()).collect();
+    let mut episode = observations[..200 * N_ENVS * spec.observation_size].to_vec();
     episode.extend(&reply.final_observations);
-    let expected = values(201, &episode, &vec![false; 201 * n_envs], &vec![0.0; n_envs * 16]);
-    let got = second.trajectories().expect("a finished rollout").truncation_values;
-    assert!(close(&got[49 * n_envs..50 * n_envs], &expected[200 * n_envs..]), "{got:?}");
-}
-
-fn observations_of(rollouts: &[Rollout]) -> Vec<f32> {
-    rollouts.iter().flat_map(|rollout| rollout.observations().to_vec()).collect()
+    let expected = values(201, &episode, &[false; 201 * N_ENVS], &[0.0; N_ENVS * 16]);
+    let got = rollouts[1].trajectories().expect("a finished rollout").truncation_values;
+    assert!(close(&got[49 * N_ENVS..50 * N_ENVS], &expected[200 * N_ENVS..]), "{got:?}");
 }
 
 /// An LSTM of one cell that counts the steps: to the left in the first five, then to the right until the pole falls.
@@ -261,7 +277,7 @@ fn a_server_that_is_killed_ends_the_training_soon_and_leaves_a_checkpoint() {
     let killed = Instant::now();
     kill("-KILL", server);
     let output = child.wait_with_output().expect("perturb ends");
-    assert!(killed.elapsed() < SECONDS, "{:?}", killed.elapsed());
+    assert!(killed.elapsed() < SOON, "{:?}", killed.elapsed());
     assert_eq!(output.status.code(), Some(1));
     let message = stderr(&output);
     assert!(message.contains("lost the server at unix:") && message.contains("signal: 9"), "{message}");
@@ -284,67 +300,70 @@ fn a_learner_that_is_killed_takes_its_server_along() {
     Checkpoint::load(out.path()).expect("a whole checkpoint");
 }
 
-#[test]
-fn a_signal_ends_a_training_after_the_iteration_with_its_checkpoint() {
-    for (signal, status) in [("-INT", 130), ("-TERM", 143)] {
-        let out = tempfile::tempdir().expect("a directory");
-        let path = out.path().to_str().expect("a path");
-        let arguments = ["train", "--env", "CartPole", "--episodes", "1000000", "--out", path];
-        let child = perturb(&arguments).spawn().expect("perturb");
-        wait_for("a checkpoint", || out.path().join("checkpoint/checkpoint.json").exists());
-        let server = child_server(child.id()).expect("a private server");
-        kill(signal, child.id());
-        let output = child.wait_with_output().expect("perturb ends");
-        assert_eq!(output.status.code(), Some(status), "{}", stderr(&output));
-        assert!(stderr(&output).contains("stopped by signal"), "{}", stderr(&output));
-        assert!(stderr(&output).contains(&format!("perturb train --resume {path}")), "{}", stderr(&output));
-        assert!(!is_running(server));
-        let episodes = Checkpoint::load(out.path()).expect("a whole checkpoint").state.counters.episodes;
-        assert_eq!(read(out.path(), "monitor.csv").lines().count() as u64, 2 + episodes);
-    }
+#[rstest]
+#[case::interrupt("-INT", 130)]
+#[case::terminate("-TERM", 143)]
+fn a_signal_ends_a_training_after_the_iteration_with_its_checkpoint(#[case] signal: &str, #[case] status: i32) {
+    let out = tempfile::tempdir().expect("a directory");
+    let path = out.path().to_str().expect("a path");
+    let arguments = ["train", "--env", "CartPole", "--episodes", "1000000", "--out", path];
+    let child = perturb(&arguments).spawn().expect("perturb");
+    wait_for("a checkpoint", || out.path().join("checkpoint/checkpoint.json").exists());
+    let server = child_server(child.id()).expect("a private server");
+    kill(signal, child.id());
+    let output = child.wait_with_output().expect("perturb ends");
+    assert_eq!(output.status.code(), Some(status), "{}", stderr(&output));
+    assert!(stderr(&output).contains("stopped by signal"), "{}", stderr(&output));
+    assert!(stderr(&output).contains(&format!("perturb train --resume {path}")), "{}", stderr(&output));
+    assert!(!is_running(server));
+    let episodes = Checkpoint::load(out.path()).expect("a whole checkpoint").state.counters.episodes;
+    assert_eq!(read(out.path(), "monitor.csv").lines().count() as u64, 2 + episodes);
 }
 
 #[test]
-fn the_program_trains_tests_and_refuses_with_sentences() {
+fn wrong_commands_are_refused_with_sentences_and_delete_nothing() {
+    let out = tempfile::tempdir().expect("a directory");
+    let directory = out.path().to_str().expect("a path");
+    let run = format!("{directory}/run");
+    let new = ["train", "--env", "CartPole", "--out", &run];
+    let overwrite = [&new[..], &["--overwrite"]].concat();
+    let output = perturb(&[&new[..], &["--episodes", "20"]].concat()).output().expect("perturb runs");
+    assert!(output.status.success(), "{}", stderr(&output));
+    let server = server(1);
+    let address = server.address().to_string();
+    let wrong = [
+        new.to_vec(),
+        [&new[..], &["--algorithm", "dqn"]].concat(),
+        [&new[..], &["--algorithm", "rl2-ppo", "--architecture", "ff"]].concat(),
+        [&new[..], &["--architecture", "mlp"]].concat(),
+        [&new[..], &["--set", "foo=1"]].concat(),
+        vec!["train", "--out", &run],
+        vec!["train", "--env", "Pong", "--out", &run, "--overwrite", "--server", &address],
+        [&overwrite[..], &["--set", "n_minibatches=3"]].concat(),
+        [&overwrite[..], &["--server", &address, "--set", "num_envs=20000"]].concat(),
+        vec!["evaluate", "--checkpoint", "/nonexistent"],
+        vec!["envs", "--server", "nowhere"],
+        vec!["envs", "--server", "127.0.0.1:1"],
+    ];
+    let said = wrong.iter().map(|arguments| refusal(arguments, &[(directory, "DIR"), (&address, "SERVER")]));
+    assert_snapshot!(said.collect::<String>());
+    assert!(Path::new(&run).join("checkpoint").exists(), "refusals delete nothing");
+}
+
+#[test]
+fn the_program_trains_and_tests() {
     let out = tempfile::tempdir().expect("a directory");
     let run = out.path().join("run");
     let run = run.to_str().expect("a path");
-    let call = |arguments: &[&str]| perturb(arguments).output().expect("perturb runs");
-    let refused = |arguments: &[&str], status: i32, part: &str| {
-        let output = call(arguments);
-        assert_eq!(output.status.code(), Some(status), "{arguments:?}: {}", stderr(&output));
-        assert!(stderr(&output).contains(part), "{arguments:?}: {}", stderr(&output));
-    };
-
-    let base = ["train", "--env", "CartPole", "--episodes", "20", "--out", run];
-    let output = call(&base);
-    assert!(output.status.success(), "{}", stderr(&output));
-    refused(&base, 1, "already holds a run");
-    refused(
-        &["train", "--env", "CartPole", "--out", run, "--algorithm", "dqn"],
-        2,
-        "possible values: a2c, ppo, epopt-a2c",
-    );
-    let forgetful = ["train", "--env", "CartPole", "--out", run, "--algorithm", "rl2-ppo", "--architecture", "ff"];
-    refused(&forgetful, 2, "rl2-ppo cannot train the architecture ff");
-    refused(&["train", "--env", "CartPole", "--out", run, "--architecture", "mlp"], 2, "possible values: ff, rc");
-    refused(&["train", "--env", "CartPole", "--out", run, "--set", "foo=1"], 2, "unknown key `foo`");
-    refused(&["train", "--out", run], 2, "no environment was named");
-    refused(&["train", "--env", "Pong", "--out", run, "--overwrite"], 1, "there is no environment `Pong`");
-    let overwrite = ["train", "--env", "CartPole", "--out", run, "--overwrite"];
-    refused(&[&overwrite[..], &["--set", "n_minibatches=3"]].concat(), 2, "a divisor of n_steps · num_envs");
-    let other = server(1);
-    let too_many = ["--server", &other.address().to_string(), "--set", "num_envs=20000"];
-    refused(&[&overwrite[..], &too_many].concat(), 1, "refused to open a session");
-    refused(&["evaluate", "--checkpoint", "/nonexistent"], 1, "holds no checkpoint");
-    refused(&["envs", "--server", "nowhere"], 2, "the port is missing");
-    refused(&["envs", "--server", "127.0.0.1:1"], 1, "no server answers at http://127.0.0.1:1");
-    assert!(Path::new(run).join("checkpoint").exists(), "refusals delete nothing");
-
     let json: PathBuf = out.path().join("result.json");
-    let json_text = json.to_str().expect("a path");
-    let output = call(&["evaluate", "--checkpoint", run, "--versions", "D,E", "--episodes", "20", "--json", json_text]);
-    assert!(output.status.success(), "{}", stderr(&output));
+    let json = json.to_str().expect("a path");
+    for arguments in [
+        &["train", "--env", "CartPole", "--episodes", "20", "--out", run][..],
+        &["evaluate", "--checkpoint", run, "--versions", "D,E", "--episodes", "20", "--json", json],
+    ] {
+        let output = perturb(arguments).output().expect("perturb runs");
+        assert!(output.status.success(), "{}", stderr(&output));
+    }
     let value: serde_json::Value = serde_json::from_str(&read(out.path(), "result.json")).expect("JSON");
     for (key, expected) in [
         ("environment", serde_json::json!("CartPole")),
@@ -361,8 +380,11 @@ fn the_program_trains_tests_and_refuses_with_sentences() {
     for key in ["success_percent", "mean_return", "mean_length"] {
         assert!(results["D"][key].is_number(), "{key}");
     }
+}
 
-    let output = call(&["envs", "--json"]);
+#[test]
+fn the_program_prints_the_catalogue() {
+    let output = perturb(&["envs", "--json"]).output().expect("perturb runs");
     let catalogue: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!(catalogue["environments"][0]["parameters"][0]["name"], "force");
     assert_eq!(catalogue["environments"][0]["parameters"][0]["E"], serde_json::json!([[1.0, 5.0], [15.0, 20.0]]));

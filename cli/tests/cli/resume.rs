@@ -5,12 +5,14 @@ use std::path::{Path, PathBuf};
 use std::process::Child;
 use std::time::Duration;
 
-use crate::common::{addresses, child_server, config, kill, perturb, read, run, server, stderr, wait_for};
+use crate::common::{addresses, child_server, config, kill, perturb, read, refusal, run, server, stderr, wait_for};
+use insta::assert_snapshot;
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{ClientError, OpenOptions, Servers, Session, StepReply};
 use perturb_learner::training::{Outcome, RunDirectory, resume, train};
 use perturb_study::Version;
 use perturb_study::interrupt::StopFlag;
+use serde_json::Value;
 use tempfile::TempDir;
 
 /// Each algorithm with each architecture, discrete and continuous actions, and MuJoCo. Rollouts end in mid-episode,
@@ -331,106 +333,117 @@ fn numbers_that_are_not_finite_leave_the_last_checkpoint() {
     assert_eq!(saved.state.counters.iterations, 1, "the one that was there before");
 }
 
-#[test]
-fn a_run_that_cannot_be_resumed_says_why() {
-    let (_server, servers) = servers_of(1);
-    let base = broken_off();
-    let refused = |change: &dyn Fn(&Path), parts: &[&str]| {
-        let out = tempfile::tempdir().expect("a directory");
-        copy(base.path(), out.path());
-        change(out.path());
-        let monitor = fs::read(out.path().join("monitor.csv")).unwrap_or_default();
-        let error = go_on(&servers, out.path()).expect_err("it cannot be resumed");
-        for part in parts {
-            assert!(error.contains(part), "{part}: {error}");
-        }
-        assert_eq!(fs::read(out.path().join("monitor.csv")).unwrap_or_default(), monitor, "nothing was changed");
-    };
-    let edit = |run: &Path, pointer: &str, value: serde_json::Value| {
-        let path = run.join("checkpoint/checkpoint.json");
-        let mut document: serde_json::Value = serde_json::from_slice(&bytes(&path)).expect("JSON");
-        *document.pointer_mut(pointer).expect("a value") = value;
-        fs::write(path, document.to_string()).expect("a file");
-    };
-    let folder_file = |run: &Path, prefix: &str| {
-        let folder = run.join("checkpoint");
-        folder.join(names(&folder).into_iter().find(|name| name.starts_with(prefix)).expect("a file"))
-    };
+fn edit(run: &Path, pointer: &str, value: Value) {
+    let path = run.join("checkpoint/checkpoint.json");
+    let mut document: Value = serde_json::from_slice(&bytes(&path)).expect("JSON");
+    *document.pointer_mut(pointer).expect("a value") = value;
+    fs::write(path, document.to_string()).expect("a file");
+}
 
-    refused(
-        &|run| edit(run, "/environment_spec/revision", 77.into()),
-        &["trained in CartPole with revision 77", "version of perturb-server"],
-    );
-    refused(
-        &|run| edit(run, "/environment_spec/model_hash", "abc".into()),
-        &["trained in CartPole with model \"abc\", the server's has \"\""],
-    );
-    refused(
-        &|run| edit(run, "/config/num_envs", 6.into()),
-        &["checkpoint.json", "config: reward_normaliser: returns has 4 numbers, expected 6"],
-    );
-    refused(&|run| edit(run, "/config/seed", 9.into()), &["config: seed is 9, but the training began with 1"]);
-    refused(&|run| edit(run, "/config/gamma", 0.5.into()), &["reward_normaliser: gamma is 0.99, but 0.5 in the"]);
-    refused(&|run| edit(run, "/config/num_envs", 0.into()), &["checkpoint.json", "config: num_envs is 0, but must be"]);
-    refused(&|run| edit(run, "/episodes_per_trial", 0.into()), &["episodes_per_trial is 0, which"]);
-    refused(&|run| edit(run, "/algorithm", "rl2-ppo".into()), &["policy: observation_size is 4, expected 8"]);
-    refused(&|run| edit(run, "/resume/algorithm/rng", serde_json::Value::Null), &["cannot bring the optimiser back"]);
-    refused(&|run| edit(run, "/resume/history", 5.into()), &["checkpoint.json", "resume is not understood"]);
-    let without_state = |run: &Path| {
-        edit(run, "/resume", serde_json::Value::Null);
+/// The file of the checkpoint whose name begins so.
+fn file(run: &Path, prefix: &str) -> PathBuf {
+    let folder = run.join("checkpoint");
+    folder.join(names(&folder).into_iter().find(|name| name.starts_with(prefix)).expect("a file"))
+}
+
+fn flip_a_bit(path: &Path) {
+    let mut content = bytes(path);
+    let middle = content.len() / 2;
+    content[middle] ^= 1;
+    fs::write(path, content).expect("a file");
+}
+
+/// What may happen to a run so that it cannot go on.
+const DAMAGES: &[(&str, fn(&Path))] = &[
+    ("another revision of the environment", |run| edit(run, "/environment_spec/revision", 77.into())),
+    ("another model", |run| edit(run, "/environment_spec/model_hash", "abc".into())),
+    ("more environments", |run| edit(run, "/config/num_envs", 6.into())),
+    ("another seed", |run| edit(run, "/config/seed", 9.into())),
+    ("another discount", |run| edit(run, "/config/gamma", 0.5.into())),
+    ("no environments", |run| edit(run, "/config/num_envs", 0.into())),
+    ("trials without episodes", |run| edit(run, "/episodes_per_trial", 0.into())),
+    ("another algorithm", |run| edit(run, "/algorithm", "rl2-ppo".into())),
+    ("no random stream of the optimiser", |run| edit(run, "/resume/algorithm/rng", Value::Null)),
+    ("a history that is none", |run| edit(run, "/resume/history", 5.into())),
+    ("nothing to go on with", |run| {
+        edit(run, "/resume", Value::Null);
         Checkpoint::load(run).expect("it can be tested");
-    };
-    refused(&without_state, &["can be tested but not resumed"]);
-    for prefix in ["resume-", "weights-"] {
-        let flip = |run: &Path| {
-            let path = folder_file(run, prefix);
-            let mut content = bytes(&path);
-            let middle = content.len() / 2;
-            content[middle] ^= 1;
-            fs::write(path, content).expect("a file");
-        };
-        refused(&flip, &[prefix, "is not a usable checkpoint", "another checksum"]);
-        refused(&|run| fs::remove_file(folder_file(run, prefix)).expect("a file"), &["cannot read", prefix]);
-    }
-    let shorten = |run: &Path| {
+    }),
+    ("a bit of the state", |run| flip_a_bit(&file(run, "resume-"))),
+    ("a bit of the weights", |run| flip_a_bit(&file(run, "weights-"))),
+    ("no state", |run| fs::remove_file(file(run, "resume-")).expect("a file")),
+    ("no weights", |run| fs::remove_file(file(run, "weights-")).expect("a file")),
+    ("half a log", |run| {
         let path = run.join("monitor.csv");
         fs::write(&path, &bytes(&path)[..200]).expect("a file");
-    };
-    refused(&shorten, &["monitor.csv has changed since the checkpoint was written: it has 200 bytes, but had"]);
-    refused(&|run| fs::remove_file(run.join("progress.csv")).expect("a file"), &["progress.csv", "it is gone"]);
-    refused(&|run| fs::remove_dir_all(run.join("checkpoint")).expect("a folder"), &["there is nothing to resume"]);
-    refused(
-        &|run| {
-            names(run)
-                .iter()
-                .for_each(|name| drop(fs::remove_file(run.join(name)).or_else(|_| fs::remove_dir_all(run.join(name)))))
-        },
-        &["holds no run"],
-    );
-    let error = |path: &Path| format!("{:#}", RunDirectory::resume(path).expect_err("no run"));
-    assert!(error(&base.path().join("checkpoint")).contains("is the checkpoint in a run"));
-    assert!(error(&base.path().join("nowhere")).contains("there is no such directory"));
+    }),
+    ("no log", |run| fs::remove_file(run.join("progress.csv")).expect("a file")),
+    ("no checkpoint", |run| fs::remove_dir_all(run.join("checkpoint")).expect("a folder")),
+    ("nothing at all", |run| {
+        fs::remove_dir_all(run).expect("a folder");
+        fs::create_dir(run).expect("a folder");
+    }),
+];
+
+#[test]
+fn a_run_that_cannot_be_resumed_says_why_and_is_not_changed() {
+    let (_server, servers) = servers_of(1);
+    let base = broken_off();
+    let mut said = String::new();
+    for (damage, to) in DAMAGES {
+        let out = tempfile::tempdir().expect("a directory");
+        copy(base.path(), out.path());
+        to(out.path());
+        let monitor = fs::read(out.path().join("monitor.csv")).unwrap_or_default();
+        let mut error = go_on(&servers, out.path()).expect_err(damage);
+        error = error.replace(&out.path().display().to_string(), "RUN");
+        for name in names(&base.path().join("checkpoint")) {
+            // Numbers of the training and a checksum are in the names.
+            error = error.replace(&name, name.split_once('-').map_or(&name, |(kind, _)| kind));
+        }
+        // How long the log was depends on the times in it.
+        let length = error.find("but had ").map(|start| start + "but had ".len());
+        let digits = |start: usize| error[start..].chars().take_while(char::is_ascii_digit).count();
+        if let Some((start, digits)) = length.map(|start| (start, digits(start))) {
+            error.replace_range(start..start + digits, "N");
+        }
+        said += &format!("{damage}\n{error}\n\n");
+        assert_eq!(fs::read(out.path().join("monitor.csv")).unwrap_or_default(), monitor, "{damage}");
+    }
+    assert_snapshot!(said);
     go_on(&servers, base.path()).expect("untouched, it goes on");
+}
+
+#[test]
+fn what_is_no_run_is_not_resumed() {
+    let base = broken_off();
+    let error = |name: &str| {
+        let error = RunDirectory::resume(&base.path().join(name)).expect_err("no run");
+        format!("{error:#}").replace(&base.path().display().to_string(), "RUN")
+    };
+    let inside = "RUN/checkpoint is the checkpoint in a run; give the run's directory, which holds it";
+    assert_eq!(error("checkpoint"), inside);
+    assert!(error("nowhere").starts_with("RUN/nowhere"), "{}", error("nowhere"));
+    assert!(error("nowhere").contains("there is no such directory"), "{}", error("nowhere"));
 }
 
 #[test]
 fn the_program_resumes_what_is_left_to_do_and_nobody_else_does() {
     let base = broken_off();
     let run = base.path().to_str().expect("a path");
-    let refused = |arguments: &[&str], status: i32, part: &str| {
-        let output = perturb(arguments).output().expect("perturb runs");
-        assert_eq!(output.status.code(), Some(status), "{arguments:?}: {}", stderr(&output));
-        assert!(stderr(&output).contains(part), "{arguments:?}: {}", stderr(&output));
-    };
-    refused(&["train", "--resume", run, "--out", run], 2, "cannot be used with");
-    refused(&["train", "--resume", run, "--set", "seed=2"], 2, "cannot be used with");
-    refused(&["train", "--env", "CartPole"], 2, "--out <DIR>");
-    refused(&["train", "--resume", run, "--server", "unix:/tmp/x", "--workers", "1"], 2, "--workers is for the server");
-
+    let refused = |arguments: &[&str]| refusal(arguments, &[(run, "RUN")]);
+    let mut said = [
+        &["train", "--resume", run, "--out", run][..],
+        &["train", "--resume", run, "--set", "seed=2"],
+        &["train", "--env", "CartPole"],
+        &["train", "--resume", run, "--server", "unix:/tmp/x", "--workers", "1"],
+    ]
+    .map(refused)
+    .concat();
     let held = RunDirectory::resume(base.path()).expect("a run");
-    refused(&["train", "--resume", run], 1, &format!("another process trains in {run}"));
-    let overwrite = ["train", "--env", "CartPole", "--out", run, "--overwrite"];
-    refused(&overwrite, 1, &format!("another process trains in {run}"));
+    said += &refused(&["train", "--resume", run]);
+    said += &refused(&["train", "--env", "CartPole", "--out", run, "--overwrite"]);
+    assert_snapshot!(said);
     drop(held);
 
     for finished in [false, true] {

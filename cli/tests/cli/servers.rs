@@ -4,9 +4,8 @@ use std::collections::BTreeMap;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::Child;
-use std::time::{Duration, Instant};
 
-use crate::common::{addresses, kill, perturb, server, stderr};
+use crate::common::{addresses, kill, perturb, server, stderr, wait_for};
 use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers, Session};
 use perturb_study::Version;
 use perturb_study::{Folder, Plan};
@@ -24,17 +23,6 @@ name = 'a2c'
 architectures = ['ff']
 grid = { learning_rate = [7e-3, 7e-4] }
 ";
-
-/// How long anything may take that must not hang.
-const LIMIT: Duration = Duration::from_secs(300);
-
-fn wait_for(what: &str, mut condition: impl FnMut() -> bool) {
-    let start = Instant::now();
-    while !condition() {
-        assert!(start.elapsed() < LIMIT, "{what} did not happen within {LIMIT:?}");
-        std::thread::sleep(Duration::from_millis(20));
-    }
-}
 
 /// One folder with runs of [`PLAN`].
 struct Runs {

@@ -5,8 +5,9 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use crate::common::{addresses, child_server, kill, perturb, run, server, stderr, wait_for};
+use crate::common::{addresses, child_server, kill, perturb, refusal, run, server, stderr, wait_for};
 use gif::{ColorOutput, DecodeOptions};
+use insta::assert_snapshot;
 use perturb_cli::video::{Footage, VideoFile, VideoOptions, film};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{PrivateServer, Servers};
@@ -239,31 +240,37 @@ fn what_cannot_be_filmed_is_refused_in_words() {
     let server = server(1);
     let (out, _) = trained(&server, CART_POLE);
     let folder = tempfile::tempdir().expect("a folder");
-    let [good, no_video, blocked, unnamed] = ["a.gif", "a.avi", "file/a.gif", "a"].map(|name| folder.path().join(name));
     std::fs::write(folder.path().join("file"), "").expect("a file");
-    let refused = |file: &Path, more: &[&str], code: i32, part: &str| {
-        let output = video(&out, file, more).output().expect("perturb");
-        assert_eq!(output.status.code(), Some(code), "{more:?}: {}", stderr(&output));
-        assert!(stderr(&output).contains(part), "{more:?}: {}", stderr(&output));
-    };
-    refused(&no_video, &[], 2, "ends in .mp4 or .gif");
-    refused(&unnamed, &[], 2, "ends in .mp4 or .gif");
-    refused(&blocked, &[], 1, "file");
-    refused(&good, &["--episodes", "0"], 2, "--episodes");
-    refused(&good, &["--version", "X"], 2, "possible values: D, R, E");
-    refused(&good, &["--fps", "0"], 2, "0.1 to 1000");
-    refused(&good, &["--seed=-1"], 2, "--seed");
-    refused(&good, &["--server", "unix:/nowhere.sock"], 1, "no server answers");
-    refused(&good, &["--server", &server.address().to_string(), "--workers", "2"], 2, "--workers");
-    for (side, size) in [("--width", "239"), ("--height", "2049")] {
-        let mut command = perturb(&["video", "--out", good.to_str().expect("UTF-8"), side, size, "--checkpoint"]);
-        let output = command.arg(out.path()).output().expect("perturb");
-        assert_eq!(output.status.code(), Some(2));
-        assert!(stderr(&output).contains("expected 240 to 2048"), "{}", stderr(&output));
-    }
     let empty = tempfile::tempdir().expect("a folder");
-    let output = video(&empty, &good, &[]).output().expect("perturb");
-    assert!(stderr(&output).contains("holds no checkpoint"), "{}", stderr(&output));
+    let [run, directory, nothing] = [&out, &folder, &empty].map(|path| path.path().to_str().expect("UTF-8"));
+    let address = server.address().to_string();
+    let in_folder = |name: &str| format!("{directory}/{name}");
+    let film = |name: &str, more: &[&str]| {
+        let file = in_folder(name);
+        let arguments = [&["video", "--checkpoint", run, "--out", &file][..], more].concat();
+        refusal(&arguments, &[(run, "RUN"), (directory, "DIR"), (&address, "SERVER")])
+    };
+    let mut said = String::new();
+    said += &film("a.avi", &[]);
+    said += &film("a", &[]);
+    said += &film("file/a.gif", &[]);
+    for wrong in [
+        &["--episodes", "0"][..],
+        &["--version", "X"],
+        &["--fps", "0"],
+        &["--seed=-1"],
+        &["--server", "unix:/nowhere.sock"],
+        &["--server", &address, "--workers", "2"],
+        &["--width", "239"],
+        &["--height", "2049"],
+    ] {
+        said += &film("a.gif", wrong);
+    }
+    said += &refusal(
+        &["video", "--checkpoint", nothing, "--out", &in_folder("a.gif")],
+        &[(nothing, "EMPTY"), (directory, "DIR")],
+    );
+    assert_snapshot!(said);
     assert_eq!(names(&folder), [folder.path().join("file")], "nothing was written");
 }
 

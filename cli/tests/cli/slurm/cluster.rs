@@ -5,8 +5,9 @@ use std::fs;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
+use crate::common::wait_within;
 use tempfile::TempDir;
 
 const PROGRAMS: [&str; 6] = ["munged", "slurmctld", "slurmd", "sbatch", "squeue", "sinfo"];
@@ -59,7 +60,7 @@ impl Cluster {
         // Temporary directories may be written by others, which it would refuse.
         cluster.daemon("munged", &[&["--foreground".to_owned(), "--force".to_owned()], &munged[..]].concat());
         let socket = path.join("munge-socket");
-        wait_for("munged", START_LIMIT, || socket.exists());
+        wait_within(START_LIMIT, "munged", || socket.exists());
         cluster.daemon("slurmctld", &["-D".to_owned()]);
         for node in ["n1", "n2"] {
             cluster.daemon("slurmd", &["-D".to_owned(), "-N".to_owned(), node.to_owned()]);
@@ -68,7 +69,7 @@ impl Cluster {
             let output = cluster.command("sinfo").args(["--noheader", "--Node", "--format=%T"]).output();
             output.is_ok_and(|output| output.stdout == b"idle\nidle\n")
         };
-        wait_for("two idle nodes", START_LIMIT, idle);
+        wait_within(START_LIMIT, "two idle nodes", idle);
         cluster
     }
 
@@ -178,14 +179,6 @@ fn parent(id: u32) -> u32 {
 
 fn kill(id: u32) {
     let _ = Command::new("kill").args(["-KILL", &id.to_string()]).stderr(Stdio::null()).status();
-}
-
-pub fn wait_for(what: &str, limit: Duration, mut condition: impl FnMut() -> bool) {
-    let start = Instant::now();
-    while !condition() {
-        assert!(start.elapsed() < limit, "{what} did not happen within {limit:?}");
-        std::thread::sleep(Duration::from_millis(20));
-    }
 }
 
 /// As small as it goes, and quick to notice a lost node and to give its jobs to another one.

@@ -8,14 +8,15 @@ use std::fs;
 use std::io::Write;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Child, Command, Output};
 use std::time::{Duration, Instant};
 
 use perturb_learner::client::PrivateServer;
 use perturb_study::{Folder, Plan};
 use tempfile::TempDir;
 
-use self::cluster::{Cluster, wait_for};
+use self::cluster::Cluster;
+use crate::common::{kill, perturb, stderr, wait_within};
 
 /// Set to 1, Slurm must be there.
 const REQUIRED: &str = "PERTURB_SLURM_REQUIRED";
@@ -63,11 +64,10 @@ impl Experiment {
     }
 
     fn run(&self, name: &str, arguments: &[&str]) -> Command {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_perturb"));
-        command.arg("run").arg(&self.file).arg("--out").arg(self.out(name)).args(arguments);
+        let mut command = perturb(&["run"]);
+        command.arg(&self.file).arg("--out").arg(self.out(name)).args(arguments);
         // Whether a training begins or goes on stands in its log then.
         command.env("RUST_LOG", "warn,perturb_learner::training=debug");
-        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         command
     }
 
@@ -79,6 +79,10 @@ impl Experiment {
 
     fn cell(&self, name: &str, id: &str) -> PathBuf {
         Folder::new(&self.out(name)).cell(id).path().to_owned()
+    }
+
+    fn result(&self, id: &str) -> PathBuf {
+        self.cell("slurm", id).join("result.json")
     }
 
     /// The bytes of all results.
@@ -96,8 +100,8 @@ impl Experiment {
     /// What `perturb report` prints and writes.
     fn report(&self, name: &str) -> BTreeMap<String, Vec<u8>> {
         let page = self.out("page.html");
-        let mut command = Command::new(env!("CARGO_BIN_EXE_perturb"));
-        let output = command.arg("report").arg(self.out(name)).arg("--html").arg(&page).output().expect("ended");
+        let mut command = perturb(&["report"]);
+        let output = command.arg(self.out(name)).arg("--html").arg(&page).output().expect("ended");
         assert!(output.status.success(), "{}", stderr(&output));
         let mut files =
             BTreeMap::from([("text".into(), output.stdout), ("page".into(), fs::read(page).expect("read"))]);
@@ -112,10 +116,6 @@ impl Experiment {
         let text = fs::read_to_string(self.out(name).join("slurm/1/cells.txt")).expect("a list");
         text.lines().map(|line| line.split(',').map(str::to_owned).collect()).collect()
     }
-}
-
-fn stderr(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
 fn end(child: Child) -> Output {
@@ -144,97 +144,109 @@ fn a_plan_survives_the_loss_of_a_node() {
     let whole = end(experiment.run("whole", &["--jobs", "2"]).spawn().expect("started"));
     assert!(whole.status.success(), "{}", stderr(&whole));
     let local_seconds = start.elapsed().as_secs();
-
     let mut cluster = Cluster::start();
     refusals(&experiment, &cluster);
 
-    // Ctrl-C leaves the jobs alone, and the same command finds them again.
     let start = Instant::now();
+    let mut run = interrupted_and_begun_again(&experiment, &cluster);
+    let victim = in_mid_training_on_n1(&experiment, &cluster, &mut run);
+    cluster.kill_node(1);
+    let killed_after = start.elapsed().as_secs();
+    let results = || experiment.results("slurm").into_keys();
+    let done: Vec<_> = results().map(|id| (id, identity(&experiment.result(id)))).collect();
+    assert!(!done.iter().any(|(id, _)| *id == victim), "{victim} was done before the node died");
+
+    let output = end(run);
+    let said = stderr(&output);
+    assert!(output.status.success(), "{said}\n{}", cluster.logs());
+    assert!(said.contains("is in the queue, with ") && said.contains(" cells are done"), "{said}");
+    let seconds = start.elapsed().as_secs();
+    same_results_and_report(&experiment);
+    let moved = job_that_moved(&experiment);
+    assert!(experiment.jobs("slurm")[moved].contains(&victim));
+    nothing_was_done_twice(&experiment, &victim, done);
+    say(&format!(
+        "{} cells in {} jobs: {seconds} s on two nodes, n1 killed after {killed_after} s, job {moved} went to n2, \
+         where {victim} went on from its checkpoint; {local_seconds} s locally, and the report is the same",
+        experiment.plan.cells.len(),
+        experiment.jobs("slurm").len(),
+    ));
+    shared_server(&experiment, &cluster);
+}
+
+/// Ctrl-C leaves the jobs alone, and the same command finds them again.
+fn interrupted_and_begun_again(experiment: &Experiment, cluster: &Cluster) -> Child {
     let arguments = ["--cells-per-job", "2", "--time", "2:00:00"];
-    let first = experiment.on(&cluster, "slurm", &arguments).spawn().expect("started");
-    wait_for("jobs on both nodes", LIMIT, || ["n1", "n2"].iter().all(|node| !cluster.running_on(node).is_empty()));
-    assert!(Command::new("kill").args(["-INT", &first.id().to_string()]).status().expect("kill").success());
+    let first = experiment.on(cluster, "slurm", &arguments).spawn().expect("started");
+    wait_within(LIMIT, "jobs on both nodes", || ["n1", "n2"].iter().all(|node| !cluster.running_on(node).is_empty()));
+    kill("-INT", first.id());
     let first = end(first);
     assert_eq!(first.status.code(), Some(130), "{}", stderr(&first));
     assert!(stderr(&first).contains("goes on: the same command watches it again, scancel "), "{}", stderr(&first));
-    let mut second = experiment.on(&cluster, "slurm", &arguments).spawn().expect("started");
+    experiment.on(cluster, "slurm", &arguments).spawn().expect("started")
+}
 
-    // A node dies in the middle of a training.
+/// Waits for a cell whose training on node n1 has begun and is not so far that it may end before the node is killed.
+fn in_mid_training_on_n1(experiment: &Experiment, cluster: &Cluster, run: &mut Child) -> String {
     let jobs = experiment.jobs("slurm");
     let in_work = |id: &String| {
         let cell = experiment.cell("slurm", id);
         let budget = experiment.plan.find(id).map_or(0, |cell| cell.config.common.episodes as usize);
         let log = fs::read_to_string(cell.join("training/monitor.csv"));
         let trained = log.map_or(0, |text| text.lines().count());
-        // Not so far that it may end before it is killed.
         (3..budget / 2).contains(&trained) && cell.join("training/checkpoint/checkpoint.json").exists()
     };
     let mut victim = None;
-    wait_for("a training on n1", LIMIT, || {
+    wait_within(LIMIT, "a training on n1", || {
         let cells = cluster.running_on("n1").into_iter().flat_map(|job| jobs[job].clone());
         victim = cells.into_iter().find(in_work);
-        let ended = second.try_wait().expect("its status");
+        let ended = run.try_wait().expect("its status");
         assert!(
             victim.is_some() || ended.is_none(),
             "no training on n1 was seen in its first half before all had ended"
         );
         victim.is_some()
     });
-    cluster.kill_node(1);
-    let killed_after = start.elapsed().as_secs();
-    let victim = victim.expect("a cell");
-    let file = |id: &str| experiment.cell("slurm", id).join("result.json");
-    let done: Vec<_> = experiment.results("slurm").into_keys().map(|id| (id, identity(&file(id)))).collect();
-    assert!(!done.iter().any(|(id, _)| *id == victim), "{victim} was done before the node died");
+    victim.expect("a cell")
+}
 
-    let output = end(second);
-    let said = stderr(&output);
-    assert!(output.status.success(), "{said}\n{}", cluster.logs());
-    assert!(said.contains("is in the queue, with ") && said.contains(" cells are done"), "{said}");
-    let seconds = start.elapsed().as_secs();
-
-    // The same results, byte for byte, and the same report.
-    let cells = experiment.plan.cells.len();
-    assert_eq!(experiment.results("whole").len(), cells);
+/// Byte for byte.
+fn same_results_and_report(experiment: &Experiment) {
+    assert_eq!(experiment.results("whole").len(), experiment.plan.cells.len());
     assert!(experiment.results("slurm") == experiment.results("whole"), "results differ");
     let (whole, slurm) = (experiment.report("whole"), experiment.report("slurm"));
     assert!(whole.keys().eq(slurm.keys()));
     for (name, content) in &whole {
         assert!(*content == slurm[name], "{name} differs");
     }
-    // Nothing was submitted twice: Slurm gave the lost job to the other node.
-    assert!(!experiment.out("slurm/slurm/2").exists(), "{said}");
-    let restarted: Vec<usize> = (0..jobs.len())
+}
+
+/// The one job that Slurm gave to the other node. Nothing was submitted twice.
+fn job_that_moved(experiment: &Experiment) -> usize {
+    assert!(!experiment.out("slurm/slurm/2").exists());
+    let moved: Vec<usize> = (0..experiment.jobs("slurm").len())
         .filter(|job| {
             let log = fs::read_to_string(experiment.out(&format!("slurm/slurm/1/{job}.log"))).expect("a log");
             log.contains("on n1, restarted 0 times") && log.contains("on n2, restarted 1 times")
         })
         .collect();
-    assert_eq!(restarted.len(), 1);
-    assert!(jobs[restarted[0]].contains(&victim));
-    // No cell was done twice: what was done stayed, and the training that was broken off went on from its checkpoint.
+    assert_eq!(moved.len(), 1);
+    moved[0]
+}
+
+/// What was done stayed, and the training that was broken off went on from its checkpoint.
+fn nothing_was_done_twice(experiment: &Experiment, victim: &str, done: Vec<(&str, Option<(u64, i64, i64)>)>) {
     for (id, before) in done {
-        assert_eq!(identity(&file(id)), before, "{id} was written again");
+        assert_eq!(identity(&experiment.result(id)), before, "{id} was written again");
     }
     for cell in &experiment.plan.cells {
-        assert_eq!(experiment.said("slurm", &cell.id, "training begins"), 1, "{}", cell.id);
-        assert_eq!(
-            experiment.said("slurm", &cell.id, "training goes on"),
-            usize::from(cell.id == victim),
-            "{}",
-            cell.id
-        );
+        let said = |words: &str| experiment.said("slurm", &cell.id, words);
+        assert_eq!(said("training begins"), 1, "{}", cell.id);
+        assert_eq!(said("training goes on"), usize::from(cell.id == victim), "{}", cell.id);
         for version in cell.tests.sets.iter().filter_map(|set| set.plain()) {
-            assert_eq!(experiment.said("slurm", &cell.id, &format!("testing on {version}")), 1, "{}", cell.id);
+            assert_eq!(said(&format!("testing on {version}")), 1, "{}", cell.id);
         }
     }
-    say(&format!(
-        "{cells} cells in {} jobs: {seconds} s on two nodes, n1 killed after {killed_after} s, job {} went to n2, \
-         where {victim} went on from its checkpoint; {local_seconds} s locally, and the report is the same",
-        jobs.len(),
-        restarted[0]
-    ));
-    shared_server(&experiment, &cluster);
 }
 
 /// What Slurm refuses is said in its words, and leaves nothing behind.

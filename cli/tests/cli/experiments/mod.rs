@@ -1,0 +1,110 @@
+//! Experiments with real worker processes and servers.
+
+mod reports;
+mod running;
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::process::{Child, Command, Output};
+
+use crate::common::{is_running, kill, perturb, stderr, wait_for};
+use perturb_study::{CellResult, CellState, Folder, Plan};
+use tempfile::TempDir;
+
+/// Eight cells of a second or so.
+const PLAN: &str = "
+environments = ['CartPole', 'Pendulum']
+versions = ['D', 'E']
+test_versions = ['D', 'R']
+test_episodes = 12
+settings = { episodes = 40, num_envs = 4 }
+
+[[algorithm]]
+name = 'a2c'
+architectures = ['ff']
+grid = { learning_rate = [7e-3, 7e-4] }
+";
+
+struct Experiment {
+    directory: TempDir,
+    plan: Plan,
+}
+
+impl Experiment {
+    fn new(text: &str) -> Self {
+        let directory = tempfile::tempdir().expect("a directory");
+        std::fs::write(directory.path().join("file.toml"), text).expect("written");
+        let plan = Plan::parse("file.toml", text.into()).unwrap_or_else(|error| panic!("{error}"));
+        Self { directory, plan }
+    }
+
+    fn out(&self, name: &str) -> PathBuf {
+        self.directory.path().join(name)
+    }
+
+    fn command(&self, name: &str, arguments: &[&str]) -> Command {
+        let mut command = perturb(&["run"]);
+        command.arg(self.directory.path().join("file.toml")).arg("--out").arg(self.out(name)).args(arguments);
+        command
+    }
+
+    fn run(&self, name: &str, arguments: &[&str]) -> Output {
+        let child = self.command(name, arguments).spawn().expect("started");
+        child.wait_with_output().expect("ended")
+    }
+
+    /// The page that `perturb report` makes of a run.
+    fn page(&self, name: &str) -> String {
+        let path = self.out("page.html");
+        let mut command = perturb(&["report"]);
+        succeeded(&command.arg(self.out(name)).arg("--html").arg(&path).output().expect("ended"));
+        std::fs::read_to_string(path).expect("a page")
+    }
+
+    /// Small heatmaps of a run.
+    fn heatmap(&self, name: &str, arguments: &[&str]) -> Output {
+        let mut command = perturb(&["heatmap", "--grid", "2", "--episodes", "1"]);
+        command.arg(self.out(name)).args(arguments).output().expect("ended")
+    }
+
+    /// The bytes of all results.
+    fn results(&self, name: &str) -> BTreeMap<String, Vec<u8>> {
+        let folder = Folder::new(&self.out(name));
+        let read = |id: &str| std::fs::read(folder.cell(id).path().join("result.json")).ok();
+        self.plan.cells.iter().filter_map(|cell| Some((cell.id.clone(), read(&cell.id)?))).collect()
+    }
+
+    fn cell_result(&self, name: &str, index: usize) -> Box<CellResult> {
+        match Folder::new(&self.out(name)).state(&self.plan.cells[index]) {
+            Ok(CellState::Done(result)) => result,
+            other => panic!("cell {index} is {other:?}"),
+        }
+    }
+
+    /// How often a training was begun.
+    fn attempts(&self, name: &str) -> Vec<usize> {
+        let folder = Folder::new(&self.out(name));
+        let log = |id: &str| std::fs::read_to_string(folder.cell(id).log()).unwrap_or_default();
+        self.plan.cells.iter().map(|cell| log(&cell.id).lines().filter(|line| *line == "training").count()).collect()
+    }
+}
+
+#[track_caller]
+fn succeeded(output: &Output) {
+    assert!(output.status.success(), "{}: {}", output.status, stderr(output));
+}
+
+/// The processes that `parent` started.
+fn children(parent: u32) -> Vec<u32> {
+    let list = std::fs::read_to_string(format!("/proc/{parent}/task/{parent}/children")).unwrap_or_default();
+    list.split_whitespace().filter_map(|id| id.parse().ok()).collect()
+}
+
+/// Kills a run with -9, and waits until all that it started has ended.
+fn kill_all(mut child: Child) {
+    let started = children(child.id());
+    assert!(!started.is_empty());
+    kill("-KILL", child.id());
+    child.wait().expect("ended");
+    wait_for("the end of what the run started", || !started.iter().any(|&id| is_running(id)));
+}

@@ -1,0 +1,304 @@
+//! How a run does its cells: once each, whatever comes between.
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command};
+
+use super::{Experiment, PLAN, children, kill_all, succeeded};
+use crate::common::{is_running, kill, perturb, stderr, wait_for};
+use perturb_learner::client::PrivateServer;
+use perturb_study::{CellResult, CellState, Counts, Folder, Plan};
+
+#[test]
+fn results_depend_neither_on_jobs_nor_on_kills() {
+    let experiment = Experiment::new(PLAN);
+    let cells = experiment.plan.cells.len();
+    succeeded(&experiment.run("whole", &["--jobs", "1"]));
+    let whole = experiment.results("whole");
+    assert_eq!(whole.len(), cells);
+    assert_eq!(experiment.attempts("whole"), vec![1; cells]);
+
+    for done in [1, 2, 4] {
+        let child = experiment.command("killed", &["--jobs", "2"]).spawn().expect("started");
+        wait_for("a few results", || experiment.results("killed").len() >= done);
+        kill_all(child);
+        assert!(experiment.results("killed").len() < cells, "killed before the end");
+    }
+    succeeded(&experiment.run("killed", &["--jobs", "3"]));
+    assert_eq!(experiment.results("killed"), whole);
+    let folder = Folder::new(&experiment.out("killed"));
+    let unfinished = |id: &str| {
+        let entries = std::fs::read_dir(folder.cell(id).path()).expect("a folder");
+        entries
+            .filter(|entry| entry.as_ref().is_ok_and(|entry| entry.file_name().to_string_lossy().starts_with(".tmp")))
+    };
+    assert!(experiment.plan.cells.iter().all(|cell| unfinished(&cell.id).count() == 0));
+}
+
+#[test]
+fn a_result_says_what_was_done_and_how_to_do_it_again() {
+    let experiment = Experiment::new(PLAN);
+    succeeded(&experiment.run("out", &["--cell", "3"]));
+    let result = experiment.cell_result("out", 3);
+    let cell = &experiment.plan.cells[3];
+    assert_eq!(result.id, cell.id);
+    assert_eq!(result.training.settings, cell.config.table());
+    assert_eq!((result.training.run, result.training.seed), (1, 1));
+    assert!(result.training.counters.episodes >= 40);
+    assert_eq!(result.results.values().map(|test| test.episodes).collect::<Vec<_>>(), [12, 12]);
+    assert!(result.commit.starts_with(env!("CARGO_PKG_VERSION")) && result.commit.len() > 10, "{}", result.commit);
+
+    let (train, evaluate) = result.command.split_once(" && ").expect("two commands");
+    let out = experiment.out("again");
+    let json = experiment.out("again.json");
+    for (command, more) in [(train, &[][..]), (evaluate, &["--json", json.to_str().expect("a path")][..])] {
+        let arguments: Vec<&str> = command
+            .split(' ')
+            .skip(1)
+            .map(|word| if word == "RUN" { out.to_str().expect("a path") } else { word })
+            .collect();
+        let output = perturb(&arguments).args(more).output().expect("ended");
+        succeeded(&output);
+    }
+    let again: serde_json::Value = serde_json::from_slice(&std::fs::read(json).expect("written")).expect("JSON");
+    assert_eq!(again["results"], serde_json::to_value(&result.results).expect("JSON"));
+}
+
+#[test]
+fn two_runs_on_one_folder_share_the_cells() {
+    let experiment = Experiment::new(PLAN);
+    let runs: Vec<Child> =
+        (0..2).map(|_| experiment.command("out", &["--jobs", "2"]).spawn().expect("started")).collect();
+    for run in runs {
+        succeeded(&run.wait_with_output().expect("ended"));
+    }
+    let cells = experiment.plan.cells.len();
+    assert_eq!(experiment.results("out").len(), cells);
+    assert_eq!(experiment.attempts("out"), vec![1; cells]);
+}
+
+#[test]
+fn a_failed_cell_is_recorded_with_its_reason_and_the_others_are_done() {
+    let experiment = Experiment::new(&PLAN.replace("7e-3, 7e-4", "1e38, 7e-4"));
+    let output = experiment.run("out", &["--jobs", "2"]);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(stderr(&output).contains("4 of 8 cells failed") && stderr(&output).contains("--retry-failed"));
+    assert_eq!(experiment.results("out").len(), 4);
+    let failed =
+        experiment.plan.cells.iter().find(|cell| cell.config.table()["learning_rate"].as_float() == Some(1e38));
+    let failed = failed.expect("a cell");
+    let out = experiment.out("out").display().to_string();
+    let Ok(CellState::Failed(failure)) = Folder::new(&experiment.out("out")).state(failed) else { panic!() };
+    assert!(
+        failure.reason.contains("lower the learning rate") && !failure.reason.contains(&*out),
+        "{}",
+        failure.reason
+    );
+
+    let attempts = experiment.attempts("out");
+    assert_eq!(experiment.run("out", &[]).status.code(), Some(1));
+    assert_eq!(experiment.attempts("out"), attempts, "not tried again");
+    assert_eq!(experiment.run("out", &["--retry-failed"]).status.code(), Some(1));
+    assert_eq!(experiment.attempts("out")[failed.index], 2 * attempts[failed.index]);
+}
+
+/// What two runs that try again at once find failed: each failing cell is tried again once, by one of them.
+#[test]
+fn two_runs_that_try_again_at_once_try_each_cell_once() {
+    let experiment = Experiment::new(&PLAN.replace("7e-3, 7e-4", "1e38, 2e38"));
+    let cells = experiment.plan.cells.len();
+    assert_eq!(experiment.run("out", &["--jobs", "2"]).status.code(), Some(1));
+    assert_eq!(experiment.attempts("out"), vec![1; cells]);
+    let folder = Folder::new(&experiment.out("out"));
+    let held: Vec<_> = experiment.plan.cells.iter().map(|cell| folder.cell(&cell.id).try_lock()).collect();
+    let runs: Vec<Child> = (0..2)
+        .map(|_| experiment.command("out", &["--jobs", "2", "--retry-failed"]).spawn().expect("started"))
+        .collect();
+    // Both have seen the failures: each has started a worker for the first cell, which found it locked.
+    let log = folder.cell(&experiment.plan.cells[0].id).log();
+    let busy = || std::fs::read_to_string(&log).map_or(0, |text| text.matches("another process works on").count());
+    wait_for("two runs", || busy() >= 2);
+    drop(held);
+    for run in runs {
+        let output = run.wait_with_output().expect("ended");
+        assert!(output.status.code() == Some(1) && stderr(&output).contains("8 of 8 cells failed"), "{output:?}");
+    }
+    assert_eq!(experiment.attempts("out"), vec![2; cells]);
+}
+
+#[test]
+fn a_result_names_the_program_that_began_its_training_if_it_is_another() {
+    let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 1000, checkpoint_interval = 200"));
+    let id = &experiment.plan.cells[0].id;
+    let document =
+        |name: &str| Folder::new(&experiment.out(name)).cell(id).training().join("checkpoint/checkpoint.json");
+    let child = experiment.command("same", &["--cell", "0"]).spawn().expect("started");
+    wait_for("a checkpoint", || document("same").exists());
+    kill_all(child);
+    assert!(experiment.results("same").is_empty(), "killed before the end");
+    let copied = Command::new("cp").arg("-a").args([experiment.out("same"), experiment.out("other")]).status();
+    assert!(copied.expect("cp").success());
+    let text = std::fs::read_to_string(document("other")).expect("a checkpoint");
+    assert_eq!(text.matches(perturb_study::VERSION).count(), 1, "{text}");
+    std::fs::write(document("other"), text.replace(perturb_study::VERSION, "0.0.9 (abc)")).expect("written");
+
+    for name in ["same", "other", "whole"] {
+        succeeded(&experiment.run(name, &["--cell", "0"]));
+    }
+    assert_eq!(experiment.results("same"), experiment.results("whole"), "as if it had not been broken off");
+    assert!(!String::from_utf8_lossy(&experiment.results("whole")[id]).contains("earlier_commits"));
+    let other = experiment.cell_result("other", 0);
+    assert_eq!(other.earlier_commits, ["0.0.9 (abc)"]);
+    let whole = experiment.cell_result("whole", 0);
+    assert_eq!(CellResult { earlier_commits: Vec::new(), ..*other }, *whole);
+}
+
+#[test]
+fn a_signal_stops_the_workers_and_the_same_command_goes_on() {
+    let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 100"));
+    for (name, code) in [("-INT", 130), ("-TERM", 143)] {
+        let begun: usize = experiment.attempts("out").iter().sum();
+        let child = experiment.command("out", &["--jobs", "2"]).spawn().expect("started");
+        let id = child.id();
+        wait_for("trainings", || experiment.attempts("out").iter().sum::<usize>() > begun);
+        let started = children(id);
+        kill(name, id);
+        let output = child.wait_with_output().expect("ended");
+        assert_eq!(output.status.code(), Some(code), "{}", stderr(&output));
+        assert!(stderr(&output).contains("the same command goes on"));
+        wait_for("the end of what the run started", || !started.iter().any(|&id| is_running(id)));
+    }
+    succeeded(&experiment.run("out", &[]));
+    assert_eq!(experiment.results("out").len(), experiment.plan.cells.len());
+}
+
+#[test]
+fn a_lost_server_is_no_cells_failure() {
+    let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 100000"));
+    let server = PrivateServer::start(Some(1)).unwrap_or_else(|error| panic!("{error}"));
+    let address = server.address().to_string();
+    let child = experiment.command("out", &["--jobs", "2", "--server", &address]).spawn().expect("started");
+    let progress = experiment.out("out/cells").join(&experiment.plan.cells[0].id).join("training/progress.csv");
+    wait_for("a training", || progress.exists());
+    kill("-KILL", server.process_id());
+    let output = child.wait_with_output().expect("ended");
+    assert_eq!(output.status.code(), Some(1));
+    assert!(stderr(&output).contains("cannot go on without a server"), "{}", stderr(&output));
+    let folder = Folder::new(&experiment.out("out"));
+    assert!(experiment.plan.cells.iter().all(|cell| !folder.cell(&cell.id).is_settled(true)));
+
+    let one = experiment.run("out", &["--cell", "0", "--server", &address]);
+    assert_eq!(one.status.code(), Some(69), "{}", stderr(&one));
+}
+
+#[test]
+fn a_cell_that_somebody_works_on_is_left_alone() {
+    let experiment = Experiment::new(PLAN);
+    let place = Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[0].id);
+    let lock = place.try_lock().expect("a file").expect("a lock");
+    let output = experiment.run("out", &["--cell", "0"]);
+    assert_eq!(output.status.code(), Some(75), "{}", stderr(&output));
+    drop(lock);
+    succeeded(&experiment.run("out", &["--cell", &experiment.plan.cells[0].id]));
+    assert_eq!(experiment.results("out").len(), 1);
+}
+
+#[test]
+fn a_wrong_command_is_refused_before_anything_is_done() {
+    let experiment = Experiment::new(&PLAN.replace("'Pendulum'", "'Pendulums'"));
+    let output = experiment.run("out", &[]);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(stderr(&output).contains("no environment `Pendulums`"), "{}", stderr(&output));
+    assert!(!experiment.out("out").exists());
+    let output = experiment.run("out", &["--cell", "8"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(stderr(&output).contains("give an index from 0 to 7"), "{}", stderr(&output));
+    let wrong: [&[&str]; 7] = [
+        &["--cell", "1,2", "--exit-with-stdin"],
+        &["--cell", "1,8"],
+        &["--leave-plan"],
+        &["--time", "5"],
+        &["--engine", "slurm", "--time", "5m"],
+        &["--engine", "slurm", "--cells-per-job", "1001"],
+        &["--engine", "slurm", "--cell", "1"],
+    ];
+    for arguments in wrong {
+        let output = experiment.run("out", arguments);
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}: {}", stderr(&output));
+    }
+    assert!(!experiment.out("out").exists());
+}
+
+#[test]
+fn several_cells_are_done_and_the_missing_ones_listed() {
+    let experiment = Experiment::new(PLAN);
+    let ids: Vec<&str> = experiment.plan.cells.iter().map(|cell| cell.id.as_str()).collect();
+    let plan = |arguments: &[&str]| {
+        let mut command = perturb(&["plan"]);
+        command.arg(experiment.out("file.toml")).args(arguments).arg("--missing").arg(experiment.out("out"));
+        let output = command.output().expect("ended");
+        succeeded(&output);
+        String::from_utf8(output.stdout).expect("text")
+    };
+    assert_eq!(plan(&[]).lines().count(), 8);
+    succeeded(&experiment.run("out", &["--cell", &format!("1,{}", ids[3]), "--jobs", "2"]));
+    let results = experiment.results("out");
+    assert!(results.len() == 2 && results.contains_key(ids[1]) && results.contains_key(ids[3]));
+    let mut attempts = [0; 8];
+    (attempts[1], attempts[3]) = (1, 1);
+    assert_eq!(experiment.attempts("out"), attempts, "in worker processes");
+    let lines = plan(&[]);
+    let first: Vec<String> = lines.lines().take(2).map(|line| line.trim().replace("  ", " ")).collect();
+    assert_eq!(first, [format!("0 {}", ids[0]), format!("2 {}", ids[2])]);
+    let listed: serde_json::Value = serde_json::from_str(&plan(&["--json"])).expect("JSON");
+    assert_eq!(listed.as_array().map(Vec::len), Some(6));
+    assert_eq!(listed[1], serde_json::json!({ "index": 2, "id": ids[2] }));
+
+    // The folder's plan stays if it is told to.
+    let kept = || std::fs::read_to_string(experiment.out("out/plan.toml")).expect("a plan");
+    let before = kept();
+    std::fs::write(experiment.out("file.toml"), format!("{PLAN}\n# extended")).expect("written");
+    succeeded(&experiment.run("out", &["--cell", "0", "--leave-plan", "--jobs", "1"]));
+    assert_eq!(kept(), before);
+    succeeded(&experiment.run("out", &["--cell", "0"]));
+    assert_ne!(kept(), before);
+}
+
+fn shipped(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../experiments").join(name)
+}
+
+#[test]
+fn the_shipped_files_ask_for_what_they_say() {
+    let paper = Plan::load(&shipped("paper.toml")).unwrap_or_else(|error| panic!("{error}")).counts();
+    let expected = Counts { configurations: 183, trainings: 3_294, pairs: 9_882, all_pairs: 49_410, runs: 5 };
+    assert_eq!(paper, expected);
+    for (name, configurations, trainings) in
+        [("quick.toml", 3, 18), ("classic.toml", 4, 24), ("locomotion.toml", 2, 12), ("rl2-n.toml", 189, 3402)]
+    {
+        let counts = Plan::load(&shipped(name)).unwrap_or_else(|error| panic!("{error}")).counts();
+        assert_eq!((counts.configurations, counts.trainings), (configurations, trainings), "{name}");
+    }
+}
+
+#[test]
+fn plan_prints_the_papers_counts_and_an_estimate_from_measurements() {
+    let printed = |arguments: &[&str]| {
+        let output = perturb(arguments).output().expect("ended");
+        succeeded(&output);
+        String::from_utf8(output.stdout).expect("text")
+    };
+    let paper = shipped("paper.toml").display().to_string();
+    let counts = "183 configurations, 3 294 trainings, 9 882 train/test pairs, 49 410 with 5 runs\n";
+    assert_eq!(printed(&["plan", &paper, "--measure", "0"]), counts);
+
+    let experiment = Experiment::new(PLAN);
+    let file = experiment.out("file.toml").display().to_string();
+    let text = printed(&["plan", &file, "--cells", "--measure", "1"]);
+    for cell in &experiment.plan.cells {
+        assert!(text.contains(&format!("{:>6} {}\n", cell.index, cell.id)), "{text}");
+    }
+    assert!(text.contains("2 configurations, 8 trainings, 16 train/test pairs, 16 with 1 run"), "{text}");
+    // 40 episodes of 200 steps in each of 8 trainings, 12 in each of 16 tests.
+    assert!(text.contains("6.40e4 steps of training, 3.84e4 of testing"), "{text}");
+    assert!(text.contains("measured: 2 trainings") && text.contains("which takes"), "{text}");
+}
