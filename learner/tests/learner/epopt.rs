@@ -16,6 +16,7 @@ use perturb_study::random::{Purpose, normal, stream, uniform};
 use perturb_study::settings::{A2cConfig, EpoptConfig, PpoConfig};
 use proptest::prelude::*;
 use rand_chacha::ChaCha8Rng;
+use rstest::rstest;
 use tch::{Kind, Tensor};
 
 const O: usize = 3;
@@ -241,20 +242,43 @@ fn at(rollout: &Rollout, p: usize) -> (Vec<f32>, [bool; 2]) {
     (numbers.to_vec(), [trajectories.terminated[p], trajectories.truncated[p]])
 }
 
-proptest! {
-    #[test]
-    fn every_step_of_the_chosen_episodes_is_a_sample_once(
-        lengths in prop::collection::vec(prop::collection::vec(1usize..12, 1..6), 1..7),
-        choice in prop::collection::vec(any::<bool>(), 36),
-    ) {
+/// Episodes of up to six environments, and some of them.
+fn some_episodes() -> impl Strategy<Value = (Rollout, Vec<Span>)> {
+    let lengths = prop::collection::vec(prop::collection::vec(1usize..12, 1..6), 1..7);
+    (lengths, prop::collection::vec(any::<bool>(), 36)).prop_map(|(lengths, choice)| {
         let rollout = coded(&lengths);
-        let n_envs = rollout.n_envs();
         let episodes = rollout.episodes();
-        prop_assert_eq!(episodes.len(), lengths.iter().map(Vec::len).sum::<usize>());
-        let mut chosen: Vec<Span> = episodes.iter().zip(&choice).filter(|(_, chosen)| **chosen).map(|(e, _)| *e).collect();
+        assert_eq!(episodes.len(), lengths.iter().map(Vec::len).sum::<usize>());
+        let mut chosen: Vec<Span> =
+            episodes.iter().zip(&choice).filter(|(_, chosen)| **chosen).map(|(e, _)| *e).collect();
         if chosen.is_empty() {
             chosen.push(episodes[0]);
         }
+        (rollout, chosen)
+    })
+}
+
+/// An episode of a rollout as one that is alone.
+fn alone(rollout: &Rollout, episode: &Span, estimate: &dyn Fn(&Trajectories<'_>) -> Estimates) -> Estimates {
+    let whole = rollout.trajectories().expect("finished");
+    let places = || (0..episode.length).map(|t| (episode.start + t) * rollout.n_envs() + episode.environment);
+    let numbers = |data: &[f32]| places().map(|p| data[p]).collect::<Vec<_>>();
+    let flags = |data: &[bool]| places().map(|p| data[p]).collect::<Vec<_>>();
+    estimate(&Trajectories {
+        n_envs: 1,
+        rewards: &numbers(whole.rewards),
+        values: &numbers(whole.values),
+        terminated: &flags(whole.terminated),
+        truncated: &flags(whole.truncated),
+        truncation_values: &numbers(whole.truncation_values),
+        last_values: &[99.0],
+    })
+}
+
+proptest! {
+    #[test]
+    fn every_step_of_the_chosen_episodes_is_a_sample_once((rollout, chosen) in some_episodes()) {
+        let n_envs = rollout.n_envs();
         let packed = rollout.select(&chosen).expect("its own episodes");
         let samples: Vec<usize> = packed.samples().expect("not all are").into_iter().map(|i| i as usize).collect();
         let columns = packed.n_envs();
@@ -290,37 +314,29 @@ proptest! {
                 prop_assert_eq!(before + n_envs, source, "steps are in order");
             }
         }
+    }
 
-        // Advantages are those of each episode alone: the same sums in the same order.
-        let (gamma, lambda) = (0.9, 0.8);
-        for bootstrap in [true, false] {
-            let estimators: [&dyn Fn(&Trajectories<'_>) -> Estimates; 2] = [
-                &|trajectories| gae(trajectories, gamma, lambda, bootstrap),
-                &|trajectories| n_step_returns(trajectories, gamma, bootstrap),
-            ];
-            for estimate in estimators {
-                let together = estimate(&packed.trajectories().expect("finished"));
-                for episode in &chosen {
-                    let places = || (0..episode.length).map(|t| (episode.start + t) * n_envs + episode.environment);
-                    let whole = rollout.trajectories().expect("finished");
-                    let numbers = |data: &[f32]| places().map(|p| data[p]).collect::<Vec<_>>();
-                    let flags = |data: &[bool]| places().map(|p| data[p]).collect::<Vec<_>>();
-                    let alone = estimate(&Trajectories {
-                        n_envs: 1,
-                        rewards: &numbers(whole.rewards),
-                        values: &numbers(whole.values),
-                        terminated: &flags(whole.terminated),
-                        truncated: &flags(whole.truncated),
-                        truncation_values: &numbers(whole.truncation_values),
-                        last_values: &[99.0],
-                    });
-                    let first = places().next().expect("a step");
-                    let is_first = |&&place: &&usize| packed.observations()[2 * place] as usize == first;
-                    let start = *samples.iter().find(is_first).expect("it is there");
-                    for t in 0..episode.length {
-                        prop_assert_eq!(together.advantages[start + t * columns], alone.advantages[t]);
-                        prop_assert_eq!(together.returns[start + t * columns], alone.returns[t]);
-                    }
+    /// The same sums in the same order.
+    #[test]
+    fn advantages_of_chosen_episodes_are_those_of_each_alone(
+        (rollout, chosen) in some_episodes(), bootstrap in any::<bool>()
+    ) {
+        let packed = rollout.select(&chosen).expect("its own episodes");
+        let samples: Vec<usize> = packed.samples().expect("not all are").into_iter().map(|i| i as usize).collect();
+        let estimators: [&dyn Fn(&Trajectories<'_>) -> Estimates; 2] = [
+            &|trajectories| gae(trajectories, 0.9, 0.8, bootstrap),
+            &|trajectories| n_step_returns(trajectories, 0.9, bootstrap),
+        ];
+        for estimate in estimators {
+            let together = estimate(&packed.trajectories().expect("finished"));
+            for episode in &chosen {
+                let alone = alone(&rollout, episode, estimate);
+                let first = episode.start * rollout.n_envs() + episode.environment;
+                let is_first = |&&place: &&usize| packed.observations()[2 * place] as usize == first;
+                let start = *samples.iter().find(is_first).expect("it is there");
+                for t in 0..episode.length {
+                    prop_assert_eq!(together.advantages[start + t * packed.n_envs()], alone.advantages[t]);
+                    prop_assert_eq!(together.returns[start + t * packed.n_envs()], alone.returns[t]);
                 }
             }
         }
@@ -612,29 +628,36 @@ fn pull(policy: &Policy, rng: &mut ChaCha8Rng, episodes: usize) -> Rollout {
     rollout
 }
 
-#[test]
-fn it_avoids_what_is_catastrophic_in_some_environments_and_its_base_does_not() {
+fn a2c(policy: &Policy) -> Box<dyn Algorithm> {
+    let config = A2cConfig { learning_rate: 7e-3, ..A2cConfig::default() };
+    Box::new(A2c::new(config, policy).expect("valid settings"))
+}
+
+fn ppo(policy: &Policy) -> Box<dyn Algorithm> {
+    let config = PpoConfig { learning_rate: 3e-3, ..PpoConfig::default() };
+    Box::new(Ppo::new(config, policy, 5).expect("valid settings"))
+}
+
+/// Of the episodes of a policy that takes either arm, a tenth is catastrophic; the worst fifth holds those and safe ones.
+#[rstest]
+#[case::a2c(a2c, 1500)]
+#[case::ppo(ppo, 100)]
+fn it_avoids_what_is_catastrophic_in_some_environments_and_its_base_does_not(
+    #[case] base: fn(&Policy) -> Box<dyn Algorithm>,
+    #[case] updates: usize,
+    #[values(0.2, 1.0)] epsilon: f64,
+) {
     let spec = PolicySpec { observation_size: 1, action: ActionKind::Discrete { n: 2 }, hidden: vec![8], lstm: None };
-    // Of the episodes of a policy that takes either arm, a tenth is catastrophic; the worst fifth holds those and safe ones.
-    for (epsilon, which) in [(0.2, 0), (0.2, 1), (1.0, 0), (1.0, 1)] {
-        let mut policy = Policy::new(spec.clone(), 5).expect("a policy");
-        let mut rng = stream(5, Purpose::Actions);
-        let a2c = A2cConfig { learning_rate: 7e-3, ..A2cConfig::default() };
-        let ppo = PpoConfig { learning_rate: 3e-3, ..PpoConfig::default() };
-        let base: Box<dyn Algorithm> = if which == 0 {
-            Box::new(A2c::new(a2c, &policy).expect("valid settings"))
-        } else {
-            Box::new(Ppo::new(ppo, &policy, 5).expect("valid settings"))
-        };
-        let mut algorithm = epopt(base, epsilon, 0);
-        for _ in 0..[1500, 100][which] {
-            let rollout = pull(&policy, &mut rng, 128);
-            algorithm.update(&mut policy, &rollout, 1.0).expect("an update");
-        }
-        let last = pull(&policy, &mut rng, 1024);
-        let safe = last.actions().iter().filter(|&&action| action == SAFE).count() as f64 / 1024.0;
-        // Both are nearly sure in the end; at first it is ½.
-        let expected = if epsilon < 1.0 { 0.9..=1.0 } else { 0.0..=0.1 };
-        assert!(expected.contains(&safe), "ε = {epsilon}, {}: {safe}", ["A2C", "PPO"][which]);
+    let mut policy = Policy::new(spec, 5).expect("a policy");
+    let mut rng = stream(5, Purpose::Actions);
+    let mut algorithm = epopt(base(&policy), epsilon, 0);
+    for _ in 0..updates {
+        let rollout = pull(&policy, &mut rng, 128);
+        algorithm.update(&mut policy, &rollout, 1.0).expect("an update");
     }
+    let last = pull(&policy, &mut rng, 1024);
+    let safe = last.actions().iter().filter(|&&action| action == SAFE).count() as f64 / 1024.0;
+    // Both are nearly sure in the end; at first it is ½.
+    let expected = if epsilon < 1.0 { 0.9..=1.0 } else { 0.0..=0.1 };
+    assert!(expected.contains(&safe), "{safe}");
 }

@@ -7,6 +7,7 @@ use perturb_learner::rollout::{Rollout, RolloutStep};
 use perturb_study::random::{Purpose, normal, stream, uniform};
 use perturb_study::settings::{A2cConfig, PpoConfig, Schedule, SettingError};
 use rand_chacha::ChaCha8Rng;
+use rstest::rstest;
 use tch::{Kind, Tensor};
 
 const N_ENVS: usize = 16;
@@ -131,63 +132,68 @@ fn ppo(training: &Training, n_minibatches: usize) -> Ppo {
     Ppo::new(config, &training.policy, 5).expect("valid settings")
 }
 
-#[test]
-fn a2c_learns_the_identity() {
-    // Chance is 0.25; the best discrete policy gets 1, the best continuous one of deviation σ gets -2σ² (at first -2.7).
-    for (action, updates, enough) in [(DISCRETE, 1500, 0.95), (CONTINUOUS, 2000, -0.4)] {
-        let mut training = Training::new(action, 5);
-        let mut algorithm = a2c(&training);
-        let reward = training.train(&mut algorithm, updates);
-        assert!(reward > enough, "{action:?}: {reward}");
-    }
+// Chance is 0.25; the best discrete policy gets 1, the best continuous one of deviation σ gets -2σ² (at first -2.7).
+
+#[rstest]
+#[case(DISCRETE, 1500, 0.95)]
+#[case(CONTINUOUS, 2000, -0.4)]
+fn a2c_learns_the_identity(#[case] action: ActionKind, #[case] updates: usize, #[case] enough: f64) {
+    let mut training = Training::new(action, 5);
+    let mut algorithm = a2c(&training);
+    let reward = training.train(&mut algorithm, updates);
+    assert!(reward > enough, "{reward}");
 }
 
-#[test]
-fn ppo_learns_the_identity() {
-    for (action, updates, enough) in [(DISCRETE, 40, 0.95), (CONTINUOUS, 100, -0.2)] {
-        for n_minibatches in [1, 4] {
-            let mut training = Training::new(action, 32);
-            let mut algorithm = ppo(&training, n_minibatches);
-            let reward = training.train(&mut algorithm, updates);
-            assert!(reward > enough, "{action:?}, {n_minibatches} minibatches: {reward}");
-        }
-    }
+#[rstest]
+#[case(DISCRETE, 40, 0.95)]
+#[case(CONTINUOUS, 100, -0.2)]
+fn ppo_learns_the_identity(
+    #[case] action: ActionKind,
+    #[case] updates: usize,
+    #[case] enough: f64,
+    #[values(1, 4)] n_minibatches: usize,
+) {
+    let mut training = Training::new(action, 32);
+    let mut algorithm = ppo(&training, n_minibatches);
+    let reward = training.train(&mut algorithm, updates);
+    assert!(reward > enough, "{reward}");
 }
 
-#[test]
-fn ppo_begins_with_ratio_1_and_clips_nothing() {
-    for (action, n_minibatches) in [(DISCRETE, 1), (DISCRETE, 4), (CONTINUOUS, 1), (CONTINUOUS, 4)] {
-        let mut training = Training::new(action, 32);
-        training.collect();
-        // A learning rate that moves no weight by a rounding, so that each of four minibatches is a first one.
-        let config = PpoConfig {
-            n_steps: 32,
-            n_epochs: 1,
-            n_minibatches,
-            learning_rate: 1e-12,
-            kl_coef: 0.5,
-            ..PpoConfig::default()
-        };
-        let mut first = Ppo::new(config.clone(), &training.policy, 1).expect("valid settings");
-        let stats = first.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
-        assert_eq!(stats.clip_fraction, Some(0.0));
-        // The actor's log-probabilities are off by 1e-6 at most, the divergence by half the square of that; but its
-        // f32 terms are rounded to 2⁻²⁴ each.
-        assert!(stats.approx_kl.expect("PPO's").abs() < 2e-7, "{stats:?}");
-        // The policy diverges from itself by nothing; a minibatch's outputs may differ from all's by a rounding.
-        assert!(stats.kl_divergence.expect("a penalty").abs() < 2e-7, "{stats:?}");
-        // With ratio 1, the surrogate is minus the mean of the normalised advantages, 0 but for the ratios' error.
-        assert!(stats.policy_gradient_loss.abs() < 1e-5, "{stats:?}");
-        // The rollout's own values lie inside any clipping interval.
-        let mut unclipped =
-            Ppo::new(PpoConfig { clip_range_vf: 0.0, ..config.clone() }, &training.policy, 1).expect("valid settings");
-        let value_loss = unclipped.update(&mut training.policy, &training.rollout, 1.0).expect("an update").value_loss;
-        assert!((value_loss - stats.value_loss).abs() < 1e-6 * value_loss, "f32 rounding: {value_loss} {stats:?}");
-        let config = PpoConfig { n_epochs: 10, learning_rate: 1e-2, ..config };
-        let mut later = Ppo::new(config, &training.policy, 1).expect("valid settings");
-        let stats = later.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
-        assert!(stats.clip_fraction > Some(0.0) && stats.approx_kl > Some(1e-4), "a moved policy: {stats:?}");
-    }
+#[rstest]
+fn ppo_begins_with_ratio_1_and_clips_nothing(
+    #[values(DISCRETE, CONTINUOUS)] action: ActionKind,
+    #[values(1, 4)] n_minibatches: usize,
+) {
+    let mut training = Training::new(action, 32);
+    training.collect();
+    // A learning rate that moves no weight by a rounding, so that each of four minibatches is a first one.
+    let config = PpoConfig {
+        n_steps: 32,
+        n_epochs: 1,
+        n_minibatches,
+        learning_rate: 1e-12,
+        kl_coef: 0.5,
+        ..PpoConfig::default()
+    };
+    let mut first = Ppo::new(config.clone(), &training.policy, 1).expect("valid settings");
+    let stats = first.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
+    assert_eq!(stats.clip_fraction, Some(0.0));
+    // The actor's log-probabilities are off by 1e-6 at most, the divergence by half the square of that; but its
+    // f32 terms are rounded to 2⁻²⁴ each.
+    assert!(stats.approx_kl.expect("PPO's").abs() < 2e-7, "{stats:?}");
+    // The policy diverges from itself by nothing; a minibatch's outputs may differ from all's by a rounding.
+    assert!(stats.kl_divergence.expect("a penalty").abs() < 2e-7, "{stats:?}");
+    // With ratio 1, the surrogate is minus the mean of the normalised advantages, 0 but for the ratios' error.
+    assert!(stats.policy_gradient_loss.abs() < 1e-5, "{stats:?}");
+    // The rollout's own values lie inside any clipping interval.
+    let mut unclipped =
+        Ppo::new(PpoConfig { clip_range_vf: 0.0, ..config.clone() }, &training.policy, 1).expect("valid settings");
+    let value_loss = unclipped.update(&mut training.policy, &training.rollout, 1.0).expect("an update").value_loss;
+    assert!((value_loss - stats.value_loss).abs() < 1e-6 * value_loss, "f32 rounding: {value_loss} {stats:?}");
+    let config = PpoConfig { n_epochs: 10, learning_rate: 1e-2, ..config };
+    let mut later = Ppo::new(config, &training.policy, 1).expect("valid settings");
+    let stats = later.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
+    assert!(stats.clip_fraction > Some(0.0) && stats.approx_kl > Some(1e-4), "a moved policy: {stats:?}");
 }
 
 #[test]
@@ -226,29 +232,28 @@ fn the_loss_is_the_weighted_sum_of_its_parts() {
     }
 }
 
-#[test]
-fn a_penalty_on_the_divergence_keeps_the_policy_near() {
-    for (action, n_minibatches) in [(DISCRETE, 1), (DISCRETE, 4), (CONTINUOUS, 1), (CONTINUOUS, 4)] {
-        let mut training = Training::new(action, 8);
-        training.collect();
-        let copy = || Policy::from_weights(training.policy.spec().clone(), &training.policy.weights()).expect("a copy");
-        let rollout = &training.rollout;
-        let moved_by = |kl_coef| {
-            let (before, mut after) = (copy(), copy());
-            let config = PpoConfig { n_steps: 8, n_minibatches, learning_rate: 1e-2, kl_coef, ..PpoConfig::default() };
-            let mut ppo = Ppo::new(config, &after, 1).expect("valid settings");
-            ppo.update(&mut after, rollout, 1.0).expect("an update");
-            let distributions = |policy: &Policy| {
-                let sequences = Sequences::new(policy.spec(), 8, rollout.observations(), rollout.starts(), &[]);
-                policy
-                    .evaluate(&sequences.expect("shapes that fit"), &Tensor::of_slice(rollout.actions()))
-                    .distributions
-            };
-            distributions(&before).divergence_to(&distributions(&after)).mean(Kind::Float).double_value(&[])
+#[rstest]
+fn a_penalty_on_the_divergence_keeps_the_policy_near(
+    #[values(DISCRETE, CONTINUOUS)] action: ActionKind,
+    #[values(1, 4)] n_minibatches: usize,
+) {
+    let mut training = Training::new(action, 8);
+    training.collect();
+    let copy = || Policy::from_weights(training.policy.spec().clone(), &training.policy.weights()).expect("a copy");
+    let rollout = &training.rollout;
+    let moved_by = |kl_coef| {
+        let (before, mut after) = (copy(), copy());
+        let config = PpoConfig { n_steps: 8, n_minibatches, learning_rate: 1e-2, kl_coef, ..PpoConfig::default() };
+        let mut ppo = Ppo::new(config, &after, 1).expect("valid settings");
+        ppo.update(&mut after, rollout, 1.0).expect("an update");
+        let distributions = |policy: &Policy| {
+            let sequences = Sequences::new(policy.spec(), 8, rollout.observations(), rollout.starts(), &[]);
+            policy.evaluate(&sequences.expect("shapes that fit"), &Tensor::of_slice(rollout.actions())).distributions
         };
-        let (free, held) = (moved_by(0.0), moved_by(30.0));
-        assert!(0.0 < held && held < 0.5 * free, "{action:?}, {n_minibatches} minibatches: {held} {free}");
-    }
+        distributions(&before).divergence_to(&distributions(&after)).mean(Kind::Float).double_value(&[])
+    };
+    let (free, held) = (moved_by(0.0), moved_by(30.0));
+    assert!(0.0 < held && held < 0.5 * free, "{action:?}, {n_minibatches} minibatches: {held} {free}");
 }
 
 #[test]
@@ -350,36 +355,62 @@ fn rollouts_that_do_not_fit_are_refused() {
     assert!(matches!(training.rollout.finish(&[0.0; 3]), Err(Error::Length { .. })));
 }
 
+#[track_caller]
+fn assert_refused(result: Result<(), SettingError>, setting: &str) {
+    assert!(matches!(&result, Err(error) if error.name == setting), "{setting}: {result:?}");
+}
+
+#[rstest]
+#[case("learning_rate", |config: &mut A2cConfig, bad| config.learning_rate = bad)]
+#[case("gamma", |config: &mut A2cConfig, bad| config.gamma = bad)]
+#[case("ent_coef", |config: &mut A2cConfig, bad| config.ent_coef = bad)]
+#[case("vf_coef", |config: &mut A2cConfig, bad| config.vf_coef = bad)]
+#[case("max_grad_norm", |config: &mut A2cConfig, bad| config.max_grad_norm = bad)]
+#[case("rms_alpha", |config: &mut A2cConfig, bad| config.rms_alpha = bad)]
+#[case("rms_eps", |config: &mut A2cConfig, bad| config.rms_eps = bad)]
+fn a2cs_settings_outside_their_ranges_are_refused_by_name(
+    #[case] name: &str,
+    #[case] set: fn(&mut A2cConfig, f64),
+    #[values(f64::NAN, f64::INFINITY, -1.0)] bad: f64,
+) {
+    let mut config = A2cConfig::default();
+    config.validate().expect("defaults are valid");
+    set(&mut config, bad);
+    assert_refused(config.validate(), name);
+}
+
+#[rstest]
+#[case("learning_rate", |config: &mut PpoConfig, bad| config.learning_rate = bad)]
+#[case("gamma", |config: &mut PpoConfig, bad| config.gamma = bad)]
+#[case("gae_lambda", |config: &mut PpoConfig, bad| config.gae_lambda = bad)]
+#[case("clip_range", |config: &mut PpoConfig, bad| config.clip_range = bad)]
+#[case("clip_range_vf", |config: &mut PpoConfig, bad| config.clip_range_vf = bad)]
+#[case("ent_coef", |config: &mut PpoConfig, bad| config.ent_coef = bad)]
+#[case("kl_coef", |config: &mut PpoConfig, bad| config.kl_coef = bad)]
+#[case("vf_coef", |config: &mut PpoConfig, bad| config.vf_coef = bad)]
+#[case("max_grad_norm", |config: &mut PpoConfig, bad| config.max_grad_norm = bad)]
+#[case("adam_eps", |config: &mut PpoConfig, bad| config.adam_eps = bad)]
+fn ppos_settings_outside_their_ranges_are_refused_by_name(
+    #[case] name: &str,
+    #[case] set: fn(&mut PpoConfig, f64),
+    #[values(f64::NAN, f64::INFINITY, -1.0)] bad: f64,
+) {
+    let mut config = PpoConfig::default();
+    config.validate().expect("defaults are valid");
+    set(&mut config, bad);
+    assert_refused(config.validate(), name);
+}
+
 #[test]
-fn settings_outside_their_ranges_are_refused_by_name() {
-    let refused = |result: Result<(), SettingError>, setting| {
-        assert!(matches!(&result, Err(error) if error.name == setting), "{setting}: {result:?}");
-    };
-    A2cConfig::default().validate().expect("defaults are valid");
-    PpoConfig::default().validate().expect("defaults are valid");
-    for bad in [f64::NAN, f64::INFINITY, -1.0] {
-        refused(A2cConfig { learning_rate: bad, ..A2cConfig::default() }.validate(), "learning_rate");
-        refused(A2cConfig { gamma: bad, ..A2cConfig::default() }.validate(), "gamma");
-        refused(A2cConfig { ent_coef: bad, ..A2cConfig::default() }.validate(), "ent_coef");
-        refused(A2cConfig { vf_coef: bad, ..A2cConfig::default() }.validate(), "vf_coef");
-        refused(A2cConfig { max_grad_norm: bad, ..A2cConfig::default() }.validate(), "max_grad_norm");
-        refused(A2cConfig { rms_alpha: bad, ..A2cConfig::default() }.validate(), "rms_alpha");
-        refused(A2cConfig { rms_eps: bad, ..A2cConfig::default() }.validate(), "rms_eps");
-        refused(PpoConfig { learning_rate: bad, ..PpoConfig::default() }.validate(), "learning_rate");
-        refused(PpoConfig { gamma: bad, ..PpoConfig::default() }.validate(), "gamma");
-        refused(PpoConfig { gae_lambda: bad, ..PpoConfig::default() }.validate(), "gae_lambda");
-        refused(PpoConfig { clip_range: bad, ..PpoConfig::default() }.validate(), "clip_range");
-        refused(PpoConfig { clip_range_vf: bad, ..PpoConfig::default() }.validate(), "clip_range_vf");
-        refused(PpoConfig { ent_coef: bad, ..PpoConfig::default() }.validate(), "ent_coef");
-        refused(PpoConfig { kl_coef: bad, ..PpoConfig::default() }.validate(), "kl_coef");
-        refused(PpoConfig { vf_coef: bad, ..PpoConfig::default() }.validate(), "vf_coef");
-        refused(PpoConfig { max_grad_norm: bad, ..PpoConfig::default() }.validate(), "max_grad_norm");
-        refused(PpoConfig { adam_eps: bad, ..PpoConfig::default() }.validate(), "adam_eps");
-    }
-    refused(A2cConfig { n_steps: 0, ..A2cConfig::default() }.validate(), "n_steps");
-    refused(PpoConfig { n_steps: 0, ..PpoConfig::default() }.validate(), "n_steps");
-    refused(PpoConfig { n_epochs: 0, ..PpoConfig::default() }.validate(), "n_epochs");
-    refused(PpoConfig { n_minibatches: 0, ..PpoConfig::default() }.validate(), "n_minibatches");
+fn counts_of_0_are_refused_by_name() {
+    assert_refused(A2cConfig { n_steps: 0, ..A2cConfig::default() }.validate(), "n_steps");
+    assert_refused(PpoConfig { n_steps: 0, ..PpoConfig::default() }.validate(), "n_steps");
+    assert_refused(PpoConfig { n_epochs: 0, ..PpoConfig::default() }.validate(), "n_epochs");
+    assert_refused(PpoConfig { n_minibatches: 0, ..PpoConfig::default() }.validate(), "n_minibatches");
+}
+
+#[test]
+fn settings_in_a_file_have_defaults_and_no_other_names() {
     let unknown = toml::from_str::<PpoConfig>("learning_rat = 1e-3").expect_err("a misspelt setting");
     assert!(unknown.to_string().contains("learning_rat"), "{unknown}");
     let config: PpoConfig = toml::from_str("learning_rate = 1e-3").expect("other settings have defaults");

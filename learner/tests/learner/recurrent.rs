@@ -8,6 +8,7 @@ use perturb_learner::rollout::{Rollout, RolloutStep};
 use perturb_study::random::{Purpose, normal, stream, uniform};
 use perturb_study::settings::{A2cConfig, PpoConfig};
 use rand_chacha::ChaCha8Rng;
+use rstest::rstest;
 use tch::{Kind, Tensor};
 
 const DISCRETE: ActionKind = ActionKind::Discrete { n: 3 };
@@ -334,57 +335,63 @@ fn ppo(training: &Training, n_minibatches: usize) -> Ppo {
     Ppo::new(config, &training.policy, 5).expect("valid settings")
 }
 
-#[test]
-fn only_a_recurrent_policy_recalls() {
-    // Chance is ½; four standard deviations of the 128 episodes of A2C's four rollouts are 0.18.
-    let expected = |lstm: Option<usize>| if lstm.is_some() { 0.95..=1.0 } else { 0.0..=0.68 };
-    for (lstm, n_minibatches) in [(Some(16), 1), (Some(16), 4), (None, 4)] {
-        let mut training = Training::new(lstm, 30);
-        let mut algorithm = ppo(&training, n_minibatches);
-        let share = training.train(&mut algorithm, 60);
-        assert!(expected(lstm).contains(&share), "PPO {lstm:?}, {n_minibatches} minibatches: {share}");
-    }
-    for lstm in [Some(16), None] {
-        let mut training = Training::new(lstm, 8);
-        let mut algorithm = a2c(&training);
-        let share = training.train(&mut algorithm, 1600);
-        assert!(expected(lstm).contains(&share), "A2C {lstm:?}: {share}");
-    }
+/// The share of signs told in the end. Chance is ½; four standard deviations of the 128 episodes of A2C's four rollouts
+/// are 0.18.
+fn assert_recalls(lstm: Option<usize>, share: f64) {
+    let expected = if lstm.is_some() { 0.95..=1.0 } else { 0.0..=0.68 };
+    assert!(expected.contains(&share), "{share}");
 }
 
-#[test]
-fn ppo_begins_with_ratio_1_and_clips_nothing() {
-    for n_minibatches in [1, 4] {
-        let mut training = Training::new(Some(16), 30);
-        let mut algorithm = ppo(&training, n_minibatches);
-        training.train(&mut algorithm, 20); // ends with a rollout of a policy that uses its memory
-        assert!(training.rollout.memory().iter().any(|&x| x != 0.0));
-        let config = PpoConfig {
-            n_steps: 30,
-            n_epochs: 1,
-            n_minibatches,
-            learning_rate: 1e-12,
-            kl_coef: 0.5,
-            ..PpoConfig::default()
-        };
-        let mut first = Ppo::new(config.clone(), &training.policy, 1).expect("valid settings");
-        let stats = first.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
-        assert_eq!(stats.clip_fraction, Some(0.0));
-        // The divergence is half the square of the log-probabilities' errors of 1e-6; its f32 terms are rounded to 2⁻²⁴.
-        assert!(stats.approx_kl.expect("PPO's").abs() < 2e-7, "{stats:?}");
-        // The policy diverges from itself by nothing; a minibatch's outputs may differ from all's by a rounding.
-        assert!(stats.kl_divergence.expect("a penalty").abs() < 2e-7, "{stats:?}");
-        // With ratio 1, the surrogate is minus the mean of the normalised advantages, 0 but for the ratios' error.
-        assert!(stats.policy_gradient_loss.abs() < 1e-5, "{stats:?}");
-        let config = PpoConfig { n_epochs: 10, learning_rate: 1e-2, ..config };
-        let mut later = Ppo::new(config, &training.policy, 1).expect("valid settings");
-        let stats = later.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
-        assert!(stats.approx_kl > Some(1e-4), "a moved policy: {stats:?}");
-        let divergence = stats.kl_divergence.expect("a penalty");
-        assert!(divergence > 1e-4, "{stats:?}");
-        let sum = stats.policy_gradient_loss + 0.5 * stats.value_loss + 0.5 * divergence;
-        assert!((stats.loss - sum).abs() < 1e-6, "f32 rounding of numbers of order 1: {stats:?}");
-    }
+#[rstest]
+#[case::in_one_minibatch(Some(16), 1)]
+#[case::in_four(Some(16), 4)]
+#[case::without_memory(None, 4)]
+fn only_a_recurrent_policy_of_ppo_recalls(#[case] lstm: Option<usize>, #[case] n_minibatches: usize) {
+    let mut training = Training::new(lstm, 30);
+    let mut algorithm = ppo(&training, n_minibatches);
+    assert_recalls(lstm, training.train(&mut algorithm, 60));
+}
+
+#[rstest]
+#[case::with_memory(Some(16))]
+#[case::without(None)]
+fn only_a_recurrent_policy_of_a2c_recalls(#[case] lstm: Option<usize>) {
+    let mut training = Training::new(lstm, 8);
+    let mut algorithm = a2c(&training);
+    assert_recalls(lstm, training.train(&mut algorithm, 1600));
+}
+
+#[rstest]
+fn ppo_begins_with_ratio_1_and_clips_nothing(#[values(1, 4)] n_minibatches: usize) {
+    let mut training = Training::new(Some(16), 30);
+    let mut algorithm = ppo(&training, n_minibatches);
+    training.train(&mut algorithm, 20); // ends with a rollout of a policy that uses its memory
+    assert!(training.rollout.memory().iter().any(|&x| x != 0.0));
+    let config = PpoConfig {
+        n_steps: 30,
+        n_epochs: 1,
+        n_minibatches,
+        learning_rate: 1e-12,
+        kl_coef: 0.5,
+        ..PpoConfig::default()
+    };
+    let mut first = Ppo::new(config.clone(), &training.policy, 1).expect("valid settings");
+    let stats = first.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
+    assert_eq!(stats.clip_fraction, Some(0.0));
+    // The divergence is half the square of the log-probabilities' errors of 1e-6; its f32 terms are rounded to 2⁻²⁴.
+    assert!(stats.approx_kl.expect("PPO's").abs() < 2e-7, "{stats:?}");
+    // The policy diverges from itself by nothing; a minibatch's outputs may differ from all's by a rounding.
+    assert!(stats.kl_divergence.expect("a penalty").abs() < 2e-7, "{stats:?}");
+    // With ratio 1, the surrogate is minus the mean of the normalised advantages, 0 but for the ratios' error.
+    assert!(stats.policy_gradient_loss.abs() < 1e-5, "{stats:?}");
+    let config = PpoConfig { n_epochs: 10, learning_rate: 1e-2, ..config };
+    let mut later = Ppo::new(config, &training.policy, 1).expect("valid settings");
+    let stats = later.update(&mut training.policy, &training.rollout, 1.0).expect("an update");
+    assert!(stats.approx_kl > Some(1e-4), "a moved policy: {stats:?}");
+    let divergence = stats.kl_divergence.expect("a penalty");
+    assert!(divergence > 1e-4, "{stats:?}");
+    let sum = stats.policy_gradient_loss + 0.5 * stats.value_loss + 0.5 * divergence;
+    assert!((stats.loss - sum).abs() < 1e-6, "f32 rounding of numbers of order 1: {stats:?}");
 }
 
 #[test]

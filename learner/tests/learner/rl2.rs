@@ -38,6 +38,16 @@ fn as_bits(flag: bool) -> f32 {
     f32::from(u8::from(flag))
 }
 
+/// What is seen beside an observation: the last action and reward, and that no episode has ended.
+fn beside(action: ActionKind, taken: f32, reward: f32) -> Vec<f32> {
+    let mut beside: Vec<f32> = match action {
+        ActionKind::Discrete { n } => (0..n).map(|j| as_bits(taken == j as f32)).collect(),
+        ActionKind::Continuous { .. } => vec![taken],
+    };
+    beside.extend([reward, 0.0]);
+    beside
+}
+
 /// What a plain recurrent policy does whose observations are extended by hand, as `[s, a, r, 0]`, or `[s, 0, 0, 0]` at the
 /// start of an episode.
 fn extended_by_hand(servers: &Servers, options: &OpenOptions, policy: &Policy, n_steps: usize) -> Rollout {
@@ -64,12 +74,7 @@ fn extended_by_hand(servers: &Servers, options: &OpenOptions, policy: &Policy, n
         acts.write_bytes(&mut bytes);
         session.step(&bytes, &mut reply).expect("a step");
         for (i, beside) in beside.iter_mut().enumerate() {
-            let mut last: Vec<f32> = match spec.action {
-                ActionKind::Discrete { n } => (0..n).map(|j| as_bits(acts.actions[i] == j as f32)).collect(),
-                ActionKind::Continuous { .. } => vec![acts.actions[i]],
-            };
-            last.extend([reply.rewards[i], 0.0]);
-            *beside = last;
+            *beside = self::beside(spec.action, acts.actions[i], reply.rewards[i]);
         }
         let mut truncation_values = vec![0.0; n];
         for (end, observation) in reply.ended.iter().zip(reply.final_observations.chunks(size)) {
@@ -415,25 +420,36 @@ impl Bandits {
     }
 }
 
-#[test]
-fn it_adapts_within_a_trial() {
-    let mut bandits = Bandits::new(true, 1);
+fn bandits_a2c(policy: &Policy) -> A2c {
     let config = A2cConfig { n_steps: TRIAL, learning_rate: 7e-3, ..A2cConfig::default() };
-    let mut a2c = A2c::new(config.clone(), &bandits.policy).expect("valid settings");
-    // The best is 1: the first pull tells which arm pays. Without what came of it ½ is the best.
+    A2c::new(config, policy).expect("valid settings")
+}
+
+// The best share is 1: the first pull tells which arm pays. Without what came of it ½ is the best.
+
+#[test]
+fn a2c_adapts_within_a_trial() {
+    let mut bandits = Bandits::new(true, 1);
+    let mut a2c = bandits_a2c(&bandits.policy);
     let share = bandits.train(&mut a2c, 1500);
-    assert!(share > 0.9, "RL²-A2C: {share}");
+    assert!(share > 0.9, "{share}");
+}
 
+#[test]
+fn ppo_adapts_within_a_trial() {
     let mut bandits = Bandits::new(true, 4);
-    let config_ppo =
+    let config =
         PpoConfig { n_steps: 4 * TRIAL, learning_rate: 3e-3, n_epochs: 5, kl_coef: 0.2, ..PpoConfig::default() };
-    let mut ppo = Ppo::new(config_ppo, &bandits.policy, 5).expect("valid settings");
+    let mut ppo = Ppo::new(config, &bandits.policy, 5).expect("valid settings");
     let share = bandits.train(&mut ppo, 100);
-    assert!(share > 0.9, "RL²-PPO: {share}");
+    assert!(share > 0.9, "{share}");
+}
 
+#[test]
+fn without_rl2_it_does_not_adapt() {
     let mut bandits = Bandits::new(false, 1);
-    let mut a2c = A2c::new(config, &bandits.policy).expect("valid settings");
+    let mut a2c = bandits_a2c(&bandits.policy);
     let share = bandits.train(&mut a2c, 1500);
     // If all pulls of a trial are the same arm, 400 shares of 0 or 1: four standard deviations of their mean.
-    assert!((share - 0.5).abs() < 0.1, "A2C: {share}");
+    assert!((share - 0.5).abs() < 0.1, "{share}");
 }
