@@ -14,13 +14,13 @@ use perturb::{
     env::{Action, ActionSpace, EnvironmentSpec, Episodes, Settings, Version},
     proto::{
         self, SessionRequest, SessionResponse,
-        perturb_client::PerturbClient,
         perturb_server::{Perturb, PerturbServer},
         session_request::Request as Ask,
         session_response::Response as Answer,
     },
     tasks,
 };
+use perturb_protocol::{Address, Connection, Stream as Session};
 use std::{
     env as process_env, fs,
     io::{BufRead, BufReader},
@@ -29,18 +29,14 @@ use std::{
     process::{Child, Command, Stdio},
     time::Instant,
 };
-use tokio::{net::UnixListener, sync::mpsc};
-use tokio_stream::{
-    Stream, StreamExt,
-    wrappers::{ReceiverStream, UnixListenerStream},
-};
+use tokio::net::UnixListener;
+use tokio_stream::{Stream, StreamExt, wrappers::UnixListenerStream};
 use tonic::{Request, Response, Status, Streaming, transport::Server};
 
 type Failure = Box<dyn std::error::Error>;
 
 /// Yardstick and served loop take turns, in short rounds, so that a busy neighbour disturbs both; medians are printed.
 const ROUNDS: usize = 25;
-const MESSAGE_LIMIT: usize = 64 << 20;
 
 fn main() -> Result<(), Failure> {
     let arguments: Vec<String> = process_env::args().collect();
@@ -252,16 +248,13 @@ impl Noise {
 struct Client {
     spec: &'static EnvironmentSpec,
     batch: usize,
-    requests: mpsc::Sender<SessionRequest>,
-    responses: Streaming<SessionResponse>,
+    session: Session,
     noise: Noise,
 }
 
 impl Client {
     async fn open(socket: &Path, name: &str, batch: usize) -> Result<Self, Failure> {
-        let channel = tonic::transport::Endpoint::try_from(format!("unix:{}", socket.display()))?.connect().await?;
-        let mut client = PerturbClient::new(channel).max_decoding_message_size(MESSAGE_LIMIT);
-        let (requests, outgoing) = mpsc::channel(4);
+        let connection = Connection::open(&Address::Unix(socket.into())).await?;
         let open = proto::Open {
             environment: name.into(),
             version: proto::Version::Default.into(),
@@ -270,11 +263,8 @@ impl Client {
             autoreset_mode: proto::AutoresetMode::SameStep.into(),
             ..Default::default()
         };
-        requests.send(SessionRequest { request: Some(Ask::Open(open)) }).await?;
-        let mut responses = client.session(ReceiverStream::new(outgoing)).await?.into_inner();
-        let opened = responses.message().await?.and_then(|r| r.response);
-        assert!(matches!(opened, Some(Answer::Opened(_))), "{opened:?}");
-        Ok(Self { spec: tasks::catalogue().find(name)?, batch, requests, responses, noise: Noise(7) })
+        let (session, _) = Session::open(&connection, open).await?;
+        Ok(Self { spec: tasks::catalogue().find(name)?, batch, session, noise: Noise(7) })
     }
 
     /// Takes `trips` steps, each after the reply to the last. Returns the seconds.
@@ -299,30 +289,21 @@ impl Client {
 
     /// Asks for a picture and waits for it.
     async fn draw(&mut self) -> Result<(), Failure> {
-        self.requests.send(SessionRequest { request: Some(Ask::Render(proto::Render::default())) }).await?;
-        match self.responses.message().await?.and_then(|r| r.response) {
-            Some(Answer::Render(picture)) => {
-                assert_eq!((picture.width, picture.height, picture.pixels.len()), (480, 480, 480 * 480 * 3));
-                Ok(())
-            }
-            other => Err(format!("{other:?}").into()),
-        }
+        let picture = self.session.ask(proto::Render::default()).await?;
+        assert_eq!((picture.width, picture.height, picture.pixels.len()), (480, 480, 480 * 480 * 3));
+        Ok(())
     }
 
     async fn send(&mut self) -> Result<(), Failure> {
         let actions = self.actions();
-        Ok(self.requests.send(SessionRequest { request: Some(Ask::Step(proto::Step { actions })) }).await?)
+        Ok(self.session.send(proto::Step { actions }).await?)
     }
 
     async fn receive(&mut self) -> Result<(), Failure> {
-        match self.responses.message().await?.and_then(|r| r.response) {
-            Some(Answer::Stepped(stepped)) => {
-                assert_eq!(stepped.observations.len(), 4 * self.batch * self.spec.observation.len());
-                assert_eq!(stepped.rewards.len(), 4 * self.batch);
-                Ok(())
-            }
-            other => Err(format!("{other:?}").into()),
-        }
+        let stepped = self.session.receive::<proto::Step>().await?;
+        assert_eq!(stepped.observations.len(), 4 * self.batch * self.spec.observation.len());
+        assert_eq!(stepped.rewards.len(), 4 * self.batch);
+        Ok(())
     }
 
     fn actions(&mut self) -> Bytes {
