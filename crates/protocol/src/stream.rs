@@ -19,11 +19,11 @@ pub trait Ask: Into<Request> {
     /// What it is called in errors.
     const NAME: &'static str;
 
-    /// Its reply in a response, or the name of another one that came instead.
+    /// Its reply in a response, or what another one is called that came instead.
     ///
     /// # Errors
-    /// The response, if it is another one.
-    fn reply(response: Response) -> Result<Self::Reply, Response>;
+    /// The other response's name.
+    fn reply(response: Response) -> Result<Self::Reply, &'static str>;
 }
 
 macro_rules! requests {
@@ -39,10 +39,10 @@ macro_rules! requests {
                 type Reply = proto::$reply;
                 const NAME: &'static str = $name;
 
-                fn reply(response: Response) -> Result<Self::Reply, Response> {
+                fn reply(response: Response) -> Result<Self::Reply, &'static str> {
                     match response {
                         Response::$answer(reply) => Ok(reply),
-                        other => Err(other),
+                        other => Err(name_of(&other)),
                     }
                 }
             }
@@ -131,7 +131,7 @@ impl Stream {
             }
             Some(Some(response)) => A::reply(response).map_err(|other| {
                 let expected = format!("the reply to {}", A::NAME);
-                self.mismatch::<A>(name_of(&other).into(), expected)
+                self.mismatch::<A>(other.into(), expected)
             }),
             Some(None) => Err(self.mismatch::<A>("an empty reply".into(), "a reply".into())),
             None => Err(lost(&self.address, A::NAME, &Status::unavailable("the server ended the stream"))),

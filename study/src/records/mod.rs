@@ -214,7 +214,7 @@ impl Difference {
 
     /// Whether it is more than rounding. NaN is.
     pub fn is_real(&self) -> bool {
-        !(self.relative <= ROUNDING)
+        self.relative.is_nan() || self.relative > ROUNDING
     }
 }
 
