@@ -10,33 +10,18 @@ use crate::evaluation::{TestError, TestOptions, Tester};
 use crate::logging::Progress;
 use crate::training::{RunDirectory, RunDirectoryError, TrainError, resume, train};
 use perturb_protocol::Distribution;
-use perturb_study::files::delete;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::{self, RecordsError};
+use perturb_study::scheduler::Event;
 use perturb_study::sets::{Parameters, TestSet};
 use perturb_study::{
-    Cell, CellFolder, CellResult, CellState, Failure, FailureMark, FolderError, Tests, Timing, Training,
+    Cell, CellFolder, CellResult, CellState, Counters, Failure, FailureMark, FolderError, Tests, Timing, Training,
 };
 
 /// Stands for the program that began a training whose checkpoint does not say.
 const UNKNOWN: &str = "unknown";
 /// What a stop without a signal counts as.
 const SIGTERM: i32 = 15;
-
-/// How doing a cell ended.
-#[derive(Debug)]
-pub enum CellEnd {
-    /// There is a result, of now or of earlier.
-    Done,
-    /// It failed, now or earlier, and the reason is recorded.
-    Failed(Failure),
-    /// Somebody else works on it.
-    Busy,
-    /// This signal asked to end. What was trained is kept.
-    Stopped(i32),
-    /// The servers are gone, which is not the cell's failure.
-    NoServer(CellError),
-}
 
 /// Why a cell has no result.
 #[derive(Debug, thiserror::Error)]
@@ -64,8 +49,8 @@ impl CellError {
     }
 }
 
-/// Trains and tests `cell` in `folder`, unless that is done, or has failed otherwise than `retry` says. Calls `report`
-/// with what is being done and the number of episodes.
+/// Trains and tests `cell` in `folder`, unless that is done, or has failed otherwise than `retry` says, and says how that
+/// ended, which is what a worker's last line tells. Calls `tell` with what is being done.
 ///
 /// # Errors
 /// [`FolderError`]: the folder cannot be read or written. Whatever else goes wrong is recorded in it.
@@ -75,37 +60,35 @@ pub fn run_cell(
     folder: &CellFolder,
     retry: Option<FailureMark>,
     stop: &StopFlag,
-    report: &mut dyn FnMut(&str, u64),
-) -> Result<CellEnd, FolderError> {
-    let Some(_lock) = folder.try_lock()? else { return Ok(CellEnd::Busy) };
+    tell: &mut dyn FnMut(Event),
+) -> Result<Event, FolderError> {
+    let Some(_lock) = folder.try_lock()? else { return Ok(Event::Busy) };
     match folder.state()? {
-        CellState::Done(_) => return Ok(CellEnd::Done),
-        CellState::Failed(failure) if folder.failure_mark() != retry => return Ok(CellEnd::Failed(failure)),
-        CellState::Failed(_) => {
-            // What was trained so far led to the failure.
-            delete(&folder.training())?;
-            folder.forget_failure()?;
+        CellState::Done(_) => return Ok(Event::Done),
+        CellState::Failed(failure) if folder.failure_mark() != retry => {
+            return Ok(Event::Failed { reason: failure.reason });
         }
+        CellState::Failed(_) => folder.forget_failure()?,
         CellState::Missing => {}
     }
     let start = Instant::now();
-    let ended = train_and_test(servers, cell, folder, stop, report);
+    let ended = train_and_test(servers, cell, folder, stop, tell);
     match (ended, stop.signal()) {
         (Ok(Some(result)), _) => {
             folder.write_timing(&Timing { seconds: start.elapsed().as_secs_f64() })?;
             folder.write_result(&result)?; // last: whoever sees it may read everything else
-            Ok(CellEnd::Done)
+            Ok(Event::Done)
         }
-        (Ok(None), signal) => Ok(CellEnd::Stopped(signal.unwrap_or(SIGTERM))),
+        (Ok(None), signal) => Ok(Event::Stopped { signal: signal.unwrap_or(SIGTERM) }),
         // Whoever stops a run may end its servers too.
-        (Err(_), Some(signal)) => Ok(CellEnd::Stopped(signal)),
-        (Err(error), None) if error.can_be_retried() => Ok(CellEnd::NoServer(error)),
+        (Err(_), Some(signal)) => Ok(Event::Stopped { signal }),
+        (Err(error), None) if error.can_be_retried() => Ok(Event::LostServer { reason: error.to_string() }),
         (Err(error), None) => {
             // Without the folder's place: wherever the same happens, the same is recorded.
             let reason = error.to_string().replace(&format!("{}/", folder.path().display()), "");
             let failure = Failure { id: cell.id.clone(), reason, commit: perturb_study::VERSION.into() };
             folder.write_failure(&failure)?;
-            Ok(CellEnd::Failed(failure))
+            Ok(Event::Failed { reason: failure.reason })
         }
     }
 }
@@ -116,13 +99,13 @@ fn train_and_test(
     cell: &Cell,
     folder: &CellFolder,
     stop: &StopFlag,
-    report: &mut dyn FnMut(&str, u64),
+    tell: &mut dyn FnMut(Event),
 ) -> Result<Option<CellResult>, CellError> {
-    let Some(checkpoint) = trained(servers, cell, &folder.training(), stop, report)? else { return Ok(None) };
+    let Some(checkpoint) = trained(servers, cell, &folder.training(), stop, tell)? else { return Ok(None) };
     let Tests { episodes, ref sets, ref success } = cell.tests;
     let options = TestOptions { episodes, seed: cell.config.common.seed, success: success.clone() };
     let tester = Tester::new(servers, &checkpoint, options)?;
-    let mut testing = |set: &TestSet, episodes| report(&format!("testing on {}", set.name), episodes);
+    let mut testing = |set: &TestSet, episodes| tell(Event::Testing { set: set.name.clone(), episodes });
     let records = match tester.test(sets, stop, &mut testing) {
         Err(TestError::Stopped { .. }) => return Ok(None),
         records => records?,
@@ -173,20 +156,25 @@ fn trained(
     cell: &Cell,
     directory: &Path,
     stop: &StopFlag,
-    report: &mut dyn FnMut(&str, u64),
+    tell: &mut dyn FnMut(Event),
 ) -> Result<Option<Checkpoint>, TrainError> {
     let config = &cell.config;
-    let progress = |progress: &Progress| report("training", progress.episodes);
-    let earlier = earlier(directory)?;
-    let outcome = match earlier.filter(|(_, checkpoint, _)| checkpoint.state.config == config.table()) {
-        Some((_, checkpoint, _)) if checkpoint.state.counters.episodes >= config.common.episodes => {
-            return Ok(Some(checkpoint));
-        }
+    let earlier = earlier(directory)?.filter(|(_, checkpoint, _)| checkpoint.state.config == config.table());
+    let Counters { episodes, timesteps, .. } =
+        earlier.as_ref().map_or_else(Counters::default, |(_, checkpoint, _)| checkpoint.state.counters);
+    tell(Event::Training { episodes, timesteps, saved: timesteps });
+    let progress = |&Progress { episodes, timesteps, saved_timesteps: saved, .. }: &Progress| {
+        tell(Event::Training { episodes, timesteps, saved });
+    };
+    let outcome = match earlier {
+        Some((_, checkpoint, _)) if episodes >= config.common.episodes => return Ok(Some(checkpoint)),
         Some((directory, checkpoint, state)) => {
             resume(servers, config, &directory, (checkpoint, state), stop, progress)?
         }
         None => train(servers, config, &RunDirectory::choose(directory, true)?, stop, progress)?,
     };
+    let Counters { episodes, timesteps, .. } = outcome.checkpoint.state.counters;
+    tell(Event::Training { episodes, timesteps, saved: timesteps });
     Ok(outcome.signal.is_none().then_some(outcome.checkpoint))
 }
 

@@ -6,7 +6,7 @@
 //! DIR/cells/ID/failure.json  why it failed
 //! DIR/cells/ID/timing.json   how long it took; everything that differs from run to run
 //! DIR/cells/ID/training/     what `perturb train --out` writes
-//! DIR/cells/ID/log.txt       what a worker process said
+//! DIR/cells/ID/log.txt       warnings of worker processes
 //! DIR/cells/ID/lock          locked while someone works on the cell
 //! DIR/heatmaps/              what `perturb heatmap DIR` writes
 //! DIR/report/                what `perturb report` writes
@@ -44,7 +44,7 @@ pub struct CellFolder {
 }
 
 /// Tells one record of a failure from the next, even if both say the same.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FailureMark {
     /// The file's number, which another file may get when this one is deleted …
     inode: u64,
@@ -283,12 +283,25 @@ impl CellFolder {
         files::write_json(&self.path.join("failure.json"), failure)
     }
 
-    /// Forgets a failure.
+    /// Forgets a failure, and the training that led to it.
     ///
     /// # Errors
     /// [`FileError`].
     pub fn forget_failure(&self) -> files::Result<()> {
+        files::delete(&self.training())?;
         files::delete(&self.path.join("failure.json"))
+    }
+
+    /// Forgets the failure `mark`, and no other. Says whether that was possible: not while somebody works on the cell.
+    ///
+    /// # Errors
+    /// [`FileError`].
+    pub fn forgive(&self, mark: FailureMark) -> files::Result<bool> {
+        let lock = self.try_lock()?;
+        if lock.is_some() && self.failure_mark() == Some(mark) {
+            self.forget_failure()?;
+        }
+        Ok(lock.is_some())
     }
 
     /// Records how long the cell took.
@@ -302,27 +315,6 @@ impl CellFolder {
     /// How long the cell took; `None` if that is not known.
     pub fn timing(&self) -> Option<Timing> {
         read(&self.path.join("timing.json")).ok().flatten()
-    }
-}
-
-impl std::fmt::Display for FailureMark {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { inode, written: (seconds, nanoseconds) } = self;
-        write!(f, "{inode}.{seconds}.{nanoseconds}")
-    }
-}
-
-impl std::str::FromStr for FailureMark {
-    type Err = String;
-
-    /// What `Display` writes.
-    fn from_str(text: &str) -> std::result::Result<Self, String> {
-        let wrong = || format!("expected three whole numbers with points between them, got `{text}`");
-        let mut parts = text.split('.');
-        let mut next = || parts.next().ok_or_else(wrong);
-        let (inode, seconds, nanoseconds) = (next()?, next()?, next()?);
-        let number = |text: &str| text.parse().map_err(|_| wrong());
-        Ok(Self { inode: inode.parse().map_err(|_| wrong())?, written: (number(seconds)?, number(nanoseconds)?) })
     }
 }
 
@@ -405,12 +397,15 @@ mod tests {
         cell.write_failure(&failure).unwrap();
         let first = cell.failure_mark().unwrap();
         assert_eq!(cell.failure_mark(), Some(first));
-        assert_eq!(first.to_string().parse(), Ok(first));
+        assert_eq!(serde_json::from_value::<FailureMark>(serde_json::to_value(first).unwrap()).unwrap(), first);
         cell.write_failure(&failure).unwrap();
         assert_ne!(cell.failure_mark(), Some(first));
-        for wrong in ["", "1.2", "1.2.x", "-1.2.3"] {
-            assert!(wrong.parse::<FailureMark>().unwrap_err().contains(wrong));
-        }
+        assert!(cell.forgive(first).unwrap() && cell.failure_mark().is_some(), "it is another one");
+        let lock = cell.try_lock().unwrap();
+        assert!(!cell.forgive(cell.failure_mark().unwrap()).unwrap() && cell.failure_mark().is_some());
+        drop(lock);
+        assert!(cell.forgive(cell.failure_mark().unwrap()).unwrap());
+        assert_eq!(cell.failure_mark(), None);
     }
 
     #[test]

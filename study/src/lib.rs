@@ -1,8 +1,8 @@
 //! perturb's studies: what is asked for, and what came of it, as plain data. Without libtorch.
 //!
 //! - [`settings`]: of a training.
-//! - [`Plan`] expands an experiment file to cells, [`Folder`] is where they are kept, [`run()`] has worker processes do
-//!   them, [`slurm`] a cluster.
+//! - [`Plan`] expands an experiment file to cells, [`Folder`] is where they are kept, [`scheduler`] has processes or a
+//!   cluster do them.
 //! - [`Results`] reads them back and selects; [`paper`] is what was published.
 //! - [`report`] compares them, in [`table::Table`]s and on a page; [`plot`] draws.
 #![forbid(unsafe_code)]
@@ -24,12 +24,11 @@ pub mod random;
 pub mod records;
 pub mod report;
 mod results;
-mod run;
 mod scenarios;
+pub mod scheduler;
 mod selection;
 pub mod sets;
 pub mod settings;
-pub mod slurm;
 mod statistics;
 pub mod success;
 pub mod table;
@@ -46,7 +45,6 @@ pub use means::{geometric_mean, mean, wilson};
 pub use paper::Method;
 pub use plan::{Cell, Counts, Plan, PlanCheckError, PlanError, Tests, TrainedOn};
 pub use results::{Counters, TestResult};
-pub use run::{Attempt, BUSY, NO_SERVER, ON, RunEnd, RunError, RunOptions, RunStatus, run};
 pub use scenarios::{Metric, Scenario, Version};
 pub use selection::{MethodResults, Results, Selected, SelectedRun, average, interquartile};
 pub use statistics::{Iqm, Summary, interquartile_mean};

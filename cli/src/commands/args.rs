@@ -5,11 +5,10 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand};
 
 use perturb_learner::client::Address;
-use perturb_study::FailureMark;
 use perturb_study::Version;
+use perturb_study::scheduler::slurm::TimeLimit;
 use perturb_study::sets::Assignment;
 use perturb_study::settings::{AlgorithmName, Architecture};
-use perturb_study::slurm::TimeLimit;
 use perturb_study::success::Threshold;
 
 /// Trains policies over environment servers and tests whether they still work when the physics changes.
@@ -251,25 +250,18 @@ pub(super) struct RunArgs {
     /// Try cells again that have failed.
     #[arg(long)]
     pub(super) retry_failed: bool,
-    /// Do these cells only, by index or id, separated by commas: one in this process, several, or with --jobs, in worker
-    /// processes.
+    /// Do these cells only, by index or id, separated by commas. A plan.toml that is in DIR stays as it is.
     #[arg(long, value_name = "K", value_delimiter = ',')]
     pub(super) cell: Vec<String>,
     /// When nothing is left to do, also write the report, as `perturb report DIR --html FILE` does.
     #[arg(long, value_name = "FILE", conflicts_with = "cell")]
     pub(super) html: Option<PathBuf>,
-    /// With --cell and several servers: how many of them earlier tries have lost, so that the next one's turn comes.
-    #[arg(long, value_name = "N", default_value_t = 0, requires = "cell", hide = true)]
-    pub(super) losses: u32,
-    /// Of a worker: try again if this is how the cell has failed, and not if it has failed once more since.
-    #[arg(long, value_name = "MARK", hide = true, requires = "exit_with_stdin")]
-    pub(super) retry_failure: Option<FailureMark>,
-    /// With a single --cell: stop when standard input is closed, and show no progress.
-    #[arg(long)]
-    pub(super) exit_with_stdin: bool,
-    /// With --cell: leave DIR/plan.toml as it is if there is one, also if PLAN differs.
-    #[arg(long, requires = "cell")]
-    pub(super) leave_plan: bool,
+    /// Print what happens to each cell as JSON lines.
+    #[arg(long, conflicts_with = "engine")]
+    pub(super) json: bool,
+    /// Do the cell that a line of standard input names; stop when standard input is closed.
+    #[arg(long, hide = true, requires = "server", conflicts_with_all = ["cell", "jobs", "engine", "retry_failed", "html"])]
+    pub(super) worker: bool,
     #[command(flatten)]
     pub(super) engine: EngineArgs,
     #[command(flatten)]
@@ -281,7 +273,7 @@ pub(super) struct RunArgs {
 pub(super) struct EngineArgs {
     /// Submit the cells as jobs of this engine, watch them, and submit again what it lost. DIR and this program must be
     /// at the same place on all its machines. --jobs and --workers are those of each of its jobs.
-    #[arg(long, value_name = "NAME", conflicts_with_all = ["cell", "exit_with_stdin"])]
+    #[arg(long, value_name = "NAME", conflicts_with = "cell")]
     pub(super) engine: Option<Engine>,
     /// Slurm's partition [default: Slurm's].
     #[arg(long, value_name = "NAME", requires = "engine")]

@@ -10,7 +10,7 @@ use perturb_study::interrupt::StopFlag;
 use perturb_study::records::{FILE, Records};
 
 use super::args::AuditArgs;
-use super::bar::Bar;
+use super::display::Display;
 use super::error::{CommandError, Result, system};
 use super::rates::file_in;
 use super::{Ending, servers};
@@ -35,9 +35,10 @@ pub(super) fn run(args: &AuditArgs) -> Result<Ending> {
         let records = Records::read(&one.records)?;
         let checkpoint = Checkpoint::load(&one.checkpoint)?;
         let most = if args.all { usize::MAX } else { args.episodes };
-        let mut bar = Bar::new(format!("playing {} again", one.name), most.min(records.episodes.len()) as u64);
-        let done = audit(&servers, &checkpoint, &records, most, &stop, &mut |episodes| bar.testing(episodes))?;
-        drop(bar);
+        let mut display =
+            Display::of_episodes(format!("playing {} again", one.name), most.min(records.episodes.len()) as u64);
+        let done = audit(&servers, &checkpoint, &records, most, &stop, &mut |episodes| display.episodes(episodes))?;
+        drop(display);
         let Audit { episodes, different: of_policy } = done;
         for line in of_policy.iter().take(SHOWN) {
             writeln!(out, "{}: {line}", one.name)?;

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use super::args::DemoArgs;
-use super::bar::Bar;
+use super::display::Display;
 use super::error::{Result, system};
 use super::train::describe;
 use super::{Ending, servers};
@@ -80,9 +80,9 @@ fn train_on(
     let config = TrainConfig::from_table("the demo", config.table())?;
     let directory = RunDirectory::choose(directory, false)?;
     let start = Instant::now();
-    let mut bar = Bar::new(describe(&config), args.episodes);
-    let outcome = train(servers, &config, &directory, stop, |progress| bar.training(progress))?;
-    drop(bar);
+    let mut display = Display::of_episodes(describe(&config), args.episodes);
+    let outcome = train(servers, &config, &directory, stop, |progress| display.training(progress))?;
+    drop(display);
     let (progress, seconds) = (&outcome.progress, start.elapsed().as_secs_f64());
     writeln!(
         std::io::stdout(),
@@ -100,8 +100,8 @@ fn success_percent(
     version: Version,
     stop: &StopFlag,
 ) -> Result<f64> {
-    let mut bar = Bar::new(format!("testing on {version}"), args.test_episodes);
-    let report = |episodes| bar.testing(episodes);
+    let mut display = Display::of_episodes(format!("testing on {version}"), args.test_episodes);
+    let report = |episodes| display.episodes(episodes);
     Ok(test(servers, checkpoint, version, args.test_episodes, args.seed, stop, report)?.success_percent)
 }
 

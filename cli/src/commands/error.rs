@@ -9,11 +9,12 @@ use perturb_learner::training::{RunDirectoryError, TrainError};
 use perturb_study::files::FileError;
 use perturb_study::plot::PlotError;
 use perturb_study::records::RecordsError;
+use perturb_study::scheduler::RunError;
+use perturb_study::scheduler::slurm::{OptionError, SlurmError};
 use perturb_study::sets::SetError;
 use perturb_study::settings::ConfigError;
-use perturb_study::slurm::{OptionError, SlurmError};
 use perturb_study::success::ThresholdError;
-use perturb_study::{FolderError, PlanCheckError, PlanError, RunError, VerifyError};
+use perturb_study::{FolderError, PlanCheckError, PlanError, VerifyError};
 
 use crate::video::VideoError;
 
@@ -62,7 +63,10 @@ pub(super) enum CommandError {
     #[error(transparent)]
     Records(#[from] RecordsError),
     #[error(transparent)]
-    Run(#[from] RunError),
+    Run(#[from] RunError<FileError>),
+    /// Cells were not all done by Slurm.
+    #[error(transparent)]
+    SlurmRun(#[from] RunError<SlurmError>),
     #[error(transparent)]
     Set(#[from] SetError),
     #[error(transparent)]

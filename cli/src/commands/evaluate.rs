@@ -5,7 +5,7 @@ use std::io::Write;
 use serde_json::{Map, Value, json};
 
 use super::args::EvaluateArgs;
-use super::bar::Bar;
+use super::display::Display;
 use super::error::{Result, system};
 use super::{Ending, servers, sets};
 use perturb_learner::checkpoint::{Checkpoint, State};
@@ -25,17 +25,17 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
     let state = &checkpoint.state;
     let options = TestOptions { episodes: args.episodes, seed, success: args.success.clone() };
     let tester = Tester::new(&servers, &checkpoint, options)?;
-    let mut bar: Option<(String, Bar)> = None;
+    let mut display: Option<(String, Display)> = None;
     let mut report = |set: &TestSet, episodes| {
-        if bar.as_ref().is_none_or(|(name, _)| *name != set.name) {
-            bar = Some((set.name.clone(), Bar::new(format!("testing on {}", set.name), args.episodes)));
+        if display.as_ref().is_none_or(|(name, _)| *name != set.name) {
+            display = Some((set.name.clone(), Display::of_episodes(format!("testing on {}", set.name), args.episodes)));
         }
-        if let Some((_, bar)) = &mut bar {
-            bar.testing(episodes);
+        if let Some((_, display)) = &mut display {
+            display.episodes(episodes);
         }
     };
     let records = tester.test(&sets, &stop, &mut report)?;
-    drop(bar);
+    drop(display);
     if let Some(path) = &args.records {
         records.write(path)?;
     }

@@ -4,7 +4,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use super::args::HeatmapArgs;
-use super::bar::Bar;
+use super::display::Display;
 use super::error::{CommandError, Result, system};
 use super::{Ending, servers, sets};
 use perturb_learner::checkpoint::{Checkpoint, State};
@@ -172,6 +172,6 @@ fn test(
     stop: &StopFlag,
 ) -> Result<(Heatmap, Records)> {
     let HeatmapOptions { parameters: [x, y], grid, episodes, .. } = options;
-    let mut bar = Bar::new(format!("testing over {x} and {y}"), (grid * grid) as u64 * episodes);
-    Ok(heatmap(servers, checkpoint, options, stop, &mut |episodes| bar.testing(episodes))?)
+    let mut display = Display::of_episodes(format!("testing over {x} and {y}"), (grid * grid) as u64 * episodes);
+    Ok(heatmap(servers, checkpoint, options, stop, &mut |episodes| display.episodes(episodes))?)
 }

@@ -2,13 +2,12 @@
 //! heatmap | video`.
 //!
 //! Results go to standard output, everything else to standard error. Exit status: 0 done, 1 failed, 2 wrong usage, 128 +
-//! the signal's number if Ctrl-C or SIGTERM ended it. `run --cell` has two more: 69 without a server, 75 if another
-//! process works on the cell.
+//! the signal's number if Ctrl-C or SIGTERM ended it.
 
 mod args;
 mod audit;
-mod bar;
 mod demo;
+mod display;
 mod envs;
 mod error;
 mod evaluate;
@@ -38,7 +37,7 @@ enum Ending {
     Done,
     /// It was asked to end by this signal.
     Signal(i32),
-    /// It could not do its work now, for the reason that this exit status stands for.
+    /// It did its work, and its answer is this exit status.
     Status(u8),
 }
 

@@ -1,50 +1,43 @@
 //! `perturb run`.
 
-use std::fs::File;
-use std::io::{IsTerminal, Read};
+use std::io::{BufRead, Read};
 use std::os::unix::process::CommandExt;
-use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::Command;
 use std::sync::Mutex;
-use std::time::{Duration, Instant};
-
-use indicatif::{ProgressBar, ProgressStyle};
 
 use super::args::{Engine, RunArgs};
-use super::bar::Bar;
+use super::display::Display;
 use super::error::{CommandError, Result, system};
-use super::plan::{duration, step_limits};
-use super::{Ending, report, servers, single_thread, slurm};
-use perturb_learner::cell::{CellEnd, run_cell};
+use super::plan::step_limits;
+use super::{Ending, refuse_workers, report, single_thread, slurm};
+use perturb_learner::cell::run_cell;
 use perturb_learner::client::{Address, PrivateServer, Servers};
 use perturb_study::interrupt::StopFlag;
-use perturb_study::{
-    Attempt, BUSY, Cell, Folder, NO_SERVER, ON, Plan, RunEnd, RunOptions, RunStatus, run as run_cells,
+use perturb_study::scheduler::{
+    Backend, Event, Local, Order, Report, RunEnd, RunError, Teller, run as run_cells, write_line,
 };
-
-/// How often a plain line is printed.
-const LINE_INTERVAL: Duration = Duration::from_secs(10);
+use perturb_study::{Cell, Folder, Plan};
 
 pub(super) fn run(args: &RunArgs) -> Result<Ending> {
-    let plan = Plan::load(&args.plan)?;
     let folder = Folder::new(&args.out);
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
+    if args.worker {
+        return work(args, &folder, &stop);
+    }
+    let plan = Plan::load(&args.plan)?;
     if args.engine.engine == Some(Engine::Slurm) {
         return slurm::run(args, &plan, &stop);
     }
-    match &args.cell[..] {
-        [name] if args.jobs.is_none() => one_cell(args, &plan, &folder, find(args, &plan, name)?, &stop),
-        [] => all_cells(args, &plan, &folder, &stop),
-        names => {
-            let cells = names.iter().map(|name| find(args, &plan, name).cloned()).collect::<Result<_, _>>()?;
-            all_cells(args, &Plan { cells, ..plan.clone() }, &folder, &stop)
-        }
+    if args.cell.is_empty() {
+        return all_cells(args, &plan, &folder, &stop);
     }
+    let cells = args.cell.iter().map(|name| find(args, &plan, name)).collect::<Result<_>>()?;
+    all_cells(args, &Plan { cells, ..plan }, &folder, &stop)
 }
 
-/// The cell that --cell names.
-fn find<'a>(args: &RunArgs, plan: &'a Plan, name: &str) -> Result<&'a Cell> {
-    plan.find(name).ok_or_else(|| {
+/// The cell with this index or id.
+fn find(args: &RunArgs, plan: &Plan, name: &str) -> Result<Cell> {
+    plan.find(name).cloned().ok_or_else(|| {
         CommandError::Usage(format!(
             "{} has no cell `{name}`: give an index from 0 to {}, or an id that `perturb plan --cells` prints",
             args.plan.display(),
@@ -53,60 +46,31 @@ fn find<'a>(args: &RunArgs, plan: &'a Plan, name: &str) -> Result<&'a Cell> {
     })
 }
 
-/// Does one cell in this process.
-fn one_cell(args: &RunArgs, plan: &Plan, folder: &Folder, cell: &Cell, stop: &StopFlag) -> Result<Ending> {
-    if args.exit_with_stdin {
-        stop_with_input(stop)?;
-    }
-    let place = folder.cell(&cell.id);
-    let retry = args.retry_failure.or_else(|| place.failure_mark().filter(|_| args.retry_failed));
-    // A worker has its plan from there.
-    if !args.exit_with_stdin {
-        keep_plan(args, plan, folder)?;
-    }
-    let servers = match server_of(args, cell) {
-        Ok(servers) => servers,
-        Err(CommandError::Client(error)) => return no_server(&error),
-        Err(error) => return Err(error),
-    };
-    if args.exit_with_stdin {
-        servers.addresses().for_each(|address| eprintln!("{ON}{address}"));
-    }
-    let mut bar = (!args.exit_with_stdin).then(|| Bar::new(cell.id.as_str(), cell.config.common.episodes));
-    let mut stage = String::new();
-    let mut report = |what: &str, episodes| match &mut bar {
-        Some(bar) => bar.testing(episodes),
-        None if what != stage => {
-            eprintln!("{what}"); // the log says what was begun, and how often
-            what.clone_into(&mut stage);
+/// Does the cell of the order on standard input, as a process that another one started for it.
+fn work(args: &RunArgs, folder: &Folder, stop: &StopFlag) -> Result<Ending> {
+    let mut text = String::new();
+    std::io::stdin().lock().read_line(&mut text).map_err(system("read the order"))?;
+    let order: Order = serde_json::from_str(&text)
+        .map_err(|error| CommandError::Usage(format!("the order is not understood: {error}")))?;
+    stop_with_input(stop)?;
+    let mut teller = Teller::new(&order.cell, std::io::stdout());
+    let plan = Plan::load(&args.plan).map_err(CommandError::from);
+    let cell = match plan.and_then(|plan| find(args, &plan, &order.cell)) {
+        Ok(cell) => cell,
+        Err(error) => {
+            teller.tell(Event::Refused { reason: error.to_string() });
+            return Ok(Ending::Done);
         }
-        None => {}
     };
-    match run_cell(&servers, cell, &place, retry, stop, &mut report)? {
-        CellEnd::Done => Ok(Ending::Done),
-        CellEnd::Failed(failure) => Err(CommandError::Failed(format!("{} failed: {}", cell.id, failure.reason))),
-        CellEnd::Stopped(signal) => Ok(Ending::Signal(signal)),
-        CellEnd::Busy => {
-            eprintln!("perturb: another process works on {}", cell.id);
-            Ok(Ending::Status(BUSY))
+    let ended = match Servers::connect_to_one(&args.server.server, order.turn) {
+        Ok(servers) => {
+            servers.addresses().for_each(|address| teller.tell(Event::Server { address: address.to_string() }));
+            run_cell(&servers, &cell, &folder.cell(&cell.id), order.retry, stop, &mut |event| teller.tell(event))
         }
-        CellEnd::NoServer(error) => no_server(&error),
-    }
-}
-
-/// The server of one cell: one of those that were named, by turns, or one of its own.
-fn server_of(args: &RunArgs, cell: &Cell) -> Result<Servers> {
-    let named = &args.server.server;
-    if named.is_empty() {
-        return servers(&args.server);
-    }
-    super::refuse_workers(&args.server)?;
-    Ok(Servers::connect_to_one(named, cell.index + args.losses as usize)?)
-}
-
-fn no_server(error: &dyn std::error::Error) -> Result<Ending> {
-    eprintln!("perturb: {error}");
-    Ok(Ending::Status(NO_SERVER))
+        Err(error) => Ok(Event::LostServer { reason: error.to_string() }),
+    };
+    teller.tell(ended.unwrap_or_else(|error| Event::Failed { reason: error.to_string() }));
+    Ok(Ending::Done)
 }
 
 /// Raises the flag when standard input is closed.
@@ -123,40 +87,55 @@ fn stop_with_input(stop: &StopFlag) -> Result<()> {
 
 /// Does all cells in worker processes.
 fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> Result<Ending> {
-    if args.exit_with_stdin {
-        return Err(CommandError::Usage("--exit-with-stdin needs a single --cell, and no --jobs".into()));
-    }
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let jobs = args.jobs.unwrap_or(cores);
+    let jobs = args.jobs.unwrap_or(cores).min(plan.cells.len());
     let (local, addresses) = shared_servers(args)?;
     let local = local.map(Mutex::new);
     let (servers, troubles) = Servers::connect_to_some(&addresses)?;
     troubles.iter().for_each(|trouble| eprintln!("perturb: {trouble}; going on with the other servers"));
     step_limits(&servers, plan)?; // refuses environments that there are not
     drop(servers);
-    keep_plan(args, plan, folder)?;
     let addresses: Vec<String> = addresses.iter().map(Address::to_string).collect();
-    let worker = |cell: &Cell, attempt| worker(args, folder, cell, attempt, &addresses);
-    let server_trouble = || {
+    let command = || worker(args, folder, &addresses);
+    let server_ended = || {
         let status = local.as_ref()?.lock().ok()?.exit_status()?;
         Some(format!("the private server ended with {status}"))
     };
-    let options =
-        RunOptions { jobs, retry_failed: args.retry_failed, worker: &worker, server_trouble: &server_trouble };
-    let mut line = Line::new(plan.cells.len());
-    let end = run_cells(plan, folder, &options, stop, &mut |status| show(&mut line, status));
-    line.finish();
-    match end? {
-        RunEnd::Stopped(signal) => {
-            eprintln!("stopped by signal {signal}; the same command goes on");
-            Ok(Ending::Signal(signal))
-        }
-        RunEnd::Finished { failed } => finished(args, plan, folder, &failed),
-    }
+    do_cells(args, plan, folder, &mut Local::new(plan, folder, jobs, &command, &server_ended), stop)
 }
 
-/// All cells are done, or have failed.
-pub(super) fn finished(args: &RunArgs, plan: &Plan, folder: &Folder, failed: &[String]) -> Result<Ending> {
+/// Has `backend` do all cells, shows how far that is, and says how it ended.
+pub(super) fn do_cells<B: Backend>(
+    args: &RunArgs,
+    plan: &Plan,
+    folder: &Folder,
+    backend: &mut B,
+    stop: &StopFlag,
+) -> Result<Ending>
+where
+    CommandError: From<RunError<B::Error>>,
+{
+    keep_plan(args, plan, folder)?;
+    let mut display = Display::of_cells(plan.cells.len());
+    let mut report = |report: Report<'_>| match report {
+        Report::Status(status) => display.cells(status),
+        Report::Note(sentence) => display.say(sentence),
+        Report::Line(line) if args.json => write_line(&mut std::io::stdout(), line),
+        Report::Line(_) => {}
+    };
+    let end = run_cells(plan, folder, backend, args.retry_failed, stop, &mut report);
+    drop(display);
+    let failed = match end? {
+        RunEnd::Finished { failed } => failed,
+        RunEnd::Stopped { signal, left } => {
+            let jobs = left.join(" ");
+            eprintln!("stopped by signal {signal}; the same command goes on");
+            if !left.is_empty() {
+                eprintln!("Slurm job {jobs} runs meanwhile, and is watched again then; to end it: scancel {jobs}");
+            }
+            return Ok(Ending::Signal(signal));
+        }
+    };
     if let Some(page) = &args.html {
         report::write(folder, Some(page))?;
         eprintln!("the report is in {} and {}", page.display(), folder.path().join("report").display());
@@ -173,16 +152,15 @@ pub(super) fn finished(args: &RunArgs, plan: &Plan, folder: &Folder, failed: &[S
     )))
 }
 
-/// Copies the plan into its folder, and says so if another one was there.
-pub(super) fn keep_plan(args: &RunArgs, plan: &Plan, folder: &Folder) -> Result<()> {
-    if args.leave_plan && folder.plan_path().exists() {
+/// Copies the plan into its folder, and says so if another one was there. Single cells leave that one: their plan may be
+/// older, that of a job which had to wait for instance.
+fn keep_plan(args: &RunArgs, plan: &Plan, folder: &Folder) -> Result<()> {
+    let kept = folder.plan_path();
+    if !args.cell.is_empty() && kept.exists() {
         return Ok(());
     }
     if folder.keep_plan(plan)? {
-        eprintln!(
-            "{} was another plan; it is replaced, and cells that both have are kept",
-            folder.plan_path().display()
-        );
+        eprintln!("{} was another plan; it is replaced, and cells that both have are kept", kept.display());
     }
     Ok(())
 }
@@ -191,7 +169,7 @@ pub(super) fn keep_plan(args: &RunArgs, plan: &Plan, folder: &Folder) -> Result<
 fn shared_servers(args: &RunArgs) -> Result<(Option<PrivateServer>, Vec<Address>)> {
     let named = &args.server.server;
     if !named.is_empty() {
-        super::refuse_workers(&args.server)?;
+        refuse_workers(&args.server)?;
         return Ok((None, named.clone()));
     }
     let server = PrivateServer::start(args.server.workers)?;
@@ -199,84 +177,14 @@ fn shared_servers(args: &RunArgs) -> Result<(Option<PrivateServer>, Vec<Address>
     Ok((Some(server), vec![address]))
 }
 
-/// The command that does one cell.
-fn worker(
-    args: &RunArgs,
-    folder: &Folder,
-    cell: &Cell,
-    attempt: Attempt,
-    addresses: &[String],
-) -> std::io::Result<Command> {
-    let place = folder.cell(&cell.id);
-    std::fs::create_dir_all(place.path())?;
-    let log = File::options().create(true).append(true).open(place.log())?;
+/// The command of a worker.
+fn worker(args: &RunArgs, folder: &Folder, addresses: &[String]) -> Command {
     // The running program, even if its file has been replaced meanwhile: all cells of a run are of one commit.
-    let program = Path::new("/proc/self/exe");
-    let mut command = Command::new(program);
-    // The copy, which nobody edits meanwhile.
-    let plan = if args.leave_plan { args.plan.clone() } else { folder.plan_path() };
+    let mut command = Command::new("/proc/self/exe");
+    // The copy, which nobody edits meanwhile, unless it may be another plan's.
+    let plan = if args.cell.is_empty() { folder.plan_path() } else { args.plan.clone() };
     command.arg0("perturb").arg("run").arg(plan).arg("--out").arg(folder.path());
-    command.args(["--cell", &cell.id, "--exit-with-stdin", "--server", &addresses.join(",")]);
-    command.args(["--losses", &attempt.losses.to_string()]);
-    if let Some(failure) = attempt.retry {
-        command.args(["--retry-failure", &failure.to_string()]);
-    }
+    command.args(["--worker", "--server", &addresses.join(",")]);
     single_thread::set(&mut command);
-    command.stdout(Stdio::null()).stderr(log);
-    Ok(command)
-}
-
-/// Shows how far the run is.
-fn show(line: &mut Line, status: &RunStatus) {
-    line.show(status.done, status.failed, &format!("{} running", status.running.len()), status.remaining);
-}
-
-/// The line that says how far a run is.
-pub(super) struct Line {
-    bar: Option<ProgressBar>,
-    last_line: Option<Instant>,
-    cells: usize,
-}
-
-impl Line {
-    /// Of so many cells.
-    pub(super) fn new(cells: usize) -> Self {
-        let bar = std::io::stderr().is_terminal().then(|| {
-            let style = ProgressStyle::with_template("{wide_bar} {pos}/{len} cells  {msg}");
-            ProgressBar::new(cells as u64).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
-        });
-        Self { bar, last_line: None, cells }
-    }
-
-    /// How many cells are done and have failed, what is going on, and how long it may take.
-    pub(super) fn show(&mut self, done: usize, failed: usize, doing: &str, remaining: Option<Duration>) {
-        let settled = done + failed;
-        let left = remaining.map_or_else(String::new, |left| format!(", {} left", duration(left.as_secs_f64())));
-        let failed = if failed > 0 { format!(", {failed} failed") } else { String::new() };
-        let figures = format!("{doing}{failed}{left}");
-        if let Some(bar) = &self.bar {
-            bar.set_position(settled as u64);
-            bar.set_message(figures);
-            return;
-        }
-        if self.last_line.is_none_or(|time| time.elapsed() >= LINE_INTERVAL) {
-            self.last_line = Some(Instant::now());
-            eprintln!("{settled}/{} cells: {figures}", self.cells);
-        }
-    }
-
-    /// A sentence beside it.
-    pub(super) fn say(&self, sentence: &str) {
-        match &self.bar {
-            Some(bar) => bar.suspend(|| eprintln!("{sentence}")),
-            None => eprintln!("{sentence}"),
-        }
-    }
-
-    /// Takes the line away.
-    pub(super) fn finish(&self) {
-        if let Some(bar) = &self.bar {
-            bar.finish_and_clear();
-        }
-    }
+    command
 }

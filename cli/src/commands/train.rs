@@ -6,7 +6,7 @@ use std::path::Path;
 use toml::{Table, Value};
 
 use super::args::TrainArgs;
-use super::bar::Bar;
+use super::display::Display;
 use super::error::{CommandError, Result, system};
 use super::{Ending, servers, sets};
 use perturb_learner::logging::Progress;
@@ -32,9 +32,9 @@ fn begin(args: &TrainArgs, out: &Path) -> Result<Ending> {
     let servers = servers(&args.server)?;
     let environment = servers.environment(&config.common.environment)?; // its refusal lists the names
     perturb_study::sets::check("--parameters", &config.common.parameters, &environment)?;
-    let mut bar = Bar::new(describe(&config), config.common.episodes);
-    let outcome = train(&servers, &config, &directory, &stop, |progress| bar.training(progress))?;
-    bar.finish();
+    let mut display = Display::of_episodes(describe(&config), config.common.episodes);
+    let outcome = train(&servers, &config, &directory, &stop, |progress| display.training(progress))?;
+    drop(display);
     end(&config, &directory, &outcome)
 }
 
@@ -51,10 +51,10 @@ fn go_on(args: &TrainArgs, path: &Path) -> Result<Ending> {
     }
     eprintln!("{}: going on after {done} of {budget} episodes", describe(&config));
     let servers = servers(&args.server)?;
-    let mut bar = Bar::new(describe(&config), budget);
-    let report = |progress: &Progress| bar.training(progress);
+    let mut display = Display::of_episodes(describe(&config), budget);
+    let report = |progress: &Progress| display.training(progress);
     let outcome = resume(&servers, &config, &directory, (checkpoint, state), &stop, report)?;
-    bar.finish();
+    drop(display);
     end(&config, &directory, &outcome)
 }
 

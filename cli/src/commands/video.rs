@@ -3,7 +3,7 @@
 use std::io::Write;
 
 use super::args::VideoArgs;
-use super::bar::Bar;
+use super::display::Display;
 use super::error::{Result, system};
 use super::{Ending, servers, sets};
 use crate::video::{Footage, VideoFile, VideoOptions, film};
@@ -23,9 +23,9 @@ pub(super) fn run(args: &VideoArgs) -> Result<Ending> {
         size: (args.width, args.height),
         fps: args.fps,
     };
-    let mut bar = Bar::new(format!("filming on {}", options.set.name), args.episodes);
-    let footage = film(&servers, &checkpoint, &options, file, &stop, &mut |episodes| bar.testing(episodes))?;
-    drop(bar);
+    let mut display = Display::of_episodes(format!("filming on {}", options.set.name), args.episodes);
+    let footage = film(&servers, &checkpoint, &options, file, &stop, &mut |episodes| display.episodes(episodes))?;
+    drop(display);
     let mut out = std::io::stdout();
     let episodes: Vec<_> = footage.episodes.iter().enumerate().collect();
     let table = Table::of("", &episodes)

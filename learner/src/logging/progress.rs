@@ -58,6 +58,8 @@ pub struct Progress {
     pub episodes: u64,
     /// Episodes that have ended; EPOpt generates more than it learns from.
     pub generated_episodes: u64,
+    /// Steps that the last checkpoint on disk counts.
+    pub saved_timesteps: u64,
     /// Mean return, mean length and share of successes of the last 100 episodes; `None` before the first has ended.
     pub recent: Option<[f64; 3]>,
     /// The last update.
@@ -189,6 +191,7 @@ mod tests {
             shares: [0.25, 0.5, 1.25],
             episodes: 9,
             generated_episodes: 90,
+            saved_timesteps: 0,
             recent: Some([10.0, 11.0, 0.12]),
             update,
         };

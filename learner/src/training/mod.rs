@@ -101,8 +101,8 @@ struct Training<'a> {
     updating: Duration,
     /// How long the last update took.
     last_update: Option<Duration>,
-    /// Episodes in the last checkpoint on disk.
-    saved: Option<u64>,
+    /// What the last checkpoint on disk counts.
+    saved: Option<Counters>,
 }
 
 impl<'a> Training<'a> {
@@ -165,7 +165,7 @@ impl<'a> Training<'a> {
             .algorithm
             .load_state(&resume.algorithm)
             .map_err(|error| TrainError::Restore { what: "optimiser", source: Box::new(error.into()) })?;
-        training.saved = Some(training.whole.state.counters.episodes);
+        training.saved = Some(training.whole.state.counters);
         training.recent.extend(&resume.history.recent);
         training.clock = Clock::start(resume.history.elapsed);
         training.shares_before = resume.history.shares;
@@ -226,9 +226,8 @@ impl<'a> Training<'a> {
             if logged {
                 logs.progress(&progress).map_err(|error| self.failed(error.into(), directory))?;
             }
-            let due =
-                self.saved.is_none_or(|saved| progress.episodes / checkpoint_interval > saved / checkpoint_interval);
-            if finished || due || signal.is_some() {
+            let due = |saved: Counters| progress.episodes / checkpoint_interval > saved.episodes / checkpoint_interval;
+            if finished || self.saved.is_none_or(due) || signal.is_some() {
                 self.save(logs, directory).map_err(|error| self.failed(error, directory))?;
             }
             if finished || signal.is_some() {
@@ -317,13 +316,14 @@ impl<'a> Training<'a> {
         };
         let state = ResumeState { collector: self.collector.state()?, algorithm: self.algorithm.state(), history };
         self.whole.save(&directory.checkpoint(), Some(&state))?;
-        self.saved = Some(self.whole.state.counters.episodes);
+        self.saved = Some(self.whole.state.counters);
         Ok(())
     }
 
     /// Says what is left of a training that `error` ended.
     fn failed(&self, error: TrainError, directory: &RunDirectory) -> TrainError {
-        let last = self.saved.map(|episodes| LastCheckpoint { episodes, run: directory.path().to_owned() });
+        let last =
+            self.saved.map(|Counters { episodes, .. }| LastCheckpoint { episodes, run: directory.path().to_owned() });
         TrainError::Failed { last, source: Box::new(error) }
     }
 
@@ -344,6 +344,7 @@ impl<'a> Training<'a> {
             shares: self.shares(),
             episodes,
             generated_episodes,
+            saved_timesteps: self.saved.map_or(0, |saved| saved.timesteps),
             recent: (!self.recent.is_empty()).then(|| [mean(0), mean(1), mean(2)]),
             update,
         }

@@ -45,6 +45,8 @@ impl Experiment {
     fn command(&self, name: &str, arguments: &[&str]) -> Command {
         let mut command = perturb(&["run"]);
         command.arg(self.directory.path().join("file.toml")).arg("--out").arg(self.out(name)).args(arguments);
+        // Whether a training begins or goes on stands in its log then.
+        command.env("RUST_LOG", "warn,perturb_learner::training=debug");
         command
     }
 
@@ -81,11 +83,12 @@ impl Experiment {
         }
     }
 
-    /// How often a training was begun.
+    /// How often each cell's training was begun, or gone on with.
     fn attempts(&self, name: &str) -> Vec<usize> {
         let folder = Folder::new(&self.out(name));
         let log = |id: &str| std::fs::read_to_string(folder.cell(id).log()).unwrap_or_default();
-        self.plan.cells.iter().map(|cell| log(&cell.id).lines().filter(|line| *line == "training").count()).collect()
+        let count = |log: String| log.matches("training begins").count() + log.matches("training goes on").count();
+        self.plan.cells.iter().map(|cell| count(log(&cell.id))).collect()
     }
 }
 

@@ -110,13 +110,15 @@ fn two_runs_that_try_again_at_once_try_each_cell_once() {
     assert_eq!(experiment.attempts("out"), vec![1; cells]);
     let folder = Folder::new(&experiment.out("out"));
     let held: Vec<_> = experiment.plan.cells.iter().map(|cell| folder.cell(&cell.id).try_lock()).collect();
-    let runs: Vec<Child> = (0..2)
-        .map(|_| experiment.command("out", &["--jobs", "2", "--retry-failed"]).spawn().expect("started"))
-        .collect();
-    // Both have seen the failures: each has started a worker for the first cell, which found it locked.
-    let log = folder.cell(&experiment.plan.cells[0].id).log();
-    let busy = || std::fs::read_to_string(&log).map_or(0, |text| text.matches("another process works on").count());
-    wait_for("two runs", || busy() >= 2);
+    let told = [0, 1].map(|run| experiment.out(&format!("{run}.jsonl")));
+    let run = |told: &PathBuf| {
+        let mut command = experiment.command("out", &["--jobs", "2", "--retry-failed", "--json"]);
+        command.stdout(std::fs::File::create(told).expect("a file")).spawn().expect("started")
+    };
+    let runs: Vec<Child> = told.iter().map(run).collect();
+    // Both have seen the failures: each has started a worker for a cell, which found it locked.
+    let busy = |told: &PathBuf| std::fs::read_to_string(told).is_ok_and(|text| text.contains(r#""event":"busy""#));
+    wait_for("two runs", || told.iter().all(busy));
     drop(held);
     for run in runs {
         let output = run.wait_with_output().expect("ended");
@@ -187,19 +189,22 @@ fn a_lost_server_is_no_cells_failure() {
     assert!(experiment.plan.cells.iter().all(|cell| !folder.cell(&cell.id).is_settled(true)));
 
     let one = experiment.run("out", &["--cell", "0", "--server", &address]);
-    assert_eq!(one.status.code(), Some(69), "{}", stderr(&one));
+    assert!(one.status.code() == Some(1) && stderr(&one).contains("no server answers at"), "{}", stderr(&one));
 }
 
 #[test]
-fn a_cell_that_somebody_works_on_is_left_alone() {
+fn a_cell_that_somebody_works_on_is_left_alone_until_they_have_given_it_up() {
     let experiment = Experiment::new(PLAN);
     let place = Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[0].id);
     let lock = place.try_lock().expect("a file").expect("a lock");
-    let output = experiment.run("out", &["--cell", "0"]);
-    assert_eq!(output.status.code(), Some(75), "{}", stderr(&output));
+    let told = experiment.out("told.jsonl");
+    let mut command = experiment.command("out", &["--cell", "0", "--json"]);
+    let run = command.stdout(std::fs::File::create(&told).expect("a file")).spawn().expect("started");
+    let told = || std::fs::read_to_string(&told).expect("lines");
+    wait_for("a worker", || told().contains(r#""event":"busy""#));
     drop(lock);
-    succeeded(&experiment.run("out", &["--cell", &experiment.plan.cells[0].id]));
-    assert_eq!(experiment.results("out").len(), 1);
+    succeeded(&run.wait_with_output().expect("ended"));
+    assert_eq!((experiment.results("out").len(), told().matches(r#""event":"done""#).count()), (1, 1));
 }
 
 #[test]
@@ -212,10 +217,11 @@ fn a_wrong_command_is_refused_before_anything_is_done() {
     let output = experiment.run("out", &["--cell", "8"]);
     assert_eq!(output.status.code(), Some(2));
     assert!(stderr(&output).contains("give an index from 0 to 7"), "{}", stderr(&output));
-    let wrong: [&[&str]; 7] = [
-        &["--cell", "1,2", "--exit-with-stdin"],
+    let wrong: [&[&str]; 8] = [
         &["--cell", "1,8"],
-        &["--leave-plan"],
+        &["--worker"],
+        &["--worker", "--server", "unix:/x", "--jobs", "2"],
+        &["--engine", "slurm", "--json"],
         &["--time", "5"],
         &["--engine", "slurm", "--time", "5m"],
         &["--engine", "slurm", "--cells-per-job", "1001"],
@@ -253,14 +259,30 @@ fn several_cells_are_done_and_the_missing_ones_listed() {
     assert_eq!(listed.as_array().map(Vec::len), Some(6));
     assert_eq!(listed[1], serde_json::json!({ "index": 2, "id": ids[2] }));
 
-    // The folder's plan stays if it is told to.
+    // Single cells leave the folder's plan as it is: theirs may be older.
     let kept = || std::fs::read_to_string(experiment.out("out/plan.toml")).expect("a plan");
-    let before = kept();
     std::fs::write(experiment.out("file.toml"), format!("{PLAN}\n# extended")).expect("written");
-    succeeded(&experiment.run("out", &["--cell", "0", "--leave-plan", "--jobs", "1"]));
-    assert_eq!(kept(), before);
-    succeeded(&experiment.run("out", &["--cell", "0"]));
-    assert_ne!(kept(), before);
+    for arguments in [&["--cell", "0", "--jobs", "1"][..], &["--cell", "0"]] {
+        succeeded(&experiment.run("out", arguments));
+        assert_eq!(kept(), PLAN);
+    }
+    succeeded(&experiment.run("out", &["--jobs", "2"]));
+    assert_ne!(kept(), PLAN);
+}
+
+#[test]
+fn a_run_tells_what_happens_to_each_cell() {
+    let experiment = Experiment::new(PLAN);
+    let output = experiment.run("out", &["--cell", "1,2", "--json"]);
+    succeeded(&output);
+    let text = String::from_utf8(output.stdout).expect("text");
+    let lines: Vec<serde_json::Value> = text.lines().map(|line| serde_json::from_str(line).expect("JSON")).collect();
+    for cell in &experiment.plan.cells[1..=2] {
+        let of_cell = lines.iter().filter(|line| line["cell"] == *cell.id);
+        let mut events: Vec<&str> = of_cell.filter_map(|line| line["event"].as_str()).collect();
+        events.dedup();
+        assert_eq!(events, ["server", "training", "testing", "done"], "{text}");
+    }
 }
 
 fn shipped(name: &str) -> PathBuf {

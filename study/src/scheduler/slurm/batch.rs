@@ -16,7 +16,7 @@ pub(super) enum Size {
 
 /// A cell that is to be submitted.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Load {
+pub(super) struct CellLoad {
     /// Its place in the plan.
     pub(super) cell: usize,
     /// How long it may take.
@@ -28,7 +28,7 @@ pub(super) struct Load {
 
 /// Puts `loads` into at most `most_jobs` jobs, in their order. If that is too few for jobs of so many seconds, jobs
 /// become longer; what still has no place is left out, for a later submission.
-pub(super) fn batches(loads: &[Load], size: Size, most_jobs: usize) -> Vec<Vec<usize>> {
+pub(super) fn batches(loads: &[CellLoad], size: Size, most_jobs: usize) -> Vec<Vec<usize>> {
     let mut size = size;
     let all: f64 = loads.iter().map(|load| load.seconds).sum();
     loop {
@@ -43,7 +43,7 @@ pub(super) fn batches(loads: &[Load], size: Size, most_jobs: usize) -> Vec<Vec<u
     }
 }
 
-fn fill(loads: &[Load], size: Size) -> Vec<Vec<usize>> {
+fn fill(loads: &[CellLoad], size: Size) -> Vec<Vec<usize>> {
     let mut jobs: Vec<Vec<usize>> = Vec::new();
     let mut filling = 0.0;
     let mut closed = true;
@@ -71,8 +71,8 @@ fn fill(loads: &[Load], size: Size) -> Vec<Vec<usize>> {
 mod tests {
     use super::*;
 
-    fn loads(seconds: &[f64]) -> Vec<Load> {
-        seconds.iter().enumerate().map(|(cell, &seconds)| Load { cell, seconds, alone: false }).collect()
+    fn loads(seconds: &[f64]) -> Vec<CellLoad> {
+        seconds.iter().enumerate().map(|(cell, &seconds)| CellLoad { cell, seconds, alone: false }).collect()
     }
 
     #[test]

@@ -17,16 +17,15 @@
 mod batch;
 mod commands;
 mod error;
+mod jobs;
 mod options;
 mod script;
 mod submission;
-mod watch;
 
 pub use commands::{QueuedJob, Slurm};
 pub use error::{AnyError, SlurmError};
+pub use jobs::Jobs;
 pub use options::{OptionError, SlurmOptions, Task, TimeLimit};
-pub use watch::count;
-pub use watch::{Event, SlurmEnd, SlurmStatus, run_on_slurm};
 
 /// The most cells of a job: their ids must fit in one argument of a command, which Linux limits to 128 KiB.
 pub const MOST_CELLS_PER_JOB: usize = 1000;

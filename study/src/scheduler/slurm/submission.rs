@@ -4,8 +4,10 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::super::folder::{Folder, FolderError};
+use super::commands::QueuedJob;
 use crate::files::{self, write_atomically, write_json};
+use crate::folder::{Folder, FolderError};
+use crate::plan::Plan;
 
 const CELLS: &str = "cells.txt";
 const DOCUMENT: &str = "submission.json";
@@ -71,7 +73,7 @@ fn read(path: &Path, number: u32) -> Result<Option<Submission>, FolderError> {
 /// Writes down what is about to be submitted, `submission.json` last.
 pub(super) fn create(
     folder: &Folder,
-    plan: &str,
+    plan: &Plan,
     jobs: Vec<Vec<String>>,
     script: &dyn Fn(&Path) -> Result<String, super::SlurmError>,
 ) -> Result<Submission, super::SlurmError> {
@@ -79,7 +81,7 @@ pub(super) fn create(
     let number = numbers(&directory)?.last().map_or(1, |last| last + 1);
     let path = directory.join(number.to_string());
     let lines: String = jobs.iter().map(|cells| cells.join(",") + "\n").collect();
-    write_atomically(&path.join("plan.toml"), plan.as_bytes())?;
+    plan.files().try_for_each(|(name, content)| write_atomically(&path.join(name), content))?;
     write_atomically(&path.join(CELLS), lines.as_bytes())?;
     write_atomically(&path.join("job.sh"), script(&path)?.as_bytes())?;
     // Folders of different places have different names in one queue.
@@ -97,7 +99,17 @@ impl Submission {
         self.write()
     }
 
-    /// What job `index` of the array said.
+    /// Whether squeue's `job` is of this array.
+    pub(super) fn has(&self, job: &QueuedJob) -> bool {
+        job.name == self.names.name && self.names.job.as_ref().is_none_or(|array| *array == job.array)
+    }
+
+    /// The lines that job `index` of the array tells.
+    pub(super) fn events(&self, index: usize) -> PathBuf {
+        self.path.join(format!("{index}.jsonl"))
+    }
+
+    /// What else it said.
     pub(super) fn log(&self, index: usize) -> PathBuf {
         self.path.join(format!("{index}.log"))
     }
@@ -126,11 +138,13 @@ mod tests {
         let jobs = |ids: &[&[&str]]| -> Vec<Vec<String>> {
             ids.iter().map(|job| job.iter().map(|id| (*id).to_owned()).collect()).collect()
         };
+        let plan = "environments = ['Hopper']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+        let plan = Plan::parse("test", plan.into()).unwrap();
         let script = |_: &Path| Ok("#!/bin/sh\n".to_owned());
-        let mut first = create(&folder, "plan", jobs(&[&["a", "b"], &["c"]]), &script).unwrap();
+        let mut first = create(&folder, &plan, jobs(&[&["a", "b"], &["c"]]), &script).unwrap();
         // Broken off before it was complete: its number is not used again.
         fs::create_dir(super::directory(&folder).join("2")).unwrap();
-        let third = create(&folder, "plan", jobs(&[&["d"]]), &script).unwrap();
+        let third = create(&folder, &plan, jobs(&[&["d"]]), &script).unwrap();
         assert_eq!(third.number, 3);
         assert_ne!(first.names.name, third.names.name);
         first.accepted("17").unwrap();

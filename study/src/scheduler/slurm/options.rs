@@ -17,14 +17,10 @@ pub struct SlurmOptions {
     pub array_limit: Option<u32>,
     /// How many cells a job does, 1 to [`MOST_CELLS_PER_JOB`]; `None` for as many as take some minutes.
     pub cells_per_job: Option<usize>,
-    /// Whether cells that failed are tried again.
-    pub retry_failed: bool,
     /// What a job runs.
     pub task: Task,
     /// How often Slurm is asked for its queue. A cell that is lost is noticed by two answers in succession.
     pub queue_interval: Duration,
-    /// How often results are looked for in the folder.
-    pub folder_interval: Duration,
 }
 
 /// What a job runs on its node.

@@ -1,18 +1,21 @@
-//! Watching, with commands that only look like Slurm's. A real Slurm is in `cli/tests/cli/slurm`.
+//! The state machine over jobs, with a clock of its own and commands that only look like Slurm's. A real Slurm is in
+//! `cli/tests/cli/slurm`.
 
 use std::cell::Cell;
 use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tempfile::TempDir;
 
+use super::super::{Backend, Report, RunEnd, RunError, Scheduler};
 use super::submission::{self, Submission};
-use super::{Event, Slurm, SlurmEnd, SlurmError, SlurmOptions, Task, run_on_slurm};
+use super::{Jobs, Slurm, SlurmError, SlurmOptions, Task};
+use crate::folder::{Failure, Folder};
 use crate::interrupt::StopFlag;
-use crate::{Folder, Plan};
+use crate::plan::Plan;
 
 /// Four cells.
 const PLAN: &str = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 2
@@ -36,17 +39,15 @@ submission=$(dirname "$script")
 [ ! -f hook.sh ] || . ./hook.sh
 echo $number"#;
 
-/// Options for tests: asked often.
+/// Options for tests.
 pub(super) fn options() -> SlurmOptions {
     SlurmOptions {
         partition: None,
         time: None,
         array_limit: None,
         cells_per_job: Some(1),
-        retry_failed: false,
         task: Task { program: "/bin/true".into(), jobs: 1, workers: 1, servers: Vec::new() },
-        queue_interval: Duration::from_millis(30),
-        folder_interval: Duration::from_millis(10),
+        queue_interval: Duration::from_secs(15),
     }
 }
 
@@ -56,6 +57,7 @@ struct Fake {
     plan: Plan,
     options: SlurmOptions,
     limit: Duration,
+    retry_failed: bool,
     /// How often costs were asked for.
     costs: Cell<u32>,
 }
@@ -79,7 +81,8 @@ impl Fake {
         let folder = Folder::new(&directory.path().join("out"));
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let limit = Duration::from_secs(60);
-        let fake = Self { directory, folder, plan, options: options(), limit, costs: Cell::new(0) };
+        let fake =
+            Self { directory, folder, plan, options: options(), limit, retry_failed: false, costs: Cell::new(0) };
         fs::create_dir(fake.bin()).unwrap();
         fake.command("sbatch", SBATCH);
         fake.command("squeue", "cat queue 2>/dev/null; true");
@@ -98,7 +101,8 @@ impl Fake {
 
     fn hook(&self, script: &str) {
         let done = "done_() { for id in $(echo \"$1\" | tr , ' '); do mkdir -p ../out/cells/$id; \
-                    echo x >../out/cells/$id/result.json; done; }";
+                    echo x >../out/cells/$id/result.json; done; }
+                    says() { echo '{\"cell\":\"'$2'\",\"event\":\"'$3'\"'$4'}' >>\"$submission/$1.jsonl\"; }";
         fs::write(self.bin().join("hook.sh"), format!("{done}\n{script}\n")).unwrap();
     }
 
@@ -106,25 +110,37 @@ impl Fake {
         Slurm::in_directory(self.bin(), self.limit)
     }
 
-    /// Runs; `watch` hears every sentence.
-    fn run_with(&self, stop: &StopFlag, watch: &mut dyn FnMut(Event)) -> Result<SlurmEnd, SlurmError> {
+    /// Runs, a second at each step; `watch` hears every sentence.
+    fn run_with(&self, stop: &StopFlag, watch: &mut dyn FnMut(Report<'_>)) -> Result<RunEnd, RunError<SlurmError>> {
         let costs = || {
             self.costs.set(self.costs.get() + 1);
             Ok(vec![100.0; self.plan.cells.len()])
         };
-        run_on_slurm(&self.plan, &self.folder, &self.slurm(), &self.options, &costs, stop, watch)
+        let slurm = self.slurm();
+        let mut jobs = Jobs::new(&self.plan, &self.folder, &slurm, &self.options, &costs, stop).unwrap();
+        let mut scheduler = Scheduler::new(&self.plan, &self.folder, &mut jobs, self.retry_failed, watch);
+        let start = Instant::now();
+        for second in 0..1000 {
+            let stepped = scheduler.step(start + Duration::from_secs(second))?;
+            match (stepped, stop.signal()) {
+                (Some(failed), _) => return Ok(RunEnd::Finished { failed }),
+                (None, Some(signal)) => return Ok(RunEnd::Stopped { signal, left: jobs.stop() }),
+                (None, None) => {}
+            }
+        }
+        panic!("it does not end");
     }
 
-    fn run(&self) -> Result<SlurmEnd, SlurmError> {
+    fn run(&self) -> Result<RunEnd, RunError<SlurmError>> {
         self.run_with(&StopFlag::default(), &mut |_| {})
     }
 
     /// Runs until a sentence with these words is said.
-    fn run_until(&self, words: &str) -> Result<SlurmEnd, SlurmError> {
+    fn run_until(&self, words: &str) -> Result<RunEnd, RunError<SlurmError>> {
         let stop = StopFlag::default();
         let raised = stop.clone();
-        self.run_with(&stop, &mut |event| match event {
-            Event::Note(sentence) if sentence.contains(words) => raised.raise(2),
+        self.run_with(&stop, &mut |report| match report {
+            Report::Note(sentence) if sentence.contains(words) => raised.raise(2),
             _ => {}
         })
     }
@@ -148,12 +164,12 @@ impl Fake {
     }
 }
 
-fn finished() -> SlurmEnd {
-    SlurmEnd::Finished { failed: Vec::new() }
+fn finished() -> RunEnd {
+    RunEnd::Finished { failed: Vec::new() }
 }
 
-fn stopped(arrays: &[&str]) -> SlurmEnd {
-    SlurmEnd::Stopped { signal: 2, arrays: arrays.iter().map(|&array| array.to_owned()).collect() }
+fn stopped(arrays: &[&str]) -> RunEnd {
+    RunEnd::Stopped { signal: 2, left: arrays.iter().map(|&array| array.to_owned()).collect() }
 }
 
 fn singles(ids: &[String]) -> Vec<Vec<String>> {
@@ -189,14 +205,14 @@ fn what_slurm_lost_is_submitted_again() {
     let ids = fake.ids();
     // Each cell may take 100 s: three make a job. Its first one is done, then the node is lost; the other job vanishes.
     fake.hook(&format!(
-        "if [ $number = 1 ]; then done_ {}; echo \"1|0|NODE_FAIL|NodeDown|n1|$name\" >queue
+        "if [ $number = 1 ]; then done_ {0}; says 0 {0} done; echo \"1|0|NODE_FAIL|NodeDown|n1|$name\" >queue
          else for cells in $(cat \"$submission/cells.txt\"); do done_ $cells; done; fi",
         ids[0]
     ));
     let mut said = Vec::new();
-    let end = fake.run_with(&StopFlag::default(), &mut |event| match event {
-        Event::Note(sentence) => said.push(sentence),
-        Event::Status(_) => {}
+    let end = fake.run_with(&StopFlag::default(), &mut |report| match report {
+        Report::Note(sentence) => said.push(sentence.to_owned()),
+        _ => {}
     });
     assert_eq!(end.unwrap(), finished());
     let jobs: Vec<_> = fake.submissions().into_iter().map(|submission| submission.jobs).collect();
@@ -216,11 +232,12 @@ fn a_cell_that_gets_no_further_is_given_up_and_the_others_are_done() {
         ids[1]
     ));
     let error = fake.run().unwrap_err();
-    let SlurmError::GaveUp { ids: given_up, .. } = &error else { panic!("{error}") };
+    let RunError::GaveUp { ids: given_up, .. } = &error else { panic!("{error}") };
     assert_eq!(*given_up, [ids[1].clone()]);
     let message = error.to_string();
     assert!(
-        message.starts_with("1 cell without a result after 3 jobs") && message.contains("(gone) said `no space left`"),
+        message.starts_with("1 cell without a result after 3 attempts")
+            && message.contains("(gone) said `no space left`"),
         "{message}"
     );
     assert_eq!(fake.submissions().len(), 3);
@@ -235,14 +252,11 @@ fn a_training_that_gets_further_each_time_is_not_given_up() {
     let fake = Fake::new();
     let ids = fake.ids();
     ids[1..].iter().for_each(|id| fake.finish(id));
-    let checkpoint = fake.folder.cell(&ids[0]).training().join("checkpoint");
-    fs::create_dir_all(&checkpoint).unwrap();
     // A time limit ends it five times.
     fake.hook(&format!(
         "echo \"$number|0|TIMEOUT|TimeLimit|n1|$name\" >queue
-         echo '{{\"counters\": {{\"timesteps\": '$number'}}, \"other\": 0}}' >'{}/checkpoint.json'
-         [ $number -lt 6 ] || done_ {}",
-        checkpoint.display(),
+         says 0 {0} training ',\"episodes\":1,\"timesteps\":1,\"saved\":'$number
+         [ $number -lt 6 ] || done_ {0}",
         ids[0]
     ));
     assert_eq!(fake.run().unwrap(), finished());
@@ -265,9 +279,9 @@ fn slurms_refusal_is_shown_and_leaves_nothing_behind() {
     assert_eq!(fake.run_until("QOSMaxSubmitJobPerUserLimit; results are still looked for").unwrap(), stopped(&["1"]));
     let (stop, refusal) = (StopFlag::default(), fake.bin().join("refusal"));
     let raised = stop.clone();
-    let end = fake.run_with(&stop, &mut |event| match event {
-        Event::Note(sentence) if sentence.contains("MaxSubmit") => fs::remove_file(&refusal).unwrap(),
-        Event::Note(sentence) if sentence.contains("submitted 2 cells") => raised.raise(2),
+    let end = fake.run_with(&stop, &mut |report| match report {
+        Report::Note(sentence) if sentence.contains("MaxSubmit") => fs::remove_file(&refusal).unwrap(),
+        Report::Note(sentence) if sentence.contains("submitted 2 cells") => raised.raise(2),
         _ => {}
     });
     assert_eq!(end.unwrap(), stopped(&["1", "2"]));
@@ -288,9 +302,9 @@ fn a_silent_slurm_is_no_reason_to_submit_again() {
 
     // It falls silent while it is watched: results are found all the same.
     fake.command("squeue", "cat queue");
-    let end = fake.run_with(&StopFlag::default(), &mut |event| match event {
-        Event::Note(sentence) if sentence.contains("is in the queue") => fake.command("squeue", silent),
-        Event::Note(sentence) if sentence.contains("did not answer") => {
+    let end = fake.run_with(&StopFlag::default(), &mut |report| match report {
+        Report::Note(sentence) if sentence.contains("is in the queue") => fake.command("squeue", silent),
+        Report::Note(sentence) if sentence.contains("did not answer") => {
             fake.ids().iter().for_each(|id| fake.finish(id));
         }
         _ => {}
@@ -315,7 +329,7 @@ fn what_somebody_cancelled_is_submitted_again_by_the_next_call_only() {
 fn a_submission_whose_number_nobody_heard_is_found_by_its_name() {
     let fake = Fake::new();
     let script = |_: &Path| Ok(String::new());
-    let lost = submission::create(&fake.folder, "plan", singles(&fake.ids()), &script).unwrap();
+    let lost = submission::create(&fake.folder, &fake.plan, singles(&fake.ids()), &script).unwrap();
     let line = |index| format!("7|{index}|RUNNING|None|n1|{}\n", lost.names.name);
     fake.write("queue", &(0..4).map(line).collect::<String>());
     assert_eq!(fake.run_until("Slurm job 7 is in the queue").unwrap(), stopped(&["7"]));
@@ -332,15 +346,30 @@ fn failed_cells_are_tried_again_on_request_only() {
     ids[1..].iter().for_each(|id| fake.finish(id));
     let failed = fake.folder.cell(&ids[0]);
     fs::create_dir_all(failed.training()).unwrap();
-    fs::write(failed.path().join("failure.json"), "x").unwrap();
-    assert_eq!(fake.run().unwrap(), SlurmEnd::Finished { failed: vec![ids[0].clone()] });
+    let failure = Failure { id: ids[0].clone(), reason: "NaN".into(), commit: "x".into() };
+    failed.write_failure(&failure).unwrap();
+    assert_eq!(fake.run().unwrap(), RunEnd::Finished { failed: vec![ids[0].clone()] });
     assert!(fake.submissions().is_empty());
-    fake.options.retry_failed = true;
+    fake.retry_failed = true;
     fake.hook(&format!("done_ {}", ids[0]));
     assert_eq!(fake.run().unwrap(), finished());
     assert_eq!(fake.submissions()[0].jobs, singles(&ids[..1]));
     assert!(!failed.training().exists(), "from the beginning");
     assert!(!failed.path().join("failure.json").exists());
+}
+
+#[test]
+fn a_cell_that_failed_in_an_array_of_before_is_tried_again_while_the_array_goes_on() {
+    let mut fake = Fake::new();
+    fake.options.cells_per_job = Some(4);
+    let ids = fake.ids();
+    assert_eq!(fake.run_until("submitted 4 cells as Slurm job 1: 1 job").unwrap(), stopped(&["1"]));
+    let failure = Failure { id: ids[0].clone(), reason: "NaN".into(), commit: "x".into() };
+    fake.folder.cell(&ids[0]).write_failure(&failure).unwrap();
+    fake.retry_failed = true;
+    assert_eq!(fake.run_until("submitted 1 cell as Slurm job 2").unwrap(), stopped(&["1", "2"]));
+    assert_eq!(fake.submissions()[1].jobs, singles(&ids[..1]));
+    assert!(!fake.folder.cell(&ids[0]).is_settled(true));
 }
 
 #[test]

@@ -32,7 +32,7 @@ if [ ! -x "$program" ]; then
     echo "perturb: $SLURMD_NODENAME finds no program $program: put it in a folder that all nodes see" >&2
     exit 1
 fi
-exec "$program" run {plan} --leave-plan --out {folder} --cell "$cells" --jobs {jobs} {servers}
+exec "$program" run {plan} --json --out {folder} --cell "$cells" --jobs {jobs} {servers}
 "#
     ))
 }
@@ -72,7 +72,7 @@ mod tests {
         let (succeeded, said) = run(&task, directory.path(), "0");
         let shown = directory.path().display();
         let expected = format!(
-            "[run][{shown}/plan.toml][--leave-plan][--out][{shown}/it's $HOME][--cell][a,b][--jobs][2][--workers][3]"
+            "[run][{shown}/plan.toml][--json][--out][{shown}/it's $HOME][--cell][a,b][--jobs][2][--workers][3]"
         );
         assert!(succeeded && said.starts_with(&expected), "{said}");
         assert!(said.contains("job 7_0 on n1, restarted 0 times"), "{said}");

@@ -57,6 +57,12 @@ pub struct QueuedJob {
 }
 
 impl QueuedJob {
+    /// As it is when it was just submitted.
+    pub(super) fn pending(array: &str, index: usize, name: &str) -> Self {
+        let [array, state, name] = [array, "PENDING", name].map(str::to_owned);
+        Self { array, index, state, reason: String::new(), node: String::new(), name }
+    }
+
     /// Whether it runs, or will.
     pub fn is_live(&self) -> bool {
         !ENDED.contains(&self.state.as_str())
@@ -190,7 +196,8 @@ fn sbatch_arguments(submission: &Submission, options: &SlurmOptions) -> Result<V
         format!("--cpus-per-task={}", options.task.cores()),
         "--requeue".to_owned(), // what a lost node did goes back into the queue, also while nobody watches
         format!("--chdir={path}"),
-        format!("--output={}/%a.log", path.replace('%', "%%")),
+        format!("--output={}/%a.jsonl", path.replace('%', "%%")),
+        format!("--error={}/%a.log", path.replace('%', "%%")),
         "--open-mode=append".to_owned(),
     ];
     arguments.extend(options.partition.as_ref().map(|name| format!("--partition={name}")));
@@ -226,9 +233,9 @@ fn not_understood(program: &'static str, expected: &'static str, got: &str) -> S
 
 #[cfg(test)]
 mod tests {
+    use super::super::submission::Names;
+    use super::super::tests::options;
     use super::*;
-    use crate::slurm::submission::Names;
-    use crate::slurm::tests::options;
 
     #[test]
     fn squeues_lines_are_understood() {
@@ -260,7 +267,8 @@ mod tests {
         let submission = Submission { number: 1, path: "/shared/100%/slurm/1".into(), jobs, names };
         let text = sbatch_arguments(&submission, &options).unwrap().join(" ");
         let expected = "--array=0-2 --nodes=1 --ntasks=1 --cpus-per-task=1 --requeue --chdir=/shared/100%/slurm/1 \
-                        --output=/shared/100%%/slurm/1/%a.log --open-mode=append /shared/100%/slurm/1/job.sh";
+                        --output=/shared/100%%/slurm/1/%a.jsonl \
+                        --error=/shared/100%%/slurm/1/%a.log --open-mode=append /shared/100%/slurm/1/job.sh";
         assert!(text.ends_with(expected), "{text}");
         options.partition = Some("long".into());
         options.time = Some("1-00".parse().unwrap());

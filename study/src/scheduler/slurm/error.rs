@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use super::super::folder::FolderError;
+use super::super::count;
 use super::options::OptionError;
-use super::watch::{MOST_ATTEMPTS, count};
 use crate::files::FileError;
+use crate::folder::FolderError;
 
 /// Of whoever finds out what cells cost.
 pub type AnyError = Box<dyn std::error::Error + Send + Sync>;
@@ -80,18 +80,5 @@ pub enum SlurmError {
         arrays: Vec<String>,
         /// How many cells are missing.
         missing: usize,
-    },
-    /// Cells were submitted several times, and their jobs ended without bringing them any further.
-    #[error(
-        "{} without a result after {MOST_ATTEMPTS} jobs, the first is {}: {words}; when that is mended, the same command \
-         tries again",
-        count(ids.len(), "cell"),
-        ids[0]
-    )]
-    GaveUp {
-        /// Ids, at least one.
-        ids: Vec<String>,
-        /// How the last job of the first one ended, and what it said last.
-        words: String,
     },
 }

@@ -1,0 +1,214 @@
+//! What a worker is told and what it tells: one JSON object a line, on its standard input and output.
+
+use std::fs::File;
+use std::io::Write;
+use std::os::unix::fs::FileExt;
+use std::time::{Duration, Instant};
+
+use serde::{Deserialize, Serialize};
+
+use super::count;
+use crate::folder::FailureMark;
+
+/// How often a worker says how far it is.
+const INTERVAL: Duration = Duration::from_secs(1);
+
+/// The only line that a worker reads. It stops when its standard input is closed, which also happens when the process
+/// that started it dies, however it dies.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Order {
+    /// The cell's id.
+    pub cell: String,
+    /// The failure that it may forget, and no other.
+    pub retry: Option<FailureMark>,
+    /// Which of several servers it should take, counted around.
+    pub turn: usize,
+}
+
+/// A line that a worker writes, `{"cell": "…", "event": "training", …}`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Line {
+    /// The cell's id.
+    pub cell: String,
+    /// What happens to it.
+    #[serde(flatten)]
+    pub event: Event,
+}
+
+/// What happens to a cell. All but the first three end an attempt, and are a worker's last line.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+#[expect(missing_docs, reason = "the variants say what their fields are")]
+pub enum Event {
+    /// There is a server for it, at this address.
+    Server { address: String },
+    /// It is trained, so far for so many episodes and steps, of which `saved` steps are in a checkpoint: what another
+    /// attempt would begin with. The first such line of an attempt says where that begins.
+    Training { episodes: u64, timesteps: u64, saved: u64 },
+    /// It is tested on this set, so far in so many episodes.
+    Testing { set: String, episodes: u64 },
+    /// There is a result, of now or of earlier.
+    Done,
+    /// It failed, now or earlier, for this reason.
+    Failed { reason: String },
+    /// Somebody else works on it.
+    Busy,
+    /// There is no server, or no longer, which is not the cell's failure.
+    LostServer { reason: String },
+    /// This signal asked to end. What was trained is kept.
+    Stopped { signal: i32 },
+    /// The order makes no sense to the worker.
+    Refused { reason: String },
+    /// The worker ended without a last line, in this way: said by whoever started it.
+    Killed { reason: String },
+}
+
+impl Event {
+    pub(super) fn is_last(&self) -> bool {
+        !matches!(self, Self::Server { .. } | Self::Training { .. } | Self::Testing { .. })
+    }
+
+    /// What stays the same while it only says how far something is.
+    fn stage(&self) -> Option<(&str, u64)> {
+        match self {
+            Self::Training { saved, .. } => Some(("", *saved)),
+            Self::Testing { set, .. } => Some((set, 0)),
+            _ => None,
+        }
+    }
+}
+
+impl std::fmt::Display for Event {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Server { address } => write!(f, "on {address}"),
+            Self::Training { episodes, .. } => write!(f, "{} of training", count(*episodes as usize, "episode")),
+            Self::Testing { set, episodes } => write!(f, "{} on {set}", count(*episodes as usize, "test episode")),
+            Self::Done => write!(f, "done"),
+            Self::Busy => write!(f, "others work on it"),
+            Self::Stopped { signal } => write!(f, "signal {signal} ended its process"),
+            Self::Failed { reason }
+            | Self::LostServer { reason }
+            | Self::Refused { reason }
+            | Self::Killed { reason } => write!(f, "{reason}"),
+        }
+    }
+}
+
+/// Writes a cell's lines.
+pub struct Teller<W> {
+    cell: String,
+    out: W,
+    last: Option<(Event, Instant)>,
+}
+
+impl<W: Write> Teller<W> {
+    /// Of the cell with this id.
+    pub fn new(cell: &str, out: W) -> Self {
+        Self { cell: cell.to_owned(), out, last: None }
+    }
+
+    /// Writes a line, unless it says hardly more than one of a moment ago.
+    pub fn tell(&mut self, event: Event) {
+        let said = |(last, time): &(Event, Instant)| time.elapsed() < INTERVAL && last.stage() == event.stage();
+        if event.stage().is_some() && self.last.as_ref().is_some_and(said) {
+            return;
+        }
+        self.last = Some((event.clone(), Instant::now()));
+        write_line(&mut self.out, &Line { cell: self.cell.clone(), event });
+    }
+}
+
+/// Writes `line` for whoever reads. That nobody does is no reason to stop: the folder says what was done.
+pub fn write_line(out: &mut impl Write, line: &impl Serialize) {
+    let Ok(mut text) = serde_json::to_vec(line) else { return };
+    text.push(b'\n');
+    if let Err(error) = out.write_all(&text).and_then(|()| out.flush()) {
+        tracing::debug!(%error, "nobody reads what is told");
+    }
+}
+
+/// The lines that were completed in `file` since `offset`, which goes on behind them. Others may write there too, a
+/// cluster's prologue for instance: what is no such line is passed over.
+pub(super) fn read_lines(file: &File, offset: &mut u64) -> std::io::Result<Vec<Line>> {
+    let mut new = Vec::new();
+    let mut piece = [0; 1 << 14];
+    loop {
+        match file.read_at(&mut piece, *offset + new.len() as u64)? {
+            0 => break,
+            count => new.extend_from_slice(&piece[..count]),
+        }
+    }
+    let Some(end) = new.iter().rposition(|&byte| byte == b'\n') else { return Ok(Vec::new()) };
+    *offset += end as u64 + 1;
+    Ok(new[..end].split(|&byte| byte == b'\n').filter_map(|line| serde_json::from_slice(line).ok()).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use rstest::rstest;
+
+    use super::*;
+
+    #[rstest]
+    #[case(Event::Server { address: "unix:/x".into() }, r#""server","address":"unix:/x"}"#)]
+    #[case(
+        Event::Training { episodes: 3, timesteps: 40, saved: 20 },
+        r#""training","episodes":3,"timesteps":40,"saved":20}"#
+    )]
+    #[case(Event::Testing { set: "D".into(), episodes: 5 }, r#""testing","set":"D","episodes":5}"#)]
+    #[case(Event::Done, r#""done"}"#)]
+    #[case(Event::Failed { reason: "NaN".into() }, r#""failed","reason":"NaN"}"#)]
+    #[case(Event::Busy, r#""busy"}"#)]
+    #[case(Event::LostServer { reason: "gone".into() }, r#""lost_server","reason":"gone"}"#)]
+    #[case(Event::Stopped { signal: 15 }, r#""stopped","signal":15}"#)]
+    #[case(Event::Refused { reason: "no".into() }, r#""refused","reason":"no"}"#)]
+    #[case(Event::Killed { reason: "no".into() }, r#""killed","reason":"no"}"#)]
+    fn a_line_is_a_flat_object_and_reads_back(#[case] event: Event, #[case] text: &str) {
+        let line = Line { cell: "a".into(), event };
+        let text = format!(r#"{{"cell":"a","event":{text}"#);
+        assert_eq!(serde_json::to_string(&line).unwrap(), text);
+        assert_eq!(serde_json::from_str::<Line>(&text).unwrap(), line);
+    }
+
+    #[test]
+    fn how_far_it_is_is_said_once_a_second_but_each_checkpoint_at_once() {
+        let mut out = Vec::new();
+        let mut teller = Teller::new("a", &mut out);
+        let training = |episodes, saved| Event::Training { episodes, timesteps: 10 * episodes, saved };
+        for (episodes, saved) in [(0, 0), (1, 0), (2, 20), (3, 20)] {
+            teller.tell(training(episodes, saved));
+        }
+        teller.tell(Event::Testing { set: "D".into(), episodes: 1 });
+        teller.tell(Event::Testing { set: "R".into(), episodes: 1 });
+        teller.last = teller.last.map(|(last, time)| (last, time.checked_sub(INTERVAL).unwrap()));
+        teller.tell(Event::Testing { set: "R".into(), episodes: 2 });
+        teller.tell(Event::Done);
+        let words: Vec<String> = String::from_utf8(out).unwrap().lines().map(|line| line.replace('"', "")).collect();
+        assert_eq!(
+            words,
+            [
+                "{cell:a,event:training,episodes:0,timesteps:0,saved:0}",
+                "{cell:a,event:training,episodes:2,timesteps:20,saved:20}",
+                "{cell:a,event:testing,set:D,episodes:1}",
+                "{cell:a,event:testing,set:R,episodes:1}",
+                "{cell:a,event:testing,set:R,episodes:2}",
+                "{cell:a,event:done}",
+            ]
+        );
+    }
+
+    #[test]
+    fn a_file_is_read_line_by_line_while_it_is_written() {
+        let mut out = tempfile::tempfile().unwrap();
+        let (file, mut offset) = (out.try_clone().unwrap(), 0);
+        let mut read =
+            || read_lines(&file, &mut offset).unwrap().into_iter().map(|line| line.event).collect::<Vec<_>>();
+        assert_eq!(read(), []);
+        out.write_all(b"a prologue's words\n{\"cell\":\"a\",\"event\":\"busy\"}\n{\"cell\":\"a\",\"ev").unwrap();
+        assert_eq!(read(), [Event::Busy]);
+        assert_eq!(read(), []);
+        out.write_all(b"ent\":\"done\"}\n").unwrap();
+        assert_eq!(read(), [Event::Done]);
+    }
+}

@@ -1,0 +1,472 @@
+//! Doing the cells of a plan: on this machine, or on a cluster.
+//!
+//! [`run()`] is one state machine over a [`Backend`] that begins cells and tells what becomes of them: [`Local`] in
+//! processes of this machine, [`slurm`] in jobs. Whatever is told, the folder says what is done: a cell is settled when
+//! its result is there, or a failure that counts. So several runs, of both kinds, may share a folder.
+
+mod event;
+mod local;
+pub mod slurm;
+mod times;
+
+use std::collections::VecDeque;
+use std::error::Error;
+use std::time::{Duration, Instant};
+
+use crate::files::FileError;
+use crate::folder::{Failure, FailureMark, Folder};
+use crate::interrupt::StopFlag;
+use crate::plan::Plan;
+pub use event::{Event, Line, Order, Teller, write_line};
+pub use local::Local;
+use times::Times;
+
+/// How often in a row a cell may be broken off without getting any further.
+pub const MOST_ATTEMPTS: u32 = 3;
+/// How often in a row a cell may be without a server before the run ends: after some fifteen seconds, in which a server
+/// may have been started again.
+const MOST_LOST_SERVERS: u32 = 5;
+/// A cell that had a server for so long made some progress: what is lost then is not lost in a row.
+const HAD_A_SERVER: Duration = Duration::from_secs(60);
+/// How long nothing is begun after a cell had no server; doubled at each time in a row.
+const SERVER_PAUSE: Duration = Duration::from_secs(1);
+/// How often the folder is looked at, and it is said how far the run is.
+const LOOK_INTERVAL: Duration = Duration::from_secs(1);
+/// How long this process sleeps at a time.
+const TICK: Duration = Duration::from_millis(50);
+
+/// What does cells.
+pub trait Backend {
+    /// Why it cannot.
+    type Error: Error + 'static;
+    /// Whether a cell that is broken off too often has failed. If not, its machines may be to blame: nothing is
+    /// recorded, and the next run tries again.
+    const CONVICTS: bool;
+
+    /// What has happened since the last call.
+    ///
+    /// # Errors
+    /// The run cannot go on.
+    fn poll(&mut self, now: Instant) -> Result<Vec<News>, Self::Error>;
+    /// How many cells it would take now.
+    fn room(&self) -> usize;
+    /// Begins with some of `offers`, and gives the cells that it took: these, and those that it has in work already.
+    ///
+    /// # Errors
+    /// The run cannot go on.
+    fn begin(&mut self, offers: &[Offer]) -> Result<Vec<usize>, Self::Error>;
+    /// What it is doing, in a few words, and how many cells at a time.
+    fn load(&self) -> (String, usize);
+    /// Ends all that cannot go on without this process, and names what can.
+    fn stop(&mut self) -> Vec<String>;
+}
+
+/// A cell that waits to be done.
+#[derive(Clone, Copy, Debug)]
+pub struct Offer {
+    /// Its place in the plan.
+    pub cell: usize,
+    /// The failure that is forgiven it.
+    pub retry: Option<FailureMark>,
+    /// How often it was broken off without getting any further.
+    pub attempts: u32,
+    /// How many servers it has lost.
+    pub lost_servers: usize,
+    /// What other cells of its kind took, s; `None` before the first.
+    pub seconds: Option<f64>,
+}
+
+/// What a backend has to say. Cells are places in the plan.
+#[derive(Clone, Debug, PartialEq)]
+pub enum News {
+    /// Something happened to a cell.
+    Event(usize, Event),
+    /// A cell was given back before its turn came.
+    Returned(usize),
+    /// The servers are gone, for this reason.
+    NoServer(String),
+    /// A sentence.
+    Note(String),
+}
+
+/// What a run says while it goes on.
+#[derive(Clone, Debug)]
+pub enum Report<'a> {
+    /// How far it is.
+    Status(&'a Status),
+    /// A sentence about what happened.
+    Note(&'a str),
+    /// What happened to a cell.
+    Line(&'a Line),
+}
+
+/// How far a run is.
+#[derive(Clone, Debug)]
+pub struct Status {
+    /// Cells of the plan.
+    pub cells: usize,
+    /// Cells with a result.
+    pub done: usize,
+    /// Cells that failed.
+    pub failed: usize,
+    /// The ids of cells in work, and what is being done.
+    pub running: Vec<(String, Event)>,
+    /// What the backend is doing, in a few words.
+    pub doing: String,
+    /// How long it may take, by what finished cells took; `None` before the first.
+    pub remaining: Option<Duration>,
+}
+
+/// How a run ended.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum RunEnd {
+    /// All cells have a result or have failed; these have failed.
+    Finished {
+        /// Ids.
+        failed: Vec<String>,
+    },
+    /// This signal ended it. Calling it again goes on.
+    Stopped {
+        /// Its number.
+        signal: i32,
+        /// What goes on without this process: a cluster's jobs.
+        left: Vec<String>,
+    },
+}
+
+/// Why a run cannot go on.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum RunError<E: Error + 'static> {
+    /// The folder cannot be read or written.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// A worker does not know the plan's cells.
+    #[error("a worker refused its order: {0}; did another run replace the folder's plan.toml meanwhile?")]
+    Refused(String),
+    /// The servers are gone.
+    #[error("the run cannot go on without a server: {0}; finished cells are kept, call it again to go on")]
+    NoServer(String),
+    /// Cells were tried several times, which did not bring them any further.
+    #[error(
+        "{} without a result after {MOST_ATTEMPTS} attempts, the first is {}: {words}; when that is mended, the same \
+         command tries again",
+        count(ids.len(), "cell"),
+        ids[0]
+    )]
+    GaveUp {
+        /// Ids, at least one.
+        ids: Vec<String>,
+        /// How the last attempt at the first one ended.
+        words: String,
+    },
+    /// What does the cells cannot.
+    #[error(transparent)]
+    Backend(E),
+}
+
+/// Does every cell of `plan` that has no result in `folder`; with `retry_failed`, also those that had failed before.
+/// Returns when no cell is left, also none that another run works on.
+///
+/// # Errors
+/// [`RunError`]; the backend has then been stopped.
+pub fn run<B: Backend>(
+    plan: &Plan,
+    folder: &Folder,
+    backend: &mut B,
+    retry_failed: bool,
+    stop: &StopFlag,
+    report: &mut dyn FnMut(Report<'_>),
+) -> Result<RunEnd, RunError<B::Error>> {
+    let mut scheduler = Scheduler::new(plan, folder, backend, retry_failed, report);
+    let end = loop {
+        match (scheduler.step(Instant::now()), stop.signal()) {
+            (Ok(None), None) => std::thread::sleep(TICK),
+            (Ok(Some(failed)), _) => break Ok(RunEnd::Finished { failed }),
+            (Err(error), None) => break Err(error),
+            // Whoever stops a run may end its servers and commands too.
+            (_, Some(signal)) => break Ok(RunEnd::Stopped { signal, left: scheduler.backend.stop() }),
+        }
+    };
+    scheduler.backend.stop();
+    end
+}
+
+/// What is known of a cell.
+#[derive(Debug, Default)]
+struct Tracked {
+    phase: Phase,
+    /// A failure that was there before this run and does not count. One that is recorded later does, whoever tried.
+    forgiven: Option<FailureMark>,
+    /// How often in a row it was broken off without getting any further.
+    attempts: u32,
+    /// Steps of its training that are in a checkpoint.
+    saved: u64,
+    lost_servers: usize,
+    lost_in_a_row: u32,
+    /// When it was begun, …
+    begun: Option<Instant>,
+    /// … had a server (looking for one, of which many may be silent, is not having one) …
+    served: Option<Instant>,
+    /// … and what happened to it last.
+    last: Option<Event>,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+enum Phase {
+    #[default]
+    Waiting,
+    Running,
+    /// Others work on it.
+    Elsewhere,
+    Done,
+    Failed,
+    /// It was broken off too often.
+    GivenUp,
+}
+
+struct Scheduler<'a, B> {
+    plan: &'a Plan,
+    folder: &'a Folder,
+    backend: &'a mut B,
+    report: &'a mut dyn FnMut(Report<'_>),
+    /// By the cells' places in the plan.
+    cells: Vec<Tracked>,
+    /// The cells that wait, in order.
+    queue: VecDeque<usize>,
+    times: Times<'a>,
+    paused_until: Option<Instant>,
+    look_at: Option<Instant>,
+}
+
+type Step<B, T> = Result<T, RunError<<B as Backend>::Error>>;
+
+impl<'a, B: Backend> Scheduler<'a, B> {
+    fn new(
+        plan: &'a Plan,
+        folder: &'a Folder,
+        backend: &'a mut B,
+        retry_failed: bool,
+        report: &'a mut dyn FnMut(Report<'_>),
+    ) -> Self {
+        let forgiven = |id: &str| folder.cell(id).failure_mark().filter(|_| retry_failed);
+        let cells = plan.cells.iter().map(|cell| Tracked { forgiven: forgiven(&cell.id), ..Tracked::default() });
+        Self {
+            plan,
+            folder,
+            backend,
+            report,
+            cells: cells.collect(),
+            queue: (0..plan.cells.len()).collect(),
+            times: Times::default(),
+            paused_until: None,
+            look_at: None,
+        }
+    }
+
+    /// Takes note of what happened and begins what can be begun. At the end gives the ids of the cells that failed.
+    fn step(&mut self, now: Instant) -> Step<B, Option<Vec<String>>> {
+        for news in self.backend.poll(now).map_err(RunError::Backend)? {
+            match news {
+                News::Note(sentence) => (self.report)(Report::Note(&sentence)),
+                News::NoServer(reason) => return Err(RunError::NoServer(reason)),
+                News::Returned(cell) if self.settled(cell) => {}
+                News::Returned(cell) => self.wait(cell),
+                News::Event(cell, event) => self.hear(cell, event, now)?,
+            }
+        }
+        let looks = self.look_at.is_none_or(|time| now >= time);
+        if looks {
+            self.look(now)?;
+        }
+        self.begin(now)?;
+        if looks {
+            let status = self.status(now);
+            (self.report)(Report::Status(&status));
+        }
+        self.end()
+    }
+
+    fn hear(&mut self, cell: usize, event: Event, now: Instant) -> Step<B, ()> {
+        let line = Line { cell: self.id(cell).to_owned(), event: event.clone() };
+        (self.report)(Report::Line(&line));
+        let tracked = &mut self.cells[cell];
+        tracked.last = Some(event.clone());
+        match event {
+            Event::Server { .. } => tracked.served = tracked.served.or(Some(now)),
+            Event::Training { saved, .. } if saved > tracked.saved => (tracked.saved, tracked.attempts) = (saved, 0),
+            event if event.is_last() && !self.settled(cell) => self.conclude(cell, event, now)?,
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// Decides what becomes of a cell whose attempt ended without settling it.
+    fn conclude(&mut self, cell: usize, end: Event, now: Instant) -> Step<B, ()> {
+        let tracked = &mut self.cells[cell];
+        match end {
+            Event::Busy => tracked.phase = Phase::Elsewhere,
+            Event::Refused { reason } => return Err(RunError::Refused(reason)),
+            Event::Failed { reason } => self.record_failure(cell, reason)?,
+            Event::LostServer { reason } => {
+                let served_long = tracked.served.is_some_and(|since| now - since >= HAD_A_SERVER);
+                tracked.lost_in_a_row = if served_long { 1 } else { tracked.lost_in_a_row + 1 };
+                tracked.lost_servers += 1;
+                if tracked.lost_in_a_row >= MOST_LOST_SERVERS {
+                    return Err(RunError::NoServer(format!("{}: {reason}", self.id(cell))));
+                }
+                self.paused_until = Some(now + SERVER_PAUSE * (1 << (tracked.lost_in_a_row - 1)));
+                // At the front: if the servers are gone, the run ends soon, however many cells it has.
+                tracked.phase = Phase::Waiting;
+                self.queue.push_front(cell);
+            }
+            end => {
+                tracked.attempts += 1;
+                if tracked.attempts < MOST_ATTEMPTS {
+                    self.wait(cell);
+                } else if B::CONVICTS {
+                    let times = format!("{MOST_ATTEMPTS} attempts in a row have not brought it any further");
+                    self.record_failure(cell, format!("{end}; {times}"))?;
+                } else {
+                    tracked.phase = Phase::GivenUp;
+                    let id = self.id(cell);
+                    let note = format!("{id} is given up: {MOST_ATTEMPTS} attempts have not brought it any further");
+                    (self.report)(Report::Note(&note));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Records the failure of a worker that could not do so itself.
+    fn record_failure(&mut self, cell: usize, reason: String) -> Step<B, ()> {
+        let place = self.folder.cell(self.id(cell));
+        let Some(_lock) = place.try_lock()? else {
+            self.cells[cell].phase = Phase::Elsewhere;
+            return Ok(());
+        };
+        if !self.settled(cell) {
+            place.write_failure(&Failure { id: self.id(cell).to_owned(), reason, commit: crate::VERSION.into() })?;
+            self.cells[cell].phase = Phase::Failed;
+        }
+        Ok(())
+    }
+
+    /// Whether a cell has a result, or has failed and that counts.
+    fn settled(&mut self, cell: usize) -> bool {
+        let Tracked { phase, forgiven, .. } = &mut self.cells[cell];
+        let place = self.folder.cell(&self.plan.cells[cell].id);
+        if matches!(phase, Phase::Done | Phase::Failed) {
+            return true;
+        } else if place.is_settled(false) {
+            *phase = Phase::Done;
+            if let Some(timing) = place.timing() {
+                self.times.add(&self.plan.cells[cell], timing.seconds);
+            }
+        } else if place.failure_mark().is_some_and(|failure| Some(failure) != *forgiven) {
+            *phase = Phase::Failed;
+        }
+        matches!(phase, Phase::Done | Phase::Failed)
+    }
+
+    /// Takes note of what is in the folder, whoever did it, and of cells that others have given up.
+    fn look(&mut self, now: Instant) -> Step<B, ()> {
+        let begun = Instant::now();
+        for cell in 0..self.cells.len() {
+            if !self.settled(cell)
+                && self.cells[cell].phase == Phase::Elsewhere
+                && self.folder.cell(self.id(cell)).try_lock()?.is_some()
+            {
+                self.wait(cell);
+            }
+        }
+        // A folder of many cells on a slow file system is not looked at all the time.
+        self.look_at = Some(now + LOOK_INTERVAL.max(begun.elapsed() * 20));
+        Ok(())
+    }
+
+    fn begin(&mut self, now: Instant) -> Step<B, ()> {
+        let room = self.backend.room();
+        if self.paused_until.is_some_and(|end| now < end) {
+            return Ok(());
+        }
+        let mut offers = Vec::new();
+        for cell in self.queue.clone() {
+            // Another run may have done it meanwhile.
+            if offers.len() < room && !self.settled(cell) {
+                let Tracked { forgiven: retry, attempts, lost_servers, .. } = self.cells[cell];
+                let seconds = self.times.of_pair(&self.plan.cells[cell]);
+                offers.push(Offer { cell, retry, attempts, lost_servers, seconds });
+            }
+        }
+        if !offers.is_empty() {
+            for cell in self.backend.begin(&offers).map_err(RunError::Backend)? {
+                let tracked = &mut self.cells[cell];
+                (tracked.phase, tracked.begun, tracked.served, tracked.last) = (Phase::Running, Some(now), None, None);
+            }
+        }
+        self.queue.retain(|&cell| self.cells[cell].phase == Phase::Waiting);
+        Ok(())
+    }
+
+    fn wait(&mut self, cell: usize) {
+        self.cells[cell].phase = Phase::Waiting;
+        self.queue.push_back(cell);
+    }
+
+    /// The ids of the cells that failed; `None` while cells are left.
+    fn end(&self) -> Step<B, Option<Vec<String>>> {
+        let of = |phases: &[Phase]| -> Vec<usize> {
+            (0..self.cells.len()).filter(|&cell| phases.contains(&self.cells[cell].phase)).collect()
+        };
+        let ids = |cells: Vec<usize>| cells.into_iter().map(|cell| self.id(cell).to_owned()).collect();
+        if !of(&[Phase::Waiting, Phase::Running, Phase::Elsewhere]).is_empty() {
+            return Ok(None);
+        }
+        let given_up = of(&[Phase::GivenUp]);
+        match given_up.first().map(|&first| &self.cells[first].last) {
+            None => Ok(Some(ids(of(&[Phase::Failed])))),
+            Some(last) => {
+                let words = last.as_ref().map(Event::to_string).unwrap_or_default();
+                Err(RunError::GaveUp { ids: ids(given_up), words })
+            }
+        }
+    }
+
+    fn status(&self, now: Instant) -> Status {
+        let (doing, at_a_time) = self.backend.load();
+        let number = |phase| self.cells.iter().filter(|cell| cell.phase == phase).count();
+        let (mut running, mut left) = (Vec::new(), Vec::new());
+        for (tracked, cell) in self.cells.iter().zip(&self.plan.cells) {
+            match (tracked.phase, &tracked.last, tracked.begun) {
+                (Phase::Running, Some(event), Some(begun)) => {
+                    running.push((cell.id.clone(), event.clone()));
+                    left.push((cell, (now - begun).as_secs_f64()));
+                }
+                // Before its turn in a job, a cell takes no time.
+                (Phase::Waiting | Phase::Running, ..) => left.push((cell, 0.0)),
+                _ => {}
+            }
+        }
+        Status {
+            cells: self.cells.len(),
+            done: number(Phase::Done),
+            failed: number(Phase::Failed),
+            running,
+            doing,
+            remaining: self.times.remaining(left.into_iter(), at_a_time),
+        }
+    }
+
+    fn id(&self, cell: usize) -> &'a str {
+        &self.plan.cells[cell].id
+    }
+}
+
+/// "1 cell", "2 cells".
+pub fn count(number: usize, noun: &str) -> String {
+    if number == 1 { format!("1 {noun}") } else { format!("{number} {noun}s") }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,384 @@
+//! The rules of the state machine, with a backend that follows a script and a clock of its own.
+
+use std::collections::HashMap;
+use std::convert::Infallible;
+
+use rstest::rstest;
+use tempfile::TempDir;
+
+use super::*;
+
+/// Four cells.
+const PLAN: &str = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 2
+    [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+
+/// What an attempt does, an act a second.
+#[derive(Clone, Debug)]
+enum Act {
+    Say(Event),
+    Wait(u64),
+    /// The result appears.
+    Result,
+    /// A failure is recorded.
+    Failure,
+    End(Event),
+    /// Its turn does not come.
+    Return,
+}
+use Act::{Failure as Fails, Result as Succeeds, Return, Say, Wait};
+
+fn ends(end: Event) -> Act {
+    Act::End(end)
+}
+
+fn killed() -> Act {
+    ends(Event::Killed { reason: "signal 9".into() })
+}
+
+fn lost() -> Act {
+    ends(Event::LostServer { reason: "gone".into() })
+}
+
+fn server() -> Act {
+    Say(Event::Server { address: "unix:/x".into() })
+}
+
+fn saved(saved: u64) -> Act {
+    Say(Event::Training { episodes: 1, timesteps: saved + 5, saved })
+}
+
+fn done() -> Vec<Act> {
+    vec![Succeeds, ends(Event::Done)]
+}
+
+/// Follows a script: what the nth attempt at a cell does, n from 1.
+struct Fake<'a, const CONVICTS: bool> {
+    place: &'a Place,
+    script: &'a dyn Fn(usize, usize) -> Vec<Act>,
+    jobs: usize,
+    start: Instant,
+    now: Instant,
+    running: Vec<(usize, VecDeque<Act>)>,
+    /// For each attempt its cell, when it began, and how many servers the cell had lost.
+    begun: Vec<(usize, u64, usize)>,
+    most_at_a_time: usize,
+}
+
+impl<const CONVICTS: bool> Backend for Fake<'_, CONVICTS> {
+    type Error = Infallible;
+    const CONVICTS: bool = CONVICTS;
+
+    fn poll(&mut self, now: Instant) -> Result<Vec<News>, Infallible> {
+        self.now = now;
+        let mut news = Vec::new();
+        let place = self.place;
+        self.running.retain_mut(|(cell, acts)| {
+            match acts.pop_front() {
+                Some(Say(event) | Act::End(event)) => news.push(News::Event(*cell, event)),
+                Some(Wait(seconds)) if seconds > 1 => acts.push_front(Wait(seconds - 1)),
+                Some(Wait(_)) => {}
+                Some(Succeeds) => place.write(*cell, "result.json"),
+                Some(Fails) => place.fail(*cell),
+                Some(Return) => news.push(News::Returned(*cell)),
+                None => panic!("an attempt at cell {cell} has no end"),
+            }
+            !acts.is_empty()
+        });
+        Ok(news)
+    }
+
+    fn room(&self) -> usize {
+        self.jobs - self.running.len()
+    }
+
+    fn begin(&mut self, offers: &[Offer]) -> Result<Vec<usize>, Infallible> {
+        for offer in offers {
+            // As a worker does.
+            if let Some(failure) = offer.retry {
+                self.place.folder.cell(self.place.id(offer.cell)).forgive(failure).unwrap();
+            }
+            self.begun.push((offer.cell, (self.now - self.start).as_secs(), offer.lost_servers));
+            let attempt = self.begun.iter().filter(|(cell, ..)| *cell == offer.cell).count();
+            self.running.push((offer.cell, (self.script)(offer.cell, attempt).into()));
+        }
+        self.most_at_a_time = self.most_at_a_time.max(self.running.len());
+        Ok(offers.iter().map(|offer| offer.cell).collect())
+    }
+
+    fn load(&self) -> (String, usize) {
+        (format!("{} running", self.running.len()), self.jobs)
+    }
+
+    fn stop(&mut self) -> Vec<String> {
+        Vec::new()
+    }
+}
+
+/// A folder for the plan.
+struct Place {
+    _directory: TempDir,
+    folder: Folder,
+    plan: Plan,
+}
+
+/// What a run came to.
+#[derive(Debug)]
+struct Ran {
+    end: Result<Vec<String>, String>,
+    begun: Vec<(usize, u64, usize)>,
+    most_at_a_time: usize,
+    notes: Vec<String>,
+    statuses: Vec<Status>,
+}
+
+impl Ran {
+    /// How often the cells were begun.
+    fn attempts(&self) -> Vec<usize> {
+        (0..4).map(|cell| self.begun.iter().filter(|(begun, ..)| *begun == cell).count()).collect()
+    }
+
+    /// When cell 0 was begun, s.
+    fn times(&self) -> Vec<u64> {
+        self.begun.iter().filter(|(cell, ..)| *cell == 0).map(|(_, time, _)| *time).collect()
+    }
+}
+
+impl Place {
+    fn new() -> Self {
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(directory.path());
+        Self { _directory: directory, folder, plan: Plan::parse("test", PLAN.into()).unwrap() }
+    }
+
+    fn id(&self, cell: usize) -> &str {
+        &self.plan.cells[cell].id
+    }
+
+    fn write(&self, cell: usize, name: &str) {
+        let path = self.folder.cell(self.id(cell)).path().to_owned();
+        std::fs::create_dir_all(&path).unwrap();
+        std::fs::write(path.join(name), "x").unwrap();
+    }
+
+    fn fail(&self, cell: usize) {
+        let failure = Failure { id: self.id(cell).to_owned(), reason: "NaN".into(), commit: "x".into() };
+        self.folder.cell(self.id(cell)).write_failure(&failure).unwrap();
+    }
+
+    fn failure(&self, cell: usize) -> String {
+        std::fs::read_to_string(self.folder.cell(self.id(cell)).path().join("failure.json")).unwrap_or_default()
+    }
+
+    fn finished(&self, failed: &[usize]) -> Result<Vec<String>, String> {
+        Ok(failed.iter().map(|&cell| self.id(cell).to_owned()).collect())
+    }
+
+    /// Runs to the end, one job at a time.
+    fn run(&self, script: &dyn Fn(usize, usize) -> Vec<Act>) -> Ran {
+        self.run_on::<true>(1, false, script)
+    }
+
+    fn run_on<const CONVICTS: bool>(
+        &self,
+        jobs: usize,
+        retry_failed: bool,
+        script: &dyn Fn(usize, usize) -> Vec<Act>,
+    ) -> Ran {
+        let start = Instant::now();
+        let (begun, running) = (Vec::new(), Vec::new());
+        let mut fake =
+            Fake::<CONVICTS> { place: self, script, jobs, start, now: start, running, begun, most_at_a_time: 0 };
+        let (mut notes, mut statuses) = (Vec::new(), Vec::new());
+        let mut report = |report: Report<'_>| match report {
+            Report::Status(status) => statuses.push(status.clone()),
+            Report::Note(note) => notes.push(note.to_owned()),
+            Report::Line(_) => {}
+        };
+        let mut scheduler = Scheduler::new(&self.plan, &self.folder, &mut fake, retry_failed, &mut report);
+        let end = (0..10_000).find_map(|second| scheduler.step(start + Duration::from_secs(second)).transpose());
+        let end = end.expect("it ends").map_err(|error| error.to_string());
+        Ran { end, begun: fake.begun, most_at_a_time: fake.most_at_a_time, notes, statuses }
+    }
+}
+
+#[test]
+fn every_cell_is_done_once_and_a_second_run_does_nothing() {
+    let place = Place::new();
+    for (run, attempts) in [[1, 1, 1, 1], [0, 0, 0, 0]].into_iter().enumerate() {
+        let ran = place.run_on::<true>(3, false, &|_, _| done());
+        assert_eq!(ran.end, place.finished(&[]));
+        assert_eq!(ran.attempts(), attempts, "run {}", run + 1);
+        assert!(ran.most_at_a_time <= 3);
+    }
+}
+
+#[rstest]
+#[case::killed(vec![killed()], 3, "signal 9; 3 attempts in a row have not brought it any further")]
+#[case::stopped_alone(vec![ends(Event::Stopped { signal: 15 })], 3, "signal 15 ended its process; 3 attempts")]
+#[case::failed_unrecorded(vec![ends(Event::Failed { reason: "disk full".into() })], 1, "disk full")]
+#[case::failed(vec![Fails, ends(Event::Failed { reason: "NaN".into() })], 1, "NaN")]
+#[case::done_without_a_result(vec![ends(Event::Done)], 3, "done; 3 attempts in a row")]
+fn a_cell_that_ends_like_this_has_failed_after(
+    #[case] acts: Vec<Act>,
+    #[case] attempts: usize,
+    #[case] recorded: &str,
+) {
+    let place = Place::new();
+    let ran = place.run(&|cell, _| if cell == 1 { acts.clone() } else { done() });
+    assert_eq!(ran.end, place.finished(&[1]));
+    assert_eq!(ran.attempts(), [1, attempts, 1, 1]);
+    assert!(place.failure(1).contains(recorded), "{}", place.failure(1));
+}
+
+#[test]
+fn an_attempt_that_ended_in_a_checkpoint_does_not_count() {
+    let place = Place::new();
+    let script = |cell, attempt| match (cell, attempt) {
+        (0, 1..=5) => vec![server(), saved(100 * attempt as u64), killed()],
+        (0, 6..=7) => vec![saved(500), killed()],
+        _ => done(),
+    };
+    let ran = place.run(&script);
+    assert_eq!(ran.end, place.finished(&[0]));
+    assert_eq!(ran.attempts(), [7, 1, 1, 1]);
+}
+
+#[test]
+fn a_killed_cell_waits_until_the_others_had_their_turn() {
+    let place = Place::new();
+    let ran = place.run(&|cell, attempt| if cell == 0 && attempt < 3 { vec![killed()] } else { done() });
+    assert_eq!(ran.begun.iter().map(|(cell, ..)| *cell).collect::<Vec<_>>(), [0, 1, 2, 3, 0, 0]);
+    assert_eq!(ran.end, place.finished(&[]));
+}
+
+#[test]
+fn servers_that_are_lost_in_a_row_are_waited_for_longer_and_longer_and_not_for_ever() {
+    let place = Place::new();
+    let ran = place.run(&|_, _| vec![lost()]);
+    let message = format!("the run cannot go on without a server: {}: gone; finished cells are kept", place.id(0));
+    assert!(ran.end.as_ref().is_err_and(|error| error.starts_with(&message)), "{:?}", ran.end);
+    // The loss is heard a second after the beginning; then 1, 2, 4 and 8 s are waited.
+    assert_eq!(ran.times(), [0, 2, 5, 10, 19], "at the front of the queue");
+    assert_eq!(ran.attempts(), [5, 0, 0, 0]);
+    assert_eq!(ran.begun.iter().map(|(.., lost)| *lost).collect::<Vec<_>>(), [0, 1, 2, 3, 4], "for their turns");
+    assert!((0..4).all(|cell| !place.folder.cell(place.id(cell)).is_settled(true)), "no cell is blamed");
+}
+
+#[rstest]
+#[case::had_one_for_a_minute(vec![server(), Wait(60), lost()], true)]
+#[case::had_one_for_less(vec![server(), Wait(50), lost()], false)]
+#[case::only_looked_for_one(vec![Wait(300), lost()], false)]
+fn what_is_lost_after_a_minute_is_not_lost_in_a_row(#[case] sixth: Vec<Act>, #[case] goes_on: bool) {
+    let place = Place::new();
+    let ran = place.run(&|_, attempt| match attempt {
+        1..=4 => vec![lost()],
+        5 => sixth.clone(),
+        6..=8 => vec![lost()],
+        _ => done(),
+    });
+    assert_eq!(ran.end.is_ok(), goes_on, "{:?}", ran.end);
+}
+
+#[test]
+fn an_earlier_failure_counts_unless_it_is_forgiven() {
+    let place = Place::new();
+    place.fail(2);
+    assert_eq!(place.run(&|_, _| done()).end, place.finished(&[2]));
+    // While others try again it does not count; a failure that they record does.
+    let ran = place.run_on::<true>(1, true, &|_, attempt| if attempt == 1 { vec![lost()] } else { done() });
+    assert_eq!((ran.end, ran.begun.len()), (place.finished(&[]), 2));
+}
+
+#[test]
+fn a_failure_that_another_run_records_meanwhile_counts() {
+    let place = Place::new();
+    place.fail(2);
+    // While cell 0 is done, another run tries cell 2 again, in vain.
+    let script = |cell, _| {
+        if cell == 0 {
+            place.folder.cell(place.id(2)).forget_failure().unwrap();
+            place.fail(2);
+        }
+        done()
+    };
+    let ran = place.run_on::<true>(1, true, &script);
+    assert_eq!(ran.end, place.finished(&[2]));
+    assert_eq!(ran.attempts(), [1, 1, 0, 1], "it is not tried once more");
+}
+
+#[test]
+fn a_cell_that_others_work_on_is_waited_for_and_taken_over() {
+    let place = Place::new();
+    let lock = std::cell::Cell::new(place.folder.cell(place.id(1)).try_lock().unwrap());
+    let script = |cell, attempt| match (cell, attempt) {
+        (1, 1) => vec![ends(Event::Busy)],
+        (3, 1) => {
+            // Others give cell 1 up while cell 3 is done.
+            drop(lock.take());
+            vec![Wait(30), Succeeds, ends(Event::Done)]
+        }
+        _ => done(),
+    };
+    let ran = place.run(&script);
+    assert_eq!(ran.end, place.finished(&[]));
+    assert_eq!(ran.begun.iter().map(|(cell, ..)| *cell).collect::<Vec<_>>(), [0, 1, 2, 3, 1]);
+}
+
+#[test]
+fn what_others_did_is_not_done_again_and_seen_at_once() {
+    let place = Place::new();
+    let script = |cell, _| {
+        if cell == 0 {
+            (1..4).for_each(|cell| place.write(cell, "result.json"));
+            return vec![Wait(5), Succeeds, ends(Event::Done)];
+        }
+        panic!("cell {cell} is done")
+    };
+    let ran = place.run(&script);
+    assert_eq!(ran.end, place.finished(&[]));
+    assert_eq!(ran.statuses[1].done, 3);
+}
+
+#[test]
+fn an_order_that_is_refused_ends_the_run() {
+    let place = Place::new();
+    let ran = place.run(&|_, _| vec![ends(Event::Refused { reason: "no such cell".into() })]);
+    assert!(ran.end.is_err_and(|error| error.starts_with("a worker refused its order: no such cell; did another run")));
+}
+
+#[test]
+fn machines_may_be_to_blame_then_a_cell_is_given_up_and_the_others_are_done() {
+    let place = Place::new();
+    let ran = place.run_on::<false>(2, false, &|cell, _| if cell == 1 { vec![killed()] } else { done() });
+    let message = format!("1 cell without a result after 3 attempts, the first is {}: signal 9; when", place.id(1));
+    assert!(ran.end.as_ref().is_err_and(|error| error.starts_with(&message)), "{:?}", ran.end);
+    assert_eq!(ran.attempts(), [1, 3, 1, 1]);
+    assert_eq!(place.failure(1), "", "nothing is recorded");
+    let note = format!("{} is given up: 3 attempts have not brought it any further", place.id(1));
+    assert_eq!(ran.notes, [note]);
+}
+
+#[test]
+fn a_cell_without_its_turn_is_not_to_blame() {
+    let place = Place::new();
+    let ran = place.run(&|cell, attempt| if cell == 0 && attempt < 9 { vec![Return] } else { done() });
+    assert_eq!((ran.attempts(), ran.end), (vec![9, 1, 1, 1], place.finished(&[])));
+}
+
+#[test]
+fn the_status_says_what_is_done_with_each_cell() {
+    let place = Place::new();
+    place.fail(3);
+    let script = |cell, _| match cell {
+        0 => done(),
+        _ => vec![server(), saved(7), Wait(2), Succeeds, ends(Event::Done)],
+    };
+    let ran = place.run_on::<true>(2, false, &script);
+    let status = &ran.statuses[4];
+    assert_eq!((status.cells, status.done, status.failed), (4, 1, 1));
+    assert_eq!(status.doing, "2 running");
+    let running: HashMap<&str, String> =
+        status.running.iter().map(|(id, activity)| (id.as_str(), activity.to_string())).collect();
+    assert_eq!(running[place.id(1)], "1 episode of training");
+    assert_eq!(running[place.id(2)], "1 episode of training");
+}
