@@ -2,6 +2,7 @@
 //! server on a Unix socket. Prints env steps/s and where the time went.
 
 use perturb_learner::client::Servers;
+use perturb_learner::logging::TimeShares;
 use perturb_learner::training::{RunDirectory, train};
 use perturb_study::interrupt::StopFlag;
 use perturb_study::settings::TrainConfig;
@@ -34,10 +35,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let progress = outcome.progress;
     assert_eq!(progress.timesteps, ITERATIONS * 8 * 128);
     assert_eq!(progress.update.n_updates, ITERATIONS * 10);
-    let length = progress.recent.map_or(0.0, |recent| recent[1]);
+    let length = progress.recent.map_or(0.0, |recent| recent.length);
     assert!(length > 60.0, "after 100 iterations episodes last {length} steps, no more than without learning");
 
-    let [acting, waiting, updating] = progress.shares.map(|seconds| 100.0 * seconds / progress.elapsed);
+    let TimeShares { acting, waiting, updating } = progress.percent();
     let threads = std::env::var("OPENBLAS_NUM_THREADS").unwrap_or_else(|_| "default".into());
     println!(
         "training/ppo_ff/cart_pole/8x128: {:.0} env steps/s; {acting:.1} % acting, {waiting:.1} % waiting for the \

@@ -113,21 +113,22 @@ fn train_and_test(
     records.write(&folder.path().join(records::FILE))?;
     let results = sets.iter().map(|set| (set.name.clone(), records.result(&set.name, None))).collect();
     let state = checkpoint.state;
+    let common = &state.config.common;
     Ok(Some(CellResult {
         format_version: CellResult::FORMAT_VERSION,
         id: cell.id.clone(),
         training: Training {
-            environment: state.environment,
+            environment: common.environment.clone(),
             environment_revision: state.environment_spec.revision,
             model_hash: state.environment_spec.model_hash,
-            version: state.train_version,
+            version: common.version,
             set: cell.set.clone(),
             method: cell.method(),
             configuration: cell.configuration.clone(),
             run: cell.run,
-            seed: state.seed,
+            seed: common.seed,
             counters: state.counters,
-            settings: state.config,
+            settings: state.config.table(),
         },
         results,
         agreement: Some(records.agreement()),
@@ -159,7 +160,7 @@ fn trained(
     tell: &mut dyn FnMut(Event),
 ) -> Result<Option<Checkpoint>, TrainError> {
     let config = &cell.config;
-    let earlier = earlier(directory)?.filter(|(_, checkpoint, _)| checkpoint.state.config == config.table());
+    let earlier = earlier(directory)?.filter(|(_, checkpoint, _)| checkpoint.state.config == *config);
     let Counters { episodes, timesteps, .. } =
         earlier.as_ref().map_or_else(Counters::default, |(_, checkpoint, _)| checkpoint.state.counters);
     tell(Event::Training { episodes, timesteps, saved: timesteps });
@@ -168,9 +169,7 @@ fn trained(
     };
     let outcome = match earlier {
         Some((_, checkpoint, _)) if episodes >= config.common.episodes => return Ok(Some(checkpoint)),
-        Some((directory, checkpoint, state)) => {
-            resume(servers, config, &directory, (checkpoint, state), stop, progress)?
-        }
+        Some((directory, checkpoint, state)) => resume(servers, &directory, (checkpoint, state), stop, progress)?,
         None => train(servers, config, &RunDirectory::choose(directory, true)?, stop, progress)?,
     };
     let Counters { episodes, timesteps, .. } = outcome.checkpoint.state.counters;
@@ -209,7 +208,12 @@ fn command(cell: &Cell) -> String {
     let common = &cell.config.common;
     let mut text = format!(
         "perturb train --out RUN --env {} --version {} --algorithm {} --architecture {} --episodes {} --seed {}",
-        common.environment, common.version, common.algorithm, common.architecture, common.episodes, common.seed
+        common.environment,
+        common.version,
+        cell.config.settings.name(),
+        common.architecture,
+        common.episodes,
+        common.seed
     );
     if !common.parameters.is_empty() {
         let _ = write!(text, " --parameters {}", parameters(&common.parameters));

@@ -31,7 +31,7 @@ pub fn measure(servers: &Servers, cell: &Cell, limit: Duration) -> Result<Measur
     let since = |before: Option<f64>, last: f64| last - before.unwrap_or(0.0);
     let steps = since(before.map(|first| first.timesteps as f64), last.timesteps as f64);
     let seconds = since(before.map(|first| first.elapsed), last.elapsed);
-    let updating = since(before.map(|first| first.shares[2]), last.shares[2]);
+    let updating = since(before.map(|first| first.shares.updating), last.shares.updating);
     let speed = Speed { training: seconds / steps, testing: (seconds - updating).max(0.0) / steps };
     Ok(Measurement { environment: cell.config.common.environment.clone(), method: cell.method(), speed })
 }

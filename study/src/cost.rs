@@ -7,7 +7,7 @@ use std::collections::HashMap;
 
 use super::plan::{Cell, Plan, distinct};
 use crate::Method;
-use crate::settings::{TrainConfig, WrapperSettings};
+use crate::settings::{TrainConfig, Wrapper};
 
 /// Seconds that a step of one environment takes, with all that belongs to it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -115,7 +115,7 @@ fn cell_estimates(
 /// How many episodes a training has: more than its budget if it learns from the worst of them only.
 fn generated_episodes(config: &TrainConfig) -> f64 {
     let budget = config.common.episodes as f64;
-    let WrapperSettings::Epopt(epopt) = &config.settings.wrapper else { return budget };
+    let Wrapper::Epopt(epopt) = &config.settings.wrapper else { return budget };
     let full = (epopt.full_iterations as f64 * epopt.episodes_per_iteration as f64).min(budget);
     full + (budget - full) / epopt.epsilon
 }

@@ -13,7 +13,7 @@ use toml::{Table, Value};
 
 use crate::files::{self, FileError};
 use crate::sets::{self, Assignment, Contexts, SetError, TestSet, set_of, set_of_csv};
-use crate::settings::{ConfigError, TrainConfig, WrapperSettings};
+use crate::settings::{ConfigError, TrainConfig};
 use crate::success::{Criterion, Threshold, ThresholdError};
 use crate::{Method, Version};
 
@@ -324,13 +324,7 @@ impl Cell {
 
     /// What trains.
     pub fn method(&self) -> Method {
-        let TrainConfig { common, settings } = &self.config;
-        let has_trials = matches!(settings.wrapper, WrapperSettings::Rl2(_));
-        Method {
-            algorithm: common.algorithm.to_string(),
-            architecture: common.architecture.to_string(),
-            episodes_per_trial: has_trials.then(|| settings.episodes_per_trial()),
-        }
+        self.config.method()
     }
 }
 
@@ -610,11 +604,9 @@ impl Expansion<'_> {
         for run in 1..=self.file.runs {
             let mut config = config.clone();
             config.common.seed = self.file.seed + u64::from(run - 1);
-            let common = &config.common;
-            let id = format!(
-                "{environment}-{}-{}-{trained_on}-{configuration}-s{}",
-                common.algorithm, common.architecture, common.seed
-            );
+            let (name, common) = (config.settings.name(), &config.common);
+            let id =
+                format!("{environment}-{name}-{}-{trained_on}-{configuration}-s{}", common.architecture, common.seed);
             if let Some(first) = self.places.insert(id.clone(), name.to_owned()) {
                 return Err(PlanError::Twice { path: self.path.to_owned(), first, second: name.to_owned(), id });
             }

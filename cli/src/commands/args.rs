@@ -8,7 +8,7 @@ use perturb_learner::client::Address;
 use perturb_study::Version;
 use perturb_study::scheduler::slurm::TimeLimit;
 use perturb_study::sets::Assignment;
-use perturb_study::settings::{AlgorithmName, Architecture};
+use perturb_study::settings::{Architecture, Settings};
 use perturb_study::success::Threshold;
 
 /// Trains policies over environment servers and tests whether they still work when the physics changes.
@@ -81,11 +81,11 @@ pub(super) struct TrainArgs {
     #[arg(long, value_name = "PARAMETER=VALUES", num_args = 1..)]
     pub(super) parameters: Vec<Assignment>,
     /// What learns [default: ppo].
-    #[arg(long)]
-    pub(super) algorithm: Option<AlgorithmName>,
+    #[arg(long, value_parser = Settings::names())]
+    pub(super) algorithm: Option<String>,
     /// What acts [default: ff; with RL², which has no other, rc].
-    #[arg(long)]
-    pub(super) architecture: Option<Architecture>,
+    #[arg(long, value_parser = Architecture::NAMES)]
+    pub(super) architecture: Option<String>,
     /// RL² only: episodes in a trial [default: 2].
     #[arg(long, value_name = "N")]
     pub(super) episodes_per_trial: Option<u64>,

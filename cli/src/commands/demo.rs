@@ -15,7 +15,7 @@ use perturb_learner::client::Servers;
 use perturb_learner::evaluation::test;
 use perturb_learner::training::{Outcome, RunDirectory, train};
 use perturb_study::interrupt::StopFlag;
-use perturb_study::settings::{AlgorithmName, Architecture, TrainConfig};
+use perturb_study::settings::{Sources, TrainConfig};
 use perturb_study::table::Table;
 use perturb_study::{Method, Metric, Scenario, Version, paper};
 
@@ -72,12 +72,13 @@ fn train_on(
     directory: &Path,
     stop: &StopFlag,
 ) -> Result<Outcome> {
-    let mut config = TrainConfig::defaults(AlgorithmName::Ppo, Architecture::Ff);
-    config.common.environment = ENVIRONMENT.into();
-    config.common.version = version;
-    config.common.episodes = args.episodes;
-    config.common.seed = args.seed;
-    let config = TrainConfig::from_table("the demo", config.table())?;
+    let settings = [
+        format!("environment={ENVIRONMENT}"),
+        format!("version={version}"),
+        format!("episodes={}", args.episodes),
+        format!("seed={}", args.seed),
+    ];
+    let config = TrainConfig::load(&Sources { sets: &settings, ..Sources::default() })?;
     let directory = RunDirectory::choose(directory, false)?;
     let start = Instant::now();
     let mut display = Display::of_episodes(describe(&config), args.episodes);

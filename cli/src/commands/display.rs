@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::plan::duration;
-use perturb_learner::logging::Progress;
+use perturb_learner::logging::{EpisodeFigures, Progress};
 use perturb_study::scheduler::Status;
 
 /// How often a plain line is printed.
@@ -48,7 +48,7 @@ impl Display {
     /// After an iteration of a training.
     pub(super) fn training(&mut self, progress: &Progress) {
         let figures = match progress.recent {
-            Some([episode_return, _, success]) => {
+            Some(EpisodeFigures { episode_return, success, .. }) => {
                 let percent = 100.0 * success;
                 format!("return {episode_return:.1}, success {percent:.0} %, {:.0} steps/s", progress.fps())
             }

@@ -14,15 +14,17 @@ use perturb_study::TestResult;
 use perturb_study::files::write_json;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::sets::TestSet;
+use perturb_study::settings::TrainConfig;
 use perturb_study::table::Table;
 
 pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
     let checkpoint = Checkpoint::load(&args.checkpoint)?;
     let sets = sets::tested(&args.versions, &args.set)?;
-    let seed = args.seed.unwrap_or(checkpoint.state.seed);
+    let seed = args.seed.unwrap_or(checkpoint.state.config.common.seed);
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = servers(&args.server)?;
-    let state = &checkpoint.state;
+    let (state, config) = (&checkpoint.state, &checkpoint.state.config);
+    let common = &config.common;
     let options = TestOptions { episodes: args.episodes, seed, success: args.success.clone() };
     let tester = Tester::new(&servers, &checkpoint, options)?;
     let mut display: Option<(String, Display)> = None;
@@ -57,12 +59,11 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
     let success = criterion.map(|criterion| format!(", success: {criterion}")).unwrap_or_default();
     writeln!(
         std::io::stdout(),
-        "{} {} {}, trained on {} with seed {}, {} test episodes each{success}\n{}",
-        state.environment,
-        state.algorithm,
-        state.architecture,
-        state.train_version,
-        state.seed,
+        "{} {}, trained on {} with seed {}, {} test episodes each{success}\n{}",
+        common.environment,
+        config.method(),
+        common.version,
+        common.seed,
         args.episodes,
         table.build().to_text()
     )?;
@@ -72,13 +73,14 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
 /// The result as JSON: who was tested, and the figures of each set.
 fn document(state: &State, evaluation_seed: u64, results: &[(String, TestResult)]) -> Value {
     let results: Map<String, Value> = results.iter().map(|(set, result)| (set.clone(), json!(result))).collect();
+    let TrainConfig { common, settings } = &state.config;
     json!({
-        "environment": state.environment,
-        "algorithm": state.algorithm,
-        "architecture": state.architecture,
-        "train_version": state.train_version,
-        "episodes_per_trial": state.episodes_per_trial,
-        "seed": state.seed,
+        "environment": common.environment,
+        "algorithm": settings.name(),
+        "architecture": common.architecture,
+        "train_version": common.version,
+        "episodes_per_trial": settings.episodes_per_trial(),
+        "seed": common.seed,
         "evaluation_seed": evaluation_seed,
         "training_episodes": state.counters.episodes,
         "results": results,

@@ -15,6 +15,7 @@ use perturb_protocol::{Distribution, Version};
 use perturb_study::files::write_atomically;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::Records;
+use perturb_study::settings::{Common, TrainConfig};
 use perturb_study::{
     Folder, Heatmap, HeatmapOptions, HeatmapPlace, NoHeatmap, Plan, Results, Selected, heatmap_files, heatmap_places,
     store_heatmap,
@@ -34,11 +35,11 @@ fn of_checkpoint(args: &HeatmapArgs, path: &Path) -> Result<Ending> {
     let state = &checkpoint.state;
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = servers(&args.server)?;
-    let environment = servers.environment(&state.environment)?;
+    let environment = servers.environment(&state.config.common.environment)?;
     let parameters = match (&args.x, &args.y) {
         (Some(x), Some(y)) => [x.clone(), y.clone()],
         _ => usual_axes(&environment).ok_or_else(|| {
-            let message = format!("give --x and --y: it is not known which of {}'s to show", state.environment);
+            let message = format!("give --x and --y: it is not known which of {}'s to show", environment.name);
             CommandError::Usage(message)
         })?,
     };
@@ -85,8 +86,8 @@ fn fixed(args: &HeatmapArgs) -> Result<sets::Fixed> {
 
 /// In the working directory: a training's folder has nothing in it that its training did not write.
 fn default_path(state: &State, [x, y]: &[String; 2]) -> PathBuf {
-    let State { environment, algorithm, architecture, train_version, seed, .. } = state;
-    format!("{environment}-{algorithm}-{architecture}-{train_version}-s{seed}-{x}-{y}").into()
+    let TrainConfig { common: Common { environment, architecture, version, seed, .. }, settings } = &state.config;
+    format!("{environment}-{}-{architecture}-{version}-s{seed}-{x}-{y}", settings.name()).into()
 }
 
 /// Of everything that was selected in the first run of an experiment, unless it is there already.
@@ -143,7 +144,7 @@ fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<Ending> {
 fn checkpoint_of(folder: &Folder, Selected { cell, result }: Selected<'_>) -> Result<Checkpoint> {
     let checkpoint = Checkpoint::load(&folder.cell(&cell.id).training())?;
     let (state, training) = (&checkpoint.state, &result.training);
-    if training.settings != state.config || training.counters != state.counters {
+    if training.settings != state.config.table() || training.counters != state.counters {
         let message = format!("the checkpoint of {} is not the one that its result.json came from", cell.id);
         return Err(CommandError::Failed(message));
     }
@@ -160,7 +161,7 @@ fn options(args: &HeatmapArgs, parameters: [String; 2], state: &State) -> Heatma
         parameters,
         grid: args.grid,
         episodes: args.episodes,
-        seed: args.seed.unwrap_or(state.seed),
+        seed: args.seed.unwrap_or(state.config.common.seed),
         fixed: sets::Fixed::new(),
     }
 }

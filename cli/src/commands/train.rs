@@ -9,7 +9,7 @@ use super::args::TrainArgs;
 use super::display::Display;
 use super::error::{CommandError, Result, system};
 use super::{Ending, servers, sets};
-use perturb_learner::logging::Progress;
+use perturb_learner::logging::{EpisodeFigures, Progress, TimeShares};
 use perturb_learner::training::{Outcome, RunDirectory, resume, train};
 use perturb_study::Version;
 use perturb_study::interrupt::StopFlag;
@@ -42,7 +42,7 @@ fn begin(args: &TrainArgs, out: &Path) -> Result<Ending> {
 fn go_on(args: &TrainArgs, path: &Path) -> Result<Ending> {
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let (directory, checkpoint, state) = RunDirectory::resume(path)?;
-    let config = checkpoint.config()?;
+    let config = checkpoint.state.config.clone();
     let (done, budget) = (checkpoint.state.counters.episodes, config.common.episodes);
     if done >= budget {
         eprintln!("the training in {} is finished: it has {done} of {budget} episodes", path.display());
@@ -53,7 +53,7 @@ fn go_on(args: &TrainArgs, path: &Path) -> Result<Ending> {
     let servers = servers(&args.server)?;
     let mut display = Display::of_episodes(describe(&config), budget);
     let report = |progress: &Progress| display.training(progress);
-    let outcome = resume(&servers, &config, &directory, (checkpoint, state), &stop, report)?;
+    let outcome = resume(&servers, &directory, (checkpoint, state), &stop, report)?;
     drop(display);
     end(&config, &directory, &outcome)
 }
@@ -87,14 +87,14 @@ fn print_policy(directory: &RunDirectory) -> std::io::Result<()> {
 /// What is trained, in a few words.
 pub(super) fn describe(config: &TrainConfig) -> String {
     let common = &config.common;
-    format!("{} {} {} {}", common.environment, common.version, common.algorithm, common.architecture)
+    format!("{} {} {} {}", common.environment, common.version, config.settings.name(), common.architecture)
 }
 
 /// A line of figures, with the shares of the time.
 pub(super) fn summarise(progress: &Progress) {
-    let [acting, waiting, updating] = progress.shares.map(|seconds| 100.0 * seconds / progress.elapsed.max(1e-9));
+    let TimeShares { acting, waiting, updating } = progress.percent();
     let recent = match progress.recent {
-        Some([episode_return, length, success]) => {
+        Some(EpisodeFigures { episode_return, length, success }) => {
             format!("; the last 100: return {episode_return:.1}, length {length:.1}, success {:.1} %", 100.0 * success)
         }
         None => String::new(),
@@ -118,8 +118,8 @@ fn flags(args: &TrainArgs) -> Result<Table> {
     };
     text("environment", args.env.clone());
     text("version", args.version.map(|version| version.to_string()));
-    text("algorithm", args.algorithm.map(|algorithm| algorithm.to_string()));
-    text("architecture", args.architecture.map(|architecture| architecture.to_string()));
+    text("algorithm", args.algorithm.clone());
+    text("architecture", args.architecture.clone());
     if !args.parameters.is_empty() {
         let set = sets::drawn(args.version.unwrap_or(Version::D), &args.parameters)?;
         let parameters = Table::try_from(set.drawn()).map_err(|error| CommandError::Usage(error.to_string()))?;

@@ -19,7 +19,7 @@ pub(super) fn run(args: &VideoArgs) -> Result<Ending> {
     let options = VideoOptions {
         set: sets::drawn(args.version, &args.parameters)?,
         episodes: args.episodes,
-        seed: args.seed.unwrap_or(checkpoint.state.seed),
+        seed: args.seed.unwrap_or(checkpoint.state.config.common.seed),
         size: (args.width, args.height),
         fps: args.fps,
     };

@@ -133,8 +133,8 @@ impl<'a> Film<'a> {
     fn open(servers: &'a Servers, checkpoint: &'a Checkpoint, options: &'a VideoOptions) -> Result<Self, VideoError> {
         let state = &checkpoint.state;
         let open = OpenOptions {
-            episodes_per_trial: state.episodes_per_trial,
-            ..open_options(&state.environment, &options.set, options.seed)
+            episodes_per_trial: state.config.settings.episodes_per_trial(),
+            ..open_options(&state.config.common.environment, &options.set, options.seed)
         };
         let mut reply = StepReply::default();
         let (single, begun) = Single::open(servers, &open, &mut reply.observations)?;
@@ -143,7 +143,7 @@ impl<'a> Film<'a> {
         options.set.check(&environment).map_err(TestError::Set)?;
         let title = (
             format!("{} {}", environment.name, options.set.name),
-            format!("{} {}, trained on {}", state.algorithm, state.architecture, state.train_version),
+            format!("{}, trained on {}", state.config.method(), state.config.common.version),
         );
         let panel = Panel::new(options.size, title, environment.parameters.len())?;
         let mut film = Self {
@@ -221,7 +221,7 @@ impl<'a> Film<'a> {
         let end = reply.ended.pop();
         self.agent.remember(&mut reply.rewards, &[end.is_some()]).map_err(TestError::Numbers)?;
         let Some(end) = end else { return Ok(()) };
-        if end.episode_in_trial + 1 == self.state.episodes_per_trial {
+        if end.episode_in_trial + 1 == self.state.config.settings.episodes_per_trial() {
             self.agent.begin_trial(0, self.begun.trial_index);
         }
         shown.episode_return = end.episode_return;
@@ -249,7 +249,7 @@ impl<'a> Film<'a> {
     /// Shows the episode that has begun.
     fn announce(&mut self) {
         let (number, episodes) = (self.footage.episodes.len() + 1, self.options.episodes);
-        let trial = match self.state.episodes_per_trial {
+        let trial = match self.state.config.settings.episodes_per_trial() {
             1 => String::new(),
             _ => format!(", trial {}", self.begun.trial_index + 1),
         };

@@ -104,7 +104,7 @@ fn recurrent_policies_are_trained_and_tested_alike_on_one_server_and_on_two() {
         assert!(outcome.progress.episodes >= 12);
         let checkpoint = Checkpoint::load(out.path()).expect("a checkpoint");
         assert_eq!(checkpoint, outcome.checkpoint);
-        assert_eq!(checkpoint.state.policy.lstm, Some(256));
+        assert_eq!(checkpoint.policy.lstm, Some(256));
         assert_eq!(run(&two, &text).1.checkpoint, checkpoint, "{settings}");
         let figures = |servers: &Servers| {
             test(servers, &checkpoint, Version::E, 10, 1, &StopFlag::default(), |_| {}).expect("a test")
@@ -202,7 +202,7 @@ fn every_test_episode_begins_without_memories() {
     let servers = Servers::connect(&addresses(&server)).expect("a connection");
     let (_out, outcome) = run(&servers, "environment = 'CartPole'\nepisodes = 1\nnormalize_observations = false");
     let mut checkpoint = outcome.checkpoint;
-    let action = checkpoint.state.policy.action;
+    let action = checkpoint.policy.action;
     let spec = PolicySpec { observation_size: 4, action, hidden: vec![], lstm: Some(1) };
     let mut weights = Policy::new(spec.clone(), 1).expect("a policy").weights();
     for array in &mut weights {
@@ -213,7 +213,7 @@ fn every_test_episode_begins_without_memories() {
             _ => vec![0.0; array.data.len()],
         };
     }
-    checkpoint.state.policy = spec;
+    checkpoint.policy = spec;
     checkpoint.weights = weights;
     let length = |episodes| {
         let result = test(&servers, &checkpoint, Version::D, episodes, 1, &StopFlag::default(), |_| {});

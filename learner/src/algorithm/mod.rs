@@ -10,7 +10,7 @@ pub use a2c::A2c;
 pub use epopt::{Epopt, Selection};
 pub use ppo::Ppo;
 
-use perturb_study::settings::{BaseSettings, Settings, WrapperSettings};
+use perturb_study::settings::{Base, Settings, Wrapper};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use tch::Tensor;
@@ -61,7 +61,7 @@ pub struct AlgorithmState {
 }
 
 /// What happened in an update, by stable-baselines3's names. Averages are over the update's gradient steps.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct UpdateStats {
     /// The optimiser's step size.
     pub learning_rate: f64,
@@ -109,12 +109,12 @@ fn check_rollout(rollout: &Rollout, policy: &Policy, n_steps: usize) -> Result<(
 /// A setting out of its range.
 pub fn build(settings: &Settings, policy: &Policy, seed: u64) -> Result<Box<dyn Algorithm>> {
     let base: Box<dyn Algorithm> = match &settings.base {
-        BaseSettings::A2c(settings) => Box::new(A2c::new(settings.clone(), policy)?),
-        BaseSettings::Ppo(settings) => Box::new(Ppo::new(settings.clone(), policy, seed)?),
+        Base::A2c(settings) => Box::new(A2c::new(settings.clone(), policy)?),
+        Base::Ppo(settings) => Box::new(Ppo::new(settings.clone(), policy, seed)?),
     };
     Ok(match &settings.wrapper {
-        WrapperSettings::Plain | WrapperSettings::Rl2(_) => base,
-        WrapperSettings::Epopt(settings) => Box::new(Epopt::new(settings.clone(), base)?),
+        Wrapper::Plain | Wrapper::Rl2(_) => base,
+        Wrapper::Epopt(settings) => Box::new(Epopt::new(settings.clone(), base)?),
     })
 }
 

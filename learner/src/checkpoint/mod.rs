@@ -19,13 +19,13 @@ use self::files::{ArraysFile, damaged, remove_others};
 pub use self::resume::{History, ResumeState};
 use crate::policy::{ActionKind, Inputs, ObservationNormaliser, PolicySpec, RewardNormaliser, Weights};
 use crate::proto;
-use perturb_protocol::Version;
 use perturb_study::Counters;
 use perturb_study::files::{FileError, write_atomically};
-use perturb_study::settings::{AlgorithmName, Architecture, ConfigError, TrainConfig, Wrapper};
+use perturb_study::settings::TrainConfig;
 
-/// Of the JSON's layout; raised when older programs could misread it.
-const FORMAT_VERSION: u32 = 1;
+/// Of the JSON's layout; raised when older programs could misread it. Format 1 says beside the configuration what follows
+/// from it.
+const FORMAT_VERSION: u32 = 2;
 const JSON: &str = "checkpoint.json";
 const WEIGHTS_PREFIX: &str = "weights-";
 
@@ -34,31 +34,17 @@ const WEIGHTS_PREFIX: &str = "weights-";
 pub struct Checkpoint {
     /// Everything but the weights.
     pub state: State,
+    /// The shape of the policy; that of [`State::policy`] if it was trained.
+    pub policy: PolicySpec,
     /// The policy's weights, in the order of [`PolicySpec::layout`].
     pub weights: Weights,
 }
 
 /// Everything in a checkpoint but the weights.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct State {
-    /// The environment's name in the catalogue.
-    pub environment: String,
     /// What the environment was like.
     pub environment_spec: EnvironmentSummary,
-    /// What learned.
-    pub algorithm: AlgorithmName,
-    /// What acts.
-    pub architecture: Architecture,
-    /// The shape of the policy.
-    pub policy: PolicySpec,
-    /// Where the parameters came from while training.
-    pub train_version: Version,
-    /// Episodes in a trial; 1 without trials.
-    #[serde(default = "one")]
-    pub episodes_per_trial: u32,
-    /// The seed of the training.
-    pub seed: u64,
     /// The statistics of observations; `None` if they were not normalised.
     pub observation_normaliser: Option<ObservationNormaliser>,
     /// The statistics of rewards; `None` if they were not normalised.
@@ -66,15 +52,11 @@ pub struct State {
     /// How far the training had come.
     pub counters: Counters,
     /// The training's configuration, flat, as in `config.toml`.
-    pub config: toml::Table,
+    pub config: TrainConfig,
     /// The programs that trained, each with its commit, in order and without repetitions; empty in checkpoints of
     /// earlier programs, which did not say.
     #[serde(default)]
     pub commits: Vec<String>,
-}
-
-fn one() -> u32 {
-    1
 }
 
 /// What an environment must still be for a policy to fit it.
@@ -192,7 +174,6 @@ impl Checkpoint {
         let (directory, mut document) = Document::read(path)?;
         let resume = document.resume.take();
         let checkpoint = Self::of(&directory, document)?;
-        checkpoint.check_config().map_err(|reason| damaged(&directory.join(JSON), format!("config: {reason}")))?;
         let resume = resume.ok_or_else(|| CheckpointError::NotResumable { path: directory.clone() })?;
         Ok((checkpoint, ResumeState::read(&directory, resume)?))
     }
@@ -202,54 +183,12 @@ impl Checkpoint {
         let json = directory.join(JSON);
         let state: State = serde_json::from_value(document.rest)
             .map_err(|error| damaged(&json, format!("it is not understood: {error}")))?;
-        let wrong = |name: &str, reason: String| damaged(&json, format!("{name}: {reason}"));
         state.check().map_err(|reason| damaged(&json, reason))?;
-        if let Some(normaliser) = &state.observation_normaliser {
-            normaliser
-                .check(state.environment_spec.observation.len())
-                .map_err(|reason| wrong("observation_normaliser", reason))?;
-        }
-        if let Some(normaliser) = &state.reward_normaliser {
-            normaliser.check().map_err(|reason| wrong("reward_normaliser", reason))?;
-        }
-
+        let policy = state.policy();
         let bytes = document.weights.read(directory)?;
         let file = document.weights.path(directory);
-        let weights = decode_weights(&bytes, &state.policy).map_err(|reason| damaged(&file, reason))?;
-        Ok(Self { state, weights })
-    }
-
-    /// Whether the configuration is the one that everything else came from; says what is wrong if it is not.
-    fn check_config(&self) -> std::result::Result<(), String> {
-        let config = self.config().map_err(|error| error.to_string())?;
-        let (state, common) = (&self.state, &config.common);
-        let own = [
-            ("environment", state.environment.clone(), common.environment.clone()),
-            ("algorithm", state.algorithm.to_string(), common.algorithm.to_string()),
-            ("architecture", state.architecture.to_string(), common.architecture.to_string()),
-            ("version", state.train_version.to_string(), common.version.to_string()),
-            ("seed", state.seed.to_string(), common.seed.to_string()),
-            (
-                "episodes_per_trial",
-                state.episodes_per_trial.to_string(),
-                config.settings.episodes_per_trial().to_string(),
-            ),
-            (
-                "normalize_observations",
-                state.observation_normaliser.is_some().to_string(),
-                common.normalize_observations.to_string(),
-            ),
-            ("normalize_rewards", state.reward_normaliser.is_some().to_string(), common.normalize_rewards.to_string()),
-        ];
-        if let Some((key, trained, got)) = own.into_iter().find(|(_, trained, got)| trained != got) {
-            return Err(format!("{key} is {got}, but the training began with {trained}"));
-        }
-        match &state.reward_normaliser {
-            Some(normaliser) => normaliser
-                .fits(common.num_envs, config.settings.gamma())
-                .map_err(|reason| format!("reward_normaliser: {reason}")),
-            None => Ok(()),
-        }
+        let weights = decode_weights(&bytes, &policy).map_err(|reason| damaged(&file, reason))?;
+        Ok(Self { state, policy, weights })
     }
 
     /// Names the policy: the iterations of its training, and a checksum of its weights. Weights of equal trainings have
@@ -261,34 +200,35 @@ impl Checkpoint {
         let weights = encode_weights(&self.weights)?;
         Ok(format!("{:08}-{:08x}", self.state.counters.iterations, crc32c::crc32c(&weights)))
     }
-
-    /// The configuration of the training.
-    ///
-    /// # Errors
-    /// A configuration that this program does not understand.
-    pub fn config(&self) -> std::result::Result<TrainConfig, ConfigError> {
-        TrainConfig::from_table("the checkpoint's configuration", self.state.config.clone())
-    }
 }
 
 impl State {
-    /// Whether the parts go together; says what is wrong if they do not.
+    /// Whether the statistics are those that the configuration asks for; says what is wrong if they are not.
     fn check(&self) -> std::result::Result<(), String> {
-        let episodes = self.episodes_per_trial;
-        if episodes == 0 || (episodes > 1 && self.algorithm.wrapper() != Wrapper::Rl2) {
-            return Err(format!("episodes_per_trial is {episodes}, which {} cannot have", self.algorithm));
-        }
-        let (got, expected) = (self.policy.observation_size, self.inputs(1).size());
-        if got != expected {
-            return Err(format!("policy: observation_size is {got}, expected {expected} with {}", self.algorithm));
-        }
-        Ok(())
+        let (common, gamma) = (&self.config.common, self.config.settings.gamma());
+        let observations = match &self.observation_normaliser {
+            Some(normaliser) => normaliser.check(self.environment_spec.observation.len()),
+            None if common.normalize_observations => Err("there is none".into()),
+            None => Ok(()),
+        };
+        observations.map_err(|reason| format!("observation_normaliser: {reason}"))?;
+        let rewards = match &self.reward_normaliser {
+            Some(normaliser) => normaliser.check().and_then(|()| normaliser.fits(common.num_envs, gamma)),
+            None if common.normalize_rewards => Err("there is none".into()),
+            None => Ok(()),
+        };
+        rewards.map_err(|reason| format!("reward_normaliser: {reason}"))
+    }
+
+    /// The shape of a policy that this was trained with.
+    pub fn policy(&self) -> PolicySpec {
+        PolicySpec::of(self.config.common.architecture, self.inputs(1).size(), self.environment_spec.action)
     }
 
     /// What the policy gets to see of `n_envs` environments at the start of a trial.
     pub fn inputs(&self, n_envs: usize) -> Inputs {
-        let with_outcomes = self.algorithm.wrapper() == Wrapper::Rl2;
-        Inputs::new(self.environment_spec.observation.len(), self.policy.action, n_envs, with_outcomes)
+        let EnvironmentSummary { observation, action, .. } = &self.environment_spec;
+        Inputs::new(observation.len(), *action, n_envs, self.config.settings.has_trials())
     }
 }
 
@@ -303,8 +243,8 @@ impl Document {
         let text = perturb_study::files::read(&json)?;
         let document: Document =
             serde_json::from_slice(&text).map_err(|error| damaged(&json, format!("it is not understood: {error}")))?;
-        if document.format_version != FORMAT_VERSION {
-            let reason = format!("it has format {}, this program reads {FORMAT_VERSION}", document.format_version);
+        if !(1..=FORMAT_VERSION).contains(&document.format_version) {
+            let reason = format!("it has format {}, this program reads 1 to {FORMAT_VERSION}", document.format_version);
             return Err(damaged(&json, reason));
         }
         Ok((directory, document))

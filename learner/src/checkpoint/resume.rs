@@ -12,7 +12,7 @@ use super::arrays::{Array, Arrays, encode};
 use super::files::{ArraysFile, damaged};
 use super::{JSON, Result};
 use crate::algorithm::AlgorithmState;
-use crate::logging::LogLengths;
+use crate::logging::{EpisodeFigures, LogLengths, TimeShares};
 use crate::rollout::CollectorState;
 
 pub(super) const PREFIX: &str = "resume-";
@@ -32,12 +32,12 @@ pub struct ResumeState {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct History {
-    /// Return, length and success (0 or 1) of the last episodes, oldest first.
-    pub recent: Vec<[f64; 3]>,
+    /// The last episodes, oldest first.
+    pub recent: Vec<EpisodeFigures>,
     /// Seconds of training.
     pub elapsed: f64,
-    /// Of these: choosing actions, waiting for servers, updating.
-    pub shares: [f64; 3],
+    /// Where they went; format 1 has no names here, nor in `recent`.
+    pub shares: TimeShares,
     /// How long the logs were.
     pub logs: LogLengths,
 }

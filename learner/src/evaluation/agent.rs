@@ -28,7 +28,7 @@ impl<'a> Agent<'a> {
     /// Weights that do not fit.
     pub fn new(checkpoint: &'a Checkpoint, n_envs: usize, seed: u64) -> Result<Self> {
         let state = &checkpoint.state;
-        let mut actor = Actor::new(&state.policy, n_envs);
+        let mut actor = Actor::new(&checkpoint.policy, n_envs);
         actor.load(&checkpoint.weights)?;
         let first = |environment: usize| trial_stream(seed, Purpose::TestActions, environment as u32, 0);
         Ok(Self {
@@ -37,7 +37,7 @@ impl<'a> Agent<'a> {
             inputs: state.inputs(n_envs),
             seed,
             streams: (0..n_envs).map(first).collect(),
-            acts: Acts::new(state.policy.action, n_envs),
+            acts: Acts::new(checkpoint.policy.action, n_envs),
             bytes: Vec::new(),
         })
     }

@@ -4,7 +4,6 @@ use perturb_protocol::{Version, proto};
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::Records;
 use perturb_study::sets::{Context, Contexts, TestSet};
-use perturb_study::settings::Wrapper;
 use perturb_study::{Axis, Heatmap, HeatmapOptions, MOST_POINTS};
 
 use super::test::{TestError, TestOptions, Tester};
@@ -80,12 +79,8 @@ pub fn heatmap_again(
 
 /// Who is tested.
 fn policy(state: &State) -> String {
-    let State { algorithm, architecture, train_version, seed, .. } = state;
-    let trials = match algorithm.wrapper() {
-        Wrapper::Rl2 => format!(" N={}", state.episodes_per_trial),
-        _ => String::new(),
-    };
-    format!("{algorithm} {architecture}{trials}, trained on {train_version} with seed {seed}")
+    let config = &state.config;
+    format!("{}, trained on {} with seed {}", config.method(), config.common.version, config.common.seed)
 }
 
 fn axes(environment: &proto::Environment, names: &[String; 2]) -> Result<[Axis; 2], HeatmapError> {

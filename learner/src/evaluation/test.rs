@@ -10,7 +10,7 @@ use perturb_study::success::{Threshold, ThresholdError};
 use rand::Rng;
 
 use super::agent::Agent;
-use crate::checkpoint::{Checkpoint, EnvironmentSummary};
+use crate::checkpoint::{Checkpoint, EnvironmentSummary, State};
 use crate::client::{ClientError, EndedEpisode, OpenOptions, Servers, Session, StepReply};
 
 /// The most environments that are tested together, unless a set has more contexts.
@@ -114,10 +114,10 @@ impl<'a> Tester<'a> {
     /// [`TestError`].
     pub fn new(servers: &'a Servers, checkpoint: &'a Checkpoint, options: TestOptions) -> Result<Self, TestError> {
         let state = &checkpoint.state;
-        let environment = servers.environment(&state.environment)?;
+        let environment = servers.environment(&state.config.common.environment)?;
         check_unchanged(checkpoint, EnvironmentSummary::of(&environment))?;
         let id = checkpoint.id().map_err(TestError::Unnamed)?;
-        let mut about = About::new(&environment, id, state.episodes_per_trial);
+        let mut about = About::new(&environment, id, state.config.settings.episodes_per_trial());
         if let Some(threshold) = &options.success {
             about.success = about.success.map(|criterion| criterion.with(threshold)).transpose()?;
         }
@@ -306,7 +306,8 @@ fn quotas(episodes: u64, contexts: usize) -> Vec<u64> {
 /// # Errors
 /// [`TestError::Changed`].
 pub fn check_unchanged(checkpoint: &Checkpoint, served: Option<EnvironmentSummary>) -> Result<(), TestError> {
-    let (trained, environment) = (&checkpoint.state.environment_spec, checkpoint.state.environment.clone());
+    let State { environment_spec: trained, config, .. } = &checkpoint.state;
+    let environment = config.common.environment.clone();
     let advice = "test with the version of perturb that trained it, or train again";
     let (what, trained, served) = match served {
         None => ("actions", format!("{:?}", trained.action), "none".into()),

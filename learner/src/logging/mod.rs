@@ -10,5 +10,5 @@ mod tensorboard;
 pub use clock::Clock;
 pub use logs::{LogError, LogLengths, Logs};
 pub use monitor::Monitor;
-pub use progress::{Progress, ProgressLog};
+pub use progress::{EpisodeFigures, Progress, ProgressLog, TimeShares};
 pub use tensorboard::EventWriter;

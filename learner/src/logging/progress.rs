@@ -3,48 +3,37 @@
 use std::fs::File;
 use std::path::Path;
 
+use serde::{Deserialize, Serialize};
+
 use super::EventWriter;
 use super::logs::sync;
 use crate::algorithm::UpdateStats;
+use crate::client::EndedEpisode;
 
-/// The columns, by stable-baselines3's names; `time/acting`, `time/waiting` and `time/updating` are ours: seconds since
-/// the start spent on choosing actions, on waiting for servers and on updates; and `epopt/…`: EPOpt's generated episodes
-/// so far, and of the last iteration the share ε that was aimed at, the episodes kept, the mean return of all and that of
-/// the worst (conditional value at risk).
-const COLUMNS: [&str; 29] = [
-    "time/iterations",
-    "time/total_timesteps",
-    "time/time_elapsed",
-    "time/fps",
-    "time/acting",
-    "time/waiting",
-    "time/updating",
-    "rollout/episodes",
-    "rollout/ep_rew_mean",
-    "rollout/ep_len_mean",
-    "rollout/success_rate",
-    "train/learning_rate",
-    "train/policy_gradient_loss",
-    "train/value_loss",
-    "train/entropy_loss",
-    "train/loss",
-    "train/approx_kl",
-    "train/clip_fraction",
-    "train/clip_range",
-    "train/explained_variance",
-    "train/grad_norm",
-    "train/n_updates",
-    "train/std",
-    "train/kl_divergence",
-    "epopt/episodes_generated",
-    "epopt/epsilon",
-    "epopt/episodes_kept",
-    "epopt/return_mean",
-    "epopt/return_cvar",
-];
+/// What the last episodes came to: of one, or means over several.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EpisodeFigures {
+    /// The undiscounted return.
+    pub episode_return: f64,
+    /// Steps.
+    pub length: f64,
+    /// 1 for a success, 0 for none.
+    pub success: f64,
+}
+
+/// Where the time of a training went.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct TimeShares {
+    /// Choosing actions.
+    pub acting: f64,
+    /// Waiting for servers.
+    pub waiting: f64,
+    /// Updating the policy.
+    pub updating: f64,
+}
 
 /// A line of `progress.csv`.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Progress {
     /// Rollouts and updates so far.
     pub iterations: u64,
@@ -52,18 +41,41 @@ pub struct Progress {
     pub timesteps: u64,
     /// Seconds since the start.
     pub elapsed: f64,
-    /// Of these: choosing actions, waiting for servers, updating.
-    pub shares: [f64; 3],
+    /// Where these went.
+    pub shares: TimeShares,
     /// Episodes that the budget counts.
     pub episodes: u64,
     /// Episodes that have ended; EPOpt generates more than it learns from.
     pub generated_episodes: u64,
     /// Steps that the last checkpoint on disk counts.
     pub saved_timesteps: u64,
-    /// Mean return, mean length and share of successes of the last 100 episodes; `None` before the first has ended.
-    pub recent: Option<[f64; 3]>,
+    /// Means over the last 100 episodes; `None` before the first has ended.
+    pub recent: Option<EpisodeFigures>,
     /// The last update.
     pub update: UpdateStats,
+}
+
+impl From<&EndedEpisode> for EpisodeFigures {
+    fn from(episode: &EndedEpisode) -> Self {
+        Self {
+            episode_return: episode.episode_return,
+            length: f64::from(episode.length),
+            success: f64::from(u8::from(episode.success)),
+        }
+    }
+}
+
+impl EpisodeFigures {
+    /// Means over `episodes`; `None` if there are none.
+    pub fn mean<'a>(episodes: impl ExactSizeIterator<Item = &'a Self> + Clone) -> Option<Self> {
+        let count = episodes.len() as f64;
+        let mean = |figure: fn(&Self) -> f64| episodes.clone().map(figure).sum::<f64>() / count;
+        (count > 0.0).then(|| Self {
+            episode_return: mean(|episode| episode.episode_return),
+            length: mean(|episode| episode.length),
+            success: mean(|episode| episode.success),
+        })
+    }
 }
 
 impl Progress {
@@ -72,41 +84,51 @@ impl Progress {
         self.timesteps as f64 / self.elapsed.max(1e-9)
     }
 
-    /// The values of [`COLUMNS`]; `None` where there is nothing to say.
-    fn values(&self) -> [Option<f64>; COLUMNS.len()] {
-        let recent = |i: usize| self.recent.map(|recent| recent[i]);
-        let update = &self.update;
+    /// Where the time went, %.
+    pub fn percent(&self) -> TimeShares {
+        let percent = |seconds: f64| 100.0 * seconds / self.elapsed.max(1e-9);
+        let TimeShares { acting, waiting, updating } = self.shares;
+        TimeShares { acting: percent(acting), waiting: percent(waiting), updating: percent(updating) }
+    }
+
+    /// The columns with their values, `None` where there is nothing to say. They have stable-baselines3's names;
+    /// `time/acting`, `time/waiting` and `time/updating` are ours: seconds since the start spent on choosing actions, on
+    /// waiting for servers and on updates; and `epopt/…`: EPOpt's generated episodes so far, and of the last iteration the
+    /// share ε that was aimed at, the episodes kept, the mean return of all and that of the worst (conditional value at
+    /// risk).
+    fn columns(&self) -> [(&'static str, Option<f64>); 29] {
+        let Self { shares, recent, update, .. } = self;
         let selection = update.selection;
         [
-            Some(self.iterations as f64),
-            Some(self.timesteps as f64),
-            Some(self.elapsed),
-            Some(self.fps().trunc()),
-            Some(self.shares[0]),
-            Some(self.shares[1]),
-            Some(self.shares[2]),
-            Some(self.episodes as f64),
-            recent(0),
-            recent(1),
-            recent(2),
-            Some(update.learning_rate),
-            Some(update.policy_gradient_loss),
-            Some(update.value_loss),
-            Some(update.entropy_loss),
-            Some(update.loss),
-            update.approx_kl,
-            update.clip_fraction,
-            update.clip_range,
-            update.explained_variance,
-            Some(update.grad_norm),
-            Some(update.n_updates as f64),
-            update.std,
-            update.kl_divergence,
-            selection.map(|_| self.generated_episodes as f64),
-            selection.map(|selection| selection.epsilon),
-            selection.map(|selection| selection.kept as f64),
-            selection.map(|selection| selection.mean_return),
-            selection.map(|selection| selection.cvar),
+            ("time/iterations", Some(self.iterations as f64)),
+            ("time/total_timesteps", Some(self.timesteps as f64)),
+            ("time/time_elapsed", Some(self.elapsed)),
+            ("time/fps", Some(self.fps().trunc())),
+            ("time/acting", Some(shares.acting)),
+            ("time/waiting", Some(shares.waiting)),
+            ("time/updating", Some(shares.updating)),
+            ("rollout/episodes", Some(self.episodes as f64)),
+            ("rollout/ep_rew_mean", recent.map(|recent| recent.episode_return)),
+            ("rollout/ep_len_mean", recent.map(|recent| recent.length)),
+            ("rollout/success_rate", recent.map(|recent| recent.success)),
+            ("train/learning_rate", Some(update.learning_rate)),
+            ("train/policy_gradient_loss", Some(update.policy_gradient_loss)),
+            ("train/value_loss", Some(update.value_loss)),
+            ("train/entropy_loss", Some(update.entropy_loss)),
+            ("train/loss", Some(update.loss)),
+            ("train/approx_kl", update.approx_kl),
+            ("train/clip_fraction", update.clip_fraction),
+            ("train/clip_range", update.clip_range),
+            ("train/explained_variance", update.explained_variance),
+            ("train/grad_norm", Some(update.grad_norm)),
+            ("train/n_updates", Some(update.n_updates as f64)),
+            ("train/std", update.std),
+            ("train/kl_divergence", update.kl_divergence),
+            ("epopt/episodes_generated", selection.map(|_| self.generated_episodes as f64)),
+            ("epopt/epsilon", selection.map(|selection| selection.epsilon)),
+            ("epopt/episodes_kept", selection.map(|selection| selection.kept as f64)),
+            ("epopt/return_mean", selection.map(|selection| selection.mean_return)),
+            ("epopt/return_cvar", selection.map(|selection| selection.cvar)),
         ]
     }
 }
@@ -125,7 +147,7 @@ impl ProgressLog {
     /// The operating system's.
     pub fn create(directory: &Path, t_start: f64) -> std::io::Result<Self> {
         let mut csv = csv::Writer::from_writer(File::create(directory.join("progress.csv"))?);
-        csv.write_record(COLUMNS)?;
+        csv.write_record(Progress::default().columns().map(|(name, _)| name))?;
         csv.flush()?;
         Ok(Self { csv, events: EventWriter::create(directory, t_start)? })
     }
@@ -151,10 +173,10 @@ impl ProgressLog {
     /// # Errors
     /// The operating system's.
     pub fn write(&mut self, progress: &Progress) -> std::io::Result<()> {
-        let values = progress.values();
-        self.csv.write_record(values.iter().map(|value| value.map_or_else(String::new, |value| value.to_string())))?;
+        let columns = progress.columns();
+        self.csv.write_record(columns.map(|(_, value)| value.map_or_else(String::new, |value| value.to_string())))?;
         self.csv.flush()?;
-        let scalars = COLUMNS.iter().zip(values).filter_map(|(name, value)| Some((*name, value?)));
+        let scalars = columns.into_iter().filter_map(|(name, value)| Some((name, value?)));
         self.events.write(progress.timesteps, progress.elapsed, scalars)
     }
 }
@@ -188,11 +210,11 @@ mod tests {
             iterations: 6,
             timesteps: 700,
             elapsed: 2.0,
-            shares: [0.25, 0.5, 1.25],
+            shares: TimeShares { acting: 0.25, waiting: 0.5, updating: 1.25 },
             episodes: 9,
             generated_episodes: 90,
             saved_timesteps: 0,
-            recent: Some([10.0, 11.0, 0.12]),
+            recent: Some(EpisodeFigures { episode_return: 10.0, length: 11.0, success: 0.12 }),
             update,
         };
         log.write(&progress).unwrap();

@@ -13,14 +13,14 @@ use std::time::{Duration, Instant};
 use crate::algorithm::{self, Algorithm, Experience, UpdateStats};
 use crate::checkpoint::{Checkpoint, EnvironmentSummary, History, ResumeState, State};
 use crate::client::{EndedEpisode, OpenOptions, Servers, Session};
-use crate::logging::{Clock, Logs, Progress};
-use crate::policy::{Inputs, ObservationNormaliser, Policy, PolicySpec, RewardNormaliser, Weights};
+use crate::logging::{Clock, EpisodeFigures, Logs, Progress, TimeShares};
+use crate::policy::{ObservationNormaliser, Policy, RewardNormaliser, Weights};
 use crate::rollout::{Collector, Normalisers, Rollout};
 pub use error::{LastCheckpoint, TrainError};
 use perturb_study::Counters;
 use perturb_study::files::write_atomically;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::settings::{Common, TrainConfig, Wrapper};
+use perturb_study::settings::{Common, TrainConfig};
 pub use run_directory::{RunDirectory, RunDirectoryError};
 
 type Result<T> = std::result::Result<T, TrainError>;
@@ -57,27 +57,27 @@ pub fn train(
     directory.prepare()?; // from here on an earlier run is gone
     tracing::debug!(directory = %directory.path().display(), "training begins");
     let Common { environment, .. } = &config.common;
-    let mut logs = Logs::create(directory.path(), environment, &training.summary, training.clock)?;
+    let spec = &training.checkpoint.state.environment_spec;
+    let mut logs = Logs::create(directory.path(), environment, spec, training.clock)?;
     write_atomically(&directory.path().join("config.toml"), config.to_toml().as_bytes())?;
     training.run(&mut logs, directory, stop, report)
 }
 
-/// Goes on with the run in `directory` from its last `checkpoint`, whose configuration is `config`, to the same bytes as
-/// without the break, times aside; otherwise as [`train`]. `servers` may be others than before. What the logs hold
+/// Goes on with the run in `directory` from its last `checkpoint` to the same bytes as without the break, times aside;
+/// otherwise as [`train`]. `servers` may be others than before. What the logs hold
 /// beyond the checkpoint is deleted.
 ///
 /// # Errors
 /// Those of [`train`]; an environment, a state or a log that does not fit the checkpoint, before anything is changed.
 pub fn resume(
     servers: &Servers,
-    config: &TrainConfig,
     directory: &RunDirectory,
     (checkpoint, state): (Checkpoint, ResumeState),
     stop: &StopFlag,
     report: impl FnMut(&Progress),
 ) -> Result<Outcome> {
     let lengths = state.history.logs.clone();
-    let mut training = Training::resume(servers, config, checkpoint, state)?;
+    let mut training = Training::resume(servers, checkpoint, state)?;
     let mut logs = Logs::resume(directory.path(), &lengths, training.clock)?;
     tracing::debug!(directory = %directory.path().display(), "training goes on");
     training.run(&mut logs, directory, stop, report)
@@ -86,18 +86,16 @@ pub fn resume(
 /// A training between two iterations.
 struct Training<'a> {
     servers: &'a Servers,
-    config: &'a TrainConfig,
-    summary: EnvironmentSummary,
     collector: Collector<'a>,
     rollout: Rollout,
     policy: Policy,
     algorithm: Box<dyn Algorithm>,
-    /// The policy after the last whole iteration.
-    whole: Checkpoint,
-    recent: VecDeque<[f64; 3]>,
+    /// After the last whole iteration.
+    checkpoint: Checkpoint,
+    recent: VecDeque<EpisodeFigures>,
     clock: Clock,
-    /// Seconds of acting, waiting and updating in earlier processes.
-    shares_before: [f64; 3],
+    /// In earlier processes.
+    shares_before: TimeShares,
     updating: Duration,
     /// How long the last update took.
     last_update: Option<Duration>,
@@ -106,66 +104,52 @@ struct Training<'a> {
 }
 
 impl<'a> Training<'a> {
-    fn begin(servers: &'a Servers, config: &'a TrainConfig) -> Result<Self> {
+    fn begin(servers: &'a Servers, config: &TrainConfig) -> Result<Self> {
         let common = &config.common;
         let mut observations = Vec::new();
         let (session, summary) = open(servers, config, &mut observations)?;
         let observation_size = session.observation_size();
-        let with_outcomes = common.algorithm.wrapper() == Wrapper::Rl2;
-        let inputs = Inputs::new(observation_size, summary.action, common.num_envs, with_outcomes);
-        let spec = PolicySpec::of(common.architecture, inputs.size(), summary.action);
+        let state = State {
+            environment_spec: summary,
+            observation_normaliser: None,
+            reward_normaliser: None,
+            counters: Counters::default(),
+            config: config.clone(),
+            commits: Vec::new(),
+        };
+        let spec = state.policy();
         let policy = Policy::new(spec.clone(), common.seed)?;
         let normalisers = Normalisers {
             observations: common.normalize_observations.then(|| ObservationNormaliser::new(observation_size)),
             rewards: common.normalize_rewards.then(|| RewardNormaliser::new(common.num_envs, config.settings.gamma())),
         };
+        let inputs = state.inputs(common.num_envs);
         let collector = Collector::new(session, observations, &spec, inputs, normalisers, common.seed)?;
-        let whole = Checkpoint {
-            state: State {
-                environment: common.environment.clone(),
-                environment_spec: summary,
-                algorithm: common.algorithm,
-                architecture: common.architecture,
-                policy: spec,
-                train_version: common.version,
-                episodes_per_trial: config.settings.episodes_per_trial(),
-                seed: common.seed,
-                observation_normaliser: None,
-                reward_normaliser: None,
-                counters: Counters::default(),
-                config: config.table(),
-                commits: Vec::new(),
-            },
-            weights: policy.weights(),
-        };
-        Self::new(servers, config, policy, collector, whole)
+        let weights = policy.weights();
+        Self::new(servers, policy, collector, Checkpoint { state, policy: spec, weights })
     }
 
-    fn resume(
-        servers: &'a Servers,
-        config: &'a TrainConfig,
-        checkpoint: Checkpoint,
-        resume: ResumeState,
-    ) -> Result<Self> {
+    fn resume(servers: &'a Servers, checkpoint: Checkpoint, resume: ResumeState) -> Result<Self> {
         let state = &checkpoint.state;
-        let (session, served) = open(servers, config, &mut Vec::new())?;
+        let common = &state.config.common;
+        let (session, served) = open(servers, &state.config, &mut Vec::new())?;
         if let Some((what, trained, served)) = state.environment_spec.difference(&served) {
-            return Err(TrainError::Changed { environment: state.environment.clone(), what, trained, served });
+            return Err(TrainError::Changed { environment: common.environment.clone(), what, trained, served });
         }
-        let policy = Policy::from_weights(state.policy.clone(), &checkpoint.weights)?;
+        let policy = Policy::from_weights(checkpoint.policy.clone(), &checkpoint.weights)?;
         let normalisers = Normalisers {
             observations: state.observation_normaliser.clone(),
             rewards: state.reward_normaliser.clone(),
         };
-        let inputs = state.inputs(config.common.num_envs);
-        let collector = Collector::resume(session, &state.policy, inputs, normalisers, &resume.collector)
+        let inputs = state.inputs(common.num_envs);
+        let collector = Collector::resume(session, &checkpoint.policy, inputs, normalisers, &resume.collector)
             .map_err(|error| TrainError::Restore { what: "environments", source: Box::new(error.into()) })?;
-        let mut training = Self::new(servers, config, policy, collector, checkpoint)?;
+        let mut training = Self::new(servers, policy, collector, checkpoint)?;
         training
             .algorithm
             .load_state(&resume.algorithm)
             .map_err(|error| TrainError::Restore { what: "optimiser", source: Box::new(error.into()) })?;
-        training.saved = Some(training.whole.state.counters);
+        training.saved = Some(training.checkpoint.state.counters);
         training.recent.extend(&resume.history.recent);
         training.clock = Clock::start(resume.history.elapsed);
         training.shares_before = resume.history.shares;
@@ -173,16 +157,11 @@ impl<'a> Training<'a> {
     }
 
     /// With a fresh algorithm, and no past.
-    fn new(
-        servers: &'a Servers,
-        config: &'a TrainConfig,
-        policy: Policy,
-        collector: Collector<'a>,
-        mut whole: Checkpoint,
-    ) -> Result<Self> {
+    fn new(servers: &'a Servers, policy: Policy, collector: Collector<'a>, mut checkpoint: Checkpoint) -> Result<Self> {
+        let State { config, commits, .. } = &mut checkpoint.state;
         let algorithm = algorithm::build(&config.settings, &policy, config.common.seed)?;
-        if !whole.state.commits.iter().any(|commit| commit == perturb_study::VERSION) {
-            whole.state.commits.push(perturb_study::VERSION.into());
+        if !commits.iter().any(|commit| commit == perturb_study::VERSION) {
+            commits.push(perturb_study::VERSION.into());
         }
         let spec = policy.spec();
         let (n_envs, input_size, width) = (config.common.num_envs, spec.observation_size, spec.action.width());
@@ -192,16 +171,14 @@ impl<'a> Training<'a> {
         };
         Ok(Self {
             servers,
-            config,
-            summary: whole.state.environment_spec.clone(),
             collector,
             rollout,
             policy,
             algorithm,
-            whole,
+            checkpoint,
             recent: VecDeque::with_capacity(RECENT),
             clock: Clock::start(0.0),
-            shares_before: [0.0; 3],
+            shares_before: TimeShares::default(),
             updating: Duration::ZERO,
             last_update: None,
             saved: None,
@@ -216,7 +193,7 @@ impl<'a> Training<'a> {
         stop: &StopFlag,
         mut report: impl FnMut(&Progress),
     ) -> Result<Outcome> {
-        let Common { episodes, log_interval, checkpoint_interval, .. } = self.config.common;
+        let Common { episodes, log_interval, checkpoint_interval, .. } = self.checkpoint.state.config.common;
         loop {
             let progress = self.iterate(logs).map_err(|error| self.failed(error, directory))?;
             report(&progress);
@@ -234,17 +211,17 @@ impl<'a> Training<'a> {
                 if !logged {
                     logs.progress(&progress)?; // beyond the checkpoint: a run that is not stopped has no such line
                 }
-                return Ok(Outcome { checkpoint: self.whole.clone(), progress, signal });
+                return Ok(Outcome { checkpoint: self.checkpoint.clone(), progress, signal });
             }
         }
     }
 
     /// A rollout and an update.
     fn iterate(&mut self, logs: &mut Logs) -> Result<Progress> {
-        let mut counters = self.whole.state.counters;
+        let mut counters = self.checkpoint.state.counters;
         let mut written = Ok(());
         let (mut ended, mut steps) = (0, 0);
-        let Self { collector, rollout, recent, whole, algorithm, .. } = self;
+        let Self { collector, rollout, recent, checkpoint, algorithm, .. } = self;
         let on_episode = |episode: &EndedEpisode| {
             ended += 1;
             steps += u64::from(episode.length);
@@ -255,10 +232,12 @@ impl<'a> Training<'a> {
         };
         match algorithm.experience() {
             Experience::Steps(_) => {
-                collector.collect(&whole.weights, rollout, on_episode)?;
+                collector.collect(&checkpoint.weights, rollout, on_episode)?;
                 steps = (rollout.n_steps() * rollout.n_envs()) as u64;
             }
-            Experience::Episodes(count) => collector.collect_episodes(&whole.weights, count, rollout, on_episode)?,
+            Experience::Episodes(count) => {
+                collector.collect_episodes(&checkpoint.weights, count, rollout, on_episode)?
+            }
         }
         written?;
 
@@ -292,17 +271,18 @@ impl<'a> Training<'a> {
 
     /// 1 at the start, 0 when as many steps were learned from as the budget's episodes can have at most.
     fn progress_remaining(&self, timesteps: u64) -> f64 {
-        let most = self.config.common.episodes as f64 * f64::from(self.summary.step_limit);
+        let State { config, environment_spec, .. } = &self.checkpoint.state;
+        let most = config.common.episodes as f64 * f64::from(environment_spec.step_limit);
         (1.0 - timesteps as f64 / most).max(0.0)
     }
 
     /// Remembers the state after a whole iteration.
     fn keep(&mut self, weights: Weights, counters: Counters) {
         let Normalisers { observations, rewards } = self.collector.normalisers().clone();
-        self.whole.weights = weights;
-        self.whole.state.observation_normaliser = observations;
-        self.whole.state.reward_normaliser = rewards;
-        self.whole.state.counters = counters;
+        self.checkpoint.weights = weights;
+        self.checkpoint.state.observation_normaliser = observations;
+        self.checkpoint.state.reward_normaliser = rewards;
+        self.checkpoint.state.counters = counters;
     }
 
     /// Replaces the checkpoint on disk.
@@ -315,8 +295,8 @@ impl<'a> Training<'a> {
             shares: self.shares(),
         };
         let state = ResumeState { collector: self.collector.state()?, algorithm: self.algorithm.state(), history };
-        self.whole.save(&directory.checkpoint(), Some(&state))?;
-        self.saved = Some(self.whole.state.counters);
+        self.checkpoint.save(&directory.checkpoint(), Some(&state))?;
+        self.saved = Some(self.checkpoint.state.counters);
         Ok(())
     }
 
@@ -327,16 +307,17 @@ impl<'a> Training<'a> {
         TrainError::Failed { last, source: Box::new(error) }
     }
 
-    /// Seconds of acting, waiting and updating.
-    fn shares(&self) -> [f64; 3] {
-        let times = self.collector.times();
-        let now = [times.acting, times.waiting, self.updating];
-        std::array::from_fn(|i| self.shares_before[i] + now[i].as_secs_f64())
+    fn shares(&self) -> TimeShares {
+        let (before, now) = (self.shares_before, self.collector.times());
+        TimeShares {
+            acting: before.acting + now.acting.as_secs_f64(),
+            waiting: before.waiting + now.waiting.as_secs_f64(),
+            updating: before.updating + self.updating.as_secs_f64(),
+        }
     }
 
     fn progress(&self, update: UpdateStats) -> Progress {
-        let Counters { iterations, timesteps, episodes, generated_episodes, .. } = self.whole.state.counters;
-        let mean = |i: usize| self.recent.iter().map(|episode| episode[i]).sum::<f64>() / self.recent.len() as f64;
+        let Counters { iterations, timesteps, episodes, generated_episodes, .. } = self.checkpoint.state.counters;
         Progress {
             iterations,
             timesteps,
@@ -345,7 +326,7 @@ impl<'a> Training<'a> {
             episodes,
             generated_episodes,
             saved_timesteps: self.saved.map_or(0, |saved| saved.timesteps),
-            recent: (!self.recent.is_empty()).then(|| [mean(0), mean(1), mean(2)]),
+            recent: EpisodeFigures::mean(self.recent.iter()),
             update,
         }
     }
@@ -371,9 +352,9 @@ fn open<'a>(
     Ok((session, summary))
 }
 
-fn remember(recent: &mut VecDeque<[f64; 3]>, episode: &EndedEpisode) {
+fn remember(recent: &mut VecDeque<EpisodeFigures>, episode: &EndedEpisode) {
     while recent.len() >= RECENT {
         recent.pop_front();
     }
-    recent.push_back([episode.episode_return, f64::from(episode.length), f64::from(u8::from(episode.success))]);
+    recent.push_back(episode.into());
 }

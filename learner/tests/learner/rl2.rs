@@ -12,8 +12,7 @@ use perturb_learner::training::{RunDirectory, train};
 use perturb_study::Version;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::random::{Purpose, stream, uniform};
-use perturb_study::settings::TrainConfig;
-use perturb_study::settings::{A2cConfig, PpoConfig};
+use perturb_study::settings::{self, A2cConfig, PpoConfig, TrainConfig};
 use rand_chacha::ChaCha8Rng;
 
 const TWO: ActionKind = ActionKind::Discrete { n: 2 };
@@ -270,8 +269,8 @@ fn balancing_in_the_second_episode(servers: &Servers) -> Checkpoint {
     let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
     let outcome = train(servers, &config, &directory, &StopFlag::default(), |_| {}).expect("a training");
     let mut checkpoint = outcome.checkpoint;
-    assert_eq!(checkpoint.state.policy.observation_size, 4 + 2 + 1 + 1);
-    let spec = PolicySpec { hidden: vec![], lstm: Some(4), ..checkpoint.state.policy.clone() };
+    assert_eq!(checkpoint.policy.observation_size, 4 + 2 + 1 + 1);
+    let spec = PolicySpec { hidden: vec![], lstm: Some(4), ..checkpoint.policy.clone() };
     let mut weights = Policy::new(spec.clone(), 1).expect("a policy").weights();
     let (counting, rewarded) = (1e6f32, 1e6f32);
     for array in &mut weights {
@@ -296,7 +295,7 @@ fn balancing_in_the_second_episode(servers: &Servers) -> Checkpoint {
         }
     }
     checkpoint.weights = weights;
-    checkpoint.state.policy = spec;
+    checkpoint.policy = spec;
     checkpoint.state.observation_normaliser = None;
     // A variance of 100.
     let moments = serde_json::json!({ "count": 2, "mean": [0.0], "squares": [200.0] });
@@ -328,7 +327,7 @@ fn a_test_counts_the_last_episode_of_each_trial_with_its_memory_and_normalised_r
     assert_eq!(figures(&two, raw), figures(&one, raw));
     assert_ne!(figures_of(&one, raw, 2), figures(&one, raw));
     let single = &mut checkpoint.clone();
-    single.state.episodes_per_trial = 1;
+    single.state.config.settings.wrapper = settings::Wrapper::Rl2(settings::Rl2Config { episodes_per_trial: 1 });
     assert!(figures(&one, single).mean_length < 15.0, "there is no second episode");
 }
 

@@ -38,7 +38,7 @@ architectures = ['ff']
 fn results(plan: &Plan) -> Results<'_> {
     let mut results = fixture::results(plan, |cell| {
         let common = &cell.config.common;
-        let known = common.algorithm.to_string() == "a2c" || (common.environment == "CartPole" && cell.run == 1);
+        let known = cell.config.settings.name() == "a2c" || (common.environment == "CartPole" && cell.run == 1);
         let easier = match common.version {
             Version::D => [90.0, 40.0, 20.0],
             Version::R => [80.0, 70.0, 30.0],

@@ -32,7 +32,7 @@ impl Schedule {
 /// Settings of A2C. The defaults are those of OpenAI Baselines; the paper searches `learning_rate`, `n_steps` and
 /// `ent_coef`, for which `perturb train` has defaults of its own.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[serde(default)]
 pub struct A2cConfig {
     /// Step size of RMSProp, above 0 (default: `7e-4`). Larger learns faster, until the policy collapses.
     pub learning_rate: f64,
@@ -96,7 +96,7 @@ impl A2cConfig {
 
 /// Settings of PPO. The defaults are the paper's, which searches `learning_rate` and `n_steps`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[serde(default)]
 pub struct PpoConfig {
     /// Step size of Adam, above 0 (default: `3e-4`). Larger learns faster, until the policy collapses.
     pub learning_rate: f64,
@@ -184,7 +184,7 @@ impl PpoConfig {
 
 /// Settings of EPOpt. The defaults are the paper's.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[serde(default)]
 pub struct EpoptConfig {
     /// L: complete episodes in an iteration, 1 … 10⁶ (default: `100`).
     pub episodes_per_iteration: usize,
@@ -220,7 +220,7 @@ impl EpoptConfig {
 /// PPO as it is, with [`kl_coef`](PpoConfig::kl_coef) for RL²-PPO: collecting alone differs
 /// .
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[serde(default)]
 pub struct Rl2Config {
     /// N: episodes in a trial, 1 … 10⁶ (default: `2`; the paper also tries 1 and 5). Testing counts a trial's last.
     pub episodes_per_trial: u32,

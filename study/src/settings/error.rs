@@ -1,6 +1,5 @@
 //! Why a configuration is refused.
 
-use super::AlgorithmName;
 use crate::files::FileError;
 
 /// Why a configuration was refused.
@@ -26,7 +25,7 @@ pub enum ConfigError {
         /// The key.
         key: String,
         /// Whose keys were looked through.
-        algorithm: AlgorithmName,
+        algorithm: &'static str,
         /// All valid keys.
         keys: String,
     },
@@ -52,7 +51,7 @@ pub enum ConfigError {
     )]
     NeedsMemory {
         /// The algorithm.
-        algorithm: AlgorithmName,
+        algorithm: &'static str,
     },
     /// The layers cannot be merged.
     #[error("cannot merge the configuration: {0}")]

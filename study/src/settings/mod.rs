@@ -4,15 +4,16 @@
 //! result is written to `config.toml` of the run; given back with `--config` it repeats the run.
 
 mod algorithms;
+mod architecture;
 mod defaults;
 mod error;
-mod names;
+
 mod settings;
 
 pub use algorithms::{A2cConfig, EpoptConfig, PpoConfig, Rl2Config, Schedule};
+pub use architecture::Architecture;
 pub use error::{ConfigError, SettingError};
-pub use names::{AlgorithmName, Architecture, Base, Wrapper};
-pub use settings::{BaseSettings, Settings, WrapperSettings};
+pub use settings::{Base, Settings, Wrapper};
 
 use std::path::Path;
 
@@ -22,6 +23,7 @@ use toml::{Table, Value};
 
 use perturb_protocol::{Distribution, Version};
 
+use crate::Method;
 use crate::files;
 use crate::sets::Parameters;
 
@@ -29,11 +31,14 @@ use crate::sets::Parameters;
 const MOST_ENVS: usize = 65_536;
 /// The key of [`Common::parameters`].
 const PARAMETERS: &str = "parameters";
-/// As they are typed.
-const ARCHITECTURES: &[&str] = &["ff", "rc"];
+/// The key of [`Settings::name`].
+const ALGORITHM: &str = "algorithm";
+/// The key of [`Common::architecture`].
+const ARCHITECTURE: &str = "architecture";
 
 /// Everything that decides what a training does. Two trainings with equal configurations give equal bytes.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "Table", into = "Table")]
 pub struct TrainConfig {
     /// What every training has.
     pub common: Common,
@@ -52,8 +57,6 @@ pub struct Common {
     /// table `[parameters]` (default: nothing).
     #[serde(default, skip_serializing_if = "Parameters::is_empty")]
     pub parameters: Parameters,
-    /// What learns.
-    pub algorithm: AlgorithmName,
     /// What acts.
     pub architecture: Architecture,
     /// Training ends after the iteration in which this many episodes have ended, at least 1 (default: `15000`). EPOpt
@@ -117,6 +120,7 @@ impl TrainConfig {
     /// The configuration as a flat table, which [`TrainConfig::from_table`] reads back.
     pub fn table(&self) -> Table {
         let mut table = Table::try_from(&self.common).unwrap_or_default();
+        table.insert(ALGORITHM.into(), self.settings.name().into());
         table.extend(self.settings.table());
         table
     }
@@ -129,10 +133,14 @@ impl TrainConfig {
         resolve(&[(origin.to_owned(), table)])
     }
 
-    /// The defaults of an algorithm with an architecture, without an environment.
-    pub fn defaults(algorithm: AlgorithmName, architecture: Architecture) -> Self {
-        let common = defaults::common(algorithm, architecture);
-        Self { common, settings: defaults::settings(algorithm, architecture) }
+    /// What trains.
+    pub fn method(&self) -> Method {
+        let Self { common, settings } = self;
+        Method {
+            algorithm: settings.name().to_owned(),
+            architecture: common.architecture.to_string(),
+            episodes_per_trial: settings.has_trials().then(|| settings.episodes_per_trial()),
+        }
     }
 
     fn validate(&self) -> Result<(), ConfigError> {
@@ -151,42 +159,56 @@ impl TrainConfig {
                 return Err(ConfigError::Value { key: key.into(), got: value.to_string(), expected });
             }
         }
-        let Common { algorithm, architecture, .. } = self.common;
-        if (algorithm.wrapper(), architecture) == (Wrapper::Rl2, Architecture::Ff) {
-            return Err(ConfigError::NeedsMemory { algorithm });
+        let architecture = self.common.architecture;
+        if self.settings.has_trials() && architecture == Architecture::Ff {
+            return Err(ConfigError::NeedsMemory { algorithm: self.settings.name() });
         }
         self.settings.validate(architecture, num_envs)
+    }
+}
+
+impl TryFrom<Table> for TrainConfig {
+    type Error = ConfigError;
+
+    fn try_from(table: Table) -> Result<Self, ConfigError> {
+        Self::from_table("the configuration", table)
+    }
+}
+
+impl From<TrainConfig> for Table {
+    fn from(config: TrainConfig) -> Self {
+        config.table()
     }
 }
 
 /// Lays `layers` over the defaults of the algorithm that they name.
 fn resolve(layers: &[(String, Table)]) -> Result<TrainConfig, ConfigError> {
     let named = |key: &str| layers.iter().rev().find_map(|(_, table)| table.get(key));
-    let algorithm = match named("algorithm") {
-        None => AlgorithmName::Ppo,
-        Some(value) => choice("algorithm", value, &AlgorithmName::ALL.map(AlgorithmName::as_str))?,
-    };
-    let architecture = match named("architecture") {
+    let algorithm = named(ALGORITHM).cloned().unwrap_or_else(|| "ppo".into());
+    let algorithm = Settings::all()[choice(ALGORITHM, &algorithm, &Settings::names())?].clone();
+    let name = algorithm.name();
+    let architecture = match named(ARCHITECTURE) {
         None => algorithm.default_architecture(),
-        Some(value) => choice("architecture", value, ARCHITECTURES)?,
+        Some(value) => Architecture::ALL[choice(ARCHITECTURE, value, &Architecture::NAMES)?],
     };
-    let mut defaults = TrainConfig::defaults(algorithm, architecture).table();
+    let config = defaults::of(algorithm, architecture);
+    let mut defaults = config.table();
     defaults.insert(PARAMETERS.into(), Value::Table(Table::new())); // empty, it is not written
     for (origin, table) in layers {
         for (key, value) in table {
-            check(origin, key, value, &defaults, algorithm)?;
+            check(origin, key, value, &defaults, name)?;
         }
     }
     let mut builder = Config::builder().add_source(source(&defaults));
     for (_, table) in layers {
         builder = builder.add_source(source(table));
     }
-    let mut merged: Table = builder.build()?.try_deserialize()?;
+    let merged: Table = builder.build()?.try_deserialize()?;
     let wrong = |error: toml::de::Error| ConfigError::Syntax {
         origin: "the configuration".into(),
         reason: error.to_string().trim().replace('\n', ", "),
     };
-    let settings = Settings::take(algorithm, architecture, &mut merged).map_err(wrong)?;
+    let settings = config.settings.read(&merged).map_err(wrong)?;
     let config = TrainConfig { common: merged.try_into().map_err(wrong)?, settings };
     config.validate()?;
     Ok(config)
@@ -210,27 +232,21 @@ fn source(table: &Table) -> File<config::FileSourceString, FileFormat> {
 }
 
 /// Whether `key` exists and `value` has the type of its default.
-fn check(
-    origin: &str,
-    key: &str,
-    value: &Value,
-    defaults: &Table,
-    algorithm: AlgorithmName,
-) -> Result<(), ConfigError> {
+fn check(origin: &str, key: &str, value: &Value, defaults: &Table, algorithm: &'static str) -> Result<(), ConfigError> {
     let Some(default) = defaults.get(key) else {
         let keys = defaults.keys().map(String::as_str).collect::<Vec<_>>().join(", ");
         return Err(ConfigError::UnknownKey { origin: origin.to_owned(), key: key.to_owned(), algorithm, keys });
     };
-    let algorithms = AlgorithmName::ALL.map(AlgorithmName::as_str);
+    let algorithms = Settings::names();
     let choices: Option<&[&str]> = match key {
-        "algorithm" => Some(&algorithms),
+        ALGORITHM => Some(&algorithms),
         "version" => Some(&["D", "R", "E"]),
-        "architecture" => Some(ARCHITECTURES),
+        ARCHITECTURE => Some(&Architecture::NAMES),
         "learning_rate_schedule" => Some(&["constant", "linear"]),
         _ => None,
     };
     let expected = match (default, value) {
-        _ if choices.is_some() => return choice::<Value>(key, value, choices.unwrap_or_default()).map(|_| ()),
+        _ if choices.is_some() => return choice(key, value, choices.unwrap_or_default()).map(drop),
         (Value::Float(_), Value::Float(_) | Value::Integer(_)) => return Ok(()),
         (Value::Integer(_), Value::Integer(0..)) => return Ok(()),
         (Value::Boolean(_), Value::Boolean(_)) | (Value::String(_), Value::String(_)) => return Ok(()),
@@ -256,17 +272,13 @@ fn check_parameters(parameters: &Table) -> Result<(), ConfigError> {
     Ok(())
 }
 
-/// One of a few names.
-fn choice<T: serde::de::DeserializeOwned>(key: &str, value: &Value, names: &[&str]) -> Result<T, ConfigError> {
-    let refuse = || ConfigError::Value {
+/// The place of a value among a few names.
+fn choice(key: &str, value: &Value, names: &[&str]) -> Result<usize, ConfigError> {
+    names.iter().position(|name| value.as_str() == Some(name)).ok_or_else(|| ConfigError::Value {
         key: key.to_owned(),
         got: show(value),
         expected: format!("one of {}", names.iter().map(|name| format!("\"{name}\"")).collect::<Vec<_>>().join(", ")),
-    };
-    match value {
-        Value::String(name) if names.contains(&name.as_str()) => value.clone().try_into().map_err(|_| refuse()),
-        _ => Err(refuse()),
-    }
+    })
 }
 
 /// A value as its writer would recognise it.

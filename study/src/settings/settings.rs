@@ -2,8 +2,7 @@
 
 use toml::Table;
 
-use super::{A2cConfig, EpoptConfig, PpoConfig, Rl2Config};
-use super::{AlgorithmName, Architecture, Base, ConfigError, Wrapper};
+use super::{A2cConfig, Architecture, ConfigError, EpoptConfig, PpoConfig, Rl2Config};
 
 /// What EPOpt's base has no use for: an iteration is complete episodes, and one batch.
 const NOT_WITH_EPISODES: [&str; 2] = ["n_steps", "n_minibatches"];
@@ -11,114 +10,147 @@ const NOT_WITH_EPISODES: [&str; 2] = ["n_steps", "n_minibatches"];
 /// The most samples of a rollout: some gigabytes.
 const MOST_SAMPLES: u128 = 1 << 26;
 
-/// The settings of an algorithm.
+/// The settings of an algorithm, which say which one it is.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
-    /// Of what updates the policy.
-    pub base: BaseSettings,
-    /// Of what is wrapped around it.
-    pub wrapper: WrapperSettings,
+    /// What updates the policy.
+    pub base: Base,
+    /// What is wrapped around it.
+    pub wrapper: Wrapper,
 }
 
-/// The settings of what updates the policy.
+/// What updates the policy.
 #[derive(Clone, Debug, PartialEq)]
-pub enum BaseSettings {
-    /// Of A2C.
+pub enum Base {
+    /// Advantage actor-critic.
     A2c(A2cConfig),
-    /// Of PPO.
+    /// Proximal policy optimisation.
     Ppo(PpoConfig),
 }
 
-/// The settings of what is wrapped around it.
+/// What is wrapped around it.
 #[derive(Clone, Debug, PartialEq)]
-pub enum WrapperSettings {
-    /// There is nothing.
+pub enum Wrapper {
+    /// Nothing.
     Plain,
-    /// Of EPOpt.
+    /// Learning from the worst episodes of many.
     Epopt(EpoptConfig),
-    /// Of RL².
+    /// Trials of several episodes.
     Rl2(Rl2Config),
 }
 
 impl Settings {
+    /// All algorithms, each part with its own defaults, in the order in which they are listed.
+    pub fn all() -> [Self; 6] {
+        let (a2c, ppo) = (|| Base::A2c(A2cConfig::default()), || Base::Ppo(PpoConfig::default()));
+        let epopt = || Wrapper::Epopt(EpoptConfig::default());
+        let rl2 = || Wrapper::Rl2(Rl2Config::default());
+        [
+            (Wrapper::Plain, a2c()),
+            (Wrapper::Plain, ppo()),
+            (epopt(), a2c()),
+            (epopt(), ppo()),
+            (rl2(), a2c()),
+            (rl2(), ppo()),
+        ]
+        .map(|(wrapper, base)| Self { base, wrapper })
+    }
+
+    /// The names of all algorithms.
+    pub fn names() -> [&'static str; 6] {
+        Self::all().map(|settings| settings.name())
+    }
+
+    /// The algorithm's name, as it is typed.
+    pub fn name(&self) -> &'static str {
+        match (&self.wrapper, &self.base) {
+            (Wrapper::Plain, Base::A2c(_)) => "a2c",
+            (Wrapper::Plain, Base::Ppo(_)) => "ppo",
+            (Wrapper::Epopt(_), Base::A2c(_)) => "epopt-a2c",
+            (Wrapper::Epopt(_), Base::Ppo(_)) => "epopt-ppo",
+            (Wrapper::Rl2(_), Base::A2c(_)) => "rl2-a2c",
+            (Wrapper::Rl2(_), Base::Ppo(_)) => "rl2-ppo",
+        }
+    }
+
+    /// Whether the policy learns over trials.
+    pub fn has_trials(&self) -> bool {
+        matches!(self.wrapper, Wrapper::Rl2(_))
+    }
+
+    /// The architecture that is trained if none is named: one that learns over trials has to remember.
+    pub(super) fn default_architecture(&self) -> Architecture {
+        if self.has_trials() { Architecture::Rc } else { Architecture::Ff }
+    }
+
     /// The settings as a flat table.
     pub(super) fn table(&self) -> Table {
         // Serialisation of plain numbers, booleans and names cannot fail.
         let to_table = |value: Result<Table, toml::ser::Error>| value.unwrap_or_default();
         let mut table = match &self.base {
-            BaseSettings::A2c(settings) => to_table(Table::try_from(settings)),
-            BaseSettings::Ppo(settings) => to_table(Table::try_from(settings)),
+            Base::A2c(settings) => to_table(Table::try_from(settings)),
+            Base::Ppo(settings) => to_table(Table::try_from(settings)),
         };
         match &self.wrapper {
-            WrapperSettings::Plain => {}
-            WrapperSettings::Epopt(settings) => {
+            Wrapper::Plain => {}
+            Wrapper::Epopt(settings) => {
                 table.retain(|key, _| !NOT_WITH_EPISODES.contains(&key));
                 table.extend(to_table(Table::try_from(settings)));
             }
-            WrapperSettings::Rl2(settings) => table.extend(to_table(Table::try_from(settings))),
+            Wrapper::Rl2(settings) => table.extend(to_table(Table::try_from(settings))),
         }
         table
     }
 
-    /// Takes the settings of `algorithm` with `architecture` out of `merged`, where they stand among others.
-    pub(super) fn take(
-        algorithm: AlgorithmName,
-        architecture: Architecture,
-        merged: &mut Table,
-    ) -> Result<Self, toml::de::Error> {
-        let defaults = super::defaults::settings(algorithm, architecture);
-        let mut part = |keys: Table| -> Table {
-            keys.into_iter().filter_map(|(key, _)| merged.remove(&key).map(|value| (key, value))).collect()
-        };
-        let wrapper = match defaults.wrapper {
-            WrapperSettings::Plain => WrapperSettings::Plain,
-            WrapperSettings::Epopt(own) => {
-                WrapperSettings::Epopt(part(Table::try_from(own).unwrap_or_default()).try_into()?)
-            }
-            WrapperSettings::Rl2(own) => {
-                WrapperSettings::Rl2(part(Table::try_from(own).unwrap_or_default()).try_into()?)
-            }
-        };
-        let base = match defaults.base {
-            BaseSettings::A2c(own) => BaseSettings::A2c(part(Table::try_from(own).unwrap_or_default()).try_into()?),
-            BaseSettings::Ppo(own) => BaseSettings::Ppo(part(Table::try_from(own).unwrap_or_default()).try_into()?),
-        };
-        Ok(Settings { base, wrapper })
+    /// The settings of this algorithm in `table`, where they stand among others.
+    pub(super) fn read(&self, table: &Table) -> Result<Self, toml::de::Error> {
+        let table = || table.clone();
+        Ok(Self {
+            base: match self.base {
+                Base::A2c(_) => Base::A2c(table().try_into()?),
+                Base::Ppo(_) => Base::Ppo(table().try_into()?),
+            },
+            wrapper: match self.wrapper {
+                Wrapper::Plain => Wrapper::Plain,
+                Wrapper::Epopt(_) => Wrapper::Epopt(table().try_into()?),
+                Wrapper::Rl2(_) => Wrapper::Rl2(table().try_into()?),
+            },
+        })
     }
 
     /// γ, per step.
     pub fn gamma(&self) -> f64 {
         match &self.base {
-            BaseSettings::A2c(settings) => settings.gamma,
-            BaseSettings::Ppo(settings) => settings.gamma,
+            Base::A2c(settings) => settings.gamma,
+            Base::Ppo(settings) => settings.gamma,
         }
     }
 
     /// Episodes in a trial; 1 without trials.
     pub fn episodes_per_trial(&self) -> u32 {
         match &self.wrapper {
-            WrapperSettings::Rl2(settings) => settings.episodes_per_trial,
-            WrapperSettings::Plain | WrapperSettings::Epopt(_) => 1,
+            Wrapper::Rl2(settings) => settings.episodes_per_trial,
+            Wrapper::Plain | Wrapper::Epopt(_) => 1,
         }
     }
 
     /// Refuses values outside their ranges, and those that do not go together.
     pub(super) fn validate(&self, architecture: Architecture, num_envs: usize) -> Result<(), ConfigError> {
         match &self.base {
-            BaseSettings::A2c(settings) => {
+            Base::A2c(settings) => {
                 settings.validate()?;
                 check_size(settings.n_steps, num_envs)?;
             }
-            BaseSettings::Ppo(settings) => {
+            Base::Ppo(settings) => {
                 settings.validate()?;
                 check_size(settings.n_steps, num_envs)?;
                 check_minibatches(settings, architecture, num_envs)?;
             }
         }
         match &self.wrapper {
-            WrapperSettings::Plain => Ok(()),
-            WrapperSettings::Rl2(settings) => Ok(settings.validate()?),
-            WrapperSettings::Epopt(settings) => {
+            Wrapper::Plain => Ok(()),
+            Wrapper::Rl2(settings) => Ok(settings.validate()?),
+            Wrapper::Epopt(settings) => {
                 settings.validate()?;
                 let most = settings.episodes_per_iteration;
                 if num_envs <= most {
@@ -152,25 +184,4 @@ fn check_minibatches(settings: &PpoConfig, architecture: Architecture, num_envs:
     }
     let expected = format!("a divisor of {whole} which is {count}");
     Err(ConfigError::Value { key: "n_minibatches".into(), got: n_minibatches.to_string(), expected })
-}
-
-impl BaseSettings {
-    /// The defaults of what updates the policy.
-    pub(super) fn of(base: Base) -> Self {
-        match base {
-            Base::A2c => BaseSettings::A2c(A2cConfig::default()),
-            Base::Ppo => BaseSettings::Ppo(PpoConfig::default()),
-        }
-    }
-}
-
-impl WrapperSettings {
-    /// The defaults of a wrapper.
-    pub(super) fn of(wrapper: Wrapper) -> Self {
-        match wrapper {
-            Wrapper::Plain => WrapperSettings::Plain,
-            Wrapper::Epopt => WrapperSettings::Epopt(EpoptConfig::default()),
-            Wrapper::Rl2 => WrapperSettings::Rl2(Rl2Config::default()),
-        }
-    }
 }
