@@ -604,9 +604,11 @@ impl Expansion<'_> {
         for run in 1..=self.file.runs {
             let mut config = config.clone();
             config.common.seed = self.file.seed + u64::from(run - 1);
-            let (name, common) = (config.settings.name(), &config.common);
-            let id =
-                format!("{environment}-{name}-{}-{trained_on}-{configuration}-s{}", common.architecture, common.seed);
+            let (algorithm, common) = (config.settings.name(), &config.common);
+            let id = format!(
+                "{environment}-{algorithm}-{}-{trained_on}-{configuration}-s{}",
+                common.architecture, common.seed
+            );
             if let Some(first) = self.places.insert(id.clone(), name.to_owned()) {
                 return Err(PlanError::Twice { path: self.path.to_owned(), first, second: name.to_owned(), id });
             }

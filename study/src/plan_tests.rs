@@ -135,7 +135,11 @@ fn an_invalid_plan_is_refused_with_its_key() {
         ("['CartPole', 'Pendulum']", "[]", "environments is empty"),
         ("['CartPole', 'Pendulum']", "['CartPole', 'CartPole']", "a list without repetitions"),
         ("['CartPole', 'Pendulum']", "['../CartPole']", "environments is `../CartPole`, but must be names of letters"),
-        ("versions = ['D', 'E']", "versions = ['X']", "unknown variant `X`"),
+        (
+            "versions = ['D', 'E']",
+            "versions = ['X']",
+            "a version is `X`, but must be one of D, E, R, or a set [sets.X]",
+        ),
         ("n_steps = [5, 10]", "n_steps = 5", "[algorithm.grid] n_steps is 5, but must be a list"),
         ("n_steps = [5, 10]", "n_steps = []", "[algorithm.grid] n_steps is empty"),
         ("n_steps = [5, 10]", "num_envs = [5, 10]", "num_envs is in both"),
