@@ -231,8 +231,8 @@ impl Plan {
                     let trained = cell.set.as_deref().unwrap_or_default();
                     sets::check(trained, &cell.config.common.parameters, &served)?;
                     cell.tests.sets.iter().try_for_each(|set| set.check(&served))?;
-                    if let (Some(threshold), Some(criterion)) = (&cell.tests.success, &criterion) {
-                        criterion.with(threshold)?;
+                    if let Some(threshold) = &cell.tests.success {
+                        threshold.of(criterion.as_ref())?;
                     }
                     Ok(())
                 };
@@ -261,6 +261,7 @@ impl Plan {
         };
         expansion.check_plan()?;
         expansion.add_sets()?;
+        expansion.check_success()?;
         for (number, block) in file.algorithm.iter().enumerate() {
             expansion.add_block(number, block)?;
         }
@@ -394,6 +395,19 @@ impl Expansion<'_> {
         })
     }
 
+    /// Thresholds belong to environments of the plan.
+    fn check_success(&self) -> Result<(), PlanError> {
+        let own = self.file.algorithm.iter().flat_map(|block| block.environments.iter().flatten());
+        let known: Vec<&String> = distinct(self.file.environments.iter().chain(own));
+        match self.file.success.keys().find(|name| !known.contains(name)) {
+            Some(name) => {
+                let names: Vec<&str> = known.iter().map(|name| name.as_str()).collect();
+                Err(self.value("[success]", format!("`{name}`"), format!("one of {}", names.join(", "))))
+            }
+            None => Ok(()),
+        }
+    }
+
     /// Reads the tables `[sets.NAME]`.
     fn add_sets(&mut self) -> Result<(), PlanError> {
         for (name, table) in &self.file.sets {
@@ -403,6 +417,13 @@ impl Expansion<'_> {
             }
             if self.sets.contains_key(name) {
                 return Err(self.value(key, "there already", "another name than D, R and E"));
+            }
+            if table.keys().all(|key| key == VERSION) {
+                return Err(self.value(
+                    key,
+                    "without parameters",
+                    "values of some parameters, or left out: it is a version",
+                ));
             }
             let set = self.read_set(name, table).map_err(|error| {
                 let SetError { what, got, expected } = error;
@@ -452,8 +473,8 @@ impl Expansion<'_> {
 
     /// A file beside the plan.
     fn content(&self, file: &str) -> Result<Vec<u8>, String> {
-        if Path::new(file).components().count() != 1 || file.starts_with('.') {
-            return Err(format!("`{file}`, which is not the name of a file"));
+        if Path::new(file).components().count() != 1 || file.starts_with('.') || !file.ends_with(".csv") {
+            return Err(format!("`{file}`, which is not the name of a file .csv"));
         }
         let path = Path::new(self.path).parent().unwrap_or(Path::new("")).join(file);
         std::fs::read(&path).map_err(|error| format!("`{}`, which cannot be read ({error})", path.display()))
@@ -641,8 +662,14 @@ fn place_of(error: &ConfigError, name: &str, block: &Block, common: &Table) -> S
 /// Settings and tests, without environment, version and seed, as eight hexadecimal digits.
 fn fingerprint(config: &TrainConfig, tests: &Tests) -> String {
     let mut table = config.table();
-    for key in ["environment", "version", "seed"] {
-        table.remove(key);
+    // The id names the version; of a set of the plan's own it has the name alone.
+    let named = if config.common.parameters.is_empty() {
+        &["environment", "version", "seed"][..]
+    } else {
+        &["environment", "seed"]
+    };
+    for key in named {
+        table.remove(*key);
     }
     // Sorted keys, and numbers in one form only: toml's table is a sorted map, whatever the order of the file.
     let shown = |set: &TestSet| match set.plain() {

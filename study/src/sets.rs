@@ -121,6 +121,18 @@ pub fn check(set: &str, parameters: &Parameters, environment: &proto::Environmen
     Ok(())
 }
 
+/// Refuses two sets of one name: results are told apart by it.
+///
+/// # Errors
+/// [`SetError`], which names the set.
+pub fn distinct(sets: &[TestSet]) -> Result<(), SetError> {
+    let twice = |(index, set): (usize, &TestSet)| sets[..index].iter().any(|earlier| earlier.name == set.name);
+    match sets.iter().enumerate().find(|&place| twice(place)) {
+        Some((_, set)) => Err(SetError::new("a set's name", format!("`{}` twice", set.name), "another for each set")),
+        None => Ok(()),
+    }
+}
+
 /// A parameter's part of a set, as it is written: `length=0.3..0.4,0.8..0.9`, `mass=0.1`, or the points of a grid,
 /// `length=0.1..1.0/10` or `length=0.1,0.2,0.5`.
 #[derive(Clone, Debug, PartialEq)]
@@ -179,7 +191,7 @@ fn grid_points(parameter: &str, text: &str, range: &str, count: &str) -> Result<
     let count: usize =
         count.trim().parse().ok().filter(|count| (1..=MOST_CONTEXTS).contains(count)).ok_or_else(wrong)?;
     let step = |index: usize| if count == 1 { 0.0 } else { index as f64 / (count - 1) as f64 };
-    Ok(Values::Points((0..count).map(|index| low + (high - low) * step(index)).collect()))
+    finite(parameter, text, (0..count).map(|index| low + (high - low) * step(index)).collect()).map(Values::Points)
 }
 
 fn finite(parameter: &str, text: &str, points: Vec<f64>) -> Result<Vec<f64>, SetError> {
@@ -310,6 +322,7 @@ mod tests {
             (&["length=1..2/3", "mass=1..2"], "like the grid's other"),
             (&["length=1..2/200", "mass=1..2/200"], "at most 16384 points"),
             (&["length=1,inf"], "finite"),
+            (&["length=-1e308..1e308/3"], "finite"),
         ] {
             let error = set(texts).unwrap_err().to_string();
             assert!(error.contains(part), "{texts:?}: {error}");

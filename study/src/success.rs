@@ -6,6 +6,9 @@ use std::str::FromStr;
 use perturb_protocol::proto;
 use serde::{Deserialize, Serialize};
 
+/// What is counted, not measured.
+const STEPS: &str = "steps";
+
 /// A success achieved the threshold, or was better than it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -18,6 +21,10 @@ pub struct Criterion {
     pub side: Side,
     /// In the quantity's unit.
     pub threshold: f64,
+    /// The most that an episode can come to: its step limit, if steps are compared. Of thresholds beyond it nothing is
+    /// known.
+    #[serde(default)]
+    pub most: Option<f64>,
 }
 
 /// A side of a threshold, which itself belongs to it.
@@ -60,7 +67,8 @@ impl Criterion {
             proto::Comparison::AtMost => Side::AtMost,
         };
         let (quantity, unit) = (success.quantity.clone(), success.unit.clone());
-        Some(Self { quantity, unit, side, threshold: success.threshold })
+        let most = (quantity == STEPS).then(|| f64::from(environment.step_limit));
+        Some(Self { quantity, unit, side, threshold: success.threshold, most })
     }
 
     /// The same with another threshold.
@@ -72,6 +80,10 @@ impl Criterion {
             let expected = format!("one of {}, e.g. {}={}", self.quantity, self.quantity, self.threshold);
             return Err(ThresholdError { got: threshold.to_string(), expected });
         }
+        if let Some(most) = self.most.filter(|&most| threshold.value > most) {
+            let expected = format!("at most {most}, the step limit");
+            return Err(ThresholdError { got: threshold.to_string(), expected });
+        }
         Ok(Self { threshold: threshold.value, ..self.clone() })
     }
 
@@ -81,6 +93,18 @@ impl Criterion {
             Side::AtLeast => achieved >= self.threshold,
             Side::AtMost => achieved <= self.threshold,
         })
+    }
+}
+
+impl Threshold {
+    /// The criterion with this threshold; `own` is the environment's.
+    ///
+    /// # Errors
+    /// [`ThresholdError`] if it is one of another quantity, or if the server does not say what is compared.
+    pub fn of(&self, own: Option<&Criterion>) -> Result<Criterion, ThresholdError> {
+        let expected = "left out: the server does not say what its success rule compares";
+        let unknown = || ThresholdError { got: self.to_string(), expected: expected.into() };
+        own.ok_or_else(unknown)?.with(self)
     }
 }
 
@@ -131,7 +155,7 @@ mod tests {
     use super::*;
 
     fn steps(side: Side, threshold: f64) -> Criterion {
-        Criterion { quantity: "steps".into(), unit: "1".into(), side, threshold }
+        Criterion { quantity: "steps".into(), unit: "1".into(), side, threshold, most: Some(500.0) }
     }
 
     #[test]
@@ -151,6 +175,8 @@ mod tests {
         assert_eq!(criterion.with(&"steps=90".parse().unwrap()).unwrap().threshold, 90.0);
         let error = criterion.with(&"distance=90".parse().unwrap()).unwrap_err().to_string();
         assert_eq!(error, "the success threshold is distance=90, but must be one of steps, e.g. steps=80");
+        let error = criterion.with(&"steps=501".parse().unwrap()).unwrap_err().to_string();
+        assert_eq!(error, "the success threshold is steps=501, but must be at most 500, the step limit");
         for text in ["90", "steps=", "steps=x", "steps=nan"] {
             assert!(text.parse::<Threshold>().unwrap_err().to_string().contains("QUANTITY=NUMBER"), "{text}");
         }

@@ -340,7 +340,12 @@ pub(super) struct HeatmapArgs {
     #[arg(long, value_name = "PARAMETER=VALUE", num_args = 1.., requires = "checkpoint")]
     pub(super) parameters: Vec<Assignment>,
     /// Make the heatmap again from the file .parquet that an earlier one left, without playing.
-    #[arg(long, value_name = "FILE", requires = "checkpoint")]
+    #[arg(
+        long,
+        value_name = "FILE",
+        requires = "checkpoint",
+        conflicts_with_all = ["grid", "episodes", "seed", "parameters"]
+    )]
     pub(super) records: Option<PathBuf>,
     /// Points along each axis, at most 100.
     #[arg(long, value_name = "N", default_value_t = 40, value_parser = points)]

@@ -4,6 +4,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use perturb_learner::checkpoint::Checkpoint;
+use perturb_learner::client::Servers;
 use perturb_learner::evaluation::{Audit, audit};
 use perturb_study::Folder;
 use perturb_study::interrupt::StopFlag;
@@ -31,15 +32,18 @@ pub(super) fn run(args: &AuditArgs) -> Result<Ending> {
     let servers = servers(&args.server)?;
     let mut out = std::io::stdout();
     let (mut played, mut different) = (0, 0);
+    let most = if args.all { usize::MAX } else { args.episodes };
+    let mut unusable = 0;
     for one in &tested {
-        let records = Records::read(&one.records)?;
-        let checkpoint = Checkpoint::load(&one.checkpoint)?;
-        let most = if args.all { usize::MAX } else { args.episodes };
-        let mut display =
-            Display::of_episodes(format!("playing {} again", one.name), most.min(records.episodes.len()) as u64);
-        let done = audit(&servers, &checkpoint, &records, most, &stop, &mut |episodes| display.episodes(episodes))?;
-        drop(display);
-        let Audit { episodes, different: of_policy } = done;
+        let Audit { episodes, different: of_policy } = match one.audit(&servers, most, &stop) {
+            Ok(audit) => audit,
+            Err(error) if tested.len() > 1 && stop.signal().is_none() => {
+                writeln!(out, "{}: {error}", one.name)?;
+                unusable += 1;
+                continue;
+            }
+            Err(error) => return Err(error),
+        };
         for line in of_policy.iter().take(SHOWN) {
             writeln!(out, "{}: {line}", one.name)?;
         }
@@ -48,7 +52,17 @@ pub(super) fn run(args: &AuditArgs) -> Result<Ending> {
     }
     let recorded = if tested.len() == 1 { "1 policy".to_owned() } else { format!("{} policies", tested.len()) };
     writeln!(out, "{} of {played} episodes of {recorded} have the same bytes", played - different)?;
-    Ok(if different == 0 { Ending::Done } else { Ending::Status(1) })
+    Ok(if different + unusable == 0 { Ending::Done } else { Ending::Status(1) })
+}
+
+impl Tested {
+    fn audit(&self, servers: &Servers, most: usize, stop: &StopFlag) -> Result<Audit> {
+        let records = Records::read(&self.records)?;
+        let checkpoint = Checkpoint::load(&self.checkpoint)?;
+        let episodes = most.min(records.episodes.len()) as u64;
+        let mut display = Display::of_episodes(format!("playing {} again", self.name), episodes);
+        Ok(audit(servers, &checkpoint, &records, most, stop, &mut |episodes| display.episodes(episodes))?)
+    }
 }
 
 /// Whatever `args` names.
@@ -66,14 +80,18 @@ fn tested(args: &AuditArgs) -> Result<Vec<Tested>> {
     if path.join(FILE).is_file() {
         return Ok(vec![cell(path)]);
     }
+    if !path.exists() {
+        return Err(CommandError::Usage(format!("there is no {}", path.display())));
+    }
     if !path.is_dir() {
         let message = format!("{} is a file of records: give --checkpoint, the policy that was tested", path.display());
         return Err(CommandError::Usage(message));
     }
     let folder = Folder::new(path);
     let plan = perturb_study::Plan::load(&folder.require_plan()?)?;
-    let cells = plan.cells.iter().map(|found| folder.cell(&found.id).path().to_owned());
-    let tested: Vec<Tested> = cells.filter(|path| path.join(FILE).is_file()).map(|path| cell(&path)).collect();
+    let done = plan.cells.iter().map(|found| folder.cell(&found.id)).filter(|place| place.is_settled(false));
+    let paths = done.map(|place| place.path().to_owned()).filter(|path| path.join(FILE).is_file());
+    let tested: Vec<Tested> = paths.map(|path| cell(&path)).collect();
     if tested.is_empty() {
         return Err(CommandError::Failed(format!("no cell of {} has recorded episodes", path.display())));
     }

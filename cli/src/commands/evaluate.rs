@@ -48,6 +48,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
     }
     let table = Table::of("", &results)
         .text("tested on", |(set, _)| set)
+        .number("episodes", |(_, result)| result.episodes)
         .number("success, %", |(_, result)| format!("{:.1}", result.success_percent))
         .number("95 % interval", |(_, result)| {
             let [low, high] = result.success_percent_95;
@@ -59,12 +60,11 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
     let success = criterion.map(|criterion| format!(", success: {criterion}")).unwrap_or_default();
     writeln!(
         std::io::stdout(),
-        "{} {}, trained on {} with seed {}, {} test episodes each{success}\n{}",
+        "{} {}, trained on {} with seed {}{success}\n{}",
         common.environment,
         config.method(),
-        common.version,
+        common.trained_on(),
         common.seed,
-        args.episodes,
         table.build().to_text()
     )?;
     Ok(Ending::Done)
@@ -79,6 +79,7 @@ fn document(state: &State, evaluation_seed: u64, results: &[(String, TestResult)
         "algorithm": settings.name(),
         "architecture": common.architecture,
         "train_version": common.version,
+        "train_parameters": common.parameters,
         "episodes_per_trial": settings.episodes_per_trial(),
         "seed": common.seed,
         "evaluation_seed": evaluation_seed,

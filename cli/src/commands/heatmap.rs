@@ -86,8 +86,10 @@ fn fixed(args: &HeatmapArgs) -> Result<sets::Fixed> {
 
 /// In the working directory: a training's folder has nothing in it that its training did not write.
 fn default_path(state: &State, [x, y]: &[String; 2]) -> PathBuf {
-    let TrainConfig { common: Common { environment, architecture, version, seed, .. }, settings } = &state.config;
-    format!("{environment}-{}-{architecture}-{version}-s{seed}-{x}-{y}", settings.name()).into()
+    let TrainConfig { common: Common { environment, architecture, version, parameters, seed, .. }, settings } =
+        &state.config;
+    let own = if parameters.is_empty() { "" } else { "-own" };
+    format!("{environment}-{}-{architecture}-{version}{own}-s{seed}-{x}-{y}", settings.name()).into()
 }
 
 /// Of everything that was selected in the first run of an experiment, unless it is there already.
@@ -130,8 +132,9 @@ fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<Ending> {
         let (heatmap, records) = test(servers, &checkpoint, &options, &stop)
             .map_err(|error| CommandError::Place { place: place.to_string(), source: Box::new(error) })?;
         let id = checkpoint.id().map_err(|reason| CommandError::Failed(format!("{place}: {reason}")))?;
+        // Before the heatmap, whose record is what tells that it is complete.
+        records.write(&folder.path().join("heatmaps").join(format!("{}.parquet", selected.cell.id)))?;
         let path = store_heatmap(&folder, selected.cell, id, options, &heatmap)?;
-        records.write(&path.with_extension("parquet"))?;
         writeln!(out, "{}.png, .svg and .csv", path.display())?;
     }
     if failed > 0 {

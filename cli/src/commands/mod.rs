@@ -1,11 +1,13 @@
 //! The command line: `perturb envs | train | evaluate | demo | plan | run | report | curves |
-//! heatmap | video`.
+//! heatmap | video | audit | rates`.
 //!
-//! Results go to standard output, everything else to standard error. Exit status: 0 done, 1 failed, 2 wrong usage, 128 +
+//! Results go to standard output, everything else to standard error. Exit status: 0 done, 1 failed (of `audit`: an episode came out
+//! otherwise, too), 2 wrong usage, 128 +
 //! the signal's number if Ctrl-C or SIGTERM ended it.
 
 mod args;
 mod audit;
+mod cells;
 mod demo;
 mod display;
 mod envs;

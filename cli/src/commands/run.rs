@@ -6,16 +6,14 @@ use std::process::Command;
 use std::sync::Mutex;
 
 use super::args::{Engine, RunArgs};
-use super::display::Display;
+use super::cells::do_cells;
 use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
-use super::{Ending, refuse_workers, report, single_thread, slurm};
+use super::{Ending, refuse_workers, single_thread, slurm};
 use perturb_learner::cell::run_cell;
 use perturb_learner::client::{Address, PrivateServer, Servers};
 use perturb_study::interrupt::StopFlag;
-use perturb_study::scheduler::{
-    Backend, Event, Local, Order, Report, RunEnd, RunError, Teller, run as run_cells, write_line,
-};
+use perturb_study::scheduler::{Event, Local, Order, Teller};
 use perturb_study::{Cell, Folder, Plan};
 
 pub(super) fn run(args: &RunArgs) -> Result<Ending> {
@@ -102,67 +100,6 @@ fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> R
         Some(format!("the private server ended with {status}"))
     };
     do_cells(args, plan, folder, &mut Local::new(plan, folder, jobs, &command, &server_ended), stop)
-}
-
-/// Has `backend` do all cells, shows how far that is, and says how it ended.
-pub(super) fn do_cells<B: Backend>(
-    args: &RunArgs,
-    plan: &Plan,
-    folder: &Folder,
-    backend: &mut B,
-    stop: &StopFlag,
-) -> Result<Ending>
-where
-    CommandError: From<RunError<B::Error>>,
-{
-    keep_plan(args, plan, folder)?;
-    let mut display = Display::of_cells(plan.cells.len());
-    let mut report = |report: Report<'_>| match report {
-        Report::Status(status) => display.cells(status),
-        Report::Note(sentence) => display.say(sentence),
-        Report::Line(line) if args.json => write_line(&mut std::io::stdout(), line),
-        Report::Line(_) => {}
-    };
-    let end = run_cells(plan, folder, backend, args.retry_failed, stop, &mut report);
-    drop(display);
-    let failed = match end? {
-        RunEnd::Finished { failed } => failed,
-        RunEnd::Stopped { signal, left } => {
-            let jobs = left.join(" ");
-            eprintln!("stopped by signal {signal}; the same command goes on");
-            if !left.is_empty() {
-                eprintln!("Slurm job {jobs} runs meanwhile, and is watched again then; to end it: scancel {jobs}");
-            }
-            return Ok(Ending::Signal(signal));
-        }
-    };
-    if let Some(page) = &args.html {
-        report::write(folder, Some(page))?;
-        eprintln!("the report is in {} and {}", page.display(), folder.path().join("report").display());
-    }
-    let Some(first) = failed.first() else {
-        eprintln!("all {} cells are done; perturb report {}", plan.cells.len(), folder.path().display());
-        return Ok(Ending::Done);
-    };
-    Err(CommandError::Failed(format!(
-        "{} of {} cells failed, the first is {first}: see {} for the reason, and use --retry-failed to try again",
-        failed.len(),
-        plan.cells.len(),
-        folder.path().join("cells").join(first).join("failure.json").display()
-    )))
-}
-
-/// Copies the plan into its folder, and says so if another one was there. Single cells leave that one: their plan may be
-/// older, that of a job which had to wait for instance.
-fn keep_plan(args: &RunArgs, plan: &Plan, folder: &Folder) -> Result<()> {
-    let kept = folder.plan_path();
-    if !args.cell.is_empty() && kept.exists() {
-        return Ok(());
-    }
-    if folder.keep_plan(plan)? {
-        eprintln!("{} was another plan; it is replaced, and cells that both have are kept", kept.display());
-    }
-    Ok(())
 }
 
 /// The servers that all workers share.

@@ -23,7 +23,12 @@ pub(super) fn tested(versions: &[Version], args: &SetArgs) -> Result<Vec<TestSet
         sets.push(set_of(NAME, args.base, args.parameters.clone())?);
     }
     if let Some(path) = &args.contexts {
-        sets.push(set_of_csv(&stem(path), args.base, &read(path)?)?);
+        let name = stem(path);
+        if name.parse::<Version>().is_ok() {
+            let message = format!("{}: call the file otherwise, {name} is a version", path.display());
+            return Err(CommandError::Usage(message));
+        }
+        sets.push(set_of_csv(&name, args.base, &read(path)?)?);
     }
     Ok(if sets.is_empty() { Version::ALL.map(TestSet::from).to_vec() } else { sets })
 }

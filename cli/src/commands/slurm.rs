@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use super::args::RunArgs;
+use super::cells::do_cells;
 use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
-use super::run::do_cells;
 use super::{Ending, refuse_workers};
 use perturb_learner::client::{Address, Servers};
 use perturb_learner::measure::measure;

@@ -143,7 +143,7 @@ impl<'a> Film<'a> {
         options.set.check(&environment).map_err(TestError::Set)?;
         let title = (
             format!("{} {}", environment.name, options.set.name),
-            format!("{}, trained on {}", state.config.method(), state.config.common.version),
+            format!("{}, trained on {}", state.config.method(), state.config.common.trained_on()),
         );
         let panel = Panel::new(options.size, title, environment.parameters.len())?;
         let mut film = Self {

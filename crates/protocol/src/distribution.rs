@@ -117,6 +117,12 @@ impl Distribution {
         self.0[self.0.len() - 1].high
     }
 
+    /// Whether `value` is in one of the intervals, or so near as rounding brings it.
+    pub fn contains(&self, value: f64) -> bool {
+        let margin = 1e-9 * value.abs();
+        self.0.iter().any(|interval| interval.low - margin <= value && value <= interval.high + margin)
+    }
+
     /// Least and greatest value.
     pub fn range(&self) -> (f64, f64) {
         (self.0[0].low, self.0[self.0.len() - 1].high)

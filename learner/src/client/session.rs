@@ -327,8 +327,10 @@ impl Part {
         self.decode("final_observations", &stepped.final_observations, finals)?;
         for end in stepped.ended {
             let slot = start + end.slot as usize;
-            let Some(episode) = end.episode.filter(|_| self.range.contains(&slot)) else {
-                return Err(self.mismatch(format!("an ended episode of slot {slot}"), "a named episode".into()));
+            let named = end.episode.zip(end.receipt).filter(|_| self.range.contains(&slot));
+            let Some((episode, receipt)) = named else {
+                let expected = "a named episode with its receipt";
+                return Err(self.mismatch(format!("an ended episode of slot {slot}"), expected.into()));
             };
             reply.ended.push(EndedEpisode {
                 slot,
@@ -342,7 +344,7 @@ impl Part {
                 terminated: reply.terminated[slot],
                 diverged: end.diverged,
                 achieved: end.achieved,
-                receipt: end.receipt.unwrap_or_default(),
+                receipt,
             });
         }
         Ok(())

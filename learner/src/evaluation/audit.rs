@@ -85,10 +85,14 @@ pub fn audit(
     }
 }
 
-/// At most `most` of `episodes`, evenly spread.
+/// At most `most` of `episodes`: one of each of so many equal parts, the next place in each, so that first and later
+/// episodes of environments are among them.
 fn spread(episodes: &[EpisodeRecord], most: usize) -> impl Iterator<Item = &EpisodeRecord> {
     let count = most.min(episodes.len());
-    (0..count).map(move |i| &episodes[i * episodes.len() / count])
+    (0..count).map(move |i| {
+        let (first, next) = (i * episodes.len() / count, (i + 1) * episodes.len() / count);
+        &episodes[first + i % (next - first)]
+    })
 }
 
 /// Environments in which recorded episodes are played.

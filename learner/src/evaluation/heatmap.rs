@@ -24,6 +24,22 @@ pub enum HeatmapError {
         /// Its parameters.
         parameters: Vec<String>,
     },
+    /// Recorded episodes are of another policy.
+    #[error(
+        "the episodes were recorded of the policy {recorded}, the checkpoint is {got}: give the checkpoint of then"
+    )]
+    Policy {
+        /// The recorded policy.
+        recorded: String,
+        /// The checkpoint's.
+        got: String,
+    },
+    /// An axis has a value of its own.
+    #[error("{name} is an axis and has a value, too: leave it out of --parameters")]
+    Fixed {
+        /// The parameter.
+        name: String,
+    },
     /// Recorded episodes are of something else.
     #[error("the recorded episodes are not those of a heatmap over these two parameters: give the --x and --y of then")]
     NotOfAxes,
@@ -48,9 +64,12 @@ pub fn heatmap(
     let state = &checkpoint.state;
     let grid = options.grid.clamp(1, MOST_POINTS);
     let points = (grid * grid) as u64;
-    let test = TestOptions { episodes: options.episodes * points, seed: options.seed, success: None };
+    let test = TestOptions { episodes: options.episodes.saturating_mul(points), seed: options.seed, success: None };
     let tester = Tester::new(servers, checkpoint, test)?;
     let axes = axes(tester.environment(), &options.parameters)?;
+    if let Some(axis) = axes.iter().find(|axis| options.fixed.contains_key(&axis.name)) {
+        return Err(HeatmapError::Fixed { name: axis.name.clone() });
+    }
     let context = |point: usize| {
         let places = [point % grid, point / grid];
         let value = |i: usize| (axes[i].name.clone(), axes[i].value(places[i], grid));
@@ -73,6 +92,10 @@ pub fn heatmap_again(
     records: &Records,
     parameters: &[String; 2],
 ) -> Result<Heatmap, HeatmapError> {
+    let got = checkpoint.id().map_err(TestError::Unnamed)?;
+    if got != records.about.policy {
+        return Err(HeatmapError::Policy { recorded: records.about.policy.clone(), got });
+    }
     let axes = axes(environment, parameters)?;
     Heatmap::of(records, policy(&checkpoint.state), axes).ok_or(HeatmapError::NotOfAxes)
 }
@@ -80,7 +103,7 @@ pub fn heatmap_again(
 /// Who is tested.
 fn policy(state: &State) -> String {
     let config = &state.config;
-    format!("{}, trained on {} with seed {}", config.method(), config.common.version, config.common.seed)
+    format!("{}, trained on {} with seed {}", config.method(), config.common.trained_on(), config.common.seed)
 }
 
 fn axes(environment: &proto::Environment, names: &[String; 2]) -> Result<[Axis; 2], HeatmapError> {

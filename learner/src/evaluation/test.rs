@@ -1,11 +1,11 @@
 //! Testing a checkpoint on a set of its environment's parameters, and recording every episode.
 
-use perturb_protocol::{Version, proto};
+use perturb_protocol::{Distribution, Version, proto};
 use perturb_study::TestResult;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::random::{Purpose, stream};
 use perturb_study::records::{About, Difference, Ending, EpisodeRecord, RecordedTest, Records};
-use perturb_study::sets::{SetError, TestSet};
+use perturb_study::sets::{self, Context, SetError, TestSet};
 use perturb_study::success::{Threshold, ThresholdError};
 use rand::Rng;
 
@@ -42,6 +42,20 @@ pub enum TestError {
         set: String,
         /// The largest difference.
         difference: Difference,
+    },
+    /// The server requested something else of its physics than it was asked for.
+    #[error(
+        "testing on {set}: the server was asked for {parameter} in {asked}, but its receipt says {got}; mend the server"
+    )]
+    NotRequested {
+        /// The set's name.
+        set: String,
+        /// The parameter.
+        parameter: String,
+        /// What it may be.
+        asked: String,
+        /// What the receipt says.
+        got: f64,
     },
     /// The environment is no longer what the policy was trained in.
     #[error("the checkpoint was trained in {environment} with {what} {trained}, the server's has {served}: {advice}")]
@@ -100,7 +114,8 @@ pub struct Tester<'a> {
 /// The seed of the test environments on `version`.
 ///
 /// It is the first, second or third number (D, R, E) of the stream of `seed` for [`Purpose::TestEnvironments`], so that
-/// a policy never meets its training episodes again, whatever seeds are used, and the versions are independent.
+/// a policy never meets its training episodes again, whatever seeds are used, and the versions are independent. Sets have
+/// the seed of their base version: what differs between two of them is parameters, not initial states.
 pub fn environment_seed(seed: u64, version: Version) -> u64 {
     let mut rng = stream(seed, Purpose::TestEnvironments);
     let drawn: [u64; 3] = std::array::from_fn(|_| rng.next_u64());
@@ -119,7 +134,7 @@ impl<'a> Tester<'a> {
         let id = checkpoint.id().map_err(TestError::Unnamed)?;
         let mut about = About::new(&environment, id, state.config.settings.episodes_per_trial());
         if let Some(threshold) = &options.success {
-            about.success = about.success.map(|criterion| criterion.with(threshold)).transpose()?;
+            about.success = Some(threshold.of(about.success.as_ref())?);
         }
         Ok(Self { servers, checkpoint, options, about, environment })
     }
@@ -140,6 +155,7 @@ impl<'a> Tester<'a> {
         stop: &StopFlag,
         report: &mut dyn FnMut(&TestSet, u64),
     ) -> Result<Records, TestError> {
+        sets::distinct(sets)?;
         sets.iter().try_for_each(|set| set.check(&self.environment))?;
         let mut records = Records::new(self.about.clone());
         for set in sets {
@@ -196,7 +212,40 @@ impl<'a> Tester<'a> {
             report(counted.len() as u64);
         }
         counted.sort_by_key(|end| (end.environment_index, end.episode_index));
+        let asked: Vec<Vec<Distribution>> = contexts.iter().map(|context| self.asked(&test.set, context)).collect();
+        for end in &counted {
+            self.check_requested(&test.set, &asked[end.slot % contexts.len()], end)?;
+        }
         Ok(counted.into_iter().map(|end| self.record(test, end)).collect())
+    }
+
+    /// What each parameter may be in a context of a set.
+    fn asked(&self, set: &TestSet, context: &Context) -> Vec<Distribution> {
+        let drawn = set.drawn();
+        let of = |parameter: &proto::Parameter| {
+            let own = context.get(&parameter.name).map(|value| Distribution::fixed(*value));
+            let own = own.or_else(|| drawn.get(&parameter.name).cloned());
+            let of_version = match set.version {
+                Version::D => None,
+                Version::R => parameter.random.as_ref(),
+                Version::E => parameter.extreme.as_ref(),
+            };
+            let versions = || of_version.and_then(|values| values.try_into().ok());
+            own.or_else(versions).unwrap_or_else(|| Distribution::fixed(parameter.default_value))
+        };
+        self.environment.parameters.iter().map(of).collect()
+    }
+
+    /// Whether the server requested of its physics what it was asked for.
+    fn check_requested(&self, set: &TestSet, asked: &[Distribution], end: &EndedEpisode) -> Result<(), TestError> {
+        for (index, (parameter, asked)) in self.environment.parameters.iter().zip(asked).enumerate() {
+            let got = end.receipt.requested.get(index).copied().unwrap_or(f64::NAN);
+            if !asked.contains(got) {
+                let (set, parameter) = (set.name.clone(), parameter.name.clone());
+                return Err(TestError::NotRequested { set, parameter, asked: asked.to_string(), got });
+            }
+        }
+        Ok(())
     }
 
     fn record(&self, test: &RecordedTest, end: EndedEpisode) -> EpisodeRecord {

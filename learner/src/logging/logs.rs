@@ -75,7 +75,12 @@ impl Logs {
     ///
     /// # Errors
     /// [`LogError::Changed`] if one is shorter, or does not end a line there; then none was changed. [`LogError::File`].
-    pub fn resume(directory: &Path, lengths: &LogLengths, clock: Clock) -> Result<Self, LogError> {
+    pub fn resume(
+        directory: &Path,
+        lengths: &LogLengths,
+        spec: &EnvironmentSummary,
+        clock: Clock,
+    ) -> Result<Self, LogError> {
         let events = Path::new(&lengths.events_file).file_name().unwrap_or_default();
         let paths = [directory.join(MONITOR), directory.join(PROGRESS), directory.join(events)];
         let monitor = open(&paths[0], lengths.monitor, true)?;
@@ -86,7 +91,7 @@ impl Logs {
             file.set_len(length).map_err(io("shorten", path))?;
         }
         let progress = ProgressLog::resume(progress, events, lengths.events_file.clone(), clock.t_start());
-        Ok(Self { directory: directory.to_owned(), monitor: Monitor::resume(monitor, clock), progress })
+        Ok(Self { directory: directory.to_owned(), monitor: Monitor::resume(monitor, spec, clock), progress })
     }
 
     /// Adds an episode to `monitor.csv`.
@@ -167,8 +172,8 @@ mod tests {
         }
     }
 
-    fn start(directory: &Path) -> Logs {
-        let spec = EnvironmentSummary {
+    fn spec() -> EnvironmentSummary {
+        EnvironmentSummary {
             revision: 0,
             step_limit: 200,
             observation: Vec::new(),
@@ -176,8 +181,11 @@ mod tests {
             parameters: Vec::new(),
             applied: Vec::new(),
             model_hash: String::new(),
-        };
-        Logs::create(directory, "CartPole", &spec, Clock::new(100.0, 0.0)).unwrap()
+        }
+    }
+
+    fn start(directory: &Path) -> Logs {
+        Logs::create(directory, "CartPole", &spec(), Clock::new(100.0, 0.0)).unwrap()
     }
 
     fn read(directory: &Path, name: &str) -> String {
@@ -196,7 +204,7 @@ mod tests {
         drop(logs);
         assert!(read(directory.path(), MONITOR).len() > kept.len());
 
-        let mut logs = Logs::resume(directory.path(), &lengths, Clock::start(7.0)).unwrap();
+        let mut logs = Logs::resume(directory.path(), &lengths, &spec(), Clock::start(7.0)).unwrap();
         assert_eq!(logs.sync().unwrap(), lengths, "what was later is gone");
         logs.episode(&episode(3)).unwrap();
         logs.sync().unwrap();
@@ -218,7 +226,7 @@ mod tests {
             let before = fs::read(&path).unwrap();
             let changed = change(&before);
             fs::write(&path, &changed).unwrap();
-            let error = Logs::resume(directory.path(), &lengths, Clock::start(0.0)).unwrap_err().to_string();
+            let error = Logs::resume(directory.path(), &lengths, &spec(), Clock::start(0.0)).unwrap_err().to_string();
             assert_eq!(fs::read(&path).unwrap(), changed);
             fs::write(&path, before).unwrap();
             assert!(error.contains(&path.display().to_string()), "{error}");
@@ -233,7 +241,7 @@ mod tests {
         }
         assert!(refusal(MONITOR, &longer).contains("no longer end with a line"));
         fs::remove_file(directory.path().join(PROGRESS)).unwrap();
-        let error = Logs::resume(directory.path(), &lengths, Clock::start(0.0)).unwrap_err().to_string();
+        let error = Logs::resume(directory.path(), &lengths, &spec(), Clock::start(0.0)).unwrap_err().to_string();
         assert!(error.contains("it is gone") && error.contains(PROGRESS), "{error}");
     }
 }

@@ -17,6 +17,8 @@ use crate::client::EndedEpisode;
 pub struct Monitor {
     writer: csv::Writer<BufWriter<File>>,
     clock: Clock,
+    /// Columns of applied values: files that were begun by earlier programs have none.
+    applied: usize,
 }
 
 impl Monitor {
@@ -42,12 +44,12 @@ impl Monitor {
         let applied = spec.applied.iter().map(|name| format!("applied_{name}"));
         let of_environment = spec.parameters.iter().cloned().chain(applied);
         writer.write_record(columns.into_iter().map(str::to_owned).chain(of_environment))?;
-        Ok(Self { writer, clock })
+        Ok(Self { writer, clock, applied: spec.applied.len() })
     }
 
     /// Goes on at the end of `file`.
-    pub(super) fn resume(file: File, clock: Clock) -> Self {
-        Self { writer: csv::Writer::from_writer(BufWriter::new(file)), clock }
+    pub(super) fn resume(file: File, spec: &EnvironmentSummary, clock: Clock) -> Self {
+        Self { writer: csv::Writer::from_writer(BufWriter::new(file)), clock, applied: spec.applied.len() }
     }
 
     /// Adds an episode.
@@ -67,7 +69,12 @@ impl Monitor {
             episode.trial_index.to_string(),
             episode.episode_in_trial.to_string(),
         ];
-        let values = episode.receipt.requested.iter().chain(&episode.receipt.applied).map(f64::to_string);
+        let values = episode
+            .receipt
+            .requested
+            .iter()
+            .chain(episode.receipt.applied.iter().take(self.applied))
+            .map(f64::to_string);
         Ok(self.writer.write_record(fixed.into_iter().chain(values))?)
     }
 

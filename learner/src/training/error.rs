@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use perturb_study::files::FileError;
+use perturb_study::records::Difference;
 
 use super::RunDirectoryError;
 use crate::checkpoint::CheckpointError;
@@ -36,6 +37,16 @@ pub enum TrainError {
     /// The served environment has no action space.
     #[error("the server does not say what actions the environment takes: are both of one version?")]
     NoActions,
+    /// An episode did not run with the parameters that it was to run with.
+    #[error("an episode of environment {environment_index}, number {episode_index}: {difference}; mend the server")]
+    NotApplied {
+        /// The environment's index.
+        environment_index: u32,
+        /// The episode's number in it.
+        episode_index: u64,
+        /// The largest difference.
+        difference: Difference,
+    },
     /// The environment is no longer what the run began in.
     #[error(
         "the run was trained in {environment} with {what} {trained}, the server's has {served}; resume with the version \

@@ -1,7 +1,7 @@
 //! The training loop: rollout, update, log, checkpoint.
 //!
 //! Randomness: the environments' seed is the training's seed; initial weights, minibatch order and sampled actions have
-//! streams of their own (see [`crate::random`]). One thread computes everything in one order, so that equal
+//! streams of their own (see [`perturb_study::random`]). One thread computes everything in one order, so that equal
 //! configurations give equal weights, byte for byte, whatever the number of servers and of their workers.
 
 mod error;
@@ -20,6 +20,7 @@ pub use error::{LastCheckpoint, TrainError};
 use perturb_study::Counters;
 use perturb_study::files::write_atomically;
 use perturb_study::interrupt::StopFlag;
+use perturb_study::records::Comparison;
 use perturb_study::settings::{Common, TrainConfig};
 pub use run_directory::{RunDirectory, RunDirectoryError};
 
@@ -78,7 +79,8 @@ pub fn resume(
 ) -> Result<Outcome> {
     let lengths = state.history.logs.clone();
     let mut training = Training::resume(servers, checkpoint, state)?;
-    let mut logs = Logs::resume(directory.path(), &lengths, training.clock)?;
+    let mut logs =
+        Logs::resume(directory.path(), &lengths, &training.checkpoint.state.environment_spec, training.clock)?;
     tracing::debug!(directory = %directory.path().display(), "training goes on");
     training.run(&mut logs, directory, stop, report)
 }
@@ -90,6 +92,8 @@ struct Training<'a> {
     rollout: Rollout,
     policy: Policy,
     algorithm: Box<dyn Algorithm>,
+    /// Of what episodes were to run with and ran with.
+    comparison: Comparison,
     /// After the last whole iteration.
     checkpoint: Checkpoint,
     recent: VecDeque<EpisodeFigures>,
@@ -109,6 +113,7 @@ impl<'a> Training<'a> {
         let mut observations = Vec::new();
         let (session, summary) = open(servers, config, &mut observations)?;
         let observation_size = session.observation_size();
+        let comparison = Comparison::of(session.environment());
         let state = State {
             environment_spec: summary,
             observation_normaliser: None,
@@ -126,7 +131,7 @@ impl<'a> Training<'a> {
         let inputs = state.inputs(common.num_envs);
         let collector = Collector::new(session, observations, &spec, inputs, normalisers, common.seed)?;
         let weights = policy.weights();
-        Self::new(servers, policy, collector, Checkpoint { state, policy: spec, weights })
+        Self::new(servers, policy, collector, comparison, Checkpoint { state, policy: spec, weights })
     }
 
     fn resume(servers: &'a Servers, checkpoint: Checkpoint, resume: ResumeState) -> Result<Self> {
@@ -136,6 +141,7 @@ impl<'a> Training<'a> {
         if let Some((what, trained, served)) = state.environment_spec.difference(&served) {
             return Err(TrainError::Changed { environment: common.environment.clone(), what, trained, served });
         }
+        let comparison = Comparison::of(session.environment());
         let policy = Policy::from_weights(checkpoint.policy.clone(), &checkpoint.weights)?;
         let normalisers = Normalisers {
             observations: state.observation_normaliser.clone(),
@@ -144,7 +150,7 @@ impl<'a> Training<'a> {
         let inputs = state.inputs(common.num_envs);
         let collector = Collector::resume(session, &checkpoint.policy, inputs, normalisers, &resume.collector)
             .map_err(|error| TrainError::Restore { what: "environments", source: Box::new(error.into()) })?;
-        let mut training = Self::new(servers, policy, collector, checkpoint)?;
+        let mut training = Self::new(servers, policy, collector, comparison, checkpoint)?;
         training
             .algorithm
             .load_state(&resume.algorithm)
@@ -157,7 +163,13 @@ impl<'a> Training<'a> {
     }
 
     /// With a fresh algorithm, and no past.
-    fn new(servers: &'a Servers, policy: Policy, collector: Collector<'a>, mut checkpoint: Checkpoint) -> Result<Self> {
+    fn new(
+        servers: &'a Servers,
+        policy: Policy,
+        collector: Collector<'a>,
+        comparison: Comparison,
+        mut checkpoint: Checkpoint,
+    ) -> Result<Self> {
         let State { config, commits, .. } = &mut checkpoint.state;
         let algorithm = algorithm::build(&config.settings, &policy, config.common.seed)?;
         if !commits.iter().any(|commit| commit == perturb_study::VERSION) {
@@ -175,6 +187,7 @@ impl<'a> Training<'a> {
             rollout,
             policy,
             algorithm,
+            comparison,
             checkpoint,
             recent: VecDeque::with_capacity(RECENT),
             clock: Clock::start(0.0),
@@ -220,9 +233,13 @@ impl<'a> Training<'a> {
     fn iterate(&mut self, logs: &mut Logs) -> Result<Progress> {
         let mut counters = self.checkpoint.state.counters;
         let mut written = Ok(());
+        let mut not_applied = None;
         let (mut ended, mut steps) = (0, 0);
-        let Self { collector, rollout, recent, checkpoint, algorithm, .. } = self;
+        let Self { collector, rollout, recent, checkpoint, algorithm, comparison, .. } = self;
         let on_episode = |episode: &EndedEpisode| {
+            if not_applied.is_none() {
+                not_applied = difference(comparison, episode);
+            }
             ended += 1;
             steps += u64::from(episode.length);
             remember(recent, episode);
@@ -240,6 +257,9 @@ impl<'a> Training<'a> {
             }
         }
         written?;
+        if let Some(error) = not_applied {
+            return Err(error);
+        }
 
         let updating = Instant::now();
         let progress_remaining = self.progress_remaining(counters.learned_timesteps);
@@ -350,6 +370,14 @@ fn open<'a>(
     let session = Session::open(servers, &options, observations)?;
     let summary = EnvironmentSummary::of(session.environment()).ok_or(TrainError::NoActions)?;
     Ok((session, summary))
+}
+
+/// Why an episode did not run with what was requested; `None` if it did.
+fn difference(comparison: &Comparison, episode: &EndedEpisode) -> Option<TrainError> {
+    let receipt = &episode.receipt;
+    let difference = comparison.real_difference(&receipt.requested, &receipt.applied)?;
+    let EndedEpisode { environment_index, episode_index, .. } = *episode;
+    Some(TrainError::NotApplied { environment_index, episode_index, difference })
 }
 
 fn remember(recent: &mut VecDeque<EpisodeFigures>, episode: &EndedEpisode) {

@@ -188,30 +188,86 @@ impl Records {
 
     /// Compares what every episode was asked to run with and what it ran with.
     pub fn agreement(&self) -> Agreement {
-        let place =
-            |parameter: &RecordedParameter| self.about.applied.iter().position(|name| *name == parameter.applied);
-        let Some(places) = self.about.parameters.iter().map(place).collect::<Option<Vec<usize>>>() else {
-            return Agreement { episodes: 0, largest: None };
-        };
-        let differences = self.episodes.iter().flat_map(|episode| {
-            let pairs = places.iter().zip(&episode.requested).zip(&self.about.parameters);
-            pairs.map(|((&place, &requested), parameter)| {
-                let applied = episode.applied.get(place).copied().unwrap_or(f64::NAN);
-                Difference::new(&parameter.name, requested, applied)
-            })
-        });
-        let largest = differences.max_by(|a, b| a.relative.total_cmp(&b.relative));
-        Agreement { episodes: self.episodes.len() as u64, largest }
+        let comparison = Comparison::new(&self.about.parameters, &self.about.applied);
+        let of = |episode: &EpisodeRecord| comparison.largest(&episode.requested, &episode.applied);
+        let largest = self.episodes.iter().filter_map(of).max_by(|a, b| a.relative.total_cmp(&b.relative));
+        let episodes = if comparison.is_complete() { self.episodes.len() as u64 } else { 0 };
+        Agreement { episodes, largest }
     }
 }
 
-impl Difference {
-    fn new(parameter: &str, requested: f64, applied: f64) -> Self {
-        let difference = (applied - requested).abs();
-        let relative = if requested == 0.0 { difference } else { difference / requested.abs() };
-        Self { parameter: parameter.to_owned(), requested, applied, relative }
+/// Compares requested with applied parameters.
+#[derive(Clone, Debug)]
+pub struct Comparison {
+    parameters: Vec<ComparedParameter>,
+}
+
+#[derive(Clone, Debug)]
+struct ComparedParameter {
+    name: String,
+    /// Where the quantity that reads it back is among the applied values; `None` if the server does not say.
+    applied: Option<usize>,
+}
+
+impl Comparison {
+    fn new(parameters: &[RecordedParameter], applied: &[String]) -> Self {
+        let compared = |parameter: &RecordedParameter| ComparedParameter {
+            name: parameter.name.clone(),
+            applied: applied.iter().position(|name| *name == parameter.applied),
+        };
+        Self { parameters: parameters.iter().map(compared).collect() }
     }
 
+    /// For the receipts of `environment`.
+    pub fn of(environment: &proto::Environment) -> Self {
+        let About { parameters, applied, .. } = About::new(environment, String::new(), 1);
+        Self::new(&parameters, &applied)
+    }
+
+    /// The largest difference that is more than rounding; costs nothing where there is none.
+    pub fn real_difference(&self, requested: &[f64], applied: &[f64]) -> Option<Difference> {
+        let fits = |(index, parameter): (usize, &ComparedParameter)| match parameter.applied {
+            Some(place) => match (requested.get(index), applied.get(place)) {
+                (Some(&requested), Some(&applied)) => relative(requested, applied) <= ROUNDING,
+                _ => false,
+            },
+            None => true,
+        };
+        let all = self.parameters.iter().enumerate().all(fits);
+        if all { None } else { self.largest(requested, applied) }
+    }
+
+    /// Whether every parameter is read back.
+    fn is_complete(&self) -> bool {
+        self.parameters.iter().all(|parameter| parameter.applied.is_some())
+    }
+
+    /// The largest difference in a receipt; `None` if nothing is read back. A value that is missing differs.
+    pub fn largest(&self, requested: &[f64], applied: &[f64]) -> Option<Difference> {
+        let value = |values: &[f64], place: usize| values.get(place).copied().unwrap_or(f64::NAN);
+        let compared = self.parameters.iter().enumerate().filter_map(|(index, parameter)| {
+            let (requested, applied) = (value(requested, index), value(applied, parameter.applied?));
+            Some((parameter, requested, applied, relative(requested, applied)))
+        });
+        let largest = compared.max_by(|a, b| a.3.total_cmp(&b.3));
+        largest.map(|(parameter, requested, applied, relative)| Difference {
+            parameter: parameter.name.clone(),
+            requested,
+            applied,
+            relative,
+        })
+    }
+}
+
+/// A difference as a share of the requested value; of a requested 0, itself.
+fn relative(requested: f64, applied: f64) -> f64 {
+    let difference = (applied - requested).abs();
+    // Positive, so that NaN counts as the largest of all.
+    let relative = if requested == 0.0 { difference } else { difference / requested.abs() };
+    if relative.is_nan() { f64::NAN } else { relative }
+}
+
+impl Difference {
     /// Whether it is more than rounding. NaN is.
     pub fn is_real(&self) -> bool {
         self.relative.is_nan() || self.relative > ROUNDING

@@ -4,7 +4,8 @@ use super::*;
 use crate::success::Side;
 
 fn records() -> Records {
-    let success = Criterion { quantity: "steps".into(), unit: "1".into(), side: Side::AtMost, threshold: 80.0 };
+    let success =
+        Criterion { quantity: "steps".into(), unit: "1".into(), side: Side::AtMost, threshold: 80.0, most: None };
     let parameter =
         |name: &str, applied: &str| RecordedParameter { name: name.into(), unit: "kg".into(), applied: applied.into() };
     let about = About {
@@ -91,6 +92,11 @@ fn a_value_that_the_physics_did_not_take_is_named() {
     assert_eq!(largest.to_string(), "the parameter mass was requested as 0.1, but the physics ran with 0.2");
     records.episodes[3].applied[1] = f64::NAN;
     assert!(records.agreement().largest.unwrap().is_real());
-    records.about.parameters[0].applied = String::new();
-    assert_eq!(records.agreement(), Agreement { episodes: 0, largest: None }, "a server that does not say");
+    records.episodes[3].applied[1] = 0.2;
+    records.about.parameters[1].applied = String::new();
+    let agreement = records.agreement();
+    assert_eq!(agreement.episodes, 0, "a server that does not say it of every parameter");
+    assert!(agreement.largest.unwrap().is_real(), "what can be compared still is");
+    records.episodes[3].requested.clear();
+    assert!(records.agreement().largest.unwrap().is_real(), "a receipt that lacks values");
 }

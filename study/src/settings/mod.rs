@@ -8,12 +8,12 @@ mod architecture;
 mod defaults;
 mod error;
 
-mod settings;
+mod base_and_wrapper;
 
 pub use algorithms::{A2cConfig, EpoptConfig, PpoConfig, Rl2Config, Schedule};
 pub use architecture::Architecture;
+pub use base_and_wrapper::{Base, Settings, Wrapper};
 pub use error::{ConfigError, SettingError};
-pub use settings::{Base, Settings, Wrapper};
 
 use std::path::Path;
 
@@ -35,6 +35,17 @@ const PARAMETERS: &str = "parameters";
 const ALGORITHM: &str = "algorithm";
 /// The key of [`Common::architecture`].
 const ARCHITECTURE: &str = "architecture";
+
+impl Common {
+    /// What it is trained on, e.g. "D", or "D with length [0.3, 0.4]".
+    pub fn trained_on(&self) -> String {
+        let own = self.parameters.iter().map(|(name, values)| format!("{name} {values}"));
+        match own.collect::<Vec<_>>() {
+            own if own.is_empty() => self.version.to_string(),
+            own => format!("{} with {}", self.version, own.join(", ")),
+        }
+    }
+}
 
 /// Everything that decides what a training does. Two trainings with equal configurations give equal bytes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -8,6 +8,7 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use super::error::SlurmError;
+use super::job::QueuedJob;
 use super::options::{OptionError, SlurmOptions, text_of};
 use super::submission::Submission;
 use crate::interrupt::StopFlag;
@@ -18,55 +19,12 @@ const LIMIT: Duration = Duration::from_secs(60);
 const TICK: Duration = Duration::from_millis(20);
 /// What separates the fields of squeue's lines.
 const FIELDS: &str = "%F|%K|%T|%r|%N|%j";
-/// States of jobs that will not run again; in every other state a job is in the queue still.
-const ENDED: [&str; 10] = [
-    "BOOT_FAIL",
-    "CANCELLED",
-    "COMPLETED",
-    "DEADLINE",
-    "FAILED",
-    "NODE_FAIL",
-    "OUT_OF_MEMORY",
-    "PREEMPTED",
-    "REVOKED",
-    "TIMEOUT",
-];
 
 /// Slurm on this machine.
 #[derive(Clone, Debug)]
 pub struct Slurm {
     directory: Option<PathBuf>,
     limit: Duration,
-}
-
-/// A job of an array, as squeue shows it.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct QueuedJob {
-    /// The array's number.
-    pub array: String,
-    /// The job's index in it.
-    pub index: usize,
-    /// Its state, e.g. RUNNING.
-    pub state: String,
-    /// Why it is in this state; "None" often.
-    pub reason: String,
-    /// Where it runs or ran; empty while it waits.
-    pub node: String,
-    /// The array's name.
-    pub name: String,
-}
-
-impl QueuedJob {
-    /// As it is when it was just submitted.
-    pub(super) fn pending(array: &str, index: usize, name: &str) -> Self {
-        let [array, state, name] = [array, "PENDING", name].map(str::to_owned);
-        Self { array, index, state, reason: String::new(), node: String::new(), name }
-    }
-
-    /// Whether it runs, or will.
-    pub fn is_live(&self) -> bool {
-        !ENDED.contains(&self.state.as_str())
-    }
 }
 
 impl Default for Slurm {

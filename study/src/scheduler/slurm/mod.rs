@@ -17,13 +17,15 @@
 mod batch;
 mod commands;
 mod error;
+mod job;
 mod jobs;
 mod options;
 mod script;
 mod submission;
 
-pub use commands::{QueuedJob, Slurm};
+pub use commands::Slurm;
 pub use error::{AnyError, SlurmError};
+pub use job::QueuedJob;
 pub use jobs::Jobs;
 pub use options::{OptionError, SlurmOptions, Task, TimeLimit};
 

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::commands::QueuedJob;
+use super::job::QueuedJob;
 use crate::files::{self, write_atomically, write_json};
 use crate::folder::{Folder, FolderError};
 use crate::plan::Plan;
