@@ -370,7 +370,10 @@ fn flip_a_bit(path: &Path) {
 }
 
 /// What may happen to a run so that it cannot go on.
-const DAMAGES: &[(&str, fn(&Path))] = &[
+/// What it is called, and how a run is damaged.
+type Damage = (&'static str, fn(&Path));
+
+const DAMAGES: &[Damage] = &[
     ("another revision of the environment", |run| edit(run, "/environment_spec/revision", 77.into())),
     ("another model", |run| edit(run, "/environment_spec/model_hash", "abc".into())),
     ("more environments", |run| edit(run, "/config/num_envs", 6.into())),

@@ -235,7 +235,10 @@ fn job_that_moved(experiment: &Experiment) -> usize {
 }
 
 /// What was done stayed, and the training that was broken off went on from its checkpoint.
-fn nothing_was_done_twice(experiment: &Experiment, victim: &str, done: Vec<(&str, Option<(u64, i64, i64)>)>) {
+/// A cell's id, and which file its result is and when it was written, if it is there.
+type DoneCell<'a> = (&'a str, Option<(u64, i64, i64)>);
+
+fn nothing_was_done_twice(experiment: &Experiment, victim: &str, done: Vec<DoneCell<'_>>) {
     for (id, before) in done {
         assert_eq!(identity(&experiment.result(id)), before, "{id} was written again");
     }
