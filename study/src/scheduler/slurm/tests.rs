@@ -210,9 +210,10 @@ fn what_slurm_lost_is_submitted_again() {
         ids[0]
     ));
     let mut said = Vec::new();
-    let end = fake.run_with(&StopFlag::default(), &mut |report| match report {
-        Report::Note(sentence) => said.push(sentence.to_owned()),
-        _ => {}
+    let end = fake.run_with(&StopFlag::default(), &mut |report| {
+        if let Report::Note(sentence) = report {
+            said.push(sentence.to_owned());
+        }
     });
     assert_eq!(end.unwrap(), finished());
     let jobs: Vec<_> = fake.submissions().into_iter().map(|submission| submission.jobs).collect();
