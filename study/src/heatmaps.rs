@@ -1,7 +1,7 @@
 //! The heatmaps of an experiment: one for each training that was selected in the first run.
 //!
 //! ```text
-//! DIR/heatmaps/ID.csv .svg .png  of the cell ID
+//! DIR/heatmaps/ID.csv .svg .png .parquet  of the cell ID
 //! DIR/heatmaps/ID.json           what they show; written last
 //! ```
 //!

@@ -40,13 +40,11 @@ fn a_policy_is_trained_written_and_tested_with_both_algorithms() {
             .map(|line| line.split(',').map(|field| field.parse().expect("a number")).collect())
             .collect();
         assert_eq!(lines.len() as u64, outcome.progress.episodes);
-        assert_eq!(
-            monitor.lines().nth(1),
-            Some(
-                "r,l,t,success,terminated,episode_index,environment_index,trial_index,episode_in_trial,force,length,mass"
-            )
-        );
+        let columns = "r,l,t,success,terminated,episode_index,environment_index,trial_index,episode_in_trial,force,\
+                       length,mass,applied_force,applied_length,applied_mass,applied_total_mass,applied_pole_mass_length";
+        assert_eq!(monitor.lines().nth(1), Some(columns));
         for line in &lines {
+            assert_eq!(line[9..12], line[12..15], "what was requested was applied");
             assert_eq!(line[0], line[1], "CartPole pays 1 a step");
             assert!((5.0..=15.0).contains(&line[9]) && (0.25..=0.75).contains(&line[10]), "R's intervals");
         }

@@ -108,7 +108,11 @@ fn an_experiment_on_sets_runs_and_every_episode_can_be_played_again_on_one_and_o
     let two: Vec<String> = addresses(&servers).iter().map(ToString::to_string).collect();
     assert_eq!(stdout(&audit(&out, &["--all", "--server", &two.join(",")])), same);
     assert!(stdout(&audit(&out, &["--episodes", "5"])).starts_with("10 of 10 episodes"));
-    assert!(stdout(&perturb(&["report", out.to_str().unwrap()]).output().unwrap()).contains("CartPole"));
+    let report = stdout(&perturb(&["report", out.to_str().unwrap()]).output().unwrap());
+    assert!(report.contains("96 of 96 test episodes"), "requested against applied in a line: {report}");
+    for set in ["long_poles", "corners", "rows"] {
+        assert!(report.contains(set), "{set}: {report}");
+    }
 }
 
 fn parameters_are_those_of_the_sets(records: &Records) {
@@ -176,6 +180,9 @@ fn what_no_environment_has_is_refused_before_anything_begins() {
         ("mass = 0.2", "size = 0.2", "`size`, but must be one of force, length, mass"),
         ("mass = 0.2", "mass = -1", "mass of CartPole is -1, but must be within"),
         ("steps=15", "metres=15", "metres=15, but must be one of steps"),
+        ("steps=15", "steps=201", "at most 200, the step limit"),
+        ("CartPole = 'steps", "Cartpole = 'steps", "`Cartpole`, but must be one of CartPole"),
+        ("length = '0.7..0.8,0.9..1.0'\nmass = 0.2", "version = 'R'", "without parameters"),
         ("test_versions = ['E'", "test_versions = ['X'", "`X`"),
         ("rows.csv", "../rows.csv", "not the name of a file"),
     ] {
@@ -271,6 +278,30 @@ impl Drop for InThread {
         drop(self.shutdown.take());
         let _ = self.thread.take().map(JoinHandle::join);
     }
+}
+
+#[test]
+fn an_edit_that_does_not_take_effect_stops_a_training() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let server = InThread::start(Catalogue::default().with(Stuck::spec()));
+    let out = directory.path().join("out").display().to_string();
+    let train = ["train", "--env", "CartPole", "--version", "R", "--episodes", "20", "--out", &out];
+    let output = perturb(&train).args(["--server", &server.address]).output().expect("ended");
+    assert_eq!(output.status.code(), Some(1));
+    let message = stderr(&output);
+    assert!(message.contains("the parameter mass was requested as") && message.contains("ran with 0.1"), "{message}");
+}
+
+#[test]
+fn the_base_version_of_a_set_belongs_to_its_cells() {
+    let plan = |version: &str| {
+        let text = format!(
+            "environments = ['CartPole']\nversions = ['long']\ntest_versions = ['D']\n[sets.long]\nversion = '{version}'\n\
+             length = '0.3..0.4'\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']"
+        );
+        Plan::parse("test", text).expect("a plan").cells.remove(0).id
+    };
+    assert_ne!(plan("D"), plan("R"));
 }
 
 #[test]

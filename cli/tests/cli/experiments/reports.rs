@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::process::Output;
 
 use super::{Experiment, PLAN, kill_all, succeeded};
 use crate::common::{perturb, stderr, wait_for};
@@ -66,6 +67,12 @@ fn a_run_writes_its_report_when_nothing_is_left_to_do() {
     assert_eq!(names, 1, "nothing temporary stays");
 }
 
+/// A heatmap of the episodes that an earlier one left.
+fn draw_again(training: &Path, directory: &Path, records: &str) -> Output {
+    let mut command = perturb(&["heatmap", "--x", "force", "--y", "length", "--out", "again", "--checkpoint"]);
+    command.arg(training).args(["--records", records]).current_dir(directory).output().expect("ended")
+}
+
 #[test]
 fn a_heatmap_is_drawn_of_two_parameters_and_others_are_refused() {
     let experiment = Experiment::new(PLAN);
@@ -84,7 +91,7 @@ fn a_heatmap_is_drawn_of_two_parameters_and_others_are_refused() {
     let before = names(&training);
     let output = draw(&["--x", "force", "--y", "length"]);
     succeeded(&output);
-    let files = ["csv", "png", "svg"].map(|ending| format!("CartPole-a2c-ff-D-s1-force-length.{ending}"));
+    let files = ["csv", "parquet", "png", "svg"].map(|ending| format!("CartPole-a2c-ff-D-s1-force-length.{ending}"));
     assert_eq!(names(elsewhere.path()), BTreeSet::from(files), "in the working directory");
     assert_eq!(names(&training), before, "and nothing in the training's folder");
     let read = |ending: &str| {
@@ -104,6 +111,9 @@ fn a_heatmap_is_drawn_of_two_parameters_and_others_are_refused() {
     assert!(String::from_utf8(read(".svg")).expect("text").starts_with("<svg") && read(".png").starts_with(b"\x89PNG"));
     assert_eq!(draw(&["--x", "force", "--y", "length"]).status.code(), Some(0));
     assert_eq!(String::from_utf8(read(".csv")).expect("text"), table, "the same again");
+    let records = elsewhere.path().join("CartPole-a2c-ff-D-s1-force-length.parquet").display().to_string();
+    succeeded(&draw_again(&training, elsewhere.path(), &records));
+    assert_eq!(std::fs::read_to_string(elsewhere.path().join("again.csv")).expect("text"), table, "without playing");
 
     for (x, y) in [("force", "force"), ("force", "colour")] {
         let output = draw(&["--x", x, "--y", y]);
@@ -155,7 +165,7 @@ fn heatmaps_of_an_experiment_are_made_once_and_are_in_its_report() {
     assert!(!with.contains("not there") && !with.contains("src=\"http") && !with.contains("<script"));
     assert_eq!(with, experiment.page("out"), "the same folder, the same bytes");
     let first = heatmap_files(&out);
-    assert_eq!(first.len(), 16, "three files and a record of each");
+    assert_eq!(first.len(), 20, "four files and a record of each");
 
     // Half a picture does not count, nor one of a result that has been replaced.
     let is_picture = |path: &&PathBuf| path.extension().is_some_and(|ending| ending == "png");
