@@ -338,7 +338,6 @@ fn wrong_commands_are_refused_with_sentences_and_delete_nothing() {
         vec!["train", "--out", &run],
         vec!["train", "--env", "Pong", "--out", &run, "--overwrite", "--server", &address],
         [&overwrite[..], &["--set", "n_minibatches=3"]].concat(),
-        [&overwrite[..], &["--server", &address, "--set", "num_envs=20000"]].concat(),
         vec!["evaluate", "--checkpoint", "/nonexistent"],
         vec!["envs", "--server", "nowhere"],
         vec!["envs", "--server", "127.0.0.1:1"],

@@ -410,9 +410,7 @@ fn counts_of_0_are_refused_by_name() {
 }
 
 #[test]
-fn settings_in_a_file_have_defaults_and_no_other_names() {
-    let unknown = toml::from_str::<PpoConfig>("learning_rat = 1e-3").expect_err("a misspelt setting");
-    assert!(unknown.to_string().contains("learning_rat"), "{unknown}");
+fn settings_in_a_file_have_defaults() {
     let config: PpoConfig = toml::from_str("learning_rate = 1e-3").expect("other settings have defaults");
     assert_eq!(config, PpoConfig { learning_rate: 1e-3, ..PpoConfig::default() });
 }
