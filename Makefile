@@ -6,6 +6,8 @@ PACKAGES := build-essential pkg-config libclang-dev libmujoco-dev libtorch-dev l
 OPENGL := libegl1 libgl1-mesa-dri
 # A whole Slurm on one machine, for its test.
 SLURM_PACKAGES := slurmctld slurmd slurm-client munge
+# Emulates other processors, for the test that all compute the same.
+QEMU := qemu-user
 # What encodes the .mp4 files of `perturb video`, some 60 MB; everything else runs without it.
 FFMPEG := ffmpeg
 CARGO_DENY_VERSION := 0.20.2
@@ -54,7 +56,7 @@ missing=; \
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help deps opengl toolchain build demo all-pairs report-check test slurm-test slurm-acceptance lint bench audit \
+.PHONY: help deps opengl toolchain build demo all-pairs report-check test slurm-test qemu-test slurm-acceptance lint bench audit \
 	cargo-deny python-test python-wheel python-acceptance \
 	python-venv docker docker-base docker-test
 
@@ -92,6 +94,10 @@ test: deps opengl $(DM_ENV_RPC)/installed ## run all tests, then those of the se
 slurm-test: build ## do a plan on a real Slurm of two nodes, started for it, one of which dies
 	@$(call install,$(SLURM_PACKAGES))
 	PERTURB_SLURM_REQUIRED=1 cargo test $(ALL) --test cli slurm::
+
+qemu-test: build ## train on emulated processors, to the same weights as on this one
+	@$(call install,$(QEMU))
+	PERTURB_QEMU_REQUIRED=1 cargo test $(ALL) --test cli processors::
 
 slurm-acceptance: ## the same with experiments/quick.toml
 	PERTURB_SLURM_PLAN=$(CURDIR)/experiments/quick.toml $(MAKE) slurm-test

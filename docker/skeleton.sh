@@ -12,9 +12,8 @@ find . -name Cargo.toml | while read -r manifest; do
     # Targets that are named need their files; none is part of an image.
     sed -E '/^\[\[(bench|test|example)\]\]/,/^$/d' "$manifest" >"$package/Cargo.toml"
     echo '//! Empty.' >"$package/src/lib.rs"
-    for program in src/main.rs build.rs; do
-        if [ -e "$(dirname "$manifest")/$program" ]; then
-            printf '//! Empty.\n\nfn main() {}\n' >"$package/$program"
-        fi
+    (cd "$(dirname "$manifest")" && find build.rs src/main.rs src/bin -name '*.rs' 2>/dev/null || true) | while read -r program; do
+        mkdir -p "$(dirname "$package/$program")"
+        printf '//! Empty.\n\nfn main() {}\n' >"$package/$program"
     done
 done

@@ -14,7 +14,11 @@ fn main() -> Result<(), Box<dyn Error>> {
     let descriptors = PathBuf::from(env::var("OUT_DIR")?).join("descriptors.bin");
     fs::write(descriptors, compiler.encode_file_descriptor_set())?;
     // Of two equal messages with maps, only ordered ones have equal bytes.
-    let builder = tonic_prost_build::configure().bytes(".").btree_map(".dm_env_rpc");
+    let mut builder = tonic_prost_build::configure().bytes(".").btree_map(".dm_env_rpc");
+    for message in ["Channel", "RewardTerm", "Quantity"] {
+        // As the catalogue in JSON has them.
+        builder = builder.type_attribute(format!(".perturb.v1.{message}"), "#[derive(serde::Serialize)]");
+    }
     builder.compile_fds(compiler.file_descriptor_set())?;
     Ok(())
 }

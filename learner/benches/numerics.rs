@@ -5,10 +5,10 @@
 use std::time::Instant;
 
 use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
-use perturb_learner::policy::{ActionKind, Actor, Acts, ObservationNormaliser, Policy, PolicySpec};
+use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Rollout, RolloutStep};
-use perturb_study::random::{Purpose, normal, stream};
-use perturb_study::settings::Architecture;
+use perturb_policy::random::{Purpose, normal, stream};
+use perturb_policy::{ActionKind, Actor, Acts, ObservationNormaliser, PolicySpec};
 use perturb_study::settings::{A2cConfig, PpoConfig};
 
 const TASKS: [(&str, usize, ActionKind); 2] =
@@ -33,7 +33,7 @@ fn time(id: &str, repetitions: usize, mut run: impl FnMut()) {
 }
 
 fn policy(observation_size: usize, action: ActionKind) -> Policy {
-    Policy::new(PolicySpec::of(Architecture::Ff, observation_size, action), 1).expect("a policy")
+    Policy::new(PolicySpec::feed_forward(observation_size, action), 1).expect("a policy")
 }
 
 fn observations(size: usize) -> Vec<f32> {
@@ -45,7 +45,7 @@ fn observations(size: usize) -> Vec<f32> {
 fn rollout(policy: &Policy, n_steps: usize, n_envs: usize) -> Rollout {
     let spec = policy.spec();
     let mut actor = Actor::new(spec, n_envs);
-    actor.load(&policy.weights()).expect("weights that fit");
+    actor.load_flat(policy.flat_weights()).expect("weights that fit");
     let mut rng = stream(1, Purpose::Actions);
     let mut acts = Acts::new(spec.action, n_envs);
     let mut rollout = Rollout::new(n_steps, n_envs, spec.observation_size, spec.action.width());
@@ -69,14 +69,12 @@ fn rollout(policy: &Policy, n_steps: usize, n_envs: usize) -> Rollout {
     rollout
 }
 
-/// Recurrent policies of the paper's size. `plain` names updates whose gradient is left to libtorch, the measure of the
-/// two-stage one.
+/// Recurrent policies of the paper's size.
 fn recurrent(task: &str, observation_size: usize, action: ActionKind) {
-    let policy = || Policy::new(PolicySpec::of(Architecture::Rc, observation_size, action), 1).expect("a policy");
-    let (first, plain) = (policy(), policy().with_plain_autograd());
+    let mut policy = Policy::new(PolicySpec::recurrent(observation_size, action), 1).expect("a policy");
     for n_envs in [1, 16] {
-        let mut actor = Actor::new(first.spec(), n_envs);
-        actor.load(&first.weights()).expect("weights that fit");
+        let mut actor = Actor::new(policy.spec(), n_envs);
+        actor.load_flat(policy.flat_weights()).expect("weights that fit");
         let rows = observations(n_envs * observation_size);
         let (mut rng, mut acts) = (stream(1, Purpose::Actions), Acts::new(action, n_envs));
         time(&format!("act_rc/{task}/{n_envs}"), 300, || {
@@ -84,28 +82,35 @@ fn recurrent(task: &str, observation_size: usize, action: ActionKind) {
             assert_eq!(acts.values.len(), n_envs);
         });
     }
-    let mut actor = Actor::new(first.spec(), 1);
-    time(&format!("load_rc/{task}"), 100, || actor.load(&first.weights()).expect("weights that fit"));
-    for (kind, mut policy) in [("two_stage", first), ("plain", plain)] {
-        for (n_steps, n_envs) in [(5, 16), (15, 16)] {
-            let rollout = rollout(&policy, n_steps, n_envs);
-            let config = A2cConfig { n_steps, learning_rate: 1e-6, ..A2cConfig::default() };
-            let mut a2c = A2c::new(config, &policy).expect("valid settings");
-            time(&format!("a2c_rc_{kind}/{task}/{n_steps}x{n_envs}"), 50, || {
-                let stats = a2c.update(&mut policy, &rollout, 1.0).expect("an update");
-                assert!(stats.grad_norm > 0.0);
-            });
-        }
-        for (n_steps, n_envs) in [(128, 1), (128, 16)] {
-            let rollout = rollout(&policy, n_steps, n_envs);
-            let config = PpoConfig { n_steps, n_epochs: 1, learning_rate: 1e-6, ..PpoConfig::default() };
-            let mut ppo = Ppo::new(config, &policy, 1).expect("valid settings");
-            time(&format!("ppo_epoch_rc_{kind}/{task}/{n_steps}x{n_envs}"), 20, || {
-                let stats = ppo.update(&mut policy, &rollout, 1.0).expect("an update");
-                assert!(stats.grad_norm > 0.0);
-            });
-        }
+    let mut actor = Actor::new(policy.spec(), 1);
+    time(&format!("load_rc/{task}"), 100, || actor.load_flat(policy.flat_weights()).expect("weights that fit"));
+    for (n_steps, n_envs) in [(5, 16), (15, 16)] {
+        time_a2c(&format!("a2c_rc/{task}/{n_steps}x{n_envs}"), 50, &mut policy, n_steps, n_envs);
     }
+    for (n_steps, n_envs) in [(128, 1), (128, 16)] {
+        time_ppo(&format!("ppo_epoch_rc/{task}/{n_steps}x{n_envs}"), 20, &mut policy, n_steps, n_envs);
+    }
+}
+
+fn time_a2c(id: &str, repetitions: usize, policy: &mut Policy, n_steps: usize, n_envs: usize) {
+    let rollout = rollout(policy, n_steps, n_envs);
+    let config = A2cConfig { n_steps, learning_rate: 1e-6, ..A2cConfig::default() };
+    let mut a2c = A2c::new(config, policy).expect("valid settings");
+    time(id, repetitions, || {
+        let stats = a2c.update(policy, &rollout, 1.0).expect("an update");
+        assert!(stats.grad_norm > 0.0);
+    });
+}
+
+/// One epoch.
+fn time_ppo(id: &str, repetitions: usize, policy: &mut Policy, n_steps: usize, n_envs: usize) {
+    let rollout = rollout(policy, n_steps, n_envs);
+    let config = PpoConfig { n_steps, n_epochs: 1, learning_rate: 1e-6, ..PpoConfig::default() };
+    let mut ppo = Ppo::new(config, policy, 1).expect("valid settings");
+    time(id, repetitions, || {
+        let stats = ppo.update(policy, &rollout, 1.0).expect("an update");
+        assert!(stats.grad_norm > 0.0);
+    });
 }
 
 fn main() {
@@ -114,8 +119,7 @@ fn main() {
         for n_envs in [1, 16, 64, 256] {
             let policy = policy(observation_size, action);
             let mut actor = Actor::new(policy.spec(), n_envs);
-            let weights = policy.weights();
-            actor.load(&weights).expect("weights that fit");
+            actor.load_flat(policy.flat_weights()).expect("weights that fit");
             let rows = observations(n_envs * observation_size);
             let (mut rng, mut acts) = (stream(1, Purpose::Actions), Acts::new(action, n_envs));
             time(&format!("act/{task}/{n_envs}"), 2000, || {
@@ -133,25 +137,19 @@ fn main() {
         }
         let policy_for_load = policy(observation_size, action);
         let mut actor = Actor::new(policy_for_load.spec(), 1);
-        time(&format!("load/{task}"), 2000, || actor.load(&policy_for_load.weights()).expect("weights that fit"));
-        for (n_steps, n_envs) in [(5, 1), (5, 16), (15, 16), (5, 64)] {
-            let mut policy = policy(observation_size, action);
-            let rollout = rollout(&policy, n_steps, n_envs);
-            let mut a2c = A2c::new(A2cConfig { n_steps, ..A2cConfig::default() }, &policy).expect("valid settings");
-            time(&format!("a2c/{task}/{n_steps}x{n_envs}"), 1000, || {
-                let stats = a2c.update(&mut policy, &rollout, 1.0).expect("an update");
-                assert!(stats.grad_norm > 0.0);
-            });
-        }
-        for (n_steps, n_envs) in [(128, 1), (512, 1), (128, 8), (128, 16)] {
-            let mut policy = policy(observation_size, action);
-            let rollout = rollout(&policy, n_steps, n_envs);
-            let config = PpoConfig { n_steps, n_epochs: 1, learning_rate: 1e-6, ..PpoConfig::default() };
-            let mut ppo = Ppo::new(config, &policy, 1).expect("valid settings");
-            time(&format!("ppo_epoch/{task}/{n_steps}x{n_envs}"), 300, || {
-                let stats = ppo.update(&mut policy, &rollout, 1.0).expect("an update");
-                assert!(stats.grad_norm > 0.0);
-            });
+        time(&format!("load/{task}"), 2000, || {
+            actor.load_flat(policy_for_load.flat_weights()).expect("weights that fit")
+        });
+        for threads in [1, 2] {
+            let mut policy = policy(observation_size, action).with_threads(threads).expect("threads");
+            for (n_steps, n_envs) in [(5, 1), (5, 16), (15, 16), (5, 64)] {
+                let id = format!("a2c/{task}/{n_steps}x{n_envs}/{threads}");
+                time_a2c(&id, 1000, &mut policy, n_steps, n_envs);
+            }
+            for (n_steps, n_envs) in [(128, 1), (512, 1), (128, 8), (128, 16)] {
+                let id = format!("ppo_epoch/{task}/{n_steps}x{n_envs}/{threads}");
+                time_ppo(&id, 200, &mut policy, n_steps, n_envs);
+            }
         }
     }
 }

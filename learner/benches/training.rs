@@ -25,7 +25,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let out = tempfile::tempdir()?;
     let directory = RunDirectory::choose(out.path(), false)?;
     let stop = StopFlag::default();
-    let outcome = train(&servers, &config, &directory, &stop, |progress| {
+    let threads = std::thread::available_parallelism()?.get();
+    let outcome = train(&servers, &config, &directory, threads, &stop, |progress| {
         if progress.iterations == ITERATIONS {
             stop.raise(SIGNAL);
         }

@@ -12,7 +12,7 @@ use crate::training::{RunDirectory, RunDirectoryError, TrainError, resume, train
 use perturb_protocol::Distribution;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::{self, RecordsError};
-use perturb_study::scheduler::Event;
+use perturb_study::scheduler::CellEvent;
 use perturb_study::sets::{Parameters, TestSet};
 use perturb_study::{
     Cell, CellFolder, CellResult, CellState, Counters, Failure, FailureMark, FolderError, Tests, Timing, Training,
@@ -60,13 +60,13 @@ pub fn run_cell(
     folder: &CellFolder,
     retry: Option<FailureMark>,
     stop: &StopFlag,
-    tell: &mut dyn FnMut(Event),
-) -> Result<Event, FolderError> {
-    let Some(_lock) = folder.try_lock()? else { return Ok(Event::Busy) };
+    tell: &mut dyn FnMut(CellEvent),
+) -> Result<CellEvent, FolderError> {
+    let Some(_lock) = folder.try_lock()? else { return Ok(CellEvent::Busy) };
     match folder.state()? {
-        CellState::Done(_) => return Ok(Event::Done),
+        CellState::Done(_) => return Ok(CellEvent::Done),
         CellState::Failed(failure) if folder.failure_mark() != retry => {
-            return Ok(Event::Failed { reason: failure.reason });
+            return Ok(CellEvent::Failed { reason: failure.reason });
         }
         CellState::Failed(_) => folder.forget_failure()?,
         CellState::Missing => {}
@@ -77,18 +77,18 @@ pub fn run_cell(
         (Ok(Some(result)), _) => {
             folder.write_timing(&Timing { seconds: start.elapsed().as_secs_f64() })?;
             folder.write_result(&result)?; // last: whoever sees it may read everything else
-            Ok(Event::Done)
+            Ok(CellEvent::Done)
         }
-        (Ok(None), signal) => Ok(Event::Stopped { signal: signal.unwrap_or(SIGTERM) }),
+        (Ok(None), signal) => Ok(CellEvent::Stopped { signal: signal.unwrap_or(SIGTERM) }),
         // Whoever stops a run may end its servers too.
-        (Err(_), Some(signal)) => Ok(Event::Stopped { signal }),
-        (Err(error), None) if error.can_be_retried() => Ok(Event::LostServer { reason: error.to_string() }),
+        (Err(_), Some(signal)) => Ok(CellEvent::Stopped { signal }),
+        (Err(error), None) if error.can_be_retried() => Ok(CellEvent::LostServer { reason: error.to_string() }),
         (Err(error), None) => {
             // Without the folder's place: wherever the same happens, the same is recorded.
             let reason = error.to_string().replace(&format!("{}/", folder.path().display()), "");
             let failure = Failure { id: cell.id.clone(), reason, commit: perturb_study::VERSION.into() };
             folder.write_failure(&failure)?;
-            Ok(Event::Failed { reason: failure.reason })
+            Ok(CellEvent::Failed { reason: failure.reason })
         }
     }
 }
@@ -99,13 +99,13 @@ fn train_and_test(
     cell: &Cell,
     folder: &CellFolder,
     stop: &StopFlag,
-    tell: &mut dyn FnMut(Event),
+    tell: &mut dyn FnMut(CellEvent),
 ) -> Result<Option<CellResult>, CellError> {
     let Some(checkpoint) = trained(servers, cell, &folder.training(), stop, tell)? else { return Ok(None) };
     let Tests { episodes, ref sets, ref success } = cell.tests;
     let options = TestOptions { episodes, seed: cell.config.common.seed, success: success.clone() };
     let tester = Tester::new(servers, &checkpoint, options)?;
-    let mut testing = |set: &TestSet, episodes| tell(Event::Testing { set: set.name.clone(), episodes });
+    let mut testing = |set: &TestSet, episodes| tell(CellEvent::Testing { set: set.name.clone(), episodes });
     let records = match tester.test(sets, stop, &mut testing) {
         Err(TestError::Stopped { .. }) => return Ok(None),
         records => records?,
@@ -157,23 +157,23 @@ fn trained(
     cell: &Cell,
     directory: &Path,
     stop: &StopFlag,
-    tell: &mut dyn FnMut(Event),
+    tell: &mut dyn FnMut(CellEvent),
 ) -> Result<Option<Checkpoint>, TrainError> {
     let config = &cell.config;
     let earlier = earlier(directory)?.filter(|(_, checkpoint, _)| checkpoint.state.config == *config);
     let Counters { episodes, timesteps, .. } =
         earlier.as_ref().map_or_else(Counters::default, |(_, checkpoint, _)| checkpoint.state.counters);
-    tell(Event::Training { episodes, timesteps, saved: timesteps });
+    tell(CellEvent::Training { episodes, timesteps, saved: timesteps });
     let progress = |&Progress { episodes, timesteps, saved_timesteps: saved, .. }: &Progress| {
-        tell(Event::Training { episodes, timesteps, saved });
+        tell(CellEvent::Training { episodes, timesteps, saved });
     };
     let outcome = match earlier {
         Some((_, checkpoint, _)) if episodes >= config.common.episodes => return Ok(Some(checkpoint)),
-        Some((directory, checkpoint, state)) => resume(servers, &directory, (checkpoint, state), stop, progress)?,
-        None => train(servers, config, &RunDirectory::choose(directory, true)?, stop, progress)?,
+        Some((directory, checkpoint, state)) => resume(servers, &directory, (checkpoint, state), 1, stop, progress)?,
+        None => train(servers, config, &RunDirectory::choose(directory, true)?, 1, stop, progress)?,
     };
     let Counters { episodes, timesteps, .. } = outcome.checkpoint.state.counters;
-    tell(Event::Training { episodes, timesteps, saved: timesteps });
+    tell(CellEvent::Training { episodes, timesteps, saved: timesteps });
     Ok(outcome.signal.is_none().then_some(outcome.checkpoint))
 }
 

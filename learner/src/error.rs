@@ -9,52 +9,9 @@ pub enum Error {
     /// A setting is outside its range.
     #[error(transparent)]
     Setting(#[from] SettingError),
-    /// An array has the wrong number of elements.
-    #[error("{name} has {got} elements, expected {expected}")]
-    Length {
-        /// The array, with its axes, e.g. "observations `[N, O]`".
-        name: &'static str,
-        /// Elements that were given.
-        got: usize,
-        /// Elements that were expected.
-        expected: usize,
-    },
-    /// Saved arrays do not fit: one is missing, superfluous, misnamed or has another shape.
-    #[error("array {position} is {got}, expected {expected}; were these saved with other settings?")]
-    Arrays {
-        /// Place in the list.
-        position: usize,
-        /// Name and shape that were found, or "missing".
-        got: String,
-        /// Name and shape that were expected, or "nothing".
-        expected: String,
-    },
-    /// A number that must be finite is not.
-    #[error("{what} became {value} at update {update}; lower the learning rate, or look for very large rewards")]
-    NotFinite {
-        /// What became infinite or NaN, e.g. "the loss".
-        what: &'static str,
-        /// Its value: NaN, inf or -inf.
-        value: f64,
-        /// Index of the gradient step, from 0.
-        update: u64,
-    },
-    /// A policy gave a log-probability or a value that is infinite or NaN.
-    #[error(
-        "the policy's output in environment {environment} is not finite; its weights or observation hold NaN or inf"
-    )]
-    PolicyOutput {
-        /// Which of the N environments.
-        environment: usize,
-    },
-    /// An input that must be finite is not.
-    #[error("{name} hold {value}; the environment's numbers must be finite")]
-    Input {
-        /// The array, with its axes.
-        name: &'static str,
-        /// The first such element.
-        value: f32,
-    },
+    /// A policy's arrays or numbers do not fit.
+    #[error(transparent)]
+    Policy(#[from] perturb_policy::Error),
     /// A rollout was pushed to when full, or used before it was full.
     #[error("the rollout holds {got} of {expected} steps: {what}")]
     RolloutLength {
@@ -89,8 +46,3 @@ pub enum Error {
 
 /// A result with this module's [`Error`].
 pub type Result<T> = std::result::Result<T, Error>;
-
-/// `Ok` if a slice has the expected length; otherwise an [`Error::Length`].
-pub(crate) fn check_length(name: &'static str, got: usize, expected: usize) -> Result<()> {
-    if got == expected { Ok(()) } else { Err(Error::Length { name, got, expected }) }
-}

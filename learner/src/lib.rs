@@ -11,10 +11,10 @@ pub mod evaluation;
 #[cfg(test)]
 mod fixture;
 pub mod logging;
-pub mod loss;
 pub mod measure;
 pub mod policy;
 pub mod rollout;
+pub mod torch;
 pub mod training;
 
 pub use perturb_protocol::proto;

@@ -19,7 +19,7 @@ pub fn measure(servers: &Servers, cell: &Cell, limit: Duration) -> Result<Measur
     let stop = StopFlag::default();
     let start = Instant::now();
     let mut first = None;
-    let outcome = train(servers, &cell.config, &directory, &stop, |progress| {
+    let outcome = train(servers, &cell.config, &directory, 1, &stop, |progress| {
         first.get_or_insert(*progress);
         if start.elapsed() >= limit {
             stop.raise(1);

@@ -25,9 +25,9 @@ Step = Callable[[Any], Any]
 def contenders(batch: int, server: str | None) -> dict[str, Any]:
     """The batches, by name; all autoreset in the next step, as is Gymnasium's and EnvPool's way."""
     found: dict[str, Any] = {
-        "perturb": gymnasium.make_vec("perturb/CartPole-v0", num_envs=batch, server=server),
+        "perturb": gymnasium.make_vec("perturb/CartPole-v1", num_envs=batch, server=server),
         "perturb, receipts=False": gymnasium.make_vec(
-            "perturb/CartPole-v0", num_envs=batch, server=server, receipts=False
+            "perturb/CartPole-v1", num_envs=batch, server=server, receipts=False
         ),
         "Gymnasium's CartPoleVectorEnv": CartPoleVectorEnv(num_envs=batch, max_episode_steps=200),
         "Gymnasium's SyncVectorEnv": SyncVectorEnv(

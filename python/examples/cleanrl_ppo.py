@@ -47,7 +47,7 @@ def main() -> None:
 
     envs = RecordEpisodeStatistics(
         gymnasium.make_vec(
-            "perturb/CartPole-v0",
+            "perturb/CartPole-v1",
             num_envs=NUM_ENVS,
             version=arguments.version,
             server=arguments.server,

@@ -6,10 +6,10 @@ Run: python gallery.py [--out pictures] [--server unix:/path]
 import argparse
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 from PIL import Image
 
+import perturb
 from perturb.catalogue import CATALOGUE
 
 STEPS = 12
@@ -17,7 +17,7 @@ STEPS = 12
 
 def picture(name: str, version: str, server: str | None) -> np.ndarray:
     """The environment after some random actions, which are the same in every version."""
-    env = gymnasium.make(f"perturb/{name}-v0", version=version, server=server, render_mode="rgb_array")
+    env = perturb.PerturbEnv(name, version=version, server=server, render_mode="rgb_array")
     env.action_space.seed(1)
     env.reset(seed=1)
     for _ in range(STEPS):

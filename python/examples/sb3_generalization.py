@@ -5,18 +5,17 @@ Run: python sb3_generalization.py [--environment Pendulum] [--train D] [--steps 
 
 import argparse
 
-import gymnasium
 import torch
 from stable_baselines3 import PPO
 
-import perturb  # noqa: F401  (registers the environments)
+import perturb
 
 EPISODES = 100
 
 
 def success_rate(model: PPO, environment: str, version: str) -> float:
     """Successful episodes, in percent."""
-    env = gymnasium.make(f"perturb/{environment}-v0", version=version)
+    env = perturb.PerturbEnv(environment, version=version)
     successes = 0
     for episode in range(EPISODES):
         observation, _ = env.reset(seed=10_000 + episode)
@@ -39,7 +38,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # with networks this small a second thread costs more than it computes
 
-    env = gymnasium.make(f"perturb/{arguments.environment}-v0", version=arguments.train)
+    env = perturb.PerturbEnv(arguments.environment, version=arguments.train)
     model = PPO("MlpPolicy", env, seed=1, device="cpu").learn(arguments.steps)
     env.close()
     for version in "DRE":

@@ -35,7 +35,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # with networks this small a second thread costs more than it computes
 
-    env = Monitor(gymnasium.make("perturb/CartPole-v0", version=arguments.version, server=arguments.server))
+    env = Monitor(gymnasium.make("perturb/CartPole-v1", version=arguments.version, server=arguments.server))
     model = PPO("MlpPolicy", env, seed=arguments.seed, device="cpu")
     model.learn(STEPS, callback=StopAtGoal())
     last = [episode["r"] for episode in model.ep_info_buffer]

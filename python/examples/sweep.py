@@ -20,7 +20,7 @@ def main() -> None:
     n = len(lengths)
 
     server = parser.parse_args().server
-    envs = gymnasium.make_vec("perturb/CartPole-v0", num_envs=n, autoreset_mode="Disabled", server=server)
+    envs = gymnasium.make_vec("perturb/CartPole-v1", num_envs=n, autoreset_mode="Disabled", server=server)
     envs.reset(seed=1)
     for i, length in enumerate(lengths):
         options = {

@@ -11,11 +11,17 @@ from typing import TYPE_CHECKING
 import pytest
 
 from perturb import local_server
+from perturb.catalogue import CATALOGUE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 ROOT = Path(__file__).parents[2]
+
+
+def identifier(name: str) -> str:
+    """Give the id by which Gymnasium makes an environment."""
+    return f"perturb/{name}-v{CATALOGUE[name].revision}"
 
 
 class Server:

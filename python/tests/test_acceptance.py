@@ -12,7 +12,7 @@ import pytest
 
 from perturb.catalogue import CATALOGUE
 
-from .conftest import ROOT
+from .conftest import ROOT, identifier
 
 EXAMPLES = ROOT / "python/examples"
 
@@ -39,7 +39,7 @@ def run(*command: str) -> str:
 def test_stable_baselines3s_checker_accepts_every_environment_and_version(name: str, version: str, server: str) -> None:
     from stable_baselines3.common.env_checker import check_env
 
-    env = gymnasium.make(f"perturb/{name}-v0", version=version, server=server)
+    env = gymnasium.make(identifier(name), version=version, server=server)
     check_env(env)
     env.close()
 

@@ -12,7 +12,7 @@ import pytest
 import perturb
 from perturb.address import parse_address
 
-from .conftest import ROOT
+from .conftest import ROOT, identifier
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -39,7 +39,7 @@ NAN, INF = float("nan"), float("inf")
     ],
 )
 def test_a_wrong_action_moves_nothing(name: str, action: Any, says: str, server: str) -> None:
-    env, twin = (gymnasium.make(f"perturb/{name}-v0", server=server).unwrapped for _ in range(2))
+    env, twin = (gymnasium.make(identifier(name), server=server).unwrapped for _ in range(2))
     good = env.action_space.sample()
     env.reset(seed=1)
     twin.reset(seed=1)
@@ -61,7 +61,7 @@ def test_a_wrong_action_moves_nothing(name: str, action: Any, says: str, server:
     ],
 )
 def test_wrong_actions_of_a_batch_move_nothing(actions: Any, says: str, server: str) -> None:
-    envs = gymnasium.make_vec("perturb/CartPole-v0", num_envs=3, server=server)
+    envs = gymnasium.make_vec("perturb/CartPole-v1", num_envs=3, server=server)
     envs.reset(seed=1)
     saved = envs.unwrapped.snapshot()  # type: ignore[attr-defined]
     with pytest.raises(perturb.InvalidArgumentError, match=says):

@@ -481,7 +481,7 @@ def test_without_the_program_the_error_says_how_to_get_it(monkeypatch: pytest.Mo
     monkeypatch.delenv(local_server.VARIABLE)
     monkeypatch.setenv("PATH", "/nowhere")
     with pytest.raises(perturb.ServerStartError, match=r"not on PATH.*server='unix:"):
-        gymnasium.make("perturb/CartPole-v0")
+        gymnasium.make("perturb/CartPole-v1")
 
 
 def test_a_program_that_is_no_server_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -569,7 +569,7 @@ def test_gymnasiums_asynchronous_batches_work(own: bool, server: str) -> None:
     settings: dict[str, Any] = {} if own else {"server": server}
     parent = perturb.PerturbEnv("Pendulum", **settings)
     parent.reset()
-    envs: Any = gymnasium.make_vec("perturb/Pendulum-v0", num_envs=2, vectorization_mode="async", **settings)
+    envs: Any = gymnasium.make_vec("perturb/Pendulum-v1", num_envs=2, vectorization_mode="async", **settings)
     with within(SECONDS):
         observations, infos = envs.reset(seed=5)
         envs.step(np.zeros((2, 1), dtype=np.float32))

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from .conftest import ROOT
+from .conftest import ROOT, identifier
 
 CASES = [json.loads(line) for line in (ROOT / "tests/server/data/classic_control.jsonl").read_text().splitlines()]
 
@@ -29,7 +29,7 @@ def test_every_step_of_a_golden_trajectory_agrees(case: dict[str, Any], server: 
     states = [case["state0"], *case["states"]]
     # Beyond an ending there are states that a reset does not accept.
     n = next((t + 1 for t, ended in enumerate(case["terminated"]) if ended), len(case["actions"]))
-    envs = gymnasium.make_vec(f"perturb/{case['env']}-v0", num_envs=n, autoreset_mode="Disabled", server=server)
+    envs = gymnasium.make_vec(identifier(case["env"]), num_envs=n, autoreset_mode="Disabled", server=server)
     options = {"parameters": case["params"], "state": states[:n]}
     tolerance = SINGLE_STEP[case["env"]]
 
@@ -52,7 +52,7 @@ def test_every_step_of_a_golden_trajectory_agrees(case: dict[str, Any], server: 
 def test_trajectories_from_the_initial_state_agree(case: dict[str, Any], server: str) -> None:
     """Nothing is rounded on the way but Pendulum's torque: float64 errors of 1e-9 over 50 steps vanish in float32."""
     tolerance = {"Pendulum": 1e-4}.get(case["env"], 1.3e-7)  # its rounded torques pile up, and it is unstable upright
-    env = gymnasium.make(f"perturb/{case['env']}-v0", parameters=case["params"], server=server)
+    env = gymnasium.make(identifier(case["env"]), parameters=case["params"], server=server)
     discrete = isinstance(env.action_space, gymnasium.spaces.Discrete)
     env.reset(options={"state": case["state0"]})
     for t, action in enumerate(case["actions"][:50]):

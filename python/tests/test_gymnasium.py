@@ -13,6 +13,8 @@ from gymnasium.wrappers import vector as wrappers
 
 from perturb.catalogue import CATALOGUE
 
+from .conftest import identifier
+
 NAMES = list(CATALOGUE)
 MODES = list(AutoresetMode)
 
@@ -25,7 +27,7 @@ def equal(a: object, b: object) -> bool:
 @pytest.mark.parametrize("version", ["D", "R", "E"])
 @pytest.mark.parametrize("name", NAMES)
 def test_gymnasiums_checker_accepts_every_environment_and_version(name: str, version: str, server: str) -> None:
-    env = gymnasium.make(f"perturb/{name}-v0", version=version, server=server)
+    env = gymnasium.make(identifier(name), version=version, server=server)
     check_env(env.unwrapped)
     env.close()
 
@@ -34,13 +36,11 @@ def test_gymnasiums_checker_accepts_every_environment_and_version(name: str, ver
 def test_the_papers_ids_are_the_versions(name: str, server: str) -> None:
     for version, suffix in {"D": "", "R": "RandomNormal", "E": "RandomExtreme"}.items():
         old = gymnasium.make(f"Sunblaze{name}{suffix}-v0", server=server)
-        new = gymnasium.make(f"perturb/{name}-v0", version=version, server=server)
+        new = gymnasium.make(identifier(name), version=version, server=server)
         (a, a_info), (b, b_info) = old.reset(seed=3), new.reset(seed=3)
         assert equal(a, b)
         assert a_info["parameters"] == b_info["parameters"]
-        assert (a_info["parameters"] == gymnasium.make(f"perturb/{name}-v0").reset()[1]["parameters"]) == (
-            version == "D"
-        )
+        assert (a_info["parameters"] == gymnasium.make(identifier(name)).reset()[1]["parameters"]) == (version == "D")
         old.close()
         new.close()
 
@@ -64,13 +64,13 @@ def test_a_batch_gives_what_gymnasium_makes_of_single_environments(
     name: str, mode: AutoresetMode, receipts: bool, server: str
 ) -> None:
     """Observations, rewards, flags and infos, with their structure, types and masks."""
-    identifier, n, steps = f"perturb/{name}-v0", 5, 150
+    n, steps = 5, 150
     settings: dict[str, Any] = {"version": "E", "server": server, "receipts": receipts, "reward_terms": True}
     settings["episodes_per_trial"] = 2
-    ours = gymnasium.make_vec(identifier, num_envs=n, autoreset_mode=mode, **settings)
+    ours = gymnasium.make_vec(identifier(name), num_envs=n, autoreset_mode=mode, **settings)
 
     def single(i: int) -> gymnasium.Env[Any, Any]:
-        return gymnasium.make(identifier, environment_index=i, **settings)
+        return gymnasium.make(identifier(name), environment_index=i, **settings)
 
     theirs = SyncVectorEnv([lambda i=i: single(i) for i in range(n)], autoreset_mode=mode)  # type: ignore[misc]
     assert ours.metadata["autoreset_mode"] is mode
@@ -92,7 +92,7 @@ def test_a_batch_gives_what_gymnasium_makes_of_single_environments(
 
 
 def test_final_observations_and_infos_are_where_gymnasium_puts_them(server: str) -> None:
-    envs = gymnasium.make_vec("perturb/CartPole-v0", num_envs=3, autoreset_mode="SameStep", server=server)
+    envs = gymnasium.make_vec("perturb/CartPole-v1", num_envs=3, autoreset_mode="SameStep", server=server)
     envs.reset(seed=1)
     for _ in range(200):
         observations, _, terminated, _, infos = envs.step(np.ones(3, dtype=np.int64))
@@ -110,7 +110,7 @@ def test_final_observations_and_infos_are_where_gymnasium_puts_them(server: str)
 
 
 def test_success_is_told_at_the_end_and_only_there(server: str) -> None:
-    env = gymnasium.make("perturb/CartPole-v0", server=server)
+    env = gymnasium.make("perturb/CartPole-v1", server=server)
     observation, info = env.reset(seed=1)
     assert "is_success" not in info
     truncated = False
@@ -128,7 +128,7 @@ def test_success_is_told_at_the_end_and_only_there(server: str) -> None:
 
 @pytest.mark.parametrize("mode", MODES)
 def test_gymnasiums_wrappers_work_on_batches(mode: AutoresetMode, server: str) -> None:
-    envs = gymnasium.make_vec("perturb/CartPole-v0", num_envs=4, autoreset_mode=mode, server=server)
+    envs = gymnasium.make_vec("perturb/CartPole-v1", num_envs=4, autoreset_mode=mode, server=server)
     wrapped: Any = wrappers.RecordEpisodeStatistics(envs)
     wrapped = wrappers.ClipReward(wrapped, min_reward=0.0, max_reward=0.5)
     wrapped.reset(seed=1)
@@ -157,7 +157,7 @@ def test_two_environments_of_one_seed_match(server: str) -> None:
 
 def test_random_numbers_are_those_of_the_documents(server: str) -> None:
     """docs/environments.md, "Random streams": seed 7, environment 3, trial 2 of CartPole E."""
-    env = gymnasium.make("perturb/CartPole-v0", version="E", environment_index=3, server=server)
+    env = gymnasium.make("perturb/CartPole-v1", version="E", environment_index=3, server=server)
     env.reset(seed=7)
     env.reset()
     observation, info = env.reset()
@@ -171,7 +171,7 @@ def test_random_numbers_are_those_of_the_documents(server: str) -> None:
 
 
 def test_what_gymnasium_asks_of_batches_holds_for_seeds(server: str) -> None:
-    envs = gymnasium.make_vec("perturb/Pendulum-v0", num_envs=3, version="R", server=server)
+    envs = gymnasium.make_vec("perturb/Pendulum-v1", num_envs=3, version="R", server=server)
     by_number, _ = envs.reset(seed=10)
     by_list, _ = envs.reset(seed=[10, 11, 12])  # type: ignore[arg-type]
     others, _ = envs.reset(seed=11)
@@ -181,5 +181,5 @@ def test_what_gymnasium_asks_of_batches_holds_for_seeds(server: str) -> None:
 
 
 def test_without_a_seed_episodes_differ(server: str) -> None:
-    first = [gymnasium.make("perturb/Pendulum-v0", server=server).reset()[0].tobytes() for _ in range(3)]
+    first = [gymnasium.make("perturb/Pendulum-v1", server=server).reset()[0].tobytes() for _ in range(3)]
     assert len(set(first)) == 3

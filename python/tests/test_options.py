@@ -17,17 +17,17 @@ from perturb._proto import perturb_pb2 as pb
 from perturb.catalogue import CATALOGUE, Description
 from perturb.registration import register_all
 
-from .conftest import ROOT
+from .conftest import ROOT, identifier
 
 
 def make(name: str = "CartPole", **settings: Any) -> perturb.PerturbEnv:
-    env = gymnasium.make(f"perturb/{name}-v0", **settings).unwrapped
+    env = gymnasium.make(identifier(name), **settings).unwrapped
     assert isinstance(env, perturb.PerturbEnv)
     return env
 
 
 def make_vec(name: str = "CartPole", **settings: Any) -> perturb.PerturbVectorEnv:
-    envs = gymnasium.make_vec(f"perturb/{name}-v0", **settings)
+    envs = gymnasium.make_vec(identifier(name), **settings)
     assert isinstance(envs, perturb.PerturbVectorEnv)
     return envs
 
@@ -49,7 +49,7 @@ def test_the_catalogue_is_the_servers(server: str) -> None:
     for environment in served.environments:
         CATALOGUE[environment.name].require_equal(environment)
         environment.revision += 1
-        with pytest.raises(perturb.ProtocolError, match="revision 1"):
+        with pytest.raises(perturb.ProtocolError, match=f"has revision {environment.revision} of {environment.name}"):
             CATALOGUE[environment.name].require_equal(environment)
         environment.revision -= 1
         environment.observation[0].low = -7

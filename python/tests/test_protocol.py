@@ -48,7 +48,9 @@ class FakeServer:
 def opened() -> pb.Opened:
     channels = [pb.Channel(name=str(i), low=-float("inf"), high=float("inf")) for i in range(4)]
     action = pb.ActionSpace(discrete=pb.Discrete(names=["left", "right"]))
-    environment = pb.Environment(name="CartPole", observation=channels, action=action, control_timestep=0.02)
+    environment = pb.Environment(
+        name="CartPole", revision=1, observation=channels, action=action, control_timestep=0.02
+    )
     return pb.Opened(environment=environment, observations=bytes(16))
 
 
@@ -105,7 +107,7 @@ def test_another_revision_is_refused(fake: FakeServer) -> None:
     other = opened()
     other.environment.revision = 3
     fake.answers = [Answer(opened=other)]
-    with pytest.raises(perturb.ProtocolError, match="revision 3 of CartPole, this package has 0: install"):
+    with pytest.raises(perturb.ProtocolError, match="revision 3 of CartPole, this package has 1: install"):
         perturb.PerturbEnv("CartPole", server=fake.address).reset()
 
 

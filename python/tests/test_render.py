@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 import perturb
 from perturb.catalogue import CATALOGUE
 
+from .conftest import identifier
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -34,7 +36,7 @@ def differ(a: Picture, b: Picture) -> bool:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_gymnasiums_checker_accepts_the_pictures_of_every_environment(name: str, server: str) -> None:
-    env = gymnasium.make(f"perturb/{name}-v0", version="E", server=server, **SMALL)
+    env = gymnasium.make(identifier(name), version="E", server=server, **SMALL)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check_env(env.unwrapped)
@@ -111,10 +113,10 @@ def test_as_many_frames_are_shown_as_are_simulated(server: str) -> None:
     """docs/environments.md has the lengths of the steps."""
     frames = {"CartPole": 50, "MountainCar": 1, "Acrobot": 5, "Pendulum": 20, "HalfCheetah": 60.6, "Hopper": 60.6}
     for name, expected in frames.items():
-        metadata = gymnasium.make(f"perturb/{name}-v0", server=server, **SMALL).metadata
+        metadata = gymnasium.make(identifier(name), server=server, **SMALL).metadata
         assert metadata["render_modes"] == ["rgb_array"]
         assert metadata["render_fps"] == pytest.approx(expected, abs=0.01)  # the robots' is 60.606…
-    envs = gymnasium.make_vec("perturb/CartPole-v0", num_envs=2, server=server, **SMALL)
+    envs = gymnasium.make_vec("perturb/CartPole-v1", num_envs=2, server=server, **SMALL)
     assert envs.metadata["render_fps"] == 50
     assert envs.render_mode == "rgb_array"
 
@@ -148,7 +150,7 @@ def test_a_batch_gives_one_picture_of_each_environment(copy: bool, server: str) 
 
 
 def test_gymnasiums_wrappers_take_the_pictures(server: str) -> None:
-    collected = gymnasium.make("perturb/CartPole-v0", server=server, **{**SMALL, "render_mode": "rgb_array_list"})
+    collected = gymnasium.make("perturb/CartPole-v1", server=server, **{**SMALL, "render_mode": "rgb_array_list"})
     collected.reset(seed=1)
     for _ in range(3):
         collected.step(0)
@@ -156,7 +158,7 @@ def test_gymnasiums_wrappers_take_the_pictures(server: str) -> None:
     assert [frame.shape for frame in frames] == [(48, 64, 3)] * 4
     assert differ(frames[0], frames[3])
 
-    base = gymnasium.make("perturb/Pendulum-v0", server=server, **SMALL)
+    base = gymnasium.make("perturb/Pendulum-v1", server=server, **SMALL)
     assert isinstance(RenderCollection(base).reset(seed=1)[0], np.ndarray)
     seen: Any = AddRenderObservation(base, render_only=True)
     observation, _ = seen.reset(seed=1)

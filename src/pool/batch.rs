@@ -10,11 +10,15 @@ use crate::{
     scene::Scene,
 };
 use bytes::{Bytes, BytesMut};
-use std::sync::{Arc, Mutex, atomic::Ordering};
+use std::{
+    ops::RangeInclusive,
+    sync::{Arc, Mutex, atomic::Ordering},
+};
 
-/// What one shard should cost, in µs: long enough to hide the queue, short enough that workers end together and
-/// sessions take turns.
-const SHARD_COST: f64 = 20.0;
+/// What one shard should cost, in µs: long enough to hide the queue, short enough that sessions take turns …
+const SHARD_COST: RangeInclusive<f64> = 20.0..=200.0;
+/// … and so many of each worker's share that workers end together.
+const SHARDS_A_WORKER: f64 = 32.0;
 /// What each worker's share should at least cost, in µs, for more than one to be set to work.
 const LEAST_SHARE: f64 = 10.0;
 
@@ -332,7 +336,9 @@ fn put(buffer: &mut BytesMut, values: &[f32]) {
 
 /// Environments in a shard: by cost, but so many shards that every worker has one, if a shard is worth a wake-up.
 fn shard_size(spec: &EnvironmentSpec, batch: usize, workers: usize) -> usize {
-    let by_cost = (SHARD_COST / spec.step_cost).ceil() as usize;
     let by_workers = batch.div_ceil(workers);
-    if spec.step_cost * by_workers as f64 >= LEAST_SHARE { by_cost.min(by_workers).max(1) } else { by_cost.max(1) }
+    let share = spec.step_cost * by_workers as f64;
+    let cost = (share / SHARDS_A_WORKER).clamp(*SHARD_COST.start(), *SHARD_COST.end());
+    let by_cost = (cost / spec.step_cost).ceil() as usize;
+    if share >= LEAST_SHARE { by_cost.min(by_workers).max(1) } else { by_cost.max(1) }
 }

@@ -1,6 +1,6 @@
 //! Pictures of MuJoCo's models, by MuJoCo and OpenGL.
 //!
-//! The models that run the physics have no colours, no textures and no lights, which would make each environment larger.
+//! The models that run the physics have no colours, no textures and no lights, which would make each simulation larger.
 //! So pictures are of a model of their own: the same MJCF, with scenery. Only positions pass from one to the other; the
 //! parameters (power, density, friction) cannot be seen.
 

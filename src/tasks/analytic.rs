@@ -1,4 +1,5 @@
-//! What the analytic tasks share. Their dynamics are Gymnasium 1.4's in f64.
+//! What the analytic tasks share. Their dynamics are Gymnasium 1.4's in f64, with libm's sine and cosine: those of the C
+//! library have other last digits on a processor with other instructions.
 
 use crate::env::{Action, Error, Stream};
 

@@ -4,6 +4,7 @@
 //! method, and each method in one environment; the other pairs follow.
 
 use std::collections::HashMap;
+use std::iter::Sum;
 
 use super::plan::{Cell, Plan, distinct};
 use crate::Method;
@@ -12,7 +13,7 @@ use crate::settings::{TrainConfig, Wrapper};
 /// Seconds that a step of one environment takes, with all that belongs to it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Speed {
-    /// In training.
+    /// With rollouts and updates.
     pub training: f64,
     /// In testing: without the updates.
     pub testing: f64,
@@ -21,7 +22,7 @@ pub struct Speed {
 /// A training that was measured.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Measurement {
-    /// Its environment.
+    /// By its name in the catalogue.
     pub environment: String,
     /// What learned.
     pub method: Method,
@@ -29,24 +30,35 @@ pub struct Measurement {
     pub speed: Speed,
 }
 
-/// The most that cells can ask for: that every episode goes on to the step limit.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Work {
-    /// Steps of trainings.
-    pub training_steps: f64,
-    /// Steps of tests.
-    pub testing_steps: f64,
-}
-
-/// What a plan costs at most, on one core.
+/// What cells cost at most: if every episode goes on to the step limit, and on one core.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Estimate {
-    /// Steps.
-    pub work: Work,
-    /// Seconds of trainings.
+    /// Of EPOpt, also those that it does not learn from.
+    pub training_steps: f64,
+    /// Of RL², those of whole trials.
+    pub testing_steps: f64,
+    /// With rollouts and updates.
     pub training_seconds: f64,
-    /// Seconds of tests.
+    /// Without updates.
     pub testing_seconds: f64,
+}
+
+impl Estimate {
+    /// Of trainings and tests.
+    pub fn seconds(&self) -> f64 {
+        self.training_seconds + self.testing_seconds
+    }
+}
+
+impl Sum for Estimate {
+    fn sum<I: Iterator<Item = Self>>(estimates: I) -> Self {
+        estimates.fold(Self::default(), |sum, cell| Self {
+            training_steps: sum.training_steps + cell.training_steps,
+            testing_steps: sum.testing_steps + cell.testing_steps,
+            training_seconds: sum.training_seconds + cell.training_seconds,
+            testing_seconds: sum.testing_seconds + cell.testing_seconds,
+        })
+    }
 }
 
 /// The trainings to measure: of each environment with its first method, and of each method in its first environment,
@@ -70,46 +82,25 @@ fn pair(cell: &Cell) -> (&str, Method) {
     (&cell.config.common.environment, cell.method())
 }
 
-/// What `plan` costs at most, given measurements of its [`representatives`] and the step limit of each environment.
-pub fn estimate(plan: &Plan, measurements: &[Measurement], step_limit: impl Fn(&str) -> u32) -> Estimate {
-    cell_estimates(plan, measurements, step_limit).fold(Estimate::default(), |sum, cell| Estimate {
-        work: Work {
-            training_steps: sum.work.training_steps + cell.work.training_steps,
-            testing_steps: sum.work.testing_steps + cell.work.testing_steps,
-        },
-        training_seconds: sum.training_seconds + cell.training_seconds,
-        testing_seconds: sum.testing_seconds + cell.testing_seconds,
-    })
-}
-
-/// The seconds that each cell of `plan` takes at most, in its order; otherwise as [`estimate`].
-pub fn cell_seconds(plan: &Plan, measurements: &[Measurement], step_limit: impl Fn(&str) -> u32) -> Vec<f64> {
-    let estimates = cell_estimates(plan, measurements, step_limit);
-    estimates.map(|cell| cell.training_seconds + cell.testing_seconds).collect()
-}
-
-fn cell_estimates(
-    plan: &Plan,
-    measurements: &[Measurement],
-    step_limit: impl Fn(&str) -> u32,
-) -> impl Iterator<Item = Estimate> {
+/// What each cell of `plan` costs at most, in its order, given measurements of its [`representatives`] and the step limit
+/// of each environment.
+pub fn estimates(plan: &Plan, measurements: &[Measurement], step_limits: &HashMap<&str, u32>) -> Vec<Estimate> {
     let mut speeds: HashMap<(&str, Method), Speed> = HashMap::new();
-    plan.cells.iter().map(move |cell| {
+    let estimate = |cell| {
         let pair = pair(cell);
         let speed = *speeds.entry(pair.clone()).or_insert_with(|| speed_of(&pair, measurements));
-        let limit = f64::from(step_limit(pair.0));
-        let work = Work {
-            training_steps: generated_episodes(&cell.config) * limit,
-            testing_steps: (cell.tests.episodes * u64::from(cell.config.settings.episodes_per_trial())) as f64
-                * cell.tests.sets.len() as f64
-                * limit,
-        };
+        let limit = f64::from(step_limits.get(pair.0).copied().unwrap_or_default());
+        let training_steps = generated_episodes(&cell.config) * limit;
+        let trials = cell.tests.episodes * cell.tests.sets.len() as u64;
+        let testing_steps = (trials * u64::from(cell.config.settings.episodes_per_trial())) as f64 * limit;
         Estimate {
-            work,
-            training_seconds: work.training_steps * speed.training,
-            testing_seconds: work.testing_steps * speed.testing,
+            training_steps,
+            testing_steps,
+            training_seconds: training_steps * speed.training,
+            testing_seconds: testing_steps * speed.testing,
         }
-    })
+    };
+    plan.cells.iter().map(estimate).collect()
 }
 
 /// How many episodes a training has: more than its budget if it learns from the worst of them only.
@@ -186,19 +177,20 @@ mod tests {
         ];
         let of = |environment: &str, method: &Method| speed_of(&(environment, method.clone()), &measurements).training;
         assert_eq!((of("Hopper", a2c), of("Hopper", rc), of("Hopper", ppo)), (8.0, 16.0, 9.0));
-        let total = estimate(&plan, &measurements, |environment| if environment == "Hopper" { 1000 } else { 200 });
+        let limits = [("Hopper", 1000), ("CartPole", 200)].into();
+        let total: Estimate = estimates(&plan, &measurements, &limits).into_iter().sum();
         // 3 runs of 3, 3 and 1 configurations; 100 training episodes each.
         let steps = 3.0 * 7.0 * 100.0 * (200.0 + 1000.0);
-        assert_eq!(total.work, Work { training_steps: steps, testing_steps: steps * 0.3 });
+        assert_eq!((total.training_steps, total.testing_steps), (steps, steps * 0.3));
         let cart_pole = 3.0 * 100.0 * 200.0 * (3.0 * 3.0 + 3.0 * 11.0 + 4.0);
         let hopper = 3.0 * 100.0 * 1000.0 * (3.0 * 8.0 + 3.0 * 16.0 + 9.0);
         assert!((total.training_seconds - cart_pole - hopper).abs() < 1e-6 * total.training_seconds);
         assert!((total.testing_seconds - total.training_seconds * 0.3 / 4.0).abs() < 1e-6 * total.testing_seconds);
-        let cells = cell_seconds(&plan, &measurements, |environment| if environment == "Hopper" { 1000 } else { 200 });
+        let cells: Vec<f64> = estimates(&plan, &measurements, &limits).iter().map(Estimate::seconds).collect();
         // The first is CartPole with A2C: 3 s a step, and a quarter of that in a test.
         assert!((cells[0] - 100.0 * 200.0 * (3.0 + 0.3 * 3.0 / 4.0)).abs() < 1e-6 * cells[0], "{}", cells[0]);
         let sum: f64 = cells.iter().sum();
-        assert!(cells.len() == 2 * 21 && (sum - total.training_seconds - total.testing_seconds).abs() < 1e-6 * sum);
+        assert!(cells.len() == 2 * 21 && (sum - total.seconds()).abs() < 1e-6 * sum);
     }
 
     #[test]
@@ -208,13 +200,11 @@ mod tests {
             [[algorithm]]\nname = 'epopt-ppo'\narchitectures = ['ff']\nsettings = { epsilon = 0.1 }
             [[algorithm]]\nname = 'rl2-ppo'\narchitectures = ['rc']\nsettings = { episodes_per_trial = 5 }";
         let plan = Plan::parse("test", text.into()).unwrap();
-        let work = |cell: &Cell| {
-            let alone = Plan { cells: vec![cell.clone()], ..plan.clone() };
-            estimate(&alone, &[], |_| 1).work
-        };
+        let estimates = estimates(&plan, &[], &[("CartPole", 1)].into());
+        let steps = |cell: usize| (estimates[cell].training_steps, estimates[cell].testing_steps);
         // 100 iterations of 100 episodes, and a tenth of each that follows.
-        assert_eq!(work(&plan.cells[0]), Work { training_steps: 10_000.0 + 50_000.0, testing_steps: 10.0 });
-        assert_eq!(work(&plan.cells[1]), Work { training_steps: 15_000.0, testing_steps: 50.0 });
+        assert_eq!(steps(0), (10_000.0 + 50_000.0, 10.0));
+        assert_eq!(steps(1), (15_000.0, 50.0));
     }
 
     #[test]

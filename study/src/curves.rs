@@ -9,7 +9,7 @@ use super::plan::TrainedOn;
 use super::selection::MethodResults;
 use super::statistics::Summary;
 use super::table::Table;
-use crate::files::io;
+use crate::files::read_if_there;
 use crate::{Method, Version, mean};
 
 /// A point is a mean over at least so many episodes of each run …
@@ -94,13 +94,10 @@ fn read_runs(selection: &MethodResults<'_>, version: Version, folder: &Folder) -
 
 /// The episodes in the order in which they ended; none without a file.
 fn read_monitor(path: &Path) -> Result<Vec<Episode>, FolderError> {
-    if !path.exists() {
-        return Ok(Vec::new());
-    }
+    let Some(content) = read_if_there(path)? else { return Ok(Vec::new()) };
     let damaged = |error: csv::Error| FolderError::Damaged { path: path.to_owned(), reason: error.to_string() };
-    let file = std::fs::File::open(path).map_err(io("read", path))?;
-    let lines = csv::ReaderBuilder::new().comment(Some(b'#')).from_reader(file).into_deserialize();
-    lines.collect::<Result<_, _>>().map_err(damaged)
+    let mut reader = csv::ReaderBuilder::new().comment(Some(b'#')).from_reader(&content[..]);
+    reader.deserialize().collect::<Result<_, _>>().map_err(damaged)
 }
 
 /// Parts each run evenly, and averages each part over runs. What is averaged are equal shares of a training, since a
@@ -139,9 +136,9 @@ pub fn curves_table(all: &[EnvironmentCurves]) -> Table {
         .number("runs", |(.., point)| point.success.runs)
         .number("episodes", |(.., point)| point.episodes)
         .number("return_mean", |(.., point)| point.episode_return.mean)
-        .number("return_std", |(.., point)| point.episode_return.std)
+        .number("return_std", |(.., point)| point.episode_return.std.unwrap_or_default())
         .number("success_mean", |(.., point)| point.success.mean)
-        .number("success_std", |(.., point)| point.success.std)
+        .number("success_std", |(.., point)| point.success.std.unwrap_or_default())
         .build()
 }
 
@@ -163,8 +160,8 @@ mod tests {
         let second = episodes(43, |i| if i < 21 { (5.0, 1) } else { (5.0, 0) });
         let point = |episodes: f64, mean: f64, std: f64| Point {
             episodes,
-            episode_return: Summary { mean, std, runs: 2 },
-            success: Summary { mean: 50.0, std: 50.0, runs: 2 },
+            episode_return: Summary { mean, std: Some(std), runs: 2 },
+            success: Summary { mean: 50.0, std: Some(50.0), runs: 2 },
         };
         assert_eq!(points(&[(40, first), (40, second)]), [point(10.0, 3.0, 2.0), point(30.0, 4.0, 1.0)]);
     }

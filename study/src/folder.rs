@@ -90,13 +90,13 @@ pub struct CellResult {
 /// What was trained.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Training {
-    /// The environment.
+    /// By its name in the catalogue.
     pub environment: String,
-    /// Its revision.
+    /// As the server told it: a change of dynamics raises it.
     pub environment_revision: u32,
     /// SHA-256 of its model; empty without one.
     pub model_hash: String,
-    /// The training version.
+    /// Where parameters came from, but for those that the settings name.
     pub version: Version,
     /// The name of the plan's own set of parameters, if it was trained on one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -139,6 +139,7 @@ pub struct Timing {
 /// Why an experiment's folder cannot be read or written.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum FolderError {
     /// The operating system refused a file.
     #[error(transparent)]
@@ -146,17 +147,13 @@ pub enum FolderError {
     /// A file is damaged, or of a program that is too different.
     #[error("{} is not understood: {reason}; delete it to have the cell done again", path.display())]
     Damaged {
-        /// The file.
         path: PathBuf,
         /// What is wrong with it.
         reason: String,
     },
     /// There is no experiment.
     #[error("{} holds no experiment: expected plan.toml in it; give the --out of `perturb run`", path.display())]
-    NoPlan {
-        /// What was given.
-        path: PathBuf,
-    },
+    NoPlan { path: PathBuf },
 }
 
 type Result<T> = std::result::Result<T, FolderError>;
@@ -329,7 +326,7 @@ impl CellResult {
 }
 
 /// A JSON file; `None` if it is not there.
-fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
+pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
     let Some(text) = files::read_if_there(path)? else { return Ok(None) };
     let damaged = |error: serde_json::Error| FolderError::Damaged { path: path.to_owned(), reason: error.to_string() };
     serde_json::from_slice(&text).map(Some).map_err(damaged)

@@ -48,7 +48,7 @@ pub struct Axis {
 /// A policy's figures over two parameters.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Heatmap {
-    /// The environment.
+    /// By its name in the catalogue.
     pub environment: String,
     /// What was tested, e.g. "a2c ff, trained on D with seed 1".
     pub policy: String,
@@ -71,7 +71,7 @@ pub struct HeatmapPoint {
     pub y: f64,
     /// Undiscounted.
     pub mean_return: f64,
-    /// Successes, %.
+    /// Of the point's episodes.
     pub success_percent: f64,
 }
 

@@ -65,7 +65,7 @@ pub struct HeatmapRecord {
 pub struct StoredHeatmap {
     /// What it shows.
     pub record: HeatmapRecord,
-    /// The picture.
+    /// As it is in the file.
     pub png: Vec<u8>,
 }
 
@@ -168,11 +168,10 @@ pub fn store_heatmap(
 /// # Errors
 /// [`PlotError`].
 pub fn heatmap_files(heatmap: &Heatmap) -> Result<[(&'static str, Vec<u8>); 3], PlotError> {
-    let picture = plot::draw_heatmap(heatmap);
     Ok([
         ("csv", heatmap_table(heatmap).to_csv()),
-        ("svg", plot::svg(&picture)?.into_bytes()),
-        ("png", plot::png(&picture)?),
+        ("svg", plot::svg(heatmap)?.into_bytes()),
+        ("png", plot::png(heatmap)?),
     ])
 }
 

@@ -20,7 +20,6 @@ mod means;
 pub mod paper;
 mod plan;
 pub mod plot;
-pub mod random;
 pub mod records;
 pub mod report;
 mod results;
@@ -32,9 +31,10 @@ pub mod settings;
 mod statistics;
 pub mod success;
 pub mod table;
+mod value_error;
 mod verify;
 
-pub use cost::{Estimate, Measurement, Speed, Work, cell_seconds, estimate, representatives};
+pub use cost::{Estimate, Measurement, Speed, estimates, representatives};
 pub use curves::{Curve, EnvironmentCurves, Point, curves_table, read_curves};
 pub use folder::{CellFolder, CellResult, CellState, Failure, FailureMark, Folder, FolderError, Timing, Training};
 pub use heatmap::{Axis, Heatmap, HeatmapOptions, HeatmapPoint, MOST_POINTS, heatmap_table};
@@ -43,12 +43,16 @@ pub use heatmaps::{
 };
 pub use means::{geometric_mean, mean, wilson};
 pub use paper::Method;
-pub use plan::{Cell, Counts, Plan, PlanCheckError, PlanError, Tests, TrainedOn};
+pub use plan::{Cell, Counts, Plan, PlanError, Tests, TrainedOn};
 pub use results::{Counters, TestResult};
 pub use scenarios::{Metric, Scenario, Version};
 pub use selection::{MethodResults, Results, Selected, SelectedRun, average, interquartile};
 pub use statistics::{Iqm, Summary, interquartile_mean};
+pub use value_error::ValueError;
 pub use verify::{VerifyError, verify};
+
+/// Whatever went wrong, where its words are all that matters.
+pub type AnyError = Box<dyn std::error::Error + Send + Sync>;
 
 /// The version, and the commit that was built, e.g. "0.1.0 (1a2b3c4d5e6f)"; "-dirty" follows a commit whose files were
 /// changed.

@@ -5,11 +5,13 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::scenarios::Metric;
+use super::statistics::Summary;
 
 /// Every number of its tables.
 const TABLE: &str = include_str!("../data/paper_results.csv");
 /// What it averages over.
 const ENVIRONMENTS: usize = 6;
+const RUNS: usize = 5;
 
 /// An algorithm with its architecture and, of RL², the episodes in a trial: a row of the paper's tables.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -26,22 +28,6 @@ impl fmt::Display for Method {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} {}", self.algorithm, self.architecture)?;
         self.episodes_per_trial.map_or(Ok(()), |episodes| write!(f, " N={episodes}"))
-    }
-}
-
-/// Mean and standard deviation over the paper's five runs, %.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct PaperNumber {
-    /// Mean, %.
-    pub mean: f64,
-    /// Standard deviation, %; not known for averages over other environments than all of the paper's.
-    pub std: Option<f64>,
-}
-
-impl fmt::Display for PaperNumber {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{:.1}", self.mean)?;
-        self.std.map_or(Ok(()), |std| write!(f, " ± {std:.1}"))
     }
 }
 
@@ -66,19 +52,19 @@ impl Record {
 }
 
 /// The paper's number for a method in an environment; `None` if it has none. The environment "Average" is all six.
-pub fn number(environment: &str, method: &Method, metric: Metric) -> Option<PaperNumber> {
+pub fn number(environment: &str, method: &Method, metric: Metric) -> Option<Summary> {
     let record = records().find(|record| record.metric == metric && record.is_of(environment, method))?;
-    Some(PaperNumber { mean: record.mean_percent, std: Some(record.std_percent) })
+    Some(Summary { mean: record.mean_percent, std: Some(record.std_percent), runs: RUNS })
 }
 
 /// The paper's average over `environments`: the published one if they are all six, otherwise the mean of theirs.
-pub fn average(environments: &[&str], method: &Method, metric: Metric) -> Option<PaperNumber> {
+pub fn average(environments: &[&str], method: &Method, metric: Metric) -> Option<Summary> {
     let means: Option<Vec<f64>> = environments.iter().map(|name| Some(number(name, method, metric)?.mean)).collect();
     let means = means?;
     if means.len() == ENVIRONMENTS {
         return number("Average", method, metric);
     }
-    Some(PaperNumber { mean: means.iter().sum::<f64>() / means.len() as f64, std: None })
+    Some(Summary { mean: means.iter().sum::<f64>() / means.len() as f64, std: None, runs: RUNS })
 }
 
 fn records() -> impl Iterator<Item = Record> {

@@ -23,9 +23,9 @@ pub struct Counters {
 /// Figures over test episodes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TestResult {
-    /// Episodes tested.
+    /// Of RL², the last one of each trial.
     pub episodes: u64,
-    /// Successes, %.
+    /// The share of the episodes that were successes.
     pub success_percent: f64,
     /// The 95 % Wilson interval of `success_percent`, [low, high], %.
     pub success_percent_95: [f64; 2],

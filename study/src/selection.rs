@@ -16,7 +16,7 @@ use crate::{Method, Metric, Scenario, TestResult, Version, mean};
 /// What is known of a plan's cells.
 #[derive(Debug)]
 pub struct Results<'a> {
-    /// The plan.
+    /// What was asked for.
     pub plan: &'a Plan,
     /// By the cells' indices.
     pub states: Vec<CellState>,

@@ -1,12 +1,13 @@
 //! What a policy is tested on: a version of its environment, or parameters of one's own.
 
 use std::collections::BTreeMap;
-use std::fmt;
 use std::str::FromStr;
 
 use perturb_protocol::limits::DEFAULT_MAX_ENVS;
-use perturb_protocol::{Distribution, Version, proto};
+use perturb_protocol::{Distribution, DistributionError, Version, proto};
 use serde::{Deserialize, Serialize};
+
+use crate::value_error::{ValueError, require};
 
 /// The values that named parameters may take; the others keep their version's.
 pub type Parameters = BTreeMap<String, Distribution>;
@@ -35,24 +36,6 @@ pub enum Contexts {
     Drawn(Parameters),
     /// Each of these for equally many episodes: a grid, or the rows of a file.
     Listed(Vec<Context>),
-}
-
-/// Why something is no set.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{what} is {got}, but must be {expected}")]
-pub struct SetError {
-    /// Which part of which set.
-    pub what: String,
-    /// What was given.
-    pub got: String,
-    /// What is accepted.
-    pub expected: String,
-}
-
-impl SetError {
-    fn new(what: impl Into<String>, got: impl fmt::Display, expected: impl Into<String>) -> Self {
-        Self { what: what.into(), got: got.to_string(), expected: expected.into() }
-    }
 }
 
 impl From<Version> for TestSet {
@@ -89,8 +72,8 @@ impl TestSet {
     /// Whether `environment` has its parameters and accepts all of their values.
     ///
     /// # Errors
-    /// [`SetError`], which names the parameter and what is accepted.
-    pub fn check(&self, environment: &proto::Environment) -> Result<(), SetError> {
+    /// [`ValueError`], which names the parameter and what is accepted.
+    pub fn check(&self, environment: &proto::Environment) -> Result<(), ValueError> {
         match &self.contexts {
             Contexts::Drawn(parameters) => check(&self.name, parameters, environment),
             Contexts::Listed(contexts) => contexts.iter().try_for_each(|context| {
@@ -104,19 +87,18 @@ impl TestSet {
 /// Whether `environment` has these `parameters` and accepts all of their values; `set` names them in refusals.
 ///
 /// # Errors
-/// [`SetError`], which names the parameter and what is accepted.
-pub fn check(set: &str, parameters: &Parameters, environment: &proto::Environment) -> Result<(), SetError> {
+/// [`ValueError`], which names the parameter and what is accepted.
+pub fn check(set: &str, parameters: &Parameters, environment: &proto::Environment) -> Result<(), ValueError> {
     for (name, distribution) in parameters {
         let Some(known) = environment.parameters.iter().find(|parameter| parameter.name == *name) else {
             let names: Vec<&str> = environment.parameters.iter().map(|parameter| parameter.name.as_str()).collect();
             let what = format!("{set}: a parameter of {}", environment.name);
-            return Err(SetError::new(what, format!("`{name}`"), format!("one of {}", names.join(", "))));
+            return Err(ValueError::new(what, format!("`{name}`"), format!("one of {}", names.join(", "))));
         };
         let (low, high) = distribution.range();
-        if low < known.low || high > known.high {
-            let expected = format!("within {} … {} {}", known.low, known.high, known.unit);
-            return Err(SetError::new(format!("{set}: {name} of {}", environment.name), distribution, expected));
-        }
+        let what = format!("{set}: {name} of {}", environment.name);
+        let expected = format!("within {} … {} {}", known.low, known.high, known.unit);
+        require(low >= known.low && high <= known.high, what, distribution, expected)?;
     }
     Ok(())
 }
@@ -124,22 +106,21 @@ pub fn check(set: &str, parameters: &Parameters, environment: &proto::Environmen
 /// Refuses two sets of one name: results are told apart by it.
 ///
 /// # Errors
-/// [`SetError`], which names the set.
-pub fn distinct(sets: &[TestSet]) -> Result<(), SetError> {
-    let twice = |(index, set): (usize, &TestSet)| sets[..index].iter().any(|earlier| earlier.name == set.name);
-    match sets.iter().enumerate().find(|&place| twice(place)) {
-        Some((_, set)) => Err(SetError::new("a set's name", format!("`{}` twice", set.name), "another for each set")),
-        None => Ok(()),
-    }
+/// [`ValueError`], which names the set.
+pub fn distinct(sets: &[TestSet]) -> Result<(), ValueError> {
+    sets.iter().enumerate().try_for_each(|(index, TestSet { name, .. })| {
+        let is_new = sets[..index].iter().all(|earlier| earlier.name != *name);
+        require(is_new, "a set's name", format!("`{name}` twice"), "another for each set")
+    })
 }
 
 /// A parameter's part of a set, as it is written: `length=0.3..0.4,0.8..0.9`, `mass=0.1`, or the points of a grid,
 /// `length=0.1..1.0/10` or `length=0.1,0.2,0.5`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Assignment {
-    /// The parameter.
+    /// By its name in the catalogue.
     pub parameter: String,
-    /// Its values.
+    /// What it may be.
     pub values: Values,
 }
 
@@ -153,11 +134,11 @@ pub enum Values {
 }
 
 impl FromStr for Assignment {
-    type Err = SetError;
+    type Err = ValueError;
 
-    fn from_str(text: &str) -> Result<Self, SetError> {
+    fn from_str(text: &str) -> Result<Self, ValueError> {
         let expected = "PARAMETER=VALUES, e.g. length=0.3..0.4,0.8..0.9, mass=0.1 or length=0.1..1.0/10";
-        let wrong = || SetError::new("a set of parameters", format!("`{text}`"), expected);
+        let wrong = || ValueError::new("a set of parameters", format!("`{text}`"), expected);
         let (parameter, values) = text.split_once('=').ok_or_else(wrong)?;
         Ok(Self { parameter: parameter.trim().into(), values: Values::of(parameter.trim(), values.trim())? })
     }
@@ -165,26 +146,24 @@ impl FromStr for Assignment {
 
 impl Values {
     /// What `text` says of `parameter`.
-    fn of(parameter: &str, text: &str) -> Result<Self, SetError> {
+    fn of(parameter: &str, text: &str) -> Result<Self, ValueError> {
         if let Some((range, count)) = text.split_once('/') {
             return grid_points(parameter, text, range, count);
         }
         let points: Option<Vec<f64>> = text.split(',').map(|value| value.trim().parse().ok()).collect();
         match points {
             Some(points) if points.len() > 1 => finite(parameter, text, points).map(Self::Points),
-            _ => match text.parse() {
-                Ok(distribution) => Ok(Self::Drawn(distribution)),
-                Err(perturb_protocol::DistributionError { got, expected }) => {
-                    Err(SetError::new(parameter, got, expected))
-                }
-            },
+            _ => {
+                let refused = |error: DistributionError| ValueError::new(parameter, error.got, error.expected);
+                text.parse().map(Self::Drawn).map_err(refused)
+            }
         }
     }
 }
 
 /// `low..high/count`: so many points from `low` to `high`, both included.
-fn grid_points(parameter: &str, text: &str, range: &str, count: &str) -> Result<Values, SetError> {
-    let wrong = || SetError::new(parameter, format!("`{text}`"), "a grid such as 0.1..1.0/10, of at least 1 point");
+fn grid_points(parameter: &str, text: &str, range: &str, count: &str) -> Result<Values, ValueError> {
+    let wrong = || ValueError::new(parameter, format!("`{text}`"), "a grid such as 0.1..1.0/10, of at least 1 point");
     let (low, high) = range.split_once("..").ok_or_else(wrong)?;
     let number = |text: &str| text.trim().parse::<f64>().ok().filter(|number| number.is_finite()).ok_or_else(wrong);
     let (low, high) = (number(low)?, number(high)?);
@@ -194,46 +173,40 @@ fn grid_points(parameter: &str, text: &str, range: &str, count: &str) -> Result<
     finite(parameter, text, (0..count).map(|index| low + (high - low) * step(index)).collect()).map(Values::Points)
 }
 
-fn finite(parameter: &str, text: &str, points: Vec<f64>) -> Result<Vec<f64>, SetError> {
-    if points.iter().all(|point| point.is_finite()) {
-        return Ok(points);
-    }
-    Err(SetError::new(parameter, format!("`{text}`"), "finite numbers"))
+fn finite(parameter: &str, text: &str, points: Vec<f64>) -> Result<Vec<f64>, ValueError> {
+    require(points.iter().all(|point| point.is_finite()), parameter, format!("`{text}`"), "finite numbers")?;
+    Ok(points)
 }
 
 /// A set called `name` of what `assignments` say over `version`. With points, it is the grid of all their combinations,
 /// the first parameter varying fastest, and the other parameters of the set must have a single value.
 ///
 /// # Errors
-/// [`SetError`] for a parameter that is named twice, a grid with drawn parameters, or more contexts than one server
+/// [`ValueError`] for a parameter that is named twice, a grid with drawn parameters, or more contexts than one server
 /// takes.
-pub fn set_of(name: &str, version: Version, assignments: Vec<Assignment>) -> Result<TestSet, SetError> {
+pub fn set_of(name: &str, version: Version, assignments: Vec<Assignment>) -> Result<TestSet, ValueError> {
     let is_grid = assignments.iter().any(|assignment| matches!(assignment.values, Values::Points(_)));
     let mut drawn = Parameters::new();
     let mut contexts = vec![Context::new()];
     for Assignment { parameter, values } in assignments {
-        if drawn.contains_key(&parameter) || contexts[0].contains_key(&parameter) {
-            return Err(SetError::new(format!("{name}: {parameter}"), "given twice", "given once"));
-        }
+        let what = format!("{name}: {parameter}");
+        let is_new = !drawn.contains_key(&parameter) && !contexts[0].contains_key(&parameter);
+        require(is_new, &what, "given twice", "given once")?;
         let points = match values {
             Values::Drawn(distribution) if !is_grid => {
                 drawn.insert(parameter, distribution);
                 continue;
             }
-            Values::Drawn(distribution) => match distribution.range() {
-                (low, high) if low == high => vec![low],
-                _ => {
-                    let expected = "a value or points, like the grid's other parameters";
-                    return Err(SetError::new(format!("{name}: {parameter}"), distribution, expected));
-                }
-            },
+            Values::Drawn(distribution) => {
+                let (low, high) = distribution.range();
+                require(low == high, what, distribution, "a value or points, like the grid's other parameters")?;
+                vec![low]
+            }
             Values::Points(points) => points,
         };
         let count = contexts.len().saturating_mul(points.len());
-        if count > MOST_CONTEXTS {
-            let expected = format!("a grid of at most {MOST_CONTEXTS} points");
-            return Err(SetError::new(name, format!("{count} points"), expected));
-        }
+        let expected = format!("a grid of at most {MOST_CONTEXTS} points");
+        require(count <= MOST_CONTEXTS, name, format!("{count} points"), expected)?;
         let with = |point: &f64| {
             let add = |context: &Context| {
                 let mut context = context.clone();
@@ -251,10 +224,10 @@ pub fn set_of(name: &str, version: Version, assignments: Vec<Assignment>) -> Res
 /// A set called `name` of the rows of a CSV file: a header of parameters, then a row for each context.
 ///
 /// # Errors
-/// [`SetError`], which names the line.
-pub fn set_of_csv(name: &str, version: Version, text: &[u8]) -> Result<TestSet, SetError> {
+/// [`ValueError`], which names the line.
+pub fn set_of_csv(name: &str, version: Version, text: &[u8]) -> Result<TestSet, ValueError> {
     let mut reader = csv::Reader::from_reader(text);
-    let wrong = |error: csv::Error| SetError::new(name, error, "CSV: a header of parameters, then a row a context");
+    let wrong = |error: csv::Error| ValueError::new(name, error, "CSV: a header of parameters, then a row a context");
     let header = reader.headers().map_err(wrong)?.clone();
     let mut contexts = Vec::new();
     for (row, record) in reader.records().enumerate() {
@@ -262,18 +235,16 @@ pub fn set_of_csv(name: &str, version: Version, text: &[u8]) -> Result<TestSet, 
         let mut context = Context::new();
         for (parameter, value) in header.iter().zip(&record) {
             let number = value.trim().parse::<f64>().ok().filter(|number| number.is_finite());
-            let refuse =
-                || SetError::new(format!("{name}: {parameter} in line {}", row + 2), format!("`{value}`"), "a number");
-            if context.insert(parameter.trim().into(), number.ok_or_else(refuse)?).is_some() {
-                return Err(SetError::new(format!("{name}: the column {parameter}"), "there twice", "there once"));
-            }
+            let refuse = || {
+                ValueError::new(format!("{name}: {parameter} in line {}", row + 2), format!("`{value}`"), "a number")
+            };
+            let earlier = context.insert(parameter.trim().into(), number.ok_or_else(refuse)?);
+            require(earlier.is_none(), format!("{name}: the column {parameter}"), "there twice", "there once")?;
         }
         contexts.push(context);
     }
-    if !(1..=MOST_CONTEXTS).contains(&contexts.len()) {
-        let expected = format!("1 to {MOST_CONTEXTS} rows of parameters");
-        return Err(SetError::new(name, format!("{} rows", contexts.len()), expected));
-    }
+    let expected = format!("1 to {MOST_CONTEXTS} rows of parameters");
+    require((1..=MOST_CONTEXTS).contains(&contexts.len()), name, format!("{} rows", contexts.len()), expected)?;
     Ok(TestSet { name: name.into(), version, contexts: Contexts::Listed(contexts) })
 }
 
@@ -281,7 +252,7 @@ pub fn set_of_csv(name: &str, version: Version, text: &[u8]) -> Result<TestSet, 
 mod tests {
     use super::*;
 
-    fn set(texts: &[&str]) -> Result<TestSet, SetError> {
+    fn set(texts: &[&str]) -> Result<TestSet, ValueError> {
         let assignments = texts.iter().map(|text| text.parse()).collect::<Result<_, _>>()?;
         set_of("mine", Version::D, assignments)
     }

@@ -2,7 +2,7 @@
 
 use rand_chacha::ChaCha8Rng;
 
-use crate::random::{Purpose, stream, uniform};
+use perturb_policy::random::{Purpose, stream, uniform};
 
 /// Mean and deviation over runs.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -10,10 +10,10 @@ pub struct Summary {
     /// Arithmetic mean.
     pub mean: f64,
     /// Standard deviation with n in the denominator, not n - 1: that is what the paper's tables hold. Its 0.06 ± 0.12 %
-    /// over five runs of 1000 episodes can only be the rates 0.3, 0, 0, 0, 0, whose deviation with n - 1 were 0.13. 0 of
-    /// a single run, which says nothing: [`Summary::deviation`].
-    pub std: f64,
-    /// Runs.
+    /// over five runs of 1000 episodes can only be the rates 0.3, 0, 0, 0, 0, whose deviation with n - 1 were 0.13.
+    /// `None` of a single run, which has none, and where it is not known.
+    pub std: Option<f64>,
+    /// How many there are.
     pub runs: usize,
 }
 
@@ -26,26 +26,21 @@ impl Summary {
         let n = numbers.len() as f64;
         let mean = numbers.iter().sum::<f64>() / n;
         let variance = numbers.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / n;
-        Some(Self { mean, std: variance.sqrt(), runs: numbers.len() })
-    }
-
-    /// The standard deviation; `None` of a single run, which has none.
-    pub fn deviation(&self) -> Option<f64> {
-        (self.runs > 1).then_some(self.std)
+        Some(Self { mean, std: (numbers.len() > 1).then_some(variance.sqrt()), runs: numbers.len() })
     }
 }
 
 impl std::fmt::Display for Summary {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{:.1}", self.mean)?;
-        self.deviation().map_or(Ok(()), |std| write!(f, " ± {std:.1}"))
+        self.std.map_or(Ok(()), |std| write!(f, " ± {std:.1}"))
     }
 }
 
 /// An interquartile mean with its 95 % interval.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Iqm {
-    /// The interquartile mean.
+    /// The mean of the middle half of all scores.
     pub iqm: f64,
     /// 2.5th and 97.5th percentile of the bootstrap; `None` if no environment has a second run.
     pub interval_95: Option<[f64; 2]>,
@@ -114,7 +109,10 @@ mod tests {
     fn the_deviation_is_the_papers() {
         // RL²-A2C on CartPole: 0.06 ± 0.12 % Interpolation over five runs of 1000 episodes.
         let summary = Summary::of(&[0.3, 0.0, 0.0, 0.0, 0.0]).unwrap();
-        assert_eq!((format!("{:.2} ± {:.2}", summary.mean, summary.std), summary.runs), ("0.06 ± 0.12".into(), 5));
+        assert_eq!(
+            (format!("{:.2} ± {:.2}", summary.mean, summary.std.unwrap()), summary.runs),
+            ("0.06 ± 0.12".into(), 5)
+        );
         assert_eq!(Summary::of(&[]), None);
         assert_eq!(Summary::of(&[7.0]).unwrap().to_string(), "7.0", "one run does not deviate from itself");
         assert_eq!(Summary::of(&[7.0, 7.0]).unwrap().to_string(), "7.0 ± 0.0");

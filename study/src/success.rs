@@ -6,6 +6,8 @@ use std::str::FromStr;
 use perturb_protocol::proto;
 use serde::{Deserialize, Serialize};
 
+use crate::value_error::{ValueError, require};
+
 /// What is counted, not measured.
 const STEPS: &str = "steps";
 
@@ -47,15 +49,8 @@ pub struct Threshold {
     pub value: f64,
 }
 
-/// Why a threshold was refused.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("the success threshold is {got}, but must be {expected}")]
-pub struct ThresholdError {
-    /// What was given.
-    pub got: String,
-    /// What is accepted.
-    pub expected: String,
-}
+/// What a refusal calls a threshold.
+const THRESHOLD: &str = "the success threshold";
 
 impl Criterion {
     /// That of `environment`; `None` if its server does not say.
@@ -74,16 +69,12 @@ impl Criterion {
     /// The same with another threshold.
     ///
     /// # Errors
-    /// [`ThresholdError`] if that is one of another quantity.
-    pub fn with(&self, threshold: &Threshold) -> Result<Self, ThresholdError> {
-        if threshold.quantity != self.quantity {
-            let expected = format!("one of {}, e.g. {}={}", self.quantity, self.quantity, self.threshold);
-            return Err(ThresholdError { got: threshold.to_string(), expected });
-        }
-        if let Some(most) = self.most.filter(|&most| threshold.value > most) {
-            let expected = format!("at most {most}, the step limit");
-            return Err(ThresholdError { got: threshold.to_string(), expected });
-        }
+    /// [`ValueError`] if that is one of another quantity.
+    pub fn with(&self, threshold: &Threshold) -> Result<Self, ValueError> {
+        let expected = format!("one of {}, e.g. {}={}", self.quantity, self.quantity, self.threshold);
+        require(threshold.quantity == self.quantity, THRESHOLD, threshold, expected)?;
+        let most = self.most.unwrap_or(f64::INFINITY);
+        require(threshold.value <= most, THRESHOLD, threshold, format!("at most {most}, the step limit"))?;
         Ok(Self { threshold: threshold.value, ..self.clone() })
     }
 
@@ -100,11 +91,10 @@ impl Threshold {
     /// The criterion with this threshold; `own` is the environment's.
     ///
     /// # Errors
-    /// [`ThresholdError`] if it is one of another quantity, or if the server does not say what is compared.
-    pub fn of(&self, own: Option<&Criterion>) -> Result<Criterion, ThresholdError> {
+    /// [`ValueError`] if it is one of another quantity, or if the server does not say what is compared.
+    pub fn of(&self, own: Option<&Criterion>) -> Result<Criterion, ValueError> {
         let expected = "left out: the server does not say what its success rule compares";
-        let unknown = || ThresholdError { got: self.to_string(), expected: expected.into() };
-        own.ok_or_else(unknown)?.with(self)
+        own.ok_or_else(|| ValueError::new(THRESHOLD, self, expected))?.with(self)
     }
 }
 
@@ -126,10 +116,10 @@ impl fmt::Display for Threshold {
 }
 
 impl FromStr for Threshold {
-    type Err = ThresholdError;
+    type Err = ValueError;
 
-    fn from_str(text: &str) -> Result<Self, ThresholdError> {
-        let wrong = || ThresholdError { got: format!("`{text}`"), expected: "QUANTITY=NUMBER, e.g. steps=90".into() };
+    fn from_str(text: &str) -> Result<Self, ValueError> {
+        let wrong = || ValueError::new(THRESHOLD, format!("`{text}`"), "QUANTITY=NUMBER, e.g. steps=90");
         let (quantity, value) = text.split_once('=').ok_or_else(wrong)?;
         let value = value.trim().parse::<f64>().ok().filter(|value| value.is_finite()).ok_or_else(wrong)?;
         Ok(Self { quantity: quantity.trim().to_owned(), value })
@@ -137,9 +127,9 @@ impl FromStr for Threshold {
 }
 
 impl TryFrom<String> for Threshold {
-    type Error = ThresholdError;
+    type Error = ValueError;
 
-    fn try_from(text: String) -> Result<Self, ThresholdError> {
+    fn try_from(text: String) -> Result<Self, ValueError> {
         text.parse()
     }
 }

@@ -95,7 +95,7 @@ impl<'r, R> TableBuilder<'r, R> {
         self.column(Column { name: name.into(), group: None, is_number: true }, entry)
     }
 
-    /// Any column.
+    /// A column under a head that may belong to a group.
     pub fn column<E: Into<Entry>>(mut self, column: Column, entry: impl Fn(&'r R) -> E) -> Self {
         self.table.columns.push(column);
         for (row, source) in self.table.rows.iter_mut().zip(self.sources) {
@@ -104,7 +104,7 @@ impl<'r, R> TableBuilder<'r, R> {
         self
     }
 
-    /// The table.
+    /// With a row for each source.
     pub fn build(self) -> Table {
         self.table
     }

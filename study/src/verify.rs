@@ -8,6 +8,7 @@ use crate::selection::Results;
 /// Why results are not trusted.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum VerifyError {
     /// Recorded episodes cannot be read.
     #[error(transparent)]
@@ -19,11 +20,9 @@ pub enum VerifyError {
         file = records::FILE
     )]
     Test {
-        /// The cell's id.
         cell: String,
         /// The name of the set or version.
         test: String,
-        /// The figures in `result.json`.
         kept: Box<TestResult>,
         /// The figures of the episodes.
         recorded: Box<TestResult>,
@@ -33,10 +32,7 @@ pub enum VerifyError {
         "the result of cell {cell} does not follow from its recorded episodes: requested and applied parameters differ \
          otherwise; delete result.json to have the tests done again"
     )]
-    Agreement {
-        /// The cell's id.
-        cell: String,
-    },
+    Agreement { cell: String },
 }
 
 /// Computes every result again from its recorded episodes, where they are there; gives how many results have them.

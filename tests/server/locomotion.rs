@@ -14,6 +14,11 @@ fn stream(index: u64) -> Stream {
     Stream::new(7, 0, Purpose::InitialState, index)
 }
 
+/// A copy of the model that runs.
+fn model(walker: &Walker) -> Model {
+    walker.inspect(|simulation| simulation.model().try_clone()).unwrap().unwrap()
+}
+
 fn n_actions(walker: &Walker) -> usize {
     match walker.spec().action {
         ActionSpace::Continuous(channels) => channels.len(),
@@ -107,13 +112,13 @@ fn masses_are_those_of_the_geoms() {
     let torso_mass = |walker: &Walker| {
         let mut applied = [0.0; 4];
         walker.applied(&mut applied);
-        let torso = walker.model().id(Kind::Body, "torso").unwrap();
-        assert_eq!(applied[0], walker.model().body_mass()[torso]);
+        let model = model(walker);
+        assert_eq!(applied[0], model.body_mass()[model.id(Kind::Body, "torso").unwrap()]);
         applied[0]
     };
     close(torso_mass(&hopper().unwrap()), 3.665);
     let mut cheetah = half_cheetah().unwrap();
-    close(cheetah.model().body_mass().iter().sum(), 21.18);
+    close(model(&cheetah).body_mass().iter().sum(), 21.18);
     close(torso_mass(&cheetah), 9.457);
     let [power, _, friction] = defaults(&cheetah);
     for (density, mass) in [(500.0, 4.729), (1500.0, 14.186), (1000.0, 9.457)] {
@@ -138,7 +143,7 @@ fn an_edit_equals_compiling_the_edited_text() {
                 );
             }
             let compiled = Model::from_xml(&xml).unwrap().float_arrays();
-            let edited = walker.model().float_arrays();
+            let edited = walker.inspect(|simulation| simulation.model().float_arrays()).unwrap();
             assert_eq!(edited.len(), compiled.len());
             assert!(edited.iter().any(|array| array.name == "stat"));
             for (a, b) in edited.iter().zip(&compiled) {
@@ -162,7 +167,7 @@ fn an_edit_equals_compiling_the_edited_text() {
 fn felt_friction(walker: &mut Walker, friction: f64) -> f64 {
     let [power, density, _] = defaults(walker);
     walker.set_parameters(&[power, density, friction]);
-    let mut simulation = Simulation::new(walker.model().try_clone().unwrap()).unwrap();
+    let mut simulation = Simulation::new(model(walker)).unwrap();
     simulation.qvel_mut()[0] = 6.0;
     simulation.step1().unwrap();
     let momentum = |simulation: &Simulation| {
@@ -219,8 +224,8 @@ fn density_and_power_change_what_happens() {
 
 /// Poses and contacts of a saved state, computed anew.
 fn recomputed(walker: &Walker, save: &[f64]) -> Simulation {
-    let mut simulation = Simulation::new(walker.model().try_clone().unwrap()).unwrap();
-    let (n_q, n_v) = (walker.model().n_q(), walker.model().n_v());
+    let mut simulation = Simulation::new(model(walker)).unwrap();
+    let (n_q, n_v) = (simulation.model().n_q(), simulation.model().n_v());
     simulation.qpos_mut().copy_from_slice(&save[2..2 + n_q]);
     simulation.qvel_mut().copy_from_slice(&save[2 + n_q..2 + n_q + n_v]);
     simulation.step1().unwrap();

@@ -18,6 +18,8 @@ mod pool;
 mod reference;
 mod rendering;
 mod restoring;
+#[cfg(feature = "mujoco")]
+mod sharing;
 mod streams;
 mod success;
 mod toy;

@@ -1,14 +1,18 @@
-//! Snapshots that earlier servers took can be restored: what follows is what would have followed there.
+//! Snapshots that earlier servers took can be restored, unless their environment has another revision now. Each is of seed
+//! 77 and index 0 in version R, after 20 steps, as the server of commit 886bf00 saved it.
 
-use crate::common::server::{self, Actor, Server, Session, open};
+#[cfg(feature = "mujoco")]
+use crate::common::server::{Actor, environment};
+use crate::common::server::{Server, Session, open, refusal};
+use bytes::Bytes;
+use perturb::proto::Restore;
+#[cfg(feature = "mujoco")]
 use perturb::proto::{SessionResponse, session_response::Response};
-use rstest::rstest;
 
-/// The environment of seed 77 and index 0 in version R, after 20 steps, as the server of commit 886bf00 saved it.
-const STEPS: u64 = 20;
 const SEED: u64 = 77;
 
 /// The first episode's end without what it achieved: an old snapshot of a robot does not say how far it had come.
+#[cfg(feature = "mujoco")]
 fn forget(mut responses: Vec<SessionResponse>) -> Vec<SessionResponse> {
     let steps = responses.iter_mut().filter_map(|response| match &mut response.response {
         Some(Response::Stepped(stepped)) => Some(stepped),
@@ -18,19 +22,31 @@ fn forget(mut responses: Vec<SessionResponse>) -> Vec<SessionResponse> {
     responses
 }
 
-#[rstest]
-#[case("CartPole", include_bytes!("data/snapshots/CartPole"))]
-#[cfg_attr(feature = "mujoco", case("Hopper", include_bytes!("data/snapshots/Hopper")))]
+#[cfg(feature = "mujoco")]
 #[tokio::test]
-async fn what_follows_an_old_snapshot_is_what_follows_without_one(#[case] name: &str, #[case] snapshot: &'static [u8]) {
+async fn what_follows_an_old_snapshot_is_what_follows_without_one() {
+    const STEPS: u64 = 20;
     let server = Server::start(&[]);
-    let environment = server::environment(server.unix(), name).await;
-    let actor = Actor::new(&environment, 1);
-    let (mut played, _) = Session::open(server.unix(), open(name, 1, SEED)).await;
+    let hopper = environment(server.unix(), "Hopper").await;
+    let actor = Actor::new(&hopper, 1);
+    let (mut played, _) = Session::open(server.unix(), open("Hopper", 1, SEED)).await;
     played.play(actor, 0, STEPS).await;
 
-    let (mut restored, _) = Session::open(server.unix(), open(name, 1, 1)).await;
-    restored.restore(&[], vec![snapshot.into()]).await;
+    let (mut restored, _) = Session::open(server.unix(), open("Hopper", 1, 1)).await;
+    restored.restore(&[], vec![Bytes::from_static(include_bytes!("data/snapshots/Hopper"))]).await;
     assert_eq!(forget(restored.play(actor, STEPS, 400).await), forget(played.play(actor, STEPS, 400).await));
     assert_eq!(restored.snapshot(&[]).await, played.snapshot(&[]).await);
+}
+
+#[tokio::test]
+async fn an_old_snapshot_of_another_revision_is_refused_and_changes_nothing() {
+    let server = Server::start(&[]);
+    let (mut session, _) = Session::open(server.unix(), open("CartPole", 1, SEED)).await;
+    let before = session.snapshot(&[]).await;
+    let old = Bytes::from_static(include_bytes!("data/snapshots/CartPole"));
+    let refused = session.refused(Restore { mask: Bytes::new(), snapshots: vec![old] }).await;
+    let expected = "InvalidArgument: the snapshot cannot be restored: it is of CartPole-v0, this is CartPole-v1; take a new \
+                    one from a session of the same environment\n";
+    assert_eq!(refusal(refused), expected);
+    assert_eq!(session.snapshot(&[]).await, before);
 }

@@ -1,15 +1,20 @@
 //! What can be typed.
 
+use std::fmt::Display;
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
+use std::str::FromStr;
 
 use clap::{Args, Parser, Subcommand};
 
 use perturb_learner::client::Address;
-use perturb_study::Version;
 use perturb_study::scheduler::slurm::TimeLimit;
 use perturb_study::sets::Assignment;
 use perturb_study::settings::{Architecture, Settings};
 use perturb_study::success::Threshold;
+use perturb_study::{MOST_POINTS, Version};
+
+use crate::video::PIXELS;
 
 /// Trains policies over environment servers and tests whether they still work when the physics changes.
 #[derive(Debug, Parser)]
@@ -101,6 +106,9 @@ pub(super) struct TrainArgs {
     /// Delete the run that is in --out already.
     #[arg(long)]
     pub(super) overwrite: bool,
+    /// Threads of an update; their number changes no byte [default: one a core].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=64))]
+    pub(super) threads: Option<u16>,
     /// A TOML file of settings, e.g. the config.toml of an earlier run.
     #[arg(long, value_name = "FILE")]
     pub(super) config: Option<PathBuf>,
@@ -139,7 +147,8 @@ pub(super) struct EvaluateArgs {
     /// other thresholds, pandas and polars read it.
     #[arg(long, value_name = "FILE")]
     pub(super) records: Option<PathBuf>,
-    /// Episodes to test on each version or set; a grid or a list has at least one in each of its contexts. Of a policy trained with RL² trials, of each of which the last episode counts.
+    /// Episodes to test on each version or set; a grid or a list has at least one in each of its contexts. Of a policy
+    /// trained with RL² trials, of each of which the last episode counts.
     #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u64).range(1..))]
     pub(super) episodes: u64,
     /// Fixes the tests' randomness; its environments differ from those of any training, also with the same number
@@ -171,8 +180,7 @@ pub(super) struct SetArgs {
 #[derive(Args, Debug)]
 pub(super) struct AuditArgs {
     /// The --out of `perturb run`, the folder of one of its cells, or the --records of `perturb evaluate`.
-    #[arg(value_name = "DIR")]
-    pub(super) path: PathBuf,
+    pub(super) dir: PathBuf,
     /// The checkpoint that was tested, for a file of records: the --out of its training, or the checkpoint folder in it.
     #[arg(long, value_name = "DIR")]
     pub(super) checkpoint: Option<PathBuf>,
@@ -189,8 +197,7 @@ pub(super) struct AuditArgs {
 #[derive(Args, Debug)]
 pub(super) struct RatesArgs {
     /// The folder of a cell of `perturb run`, or the --records of `perturb evaluate`.
-    #[arg(value_name = "FILE")]
-    pub(super) path: PathBuf,
+    pub(super) file: PathBuf,
     /// Thresholds of success to judge the recorded episodes by, e.g. --success steps=80 steps=90 [default: the one that
     /// they were tested with].
     #[arg(long, value_name = "QUANTITY=NUMBER", num_args = 1..)]
@@ -218,7 +225,6 @@ pub(super) struct DemoArgs {
 #[derive(Args, Debug)]
 pub(super) struct PlanArgs {
     /// An experiment file, e.g. experiments/paper.toml.
-    #[arg(value_name = "FILE")]
     pub(super) file: PathBuf,
     /// List the cells with their indices and ids.
     #[arg(long)]
@@ -239,7 +245,6 @@ pub(super) struct PlanArgs {
 #[derive(Args, Debug)]
 pub(super) struct RunArgs {
     /// An experiment file, e.g. experiments/quick.toml.
-    #[arg(value_name = "PLAN")]
     pub(super) plan: PathBuf,
     /// Directory of the results; what is done there already is kept.
     #[arg(long, value_name = "DIR")]
@@ -299,7 +304,6 @@ pub(super) enum Engine {
 #[derive(Args, Debug)]
 pub(super) struct ReportArgs {
     /// The --out of `perturb run`; tables go to its folder report/.
-    #[arg(value_name = "DIR")]
     pub(super) dir: PathBuf,
     /// Also write everything, with training curves and the heatmaps of `perturb heatmap`, as one HTML page that needs
     /// nothing else.
@@ -310,7 +314,6 @@ pub(super) struct ReportArgs {
 #[derive(Args, Debug)]
 pub(super) struct CurvesArgs {
     /// The --out of `perturb run`.
-    #[arg(value_name = "DIR")]
     pub(super) dir: PathBuf,
     /// Where the pictures go [default: DIR/report].
     #[arg(long, value_name = "DIR")]
@@ -348,7 +351,7 @@ pub(super) struct HeatmapArgs {
     )]
     pub(super) records: Option<PathBuf>,
     /// Points along each axis, at most 100.
-    #[arg(long, value_name = "N", default_value_t = 40, value_parser = points)]
+    #[arg(long, value_name = "N", default_value_t = 40, value_parser = |text: &str| within(text, 1..=MOST_POINTS))]
     pub(super) grid: usize,
     /// Episodes at each point.
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..))]
@@ -386,39 +389,25 @@ pub(super) struct VideoArgs {
     #[arg(long, value_name = "N")]
     pub(super) seed: Option<u64>,
     /// Width of the pictures, 240 to 2048 pixels.
-    #[arg(long, value_name = "PIXELS", default_value_t = 480, value_parser = pixels)]
+    #[arg(long, value_name = "PIXELS", default_value_t = 480, value_parser = |text: &str| within(text, PIXELS))]
     pub(super) width: u32,
     /// Height of the pictures, 240 to 2048 pixels; the text below them comes in addition.
-    #[arg(long, value_name = "PIXELS", default_value_t = 480, value_parser = pixels)]
+    #[arg(long, value_name = "PIXELS", default_value_t = 480, value_parser = |text: &str| within(text, PIXELS))]
     pub(super) height: u32,
     /// Steps shown in a second, 0.1 to 1000 [default: as many as the environment simulates in one: real time].
-    #[arg(long, value_name = "N", value_parser = frames_per_second)]
+    #[arg(long, value_name = "N", value_parser = |text: &str| within(text, 0.1..=1000.0))]
     pub(super) fps: Option<f64>,
     #[command(flatten)]
     pub(super) server: ServerArgs,
 }
 
-fn pixels(text: &str) -> Result<u32, String> {
-    let (least, most) = (crate::video::SMALLEST, crate::video::LARGEST);
-    let number = text.parse().ok().filter(|number| (least..=most).contains(number));
-    number.ok_or_else(|| format!("expected {least} to {most}"))
+fn within<T: FromStr + PartialOrd + Display>(text: &str, range: RangeInclusive<T>) -> Result<T, String> {
+    let number = text.parse().ok().filter(|number| range.contains(number));
+    number.ok_or_else(|| format!("expected {} to {}", range.start(), range.end()))
 }
 
-fn frames_per_second(text: &str) -> Result<f64, String> {
-    let number = text.parse().ok().filter(|number| (0.1..=1000.0).contains(number));
-    number.ok_or_else(|| "expected 0.1 to 1000".into())
-}
-
-fn points(text: &str) -> Result<usize, String> {
-    let most = perturb_study::MOST_POINTS;
-    text.parse().ok().filter(|number| (1..=most).contains(number)).ok_or_else(|| format!("expected 1 to {most}"))
-}
-
-fn at_least_one(text: &str) -> Result<usize, String> {
-    match text.parse() {
-        Ok(0) | Err(_) => Err("expected a whole number, at least 1".into()),
-        Ok(number) => Ok(number),
-    }
+fn at_least_one(text: &str) -> Result<usize, &'static str> {
+    text.parse().ok().filter(|number| *number > 0).ok_or("expected a whole number, at least 1")
 }
 
 #[cfg(test)]
@@ -435,7 +424,7 @@ mod tests {
         let refused: Vec<&str> =
             train.get_arg_conflicts_with(of("resume")).iter().map(|argument| argument.get_id().as_str()).collect();
         for argument in train.get_arguments().map(|argument| argument.get_id().as_str()) {
-            let accepted = ["resume", "server", "workers", "help"].contains(&argument);
+            let accepted = ["resume", "server", "workers", "threads", "help"].contains(&argument);
             assert_ne!(refused.contains(&argument), accepted, "--{argument}");
         }
     }

@@ -2,6 +2,7 @@
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::process::ExitCode;
 
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::Servers;
@@ -14,7 +15,7 @@ use super::args::AuditArgs;
 use super::display::Display;
 use super::error::{CommandError, Result, system};
 use super::rates::file_in;
-use super::{Ending, servers};
+use super::servers;
 
 /// So many differences are told of each policy.
 const SHOWN: usize = 3;
@@ -26,7 +27,7 @@ struct Tested {
     checkpoint: PathBuf,
 }
 
-pub(super) fn run(args: &AuditArgs) -> Result<Ending> {
+pub(super) fn run(args: &AuditArgs) -> Result<ExitCode> {
     let tested = tested(args)?;
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = servers(&args.server)?;
@@ -52,7 +53,7 @@ pub(super) fn run(args: &AuditArgs) -> Result<Ending> {
     }
     let recorded = if tested.len() == 1 { "1 policy".to_owned() } else { format!("{} policies", tested.len()) };
     writeln!(out, "{} of {played} episodes of {recorded} have the same bytes", played - different)?;
-    Ok(if different + unusable == 0 { Ending::Done } else { Ending::Status(1) })
+    Ok(if different + unusable == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
 impl Tested {
@@ -67,7 +68,7 @@ impl Tested {
 
 /// Whatever `args` names.
 fn tested(args: &AuditArgs) -> Result<Vec<Tested>> {
-    let path = &args.path;
+    let path = &args.dir;
     let cell = |path: &Path| Tested {
         name: path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
         records: path.join(FILE),

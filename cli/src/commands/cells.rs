@@ -1,32 +1,30 @@
 //! Doing a plan's cells, whatever does them.
 
-use super::Ending;
 use super::args::RunArgs;
 use super::display::Display;
 use super::error::{CommandError, Result};
 use super::report;
+use super::signal_code;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::scheduler::{Backend, Report, RunEnd, RunError, run as run_cells, write_line};
+use perturb_study::scheduler::{Announcement, Backend, RunEnd, run as run_cells, write_line};
 use perturb_study::{Folder, Plan};
+use std::process::ExitCode;
 
 /// Has `backend` do all cells, shows how far that is, and says how it ended.
-pub(super) fn do_cells<B: Backend>(
+pub(super) fn do_cells(
     args: &RunArgs,
     plan: &Plan,
     folder: &Folder,
-    backend: &mut B,
+    backend: &mut dyn Backend,
     stop: &StopFlag,
-) -> Result<Ending>
-where
-    CommandError: From<RunError<B::Error>>,
-{
+) -> Result<ExitCode> {
     keep_plan(args, plan, folder)?;
     let mut display = Display::of_cells(plan.cells.len());
-    let mut report = |report: Report<'_>| match report {
-        Report::Status(status) => display.cells(status),
-        Report::Note(sentence) => display.say(sentence),
-        Report::Line(line) if args.json => write_line(&mut std::io::stdout(), line),
-        Report::Line(_) => {}
+    let mut report = |report: Announcement<'_>| match report {
+        Announcement::Status(status) => display.cells(status),
+        Announcement::Note(sentence) => display.say(sentence),
+        Announcement::Line(line) if args.json => write_line(&mut std::io::stdout(), line),
+        Announcement::Line(_) => {}
     };
     let end = run_cells(plan, folder, backend, args.retry_failed, stop, &mut report);
     drop(display);
@@ -38,7 +36,7 @@ where
             if !left.is_empty() {
                 eprintln!("Slurm job {jobs} runs meanwhile, and is watched again then; to end it: scancel {jobs}");
             }
-            return Ok(Ending::Signal(signal));
+            return Ok(signal_code(signal));
         }
     };
     if let Some(page) = &args.html {
@@ -47,7 +45,7 @@ where
     }
     let Some(first) = failed.first() else {
         eprintln!("all {} cells are done; perturb report {}", plan.cells.len(), folder.path().display());
-        return Ok(Ending::Done);
+        return Ok(ExitCode::SUCCESS);
     };
     Err(CommandError::Failed(format!(
         "{} of {} cells failed, the first is {first}: see {} for the reason, and use --retry-failed to try again",

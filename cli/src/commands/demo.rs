@@ -3,19 +3,20 @@
 use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::Path;
+use std::process::ExitCode;
 use std::time::Instant;
 
 use super::args::DemoArgs;
 use super::display::Display;
 use super::error::{Result, system};
 use super::train::describe;
-use super::{Ending, servers};
+use super::{servers, signal_code, threads};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::Servers;
 use perturb_learner::evaluation::test;
 use perturb_learner::training::{Outcome, RunDirectory, train};
 use perturb_study::interrupt::StopFlag;
-use perturb_study::settings::{Sources, TrainConfig};
+use perturb_study::settings::TrainConfig;
 use perturb_study::table::Table;
 use perturb_study::{Method, Metric, Scenario, Version, paper};
 
@@ -24,7 +25,7 @@ const PAPER_EPISODES: u64 = 15_000;
 const PAPER_TEST_EPISODES: u64 = 1000;
 const ENVIRONMENT: &str = "CartPole";
 
-pub(super) fn run(args: &DemoArgs) -> Result<Ending> {
+pub(super) fn run(args: &DemoArgs) -> Result<ExitCode> {
     let start = Instant::now();
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = servers(&args.server)?;
@@ -40,7 +41,7 @@ pub(super) fn run(args: &DemoArgs) -> Result<Ending> {
         let outcome = train_on(&servers, args, version, &directory.join(version.to_string()), &stop)?;
         if let Some(number) = outcome.signal {
             eprintln!("stopped by signal {number}");
-            return Ok(Ending::Signal(number));
+            return Ok(signal_code(number));
         }
         for test in Version::ALL {
             let rate = success_percent(&servers, args, &outcome.checkpoint, test, &stop)?;
@@ -53,7 +54,7 @@ pub(super) fn run(args: &DemoArgs) -> Result<Ending> {
     if let Some(kept) = &args.out {
         writeln!(out, "the runs are kept in {}", kept.display())?;
     }
-    Ok(Ending::Done)
+    Ok(ExitCode::SUCCESS)
 }
 
 fn budget(out: &mut impl Write, what: &str, episodes: u64, paper: u64) -> std::io::Result<()> {
@@ -78,11 +79,11 @@ fn train_on(
         format!("episodes={}", args.episodes),
         format!("seed={}", args.seed),
     ];
-    let config = TrainConfig::load(&Sources { sets: &settings, ..Sources::default() })?;
+    let config = TrainConfig::load(None, &settings, toml::Table::new())?;
     let directory = RunDirectory::choose(directory, false)?;
     let start = Instant::now();
     let mut display = Display::of_episodes(describe(&config), args.episodes);
-    let outcome = train(servers, &config, &directory, stop, |progress| display.training(progress))?;
+    let outcome = train(servers, &config, &directory, threads(None), stop, |progress| display.training(progress))?;
     drop(display);
     let (progress, seconds) = (&outcome.progress, start.elapsed().as_secs_f64());
     writeln!(

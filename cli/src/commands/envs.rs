@@ -6,21 +6,21 @@ use perturb_protocol::catalogue;
 
 use super::args::EnvsArgs;
 use super::error::Result;
-use super::{Ending, servers};
+use super::servers;
 use perturb_learner::proto::{Channel, Distribution, Environment, action_space::Kind};
 use perturb_study::table::Table;
 
-pub(super) fn run(args: &EnvsArgs) -> Result<Ending> {
+pub(super) fn run(args: &EnvsArgs) -> Result<()> {
     let catalogue = servers(&args.server)?.catalogue()?;
     let mut out = std::io::stdout().lock();
     if args.json {
         writeln!(out, "{:#}", catalogue::to_json(&catalogue))?;
-        return Ok(Ending::Done);
+        return Ok(());
     }
     for environment in &catalogue.environments {
         print(&mut out, environment)?;
     }
-    Ok(Ending::Done)
+    Ok(())
 }
 
 fn print(out: &mut impl Write, environment: &Environment) -> std::io::Result<()> {

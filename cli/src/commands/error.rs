@@ -11,10 +11,8 @@ use perturb_study::plot::PlotError;
 use perturb_study::records::RecordsError;
 use perturb_study::scheduler::RunError;
 use perturb_study::scheduler::slurm::{OptionError, SlurmError};
-use perturb_study::sets::SetError;
 use perturb_study::settings::ConfigError;
-use perturb_study::success::ThresholdError;
-use perturb_study::{FolderError, PlanCheckError, PlanError, VerifyError};
+use perturb_study::{FolderError, PlanError, ValueError, VerifyError};
 
 use crate::video::VideoError;
 
@@ -57,26 +55,19 @@ pub(super) enum CommandError {
     #[error(transparent)]
     Plan(#[from] PlanError),
     #[error(transparent)]
-    PlanCheck(#[from] PlanCheckError),
-    #[error(transparent)]
     Plot(#[from] PlotError),
     #[error(transparent)]
     Records(#[from] RecordsError),
     #[error(transparent)]
-    Run(#[from] RunError<FileError>),
-    /// Cells were not all done by Slurm.
-    #[error(transparent)]
-    SlurmRun(#[from] RunError<SlurmError>),
-    #[error(transparent)]
-    Set(#[from] SetError),
+    Run(#[from] RunError),
     #[error(transparent)]
     Slurm(#[from] SlurmError),
     #[error(transparent)]
     Test(#[from] TestError),
     #[error(transparent)]
-    Threshold(#[from] ThresholdError),
-    #[error(transparent)]
     Train(#[from] TrainError),
+    #[error(transparent)]
+    Value(#[from] ValueError),
     #[error(transparent)]
     Verify(#[from] VerifyError),
     #[error(transparent)]
@@ -104,8 +95,7 @@ impl CommandError {
                 | Self::Config(_)
                 | Self::Option(_)
                 | Self::Plan(_)
-                | Self::Set(_)
-                | Self::Threshold(_)
+                | Self::Value(_)
                 | Self::Video(VideoError::Extension { .. })
         )
     }

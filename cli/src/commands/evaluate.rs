@@ -7,7 +7,7 @@ use serde_json::{Map, Value, json};
 use super::args::EvaluateArgs;
 use super::display::Display;
 use super::error::{Result, system};
-use super::{Ending, servers, sets};
+use super::{servers, sets};
 use perturb_learner::checkpoint::{Checkpoint, State};
 use perturb_learner::evaluation::{TestOptions, Tester};
 use perturb_study::TestResult;
@@ -17,7 +17,7 @@ use perturb_study::sets::TestSet;
 use perturb_study::settings::TrainConfig;
 use perturb_study::table::Table;
 
-pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
+pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
     let checkpoint = Checkpoint::load(&args.checkpoint)?;
     let sets = sets::tested(&args.versions, &args.set)?;
     let seed = args.seed.unwrap_or(checkpoint.state.config.common.seed);
@@ -67,7 +67,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<Ending> {
         common.seed,
         table.build().to_text()
     )?;
-    Ok(Ending::Done)
+    Ok(())
 }
 
 /// The result as JSON: who was tested, and the figures of each set.

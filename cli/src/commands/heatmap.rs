@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use super::args::HeatmapArgs;
 use super::display::Display;
 use super::error::{CommandError, Result, system};
-use super::{Ending, servers, sets};
+use super::{servers, sets};
 use perturb_learner::checkpoint::{Checkpoint, State};
 use perturb_learner::client::Servers;
 use perturb_learner::evaluation::{heatmap, heatmap_again};
@@ -15,13 +15,13 @@ use perturb_protocol::{Distribution, Version};
 use perturb_study::files::write_atomically;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::Records;
+use perturb_study::sets::Context;
 use perturb_study::settings::{Common, TrainConfig};
 use perturb_study::{
-    Folder, Heatmap, HeatmapOptions, HeatmapPlace, NoHeatmap, Plan, Results, Selected, heatmap_files, heatmap_places,
-    store_heatmap,
+    Folder, Heatmap, HeatmapOptions, NoHeatmap, Plan, Results, Selected, heatmap_files, heatmap_places, store_heatmap,
 };
 
-pub(super) fn run(args: &HeatmapArgs) -> Result<Ending> {
+pub(super) fn run(args: &HeatmapArgs) -> Result<()> {
     match (&args.dir, &args.checkpoint) {
         (Some(directory), _) => of_experiment(args, directory),
         (None, Some(checkpoint)) => of_checkpoint(args, checkpoint),
@@ -30,7 +30,7 @@ pub(super) fn run(args: &HeatmapArgs) -> Result<Ending> {
 }
 
 /// Of one policy.
-fn of_checkpoint(args: &HeatmapArgs, path: &Path) -> Result<Ending> {
+fn of_checkpoint(args: &HeatmapArgs, path: &Path) -> Result<()> {
     let checkpoint = Checkpoint::load(path)?;
     let state = &checkpoint.state;
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
@@ -54,18 +54,16 @@ fn of_checkpoint(args: &HeatmapArgs, path: &Path) -> Result<Ending> {
     let path = args.out.clone().unwrap_or_else(|| default_path(state, &options.parameters));
     let mut out = std::io::stdout();
     if let Some(records) = records {
-        let mut name = path.clone().into_os_string();
-        name.push(".parquet");
-        records.write(Path::new(&name))?;
-        writeln!(out, "{}", Path::new(&name).display())?;
+        let path = path.with_added_extension("parquet");
+        records.write(&path)?;
+        writeln!(out, "{}", path.display())?;
     }
     for (ending, content) in heatmap_files(&heatmap)? {
-        let mut name = path.clone().into_os_string();
-        name.push(format!(".{ending}"));
-        write_atomically(Path::new(&name), &content)?;
-        writeln!(out, "{}", Path::new(&name).display())?;
+        let path = path.with_added_extension(ending);
+        write_atomically(&path, &content)?;
+        writeln!(out, "{}", path.display())?;
     }
-    Ok(Ending::Done)
+    Ok(())
 }
 
 /// The two parameters over which an environment's heatmaps are unless others are asked for.
@@ -74,7 +72,7 @@ fn usual_axes(environment: &proto::Environment) -> Option<[String; 2]> {
 }
 
 /// The values of other parameters.
-fn fixed(args: &HeatmapArgs) -> Result<sets::Fixed> {
+fn fixed(args: &HeatmapArgs) -> Result<Context> {
     let value = |(name, values): (String, Distribution)| match values.range() {
         (low, high) if low == high => Ok((name, low)),
         _ => Err(CommandError::Usage(format!(
@@ -93,7 +91,7 @@ fn default_path(state: &State, [x, y]: &[String; 2]) -> PathBuf {
 }
 
 /// Of everything that was selected in the first run of an experiment, unless it is there already.
-fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<Ending> {
+fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<()> {
     let folder = Folder::new(directory);
     let plan = Plan::load(&folder.require_plan()?)?;
     let results = Results::read(&plan, &folder)?;
@@ -125,7 +123,7 @@ fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<Ending> {
             }
         };
         let options = options(args, parameters, &checkpoint.state);
-        if is_there(place, &folder, &options)? {
+        if place.read(&folder)?.is_ok_and(|heatmap| heatmap.record.options == options) {
             eprintln!("{place}: is there already");
             continue;
         }
@@ -140,7 +138,7 @@ fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<Ending> {
     if failed > 0 {
         return Err(CommandError::Failed(format!("{failed} of {} heatmaps could not be made", places.len())));
     }
-    Ok(Ending::Done)
+    Ok(())
 }
 
 /// The checkpoint that a result comes from.
@@ -154,18 +152,13 @@ fn checkpoint_of(folder: &Folder, Selected { cell, result }: Selected<'_>) -> Re
     Ok(checkpoint)
 }
 
-/// Whether there is a heatmap of the current result, made like this.
-fn is_there(place: &HeatmapPlace<'_>, folder: &Folder, options: &HeatmapOptions) -> Result<bool> {
-    Ok(place.read(folder)?.is_ok_and(|heatmap| heatmap.record.options == *options))
-}
-
 fn options(args: &HeatmapArgs, parameters: [String; 2], state: &State) -> HeatmapOptions {
     HeatmapOptions {
         parameters,
         grid: args.grid,
         episodes: args.episodes,
         seed: args.seed.unwrap_or(state.config.common.seed),
-        fixed: sets::Fixed::new(),
+        fixed: Context::new(),
     }
 }
 

@@ -1,9 +1,8 @@
 //! The command line: `perturb envs | train | evaluate | demo | plan | run | report | curves |
 //! heatmap | video | audit | rates`.
 //!
-//! Results go to standard output, everything else to standard error. Exit status: 0 done, 1 failed (of `audit`: an episode came out
-//! otherwise, too), 2 wrong usage, 128 +
-//! the signal's number if Ctrl-C or SIGTERM ended it.
+//! Results go to standard output, everything else to standard error. Exit status: 0 done, 1 failed (of `audit`: an
+//! episode came out otherwise, too), 2 wrong usage, 128 + the signal's number if Ctrl-C or SIGTERM ended it.
 
 mod args;
 mod audit;
@@ -33,16 +32,6 @@ use args::{Cli, Command, ServerArgs};
 use error::{CommandError, Result};
 use perturb_learner::client::Servers;
 
-/// How a command ended that did not fail.
-enum Ending {
-    /// All was done.
-    Done,
-    /// It was asked to end by this signal.
-    Signal(i32),
-    /// It did its work, and its answer is this exit status.
-    Status(u8),
-}
-
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
@@ -54,26 +43,22 @@ pub fn main() -> ExitCode {
         // An experiment's results must not depend on what a cluster's profile exports.
         single_thread::ensure(matches!(cli.command, Command::Run(_)));
     }
+    let done = |()| ExitCode::SUCCESS;
     let result = match cli.command {
-        Command::Envs(args) => envs::run(&args),
+        Command::Envs(args) => envs::run(&args).map(done),
         Command::Train(args) => train::run(&args),
-        Command::Evaluate(args) => evaluate::run(&args),
+        Command::Evaluate(args) => evaluate::run(&args).map(done),
         Command::Demo(args) => demo::run(&args),
-        Command::Plan(args) => plan::run(&args),
+        Command::Plan(args) => plan::run(&args).map(done),
         Command::Run(args) => run::run(&args),
-        Command::Report(args) => report::run(&args),
-        Command::Curves(args) => report::curves(&args),
-        Command::Heatmap(args) => heatmap::run(&args),
-        Command::Video(args) => video::run(&args),
+        Command::Report(args) => report::run(&args).map(done),
+        Command::Curves(args) => report::curves(&args).map(done),
+        Command::Heatmap(args) => heatmap::run(&args).map(done),
+        Command::Video(args) => video::run(&args).map(done),
         Command::Audit(args) => audit::run(&args),
-        Command::Rates(args) => rates::run(&args),
+        Command::Rates(args) => rates::run(&args).map(done),
     };
-    match result {
-        Ok(Ending::Done) => ExitCode::SUCCESS,
-        Ok(Ending::Signal(number)) => signal_code(number),
-        Ok(Ending::Status(status)) => ExitCode::from(status),
-        Err(error) => fail(&error),
-    }
+    result.unwrap_or_else(|error| fail(&error))
 }
 
 fn fail(error: &CommandError) -> ExitCode {
@@ -84,6 +69,7 @@ fn fail(error: &CommandError) -> ExitCode {
     error.signal().map_or(ExitCode::from(if error.is_usage() { 2 } else { 1 }), signal_code)
 }
 
+/// The exit status of a command that this signal ended.
 fn signal_code(number: i32) -> ExitCode {
     ExitCode::from(u8::try_from(128 + number).unwrap_or(1))
 }
@@ -95,6 +81,15 @@ fn servers(args: &ServerArgs) -> Result<Servers> {
     }
     refuse_workers(args)?;
     Ok(Servers::connect(&args.server)?)
+}
+
+/// One a core, if nothing is asked for.
+fn threads(wanted: Option<u16>) -> usize {
+    wanted.map_or_else(cores, usize::from)
+}
+
+fn cores() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
 }
 
 /// Servers that were named have their threads already.

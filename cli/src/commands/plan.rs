@@ -8,13 +8,14 @@ use serde_json::json;
 
 use super::args::PlanArgs;
 use super::error::{CommandError, Result};
-use super::{Ending, servers};
+use super::servers;
 use perturb_learner::client::Servers;
 use perturb_learner::measure::measure;
+use perturb_study::scheduler::count;
 use perturb_study::table::Table;
-use perturb_study::{Cell, Estimate, Folder, Measurement, Plan, estimate, representatives};
+use perturb_study::{Cell, Estimate, Folder, Measurement, Plan, estimates, representatives};
 
-pub(super) fn run(args: &PlanArgs) -> Result<Ending> {
+pub(super) fn run(args: &PlanArgs) -> Result<()> {
     let plan = Plan::load(&args.file)?;
     let mut out = std::io::stdout();
     if args.json && !args.cells && args.missing.is_none() {
@@ -29,26 +30,26 @@ pub(super) fn run(args: &PlanArgs) -> Result<Ending> {
     if args.json {
         let listed: Vec<_> = listed.iter().map(|cell| json!({ "index": cell.index, "id": cell.id })).collect();
         writeln!(out, "{:#}", json!(listed))?;
-        return Ok(Ending::Done);
+        return Ok(());
     }
     for cell in listed {
         writeln!(out, "{:>6} {}", cell.index, cell.id)?;
     }
     if folder.is_some() {
-        return Ok(Ending::Done);
+        return Ok(());
     }
     let counts = plan.counts();
-    let runs = if counts.runs == 1 { "1 run".to_owned() } else { format!("{} runs", counts.runs) };
     writeln!(
         out,
-        "{} configurations, {} trainings, {} train/test pairs, {} with {runs}",
+        "{} configurations, {} trainings, {} train/test pairs, {} with {}",
         grouped(counts.configurations),
         grouped(counts.trainings),
         grouped(counts.pairs),
-        grouped(counts.all_pairs)
+        grouped(counts.all_pairs),
+        count(counts.runs as usize, "run")
     )?;
     if args.measure == 0 {
-        return Ok(Ending::Done);
+        return Ok(());
     }
     let servers = servers(&args.server)?;
     let limits = step_limits(&servers, &plan)?;
@@ -62,15 +63,17 @@ pub(super) fn run(args: &PlanArgs) -> Result<Ending> {
     let measure_one = |cell| measure(&servers, cell, Duration::from_secs(args.measure));
     let measurements: Vec<Measurement> = representatives.into_iter().map(measure_one).collect::<Result<_, _>>()?;
     writeln!(out, "{}", speeds(&measurements).to_text())?;
-    let estimate = estimate(&plan, &measurements, |environment| limits.get(environment).copied().unwrap_or_default());
-    print_estimate(&mut out, &plan, &estimate)?;
-    Ok(Ending::Done)
+    let estimate: Estimate = estimates(&plan, &measurements, &limits).into_iter().sum();
+    Ok(print_estimate(&mut out, &plan, &estimate)?)
 }
 
 /// The step limits of the plan's environments. Refuses plans that do not fit them.
 pub(super) fn step_limits<'a>(servers: &Servers, plan: &'a Plan) -> Result<HashMap<&'a str, u32>> {
-    plan.check(|name| Ok::<_, CommandError>(servers.environment(name)?))?;
-    let limit = |name: &'a str| Ok((name, servers.environment(name)?.step_limit));
+    let limit = |name: &'a str| {
+        let environment = servers.environment(name)?;
+        plan.check(&environment).map_err(|refused| CommandError::Failed(refused.to_string()))?;
+        Ok((name, environment.step_limit))
+    };
     plan.environments().into_iter().map(limit).collect()
 }
 
@@ -90,16 +93,15 @@ fn print_estimate(out: &mut impl Write, plan: &Plan, estimate: &Estimate) -> std
         out,
         "\nat most, if every episode of {} cells lasts until the step limit: {} steps of training, {} of testing",
         grouped(plan.cells.len()),
-        steps(estimate.work.training_steps),
-        steps(estimate.work.testing_steps)
+        steps(estimate.training_steps),
+        steps(estimate.testing_steps)
     )?;
-    let (training, testing) = (estimate.training_seconds, estimate.testing_seconds);
     writeln!(
         out,
         "which takes {} as measured: {} of training, {} of testing; with two jobs on as many free cores half of it",
-        duration(training + testing),
-        duration(training),
-        duration(testing)
+        duration(estimate.seconds()),
+        duration(estimate.training_seconds),
+        duration(estimate.testing_seconds)
     )
 }
 

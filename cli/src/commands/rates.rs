@@ -8,15 +8,14 @@ use perturb_study::records::{FILE, Records};
 use perturb_study::success::Criterion;
 use perturb_study::table::Table;
 
-use super::Ending;
 use super::args::RatesArgs;
 use super::error::{CommandError, Result};
 
-pub(super) fn run(args: &RatesArgs) -> Result<Ending> {
-    let records = Records::read(&file_in(&args.path))?;
+pub(super) fn run(args: &RatesArgs) -> Result<()> {
+    let records = Records::read(&file_in(&args.file))?;
     let about = &records.about;
     let Some(own) = &about.success else {
-        let message = format!("{} does not say what its episodes achieved: test again", args.path.display());
+        let message = format!("{} does not say what its episodes achieved: test again", args.file.display());
         return Err(CommandError::Failed(message));
     };
     let criteria: Vec<Criterion> = match &args.success[..] {
@@ -38,7 +37,7 @@ pub(super) fn run(args: &RatesArgs) -> Result<Ending> {
             format!("{low:.1} … {high:.1}")
         });
     writeln!(std::io::stdout(), "{}, policy {}\n{}", about.environment, about.policy, table.build().to_text())?;
-    Ok(Ending::Done)
+    Ok(())
 }
 
 /// The recorded episodes in `path`, which may be the folder that holds them.

@@ -3,7 +3,6 @@
 use std::io::Write;
 use std::path::Path;
 
-use super::Ending;
 use super::args::{CurvesArgs, ReportArgs};
 use super::error::Result;
 use perturb_study::files::write_atomically;
@@ -11,12 +10,12 @@ use perturb_study::plot::{Quantity, draw_curves, save};
 use perturb_study::report::{Figures, Report, html};
 use perturb_study::{Folder, Plan, Results, curves_table, read_curves, verify};
 
-pub(super) fn run(args: &ReportArgs) -> Result<Ending> {
+pub(super) fn run(args: &ReportArgs) -> Result<()> {
     let folder = Folder::new(&args.dir);
     let text = write(&folder, args.html.as_deref())?;
     write!(std::io::stdout(), "{text}")?;
     eprintln!("\nthe tables are also in {}", args.dir.join("report").display());
-    Ok(Ending::Done)
+    Ok(())
 }
 
 /// Writes the tables of an experiment and, with `page`, everything as HTML; returns the tables as text.
@@ -39,7 +38,7 @@ pub(super) fn write(folder: &Folder, page: Option<&Path>) -> Result<String> {
     Ok(report.text())
 }
 
-pub(super) fn curves(args: &CurvesArgs) -> Result<Ending> {
+pub(super) fn curves(args: &CurvesArgs) -> Result<()> {
     let folder = Folder::new(&args.dir);
     let plan = Plan::load(&folder.require_plan()?)?;
     let results = Results::read(&plan, &folder)?;
@@ -58,6 +57,5 @@ pub(super) fn curves(args: &CurvesArgs) -> Result<Ending> {
             writeln!(stdout, "{} and .png", path.display())?;
         }
     }
-    writeln!(stdout, "{}", out.join("curves.csv").display())?;
-    Ok(Ending::Done)
+    Ok(writeln!(stdout, "{}", out.join("curves.csv").display())?)
 }

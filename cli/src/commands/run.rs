@@ -2,21 +2,21 @@
 
 use std::io::{BufRead, Read};
 use std::os::unix::process::CommandExt;
-use std::process::Command;
+use std::process::{Command, ExitCode};
 use std::sync::Mutex;
 
 use super::args::{Engine, RunArgs};
 use super::cells::do_cells;
 use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
-use super::{Ending, refuse_workers, single_thread, slurm};
+use super::{cores, refuse_workers, single_thread, slurm};
 use perturb_learner::cell::run_cell;
 use perturb_learner::client::{Address, PrivateServer, Servers};
 use perturb_study::interrupt::StopFlag;
-use perturb_study::scheduler::{Event, Local, Order, Teller};
+use perturb_study::scheduler::{CellEvent, Local, Order, Teller};
 use perturb_study::{Cell, Folder, Plan};
 
-pub(super) fn run(args: &RunArgs) -> Result<Ending> {
+pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
     let folder = Folder::new(&args.out);
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     if args.worker {
@@ -45,7 +45,7 @@ fn find(args: &RunArgs, plan: &Plan, name: &str) -> Result<Cell> {
 }
 
 /// Does the cell of the order on standard input, as a process that another one started for it.
-fn work(args: &RunArgs, folder: &Folder, stop: &StopFlag) -> Result<Ending> {
+fn work(args: &RunArgs, folder: &Folder, stop: &StopFlag) -> Result<ExitCode> {
     let mut text = String::new();
     std::io::stdin().lock().read_line(&mut text).map_err(system("read the order"))?;
     let order: Order = serde_json::from_str(&text)
@@ -56,19 +56,19 @@ fn work(args: &RunArgs, folder: &Folder, stop: &StopFlag) -> Result<Ending> {
     let cell = match plan.and_then(|plan| find(args, &plan, &order.cell)) {
         Ok(cell) => cell,
         Err(error) => {
-            teller.tell(Event::Refused { reason: error.to_string() });
-            return Ok(Ending::Done);
+            teller.tell(CellEvent::Refused { reason: error.to_string() });
+            return Ok(ExitCode::SUCCESS);
         }
     };
     let ended = match Servers::connect_to_one(&args.server.server, order.turn) {
         Ok(servers) => {
-            servers.addresses().for_each(|address| teller.tell(Event::Server { address: address.to_string() }));
+            servers.addresses().for_each(|address| teller.tell(CellEvent::Server { address: address.to_string() }));
             run_cell(&servers, &cell, &folder.cell(&cell.id), order.retry, stop, &mut |event| teller.tell(event))
         }
-        Err(error) => Ok(Event::LostServer { reason: error.to_string() }),
+        Err(error) => Ok(CellEvent::LostServer { reason: error.to_string() }),
     };
-    teller.tell(ended.unwrap_or_else(|error| Event::Failed { reason: error.to_string() }));
-    Ok(Ending::Done)
+    teller.tell(ended.unwrap_or_else(|error| CellEvent::Failed { reason: error.to_string() }));
+    Ok(ExitCode::SUCCESS)
 }
 
 /// Raises the flag when standard input is closed.
@@ -84,9 +84,8 @@ fn stop_with_input(stop: &StopFlag) -> Result<()> {
 }
 
 /// Does all cells in worker processes.
-fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> Result<Ending> {
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let jobs = args.jobs.unwrap_or(cores).min(plan.cells.len());
+fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> Result<ExitCode> {
+    let jobs = args.jobs.unwrap_or_else(cores).min(plan.cells.len());
     let (local, addresses) = shared_servers(args)?;
     let local = local.map(Mutex::new);
     let (servers, troubles) = Servers::connect_to_some(&addresses)?;

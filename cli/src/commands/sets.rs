@@ -1,10 +1,7 @@
 //! The sets of parameters that are typed.
 
-use std::path::Path;
-
 use perturb_study::Version;
 use perturb_study::files::read;
-pub(super) use perturb_study::sets::Context as Fixed;
 use perturb_study::sets::{Assignment, Contexts, TestSet, set_of, set_of_csv};
 
 use super::args::SetArgs;
@@ -23,7 +20,7 @@ pub(super) fn tested(versions: &[Version], args: &SetArgs) -> Result<Vec<TestSet
         sets.push(set_of(NAME, args.base, args.parameters.clone())?);
     }
     if let Some(path) = &args.contexts {
-        let name = stem(path);
+        let name = path.file_stem().unwrap_or_default().to_string_lossy();
         if name.parse::<Version>().is_ok() {
             let message = format!("{}: call the file otherwise, {name} is a version", path.display());
             return Err(CommandError::Usage(message));
@@ -45,9 +42,4 @@ pub(super) fn drawn(version: Version, parameters: &[Assignment]) -> Result<TestS
             "--parameters has the points of a grid here; give values or intervals, as length=0.8..0.9".into(),
         )),
     }
-}
-
-/// A file's name without its folder and ending.
-fn stem(path: &Path) -> String {
-    path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }

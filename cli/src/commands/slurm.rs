@@ -1,24 +1,25 @@
 //! `perturb run --engine slurm`.
 
+use std::process::ExitCode;
 use std::time::Duration;
 
 use super::args::RunArgs;
 use super::cells::do_cells;
 use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
-use super::{Ending, refuse_workers};
+use super::refuse_workers;
 use perturb_learner::client::{Address, Servers};
 use perturb_learner::measure::measure;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::scheduler::slurm::{Jobs, Slurm, SlurmOptions, Task};
-use perturb_study::{Folder, Plan, cell_seconds, representatives};
+use perturb_study::{Estimate, Folder, Plan, estimates, representatives};
 
 /// How long each measured training takes.
 const MEASURE: Duration = Duration::from_secs(2);
 /// How often Slurm is asked: its controller has others to answer too.
 const QUEUE_INTERVAL: Duration = Duration::from_secs(15);
 
-pub(super) fn run(args: &RunArgs, plan: &Plan, stop: &StopFlag) -> Result<Ending> {
+pub(super) fn run(args: &RunArgs, plan: &Plan, stop: &StopFlag) -> Result<ExitCode> {
     let path = std::path::absolute(&args.out).map_err(system("find out where --out is"))?;
     let folder = Folder::new(&path);
     let options = options(args)?;
@@ -29,7 +30,7 @@ pub(super) fn run(args: &RunArgs, plan: &Plan, stop: &StopFlag) -> Result<Ending
     let servers = || Servers::local(args.server.workers);
     step_limits(&servers()?, plan)?;
     let costs = || Ok(costs(&servers()?, plan, stop)?);
-    do_cells(args, plan, &folder, &mut Jobs::new(plan, &folder, &slurm, &options, &costs, stop)?, stop)
+    do_cells(args, plan, &folder, &mut Jobs::new(plan, &folder, &slurm, &options, &costs, stop), stop)
 }
 
 fn options(args: &RunArgs) -> Result<SlurmOptions> {
@@ -67,5 +68,5 @@ fn costs(servers: &Servers, plan: &Plan, stop: &StopFlag) -> Result<Vec<f64>> {
         measurements.push(measure(servers, cell, MEASURE)?);
     }
     let limits = step_limits(servers, plan)?;
-    Ok(cell_seconds(plan, &measurements, |environment| limits.get(environment).copied().unwrap_or_default()))
+    Ok(estimates(plan, &measurements, &limits).iter().map(Estimate::seconds).collect())
 }

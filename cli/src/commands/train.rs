@@ -2,20 +2,21 @@
 
 use std::io::Write;
 use std::path::Path;
+use std::process::ExitCode;
 
 use toml::{Table, Value};
 
 use super::args::TrainArgs;
 use super::display::Display;
 use super::error::{CommandError, Result, system};
-use super::{Ending, servers, sets};
+use super::{servers, sets, signal_code, threads};
 use perturb_learner::logging::{EpisodeFigures, Progress, TimeShares};
 use perturb_learner::training::{Outcome, RunDirectory, resume, train};
 use perturb_study::Version;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::settings::{Sources, TrainConfig};
+use perturb_study::settings::TrainConfig;
 
-pub(super) fn run(args: &TrainArgs) -> Result<Ending> {
+pub(super) fn run(args: &TrainArgs) -> Result<ExitCode> {
     match (&args.resume, &args.out) {
         (Some(path), _) => go_on(args, path),
         (None, Some(path)) => begin(args, path),
@@ -24,22 +25,22 @@ pub(super) fn run(args: &TrainArgs) -> Result<Ending> {
 }
 
 /// A new run in `out`.
-fn begin(args: &TrainArgs, out: &Path) -> Result<Ending> {
-    let flags = flags(args)?;
-    let config = TrainConfig::load(&Sources { file: args.config.as_deref(), sets: &args.set, flags })?;
+fn begin(args: &TrainArgs, out: &Path) -> Result<ExitCode> {
+    let config = TrainConfig::load(args.config.as_deref(), &args.set, flags(args)?)?;
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let directory = RunDirectory::choose(out, args.overwrite)?;
     let servers = servers(&args.server)?;
     let environment = servers.environment(&config.common.environment)?; // its refusal lists the names
     perturb_study::sets::check("--parameters", &config.common.parameters, &environment)?;
     let mut display = Display::of_episodes(describe(&config), config.common.episodes);
-    let outcome = train(&servers, &config, &directory, &stop, |progress| display.training(progress))?;
+    let outcome =
+        train(&servers, &config, &directory, threads(args.threads), &stop, |progress| display.training(progress))?;
     drop(display);
     end(&config, &directory, &outcome)
 }
 
 /// The run in `path`, from its last checkpoint.
-fn go_on(args: &TrainArgs, path: &Path) -> Result<Ending> {
+fn go_on(args: &TrainArgs, path: &Path) -> Result<ExitCode> {
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let (directory, checkpoint, state) = RunDirectory::resume(path)?;
     let config = checkpoint.state.config.clone();
@@ -47,19 +48,19 @@ fn go_on(args: &TrainArgs, path: &Path) -> Result<Ending> {
     if done >= budget {
         eprintln!("the training in {} is finished: it has {done} of {budget} episodes", path.display());
         print_policy(&directory)?;
-        return Ok(Ending::Done);
+        return Ok(ExitCode::SUCCESS);
     }
     eprintln!("{}: going on after {done} of {budget} episodes", describe(&config));
     let servers = servers(&args.server)?;
     let mut display = Display::of_episodes(describe(&config), budget);
     let report = |progress: &Progress| display.training(progress);
-    let outcome = resume(&servers, &directory, (checkpoint, state), &stop, report)?;
+    let outcome = resume(&servers, &directory, (checkpoint, state), threads(args.threads), &stop, report)?;
     drop(display);
     end(&config, &directory, &outcome)
 }
 
 /// Says what a training came to.
-fn end(config: &TrainConfig, directory: &RunDirectory, outcome: &Outcome) -> Result<Ending> {
+fn end(config: &TrainConfig, directory: &RunDirectory, outcome: &Outcome) -> Result<ExitCode> {
     summarise(&outcome.progress);
     match outcome.signal {
         Some(number) => {
@@ -69,11 +70,11 @@ fn end(config: &TrainConfig, directory: &RunDirectory, outcome: &Outcome) -> Res
                 config.common.episodes,
                 directory.path().display()
             );
-            Ok(Ending::Signal(number))
+            Ok(signal_code(number))
         }
         None => {
             print_policy(directory)?;
-            Ok(Ending::Done)
+            Ok(ExitCode::SUCCESS)
         }
     }
 }
@@ -108,29 +109,22 @@ pub(super) fn summarise(progress: &Progress) {
 
 /// The settings among the flags.
 fn flags(args: &TrainArgs) -> Result<Table> {
-    let number = |name: &str, value: u64| {
-        let refuse = |_| CommandError::Usage(format!("--{name} {value} is too large: the most is {}", i64::MAX));
-        i64::try_from(value).map(Value::Integer).map_err(refuse)
+    let text = |value: &Option<String>| value.clone().map(Value::String);
+    let number = |name: &str, value: Option<u64>| {
+        let refuse = |value| CommandError::Usage(format!("--{name} {value} is too large: the most is {}", i64::MAX));
+        value.map(|value| i64::try_from(value).map(Value::Integer).map_err(|_| refuse(value))).transpose()
     };
-    let mut table = Table::new();
-    let mut text = |key: &str, value: Option<String>| {
-        value.map(|value| table.insert(key.to_owned(), Value::String(value)));
-    };
-    text("environment", args.env.clone());
-    text("version", args.version.map(|version| version.to_string()));
-    text("algorithm", args.algorithm.clone());
-    text("architecture", args.architecture.clone());
-    if !args.parameters.is_empty() {
-        let set = sets::drawn(args.version.unwrap_or(Version::D), &args.parameters)?;
-        let parameters = Table::try_from(set.drawn()).map_err(|error| CommandError::Usage(error.to_string()))?;
-        table.insert("parameters".into(), Value::Table(parameters));
-    }
-    for (flag, value) in
-        [("episodes", args.episodes), ("seed", args.seed), ("episodes-per-trial", args.episodes_per_trial)]
-    {
-        if let Some(value) = value {
-            table.insert(flag.replace('-', "_"), number(flag, value)?);
-        }
-    }
-    Ok(table)
+    let own = sets::drawn(args.version.unwrap_or(Version::D), &args.parameters)?.drawn();
+    let own = Table::try_from(own).map_err(|error| CommandError::Usage(error.to_string()))?;
+    let settings = [
+        ("environment", text(&args.env)),
+        ("version", text(&args.version.map(|version| version.to_string()))),
+        ("parameters", (!own.is_empty()).then_some(Value::Table(own))),
+        ("algorithm", text(&args.algorithm)),
+        ("architecture", text(&args.architecture)),
+        ("episodes", number("episodes", args.episodes)?),
+        ("seed", number("seed", args.seed)?),
+        ("episodes_per_trial", number("episodes-per-trial", args.episodes_per_trial)?),
+    ];
+    Ok(settings.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))).collect())
 }

@@ -5,13 +5,13 @@ use std::io::Write;
 use super::args::VideoArgs;
 use super::display::Display;
 use super::error::{Result, system};
-use super::{Ending, servers, sets};
+use super::{servers, sets};
 use crate::video::{Footage, VideoFile, VideoOptions, film};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::table::Table;
 
-pub(super) fn run(args: &VideoArgs) -> Result<Ending> {
+pub(super) fn run(args: &VideoArgs) -> Result<()> {
     let file = VideoFile::create(&args.out)?;
     let checkpoint = Checkpoint::load(&args.checkpoint)?;
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
@@ -38,8 +38,7 @@ pub(super) fn run(args: &VideoArgs) -> Result<Ending> {
             parameters.collect::<Vec<_>>().join(" ")
         });
     writeln!(out, "{}", table.build().to_text())?;
-    writeln!(out, "{}: {}", args.out.display(), figures(&footage))?;
-    Ok(Ending::Done)
+    Ok(writeln!(out, "{}: {}", args.out.display(), figures(&footage))?)
 }
 
 /// How many frames there are, how fast they are shown, and how fast they were made.

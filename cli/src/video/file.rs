@@ -82,11 +82,11 @@ impl VideoFile {
     /// # Errors
     /// [`VideoError::Encode`].
     pub fn begin(self, size: (u32, u32), fps: f64) -> Result<VideoWriter, VideoError> {
-        let encoder: Result<Box<dyn Encode>, String> = match self.format {
-            Format::Gif => GifEncoder::new(self.temporary.path(), size, fps).map(|encoder| Box::new(encoder) as _),
-            Format::Mp4 => Mp4Encoder::new(self.temporary.path(), size, fps).map(|encoder| Box::new(encoder) as _),
+        let (path, failed) = (self.temporary.path(), encoding(&self.path));
+        let encoder: Box<dyn Encode> = match self.format {
+            Format::Gif => Box::new(GifEncoder::new(path, size, fps).map_err(failed)?),
+            Format::Mp4 => Box::new(Mp4Encoder::new(path, size, fps).map_err(failed)?),
         };
-        let encoder = encoder.map_err(|reason| VideoError::Encode { path: self.path.clone(), reason })?;
         Ok(VideoWriter { encoder, file: self })
     }
 }
@@ -104,8 +104,7 @@ impl VideoWriter {
     /// # Errors
     /// [`VideoError::Encode`].
     pub fn write(&mut self, frame: &[u8], seconds: f64) -> Result<(), VideoError> {
-        let path = &self.file.path;
-        self.encoder.write(frame, seconds).map_err(|reason| VideoError::Encode { path: path.clone(), reason })
+        self.encoder.write(frame, seconds).map_err(encoding(&self.file.path))
     }
 
     /// Completes the video and puts it into its place.
@@ -114,10 +113,15 @@ impl VideoWriter {
     /// [`VideoError::Encode`] and [`VideoError::File`]; a video that was there before is then still there.
     pub fn finish(self) -> Result<(), VideoError> {
         let VideoFile { path, temporary, .. } = self.file;
-        self.encoder.finish().map_err(|reason| VideoError::Encode { path: path.clone(), reason })?;
+        self.encoder.finish().map_err(encoding(&path))?;
         temporary.persist(&path).map_err(|error| io("rename a file to", &path)(error.error))?;
         Ok(())
     }
+}
+
+/// Names the video in an encoder's error.
+fn encoding(path: &Path) -> impl FnOnce(std::io::Error) -> VideoError {
+    |source| VideoError::Encode { path: path.to_owned(), source }
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::panel::{EpisodeEnding, Panel, Shown, parameter};
+use super::panel::{Panel, Shown, ShownEnding, parameter};
 use super::{VideoError, VideoFile, VideoWriter};
 use perturb_learner::checkpoint::{Checkpoint, EnvironmentSummary, State};
 use perturb_learner::client::{BegunEpisode, ClientError, OpenOptions, Picture, Servers, Single, StepReply};
@@ -23,7 +23,7 @@ pub struct VideoOptions {
     pub episodes: u64,
     /// Fixes all randomness.
     pub seed: u64,
-    /// Of the pictures, in pixels, [`super::SMALLEST`] … [`super::LARGEST`]; frames are higher by the text below.
+    /// Of the pictures, in pixels, [`super::PIXELS`]; frames are higher by the text below.
     pub size: (u32, u32),
     /// Frames shown in a second, more than 0; `None` is real time.
     pub fps: Option<f64>,
@@ -140,7 +140,7 @@ impl<'a> Film<'a> {
         let (single, begun) = Single::open(servers, &open, &mut reply.observations)?;
         check_unchanged(checkpoint, EnvironmentSummary::of(single.environment()))?;
         let environment = single.environment().clone();
-        options.set.check(&environment).map_err(TestError::Set)?;
+        options.set.check(&environment).map_err(TestError::Value)?;
         let title = (
             format!("{} {}", environment.name, options.set.name),
             format!("{}, trained on {}", state.config.method(), state.config.common.trained_on()),
@@ -226,7 +226,7 @@ impl<'a> Film<'a> {
         }
         shown.episode_return = end.episode_return;
         let truncated = reply.truncated[0];
-        shown.ending = Some(EpisodeEnding { success: end.success, terminated: end.terminated, truncated });
+        shown.ending = Some(ShownEnding { success: end.success, terminated: end.terminated, truncated });
         let names = self.environment.parameters.iter().map(|parameter| parameter.name.clone());
         self.footage.episodes.push(Filmed {
             parameters: names.zip(self.begun.parameters.iter().copied()).collect(),

@@ -1,7 +1,7 @@
 //! Frames as a GIF.
 
 use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
 use gif::{Encoder, Frame, Repeat};
@@ -27,31 +27,32 @@ pub(super) struct GifEncoder {
 }
 
 impl GifEncoder {
-    pub(super) fn new(path: &Path, (width, height): (u32, u32), fps: f64) -> Result<Self, String> {
-        let fits = |pixels: u32| u16::try_from(pixels).map_err(|_| format!("a GIF has no {pixels} pixels in a row"));
+    pub(super) fn new(path: &Path, (width, height): (u32, u32), fps: f64) -> io::Result<Self> {
+        let fits = |pixels: u32| {
+            u16::try_from(pixels).map_err(|_| io::Error::other(format!("a GIF has no {pixels} pixels in a row")))
+        };
         let (width, height) = (fits(width)?, fits(height)?);
-        let file = File::create(path).map_err(|error| error.to_string())?;
-        let mut encoder = Encoder::new(BufWriter::new(file), width, height, &[]).map_err(|error| error.to_string())?;
-        encoder.set_repeat(Repeat::Infinite).map_err(|error| error.to_string())?;
+        let mut encoder =
+            Encoder::new(BufWriter::new(File::create(path)?), width, height, &[]).map_err(io::Error::other)?;
+        encoder.set_repeat(Repeat::Infinite).map_err(io::Error::other)?;
         Ok(Self { encoder, size: (width, height), seconds: 1.0 / fps })
     }
 }
 
 impl Encode for GifEncoder {
-    fn write(&mut self, frame: &[u8], seconds: f64) -> Result<(), String> {
+    fn write(&mut self, frame: &[u8], seconds: f64) -> io::Result<()> {
         let (width, height) = self.size;
         let expected = usize::from(width) * usize::from(height) * 3;
         if frame.len() != expected {
-            return Err(format!("a frame has {} bytes, expected {expected}", frame.len()));
+            return Err(io::Error::other(format!("a frame has {} bytes, expected {expected}", frame.len())));
         }
         let mut frame = Frame::from_rgb_speed(width, height, frame, SAMPLING);
         frame.delay = delay(seconds.max(self.seconds));
-        self.encoder.write_frame(&frame).map_err(|error| error.to_string())
+        self.encoder.write_frame(&frame).map_err(io::Error::other)
     }
 
-    fn finish(self: Box<Self>) -> Result<(), String> {
-        let mut file = self.encoder.into_inner().map_err(|error| error.to_string())?;
-        file.flush().map_err(|error| error.to_string())
+    fn finish(self: Box<Self>) -> io::Result<()> {
+        self.encoder.into_inner().map_err(io::Error::other)?.flush()
     }
 }
 
@@ -69,7 +70,7 @@ mod tests {
     fn a_frame_of_another_size_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let mut encoder = GifEncoder::new(&folder.path().join("a.gif"), (4, 2), 10.0).unwrap();
-        assert!(encoder.write(&[0; 23], 0.1).unwrap_err().contains("23 bytes, expected 24"));
+        assert!(encoder.write(&[0; 23], 0.1).unwrap_err().to_string().contains("23 bytes, expected 24"));
         assert!(encoder.write(&[0; 24], 0.1).is_ok());
         assert!(GifEncoder::new(&folder.path().join("a.gif"), (70_000, 2), 10.0).is_err());
     }

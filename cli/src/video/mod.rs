@@ -14,7 +14,7 @@ use std::path::PathBuf;
 
 pub use file::{VideoFile, VideoWriter};
 pub use film::{Footage, VideoOptions, film};
-pub use panel::{LARGEST, SMALLEST};
+pub use panel::PIXELS;
 
 use perturb_learner::evaluation::TestError;
 use perturb_study::files::FileError;
@@ -23,16 +23,14 @@ use perturb_study::plot::PlotError;
 /// Why there is no video.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum VideoError {
     /// The policy cannot act, or the server cannot draw.
     #[error(transparent)]
     Test(#[from] TestError),
     /// The file's name does not say what to write.
     #[error("`{}` is not a video: expected a name that ends in .mp4 or .gif", path.display())]
-    Extension {
-        /// What was given.
-        path: PathBuf,
-    },
+    Extension { path: PathBuf },
     /// The program that encodes .mp4 is missing, or cannot do it.
     #[error(
         "an .mp4 is encoded by the program ffmpeg with its encoder libx264, but {reason}: install it, on Debian with \
@@ -46,12 +44,11 @@ pub enum VideoError {
     #[error(transparent)]
     File(#[from] FileError),
     /// A frame could not be encoded.
-    #[error("cannot encode {}: {reason}", path.display())]
+    #[error("cannot encode {}: {source}", path.display())]
     Encode {
-        /// The video.
         path: PathBuf,
-        /// The encoder's words.
-        reason: String,
+        /// What the encoder says, or the operating system.
+        source: std::io::Error,
     },
     /// The text below a picture could not be drawn.
     #[error(transparent)]

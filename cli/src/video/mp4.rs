@@ -1,7 +1,7 @@
 //! Frames as an MP4, by the program ffmpeg.
 
 use std::fs::File;
-use std::io::{Read, Seek, Write};
+use std::io::{self, Read, Seek, Write};
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -38,8 +38,8 @@ pub(super) struct Mp4Encoder {
 }
 
 impl Mp4Encoder {
-    pub(super) fn new(path: &Path, (width, height): (u32, u32), fps: f64) -> Result<Self, String> {
-        let words = tempfile::tempfile().map_err(|error| error.to_string())?;
+    pub(super) fn new(path: &Path, (width, height): (u32, u32), fps: f64) -> io::Result<Self> {
+        let words = tempfile::tempfile()?;
         let (size, fps_text) = (format!("{width}x{height}"), fps.to_string());
         let child = Command::new(PROGRAM)
             .args(["-hide_banner", "-loglevel", "error", "-y"])
@@ -53,29 +53,29 @@ impl Mp4Encoder {
             .arg(path)
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
-            .stderr(words.try_clone().map_err(|error| error.to_string())?)
+            .stderr(words.try_clone()?)
             // Ctrl-C is for this process, which then ends ffmpeg.
             .process_group(0)
             .spawn()
-            .map_err(|error| format!("`{PROGRAM}` cannot be started: {error}"))?;
+            .map_err(|error| io::Error::other(format!("`{PROGRAM}` cannot be started: {error}")))?;
         Ok(Self { child, words, fps })
     }
 
     /// Why ffmpeg ended.
-    fn failure(&mut self) -> String {
+    fn failure(&mut self) -> io::Error {
         drop(self.child.stdin.take());
         let status = self.child.wait().map_or_else(|error| error.to_string(), |status| status.to_string());
         let mut words = String::new();
         let read = self.words.rewind().and_then(|()| self.words.read_to_string(&mut words));
-        match (read, words.trim()) {
+        io::Error::other(match (read, words.trim()) {
             (Ok(_), words) if !words.is_empty() => format!("{PROGRAM} ended with {status}: {words}"),
             _ => format!("{PROGRAM} ended with {status}"),
-        }
+        })
     }
 }
 
 impl Encode for Mp4Encoder {
-    fn write(&mut self, frame: &[u8], seconds: f64) -> Result<(), String> {
+    fn write(&mut self, frame: &[u8], seconds: f64) -> io::Result<()> {
         // Frames of H.264 all take the same time; equal ones take no room.
         for _ in 0..((seconds * self.fps).round() as u64).max(1) {
             let written = self.child.stdin.as_mut().map_or(Ok(()), |pipe| pipe.write_all(frame));
@@ -86,7 +86,7 @@ impl Encode for Mp4Encoder {
         Ok(())
     }
 
-    fn finish(mut self: Box<Self>) -> Result<(), String> {
+    fn finish(mut self: Box<Self>) -> io::Result<()> {
         drop(self.child.stdin.take());
         match self.child.wait() {
             Ok(status) if status.success() => Ok(()),

@@ -1,17 +1,17 @@
 //! What is written below a picture: which episode it is, with which parameters, and how it goes.
 
+use std::ops::RangeInclusive;
+
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::VideoError;
 use perturb_learner::client::Picture;
 use perturb_protocol::limits::PICTURE_PIXELS;
-use perturb_study::plot::{FAMILY, PlotError, is_dark, load_font};
+use perturb_study::plot::{FAMILY, PlotError, drawing, is_dark, load_font};
 
-/// The narrowest and lowest picture, in pixels: below it nothing could be read.
-pub const SMALLEST: u32 = 240;
-/// The widest and highest picture that a server draws, in pixels.
-pub const LARGEST: u32 = *PICTURE_PIXELS.end() as u32;
+/// Width and height of a picture: below them nothing could be read, above them a server draws none.
+pub const PIXELS: RangeInclusive<u32> = 240..=*PICTURE_PIXELS.end() as u32;
 
 /// A letter is so many times smaller than a picture is wide.
 const LETTERS: u32 = 30;
@@ -27,13 +27,13 @@ type PanelLine = (String, String);
 
 /// How an episode ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct EpisodeEnding {
+pub(super) struct ShownEnding {
     pub(super) success: bool,
     pub(super) terminated: bool,
     pub(super) truncated: bool,
 }
 
-impl EpisodeEnding {
+impl ShownEnding {
     fn text(self) -> String {
         let mut words = vec![if self.success { "success" } else { "no success" }];
         words.extend(self.terminated.then_some("terminated"));
@@ -55,7 +55,7 @@ pub(super) struct Shown {
     /// The sum of the rewards so far.
     pub(super) episode_return: f64,
     /// `None` while it goes on.
-    pub(super) ending: Option<EpisodeEnding>,
+    pub(super) ending: Option<ShownEnding>,
 }
 
 /// Makes frames of pictures: the picture, and below it the panel. Both sides of a frame are even, as H.264 wants them.
@@ -99,10 +99,10 @@ impl Panel {
         let below = frame.len();
         let pixels = (frame_height - height) as usize * frame_width as usize;
         frame.extend(std::iter::repeat_n(ground, pixels).flatten());
-        self.write(&mut frame[below..], shown).map_err(|reason| PlotError::Draw(reason).into())
+        Ok(self.write(&mut frame[below..], shown)?)
     }
 
-    fn write(&self, panel: &mut [u8], shown: &Shown) -> Result<(), String> {
+    fn write(&self, panel: &mut [u8], shown: &Shown) -> Result<(), PlotError> {
         let (width, height) = (self.frame.0 as i32, self.frame.1 - self.picture.1);
         let area = BitMapBackend::with_buffer(panel, (self.frame.0, height)).into_drawing_area();
         let mut lines: Vec<(PanelLine, RGBColor)> = vec![
@@ -122,32 +122,28 @@ impl Panel {
         let mut y = margin / 2 + margin / 4;
         for (number, ((left, right), colour)) in lines.iter().enumerate() {
             let draw = |text: &str, side, x| area.draw_text(text, &font(colour, side), (x, y));
-            draw(left, HPos::Left, margin).and_then(|()| draw(right, HPos::Right, width - margin)).map_err(words)?;
+            draw(left, HPos::Left, margin).and_then(|()| draw(right, HPos::Right, width - margin)).map_err(drawing)?;
             if let (2, Some(ending)) = (number, shown.ending) {
                 let ground = if ending.success { SUCCESS } else { NO_SUCCESS };
                 let ink = if is_dark((ground.0, ground.1, ground.2)) { WHITE } else { BLACK };
                 let (text, style) = (ending.text(), font(&ink, HPos::Right));
-                let (text_width, _) = area.estimate_text_size(&text, &style).map_err(words)?;
+                let (text_width, _) = area.estimate_text_size(&text, &style).map_err(drawing)?;
                 let corners = [
                     (width - margin - text_width as i32 - margin / 2, y - margin * 2 / 5),
                     (width - margin / 2, y + margin * 3 / 4),
                 ];
-                area.draw(&Rectangle::new(corners, ground.filled())).map_err(words)?;
-                area.draw_text(&text, &style, (width - margin, y)).map_err(words)?;
+                area.draw(&Rectangle::new(corners, ground.filled())).map_err(drawing)?;
+                area.draw_text(&text, &style, (width - margin, y)).map_err(drawing)?;
             }
             y += line_height(self.letter) as i32;
         }
-        area.present().map_err(words)
+        area.present().map_err(drawing)
     }
 }
 
 /// From one line to the next, in pixels.
 fn line_height(letter: u32) -> u32 {
     letter * 7 / 5
-}
-
-fn words(error: impl std::fmt::Display) -> String {
-    error.to_string()
 }
 
 /// A parameter with its unit, to four digits: "density 1180 kg/m³".
@@ -208,7 +204,7 @@ mod tests {
         let panel = panel((480, 480));
         let plain = frame(&panel, &shown());
         assert_eq!(frame(&panel, &shown()), plain);
-        let ending = |success, terminated, truncated| Some(EpisodeEnding { success, terminated, truncated });
+        let ending = |success, terminated, truncated| Some(ShownEnding { success, terminated, truncated });
         let others = [
             Shown { episode: "episode 2 of 3".into(), ..shown() },
             Shown {

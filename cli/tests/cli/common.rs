@@ -29,7 +29,7 @@ pub fn config(text: &str) -> TrainConfig {
 pub fn run(servers: &Servers, text: &str) -> (TempDir, Outcome) {
     let out = tempfile::tempdir().expect("a directory");
     let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
-    let outcome = train(servers, &config(text), &directory, &StopFlag::default(), |_| {});
+    let outcome = train(servers, &config(text), &directory, 2, &StopFlag::default(), |_| {});
     (out, outcome.unwrap_or_else(|error| panic!("{error:#}")))
 }
 

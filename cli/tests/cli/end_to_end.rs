@@ -11,8 +11,10 @@ use insta::assert_snapshot;
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers, Session, StepReply};
 use perturb_learner::evaluation::test;
-use perturb_learner::policy::{ActionKind, Inputs, Policy, PolicySpec, Sequences};
+use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Collector, Normalisers, Rollout};
+use perturb_learner::torch::{Sequences, TorchPolicy};
+use perturb_policy::{ActionKind, Inputs, PolicySpec};
 use perturb_study::Version;
 use perturb_study::interrupt::StopFlag;
 use rstest::rstest;
@@ -138,7 +140,7 @@ fn two_rollouts(servers: &Servers) -> (Policy, [Rollout; 2]) {
         .expect("a collector");
     let rollouts = [(); 2].map(|()| {
         let mut rollout = Rollout::new(N_STEPS, N_ENVS, size, 1);
-        collector.collect(&policy.weights(), &mut rollout, |_| {}).expect("a rollout");
+        collector.collect(policy.flat_weights(), &mut rollout, |_| {}).expect("a rollout");
         rollout
     });
     (policy, rollouts)
@@ -166,7 +168,8 @@ fn libtorch_sees_the_values_that_a_recurrent_policy_saw() {
     let spec = policy.spec();
     let values = |n_steps: usize, observations: &[f32], starts: &[bool], memory: &[f32]| {
         let sequences = Sequences::new(spec, n_steps, observations, starts, memory).expect("shapes that fit");
-        Vec::<f32>::from(policy.evaluate(&sequences, &Tensor::of_slice(&vec![0.0f32; starts.len()])).values)
+        let torch = TorchPolicy::new(spec, policy.flat_weights()).expect("a policy");
+        Vec::<f32>::from(torch.evaluate(&sequences, &Tensor::of_slice(&vec![0.0f32; starts.len()])).values)
     };
     // Values of order 1, as in the tests of the policy.
     let close = |got: &[f32], expected: &[f32]| {

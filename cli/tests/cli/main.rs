@@ -5,6 +5,7 @@ mod common;
 
 mod end_to_end;
 mod experiments;
+mod processors;
 mod resume;
 mod servers;
 mod sets;

@@ -112,7 +112,7 @@ fn assert_same(got: &Path, expected: &Path) {
 /// Goes on with the run in `path` to its end.
 fn go_on(servers: &Servers, path: &Path) -> Result<Outcome, String> {
     let (directory, checkpoint, state) = RunDirectory::resume(path).map_err(|error| format!("{error:#}"))?;
-    let outcome = resume(servers, &directory, (checkpoint, state), &StopFlag::default(), |_| {});
+    let outcome = resume(servers, &directory, (checkpoint, state), 1, &StopFlag::default(), |_| {});
     outcome.map_err(|error| format!("{error:#}"))
 }
 
@@ -128,7 +128,7 @@ fn broken_off() -> TempDir {
     let (out, copied) = (tempfile::tempdir().expect("a directory"), tempfile::tempdir().expect("a directory"));
     let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
     let mut done = false;
-    train(&servers, &config(RUNS[1]), &directory, &StopFlag::default(), |progress| {
+    train(&servers, &config(RUNS[1]), &directory, 1, &StopFlag::default(), |progress| {
         if progress.episodes > 30 && !done {
             copy(out.path(), copied.path());
             done = true;
@@ -201,7 +201,7 @@ fn a_run_goes_on_from_any_iteration_to_the_same_bytes() {
     for text in RUNS {
         let (out, kills) = (tempfile::tempdir().expect("a directory"), tempfile::tempdir().expect("a directory"));
         let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
-        let outcome = train(&one, &config(text), &directory, &StopFlag::default(), |progress| {
+        let outcome = train(&one, &config(text), &directory, 1, &StopFlag::default(), |progress| {
             copy(out.path(), &kills.path().join(progress.iterations.to_string()));
         });
         let iterations = outcome.expect("a training").progress.iterations;
@@ -232,7 +232,7 @@ fn a_run_that_was_stopped_goes_on_to_the_same_bytes() {
     let out = tempfile::tempdir().expect("a directory");
     let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
     let stop = StopFlag::default();
-    let outcome = train(&servers, &config(text), &directory, &stop, |progress| {
+    let outcome = train(&servers, &config(text), &directory, 1, &stop, |progress| {
         if progress.iterations == 16 {
             stop.raise(15); // with a checkpoint, but no line of progress.csv at that iteration
         }
@@ -246,20 +246,32 @@ fn a_run_that_was_stopped_goes_on_to_the_same_bytes() {
     assert_eq!(resumed.checkpoint, Checkpoint::load(whole.path()).expect("a checkpoint"));
 }
 
-/// Format 1 was written by perturb 0.1.0, which came to these files from the run in the fixture.
+/// Format 1 was written by perturb 0.1.0, in whose CartPole, revision 0, the fixture was trained.
 #[test]
-fn a_checkpoint_of_format_1_is_tested_and_goes_on_to_the_bytes_of_the_program_that_wrote_it() {
+fn a_checkpoint_of_format_1_is_understood_and_one_of_another_revision_refused() {
     let (_server, servers) = servers_of(1);
     let out = tempfile::tempdir().expect("a directory");
     copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/cli/fixtures/format_1"), out.path());
-    let checkpoint = Checkpoint::load(out.path()).expect("a checkpoint");
+    let (checkpoint, state) = Checkpoint::load_with_resume(out.path()).expect("a checkpoint");
     assert_eq!((checkpoint.state.counters.episodes, checkpoint.state.config.settings.name()), (21, "a2c"));
+    let last = state.history.recent.last().expect("an episode");
+    assert_eq!((state.history.recent.len(), state.collector.snapshots.len()), (21, 2));
+    assert_eq!((last.episode_return, last.length, last.success), (21.0, 21.0, 0.0));
+
     let options = TestOptions { episodes: 3, seed: 1, success: None };
+    let error = Tester::new(&servers, &checkpoint, options.clone()).err().expect("another revision").to_string();
+    let revisions = "trained in CartPole with revision 0, the server's has 1";
+    let advice = "test with the version of perturb that trained it, or train again";
+    assert_eq!(error, format!("the checkpoint was {revisions}: {advice}"));
+    let error = go_on(&servers, out.path()).expect_err("another revision");
+    let advice = "resume with the version of perturb-server that it began with, or train again";
+    assert_eq!(error, format!("the run was {revisions}; {advice}"));
+
+    // Were it of today's revision, it could be tested.
+    edit(out.path(), "/environment_spec/revision", 1.into());
+    let checkpoint = Checkpoint::load(out.path()).expect("a checkpoint");
     let tester = Tester::new(&servers, &checkpoint, options).expect("the environment is the same");
     tester.test(&[Version::D.into()], &StopFlag::default(), &mut |_, _| {}).expect("a test");
-    go_on(&servers, out.path()).expect("a training");
-    let expected = ["checkpoint.json", "resume-00000149-aed8ed8d.safetensors", "weights-00000149-c0f117c9.safetensors"];
-    assert_eq!(names(&out.path().join("checkpoint")), expected, "names have the content's checksum");
 }
 
 /// Episodes in the checkpoint on disk.
@@ -341,7 +353,7 @@ fn numbers_that_are_not_finite_leave_the_last_checkpoint() {
     let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
     let text = "environment = 'Pendulum'\nepisodes = 400\nnum_envs = 2\nlearning_rate = 1e30\nn_epochs = 1\n\
                 max_grad_norm = 1e30\nnormalize_advantage = false";
-    let error = train(&servers, &config(text), &directory, &StopFlag::default(), |_| {}).expect_err("NaN");
+    let error = train(&servers, &config(text), &directory, 1, &StopFlag::default(), |_| {}).expect_err("NaN");
     let error = format!("{error:#}");
     assert!(error.contains("training failed; the checkpoint after 0 episodes is kept in"), "{error}");
     assert!(error.contains("resumed, it would come to the same numbers"), "{error}");

@@ -8,14 +8,18 @@ enum Status {
     Sound,
     /// Until the next reset.
     Diverged(Warning),
-    /// A fatal error interrupted MuJoCo in the middle: until the data is replaced.
+    /// A fatal error interrupted MuJoCo in the middle: for good.
     Poisoned,
 }
 
 /// A simulation: a model of its own, editable, and its data.
 ///
-/// After construction and after [`reset`](Self::reset) the state is the model's initial one, and nothing derived from
-/// it (poses, contacts) is computed before [`step1`](Self::step1) or [`forward`](Self::forward).
+/// After construction and after [`reset`](Self::reset) the state is the model's initial one, after
+/// [`set_state`](Self::set_state) the one that was given, and nothing derived from it (poses, contacts) is computed
+/// before [`step1`](Self::step1), [`motion`](Self::motion) or [`forward`](Self::forward).
+///
+/// One simulation serves any number of states: what follows depends on [`state`](Self::state) and
+/// [`constants`](Self::constants) alone, not on what was simulated before.
 #[derive(Debug)]
 pub struct Simulation {
     model: Model,
@@ -45,33 +49,25 @@ impl Simulation {
         &self.model
     }
 
-    /// Replaces the data by new ones, at the initial state: the way back after a fatal error.
-    ///
-    /// # Errors
-    /// [`Error::Fatal`] without memory; the old data stay.
-    pub fn renew(&mut self) -> Result<(), Error> {
-        let data = make_data(&self.model)?;
-        // SAFETY: the old data came from mj_makeData, are owned by `self`, and are not used after this.
-        unsafe { sys::mj_deleteData(self.data.as_ptr()) };
-        (self.data, self.status) = (data, Status::Sound);
-        Ok(())
-    }
-
     // ---- model edits
 
-    /// Takes over all numbers of `model`, a copy or the origin of this simulation's.
-    ///
-    /// # Errors
-    /// [`Error::ModelMismatch`] if its sizes differ, [`Error::Fatal`].
-    pub fn assign_model(&mut self, model: &Model) -> Result<(), Error> {
-        // SAFETY: two valid models, only read.
-        if unsafe { sys::perturb_mj_same_sizes(self.model.as_ptr(), model.as_ptr()) } == 0 {
-            return Err(Error::ModelMismatch);
+    /// The constants that the edits below change, with all that follows from them: [`Model::n_constants`] numbers.
+    pub fn constants(&self, out: &mut [f64]) {
+        assert_eq!(out.len(), self.model.n_constants(), "the constants of another model");
+        let mut rest = out;
+        for (start, length) in self.model.constants() {
+            let part = rest.split_off_mut(..length).unwrap_or_default();
+            part.copy_from_slice(self.array(start, length));
         }
-        // SAFETY: two valid models of equal sizes; `&mut self` excludes other users of the destination, and `model`
-        // cannot be this simulation's own, which is borrowed mutably.
-        let failed = unsafe { sys::perturb_mj_assign_model(self.model.as_ptr(), model.as_ptr()) };
-        if failed == 0 { Ok(()) } else { Err(last_error()) }
+    }
+
+    /// Takes back what [`constants`](Self::constants) wrote, of this or another simulation of the same model.
+    pub fn set_constants(&mut self, constants: &[f64]) {
+        assert_eq!(constants.len(), self.model.n_constants(), "the constants of another model");
+        let mut rest = constants;
+        for (start, length) in self.model.constants() {
+            self.array_mut(start, length).copy_from_slice(rest.split_off(..length).unwrap_or_default());
+        }
     }
 
     /// Masses in kg, `[B]`. Follow an edit by [`set_const`](Self::set_const).
@@ -98,7 +94,7 @@ impl Simulation {
         self.array_mut(start, length)
     }
 
-    /// Recomputes what follows from the edited arrays. It overwrites the positions: reset afterwards.
+    /// Recomputes what follows from the edited arrays. It overwrites the positions: reset or set the state afterwards.
     ///
     /// # Errors
     /// [`Error::Fatal`], [`Error::Poisoned`].
@@ -145,6 +141,23 @@ impl Simulation {
         self.run(sys::perturb_mj_step2)
     }
 
+    /// Advances by one timestep: [`step1`](Self::step1), then [`step2`](Self::step2). So contacts are those before.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
+    pub fn step(&mut self) -> Result<(), Error> {
+        self.run(sys::perturb_mj_step)
+    }
+
+    /// Checks positions and velocities, and computes the poses and the velocities of bodies. It is a part of
+    /// [`step1`](Self::step1), of which contacts and forces are left out: they stay those before.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
+    pub fn motion(&mut self) -> Result<(), Error> {
+        self.run(sys::perturb_mj_motion)
+    }
+
     /// Computes everything at the current state, accelerations included, without advancing.
     ///
     /// # Errors
@@ -172,6 +185,11 @@ impl Simulation {
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
     pub fn kinematics(&mut self) -> Result<(), Error> {
         self.run(sys::perturb_mj_kinematics)
+    }
+
+    /// Whether a fatal error made it unusable for good.
+    pub fn is_poisoned(&self) -> bool {
+        self.status == Status::Poisoned
     }
 
     /// How often MuJoCo raised a warning since the last reset.
@@ -208,15 +226,52 @@ impl Simulation {
 
     // ---- state
 
+    /// All that what follows depends on besides the model, [`Model::n_state`] numbers: time in s, positions `[Q]`,
+    /// velocities `[V]`, activations `[n_act]`, where the constraint solver starts `[V]`, controls `[U]`.
+    pub fn state(&self, out: &mut [f64]) {
+        assert_eq!(out.len(), self.model.n_state(), "the state of another model");
+        out[0] = self.time();
+        let mut rest = &mut out[1..];
+        for (start, length) in self.state_arrays() {
+            let part = rest.split_off_mut(..length).unwrap_or_default();
+            part.copy_from_slice(self.array(start, length));
+        }
+    }
+
+    /// Takes back what [`state`](Self::state) wrote, of this or another simulation of the same model. Forgets everything
+    /// else, divergence included.
+    ///
+    /// # Errors
+    /// [`Error::Fatal`], [`Error::Poisoned`].
+    pub fn set_state(&mut self, state: &[f64]) -> Result<(), Error> {
+        assert_eq!(state.len(), self.model.n_state(), "the state of another model");
+        if self.status != Status::Sound {
+            self.reset()?; // a sound simulation has no warnings to be forgotten, and its steps overwrite all else
+        }
+        // SAFETY: `data` is valid for the lifetime of `self`, and `&mut self` excludes other users.
+        unsafe { (*self.data.as_ptr()).time = state[0] };
+        let mut rest = &state[1..];
+        for (start, length) in self.state_arrays() {
+            self.array_mut(start, length).copy_from_slice(rest.split_off(..length).unwrap_or_default());
+        }
+        Ok(())
+    }
+
+    /// The state's arrays in the data, with their lengths.
+    fn state_arrays(&self) -> [(*mut f64, usize); 5] {
+        let (data, model) = (self.raw(), &self.model);
+        [
+            (data.qpos, model.n_q()),
+            (data.qvel, model.n_v()),
+            (data.act, model.n_act()),
+            (data.qacc_warmstart, model.n_v()),
+            (data.ctrl, model.n_u()),
+        ]
+    }
+
     /// Simulated seconds.
     pub fn time(&self) -> f64 {
         self.raw().time
-    }
-
-    /// Sets the simulated seconds.
-    pub fn set_time(&mut self, time: f64) {
-        // SAFETY: `data` is valid for the lifetime of `self`, and `&mut self` excludes other users.
-        unsafe { (*self.data.as_ptr()).time = time };
     }
 
     /// Positions, `[Q]`.
@@ -244,28 +299,6 @@ impl Simulation {
     /// Accelerations of the last [`step2`](Self::step2) or [`forward`](Self::forward), `[V]`.
     pub fn qacc(&self) -> &[f64] {
         self.array(self.raw().qacc, self.model.n_v())
-    }
-
-    /// Where the constraint solver starts, `[V]`: part of the state.
-    pub fn qacc_warmstart(&self) -> &[f64] {
-        self.array(self.raw().qacc_warmstart, self.model.n_v())
-    }
-
-    /// Where the constraint solver starts, `[V]`.
-    pub fn qacc_warmstart_mut(&mut self) -> &mut [f64] {
-        let (start, length) = (self.raw().qacc_warmstart, self.model.n_v());
-        self.array_mut(start, length)
-    }
-
-    /// The actuators' activations, `[n_act]`.
-    pub fn act(&self) -> &[f64] {
-        self.array(self.raw().act, self.model.n_act())
-    }
-
-    /// The actuators' activations, `[n_act]`.
-    pub fn act_mut(&mut self) -> &mut [f64] {
-        let (start, length) = (self.raw().act, self.model.n_act());
-        self.array_mut(start, length)
     }
 
     /// Controls, `[U]`.

@@ -28,9 +28,6 @@ pub enum Error {
         /// What was asked for.
         name: String,
     },
-    /// A model of other sizes was given.
-    #[error("the model's sizes differ from those of the simulation; give a copy of the same model")]
-    ModelMismatch,
     /// MuJoCo raised a fatal error. The data it worked on is unusable from now on.
     #[error("MuJoCo raised a fatal error: {message}")]
     Fatal {
@@ -38,7 +35,7 @@ pub enum Error {
         message: String,
     },
     /// An earlier fatal error left the data in an undefined state.
-    #[error("the simulation is unusable after a fatal error; renew it")]
+    #[error("the simulation is unusable after a fatal error; make another")]
     Poisoned,
     /// There is no OpenGL to draw with.
     #[error("OpenGL without a display is missing: {reason}; install the Debian packages libegl1 and libgl1-mesa-dri")]

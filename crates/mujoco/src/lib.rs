@@ -28,7 +28,7 @@
 //!
 //! Each call runs under `setjmp` in `shim.c`, and the handler jumps back there: across frames of MuJoCo's C engine
 //! only, never of Rust, nor of the C++ compiler. What the interrupted call left in `mjData` is undefined, so
-//! [`Simulation`] refuses all further calls until [`Simulation::renew`].
+//! [`Simulation`] refuses all further calls; another takes its place.
 
 mod data;
 mod error;

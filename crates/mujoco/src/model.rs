@@ -149,6 +149,16 @@ impl Model {
         self.raw().ngeom as usize
     }
 
+    /// The length of a [state](crate::Simulation::state).
+    pub fn n_state(&self) -> usize {
+        1 + self.n_q() + 2 * self.n_v() + self.n_act() + self.n_u()
+    }
+
+    /// The length of [constants](crate::Simulation::constants).
+    pub fn n_constants(&self) -> usize {
+        self.constants().into_iter().map(|(_, length)| length).sum()
+    }
+
     /// The timestep in seconds.
     pub fn timestep(&self) -> f64 {
         self.raw().opt.timestep
@@ -214,6 +224,26 @@ impl Model {
             arrays.push(FloatArray { name, values });
         }
         arrays
+    }
+
+    /// The floating-point arrays that edits of masses, inertias and friction change, or mj_setConst from them, with
+    /// their lengths.
+    pub(crate) fn constants(&self) -> [(*mut f64, usize); 9] {
+        let (m, bodies, dofs) = (self.raw(), self.n_body(), self.n_v());
+        // SAFETY: the pointer is a valid model for the lifetime of `self`; only an address is taken. The statistics are
+        // plain numbers of one type.
+        let stat = unsafe { &raw mut (*self.pointer.as_ptr()).stat }.cast::<f64>();
+        [
+            (m.body_mass, bodies),
+            (m.body_inertia, 3 * bodies),
+            (m.geom_friction, 3 * self.n_geom()),
+            (m.body_subtreemass, bodies),
+            (m.body_invweight0, 2 * bodies),
+            (m.dof_invweight0, dofs),
+            (m.dof_M0, dofs),
+            (m.actuator_acc0, self.n_u()),
+            (stat, size_of::<sys::mjStatistic>() / size_of::<f64>()),
+        ]
     }
 
     pub(crate) fn raw(&self) -> &sys::mjModel {

@@ -4,7 +4,6 @@
 
 #include <mujoco/mjxmacro.h>
 #include <setjmp.h>
-#include <stddef.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -76,11 +75,6 @@ mjData* perturb_mj_make_data(const mjModel* model) {
   return failed ? NULL : data;
 }
 
-int perturb_mj_assign_model(mjModel* destination, const mjModel* source) {
-  GUARDED(mj_copyModel(destination, source))
-  return failed;
-}
-
 int perturb_mj_set_const(mjModel* model, mjData* data) {
   GUARDED(mj_setConst(model, data))
   return failed;
@@ -98,6 +92,17 @@ int perturb_mj_step1(const mjModel* model, mjData* data) {
 
 int perturb_mj_step2(const mjModel* model, mjData* data) {
   GUARDED(mj_step2(model, data))
+  return failed;
+}
+
+int perturb_mj_step(const mjModel* model, mjData* data) {
+  GUARDED(mj_step(model, data))
+  return failed;
+}
+
+int perturb_mj_motion(const mjModel* model, mjData* data) {
+  GUARDED(mj_checkPos(model, data); mj_checkVel(model, data); mj_kinematics(model, data); mj_comPos(model, data);
+          mj_comVel(model, data))
   return failed;
 }
 
@@ -151,11 +156,6 @@ int perturb_mjr_draw(mjvScene* scene, const mjrContext* context, int width, int 
     return 1;
   }
   return failed;
-}
-
-int perturb_mj_same_sizes(const mjModel* a, const mjModel* b) {
-  // The sizes are the leading ints of mjModel, up to the options.
-  return memcmp(a, b, offsetof(mjModel, opt)) == 0;
 }
 
 #define FLOAT_SIZE(pointer) _Generic((pointer), mjtNum*: sizeof(mjtNum), float*: sizeof(float), default: 0)

@@ -18,15 +18,18 @@ mjModel* perturb_mj_copy_model(const mjModel* source);
 mjData* perturb_mj_make_data(const mjModel* model);
 
 // Nonzero on failure.
-int perturb_mj_assign_model(mjModel* destination, const mjModel* source);
 int perturb_mj_set_const(mjModel* model, mjData* data);
 int perturb_mj_reset(const mjModel* model, mjData* data);
 int perturb_mj_step1(const mjModel* model, mjData* data);
 int perturb_mj_step2(const mjModel* model, mjData* data);
+int perturb_mj_step(const mjModel* model, mjData* data);
 int perturb_mj_forward(const mjModel* model, mjData* data);
 
 // Poses of bodies, geoms, cameras and lights, and nothing else. Nonzero on failure.
 int perturb_mj_kinematics(const mjModel* model, mjData* data);
+
+// Checks positions and velocities; poses and velocities of bodies, and nothing else. Nonzero on failure.
+int perturb_mj_motion(const mjModel* model, mjData* data);
 
 // Drawing. Nonzero on failure. Those of mjr need a current OpenGL context, and are not to be raced.
 int perturb_mjv_make_scene(const mjModel* model, mjvScene* scene, int most_geoms);
@@ -37,9 +40,6 @@ int perturb_mjr_make_context(mjModel* model, mjrContext* context, int width, int
 int perturb_mjr_free_context(mjrContext* context);
 // Draws the scene and reads the picture: 3 * width * height bytes, the lowest row first.
 int perturb_mjr_draw(mjvScene* scene, const mjrContext* context, int width, int height, unsigned char* pixels);
-
-// Whether two models have the same sizes, so that one may be assigned to the other or used with its data.
-int perturb_mj_same_sizes(const mjModel* a, const mjModel* b);
 
 // The model's array number `index`: its name, elements, their number, and the bytes of a floating-point element, or 0
 // for other types. Zero is returned beyond the last array.

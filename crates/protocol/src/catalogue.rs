@@ -4,7 +4,7 @@ use serde_json::{Value, json};
 
 use crate::limits;
 use crate::proto::{
-    Channel, Comparison, Distribution, Environment, ListEnvironmentsResponse, Parameter, Success, action_space::Kind,
+    Comparison, Distribution, Environment, ListEnvironmentsResponse, Parameter, Success, action_space::Kind,
 };
 
 /// Everything that a server tells of its environments, and the [`limits`] that hold for clients too. Names are those of
@@ -29,25 +29,22 @@ pub fn to_json(catalogue: &ListEnvironmentsResponse) -> Value {
 fn environment(environment: &Environment) -> Value {
     let action = match environment.action.as_ref().and_then(|action| action.kind.as_ref()) {
         Some(Kind::Discrete(discrete)) => json!({ "discrete": discrete.names }),
-        Some(Kind::Continuous(continuous)) => json!({ "continuous": channels(&continuous.channels) }),
+        Some(Kind::Continuous(continuous)) => json!({ "continuous": continuous.channels }),
         None => Value::Null,
     };
-    let named = |name: &str, key: &str, text: &str| json!({ "name": name, key: text });
-    let reward_terms = environment.reward_terms.iter().map(|term| named(&term.name, "description", &term.description));
-    let applied = environment.applied.iter().map(|quantity| named(&quantity.name, "unit", &quantity.unit));
     json!({
         "name": environment.name,
         "revision": environment.revision,
         "description": environment.description,
         "step_limit": environment.step_limit,
         "control_timestep": environment.control_timestep,
-        "observation": channels(&environment.observation),
+        "observation": environment.observation,
         "action": action,
-        "state": channels(&environment.state),
-        "reward_terms": reward_terms.collect::<Vec<_>>(),
+        "state": environment.state,
+        "reward_terms": environment.reward_terms,
         "success": environment.success.as_ref().map(success),
         "parameters": environment.parameters.iter().map(parameter).collect::<Vec<_>>(),
-        "applied": applied.collect::<Vec<_>>(),
+        "applied": environment.applied,
         "heatmap_axes": environment.heatmap_axes,
         "model_hash": environment.model_hash,
     })
@@ -86,16 +83,10 @@ fn success(success: &Success) -> Value {
     })
 }
 
-fn channels(channels: &[Channel]) -> Vec<Value> {
-    channels
-        .iter()
-        .map(|channel| json!({ "name": channel.name, "unit": channel.unit, "low": channel.low, "high": channel.high }))
-        .collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::proto::Channel;
 
     #[test]
     fn an_open_end_is_null() {

@@ -7,18 +7,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::limits::MOST_INTERVALS;
 use crate::proto;
+pub use crate::proto::Interval;
 
 /// The most intervals that a refusal repeats.
 const SHOWN_INTERVALS: usize = 8;
-
-/// The closed interval [low, high].
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Interval {
-    /// Lower end.
-    pub low: f64,
-    /// Upper end, not below `low`.
-    pub high: f64,
-}
 
 impl Interval {
     /// The interval [low, high].
@@ -156,8 +148,7 @@ impl FromStr for Distribution {
 
 impl From<&Distribution> for proto::Distribution {
     fn from(distribution: &Distribution) -> Self {
-        let interval = |&Interval { low, high }: &Interval| proto::Interval { low, high };
-        Self { intervals: distribution.0.iter().map(interval).collect() }
+        Self { intervals: distribution.0.clone() }
     }
 }
 
@@ -165,8 +156,7 @@ impl TryFrom<&proto::Distribution> for Distribution {
     type Error = DistributionError;
 
     fn try_from(distribution: &proto::Distribution) -> Result<Self, DistributionError> {
-        let interval = |&proto::Interval { low, high }: &proto::Interval| Interval { low, high };
-        Self::union(&distribution.intervals.iter().map(interval).collect::<Vec<_>>())
+        Self::union(&distribution.intervals)
     }
 }
 

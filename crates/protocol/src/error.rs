@@ -13,15 +13,11 @@ pub const REPLY_LIMIT: Duration = Duration::from_secs(60);
 /// A failure of a server, of the connection to it, or of a request.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum ClientError {
     /// Nobody answers at the address.
     #[error("no server answers at {address}: {reason}; start one with `perturb-server --listen …` or correct --server")]
-    Connect {
-        /// Where.
-        address: Address,
-        /// The transport's words.
-        reason: String,
-    },
+    Connect { address: Address, reason: String },
     /// None of several servers takes sessions.
     #[error("no server answers ({reasons}); start one with `perturb-server --listen …` or correct --server")]
     NoneConnects {
@@ -30,68 +26,28 @@ pub enum ClientError {
     },
     /// The server understood a request and refused it. The session lives on.
     #[error("the server at {address} refused {request}: {message}")]
-    Refused {
-        /// Which server.
-        address: Address,
-        /// Which request.
-        request: &'static str,
-        /// Why.
-        code: Code,
-        /// The server's sentence.
-        message: String,
-    },
+    Refused { address: Address, request: &'static str, code: Code, message: String },
     /// The connection or the server is gone, and with it the session's environments.
     #[error("lost the server at {address} during {request}: {reason}")]
     Lost {
-        /// Which server.
         address: Address,
-        /// Which request.
         request: &'static str,
         /// The status that ended the stream.
         code: Code,
-        /// The transport's words.
         reason: String,
     },
     /// The server is there, but a reply did not come in time.
     #[error("the server at {address} did not answer {request} within {} s", limit.as_secs_f64())]
-    TimedOut {
-        /// Which server.
-        address: Address,
-        /// Which request.
-        request: &'static str,
-        /// How long was waited.
-        limit: Duration,
-    },
+    TimedOut { address: Address, request: &'static str, limit: Duration },
     /// A reply does not follow the protocol.
     #[error("the server at {address} answered {request} with {got}, expected {expected}: are both of one version?")]
-    Protocol {
-        /// Which server.
-        address: Address,
-        /// Which request.
-        request: &'static str,
-        /// What came.
-        got: String,
-        /// What the protocol promises.
-        expected: String,
-    },
+    Protocol { address: Address, request: &'static str, got: String, expected: String },
     /// Servers of one run must serve the same environment.
     #[error("the servers at {first} and {other} describe {environment} differently: run one version of perturb-server")]
-    Disagreement {
-        /// A server.
-        first: Address,
-        /// Another one.
-        other: Address,
-        /// The environment.
-        environment: String,
-    },
+    Disagreement { first: Address, other: Address, environment: String },
     /// There is not one snapshot for each environment.
     #[error("there are {got} snapshots to restore, expected {expected}: one for each environment")]
-    Snapshots {
-        /// How many were given.
-        got: usize,
-        /// N.
-        expected: usize,
-    },
+    Snapshots { got: usize, expected: usize },
     /// The program `perturb-server` was not found.
     #[error(
         "the program `perturb-server` was not found ({tried}): run `cargo build --release` first, set PERTURB_SERVER \
@@ -103,20 +59,10 @@ pub enum ClientError {
     },
     /// The private server did not start.
     #[error("the private server {} did not start: {reason}", program.display())]
-    Start {
-        /// The program.
-        program: PathBuf,
-        /// What happened instead.
-        reason: String,
-    },
+    Start { program: PathBuf, reason: String },
     /// The operating system refused something that a client needs.
     #[error("cannot {action}: {source}")]
-    System {
-        /// What was tried.
-        action: &'static str,
-        /// Its answer.
-        source: std::io::Error,
-    },
+    System { action: &'static str, source: std::io::Error },
 }
 
 impl ClientError {

@@ -1,13 +1,10 @@
 //! Advantage actor-critic.
 
+use perturb_policy::{Descent, Objective, Optimiser, Surrogate};
 use perturb_study::settings::A2cConfig;
-use tch::Kind;
 
-use super::batch::Batch;
-use super::optimiser::{Descent, RmsProp};
-use super::{Algorithm, AlgorithmState, Experience, UpdateStats, check_rollout, explained_variance, scalars};
+use super::{Algorithm, AlgorithmState, Experience, UpdateStats, check_rollout, explained_variance};
 use crate::error::Result;
-use crate::loss;
 use crate::policy::Policy;
 use crate::rollout::{Rollout, n_step_returns};
 
@@ -27,8 +24,9 @@ impl A2c {
     /// Checks the settings and starts with fresh optimiser state for `policy`.
     pub fn new(config: A2cConfig, policy: &Policy) -> Result<Self> {
         config.validate()?;
-        let optimiser = RmsProp::new(config.rms_alpha, config.rms_eps, policy.n_weights());
-        let descent = Descent::new(optimiser, config.max_grad_norm, policy);
+        let n_weights = policy.flat_weights().len();
+        let optimiser = Optimiser::rms_prop(config.rms_alpha, config.rms_eps, n_weights);
+        let descent = Descent::new(optimiser, config.max_grad_norm, n_weights);
         Ok(A2c { config, descent })
     }
 }
@@ -43,21 +41,23 @@ impl Algorithm for A2c {
         check_rollout(rollout, policy, self.config.n_steps)?;
         let learning_rate = self.config.learning_rate_schedule.at(self.config.learning_rate, progress_remaining)?;
         let estimates = n_step_returns(&rollout.trajectories()?, gamma, bootstrap_truncation);
-        let batch = Batch::new(rollout, policy, &estimates)?;
-        let evaluated = policy.evaluate(&batch.sequences, &batch.actions);
-        let policy_loss = loss::policy_gradient(&evaluated.log_probs, &batch.advantages()?);
-        let value_loss = loss::value(&evaluated.values, &batch.returns()?);
-        let entropy_loss = -evaluated.entropy.mean(Kind::Float);
-        let loss = &policy_loss + &entropy_loss * ent_coef + &value_loss * vf_coef;
-        let grad_norm = self.descent.step(policy, &evaluated, &loss, learning_rate)?;
-        let [policy_gradient_loss, value_loss, entropy_loss, loss] =
-            scalars([&policy_loss, &value_loss, &entropy_loss, &loss])?;
+        let objective = Objective {
+            surrogate: Surrogate::PolicyGradient,
+            normalize_advantages: false,
+            ent_coef,
+            vf_coef,
+            value_clip_range: None,
+            kl_coef: 0.0,
+        };
+        let batch = policy.batch(rollout, &estimates)?;
+        let (losses, grad_norm) =
+            policy.descend(&batch, &batch.sequences(), &objective, &mut self.descent, learning_rate)?;
         Ok(UpdateStats {
             learning_rate,
-            policy_gradient_loss,
-            value_loss,
-            entropy_loss,
-            loss,
+            policy_gradient_loss: losses.policy,
+            value_loss: losses.value,
+            entropy_loss: -losses.entropy,
+            loss: losses.total,
             approx_kl: None,
             kl_divergence: None,
             clip_fraction: None,
@@ -76,6 +76,6 @@ impl Algorithm for A2c {
     }
 
     fn load_state(&mut self, state: &AlgorithmState) -> Result<()> {
-        self.descent.load_state(state.n_updates, &state.optimiser)
+        Ok(self.descent.load_state(state.n_updates, &state.optimiser)?)
     }
 }

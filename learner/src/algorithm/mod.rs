@@ -1,9 +1,7 @@
 //! Algorithms: what turns a rollout into better weights.
 
 mod a2c;
-mod batch;
 mod epopt;
-mod optimiser;
 mod ppo;
 
 pub use a2c::A2c;
@@ -13,12 +11,12 @@ pub use ppo::Ppo;
 use perturb_study::settings::{Base, Settings, Wrapper};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
-use tch::Tensor;
 
-use crate::error::{Result, check_length};
-use crate::loss;
-use crate::policy::{NamedArray, Policy};
-use crate::rollout::{Estimates, Rollout};
+use crate::error::Result;
+use crate::policy::Policy;
+use crate::rollout::{self, Estimates, Rollout};
+use perturb_policy::NamedArray;
+use perturb_policy::check_length;
 
 /// What an update learns from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -100,7 +98,8 @@ fn check_rollout(rollout: &Rollout, policy: &Policy, n_steps: usize) -> Result<(
     }
     check_length("the rollout's axis O", rollout.observation_size(), policy.spec().observation_size)?;
     check_length("the rollout's axis A", rollout.action_width(), policy.spec().action.width())?;
-    check_length("the rollout's memory [N, S]", rollout.memory().len(), rollout.n_envs() * policy.spec().memory_size())
+    let memory = rollout.n_envs() * policy.spec().memory_size();
+    Ok(check_length("the rollout's memory [N, S]", rollout.memory().len(), memory)?)
 }
 
 /// The algorithm of `settings` with fresh state for `policy`; `seed` fixes its randomness.
@@ -121,17 +120,10 @@ pub fn build(settings: &Settings, policy: &Policy, seed: u64) -> Result<Box<dyn 
 /// The share of the variance of the returns that the rollout's values explain.
 fn explained_variance(rollout: &Rollout, estimates: &Estimates) -> Option<f64> {
     match rollout.samples() {
-        None => loss::explained_variance(rollout.values(), &estimates.returns),
+        None => rollout::explained_variance(rollout.values(), &estimates.returns),
         Some(samples) => {
             let pick = |data: &[f32]| samples.iter().map(|&i| data[i as usize]).collect::<Vec<f32>>();
-            loss::explained_variance(&pick(rollout.values()), &pick(&estimates.returns))
+            rollout::explained_variance(&pick(rollout.values()), &pick(&estimates.returns))
         }
     }
-}
-
-/// Copies scalar tensors out, at the cost of one transfer.
-fn scalars<const K: usize>(tensors: [&Tensor; K]) -> Result<[f64; K]> {
-    let mut numbers = [0.0f32; K];
-    Tensor::f_stack(&tensors, 0)?.f_copy_data(&mut numbers, K)?;
-    Ok(numbers.map(f64::from))
 }

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
-use crate::policy::{NamedArray, PolicySpec, Weights};
+use perturb_policy::{NamedArray, PolicySpec, Weights};
 
 /// An array to be written: its elements are little-endian `bytes`.
 pub(super) struct Array {

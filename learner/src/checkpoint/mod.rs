@@ -17,11 +17,11 @@ use serde::{Deserialize, Serialize};
 use self::arrays::{decode_weights, encode_weights};
 use self::files::{ArraysFile, damaged, remove_others};
 pub use self::resume::{History, ResumeState};
-use crate::policy::{ActionKind, Inputs, ObservationNormaliser, PolicySpec, RewardNormaliser, Weights};
 use crate::proto;
+use perturb_policy::{ActionKind, Inputs, ObservationNormaliser, PolicySpec, RewardNormaliser, Weights};
 use perturb_study::Counters;
 use perturb_study::files::{FileError, write_atomically};
-use perturb_study::settings::TrainConfig;
+use perturb_study::settings::{Architecture, TrainConfig};
 
 /// Of the JSON's layout; raised when older programs could misread it. Format 1 says beside the configuration what follows
 /// from it.
@@ -222,7 +222,11 @@ impl State {
 
     /// The shape of a policy that this was trained with.
     pub fn policy(&self) -> PolicySpec {
-        PolicySpec::of(self.config.common.architecture, self.inputs(1).size(), self.environment_spec.action)
+        let shape = match self.config.common.architecture {
+            Architecture::Ff => PolicySpec::feed_forward,
+            Architecture::Rc => PolicySpec::recurrent,
+        };
+        shape(self.inputs(1).size(), self.environment_spec.action)
     }
 
     /// What the policy gets to see of `n_envs` environments at the start of a trial.

@@ -6,9 +6,10 @@ use rand::Rng;
 use super::*;
 use crate::algorithm::AlgorithmState;
 use crate::logging::{EpisodeFigures, LogLengths, TimeShares};
-use crate::policy::{NamedArray, Policy};
+use crate::policy::Policy;
 use crate::rollout::CollectorState;
-use perturb_study::random::{Purpose, stream};
+use perturb_policy::NamedArray;
+use perturb_policy::random::{Purpose, stream};
 
 fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
     // Odd seeds feed-forward, even ones recurrent.

@@ -1,11 +1,10 @@
 //! A trained policy as it acts in tests: sampled actions, frozen statistics.
 
-use perturb_study::random::{Purpose, trial_stream};
+use perturb_policy::random::{Purpose, trial_stream};
 use rand_chacha::ChaCha8Rng;
 
 use crate::checkpoint::{Checkpoint, State};
-use crate::error::Result;
-use crate::policy::{Actor, Acts, Inputs};
+use perturb_policy::{Actor, Acts, Inputs, Result};
 
 /// The policy of a checkpoint in N environments, with what it remembers of each.
 pub struct Agent<'a> {

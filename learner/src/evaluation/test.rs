@@ -1,12 +1,12 @@
 //! Testing a checkpoint on a set of its environment's parameters, and recording every episode.
 
+use perturb_policy::random::{Purpose, stream};
 use perturb_protocol::{Distribution, Version, proto};
-use perturb_study::TestResult;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::random::{Purpose, stream};
 use perturb_study::records::{About, Difference, Ending, EpisodeRecord, RecordedTest, Records};
-use perturb_study::sets::{self, Context, SetError, TestSet};
-use perturb_study::success::{Threshold, ThresholdError};
+use perturb_study::sets::{self, Context, TestSet};
+use perturb_study::success::Threshold;
+use perturb_study::{TestResult, ValueError};
 use rand::Rng;
 
 use super::agent::Agent;
@@ -25,13 +25,11 @@ pub enum TestError {
     Client(#[from] ClientError),
     /// The policy gives numbers that are not finite, or does not fit.
     #[error(transparent)]
-    Numbers(#[from] crate::error::Error),
-    /// The environment does not have the set's parameters, or refuses their values.
+    Numbers(#[from] perturb_policy::Error),
+    /// The environment does not have the set's parameters, or refuses their values; or the threshold is of something
+    /// else than what its success rule compares.
     #[error(transparent)]
-    Set(#[from] SetError),
-    /// The threshold is of something else than what the environment's success rule compares.
-    #[error(transparent)]
-    Threshold(#[from] ThresholdError),
+    Value(#[from] ValueError),
     /// The checkpoint cannot be named.
     #[error("the checkpoint cannot be named: {0}")]
     Unnamed(String),

@@ -153,7 +153,7 @@ mod tests {
     use std::fs;
 
     use super::*;
-    use crate::policy::ActionKind;
+    use perturb_policy::ActionKind;
 
     fn episode(length: u32) -> EndedEpisode {
         EndedEpisode {

@@ -96,8 +96,8 @@ impl Monitor {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::policy::ActionKind;
     use crate::proto::Receipt;
+    use perturb_policy::ActionKind;
 
     #[test]
     fn the_file_is_one_that_stable_baselines3_reads() {

@@ -126,3 +126,16 @@ fn backward(trajectories: &Trajectories<'_>, bootstrap: bool, estimate: impl Fn(
     }
     estimates
 }
+
+/// 1 - Var(return - value)/Var(return) over all samples: 1 = values are perfect, 0 = no better than a constant, below
+/// 0 = worse. None if the returns are constant, for which it is not defined.
+pub fn explained_variance(values: &[f32], returns: &[f32]) -> Option<f64> {
+    let variance = |numbers: &mut dyn Iterator<Item = f64>| {
+        let numbers: Vec<f64> = numbers.collect();
+        let mean = numbers.iter().sum::<f64>() / numbers.len() as f64;
+        numbers.iter().map(|x| (x - mean) * (x - mean)).sum::<f64>() / numbers.len() as f64
+    };
+    let total = variance(&mut returns.iter().map(|&x| f64::from(x)));
+    let left = variance(&mut returns.iter().zip(values).map(|(&r, &v)| f64::from(r) - f64::from(v)));
+    (total > 0.0).then(|| 1.0 - left / total)
+}

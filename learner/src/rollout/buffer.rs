@@ -1,7 +1,8 @@
 //! The rollout buffer.
 
 use super::advantage::Trajectories;
-use crate::error::{Error, Result, check_length};
+use crate::error::{Error, Result};
+use perturb_policy::check_length;
 
 /// One step of N environments, as it is pushed.
 #[derive(Clone, Copy, Debug)]
@@ -10,7 +11,7 @@ pub struct RolloutStep<'a> {
     pub observations: &'a [f32],
     /// `[N]` whether s_t is the first that the policy remembers: its memory was emptied before it.
     pub starts: &'a [bool],
-    /// `[N, A]` actions, as in [`Acts`](crate::policy::Acts).
+    /// `[N, A]` actions, as in [`Acts`](perturb_policy::Acts).
     pub actions: &'a [f32],
     /// `[N]` log-probabilities of the actions under the acting policy.
     pub log_probs: &'a [f32],
@@ -69,7 +70,7 @@ pub struct Rollout {
 
 impl Rollout {
     /// An empty rollout for T = `n_steps`, N = `n_envs`, O = `observation_size` and A = `action_width` (see
-    /// [`ActionKind::width`](crate::policy::ActionKind::width)). Allocates everything that it will need.
+    /// [`ActionKind::width`](perturb_policy::ActionKind::width)). Allocates everything that it will need.
     pub fn new(n_steps: usize, n_envs: usize, observation_size: usize, action_width: usize) -> Self {
         Self::with_room(Some(n_steps), n_steps, n_envs, observation_size, action_width)
     }
@@ -307,10 +308,10 @@ impl Rollout {
     }
 
     /// Places t·N + n of the samples, in order; None if every place is one.
-    pub fn samples(&self) -> Option<Vec<i64>> {
+    pub fn samples(&self) -> Option<Vec<u32>> {
         let lengths = self.lengths.as_ref()?;
         let places = (0..self.len).flat_map(|t| (0..self.n_envs).map(move |n| (t, n)));
-        Some(places.filter(|&(t, n)| t < lengths[n]).map(|(t, n)| (t * self.n_envs + n) as i64).collect())
+        Some(places.filter(|&(t, n)| t < lengths[n]).map(|(t, n)| (t * self.n_envs + n) as u32).collect())
     }
 
     /// N.

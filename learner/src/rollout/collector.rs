@@ -7,9 +7,8 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{Normalisers, Rollout, RolloutStep};
 use crate::client::{ClientError, EndedEpisode, Session, StepReply};
-use crate::error::check_length;
-use crate::policy::{Actor, Acts, Inputs, PolicySpec, Weights};
-use perturb_study::random::{Purpose, stream};
+use perturb_policy::random::{Purpose, stream};
+use perturb_policy::{Actor, Acts, Inputs, PolicySpec, check_length};
 
 /// Why a rollout could not be collected.
 #[derive(Debug, thiserror::Error)]
@@ -21,6 +20,12 @@ pub enum CollectError {
     /// A number is not finite, or an array has the wrong size.
     #[error(transparent)]
     Numbers(#[from] crate::error::Error),
+}
+
+impl From<perturb_policy::Error> for CollectError {
+    fn from(error: perturb_policy::Error) -> Self {
+        Self::Numbers(error.into())
+    }
 }
 
 impl CollectError {
@@ -200,12 +205,12 @@ impl<'a> Collector<'a> {
     /// [`CollectError`]; what was collected of this rollout is lost.
     pub fn collect(
         &mut self,
-        weights: &Weights,
+        weights: &[f32],
         rollout: &mut Rollout,
         mut on_episode: impl FnMut(&EndedEpisode),
     ) -> Result<(), CollectError> {
         self.timed(|collector| {
-            collector.actor.load(weights)?;
+            collector.actor.load_flat(weights)?;
             rollout.begin(collector.actor.memory());
             while !rollout.is_full() {
                 collector.step()?;
@@ -230,7 +235,7 @@ impl<'a> Collector<'a> {
     /// [`CollectError`]; what was collected of this rollout is lost.
     pub fn collect_episodes(
         &mut self,
-        weights: &Weights,
+        weights: &[f32],
         count: usize,
         rollout: &mut Rollout,
         mut on_episode: impl FnMut(&EndedEpisode),
@@ -240,7 +245,7 @@ impl<'a> Collector<'a> {
             let mut due: Vec<usize> = (0..n_envs).map(|i| count / n_envs + usize::from(i < count % n_envs)).collect();
             let mut active: Vec<bool> = due.iter().map(|&due| due > 0).collect();
             let mut stepped = active.clone();
-            collector.actor.load(weights)?;
+            collector.actor.load_flat(weights)?;
             collector.reset(&active)?;
             rollout.begin(collector.actor.memory());
             while active.contains(&true) {

@@ -1,7 +1,6 @@
 //! What a collector normalises with.
 
-use crate::error::Result;
-use crate::policy::{ObservationNormaliser, RewardNormaliser};
+use perturb_policy::{ObservationNormaliser, Result, RewardNormaliser};
 
 /// Statistics of a training; `None` where nothing is normalised.
 #[derive(Clone, Debug, PartialEq)]

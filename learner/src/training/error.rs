@@ -148,7 +148,7 @@ mod tests {
             let last = saved.then(|| LastCheckpoint { episodes: 7, run: "runs/a".into() });
             TrainError::Failed { last, source: Box::new(source) }.to_string()
         };
-        let numbers = || TrainError::Numbers(Error::PolicyOutput { environment: 0 });
+        let numbers = || TrainError::Numbers(perturb_policy::Error::PolicyOutput { environment: 0 }.into());
         assert!(
             shown(false, numbers()).starts_with("training failed before its first checkpoint: the policy's output")
         );

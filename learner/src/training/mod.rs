@@ -1,8 +1,8 @@
 //! The training loop: rollout, update, log, checkpoint.
 //!
 //! Randomness: the environments' seed is the training's seed; initial weights, minibatch order and sampled actions have
-//! streams of their own (see [`perturb_study::random`]). One thread computes everything in one order, so that equal
-//! configurations give equal weights, byte for byte, whatever the number of servers and of their workers.
+//! streams of their own (see [`perturb_policy::random`]). Every sum has one order, so that equal configurations give equal
+//! weights, byte for byte, whatever the number of servers, of their workers and of threads.
 
 mod error;
 mod run_directory;
@@ -14,9 +14,10 @@ use crate::algorithm::{self, Algorithm, Experience, UpdateStats};
 use crate::checkpoint::{Checkpoint, EnvironmentSummary, History, ResumeState, State};
 use crate::client::{EndedEpisode, OpenOptions, Servers, Session};
 use crate::logging::{Clock, EpisodeFigures, Logs, Progress, TimeShares};
-use crate::policy::{ObservationNormaliser, Policy, RewardNormaliser, Weights};
+use crate::policy::Policy;
 use crate::rollout::{Collector, Normalisers, Rollout};
 pub use error::{LastCheckpoint, TrainError};
+use perturb_policy::{ObservationNormaliser, RewardNormaliser};
 use perturb_study::Counters;
 use perturb_study::files::write_atomically;
 use perturb_study::interrupt::StopFlag;
@@ -42,7 +43,7 @@ pub struct Outcome {
     pub signal: Option<i32>,
 }
 
-/// Trains as `config` says and writes everything to `directory`; calls `report` after every iteration. When `stop` is
+/// Trains as `config` says, with `threads` threads in updates, which change no byte, and writes everything to `directory`; calls `report` after every iteration. When `stop` is
 /// raised, the iteration is finished and the checkpoint written.
 ///
 /// # Errors
@@ -51,10 +52,11 @@ pub fn train(
     servers: &Servers,
     config: &TrainConfig,
     directory: &RunDirectory,
+    threads: usize,
     stop: &StopFlag,
     report: impl FnMut(&Progress),
 ) -> Result<Outcome> {
-    let mut training = Training::begin(servers, config)?;
+    let mut training = Training::begin(servers, config, threads)?;
     directory.prepare()?; // from here on an earlier run is gone
     tracing::debug!(directory = %directory.path().display(), "training begins");
     let Common { environment, .. } = &config.common;
@@ -74,11 +76,12 @@ pub fn resume(
     servers: &Servers,
     directory: &RunDirectory,
     (checkpoint, state): (Checkpoint, ResumeState),
+    threads: usize,
     stop: &StopFlag,
     report: impl FnMut(&Progress),
 ) -> Result<Outcome> {
     let lengths = state.history.logs.clone();
-    let mut training = Training::resume(servers, checkpoint, state)?;
+    let mut training = Training::resume(servers, checkpoint, state, threads)?;
     let mut logs =
         Logs::resume(directory.path(), &lengths, &training.checkpoint.state.environment_spec, training.clock)?;
     tracing::debug!(directory = %directory.path().display(), "training goes on");
@@ -108,7 +111,7 @@ struct Training<'a> {
 }
 
 impl<'a> Training<'a> {
-    fn begin(servers: &'a Servers, config: &TrainConfig) -> Result<Self> {
+    fn begin(servers: &'a Servers, config: &TrainConfig, threads: usize) -> Result<Self> {
         let common = &config.common;
         let mut observations = Vec::new();
         let (session, summary) = open(servers, config, &mut observations)?;
@@ -123,7 +126,7 @@ impl<'a> Training<'a> {
             commits: Vec::new(),
         };
         let spec = state.policy();
-        let policy = Policy::new(spec.clone(), common.seed)?;
+        let policy = Policy::new(spec.clone(), common.seed)?.with_threads(threads)?;
         let normalisers = Normalisers {
             observations: common.normalize_observations.then(|| ObservationNormaliser::new(observation_size)),
             rewards: common.normalize_rewards.then(|| RewardNormaliser::new(common.num_envs, config.settings.gamma())),
@@ -134,7 +137,7 @@ impl<'a> Training<'a> {
         Self::new(servers, policy, collector, comparison, Checkpoint { state, policy: spec, weights })
     }
 
-    fn resume(servers: &'a Servers, checkpoint: Checkpoint, resume: ResumeState) -> Result<Self> {
+    fn resume(servers: &'a Servers, checkpoint: Checkpoint, resume: ResumeState, threads: usize) -> Result<Self> {
         let state = &checkpoint.state;
         let common = &state.config.common;
         let (session, served) = open(servers, &state.config, &mut Vec::new())?;
@@ -142,7 +145,7 @@ impl<'a> Training<'a> {
             return Err(TrainError::Changed { environment: common.environment.clone(), what, trained, served });
         }
         let comparison = Comparison::of(session.environment());
-        let policy = Policy::from_weights(checkpoint.policy.clone(), &checkpoint.weights)?;
+        let policy = Policy::from_weights(checkpoint.policy.clone(), &checkpoint.weights)?.with_threads(threads)?;
         let normalisers = Normalisers {
             observations: state.observation_normaliser.clone(),
             rewards: state.reward_normaliser.clone(),
@@ -235,7 +238,7 @@ impl<'a> Training<'a> {
         let mut written = Ok(());
         let mut not_applied = None;
         let (mut ended, mut steps) = (0, 0);
-        let Self { collector, rollout, recent, checkpoint, algorithm, comparison, .. } = self;
+        let Self { collector, rollout, recent, policy, algorithm, comparison, .. } = self;
         let on_episode = |episode: &EndedEpisode| {
             if not_applied.is_none() {
                 not_applied = difference(comparison, episode);
@@ -249,11 +252,11 @@ impl<'a> Training<'a> {
         };
         match algorithm.experience() {
             Experience::Steps(_) => {
-                collector.collect(&checkpoint.weights, rollout, on_episode)?;
+                collector.collect(policy.flat_weights(), rollout, on_episode)?;
                 steps = (rollout.n_steps() * rollout.n_envs()) as u64;
             }
             Experience::Episodes(count) => {
-                collector.collect_episodes(&checkpoint.weights, count, rollout, on_episode)?
+                collector.collect_episodes(policy.flat_weights(), count, rollout, on_episode)?
             }
         }
         written?;
@@ -271,7 +274,6 @@ impl<'a> Training<'a> {
             Some(last) if last < LONG_UPDATE => update()?,
             _ => self.servers.keep_alive_during(update)?,
         };
-        let weights = self.policy.weights();
         let elapsed = updating.elapsed();
         self.last_update = Some(elapsed);
         self.updating += elapsed;
@@ -285,7 +287,7 @@ impl<'a> Training<'a> {
         counters.episodes += learned_episodes;
         counters.generated_episodes += ended;
         counters.learned_timesteps += learned_steps;
-        self.keep(weights, counters);
+        self.keep(counters);
         Ok(self.progress(update))
     }
 
@@ -297,9 +299,9 @@ impl<'a> Training<'a> {
     }
 
     /// Remembers the state after a whole iteration.
-    fn keep(&mut self, weights: Weights, counters: Counters) {
+    fn keep(&mut self, counters: Counters) {
         let Normalisers { observations, rewards } = self.collector.normalisers().clone();
-        self.checkpoint.weights = weights;
+        self.policy.copy_weights(&mut self.checkpoint.weights);
         self.checkpoint.state.observation_normaliser = observations;
         self.checkpoint.state.reward_normaliser = rewards;
         self.checkpoint.state.counters = counters;

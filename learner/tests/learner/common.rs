@@ -2,10 +2,11 @@
 
 use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
 use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers};
-use perturb_learner::policy::{Policy, PolicySpec};
+use perturb_learner::policy::Policy;
 use perturb_learner::rollout::Rollout;
+use perturb_policy::PolicySpec;
+use perturb_policy::random::{Purpose, normal, stream};
 use perturb_study::Version;
-use perturb_study::random::{Purpose, normal, stream};
 use perturb_study::settings::{A2cConfig, PpoConfig};
 
 /// A server with one physics thread.

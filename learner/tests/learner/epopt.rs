@@ -6,13 +6,13 @@ use crate::common::{bases, connect, contents, moved, options, server};
 use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Epopt, Ppo, Selection, UpdateStats};
 use perturb_learner::client::{EndedEpisode, PrivateServer, Session};
 use perturb_learner::error::Error;
-use perturb_learner::policy::{
-    ActionKind, Actor, Acts, Inputs, ObservationNormaliser, Policy, PolicySpec, RewardNormaliser, Sequences,
-};
+use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{
     Collector, Estimates, Normalisers, Rollout, RolloutStep, Span, Trajectories, gae, n_step_returns,
 };
-use perturb_study::random::{Purpose, normal, stream, uniform};
+use perturb_learner::torch::{Sequences, TorchPolicy};
+use perturb_policy::random::{Purpose, normal, stream, uniform};
+use perturb_policy::{ActionKind, Actor, Acts, Inputs, ObservationNormaliser, PolicySpec, RewardNormaliser};
 use perturb_study::settings::{A2cConfig, EpoptConfig, PpoConfig};
 use proptest::prelude::*;
 use rand_chacha::ChaCha8Rng;
@@ -369,7 +369,7 @@ fn episodes_that_a_rollout_does_not_hold_are_refused() {
 }
 
 /// The mean over the samples of a packed `rollout` of a loss in which every output of the policy counts, with its gradient.
-fn loss_of(policy: &Policy, rollout: &Rollout) -> (f64, Vec<f32>) {
+fn loss_of(policy: &TorchPolicy, rollout: &Rollout) -> (f64, Vec<f32>) {
     let sequences =
         Sequences::new(policy.spec(), rollout.n_steps(), rollout.observations(), rollout.starts(), rollout.memory())
             .and_then(|sequences| sequences.with_lengths(rollout.lengths().expect("packed")))
@@ -380,7 +380,7 @@ fn loss_of(policy: &Policy, rollout: &Rollout) -> (f64, Vec<f32>) {
     let terms =
         &evaluated.log_probs * Tensor::of_slice(&weights) + evaluated.values.square() + &evaluated.entropy * 0.3;
     let loss = terms.mean(Kind::Float);
-    let mut gradient = vec![0.0; policy.n_weights()];
+    let mut gradient = vec![0.0; policy.spec().n_weights()];
     policy.gradient(&evaluated, &loss, &mut gradient).expect("a gradient");
     (loss.double_value(&[]), gradient)
 }
@@ -394,21 +394,20 @@ fn unequal() -> Vec<Vec<usize>> {
 fn padding_is_no_sample_of_a_recurrent_policys_loss_and_gradient() {
     for action in [DISCRETE, CONTINUOUS] {
         for plain_autograd in [false, true] {
-            let mut policy = moved(&spec(action, Some(8)));
-            if plain_autograd {
-                policy = policy.with_plain_autograd();
-            }
+            let policy = moved(&spec(action, Some(8)));
+            let torch = TorchPolicy::new(policy.spec(), policy.flat_weights()).expect("a policy");
+            let torch = if plain_autograd { torch.with_plain_autograd() } else { torch };
             let rollout = play(&policy, &unequal(), &zeros(&unequal()), of_episodes(policy.spec(), 4));
             let select = |episodes: &[Span]| rollout.select(episodes).expect("its own episodes");
             let packed = select(rollout.episodes());
             let (places, steps) = (packed.n_steps() * packed.n_envs(), 30);
             assert!(packed.samples().is_some_and(|samples| samples.len() == steps) && places > steps, "{places}");
-            let (loss, gradient) = loss_of(&policy, &packed);
+            let (loss, gradient) = loss_of(&torch, &packed);
 
             let (mut mean, mut mean_gradient) = (0.0, vec![0.0f64; gradient.len()]);
             for episode in rollout.episodes() {
                 let share = episode.length as f64 / steps as f64;
-                let (loss, gradient) = loss_of(&policy, &select(&[*episode]));
+                let (loss, gradient) = loss_of(&torch, &select(&[*episode]));
                 mean += share * loss;
                 mean_gradient.iter_mut().zip(gradient).for_each(|(sum, g)| *sum += share * f64::from(g));
             }
@@ -497,7 +496,7 @@ fn collect(servers: &[PrivateServer], normalised: bool) -> (Vec<(Rollout, Vec<En
     for _ in 0..2 {
         let (mut rollout, mut ended) = (Rollout::of_episodes(CARTPOLES, size, 1), Vec::new());
         let on_episode = |episode: &EndedEpisode| ended.push(episode.clone());
-        collector.collect_episodes(&policy.weights(), COUNT, &mut rollout, on_episode).expect("a rollout");
+        collector.collect_episodes(policy.flat_weights(), COUNT, &mut rollout, on_episode).expect("a rollout");
         collected.push((rollout, ended));
     }
     (collected, collector.normalisers().clone())

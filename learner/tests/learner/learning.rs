@@ -2,9 +2,11 @@
 
 use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Ppo};
 use perturb_learner::error::Error;
-use perturb_learner::policy::{ActionKind, Actor, Acts, Policy, PolicySpec, Sequences};
+use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Rollout, RolloutStep};
-use perturb_study::random::{Purpose, normal, stream, uniform};
+use perturb_learner::torch::{Sequences, TorchPolicy};
+use perturb_policy::random::{Purpose, normal, stream, uniform};
+use perturb_policy::{ActionKind, Actor, Acts, PolicySpec};
 use perturb_study::settings::{A2cConfig, PpoConfig, Schedule, SettingError};
 use rand_chacha::ChaCha8Rng;
 use rstest::rstest;
@@ -248,6 +250,7 @@ fn a_penalty_on_the_divergence_keeps_the_policy_near(
         ppo.update(&mut after, rollout, 1.0).expect("an update");
         let distributions = |policy: &Policy| {
             let sequences = Sequences::new(policy.spec(), 8, rollout.observations(), rollout.starts(), &[]);
+            let policy = TorchPolicy::new(policy.spec(), policy.flat_weights()).expect("a policy");
             policy.evaluate(&sequences.expect("shapes that fit"), &Tensor::of_slice(rollout.actions())).distributions
         };
         distributions(&before).divergence_to(&distributions(&after)).mean(Kind::Float).double_value(&[])
@@ -289,7 +292,7 @@ fn the_same_seed_learns_the_same_bytes_and_a_resumed_training_too() {
 fn a_state_of_another_algorithm_is_refused() {
     let training = Training::new(DISCRETE, 8);
     let (mut a2c, mut ppo) = (a2c(&training), ppo(&training, 1));
-    assert!(matches!(a2c.load_state(&ppo.state()), Err(Error::Arrays { .. })));
+    assert!(matches!(a2c.load_state(&ppo.state()), Err(Error::Policy(perturb_policy::Error::Arrays { .. }))));
     assert!(ppo.load_state(&a2c.state()).is_err());
 }
 
@@ -317,7 +320,7 @@ fn a_loss_that_is_not_finite_is_an_error_and_leaves_the_policy_alone() {
     let algorithms: [Box<dyn Algorithm>; 2] = [Box::new(a2c(&training)), Box::new(ppo(&training, 2))];
     for mut algorithm in algorithms {
         let result = algorithm.update(&mut training.policy, &rollout, 1.0);
-        assert!(matches!(result, Err(Error::NotFinite { update: 0, .. })), "{result:?}");
+        assert!(matches!(result, Err(Error::Policy(perturb_policy::Error::NotFinite { update: 0, .. }))), "{result:?}");
         assert_eq!(training.policy.weights(), before);
     }
 }
@@ -348,11 +351,14 @@ fn rollouts_that_do_not_fit_are_refused() {
     assert!(matches!(result, Err(Error::RolloutLength { got: 0, expected: 8, .. })), "{result:?}");
     training.collect();
     let mut short = A2c::new(A2cConfig::default(), &training.policy).expect("valid settings");
-    assert!(matches!(short.update(&mut training.policy, &training.rollout, 1.0), Err(Error::Length { .. })));
+    assert!(matches!(
+        short.update(&mut training.policy, &training.rollout, 1.0),
+        Err(Error::Policy(perturb_policy::Error::Length { .. }))
+    ));
     let mut odd = ppo(&training, 3);
     let result = odd.update(&mut training.policy, &training.rollout, 1.0);
     assert!(matches!(&result, Err(Error::Setting(error)) if error.name == "n_minibatches"), "{result:?}");
-    assert!(matches!(training.rollout.finish(&[0.0; 3]), Err(Error::Length { .. })));
+    assert!(matches!(training.rollout.finish(&[0.0; 3]), Err(Error::Policy(perturb_policy::Error::Length { .. }))));
 }
 
 #[track_caller]

@@ -4,9 +4,8 @@
 mod common;
 
 mod epopt;
+mod gradients;
 mod learning;
 mod losses;
-mod normaliser;
-mod policy;
 mod recurrent;
 mod rl2;

@@ -3,9 +3,11 @@
 
 use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Ppo};
 use perturb_learner::error::Error;
-use perturb_learner::policy::{ActionKind, Actor, Acts, Evaluated, Policy, PolicySpec, Sequences, Weights};
+use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Rollout, RolloutStep};
-use perturb_study::random::{Purpose, normal, stream, uniform};
+use perturb_learner::torch::{Evaluated, Sequences, TorchPolicy};
+use perturb_policy::random::{Purpose, normal, stream, uniform};
+use perturb_policy::{ActionKind, Actor, Acts, PolicySpec, Weights};
 use perturb_study::settings::{A2cConfig, PpoConfig};
 use rand_chacha::ChaCha8Rng;
 use rstest::rstest;
@@ -72,7 +74,7 @@ impl Window {
         window
     }
 
-    fn evaluate(&self, policy: &Policy) -> Evaluated {
+    fn evaluate(&self, policy: &TorchPolicy) -> Evaluated {
         let n_steps = self.acts.len();
         let sequences = Sequences::new(policy.spec(), n_steps, &self.observations, &self.starts, &self.memory);
         let actions: Vec<f32> = self.acts.iter().flat_map(|acts| acts.actions.clone()).collect();
@@ -84,6 +86,11 @@ impl Window {
 /// 3e-7. Over layers of at most 256 that grows to about 1e-6 of values and logits of order 1.
 const TOLERANCE: f32 = 1e-5;
 
+fn torch(spec: &PolicySpec, weights: &Weights) -> TorchPolicy {
+    let weights: Vec<f32> = weights.iter().flat_map(|array| array.data.clone()).collect();
+    TorchPolicy::new(spec, &weights).expect("a policy")
+}
+
 #[test]
 fn evaluating_a_window_equals_acting_step_by_step() {
     // Odd sizes too: layers and batches that are no multiples of the blocks.
@@ -92,8 +99,7 @@ fn evaluating_a_window_equals_acting_step_by_step() {
             let spec = spec(action, &hidden, width);
             let weights = moved(&spec);
             let window = Window::new(&spec, &weights, 12, 7);
-            let policy = Policy::from_weights(spec.clone(), &weights).expect("a policy");
-            for policy in [policy, Policy::from_weights(spec, &weights).expect("a policy").with_plain_autograd()] {
+            for policy in [torch(&spec, &weights), torch(&spec, &weights).with_plain_autograd()] {
                 let evaluated = window.evaluate(&policy);
                 let log_probs = Vec::<f32>::from(evaluated.log_probs);
                 let values = Vec::<f32>::from(evaluated.values);
@@ -115,16 +121,16 @@ fn the_two_stage_gradient_equals_autograds() {
             let spec = spec(action, &hidden, width);
             let weights = moved(&spec);
             let window = Window::new(&spec, &weights, 12, 7);
-            let gradient = |policy: Policy| {
+            let gradient = |policy: TorchPolicy| {
                 let evaluated = window.evaluate(&policy);
                 let weighting = Tensor::of_slice(&window.observations[..12 * 7]); // any numbers
                 let loss = (&evaluated.log_probs * &weighting + evaluated.values.square() + &evaluated.entropy * 0.3)
                     .mean(Kind::Float);
-                let mut gradient = vec![0.0; policy.n_weights()];
+                let mut gradient = vec![0.0; policy.spec().n_weights()];
                 policy.gradient(&evaluated, &loss, &mut gradient).expect("a gradient");
                 gradient
             };
-            let policy = || Policy::from_weights(spec.clone(), &weights).expect("a policy");
+            let policy = || torch(&spec, &weights);
             let (two_stage, plain) = (gradient(policy()), gradient(policy().with_plain_autograd()));
             let mut start = 0;
             for array in &weights {
@@ -160,7 +166,7 @@ fn a_memory_is_emptied_alone_and_values_leave_it_as_it_is() {
     actor.values_in(&observations[O..2 * O], &[2], &mut some).expect("values");
     assert_ne!(some[0], values[1], "with another past the value is another");
     assert_eq!(actor.memory(), remembered);
-    assert!(matches!(actor.values_in(&observations, &[1, 2], &mut some), Err(Error::Length { .. })));
+    assert!(matches!(actor.values_in(&observations, &[1, 2], &mut some), Err(perturb_policy::Error::Length { .. })));
 
     actor.forget(1);
     let mut second = Acts::new(DISCRETE, 3);
@@ -212,7 +218,7 @@ fn nan_is_an_error_not_an_action() {
         let mut observations = [0.5; 2 * O];
         observations[O + 2] = f32::NAN;
         let result = actor.act(&observations, &mut stream(1, Purpose::Actions), &mut Acts::new(action, 2));
-        assert!(matches!(result, Err(Error::PolicyOutput { environment: 1 })), "{result:?}");
+        assert!(matches!(result, Err(perturb_policy::Error::PolicyOutput { environment: 1 })), "{result:?}");
     }
 }
 
@@ -432,11 +438,21 @@ fn what_does_not_fit_a_recurrent_policy_is_refused() {
     let mut forgetful = Training::new(None, 6);
     forgetful.collect();
     let result = a2c(&training).update(&mut training.policy, &forgetful.rollout, 1.0);
-    assert!(matches!(result, Err(Error::Length { name: "the rollout's memory [N, S]", got: 0, expected: 512 })));
+    assert!(matches!(
+        result,
+        Err(Error::Policy(perturb_policy::Error::Length {
+            name: "the rollout's memory [N, S]",
+            got: 0,
+            expected: 512
+        }))
+    ));
     assert!(matches!(
         Sequences::new(training.policy.spec(), 2, &[0.0; 8], &[false; 5], &[]),
-        Err(Error::Length { .. })
+        Err(Error::Policy(perturb_policy::Error::Length { .. }))
     ));
     let spec = PolicySpec { lstm: Some(0), ..training.policy.spec().clone() };
-    assert!(matches!(Policy::new(spec, 1), Err(Error::Setting(error)) if error.name == "the width of the LSTM"));
+    assert!(matches!(
+        Policy::new(spec, 1),
+        Err(Error::Policy(perturb_policy::Error::Empty { name: "the width of the LSTM" }))
+    ));
 }

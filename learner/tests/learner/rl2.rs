@@ -6,12 +6,13 @@ use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{EndedEpisode, OpenOptions, Servers, Session, StepReply};
 use perturb_learner::evaluation::test;
-use perturb_learner::policy::{ActionKind, Actor, Acts, Inputs, Policy, PolicySpec};
+use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Collector, Normalisers, Rollout, RolloutStep, gae};
 use perturb_learner::training::{RunDirectory, train};
+use perturb_policy::random::{Purpose, stream, uniform};
+use perturb_policy::{ActionKind, Actor, Acts, Inputs, PolicySpec};
 use perturb_study::Version;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::random::{Purpose, stream, uniform};
 use perturb_study::settings::{self, A2cConfig, PpoConfig, TrainConfig};
 use rand_chacha::ChaCha8Rng;
 
@@ -119,7 +120,7 @@ fn a_trial_of_one_episode_is_a_recurrent_policy_with_longer_inputs() {
         let expected = extended_by_hand(&servers, &options, &policy, n_steps);
         let mut rollout = Rollout::new(n_steps, N_ENVS, policy.spec().observation_size, 1);
         let mut collector = collector(&servers, &options, &policy);
-        collector.collect(&policy.weights(), &mut rollout, |_| {}).expect("a rollout");
+        collector.collect(policy.flat_weights(), &mut rollout, |_| {}).expect("a rollout");
         assert!(rollout.starts()[N_ENVS..].contains(&true), "an episode has ended");
         assert_eq!(contents(&rollout), contents(&expected), "{environment}");
         for which in 0..2 {
@@ -150,7 +151,7 @@ impl Steps {
         for t in 0..n_steps {
             let mut rollout = Rollout::new(1, N_ENVS, policy.spec().observation_size, 1);
             let on_episode = |episode: &EndedEpisode| steps.ended.push((t, episode.clone()));
-            collector.collect(&policy.weights(), &mut rollout, on_episode).expect("a rollout");
+            collector.collect(policy.flat_weights(), &mut rollout, on_episode).expect("a rollout");
             steps.rollouts.push(rollout);
         }
         steps
@@ -222,7 +223,7 @@ fn advantages_run_across_the_episodes_of_a_trial() {
     let mut collector = collector(&servers, &options("CartPole", N_ENVS, 2), &policy);
     let mut lengths: [Vec<(u32, u32)>; N_ENVS] = Default::default();
     let on_episode = |end: &EndedEpisode| lengths[end.slot].push((end.length, end.episode_in_trial));
-    collector.collect(&policy.weights(), &mut rollout, on_episode).expect("a rollout");
+    collector.collect(policy.flat_weights(), &mut rollout, on_episode).expect("a rollout");
     let trajectories = rollout.trajectories().expect("a finished rollout");
     let (gamma, values) = (0.9, rollout.values());
     let one_step = gae(&trajectories, gamma, 0.0, true).advantages;
@@ -267,7 +268,7 @@ fn balancing_in_the_second_episode(servers: &Servers) -> Checkpoint {
     let config = TrainConfig::from_table("the test", settings.parse().expect("TOML")).expect("a configuration");
     let out = tempfile::tempdir().expect("a directory");
     let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
-    let outcome = train(servers, &config, &directory, &StopFlag::default(), |_| {}).expect("a training");
+    let outcome = train(servers, &config, &directory, 1, &StopFlag::default(), |_| {}).expect("a training");
     let mut checkpoint = outcome.checkpoint;
     assert_eq!(checkpoint.policy.observation_size, 4 + 2 + 1 + 1);
     let spec = PolicySpec { hidden: vec![], lstm: Some(4), ..checkpoint.policy.clone() };

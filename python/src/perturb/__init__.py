@@ -6,7 +6,7 @@ Importing this package registers its environments:
     import perturb
 
     env = gymnasium.make("perturb/Hopper-v0", version="R", server="unix:/tmp/perturb.sock")
-    envs = gymnasium.make_vec("perturb/CartPole-v0", num_envs=64, version="E")
+    envs = gymnasium.make_vec("perturb/CartPole-v1", num_envs=64, version="E")
 """
 
 from importlib.metadata import version as _version

@@ -11,7 +11,7 @@ _OLD_SUFFIXES = {"D": "", "R": "RandomNormal", "E": "RandomExtreme"}
 
 
 def register_all() -> None:
-    """Register `perturb/CartPole-v0` and so on, and the paper's ids, such as `SunblazeCartPoleRandomNormal-v0`.
+    """Register `perturb/CartPole-v1` and so on, and the paper's ids, such as `SunblazeCartPoleRandomNormal-v0`.
 
     Step limits are the server's: a limit here would go wrong when a snapshot is restored.
     """

@@ -18,7 +18,7 @@ use std::f64::consts::PI;
 /// What is fixed about Acrobot.
 pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "Acrobot",
-    revision: 0,
+    revision: 1,
     description: "Swing the tip of a two-link pendulum above a line.",
     make: || Ok(Box::new(Acrobot::new())),
     parameters: &[
@@ -95,12 +95,12 @@ impl Acrobot {
         let (i1, i2) = (self.link_moi, self.link_moi);
         let l1 = self.link_length;
         let g = GRAVITY;
-        let (sin2, cos2) = theta2.sin_cos();
+        let (sin2, cos2) = libm::sincos(theta2);
         let d1 = m1 * lc1 * lc1 + m2 * (l1 * l1 + lc2 * lc2 + 2.0 * l1 * lc2 * cos2) + i1 + i2;
         let d2 = m2 * (lc2 * lc2 + l1 * lc2 * cos2) + i2;
-        let phi2 = m2 * lc2 * g * (theta1 + theta2 - PI / 2.0).cos();
+        let phi2 = m2 * lc2 * g * libm::cos(theta1 + theta2 - PI / 2.0);
         let phi1 = -m2 * l1 * lc2 * dtheta2 * dtheta2 * sin2 - 2.0 * m2 * l1 * lc2 * dtheta2 * dtheta1 * sin2
-            + (m1 * lc1 + m2 * l1) * g * (theta1 - PI / 2.0).cos()
+            + (m1 * lc1 + m2 * l1) * g * libm::cos(theta1 - PI / 2.0)
             + phi2;
         let ddtheta2 = (torque + d2 / d1 * phi1 - m2 * l1 * lc2 * dtheta1 * dtheta1 * sin2 - phi2)
             / (m2 * lc2 * lc2 + i2 - d2 * d2 / d1);
@@ -162,7 +162,8 @@ impl Environment for Acrobot {
 
     fn observe(&self, out: &mut [f32]) {
         let [theta1, theta2, dtheta1, dtheta2] = self.state;
-        let values = [theta1.cos(), theta1.sin(), theta2.cos(), theta2.sin(), dtheta1, dtheta2];
+        let ((sin1, cos1), (sin2, cos2)) = (libm::sincos(theta1), libm::sincos(theta2));
+        let values = [cos1, sin1, cos2, sin2, dtheta1, dtheta2];
         out.copy_from_slice(&values.map(|x| x as f32));
     }
 
@@ -182,7 +183,7 @@ impl Environment for Acrobot {
         ];
         let diverged = analytic::advance(&mut self.state, next);
 
-        let goal = -self.state[0].cos() - (self.state[1] + self.state[0]).cos() > HEIGHT;
+        let goal = -libm::cos(self.state[0]) - libm::cos(self.state[1] + self.state[0]) > HEIGHT;
         reward_terms[0] = if goal { 0.0 } else { -1.0 };
         Transition { terminated: goal || diverged, goal, diverged }
     }

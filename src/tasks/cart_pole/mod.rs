@@ -17,7 +17,7 @@ use crate::{
 /// the observation has no bounds.
 pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "CartPole",
-    revision: 0,
+    revision: 1,
     description: "Balance a pole on a cart by pushing the cart left or right.",
     make: || Ok(Box::new(CartPole::new())),
     parameters: &[
@@ -142,7 +142,7 @@ impl Environment for CartPole {
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
         let [x, x_dot, theta, theta_dot] = self.state;
         let force = if analytic::choice(action) == 1 { self.force } else { -self.force };
-        let (sin, cos) = theta.sin_cos();
+        let (sin, cos) = libm::sincos(theta);
         let (pole_mass_length, inverse) = (self.pole_mass_length, self.inverse_total_mass);
         let temp = (force + pole_mass_length * (theta_dot * theta_dot) * sin) * inverse;
         let theta_acc = (GRAVITY * sin - cos * temp)

@@ -21,7 +21,7 @@ const STATE: &[Channel] = &[
 /// What is fixed about MountainCar.
 pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "MountainCar",
-    revision: 0,
+    revision: 1,
     description: "Swing an underpowered car up a hill.",
     make: || Ok(Box::new(MountainCar::new())),
     parameters: &[
@@ -116,7 +116,7 @@ impl Environment for MountainCar {
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
         let [mut position, mut velocity] = self.state;
         let push = f64::from(analytic::choice(action)) - 1.0;
-        velocity += push * self.force + (3.0 * position).cos() * -self.gravity;
+        velocity += push * self.force + libm::cos(3.0 * position) * -self.gravity;
         velocity = velocity.clamp(-MAX_SPEED, MAX_SPEED);
         position = (position + velocity).clamp(MIN_POSITION, MAX_POSITION);
         if position == MIN_POSITION && velocity < 0.0 {

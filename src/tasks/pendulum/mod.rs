@@ -18,7 +18,7 @@ use std::f64::consts::PI;
 /// What is fixed about Pendulum.
 pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "Pendulum",
-    revision: 0,
+    revision: 1,
     description: "Swing a rod up with a weak torque and hold it upright.",
     make: || Ok(Box::new(Pendulum::new())),
     parameters: &[
@@ -87,7 +87,7 @@ impl Pendulum {
         let angle = normalise(theta);
         reward_terms.copy_from_slice(&[-(angle * angle), -(0.1 * (velocity * velocity)), -(0.001 * (u * u))]);
 
-        let acceleration = 3.0 * GRAVITY / (2.0 * l) * theta.sin() + 3.0 / (m * (l * l)) * u;
+        let acceleration = 3.0 * GRAVITY / (2.0 * l) * libm::sin(theta) + 3.0 / (m * (l * l)) * u;
         let velocity = (velocity + acceleration * DT).clamp(-MAX_SPEED, MAX_SPEED);
         let diverged = analytic::advance(&mut self.state, [theta + velocity * DT, velocity]);
         Transition { terminated: diverged, goal: normalise(self.state[0]).abs() < UPRIGHT, diverged }
@@ -130,7 +130,8 @@ impl Environment for Pendulum {
 
     fn observe(&self, out: &mut [f32]) {
         let [theta, velocity] = self.state;
-        out.copy_from_slice(&[theta.cos() as f32, theta.sin() as f32, velocity as f32]);
+        let (sin, cos) = libm::sincos(theta);
+        out.copy_from_slice(&[cos as f32, sin as f32, velocity as f32]);
     }
 
     fn scene(&self) -> Option<Scene> {

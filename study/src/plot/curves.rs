@@ -95,7 +95,7 @@ impl CurvesPlot<'_> {
             let style = LineStyle::nth(index);
             let at = |point: &Point, sign: f64| {
                 let summary = self.quantity.of(point);
-                (point.episodes, summary.mean + sign * summary.std)
+                (point.episodes, summary.mean + sign * summary.std.unwrap_or_default())
             };
             let there = points.iter().map(|point| at(point, 1.0));
             let back = points.iter().rev().map(|point| at(point, -1.0));
@@ -118,7 +118,8 @@ impl CurvesPlot<'_> {
         }
         let values = points().map(|point| self.quantity.of(point));
         let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), summary| {
-            (low.min(summary.mean - summary.std), high.max(summary.mean + summary.std))
+            let std = summary.std.unwrap_or_default();
+            (low.min(summary.mean - std), high.max(summary.mean + std))
         });
         if low > high {
             return (end, 0.0..1.0);

@@ -18,14 +18,7 @@ const BAR: u32 = 74;
 const RANDOM: LineStyle = LineStyle { colour: WHITE, width: 1, dashes: None };
 const EXTREME: LineStyle = LineStyle { colour: WHITE, width: 1, dashes: Some((7, 5)) };
 
-/// The picture of `heatmap`.
-pub fn draw_heatmap(heatmap: &Heatmap) -> impl Plot + '_ {
-    HeatmapPlot(heatmap)
-}
-
-struct HeatmapPlot<'a>(&'a Heatmap);
-
-impl Plot for HeatmapPlot<'_> {
+impl Plot for Heatmap {
     fn size(&self) -> (u32, u32) {
         (PANEL.0, TITLE + 2 * PANEL.1 + KEY)
     }
@@ -35,14 +28,14 @@ impl Plot for HeatmapPlot<'_> {
         let unit = scale as i32;
         let (title, rest) = area.split_vertically(TITLE * scale);
         let (panels, key) = rest.split_vertically(2 * PANEL.1 * scale);
-        let Heatmap { environment, policy, episodes, .. } = self.0;
+        let Heatmap { environment, policy, episodes, .. } = self;
         title
             .draw_text(&format!("{environment}: {policy}"), &font(13, scale), (10 * unit, 8 * unit))
             .map_err(drawing)?;
         let text = format!("{episodes} episodes at each point, other parameters at their defaults");
         title.draw_text(&text, &font(11, scale), (10 * unit, 28 * unit)).map_err(drawing)?;
         let panels = panels.split_evenly((2, 1));
-        let returns = range(self.0.points.iter().map(|point| point.mean_return));
+        let returns = range(self.points.iter().map(|point| point.mean_return));
         self.panel(&panels[0], "mean return", |point| point.mean_return, returns, scale)?;
         self.panel(&panels[1], "success rate, %", |point| point.success_percent, 0.0..100.0, scale)?;
         for (i, (name, line)) in [("R", RANDOM), ("E", EXTREME)].into_iter().enumerate() {
@@ -54,7 +47,7 @@ impl Plot for HeatmapPlot<'_> {
     }
 }
 
-impl HeatmapPlot<'_> {
+impl Heatmap {
     fn panel<DB: DrawingBackend>(
         &self,
         area: &DrawingArea<DB, Shift>,
@@ -64,12 +57,12 @@ impl HeatmapPlot<'_> {
         scale: u32,
     ) -> Result<(), PlotError> {
         let (map, bar) = area.split_horizontally((PANEL.0 - BAR) * scale);
-        let [x, y] = &self.0.axes;
+        let [x, y] = &self.axes;
         let look = |axis: &Axis| AxisLook { name: label(axis), range: axis.low..axis.high, ticks: 6 };
         let mut chart = chart(&map, name, look(x), look(y), scale)?;
-        let grid = self.0.grid;
+        let grid = self.grid;
         let edge = |axis: &Axis, index: usize| axis.low + (axis.high - axis.low) * index as f64 / grid as f64;
-        let tiles = self.0.points.iter().enumerate().map(|(slot, point)| {
+        let tiles = self.points.iter().enumerate().map(|(slot, point)| {
             let (column, row) = (slot % grid, slot / grid);
             let corners = [(edge(x, column), edge(y, row)), (edge(x, column + 1), edge(y, row + 1))];
             let share = (value(point) - range.start) / (range.end - range.start);

@@ -19,7 +19,6 @@ use plotters::style::{FontStyle, register_font};
 use crate::files::{self, FileError, io, write_atomically};
 use crate::folder::FolderError;
 pub use curves::{Quantity, draw_curves};
-pub use heatmap::draw_heatmap;
 
 /// DejaVu Sans, cut down to the letters that pictures have; its licence is beside it.
 const FONT: &[u8] = include_bytes!("../../data/fonts/DejaVuSans-subset.ttf");
@@ -104,7 +103,8 @@ pub fn load_font() -> Result<(), PlotError> {
     if *loaded { Ok(()) } else { Err(PlotError::Draw("the font is damaged".into())) }
 }
 
-fn drawing(error: impl std::fmt::Display) -> PlotError {
+/// What a backend of the plotting library refused.
+pub fn drawing(error: impl std::fmt::Display) -> PlotError {
     PlotError::Draw(error.to_string())
 }
 

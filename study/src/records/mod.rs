@@ -69,14 +69,13 @@ pub struct RecordedTest {
 }
 
 /// How an episode ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ending {
     /// The task ended it.
     Terminated,
     /// The step limit ended it.
     Truncated,
-    /// The physics diverged.
+    /// The physics came to numbers that are not finite.
     Diverged,
 }
 
@@ -87,7 +86,7 @@ pub struct EpisodeRecord {
     pub set: String,
     /// With the two indices that follow its address.
     pub seed: u64,
-    /// The environment's index.
+    /// Among those that were tested together, from 0.
     pub environment_index: u32,
     /// Counts the environment's episodes from 0.
     pub episode_index: u64,
@@ -121,7 +120,7 @@ pub struct Agreement {
 /// A parameter that was asked for, and what the physics had instead.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Difference {
-    /// The parameter.
+    /// By its name in the catalogue.
     pub parameter: String,
     /// What was asked for.
     pub requested: f64,
@@ -188,7 +187,7 @@ impl Records {
 
     /// Compares what every episode was asked to run with and what it ran with.
     pub fn agreement(&self) -> Agreement {
-        let comparison = Comparison::new(&self.about.parameters, &self.about.applied);
+        let comparison = Comparison::with(&self.about);
         let of = |episode: &EpisodeRecord| comparison.largest(&episode.requested, &episode.applied);
         let largest = self.episodes.iter().filter_map(of).max_by(|a, b| a.relative.total_cmp(&b.relative));
         let episodes = if comparison.is_complete() { self.episodes.len() as u64 } else { 0 };
@@ -199,59 +198,43 @@ impl Records {
 /// Compares requested with applied parameters.
 #[derive(Clone, Debug)]
 pub struct Comparison {
-    parameters: Vec<ComparedParameter>,
-}
-
-#[derive(Clone, Debug)]
-struct ComparedParameter {
-    name: String,
-    /// Where the quantity that reads it back is among the applied values; `None` if the server does not say.
-    applied: Option<usize>,
+    /// The parameters' names, and where the quantity that reads each back is among the applied values; `None` if the
+    /// server does not say.
+    parameters: Vec<(String, Option<usize>)>,
 }
 
 impl Comparison {
-    fn new(parameters: &[RecordedParameter], applied: &[String]) -> Self {
-        let compared = |parameter: &RecordedParameter| ComparedParameter {
-            name: parameter.name.clone(),
-            applied: applied.iter().position(|name| *name == parameter.applied),
-        };
-        Self { parameters: parameters.iter().map(compared).collect() }
+    fn with(about: &About) -> Self {
+        let place = |parameter: &RecordedParameter| about.applied.iter().position(|name| *name == parameter.applied);
+        let parameters = about.parameters.iter().map(|parameter| (parameter.name.clone(), place(parameter)));
+        Self { parameters: parameters.collect() }
     }
 
     /// For the receipts of `environment`.
     pub fn of(environment: &proto::Environment) -> Self {
-        let About { parameters, applied, .. } = About::new(environment, String::new(), 1);
-        Self::new(&parameters, &applied)
+        Self::with(&About::new(environment, String::new(), 1))
     }
 
-    /// The largest difference that is more than rounding; costs nothing where there is none.
+    /// The largest difference that is more than rounding.
     pub fn real_difference(&self, requested: &[f64], applied: &[f64]) -> Option<Difference> {
-        let fits = |(index, parameter): (usize, &ComparedParameter)| match parameter.applied {
-            Some(place) => match (requested.get(index), applied.get(place)) {
-                (Some(&requested), Some(&applied)) => relative(requested, applied) <= ROUNDING,
-                _ => false,
-            },
-            None => true,
-        };
-        let all = self.parameters.iter().enumerate().all(fits);
-        if all { None } else { self.largest(requested, applied) }
+        self.largest(requested, applied).filter(Difference::is_real)
     }
 
     /// Whether every parameter is read back.
     fn is_complete(&self) -> bool {
-        self.parameters.iter().all(|parameter| parameter.applied.is_some())
+        self.parameters.iter().all(|(_, place)| place.is_some())
     }
 
     /// The largest difference in a receipt; `None` if nothing is read back. A value that is missing differs.
-    pub fn largest(&self, requested: &[f64], applied: &[f64]) -> Option<Difference> {
+    fn largest(&self, requested: &[f64], applied: &[f64]) -> Option<Difference> {
         let value = |values: &[f64], place: usize| values.get(place).copied().unwrap_or(f64::NAN);
-        let compared = self.parameters.iter().enumerate().filter_map(|(index, parameter)| {
-            let (requested, applied) = (value(requested, index), value(applied, parameter.applied?));
-            Some((parameter, requested, applied, relative(requested, applied)))
+        let compared = self.parameters.iter().enumerate().filter_map(|(index, (name, place))| {
+            let (requested, applied) = (value(requested, index), value(applied, (*place)?));
+            Some((name, requested, applied, relative(requested, applied)))
         });
         let largest = compared.max_by(|a, b| a.3.total_cmp(&b.3));
-        largest.map(|(parameter, requested, applied, relative)| Difference {
-            parameter: parameter.name.clone(),
+        largest.map(|(name, requested, applied, relative)| Difference {
+            parameter: name.clone(),
             requested,
             applied,
             relative,

@@ -15,10 +15,12 @@ use parquet::file::metadata::KeyValue;
 use parquet::file::properties::WriterProperties;
 use parquet::file::reader::{FileReader, SerializedFileReader};
 use parquet::file::writer::{SerializedColumnWriter, SerializedFileWriter};
-use parquet::record::{Field, Row};
+use parquet::record::{Row, RowAccessor};
 use parquet::schema::parser::parse_message_type;
+use parquet::schema::types::Type;
 
 use super::{About, Ending, EpisodeRecord, Records};
+use crate::AnyError;
 use crate::files::{FileError, read_if_there, write_atomically};
 
 /// What the file is called beside a result.
@@ -29,125 +31,107 @@ const KEY: &str = "perturb";
 /// Why records cannot be read or written.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum RecordsError {
     /// The operating system refused the file.
     #[error(transparent)]
     File(#[from] FileError),
     /// There is no such file.
     #[error("there are no recorded episodes in {}", path.display())]
-    Missing {
-        /// What was given.
-        path: PathBuf,
-    },
+    Missing { path: PathBuf },
     /// The file is not what this program writes.
     #[error("{} does not hold recorded episodes: {reason}", path.display())]
     Damaged {
-        /// The file.
         path: PathBuf,
         /// What is wrong with it.
         reason: String,
     },
 }
 
-/// A column: its name in the file, and its values.
-struct Column {
-    name: String,
-    values: Values,
+/// The values of a column.
+enum ColumnValues {
+    Text(Vec<ByteArray>),
+    Unsigned64(Vec<i64>),
+    Unsigned32(Vec<i32>),
+    Flag(Vec<bool>),
+    Number(Vec<f64>),
+    /// Those that are there, and for each row whether it has one.
+    Optional(Vec<f64>, Vec<i16>),
 }
 
-enum Values {
-    Text(fn(&EpisodeRecord) -> &str),
-    Unsigned64(fn(&EpisodeRecord) -> u64),
-    Unsigned32(fn(&EpisodeRecord) -> u32),
-    Flag(fn(&EpisodeRecord) -> bool),
-    Number(Box<dyn Fn(&EpisodeRecord) -> f64>),
-    Optional(fn(&EpisodeRecord) -> Option<f64>),
+impl ColumnValues {
+    /// What the schema calls their type, before and after the column's name.
+    fn kind(&self) -> (&'static str, &'static str) {
+        match self {
+            Self::Text(_) => ("required binary", " (STRING)"),
+            Self::Unsigned64(_) => ("required int64", " (INTEGER(64,false))"),
+            Self::Unsigned32(_) => ("required int32", " (INTEGER(32,false))"),
+            Self::Flag(_) => ("required boolean", ""),
+            Self::Number(_) => ("required double", ""),
+            Self::Optional(..) => ("optional double", ""),
+        }
+    }
+
+    fn write(&self, writer: &mut SerializedColumnWriter<'_>) -> Result<usize, ParquetError> {
+        match self {
+            Self::Text(texts) => writer.typed::<ByteArrayType>().write_batch(texts, None, None),
+            Self::Unsigned64(numbers) => writer.typed::<Int64Type>().write_batch(numbers, None, None),
+            Self::Unsigned32(numbers) => writer.typed::<Int32Type>().write_batch(numbers, None, None),
+            Self::Flag(flags) => writer.typed::<BoolType>().write_batch(flags, None, None),
+            Self::Number(numbers) => writer.typed::<DoubleType>().write_batch(numbers, None, None),
+            Self::Optional(numbers, there) => writer.typed::<DoubleType>().write_batch(numbers, Some(there), None),
+        }
+    }
 }
 
 impl Ending {
-    fn as_str(self) -> &'static str {
-        match self {
-            Ending::Terminated => "terminated",
-            Ending::Truncated => "truncated",
-            Ending::Diverged => "diverged",
-        }
-    }
+    const NAMED: [(&str, Self); 3] =
+        [("terminated", Self::Terminated), ("truncated", Self::Truncated), ("diverged", Self::Diverged)];
 }
 
-/// The columns of the tests that `about` describes, in order.
-fn columns(about: &About) -> Vec<Column> {
-    let column = |name: &str, values| Column { name: name.to_owned(), values };
-    let numbers = |prefix: &str, index: usize, name: &str, of: fn(&EpisodeRecord) -> &Vec<f64>| Column {
-        name: format!("{prefix}_{name}"),
-        values: Values::Number(Box::new(move |episode| of(episode).get(index).copied().unwrap_or(f64::NAN))),
+/// The columns of `records` by their names, in order. [`episode`] reads them back.
+fn columns(Records { about, episodes }: &Records) -> Vec<(String, ColumnValues)> {
+    let rows = || episodes.iter();
+    let texts = |of: fn(&EpisodeRecord) -> &str| ColumnValues::Text(rows().map(|row| of(row).into()).collect());
+    // Parquet's unsigned numbers are signed ones of the same bits.
+    let longs =
+        |of: fn(&EpisodeRecord) -> u64| ColumnValues::Unsigned64(rows().map(|row| of(row).cast_signed()).collect());
+    let ints =
+        |of: fn(&EpisodeRecord) -> u32| ColumnValues::Unsigned32(rows().map(|row| of(row).cast_signed()).collect());
+    let nth = |index: usize, of: fn(&EpisodeRecord) -> &Vec<f64>| {
+        ColumnValues::Number(rows().map(|row| of(row).get(index).copied().unwrap_or(f64::NAN)).collect())
     };
-    let mut columns = vec![
-        column("set", Values::Text(|episode| &episode.set)),
-        column("seed", Values::Unsigned64(|episode| episode.seed)),
-        column("environment_index", Values::Unsigned32(|episode| episode.environment_index)),
-        column("episode_index", Values::Unsigned64(|episode| episode.episode_index)),
+    let parameters = about.parameters.iter().enumerate();
+    let requested = parameters
+        .map(|(index, parameter)| (format!("requested_{}", parameter.name), nth(index, |row| &row.requested)));
+    let quantities = about.applied.iter().enumerate();
+    let applied = quantities.map(|(index, name)| (format!("applied_{name}"), nth(index, |row| &row.applied)));
+    let there = rows().map(|row| row.achieved.is_some().into()).collect();
+    let first = [
+        ("set", texts(|row| &row.set)),
+        ("seed", longs(|row| row.seed)),
+        ("environment_index", ints(|row| row.environment_index)),
+        ("episode_index", longs(|row| row.episode_index)),
     ];
-    for (index, parameter) in about.parameters.iter().enumerate() {
-        columns.push(numbers("requested", index, &parameter.name, |episode| &episode.requested));
-    }
-    for (index, name) in about.applied.iter().enumerate() {
-        columns.push(numbers("applied", index, name, |episode| &episode.applied));
-    }
-    columns.extend([
-        column("model_hash", Values::Text(|episode| &episode.model_hash)),
-        column("return", Values::Number(Box::new(|episode| episode.episode_return))),
-        column("length", Values::Unsigned32(|episode| episode.length)),
-        column("success", Values::Flag(|episode| episode.success)),
-        column("ending", Values::Text(|episode| episode.ending.as_str())),
-        column("achieved", Values::Optional(|episode| episode.achieved)),
-    ]);
-    columns
+    let last = [
+        ("model_hash", texts(|row| &row.model_hash)),
+        ("return", ColumnValues::Number(rows().map(|row| row.episode_return).collect())),
+        ("length", ints(|row| row.length)),
+        ("success", ColumnValues::Flag(rows().map(|row| row.success).collect())),
+        ("ending", texts(|row| Ending::NAMED[row.ending as usize].0)),
+        ("achieved", ColumnValues::Optional(rows().filter_map(|row| row.achieved).collect(), there)),
+    ];
+    let named = |(name, values): (&str, ColumnValues)| (name.to_owned(), values);
+    first.map(named).into_iter().chain(requested).chain(applied).chain(last.map(named)).collect()
 }
 
-impl Column {
-    /// Its line of the file's schema.
-    fn schema(&self) -> String {
-        let (kind, annotation) = match self.values {
-            Values::Text(_) => ("required binary", " (STRING)"),
-            Values::Unsigned64(_) => ("required int64", " (INTEGER(64,false))"),
-            Values::Unsigned32(_) => ("required int32", " (INTEGER(32,false))"),
-            Values::Flag(_) => ("required boolean", ""),
-            Values::Number(_) => ("required double", ""),
-            Values::Optional(_) => ("optional double", ""),
-        };
-        format!("{kind} {}{annotation};", self.name)
-    }
-
-    fn write(&self, episodes: &[EpisodeRecord], writer: &mut SerializedColumnWriter<'_>) -> Result<(), ParquetError> {
-        let rows = episodes.iter();
-        match &self.values {
-            Values::Text(of) => {
-                let texts: Vec<ByteArray> = rows.map(|episode| of(episode).as_bytes().to_vec().into()).collect();
-                writer.typed::<ByteArrayType>().write_batch(&texts, None, None)
-            }
-            // Parquet's unsigned numbers are signed ones of the same bits.
-            Values::Unsigned64(of) => {
-                let numbers: Vec<i64> = rows.map(|episode| of(episode).cast_signed()).collect();
-                writer.typed::<Int64Type>().write_batch(&numbers, None, None)
-            }
-            Values::Unsigned32(of) => {
-                let numbers: Vec<i32> = rows.map(|episode| of(episode).cast_signed()).collect();
-                writer.typed::<Int32Type>().write_batch(&numbers, None, None)
-            }
-            Values::Flag(of) => {
-                writer.typed::<BoolType>().write_batch(&rows.map(of).collect::<Vec<bool>>(), None, None)
-            }
-            Values::Number(of) => {
-                writer.typed::<DoubleType>().write_batch(&rows.map(of).collect::<Vec<f64>>(), None, None)
-            }
-            Values::Optional(of) => {
-                let there: Vec<i16> = rows.clone().map(|episode| i16::from(of(episode).is_some())).collect();
-                let numbers: Vec<f64> = rows.filter_map(of).collect();
-                writer.typed::<DoubleType>().write_batch(&numbers, Some(&there), None)
-            }
-        }
-        .map(drop)
-    }
+fn schema(columns: &[(String, ColumnValues)]) -> Result<Type, ParquetError> {
+    let line = |(name, values): &(String, ColumnValues)| {
+        let (kind, annotation) = values.kind();
+        format!("{kind} {name}{annotation};")
+    };
+    let lines: Vec<String> = columns.iter().map(line).collect();
+    parse_message_type(&format!("message episodes {{ {} }}", lines.join(" ")))
 }
 
 impl Records {
@@ -156,30 +140,28 @@ impl Records {
     /// # Errors
     /// [`RecordsError`].
     pub fn write(&self, path: &Path) -> Result<(), RecordsError> {
-        let failed = |error: ParquetError| RecordsError::Damaged { path: path.to_owned(), reason: error.to_string() };
+        let failed = |error: AnyError| RecordsError::Damaged { path: path.to_owned(), reason: error.to_string() };
         Ok(write_atomically(path, &self.encode().map_err(failed)?)?)
     }
 
-    fn encode(&self) -> Result<Vec<u8>, ParquetError> {
-        let columns = columns(&self.about);
-        let lines: Vec<String> = columns.iter().map(Column::schema).collect();
-        let schema = Arc::new(parse_message_type(&format!("message episodes {{ {} }}", lines.join(" ")))?);
-        let about = serde_json::to_string(&self.about).map_err(|error| ParquetError::External(error.into()))?;
+    fn encode(&self) -> Result<Vec<u8>, AnyError> {
+        let columns = columns(self);
+        let about = serde_json::to_string(&self.about)?;
         let properties = WriterProperties::builder()
             .set_compression(Compression::SNAPPY)
             .set_created_by("perturb".into())
             .set_key_value_metadata(Some(vec![KeyValue::new(KEY.into(), about)]))
             .build();
-        let mut file = SerializedFileWriter::new(Vec::new(), schema, Arc::new(properties))?;
+        let mut file = SerializedFileWriter::new(Vec::new(), Arc::new(schema(&columns)?), Arc::new(properties))?;
         let mut rows = file.next_row_group()?;
-        for column in &columns {
+        for (_, values) in &columns {
             if let Some(mut writer) = rows.next_column()? {
-                column.write(&self.episodes, &mut writer)?;
+                values.write(&mut writer)?;
                 writer.close()?;
             }
         }
         rows.close()?;
-        file.into_inner()
+        Ok(file.into_inner()?)
     }
 
     /// Reads the file.
@@ -188,92 +170,55 @@ impl Records {
     /// [`RecordsError`].
     pub fn read(path: &Path) -> Result<Self, RecordsError> {
         let content = read_if_there(path)?.ok_or_else(|| RecordsError::Missing { path: path.to_owned() })?;
-        Self::decode(content).map_err(|reason| RecordsError::Damaged { path: path.to_owned(), reason })
+        let damaged = |error: AnyError| RecordsError::Damaged { path: path.to_owned(), reason: error.to_string() };
+        Self::decode(content).map_err(damaged)
     }
 
-    fn decode(content: Vec<u8>) -> Result<Self, String> {
-        let words = |error: ParquetError| error.to_string();
-        let reader = SerializedFileReader::new(Bytes::from(content)).map_err(words)?;
-        let metadata = reader.metadata().file_metadata().key_value_metadata();
-        let about = metadata.and_then(|pairs| pairs.iter().find(|pair| pair.key == KEY)?.value.as_ref());
+    fn decode(content: Vec<u8>) -> Result<Self, AnyError> {
+        let reader = SerializedFileReader::new(Bytes::from(content))?;
+        let metadata = reader.metadata().file_metadata();
+        let about = metadata.key_value_metadata().and_then(|pairs| pairs.iter().find(|pair| pair.key == KEY));
+        let about = about.and_then(|pair| pair.value.as_ref());
         let about = about.ok_or_else(|| format!("its metadata have no `{KEY}`"))?;
-        let about: About = serde_json::from_str(about).map_err(|error| error.to_string())?;
-        let rows = reader.get_row_iter(None).map_err(words)?;
-        let episodes = rows.map(|row| episode(&about, row.map_err(words)?)).collect::<Result<_, String>>()?;
-        Ok(Self { about, episodes })
+        let mut records = Self::new(serde_json::from_str(about)?);
+        let there = metadata.schema().get_fields();
+        for (index, column) in schema(&columns(&records))?.get_fields().iter().enumerate() {
+            let name = column.name();
+            match there.get(index) {
+                Some(field) if field == column => {}
+                Some(field) if field.name() == name => {
+                    return Err(format!("the column {name} is of another type").into());
+                }
+                _ => return Err(format!("no column {name} in its place").into()),
+            }
+        }
+        for row in reader.get_row_iter(None)? {
+            records.episodes.push(episode(&records.about, &row?)?);
+        }
+        Ok(records)
     }
 }
 
-/// A row of the file.
-fn episode(about: &About, row: Row) -> Result<EpisodeRecord, String> {
-    let mut row = Fields(row.into_columns().into_iter());
+/// A row of the file, whose columns are those of [`columns`].
+fn episode(about: &About, row: &Row) -> Result<EpisodeRecord, AnyError> {
+    let mut places = 0..;
+    let mut next = || places.next().unwrap_or_default();
     Ok(EpisodeRecord {
-        set: row.text("set")?,
-        seed: row.unsigned("seed")?,
-        environment_index: row.unsigned32("environment_index")?,
-        episode_index: row.unsigned("episode_index")?,
-        requested: about
-            .parameters
-            .iter()
-            .map(|parameter| row.number(&format!("requested_{}", parameter.name)))
-            .collect::<Result<_, _>>()?,
-        applied: about.applied.iter().map(|name| row.number(&format!("applied_{name}"))).collect::<Result<_, _>>()?,
-        model_hash: row.text("model_hash")?,
-        episode_return: row.number("return")?,
-        length: row.unsigned32("length")?,
-        success: row.take("success", |field| match field {
-            Field::Bool(flag) => Some(flag),
-            _ => None,
-        })?,
-        ending: match row.text("ending")?.as_str() {
-            "terminated" => Ending::Terminated,
-            "truncated" => Ending::Truncated,
-            "diverged" => Ending::Diverged,
-            other => return Err(format!("an ending is `{other}`")),
+        set: row.get_string(next())?.clone(),
+        seed: row.get_ulong(next())?,
+        environment_index: row.get_uint(next())?,
+        episode_index: row.get_ulong(next())?,
+        requested: about.parameters.iter().map(|_| row.get_double(next())).collect::<Result<_, _>>()?,
+        applied: about.applied.iter().map(|_| row.get_double(next())).collect::<Result<_, _>>()?,
+        model_hash: row.get_string(next())?.clone(),
+        episode_return: row.get_double(next())?,
+        length: row.get_uint(next())?,
+        success: row.get_bool(next())?,
+        ending: {
+            let text = row.get_string(next())?;
+            let named = Ending::NAMED.into_iter().find(|(name, _)| name == text);
+            named.ok_or_else(|| format!("an ending is `{text}`"))?.1
         },
-        achieved: row.take("achieved", |field| match field {
-            Field::Null => Some(None),
-            Field::Double(number) => Some(Some(number)),
-            _ => None,
-        })?,
+        achieved: row.get_double(next()).ok(), // its type is right, so that it is there or null
     })
-}
-
-/// The fields of a row, taken in the order of the columns.
-struct Fields(std::vec::IntoIter<(String, Field)>);
-
-impl Fields {
-    fn take<T>(&mut self, name: &str, of: impl FnOnce(Field) -> Option<T>) -> Result<T, String> {
-        let (_, field) =
-            self.0.next().filter(|(got, _)| got == name).ok_or_else(|| format!("no column {name} in its place"))?;
-        of(field).ok_or_else(|| format!("the column {name} is of another type"))
-    }
-
-    fn text(&mut self, name: &str) -> Result<String, String> {
-        self.take(name, |field| match field {
-            Field::Str(text) => Some(text),
-            _ => None,
-        })
-    }
-
-    fn number(&mut self, name: &str) -> Result<f64, String> {
-        self.take(name, |field| match field {
-            Field::Double(number) => Some(number),
-            _ => None,
-        })
-    }
-
-    fn unsigned(&mut self, name: &str) -> Result<u64, String> {
-        self.take(name, |field| match field {
-            Field::ULong(number) => Some(number),
-            _ => None,
-        })
-    }
-
-    fn unsigned32(&mut self, name: &str) -> Result<u32, String> {
-        self.take(name, |field| match field {
-            Field::UInt(number) => Some(number),
-            _ => None,
-        })
-    }
 }

@@ -28,7 +28,8 @@ impl Report<'_> {
     }
 
     fn iqm_file(&self) -> Table {
-        let of_method = self.iqms.iter().flat_map(|row| Metric::ALL.map(|metric| (row, metric, row.iqms.get(&metric))));
+        let of_method =
+            self.averages.iter().flat_map(|row| Metric::ALL.map(|metric| (row, metric, row.iqms.get(&metric))));
         let lines: Vec<_> = of_method.collect();
         Table::of("iqm.csv", &lines)
             .method(|(row, ..)| &row.method)
@@ -91,7 +92,7 @@ impl<'r, R> TableBuilder<'r, R> {
     fn summary(self, summary: impl Fn(&'r R) -> Option<Summary>) -> Self {
         self.number("runs", |row| summary(row).map_or(0, |summary| summary.runs))
             .number("mean", |row| or_empty(summary(row).map(|summary| summary.mean)))
-            .number("std", |row| or_empty(summary(row).and_then(|summary| summary.deviation())))
+            .number("std", |row| or_empty(summary(row).and_then(|summary| summary.std)))
     }
 }
 

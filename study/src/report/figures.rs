@@ -5,12 +5,13 @@ use crate::folder::Folder;
 use crate::heatmap::HeatmapOptions;
 use crate::heatmaps::{HeatmapRecord, NoHeatmap, heatmap_places};
 use crate::plot::{PlotError, Quantity, draw_curves, svg};
+use crate::scheduler::count;
 use crate::selection::MethodResults;
 
 /// All pictures of a report.
 #[derive(Clone, Debug, Default)]
 pub struct Figures {
-    /// Training curves.
+    /// One for each environment and quantity.
     pub curves: Vec<Figure>,
     /// What is said of curves that are missing.
     pub no_curves: Vec<String>,
@@ -120,7 +121,7 @@ fn advice(missing: &[NoHeatmap], all: usize) -> Vec<String> {
 /// What a heatmap's caption says after who was tested.
 fn details(record: &HeatmapRecord) -> String {
     let HeatmapOptions { parameters: [x, y], grid, episodes, seed, .. } = &record.options;
-    let episodes = if *episodes == 1 { "1 episode".into() } else { format!("{episodes} episodes") };
+    let episodes = count(*episodes as usize, "episode");
     format!(
         " with seed {}: {x} and {y}, {grid} × {grid} points of {episodes}, test seed {seed}. Cell {}, checkpoint {}, \
          perturb {}.",

@@ -14,6 +14,7 @@ const METRICS: &str = "Default is the success rate of policies that were trained
                        tested on R, trained on D and tested on E, trained on R and tested on E.";
 const HEATMAPS: &str = "How the policies that were selected in the first run do over two parameters. Colours are mean \
                         return and success rate; the whole line is R's box, dashed lines are E's.";
+const SCENARIOS: &str = "The darker, the higher the success rate.";
 /// A text of so many bytes is broken into lines.
 const LONG: usize = 60;
 
@@ -23,8 +24,6 @@ struct Section {
     title: &'static str,
     notes: Markup,
     subsections: Vec<Subsection>,
-    /// Parts stand side by side where there is room.
-    side_by_side: bool,
 }
 
 struct Subsection {
@@ -35,7 +34,7 @@ struct Subsection {
 /// The page.
 pub fn html(report: &Report<'_>, figures: &Figures) -> String {
     let plain = |table: Table| table_subsection(&table, false);
-    let section = |id, title, notes, subsections| Section { id, title, notes, subsections, side_by_side: false };
+    let section = |id, title, notes, subsections| Section { id, title, notes, subsections };
     let metrics = report.metrics_tables().into_iter().map(plain).collect();
     let scenarios = report.scenario_tables().iter().map(|table| table_subsection(table, true)).collect();
     let sets: Vec<Subsection> = report.set_table().into_iter().map(plain).collect();
@@ -43,15 +42,7 @@ pub fn html(report: &Report<'_>, figures: &Figures) -> String {
     let sections = [
         section("metrics", "Default, Interpolation, Extrapolation", html! { p { (METRICS) } }, metrics),
         section("iqm", "Interquartile means", html! {}, vec![plain(report.iqm_table())]),
-        Section {
-            side_by_side: true,
-            ..section(
-                "scenarios",
-                "The nine scenarios",
-                html! { p { "The darker, the higher the success rate." } },
-                scenarios,
-            )
-        },
+        section("scenarios", "The nine scenarios", html! { p { (SCENARIOS) } }, scenarios),
         section("sets", "Own sets of parameters", html! {}, sets),
         section("curves", "Training curves", list(&figures.no_curves), curves(figures)),
         section("heatmaps", "Heatmaps", html! { p { (HEATMAPS) } (list(&figures.no_heatmaps)) }, heatmaps(figures)),
@@ -112,7 +103,8 @@ impl Section {
             section id=(self.id) {
                 h2 { (self.title) }
                 (self.notes)
-                div class=[self.side_by_side.then_some("columns")] {
+                // Tables of few columns stand side by side where there is room.
+                div class=[(self.id == "scenarios").then_some("columns")] {
                     @for (i, subsection) in self.subsections.iter().enumerate() {
                         div id=(self.subsection_id(i)) { (subsection.content) }
                     }

@@ -15,7 +15,7 @@ use super::folder::Failure;
 use super::plan::{Cell, Plan};
 use super::selection::{MethodResults, Results, Selected};
 use super::table::Table;
-use numbers::{MethodIqms, MethodMetrics, SetTest};
+use numbers::{MethodMetrics, SetTest};
 
 pub use figures::{Figure, FigureData, Figures};
 pub use html::html;
@@ -34,7 +34,6 @@ pub struct Report<'a> {
     overview: Vec<String>,
     metrics: Vec<MethodMetrics<'a>>,
     averages: Vec<MethodMetrics<'a>>,
-    iqms: Vec<MethodIqms>,
     set_tests: Vec<SetTest<'a>>,
     failures: Vec<&'a Failure>,
 }
@@ -48,7 +47,6 @@ impl<'a> Report<'a> {
             overview: overview(results, selections),
             metrics: numbers::metrics(selections),
             averages: numbers::averages(results.plan, selections),
-            iqms: numbers::iqms(results.plan, selections),
             set_tests: numbers::set_tests(results.plan, selections),
             failures: results.failures().collect(),
         }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::paper::{self, PaperNumber};
+use crate::paper;
 use crate::plan::{Plan, TrainedOn};
 use crate::selection::{MethodResults, average, interquartile};
 use crate::statistics::{Iqm, Summary};
@@ -13,20 +13,16 @@ const RESAMPLES: usize = 50_000;
 /// What stands for all environments together, here and in the paper.
 const AVERAGE: &str = "Average";
 
-/// A method's metrics in an environment, or averaged over all; a metric that is not known is not there.
+/// A method's metrics in an environment, or over all; a metric that is not known is not there.
 pub(super) struct MethodMetrics<'a> {
     pub(super) environment: &'a str,
     pub(super) method: Method,
     pub(super) ours: BTreeMap<Metric, Summary>,
-    pub(super) papers: BTreeMap<Metric, PaperNumber>,
+    pub(super) papers: BTreeMap<Metric, Summary>,
+    /// Of all environments only.
+    pub(super) iqms: BTreeMap<Metric, Iqm>,
     pub(super) done: usize,
     pub(super) cells: usize,
-}
-
-/// A method's interquartile means over all environments.
-pub(super) struct MethodIqms {
-    pub(super) method: Method,
-    pub(super) iqms: BTreeMap<Metric, Iqm>,
 }
 
 /// A test that the paper has no place for: of a policy that was trained on one of the plan's own sets, or on one.
@@ -49,11 +45,9 @@ impl MethodMetrics<'_> {
     pub(super) fn runs(&self) -> usize {
         least(|metric| self.ours.get(&metric).map(|summary| summary.runs))
     }
-}
 
-impl MethodIqms {
-    /// How many runs all metrics have.
-    pub(super) fn runs(&self) -> usize {
+    /// How many runs all interquartile means have.
+    pub(super) fn iqm_runs(&self) -> usize {
         least(|metric| self.iqms.get(&metric).map(|iqm| iqm.runs))
     }
 }
@@ -65,6 +59,7 @@ pub(super) fn metrics<'a>(selections: &[MethodResults<'a>]) -> Vec<MethodMetrics
         method: selection.method.clone(),
         ours: known(|metric| selection.summary(metric)),
         papers: known(|metric| paper::number(selection.environment, &selection.method, metric)),
+        iqms: BTreeMap::new(),
         done: selection.done,
         cells: selection.cells,
     };
@@ -75,27 +70,17 @@ pub(super) fn metrics<'a>(selections: &[MethodResults<'a>]) -> Vec<MethodMetrics
 pub(super) fn averages(plan: &Plan, selections: &[MethodResults<'_>]) -> Vec<MethodMetrics<'static>> {
     let environments = plan.environments();
     let of_method = |method: Method| {
-        let found = of_method(selections, &method);
+        let found: Vec<_> = selections.iter().filter(|selection| selection.method == method).collect();
         let everywhere = found.len() == environments.len();
         MethodMetrics {
             environment: AVERAGE,
             ours: known(|metric| average(&found, metric).filter(|_| everywhere)),
             papers: known(|metric| paper::average(&environments, &method, metric)),
+            iqms: known(|metric| interquartile(&found, metric, RESAMPLES).filter(|_| everywhere)),
             done: found.iter().map(|selection| selection.done).sum(),
             cells: found.iter().map(|selection| selection.cells).sum(),
             method,
         }
-    };
-    plan.methods().into_iter().map(of_method).collect()
-}
-
-/// Over the plan's environments.
-pub(super) fn iqms(plan: &Plan, selections: &[MethodResults<'_>]) -> Vec<MethodIqms> {
-    let environments = plan.environments().len();
-    let of_method = |method: Method| {
-        let found = of_method(selections, &method);
-        let everywhere = found.len() == environments;
-        MethodIqms { iqms: known(|metric| interquartile(&found, metric, RESAMPLES).filter(|_| everywhere)), method }
     };
     plan.methods().into_iter().map(of_method).collect()
 }
@@ -119,11 +104,6 @@ pub(super) fn set_tests<'a>(plan: &'a Plan, selections: &'a [MethodResults<'a>])
         }
     }
     tests
-}
-
-/// In the order of the environments.
-fn of_method<'s, 'a>(selections: &'s [MethodResults<'a>], method: &Method) -> Vec<&'s MethodResults<'a>> {
-    selections.iter().filter(|selection| selection.method == *method).collect()
 }
 
 fn known<T>(of: impl Fn(Metric) -> Option<T>) -> BTreeMap<Metric, T> {

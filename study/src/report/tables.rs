@@ -42,11 +42,11 @@ impl Report<'_> {
     pub(super) fn iqm_table(&self) -> Table {
         let title = "Interquartile mean over all environments and the runs that all of them have, with its 95 % stratified \
                      bootstrap interval";
-        let mut table = Table::of(title, &self.iqms).text("method", |row| &row.method);
+        let mut table = Table::of(title, &self.averages).text("method", |row| &row.method);
         for metric in Metric::ALL {
             table = table.number(metric.to_string(), |row| or(MISSING, row.iqms.get(&metric)));
         }
-        table.number("runs", |row| self.runs(row.runs())).build()
+        table.number("runs", |row| self.runs(row.iqm_runs())).build()
     }
 
     /// The nine scenarios of each environment.

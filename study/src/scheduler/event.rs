@@ -3,6 +3,7 @@
 use std::fs::File;
 use std::io::Write;
 use std::os::unix::fs::FileExt;
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
@@ -32,14 +33,14 @@ pub struct Line {
     pub cell: String,
     /// What happens to it.
     #[serde(flatten)]
-    pub event: Event,
+    pub event: CellEvent,
 }
 
 /// What happens to a cell. All but the first three end an attempt, and are a worker's last line.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 #[expect(missing_docs, reason = "the variants say what their fields are")]
-pub enum Event {
+pub enum CellEvent {
     /// There is a server for it, at this address.
     Server { address: String },
     /// It is trained, so far for so many episodes and steps, of which `saved` steps are in a checkpoint: what another
@@ -63,7 +64,7 @@ pub enum Event {
     Killed { reason: String },
 }
 
-impl Event {
+impl CellEvent {
     pub(super) fn is_last(&self) -> bool {
         !matches!(self, Self::Server { .. } | Self::Training { .. } | Self::Testing { .. })
     }
@@ -78,7 +79,7 @@ impl Event {
     }
 }
 
-impl std::fmt::Display for Event {
+impl std::fmt::Display for CellEvent {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Server { address } => write!(f, "on {address}"),
@@ -99,7 +100,7 @@ impl std::fmt::Display for Event {
 pub struct Teller<W> {
     cell: String,
     out: W,
-    last: Option<(Event, Instant)>,
+    last: Option<(CellEvent, Instant)>,
 }
 
 impl<W: Write> Teller<W> {
@@ -109,8 +110,8 @@ impl<W: Write> Teller<W> {
     }
 
     /// Writes a line, unless it says hardly more than one of a moment ago.
-    pub fn tell(&mut self, event: Event) {
-        let said = |(last, time): &(Event, Instant)| time.elapsed() < INTERVAL && last.stage() == event.stage();
+    pub fn tell(&mut self, event: CellEvent) {
+        let said = |(last, time): &(CellEvent, Instant)| time.elapsed() < INTERVAL && last.stage() == event.stage();
         if event.stage().is_some() && self.last.as_ref().is_some_and(said) {
             return;
         }
@@ -144,6 +145,13 @@ pub(super) fn read_lines(file: &File, offset: &mut u64) -> std::io::Result<Vec<L
     Ok(new[..end].split(|&byte| byte == b'\n').filter_map(|line| serde_json::from_slice(line).ok()).collect())
 }
 
+/// The last line with words that was written to `log` behind its byte `start`, which may say why a process ended.
+pub(super) fn last_words(log: &Path, start: u64) -> Option<String> {
+    let text = std::fs::read(log).unwrap_or_default();
+    let text = String::from_utf8_lossy(text.get(start as usize..)?).into_owned();
+    text.lines().rev().find(|line| !line.trim().is_empty()).map(str::to_owned)
+}
+
 #[cfg(test)]
 mod tests {
     use rstest::rstest;
@@ -151,20 +159,20 @@ mod tests {
     use super::*;
 
     #[rstest]
-    #[case(Event::Server { address: "unix:/x".into() }, r#""server","address":"unix:/x"}"#)]
+    #[case(CellEvent::Server { address: "unix:/x".into() }, r#""server","address":"unix:/x"}"#)]
     #[case(
-        Event::Training { episodes: 3, timesteps: 40, saved: 20 },
+        CellEvent::Training { episodes: 3, timesteps: 40, saved: 20 },
         r#""training","episodes":3,"timesteps":40,"saved":20}"#
     )]
-    #[case(Event::Testing { set: "D".into(), episodes: 5 }, r#""testing","set":"D","episodes":5}"#)]
-    #[case(Event::Done, r#""done"}"#)]
-    #[case(Event::Failed { reason: "NaN".into() }, r#""failed","reason":"NaN"}"#)]
-    #[case(Event::Busy, r#""busy"}"#)]
-    #[case(Event::LostServer { reason: "gone".into() }, r#""lost_server","reason":"gone"}"#)]
-    #[case(Event::Stopped { signal: 15 }, r#""stopped","signal":15}"#)]
-    #[case(Event::Refused { reason: "no".into() }, r#""refused","reason":"no"}"#)]
-    #[case(Event::Killed { reason: "no".into() }, r#""killed","reason":"no"}"#)]
-    fn a_line_is_a_flat_object_and_reads_back(#[case] event: Event, #[case] text: &str) {
+    #[case(CellEvent::Testing { set: "D".into(), episodes: 5 }, r#""testing","set":"D","episodes":5}"#)]
+    #[case(CellEvent::Done, r#""done"}"#)]
+    #[case(CellEvent::Failed { reason: "NaN".into() }, r#""failed","reason":"NaN"}"#)]
+    #[case(CellEvent::Busy, r#""busy"}"#)]
+    #[case(CellEvent::LostServer { reason: "gone".into() }, r#""lost_server","reason":"gone"}"#)]
+    #[case(CellEvent::Stopped { signal: 15 }, r#""stopped","signal":15}"#)]
+    #[case(CellEvent::Refused { reason: "no".into() }, r#""refused","reason":"no"}"#)]
+    #[case(CellEvent::Killed { reason: "no".into() }, r#""killed","reason":"no"}"#)]
+    fn a_line_is_a_flat_object_and_reads_back(#[case] event: CellEvent, #[case] text: &str) {
         let line = Line { cell: "a".into(), event };
         let text = format!(r#"{{"cell":"a","event":{text}"#);
         assert_eq!(serde_json::to_string(&line).unwrap(), text);
@@ -175,15 +183,15 @@ mod tests {
     fn how_far_it_is_is_said_once_a_second_but_each_checkpoint_at_once() {
         let mut out = Vec::new();
         let mut teller = Teller::new("a", &mut out);
-        let training = |episodes, saved| Event::Training { episodes, timesteps: 10 * episodes, saved };
+        let training = |episodes, saved| CellEvent::Training { episodes, timesteps: 10 * episodes, saved };
         for (episodes, saved) in [(0, 0), (1, 0), (2, 20), (3, 20)] {
             teller.tell(training(episodes, saved));
         }
-        teller.tell(Event::Testing { set: "D".into(), episodes: 1 });
-        teller.tell(Event::Testing { set: "R".into(), episodes: 1 });
+        teller.tell(CellEvent::Testing { set: "D".into(), episodes: 1 });
+        teller.tell(CellEvent::Testing { set: "R".into(), episodes: 1 });
         teller.last = teller.last.map(|(last, time)| (last, time.checked_sub(INTERVAL).unwrap()));
-        teller.tell(Event::Testing { set: "R".into(), episodes: 2 });
-        teller.tell(Event::Done);
+        teller.tell(CellEvent::Testing { set: "R".into(), episodes: 2 });
+        teller.tell(CellEvent::Done);
         let words: Vec<String> = String::from_utf8(out).unwrap().lines().map(|line| line.replace('"', "")).collect();
         assert_eq!(
             words,
@@ -206,9 +214,9 @@ mod tests {
             || read_lines(&file, &mut offset).unwrap().into_iter().map(|line| line.event).collect::<Vec<_>>();
         assert_eq!(read(), []);
         out.write_all(b"a prologue's words\n{\"cell\":\"a\",\"event\":\"busy\"}\n{\"cell\":\"a\",\"ev").unwrap();
-        assert_eq!(read(), [Event::Busy]);
+        assert_eq!(read(), [CellEvent::Busy]);
         assert_eq!(read(), []);
         out.write_all(b"ent\":\"done\"}\n").unwrap();
-        assert_eq!(read(), [Event::Done]);
+        assert_eq!(read(), [CellEvent::Done]);
     }
 }

@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::Instant;
 
-use super::event::{read_lines, write_line};
-use super::{Backend, Event, News, Offer, Order};
-use crate::files::{FileError, create_folder, io};
+use super::event::{last_words, read_lines, write_line};
+use super::{Backend, CellEvent, News, Offer, Order, Result};
+use crate::files::{create_folder, io};
 use crate::folder::Folder;
 use crate::plan::Plan;
 
@@ -27,7 +27,7 @@ struct Worker {
     events: File,
     /// Up to where they were read.
     offset: u64,
-    last: Option<Event>,
+    last: Option<CellEvent>,
     log: PathBuf,
     /// Where its words begin in the cell's log, in bytes.
     log_start: u64,
@@ -46,7 +46,7 @@ impl<'a> Local<'a> {
         Self { plan, folder, jobs, command, server_ended, workers: Vec::new() }
     }
 
-    fn start(&self, offer: &Offer) -> Result<Worker, FileError> {
+    fn start(&self, offer: &Offer) -> Result<Worker> {
         let cell = &self.plan.cells[offer.cell];
         let place = self.folder.cell(&cell.id);
         create_folder(place.path())?;
@@ -72,27 +72,25 @@ impl<'a> Local<'a> {
 
 impl Worker {
     /// What it has said since the last call, and whether it has ended.
-    fn news(&mut self) -> std::io::Result<(Vec<Event>, bool)> {
+    fn news(&mut self) -> std::io::Result<(Vec<CellEvent>, bool)> {
         let status = self.child.try_wait()?; // before its words are read, so that they are the last
-        let mut events: Vec<Event> =
+        let mut events: Vec<CellEvent> =
             read_lines(&self.events, &mut self.offset)?.into_iter().map(|line| line.event).collect();
         self.last = events.last().cloned().or(self.last.take());
-        if let Some(status) = status.filter(|_| !self.last.as_ref().is_some_and(Event::is_last)) {
-            let text = std::fs::read(&self.log).unwrap_or_default();
-            let own = String::from_utf8_lossy(text.get(self.log_start as usize..).unwrap_or_default()).into_owned();
-            let words = own.lines().rev().find(|line| !line.trim().is_empty());
-            let words = words.map_or_else(String::new, |line| format!(": {line}"));
-            events.push(Event::Killed { reason: format!("its process ended with {status}{words}") });
+        if let Some(status) = status.filter(|_| !self.last.as_ref().is_some_and(CellEvent::is_last)) {
+            let words = last_words(&self.log, self.log_start).map_or_else(String::new, |words| format!(": {words}"));
+            events.push(CellEvent::Killed { reason: format!("its process ended with {status}{words}") });
         }
         Ok((events, status.is_some()))
     }
 }
 
 impl Backend for Local<'_> {
-    type Error = FileError;
-    const CONVICTS: bool = true;
+    fn convicts(&self) -> bool {
+        true
+    }
 
-    fn poll(&mut self, _now: Instant) -> Result<Vec<News>, FileError> {
+    fn poll(&mut self, _now: Instant) -> Result<Vec<News>> {
         let mut news = Vec::new();
         for mut worker in std::mem::take(&mut self.workers) {
             let (events, ended) = worker.news().map_err(io("read what is told about", &worker.log))?;
@@ -109,7 +107,7 @@ impl Backend for Local<'_> {
         self.jobs.saturating_sub(self.workers.len())
     }
 
-    fn begin(&mut self, offers: &[Offer]) -> Result<Vec<usize>, FileError> {
+    fn begin(&mut self, offers: &[Offer]) -> Result<Vec<usize>> {
         for offer in offers {
             let worker = self.start(offer)?;
             self.workers.push(worker);
@@ -137,7 +135,7 @@ impl Backend for Local<'_> {
 mod tests {
     use std::time::Duration;
 
-    use super::super::{Line, Report, RunEnd, RunError, run};
+    use super::super::{Announcement, Line, RunEnd, run};
     use super::*;
     use crate::interrupt::StopFlag;
 
@@ -149,7 +147,7 @@ mod tests {
         say() { echo "{\"cell\":\"$id\",\"event\":$1}"; };"#;
 
     struct Ran {
-        end: Result<RunEnd, RunError<FileError>>,
+        end: Result<RunEnd>,
         lines: Vec<Line>,
     }
 
@@ -163,8 +161,8 @@ mod tests {
         };
         let mut local = Local::new(&plan, folder, 2, &command, server_ended);
         let mut lines = Vec::new();
-        let mut report = |report: Report<'_>| {
-            if let Report::Line(line) = report {
+        let mut report = |report: Announcement<'_>| {
+            if let Announcement::Line(line) = report {
                 lines.push(line.clone());
             }
         };

@@ -10,15 +10,15 @@ pub mod slurm;
 mod times;
 
 use std::collections::VecDeque;
-use std::error::Error;
 use std::time::{Duration, Instant};
 
 use crate::files::FileError;
 use crate::folder::{Failure, FailureMark, Folder};
 use crate::interrupt::StopFlag;
 use crate::plan::Plan;
-pub use event::{Event, Line, Order, Teller, write_line};
+pub use event::{CellEvent, Line, Order, Teller, write_line};
 pub use local::Local;
+use slurm::SlurmError;
 use times::Times;
 
 /// How often in a row a cell may be broken off without getting any further.
@@ -37,24 +37,21 @@ const TICK: Duration = Duration::from_millis(50);
 
 /// What does cells.
 pub trait Backend {
-    /// Why it cannot.
-    type Error: Error + 'static;
     /// Whether a cell that is broken off too often has failed. If not, its machines may be to blame: nothing is
     /// recorded, and the next run tries again.
-    const CONVICTS: bool;
-
+    fn convicts(&self) -> bool;
     /// What has happened since the last call.
     ///
     /// # Errors
     /// The run cannot go on.
-    fn poll(&mut self, now: Instant) -> Result<Vec<News>, Self::Error>;
+    fn poll(&mut self, now: Instant) -> Result<Vec<News>>;
     /// How many cells it would take now.
     fn room(&self) -> usize;
     /// Begins with some of `offers`, and gives the cells that it took: these, and those that it has in work already.
     ///
     /// # Errors
     /// The run cannot go on.
-    fn begin(&mut self, offers: &[Offer]) -> Result<Vec<usize>, Self::Error>;
+    fn begin(&mut self, offers: &[Offer]) -> Result<Vec<usize>>;
     /// What it is doing, in a few words, and how many cells at a time.
     fn load(&self) -> (String, usize);
     /// Ends all that cannot go on without this process, and names what can.
@@ -80,7 +77,7 @@ pub struct Offer {
 #[derive(Clone, Debug, PartialEq)]
 pub enum News {
     /// Something happened to a cell.
-    Event(usize, Event),
+    Event(usize, CellEvent),
     /// A cell was given back before its turn came.
     Returned(usize),
     /// The servers are gone, for this reason.
@@ -91,7 +88,7 @@ pub enum News {
 
 /// What a run says while it goes on.
 #[derive(Clone, Debug)]
-pub enum Report<'a> {
+pub enum Announcement<'a> {
     /// How far it is.
     Status(&'a Status),
     /// A sentence about what happened.
@@ -107,10 +104,10 @@ pub struct Status {
     pub cells: usize,
     /// Cells with a result.
     pub done: usize,
-    /// Cells that failed.
+    /// Cells with a failure that counts.
     pub failed: usize,
     /// The ids of cells in work, and what is being done.
-    pub running: Vec<(String, Event)>,
+    pub running: Vec<(String, CellEvent)>,
     /// What the backend is doing, in a few words.
     pub doing: String,
     /// How long it may take, by what finished cells took; `None` before the first.
@@ -137,8 +134,8 @@ pub enum RunEnd {
 /// Why a run cannot go on.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-pub enum RunError<E: Error + 'static> {
-    /// The folder cannot be read or written.
+pub enum RunError {
+    /// The folder cannot be read or written, or a worker cannot be started.
     #[error(transparent)]
     File(#[from] FileError),
     /// A worker does not know the plan's cells.
@@ -155,29 +152,31 @@ pub enum RunError<E: Error + 'static> {
         ids[0]
     )]
     GaveUp {
-        /// Ids, at least one.
+        /// At least one.
         ids: Vec<String>,
         /// How the last attempt at the first one ended.
         words: String,
     },
-    /// What does the cells cannot.
+    /// Slurm cannot do the cells.
     #[error(transparent)]
-    Backend(E),
+    Slurm(#[from] SlurmError),
 }
+
+type Result<T, E = RunError> = std::result::Result<T, E>;
 
 /// Does every cell of `plan` that has no result in `folder`; with `retry_failed`, also those that had failed before.
 /// Returns when no cell is left, also none that another run works on.
 ///
 /// # Errors
 /// [`RunError`]; the backend has then been stopped.
-pub fn run<B: Backend>(
+pub fn run(
     plan: &Plan,
     folder: &Folder,
-    backend: &mut B,
+    backend: &mut dyn Backend,
     retry_failed: bool,
     stop: &StopFlag,
-    report: &mut dyn FnMut(Report<'_>),
-) -> Result<RunEnd, RunError<B::Error>> {
+    report: &mut dyn FnMut(Announcement<'_>),
+) -> Result<RunEnd> {
     let mut scheduler = Scheduler::new(plan, folder, backend, retry_failed, report);
     let end = loop {
         match (scheduler.step(Instant::now()), stop.signal()) {
@@ -209,7 +208,7 @@ struct Tracked {
     /// … had a server (looking for one, of which many may be silent, is not having one) …
     served: Option<Instant>,
     /// … and what happened to it last.
-    last: Option<Event>,
+    last: Option<CellEvent>,
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -225,11 +224,11 @@ enum Phase {
     GivenUp,
 }
 
-struct Scheduler<'a, B> {
+struct Scheduler<'a> {
     plan: &'a Plan,
     folder: &'a Folder,
-    backend: &'a mut B,
-    report: &'a mut dyn FnMut(Report<'_>),
+    backend: &'a mut dyn Backend,
+    report: &'a mut dyn FnMut(Announcement<'_>),
     /// By the cells' places in the plan.
     cells: Vec<Tracked>,
     /// The cells that wait, in order.
@@ -239,15 +238,13 @@ struct Scheduler<'a, B> {
     look_at: Option<Instant>,
 }
 
-type Step<B, T> = Result<T, RunError<<B as Backend>::Error>>;
-
-impl<'a, B: Backend> Scheduler<'a, B> {
+impl<'a> Scheduler<'a> {
     fn new(
         plan: &'a Plan,
         folder: &'a Folder,
-        backend: &'a mut B,
+        backend: &'a mut dyn Backend,
         retry_failed: bool,
-        report: &'a mut dyn FnMut(Report<'_>),
+        report: &'a mut dyn FnMut(Announcement<'_>),
     ) -> Self {
         let forgiven = |id: &str| folder.cell(id).failure_mark().filter(|_| retry_failed);
         let cells = plan.cells.iter().map(|cell| Tracked { forgiven: forgiven(&cell.id), ..Tracked::default() });
@@ -265,10 +262,10 @@ impl<'a, B: Backend> Scheduler<'a, B> {
     }
 
     /// Takes note of what happened and begins what can be begun. At the end gives the ids of the cells that failed.
-    fn step(&mut self, now: Instant) -> Step<B, Option<Vec<String>>> {
-        for news in self.backend.poll(now).map_err(RunError::Backend)? {
+    fn step(&mut self, now: Instant) -> Result<Option<Vec<String>>> {
+        for news in self.backend.poll(now)? {
             match news {
-                News::Note(sentence) => (self.report)(Report::Note(&sentence)),
+                News::Note(sentence) => (self.report)(Announcement::Note(&sentence)),
                 News::NoServer(reason) => return Err(RunError::NoServer(reason)),
                 News::Returned(cell) if self.settled(cell) => {}
                 News::Returned(cell) => self.wait(cell),
@@ -282,19 +279,21 @@ impl<'a, B: Backend> Scheduler<'a, B> {
         self.begin(now)?;
         if looks {
             let status = self.status(now);
-            (self.report)(Report::Status(&status));
+            (self.report)(Announcement::Status(&status));
         }
         self.end()
     }
 
-    fn hear(&mut self, cell: usize, event: Event, now: Instant) -> Step<B, ()> {
+    fn hear(&mut self, cell: usize, event: CellEvent, now: Instant) -> Result<()> {
         let line = Line { cell: self.id(cell).to_owned(), event: event.clone() };
-        (self.report)(Report::Line(&line));
+        (self.report)(Announcement::Line(&line));
         let tracked = &mut self.cells[cell];
         tracked.last = Some(event.clone());
         match event {
-            Event::Server { .. } => tracked.served = tracked.served.or(Some(now)),
-            Event::Training { saved, .. } if saved > tracked.saved => (tracked.saved, tracked.attempts) = (saved, 0),
+            CellEvent::Server { .. } => tracked.served = tracked.served.or(Some(now)),
+            CellEvent::Training { saved, .. } if saved > tracked.saved => {
+                (tracked.saved, tracked.attempts) = (saved, 0)
+            }
             event if event.is_last() && !self.settled(cell) => self.conclude(cell, event, now)?,
             _ => {}
         }
@@ -302,13 +301,13 @@ impl<'a, B: Backend> Scheduler<'a, B> {
     }
 
     /// Decides what becomes of a cell whose attempt ended without settling it.
-    fn conclude(&mut self, cell: usize, end: Event, now: Instant) -> Step<B, ()> {
+    fn conclude(&mut self, cell: usize, end: CellEvent, now: Instant) -> Result<()> {
         let tracked = &mut self.cells[cell];
         match end {
-            Event::Busy => tracked.phase = Phase::Elsewhere,
-            Event::Refused { reason } => return Err(RunError::Refused(reason)),
-            Event::Failed { reason } => self.record_failure(cell, reason)?,
-            Event::LostServer { reason } => {
+            CellEvent::Busy => tracked.phase = Phase::Elsewhere,
+            CellEvent::Refused { reason } => return Err(RunError::Refused(reason)),
+            CellEvent::Failed { reason } => self.record_failure(cell, reason)?,
+            CellEvent::LostServer { reason } => {
                 let served_long = tracked.served.is_some_and(|since| now - since >= HAD_A_SERVER);
                 tracked.lost_in_a_row = if served_long { 1 } else { tracked.lost_in_a_row + 1 };
                 tracked.lost_servers += 1;
@@ -324,14 +323,14 @@ impl<'a, B: Backend> Scheduler<'a, B> {
                 tracked.attempts += 1;
                 if tracked.attempts < MOST_ATTEMPTS {
                     self.wait(cell);
-                } else if B::CONVICTS {
+                } else if self.backend.convicts() {
                     let times = format!("{MOST_ATTEMPTS} attempts in a row have not brought it any further");
                     self.record_failure(cell, format!("{end}; {times}"))?;
                 } else {
                     tracked.phase = Phase::GivenUp;
                     let id = self.id(cell);
                     let note = format!("{id} is given up: {MOST_ATTEMPTS} attempts have not brought it any further");
-                    (self.report)(Report::Note(&note));
+                    (self.report)(Announcement::Note(&note));
                 }
             }
         }
@@ -339,7 +338,7 @@ impl<'a, B: Backend> Scheduler<'a, B> {
     }
 
     /// Records the failure of a worker that could not do so itself.
-    fn record_failure(&mut self, cell: usize, reason: String) -> Step<B, ()> {
+    fn record_failure(&mut self, cell: usize, reason: String) -> Result<()> {
         let place = self.folder.cell(self.id(cell));
         let Some(_lock) = place.try_lock()? else {
             self.cells[cell].phase = Phase::Elsewhere;
@@ -370,7 +369,7 @@ impl<'a, B: Backend> Scheduler<'a, B> {
     }
 
     /// Takes note of what is in the folder, whoever did it, and of cells that others have given up.
-    fn look(&mut self, now: Instant) -> Step<B, ()> {
+    fn look(&mut self, now: Instant) -> Result<()> {
         let begun = Instant::now();
         for cell in 0..self.cells.len() {
             if !self.settled(cell)
@@ -385,7 +384,7 @@ impl<'a, B: Backend> Scheduler<'a, B> {
         Ok(())
     }
 
-    fn begin(&mut self, now: Instant) -> Step<B, ()> {
+    fn begin(&mut self, now: Instant) -> Result<()> {
         let room = self.backend.room();
         if self.paused_until.is_some_and(|end| now < end) {
             return Ok(());
@@ -400,7 +399,7 @@ impl<'a, B: Backend> Scheduler<'a, B> {
             }
         }
         if !offers.is_empty() {
-            for cell in self.backend.begin(&offers).map_err(RunError::Backend)? {
+            for cell in self.backend.begin(&offers)? {
                 let tracked = &mut self.cells[cell];
                 (tracked.phase, tracked.begun, tracked.served, tracked.last) = (Phase::Running, Some(now), None, None);
             }
@@ -415,22 +414,16 @@ impl<'a, B: Backend> Scheduler<'a, B> {
     }
 
     /// The ids of the cells that failed; `None` while cells are left.
-    fn end(&self) -> Step<B, Option<Vec<String>>> {
-        let of = |phases: &[Phase]| -> Vec<usize> {
-            (0..self.cells.len()).filter(|&cell| phases.contains(&self.cells[cell].phase)).collect()
-        };
-        let ids = |cells: Vec<usize>| cells.into_iter().map(|cell| self.id(cell).to_owned()).collect();
-        if !of(&[Phase::Waiting, Phase::Running, Phase::Elsewhere]).is_empty() {
+    fn end(&self) -> Result<Option<Vec<String>>> {
+        let in_phase = |phase| (0..self.cells.len()).filter(move |&cell| self.cells[cell].phase == phase);
+        let left = [Phase::Waiting, Phase::Running, Phase::Elsewhere];
+        if left.into_iter().flat_map(in_phase).next().is_some() {
             return Ok(None);
         }
-        let given_up = of(&[Phase::GivenUp]);
-        match given_up.first().map(|&first| &self.cells[first].last) {
-            None => Ok(Some(ids(of(&[Phase::Failed])))),
-            Some(last) => {
-                let words = last.as_ref().map(Event::to_string).unwrap_or_default();
-                Err(RunError::GaveUp { ids: ids(given_up), words })
-            }
-        }
+        let ids = |phase| in_phase(phase).map(|cell| self.id(cell).to_owned()).collect();
+        let Some(first) = in_phase(Phase::GivenUp).next() else { return Ok(Some(ids(Phase::Failed))) };
+        let words = self.cells[first].last.as_ref().map(CellEvent::to_string).unwrap_or_default();
+        Err(RunError::GaveUp { ids: ids(Phase::GivenUp), words })
     }
 
     fn status(&self, now: Instant) -> Status {

@@ -1,7 +1,6 @@
 //! The rules of the state machine, with a backend that follows a script and a clock of its own.
 
 use std::collections::HashMap;
-use std::convert::Infallible;
 
 use rstest::rstest;
 use tempfile::TempDir;
@@ -15,40 +14,40 @@ const PLAN: &str = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nrun
 /// What an attempt does, an act a second.
 #[derive(Clone, Debug)]
 enum Act {
-    Say(Event),
+    Say(CellEvent),
     Wait(u64),
     /// The result appears.
     Result,
     /// A failure is recorded.
     Failure,
-    End(Event),
+    End(CellEvent),
     /// Its turn does not come.
     Return,
 }
 use Act::{Failure as Fails, Result as Succeeds, Return, Say, Wait};
 
-fn ends(end: Event) -> Act {
+fn ends(end: CellEvent) -> Act {
     Act::End(end)
 }
 
 fn killed() -> Act {
-    ends(Event::Killed { reason: "signal 9".into() })
+    ends(CellEvent::Killed { reason: "signal 9".into() })
 }
 
 fn lost() -> Act {
-    ends(Event::LostServer { reason: "gone".into() })
+    ends(CellEvent::LostServer { reason: "gone".into() })
 }
 
 fn server() -> Act {
-    Say(Event::Server { address: "unix:/x".into() })
+    Say(CellEvent::Server { address: "unix:/x".into() })
 }
 
 fn saved(saved: u64) -> Act {
-    Say(Event::Training { episodes: 1, timesteps: saved + 5, saved })
+    Say(CellEvent::Training { episodes: 1, timesteps: saved + 5, saved })
 }
 
 fn done() -> Vec<Act> {
-    vec![Succeeds, ends(Event::Done)]
+    vec![Succeeds, ends(CellEvent::Done)]
 }
 
 /// Follows a script: what the nth attempt at a cell does, n from 1.
@@ -65,10 +64,11 @@ struct Fake<'a, const CONVICTS: bool> {
 }
 
 impl<const CONVICTS: bool> Backend for Fake<'_, CONVICTS> {
-    type Error = Infallible;
-    const CONVICTS: bool = CONVICTS;
+    fn convicts(&self) -> bool {
+        CONVICTS
+    }
 
-    fn poll(&mut self, now: Instant) -> Result<Vec<News>, Infallible> {
+    fn poll(&mut self, now: Instant) -> Result<Vec<News>> {
         self.now = now;
         let mut news = Vec::new();
         let place = self.place;
@@ -91,7 +91,7 @@ impl<const CONVICTS: bool> Backend for Fake<'_, CONVICTS> {
         self.jobs - self.running.len()
     }
 
-    fn begin(&mut self, offers: &[Offer]) -> Result<Vec<usize>, Infallible> {
+    fn begin(&mut self, offers: &[Offer]) -> Result<Vec<usize>> {
         for offer in offers {
             // As a worker does.
             if let Some(failure) = offer.retry {
@@ -189,10 +189,10 @@ impl Place {
         let mut fake =
             Fake::<CONVICTS> { place: self, script, jobs, start, now: start, running, begun, most_at_a_time: 0 };
         let (mut notes, mut statuses) = (Vec::new(), Vec::new());
-        let mut report = |report: Report<'_>| match report {
-            Report::Status(status) => statuses.push(status.clone()),
-            Report::Note(note) => notes.push(note.to_owned()),
-            Report::Line(_) => {}
+        let mut report = |report: Announcement<'_>| match report {
+            Announcement::Status(status) => statuses.push(status.clone()),
+            Announcement::Note(note) => notes.push(note.to_owned()),
+            Announcement::Line(_) => {}
         };
         let mut scheduler = Scheduler::new(&self.plan, &self.folder, &mut fake, retry_failed, &mut report);
         let end = (0..10_000).find_map(|second| scheduler.step(start + Duration::from_secs(second)).transpose());
@@ -214,10 +214,10 @@ fn every_cell_is_done_once_and_a_second_run_does_nothing() {
 
 #[rstest]
 #[case::killed(vec![killed()], 3, "signal 9; 3 attempts in a row have not brought it any further")]
-#[case::stopped_alone(vec![ends(Event::Stopped { signal: 15 })], 3, "signal 15 ended its process; 3 attempts")]
-#[case::failed_unrecorded(vec![ends(Event::Failed { reason: "disk full".into() })], 1, "disk full")]
-#[case::failed(vec![Fails, ends(Event::Failed { reason: "NaN".into() })], 1, "NaN")]
-#[case::done_without_a_result(vec![ends(Event::Done)], 3, "done; 3 attempts in a row")]
+#[case::stopped_alone(vec![ends(CellEvent::Stopped { signal: 15 })], 3, "signal 15 ended its process; 3 attempts")]
+#[case::failed_unrecorded(vec![ends(CellEvent::Failed { reason: "disk full".into() })], 1, "disk full")]
+#[case::failed(vec![Fails, ends(CellEvent::Failed { reason: "NaN".into() })], 1, "NaN")]
+#[case::done_without_a_result(vec![ends(CellEvent::Done)], 3, "done; 3 attempts in a row")]
 fn a_cell_that_ends_like_this_has_failed_after(
     #[case] acts: Vec<Act>,
     #[case] attempts: usize,
@@ -311,11 +311,11 @@ fn a_cell_that_others_work_on_is_waited_for_and_taken_over() {
     let place = Place::new();
     let lock = std::cell::Cell::new(place.folder.cell(place.id(1)).try_lock().unwrap());
     let script = |cell, attempt| match (cell, attempt) {
-        (1, 1) => vec![ends(Event::Busy)],
+        (1, 1) => vec![ends(CellEvent::Busy)],
         (3, 1) => {
             // Others give cell 1 up while cell 3 is done.
             drop(lock.take());
-            vec![Wait(30), Succeeds, ends(Event::Done)]
+            vec![Wait(30), Succeeds, ends(CellEvent::Done)]
         }
         _ => done(),
     };
@@ -330,7 +330,7 @@ fn what_others_did_is_not_done_again_and_seen_at_once() {
     let script = |cell, _| {
         if cell == 0 {
             (1..4).for_each(|cell| place.write(cell, "result.json"));
-            return vec![Wait(5), Succeeds, ends(Event::Done)];
+            return vec![Wait(5), Succeeds, ends(CellEvent::Done)];
         }
         panic!("cell {cell} is done")
     };
@@ -342,7 +342,7 @@ fn what_others_did_is_not_done_again_and_seen_at_once() {
 #[test]
 fn an_order_that_is_refused_ends_the_run() {
     let place = Place::new();
-    let ran = place.run(&|_, _| vec![ends(Event::Refused { reason: "no such cell".into() })]);
+    let ran = place.run(&|_, _| vec![ends(CellEvent::Refused { reason: "no such cell".into() })]);
     assert!(ran.end.is_err_and(|error| error.starts_with("a worker refused its order: no such cell; did another run")));
 }
 
@@ -371,7 +371,7 @@ fn the_status_says_what_is_done_with_each_cell() {
     place.fail(3);
     let script = |cell, _| match cell {
         0 => done(),
-        _ => vec![server(), saved(7), Wait(2), Succeeds, ends(Event::Done)],
+        _ => vec![server(), saved(7), Wait(2), Succeeds, ends(CellEvent::Done)],
     };
     let ran = place.run_on::<true>(2, false, &script);
     let status = &ran.statuses[4];

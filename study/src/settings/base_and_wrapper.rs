@@ -1,8 +1,10 @@
 //! The settings of an algorithm: those of what updates the policy, and those of what is wrapped around it.
 
+use serde::Serialize;
 use toml::Table;
 
 use super::{A2cConfig, Architecture, ConfigError, EpoptConfig, PpoConfig, Rl2Config};
+use crate::value_error::{ValueError, require};
 
 /// What EPOpt's base has no use for: an iteration is complete episodes, and one batch.
 const NOT_WITH_EPISODES: [&str; 2] = ["n_steps", "n_minibatches"];
@@ -20,7 +22,8 @@ pub struct Settings {
 }
 
 /// What updates the policy.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(untagged)]
 pub enum Base {
     /// Advantage actor-critic.
     A2c(A2cConfig),
@@ -29,7 +32,8 @@ pub enum Base {
 }
 
 /// What is wrapped around it.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(untagged)]
 pub enum Wrapper {
     /// Nothing.
     Plain,
@@ -86,19 +90,11 @@ impl Settings {
     /// The settings as a flat table.
     pub(super) fn table(&self) -> Table {
         // Serialisation of plain numbers, booleans and names cannot fail.
-        let to_table = |value: Result<Table, toml::ser::Error>| value.unwrap_or_default();
-        let mut table = match &self.base {
-            Base::A2c(settings) => to_table(Table::try_from(settings)),
-            Base::Ppo(settings) => to_table(Table::try_from(settings)),
-        };
-        match &self.wrapper {
-            Wrapper::Plain => {}
-            Wrapper::Epopt(settings) => {
-                table.retain(|key, _| !NOT_WITH_EPISODES.contains(&key));
-                table.extend(to_table(Table::try_from(settings)));
-            }
-            Wrapper::Rl2(settings) => table.extend(to_table(Table::try_from(settings))),
+        let mut table = Table::try_from(&self.base).unwrap_or_default();
+        if let Wrapper::Epopt(_) = self.wrapper {
+            table.retain(|key, _| !NOT_WITH_EPISODES.contains(&key));
         }
+        table.extend(Table::try_from(&self.wrapper).unwrap_or_default()); // nothing is no table
         table
     }
 
@@ -153,35 +149,27 @@ impl Settings {
             Wrapper::Epopt(settings) => {
                 settings.validate()?;
                 let most = settings.episodes_per_iteration;
-                if num_envs <= most {
-                    return Ok(());
-                }
                 let expected = format!("at most episodes_per_iteration, {most}: the others would have nothing to do");
-                Err(ConfigError::Value { key: "num_envs".into(), got: num_envs.to_string(), expected })
+                Ok(require(num_envs <= most, "num_envs", num_envs, expected)?)
             }
         }
     }
 }
 
 /// Whether a rollout is one that a machine can hold.
-fn check_size(n_steps: usize, num_envs: usize) -> Result<(), ConfigError> {
-    if n_steps as u128 * num_envs as u128 <= MOST_SAMPLES {
-        return Ok(());
-    }
+fn check_size(n_steps: usize, num_envs: usize) -> Result<(), ValueError> {
+    let fits = n_steps as u128 * num_envs as u128 <= MOST_SAMPLES;
     let expected = format!("at most {} with {num_envs} environments", MOST_SAMPLES / num_envs as u128);
-    Err(ConfigError::Value { key: "n_steps".into(), got: n_steps.to_string(), expected })
+    require(fits, "n_steps", n_steps, expected)
 }
 
 /// Whether a pass over a rollout can be parted evenly.
-fn check_minibatches(settings: &PpoConfig, architecture: Architecture, num_envs: usize) -> Result<(), ConfigError> {
+fn check_minibatches(settings: &PpoConfig, architecture: Architecture, num_envs: usize) -> Result<(), ValueError> {
     let PpoConfig { n_steps, n_minibatches, .. } = *settings;
     let (whole, count) = match architecture {
         Architecture::Ff => ("n_steps · num_envs,", n_steps as u128 * num_envs as u128),
         Architecture::Rc => ("num_envs, because a recurrent policy learns from whole environments,", num_envs as u128),
     };
-    if count.is_multiple_of(n_minibatches as u128) {
-        return Ok(());
-    }
-    let expected = format!("a divisor of {whole} which is {count}");
-    Err(ConfigError::Value { key: "n_minibatches".into(), got: n_minibatches.to_string(), expected })
+    let parts = count.is_multiple_of(n_minibatches as u128);
+    require(parts, "n_minibatches", n_minibatches, format!("a divisor of {whole} which is {count}"))
 }

@@ -1,44 +1,31 @@
 //! Why a configuration is refused.
 
 use crate::files::FileError;
+use crate::value_error::ValueError;
 
 /// Why a configuration was refused.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum ConfigError {
     /// A file cannot be read.
     #[error(transparent)]
     File(#[from] FileError),
     /// A file is not TOML, or a `--set` is not `key=value`.
     #[error("{origin}: {reason}")]
-    Syntax {
-        /// Where it stands.
-        origin: String,
-        /// What is wrong.
-        reason: String,
-    },
+    Syntax { origin: String, reason: String },
     /// A key does not exist.
     #[error("{origin}: unknown key `{key}`; {algorithm}'s keys are {keys}")]
     UnknownKey {
-        /// Where it stands.
         origin: String,
-        /// The key.
         key: String,
         /// Whose keys were looked through.
         algorithm: &'static str,
-        /// All valid keys.
         keys: String,
     },
     /// A value has the wrong type or lies outside its range.
-    #[error("{key} is {got}, but must be {expected}")]
-    Value {
-        /// The key.
-        key: String,
-        /// What was given.
-        got: String,
-        /// What is accepted.
-        expected: String,
-    },
+    #[error(transparent)]
+    Value(#[from] ValueError),
     /// No environment was named.
     #[error(
         "no environment was named: give --env NAME, or `environment` in the configuration file; `perturb envs` lists them"
@@ -49,10 +36,7 @@ pub enum ConfigError {
         "{algorithm} cannot train the architecture ff: RL² learns by what a recurrent policy remembers of a trial; give \
          --architecture rc, or another algorithm"
     )]
-    NeedsMemory {
-        /// The algorithm.
-        algorithm: &'static str,
-    },
+    NeedsMemory { algorithm: &'static str },
     /// The layers cannot be merged.
     #[error("cannot merge the configuration: {0}")]
     Merge(#[from] config::ConfigError),

@@ -26,6 +26,7 @@ use perturb_protocol::{Distribution, Version};
 use crate::Method;
 use crate::files;
 use crate::sets::Parameters;
+use crate::value_error::{ValueError, require};
 
 /// The most environments of one training.
 const MOST_ENVS: usize = 65_536;
@@ -90,35 +91,24 @@ pub struct Common {
     pub checkpoint_interval: u64,
 }
 
-/// Where a training's settings come from, weakest first.
-#[derive(Clone, Debug, Default)]
-pub struct Sources<'a> {
-    /// A TOML file.
-    pub file: Option<&'a Path>,
-    /// `key=value` pairs, later ones over earlier ones.
-    pub sets: &'a [String],
-    /// Flags.
-    pub flags: Table,
-}
-
 impl TrainConfig {
-    /// Merges and checks all layers.
+    /// Merges and checks all layers, weakest first: a TOML file, pairs `key=value`, flags by the keys of the file.
     ///
     /// # Errors
     /// [`ConfigError`], which names the key and what is accepted.
-    pub fn load(sources: &Sources<'_>) -> Result<Self, ConfigError> {
+    pub fn load(file: Option<&Path>, sets: &[String], flags: Table) -> Result<Self, ConfigError> {
         let mut layers: Vec<(String, Table)> = Vec::new();
-        if let Some(path) = sources.file {
+        if let Some(path) = file {
             let shown = path.display().to_string();
             let table = files::read_text(path)?
                 .parse::<Table>()
                 .map_err(|error| ConfigError::Syntax { origin: shown.clone(), reason: error.to_string() })?;
             layers.push((shown, table));
         }
-        for set in sources.sets {
+        for set in sets {
             layers.push((format!("--set {set}"), parse_set(set)?));
         }
-        layers.push(("the command line".into(), sources.flags.clone()));
+        layers.push(("the command line".into(), flags));
         resolve(&layers)
     }
 
@@ -165,10 +155,8 @@ impl TrainConfig {
             ("log_interval", log_interval, u64::MAX),
             ("checkpoint_interval", checkpoint_interval, u64::MAX),
         ] {
-            if value == 0 || value > most {
-                let expected = if most == u64::MAX { "at least 1".to_owned() } else { format!("between 1 and {most}") };
-                return Err(ConfigError::Value { key: key.into(), got: value.to_string(), expected });
-            }
+            let expected = if most == u64::MAX { "at least 1".to_owned() } else { format!("between 1 and {most}") };
+            require((1..=most).contains(&value), key, value, expected)?;
         }
         let architecture = self.common.architecture;
         if self.settings.has_trials() && architecture == Architecture::Ff {
@@ -268,33 +256,25 @@ fn check(origin: &str, key: &str, value: &Value, defaults: &Table, algorithm: &'
         (Value::Boolean(_), _) => "true or false",
         _ => "a text",
     };
-    Err(ConfigError::Value { key: key.to_owned(), got: show(value), expected: expected.to_owned() })
+    Err(ValueError::new(key, value, expected).into())
 }
 
 /// Whether every value of the table `[parameters]` is a distribution.
 fn check_parameters(parameters: &Table) -> Result<(), ConfigError> {
+    let expected = "a value, or a text such as \"0.3..0.4\" or \"0.3..0.4,0.8..0.9\"";
     for (name, value) in parameters {
-        value.clone().try_into::<Distribution>().map_err(|_| ConfigError::Value {
-            key: format!("{PARAMETERS}.{name}"),
-            got: show(value),
-            expected: "a value, or a text such as \"0.3..0.4\" or \"0.3..0.4,0.8..0.9\"".into(),
-        })?;
+        let is_distribution = value.clone().try_into::<Distribution>().is_ok();
+        require(is_distribution, format!("{PARAMETERS}.{name}"), value, expected)?;
     }
     Ok(())
 }
 
 /// The place of a value among a few names.
 fn choice(key: &str, value: &Value, names: &[&str]) -> Result<usize, ConfigError> {
-    names.iter().position(|name| value.as_str() == Some(name)).ok_or_else(|| ConfigError::Value {
-        key: key.to_owned(),
-        got: show(value),
-        expected: format!("one of {}", names.iter().map(|name| format!("\"{name}\"")).collect::<Vec<_>>().join(", ")),
+    names.iter().position(|name| value.as_str() == Some(name)).ok_or_else(|| {
+        let names: Vec<String> = names.iter().map(|name| format!("\"{name}\"")).collect();
+        ValueError::new(key, value, format!("one of {}", names.join(", "))).into()
     })
-}
-
-/// A value as its writer would recognise it.
-fn show(value: &Value) -> String {
-    value.to_string()
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ fn load(file: Option<&str>, sets: &[&str], flags: &str) -> Result<TrainConfig, C
     std::fs::write(&path, file.unwrap_or_default()).unwrap();
     let sets: Vec<String> = sets.iter().map(|&set| set.to_owned()).collect();
     let flags = flags.parse().unwrap();
-    TrainConfig::load(&Sources { file: file.map(|_| path.as_path()), sets: &sets, flags })
+    TrainConfig::load(file.map(|_| path.as_path()), &sets, flags)
 }
 
 fn refusal(file: Option<&str>, sets: &[&str]) -> String {
@@ -155,6 +155,6 @@ fn minibatches_must_part_a_rollout_evenly() {
 fn what_is_missing_or_not_toml_is_named() {
     assert!(matches!(load(None, &[], ""), Err(ConfigError::NoEnvironment)));
     assert!(refusal(Some("= 1"), &[]).contains("config.toml"));
-    let sources = Sources { file: Some(Path::new("/nonexistent.toml")), ..Sources::default() };
-    assert!(TrainConfig::load(&sources).unwrap_err().to_string().contains("cannot read /nonexistent.toml"));
+    let missing = TrainConfig::load(Some(Path::new("/nonexistent.toml")), &[], Table::new());
+    assert!(missing.unwrap_err().to_string().contains("cannot read /nonexistent.toml"));
 }

@@ -48,7 +48,7 @@ class Adaptor(unittest.TestCase):
         self.assertEqual(set(env.observation_spec()), {"observation", "truncated", "success", "diverged"})
         self.assertEqual(env.reward_spec().dtype, np.float32)
         env.close()
-        env = self.world("perturb/Pendulum-v0")
+        env = self.world("perturb/Pendulum-v1")
         spec = env.action_spec()["action"]
         self.assertEqual((spec.shape, spec.dtype, spec.minimum, spec.maximum), ((1,), np.float32, -2.0, 2.0))
         np.testing.assert_array_equal(env.observation_spec()["observation"].maximum, np.float32([1, 1, 8]))

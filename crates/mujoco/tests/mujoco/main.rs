@@ -2,6 +2,5 @@
 #![allow(clippy::unwrap_used)]
 
 mod faults;
-#[cfg(target_os = "linux")]
-mod memory;
 mod render;
+mod states;

@@ -28,8 +28,7 @@ pub(super) struct CellLoad {
 
 /// Puts `loads` into at most `most_jobs` jobs, in their order. If that is too few for jobs of so many seconds, jobs
 /// become longer; what still has no place is left out, for a later submission.
-pub(super) fn batches(loads: &[CellLoad], size: Size, most_jobs: usize) -> Vec<Vec<usize>> {
-    let mut size = size;
+pub(super) fn batches(loads: &[CellLoad], mut size: Size, most_jobs: usize) -> Vec<Vec<usize>> {
     let all: f64 = loads.iter().map(|load| load.seconds).sum();
     loop {
         let mut jobs = fill(loads, size);

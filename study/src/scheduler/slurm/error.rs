@@ -4,56 +4,34 @@ use std::time::Duration;
 
 use super::super::count;
 use super::options::OptionError;
+use crate::AnyError;
 use crate::files::FileError;
 use crate::folder::FolderError;
-
-/// Of whoever finds out what cells cost.
-pub type AnyError = Box<dyn std::error::Error + Send + Sync>;
 
 /// Why cells cannot be done by Slurm.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum SlurmError {
     /// Slurm's commands are not here.
     #[error("there is no `{program}` here: start this on a machine that submits to Slurm, or install slurm-client")]
-    NotInstalled {
-        /// The command.
-        program: &'static str,
-    },
+    NotInstalled { program: &'static str },
     /// A command could not be run.
     #[error("cannot run {program}: {source}")]
-    System {
-        /// The command.
-        program: &'static str,
-        /// The operating system's answer.
-        source: std::io::Error,
-    },
+    System { program: &'static str, source: std::io::Error },
     /// Slurm said no.
     #[error("{program} refused: {words}")]
-    Refused {
-        /// The command.
-        program: &'static str,
-        /// Its words.
-        words: String,
-    },
+    Refused { program: &'static str, words: String },
     /// Slurm said nothing.
     #[error("{program} did not answer within {} s; is Slurm's controller up? The same command goes on", limit.as_secs())]
     Silent {
-        /// The command.
         program: &'static str,
         /// How long it was waited for.
         limit: Duration,
     },
     /// Slurm said something else than expected.
     #[error("{program} printed `{got}`, expected {expected}")]
-    NotUnderstood {
-        /// The command.
-        program: &'static str,
-        /// What was expected.
-        expected: &'static str,
-        /// What was printed.
-        got: String,
-    },
+    NotUnderstood { program: &'static str, expected: &'static str, got: String },
     /// Slurm has no arrays.
     #[error("this Slurm takes no job arrays (MaxArraySize = 0), which --engine slurm needs; use `perturb run --cell`")]
     NoArrays,
@@ -76,7 +54,6 @@ pub enum SlurmError {
         count(*missing, "cell")
     )]
     Cancelled {
-        /// Numbers of arrays.
         arrays: Vec<String>,
         /// How many cells are missing.
         missing: usize,

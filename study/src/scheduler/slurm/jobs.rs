@@ -5,21 +5,20 @@ use std::fs::File;
 use std::path::Path;
 use std::time::Instant;
 
-use super::super::event::read_lines;
-use super::super::{Backend, Event, News, Offer, count};
+use super::super::event::{last_words, read_lines};
+use super::super::{Backend, CellEvent, News, Offer, Result, RunError, count};
 use super::batch::{CellLoad, JOB_SECONDS, Size, batches};
 use super::commands::Slurm;
-use super::error::{AnyError, SlurmError};
+use super::error::SlurmError;
 use super::job::QueuedJob;
 use super::options::SlurmOptions;
 use super::script::script;
 use super::submission::{self, Submission};
+use crate::AnyError;
 use crate::files::{Lock, create_folder, io};
 use crate::folder::Folder;
 use crate::interrupt::StopFlag;
 use crate::plan::{Plan, distinct};
-
-type Result<T> = std::result::Result<T, SlurmError>;
 
 /// The jobs of a folder in Slurm's queue. Those that are there when the process ends stay there.
 pub struct Jobs<'a> {
@@ -27,7 +26,7 @@ pub struct Jobs<'a> {
     folder: &'a Folder,
     slurm: &'a Slurm,
     options: &'a SlurmOptions,
-    costs: &'a dyn Fn() -> std::result::Result<Vec<f64>, AnyError>,
+    costs: &'a dyn Fn() -> Result<Vec<f64>, AnyError>,
     known_costs: Option<Vec<f64>>,
     stop: &'a StopFlag,
     /// Places in the plan, by id.
@@ -65,19 +64,15 @@ struct Told {
 impl<'a> Jobs<'a> {
     /// Of `folder`, for `plan`. `costs` gives, by a cell's place in the plan, the seconds it may take; it is called once
     /// at most, when something is to be submitted.
-    ///
-    /// # Errors
-    /// Options that cannot be.
     pub fn new(
         plan: &'a Plan,
         folder: &'a Folder,
         slurm: &'a Slurm,
         options: &'a SlurmOptions,
-        costs: &'a dyn Fn() -> std::result::Result<Vec<f64>, AnyError>,
+        costs: &'a dyn Fn() -> Result<Vec<f64>, AnyError>,
         stop: &'a StopFlag,
-    ) -> Result<Self> {
-        options.check(folder.path())?;
-        Ok(Self {
+    ) -> Self {
+        Self {
             plan,
             folder,
             slurm,
@@ -98,12 +93,12 @@ impl<'a> Jobs<'a> {
             ask_at: None,
             trouble: None,
             news: Vec::new(),
-        })
+        }
     }
 
     /// Asks Slurm for the jobs of this folder that may matter still.
     fn ask(&mut self) -> Result<()> {
-        let mut submissions = submission::list(self.folder)?;
+        let mut submissions = submission::list(self.folder).map_err(SlurmError::from)?;
         let matters = |id: &String| self.places.contains_key(&**id) && !self.folder.cell(id).is_settled(false);
         submissions.retain(|submission| submission.jobs.iter().flatten().any(matters));
         let names: Vec<&str> = submissions.iter().map(|submission| submission.names.name.as_str()).collect();
@@ -127,7 +122,7 @@ impl<'a> Jobs<'a> {
     }
 
     /// Goes on without an answer.
-    fn put_up_with(&mut self, error: &SlurmError) {
+    fn put_up_with(&mut self, error: &RunError) {
         let words = error.to_string();
         if self.trouble.as_ref() != Some(&words) {
             self.news.push(News::Note(format!("{words}; results are still looked for, and it is tried again")));
@@ -197,7 +192,7 @@ impl<'a> Jobs<'a> {
             // A job that did other cells is no fault of one that had no turn.
             let had_its_turn = told.is_none_or(|cells| cells.is_empty() || cells.contains(&cell));
             self.news.push(match had_its_turn {
-                true => News::Event(cell, Event::Killed { reason: self.last_words(cell) }),
+                true => News::Event(cell, CellEvent::Killed { reason: self.how_it_ended(cell) }),
                 false => News::Returned(cell),
             });
         }
@@ -218,7 +213,7 @@ impl<'a> Jobs<'a> {
         let numbers = missing.iter().filter_map(submission).filter_map(|submission| submission.names.job.clone());
         let mut arrays = distinct(numbers);
         arrays.sort_unstable();
-        Err(SlurmError::Cancelled { arrays, missing: missing.len() })
+        Err(SlurmError::Cancelled { arrays, missing: missing.len() }.into())
     }
 
     fn say_lost(&mut self, cells: &[usize]) {
@@ -242,17 +237,14 @@ impl<'a> Jobs<'a> {
     }
 
     /// How the last job that had a cell ended, and what it said last.
-    fn last_words(&self, cell: usize) -> String {
+    fn how_it_ended(&self, cell: usize) -> String {
         let (job, state) = self.end_of(cell);
         let log = self.last.get(&cell).map(|&(submission, index)| self.submissions[submission].log(index));
         let log = log.unwrap_or_default();
-        let text = std::fs::read(&log).unwrap_or_default();
-        let text = String::from_utf8_lossy(&text);
-        let line = text.lines().rev().find(|line| !line.trim().is_empty());
-        let log = log.display();
-        match line {
-            Some(line) => format!("Slurm job {job} ({state}) said `{line}`, see {log}"),
-            None => format!("Slurm job {job} ({state}) wrote nothing to {log}: do the nodes see this folder?"),
+        let shown = log.display();
+        match last_words(&log, 0) {
+            Some(words) => format!("Slurm job {job} ({state}) said `{words}`, see {shown}"),
+            None => format!("Slurm job {job} ({state}) wrote nothing to {shown}: do the nodes see this folder?"),
         }
     }
 
@@ -260,7 +252,7 @@ impl<'a> Jobs<'a> {
     fn submit(&mut self, offers: &[&Offer]) -> Result<Vec<usize>> {
         let most_jobs = match self.slurm.most_jobs(self.stop) {
             Ok(number) => number,
-            Err(error) => return self.put_off(error),
+            Err(error) => return self.put_off(error.into()),
         };
         let jobs = batches(&self.loads(offers)?, self.size(), most_jobs);
         let cells = jobs.concat();
@@ -271,9 +263,9 @@ impl<'a> Jobs<'a> {
             Ok(array) => array,
             Err(error @ (SlurmError::Refused { .. } | SlurmError::NotInstalled { .. } | SlurmError::Option(_))) => {
                 submission.forget()?; // nothing was accepted
-                return self.put_off(error);
+                return self.put_off(error.into());
             }
-            Err(error) => return Err(error),
+            Err(error) => return Err(error.into()),
         };
         submission.accepted(&array)?;
         let most = jobs.iter().map(Vec::len).max().unwrap_or_default();
@@ -291,7 +283,7 @@ impl<'a> Jobs<'a> {
     }
 
     /// While jobs are in the queue, a refusal may be for their sake: limits on how many there are. Then nothing is taken.
-    fn put_off(&mut self, error: SlurmError) -> Result<Vec<usize>> {
+    fn put_off(&mut self, error: RunError) -> Result<Vec<usize>> {
         if self.live().next().is_none() {
             return Err(error);
         }
@@ -338,8 +330,9 @@ impl<'a> Jobs<'a> {
 }
 
 impl Backend for Jobs<'_> {
-    type Error = SlurmError;
-    const CONVICTS: bool = false;
+    fn convicts(&self) -> bool {
+        false
+    }
 
     fn poll(&mut self, now: Instant) -> Result<Vec<News>> {
         self.deciding = None;

@@ -24,7 +24,7 @@ mod script;
 mod submission;
 
 pub use commands::Slurm;
-pub use error::{AnyError, SlurmError};
+pub use error::SlurmError;
 pub use job::QueuedJob;
 pub use jobs::Jobs;
 pub use options::{OptionError, SlurmOptions, Task, TimeLimit};

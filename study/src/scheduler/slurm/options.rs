@@ -46,26 +46,20 @@ impl Task {
 /// Why options were refused.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
+#[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum OptionError {
     /// A time limit that Slurm would not understand.
     #[error(
         "`{got}` is no time limit: expected minutes, or one of Slurm's other forms MM:SS, HH:MM:SS, DAYS-HH, \
          DAYS-HH:MM, DAYS-HH:MM:SS, e.g. 90 or 1-12:00:00, and more than zero"
     )]
-    Time {
-        /// What was given.
-        got: String,
-    },
+    Time { got: String },
     /// A number of cells that cannot be.
     #[error("{got} cells a job: expected 1 to {MOST_CELLS_PER_JOB}")]
-    CellsPerJob {
-        /// What was given.
-        got: usize,
-    },
+    CellsPerJob { got: usize },
     /// A path that cannot stand in a script and in Slurm's options.
     #[error("{path:?} cannot be handed to Slurm: {reason}; use another folder")]
     Path {
-        /// What was given.
         path: PathBuf,
         /// What is wrong with it.
         reason: &'static str,

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::job::QueuedJob;
 use crate::files::{self, write_atomically, write_json};
-use crate::folder::{Folder, FolderError};
+use crate::folder::{self, Folder, FolderError};
 use crate::plan::Plan;
 
 const CELLS: &str = "cells.txt";
@@ -61,10 +61,7 @@ fn numbers(directory: &Path) -> files::Result<Vec<u32>> {
 
 /// The submission in `path`; `None` if it was broken off before Slurm could hear of it.
 fn read(path: &Path, number: u32) -> Result<Option<Submission>, FolderError> {
-    let document = path.join(DOCUMENT);
-    let Some(text) = files::read_if_there(&document)? else { return Ok(None) };
-    let damaged = |error: serde_json::Error| FolderError::Damaged { path: document, reason: error.to_string() };
-    let names = serde_json::from_slice(&text).map_err(damaged)?;
+    let Some(names) = folder::read(&path.join(DOCUMENT))? else { return Ok(None) };
     let text = files::read_text(&path.join(CELLS))?;
     let jobs = text.lines().map(|line| line.split(',').map(str::to_owned).collect()).collect();
     Ok(Some(Submission { number, path: path.to_owned(), jobs, names }))

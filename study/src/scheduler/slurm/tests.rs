@@ -10,9 +10,9 @@ use std::time::{Duration, Instant};
 
 use tempfile::TempDir;
 
-use super::super::{Backend, Report, RunEnd, RunError, Scheduler};
+use super::super::{Announcement, Backend, RunEnd, RunError, Scheduler};
 use super::submission::{self, Submission};
-use super::{Jobs, Slurm, SlurmError, SlurmOptions, Task};
+use super::{Jobs, Slurm, SlurmOptions, Task};
 use crate::folder::{Failure, Folder};
 use crate::interrupt::StopFlag;
 use crate::plan::Plan;
@@ -111,13 +111,13 @@ impl Fake {
     }
 
     /// Runs, a second at each step; `watch` hears every sentence.
-    fn run_with(&self, stop: &StopFlag, watch: &mut dyn FnMut(Report<'_>)) -> Result<RunEnd, RunError<SlurmError>> {
+    fn run_with(&self, stop: &StopFlag, watch: &mut dyn FnMut(Announcement<'_>)) -> Result<RunEnd, RunError> {
         let costs = || {
             self.costs.set(self.costs.get() + 1);
             Ok(vec![100.0; self.plan.cells.len()])
         };
         let slurm = self.slurm();
-        let mut jobs = Jobs::new(&self.plan, &self.folder, &slurm, &self.options, &costs, stop).unwrap();
+        let mut jobs = Jobs::new(&self.plan, &self.folder, &slurm, &self.options, &costs, stop);
         let mut scheduler = Scheduler::new(&self.plan, &self.folder, &mut jobs, self.retry_failed, watch);
         let start = Instant::now();
         for second in 0..1000 {
@@ -131,16 +131,16 @@ impl Fake {
         panic!("it does not end");
     }
 
-    fn run(&self) -> Result<RunEnd, RunError<SlurmError>> {
+    fn run(&self) -> Result<RunEnd, RunError> {
         self.run_with(&StopFlag::default(), &mut |_| {})
     }
 
     /// Runs until a sentence with these words is said.
-    fn run_until(&self, words: &str) -> Result<RunEnd, RunError<SlurmError>> {
+    fn run_until(&self, words: &str) -> Result<RunEnd, RunError> {
         let stop = StopFlag::default();
         let raised = stop.clone();
         self.run_with(&stop, &mut |report| match report {
-            Report::Note(sentence) if sentence.contains(words) => raised.raise(2),
+            Announcement::Note(sentence) if sentence.contains(words) => raised.raise(2),
             _ => {}
         })
     }
@@ -211,7 +211,7 @@ fn what_slurm_lost_is_submitted_again() {
     ));
     let mut said = Vec::new();
     let end = fake.run_with(&StopFlag::default(), &mut |report| {
-        if let Report::Note(sentence) = report {
+        if let Announcement::Note(sentence) = report {
             said.push(sentence.to_owned());
         }
     });
@@ -281,8 +281,8 @@ fn slurms_refusal_is_shown_and_leaves_nothing_behind() {
     let (stop, refusal) = (StopFlag::default(), fake.bin().join("refusal"));
     let raised = stop.clone();
     let end = fake.run_with(&stop, &mut |report| match report {
-        Report::Note(sentence) if sentence.contains("MaxSubmit") => fs::remove_file(&refusal).unwrap(),
-        Report::Note(sentence) if sentence.contains("submitted 2 cells") => raised.raise(2),
+        Announcement::Note(sentence) if sentence.contains("MaxSubmit") => fs::remove_file(&refusal).unwrap(),
+        Announcement::Note(sentence) if sentence.contains("submitted 2 cells") => raised.raise(2),
         _ => {}
     });
     assert_eq!(end.unwrap(), stopped(&["1", "2"]));
@@ -304,8 +304,8 @@ fn a_silent_slurm_is_no_reason_to_submit_again() {
     // It falls silent while it is watched: results are found all the same.
     fake.command("squeue", "cat queue");
     let end = fake.run_with(&StopFlag::default(), &mut |report| match report {
-        Report::Note(sentence) if sentence.contains("is in the queue") => fake.command("squeue", silent),
-        Report::Note(sentence) if sentence.contains("did not answer") => {
+        Announcement::Note(sentence) if sentence.contains("is in the queue") => fake.command("squeue", silent),
+        Announcement::Note(sentence) if sentence.contains("did not answer") => {
             fake.ids().iter().for_each(|id| fake.finish(id));
         }
         _ => {}

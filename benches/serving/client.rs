@@ -1,0 +1,157 @@
+//! A server in a process of its own, and a client that steps its environments with random actions.
+
+use super::Failure;
+use bytes::Bytes;
+use perturb::{
+    env::{ActionSpace, EnvironmentSpec},
+    proto, tasks,
+};
+use perturb_protocol::{Address, Connection, Stream as Session};
+use std::{
+    env, fs,
+    io::{BufRead, BufReader},
+    path::{Path, PathBuf},
+    process::{Child, Command, Stdio},
+    time::Instant,
+};
+
+/// The seed of every session.
+pub(crate) const SEED: u64 = 1;
+
+/// A session that steps with random actions.
+pub(crate) struct Client {
+    spec: &'static EnvironmentSpec,
+    batch: usize,
+    session: Session,
+    noise: Noise,
+}
+
+impl Client {
+    pub(crate) async fn open(socket: &Path, name: &str, batch: usize) -> Result<Self, Failure> {
+        let connection = Connection::open(&Address::Unix(socket.into())).await?;
+        let open = proto::Open {
+            environment: name.into(),
+            version: proto::Version::Default.into(),
+            batch_size: batch as u32,
+            seed: SEED,
+            autoreset_mode: proto::AutoresetMode::SameStep.into(),
+            ..Default::default()
+        };
+        let (session, _) = Session::open(&connection, open).await?;
+        Ok(Self { spec: tasks::catalogue().find(name)?, batch, session, noise: Noise(7) })
+    }
+
+    /// Takes `trips` steps, each after the reply to the last. Returns the seconds.
+    pub(crate) async fn run(&mut self, trips: usize) -> Result<f64, Failure> {
+        let actions: Vec<Bytes> = (0..trips).map(|_| self.actions()).collect();
+        let start = Instant::now();
+        self.play(&actions, 1).await?;
+        Ok(start.elapsed().as_secs_f64())
+    }
+
+    /// Steps with these actions, up to `in_flight` requests on their way. Returns the last observations.
+    pub(crate) async fn play(&mut self, actions: &[Bytes], in_flight: usize) -> Result<Bytes, Failure> {
+        let (mut sent, mut last) = (0, Bytes::new());
+        for received in 0..actions.len() {
+            while sent < actions.len().min(received + in_flight) {
+                self.session.send(proto::Step { actions: actions[sent].clone() }).await?;
+                sent += 1;
+            }
+            let stepped = self.session.receive::<proto::Step>().await?;
+            assert_eq!(stepped.observations.len(), 4 * self.batch * self.spec.observation.len());
+            assert_eq!(stepped.rewards.len(), 4 * self.batch);
+            last = stepped.observations;
+        }
+        Ok(last)
+    }
+
+    /// Asks for a picture and waits for it.
+    pub(crate) async fn draw(&mut self) -> Result<(), Failure> {
+        let picture = self.session.ask(proto::Render::default()).await?;
+        assert_eq!((picture.width, picture.height, picture.pixels.len()), (480, 480, 480 * 480 * 3));
+        Ok(())
+    }
+
+    /// The next step's.
+    pub(crate) fn actions(&mut self) -> Bytes {
+        let mut bytes = Vec::with_capacity(4 * self.batch * width(self.spec));
+        for _ in 0..self.batch * width(self.spec) {
+            match self.spec.action {
+                ActionSpace::Discrete(names) => {
+                    bytes.extend(((self.noise.next() % names.len() as u64) as i32).to_le_bytes());
+                }
+                ActionSpace::Continuous(_) => bytes.extend(self.noise.unit().to_le_bytes()),
+            }
+        }
+        bytes.into()
+    }
+}
+
+/// The numbers in an action.
+pub(crate) fn width(spec: &EnvironmentSpec) -> usize {
+    match spec.action {
+        ActionSpace::Discrete(_) => 1,
+        ActionSpace::Continuous(channels) => channels.len(),
+    }
+}
+
+/// A small generator for actions: their quality does not matter here.
+struct Noise(u64);
+
+impl Noise {
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+        self.0 >> 33
+    }
+
+    fn unit(&mut self) -> f32 {
+        self.next() as f32 / (1u64 << 30) as f32 - 1.0
+    }
+}
+
+/// A server process with a socket of its own.
+pub(crate) struct Process {
+    child: Child,
+    pub(crate) socket: PathBuf,
+    _directory: tempfile::TempDir,
+}
+
+impl Process {
+    pub(crate) fn server(workers: usize) -> Result<Self, Failure> {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_perturb-server"));
+        command.args(["--log", "warn", "--workers", &workers.to_string()]);
+        Self::start(command, |socket| vec!["--listen".into(), format!("unix:{}", socket.display())])
+    }
+
+    pub(crate) fn echo() -> Result<Self, Failure> {
+        Self::start(Command::new(env::current_exe()?), |socket| vec!["echo".into(), socket.display().to_string()])
+    }
+
+    fn start(mut command: Command, arguments: impl Fn(&Path) -> Vec<String>) -> Result<Self, Failure> {
+        let directory = tempfile::tempdir()?;
+        let socket = directory.path().join("socket");
+        let mut child = command.args(arguments(&socket)).stdout(Stdio::piped()).spawn()?;
+        let stdout = child.stdout.take().ok_or("no standard output")?;
+        BufReader::new(stdout).read_line(&mut String::new())?;
+        Ok(Self { child, socket, _directory: directory })
+    }
+
+    /// Where the system tells of it.
+    pub(crate) fn proc(&self) -> PathBuf {
+        format!("/proc/{}", self.child.id()).into()
+    }
+
+    /// Resident bytes.
+    pub(crate) fn resident(&self) -> Result<f64, Failure> {
+        let status = fs::read_to_string(self.proc().join("status"))?;
+        let line = status.lines().find(|line| line.starts_with("VmRSS:")).ok_or("no VmRSS")?;
+        Ok(line.split_whitespace().nth(1).ok_or("no VmRSS")?.parse::<f64>()? * 1024.0)
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}

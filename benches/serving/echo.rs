@@ -1,0 +1,60 @@
+//! What a round trip costs without a server behind it.
+
+use super::Failure;
+use bytes::Bytes;
+use perturb::proto::{
+    self, SessionRequest, SessionResponse,
+    perturb_server::{Perturb, PerturbServer},
+    session_request::Request as Ask,
+    session_response::Response as Answer,
+};
+use std::{path::Path, pin::Pin};
+use tokio::net::UnixListener;
+use tokio_stream::{Stream, StreamExt, wrappers::UnixListenerStream};
+use tonic::{Request, Response, Status, Streaming, transport::Server};
+
+/// Answers every step with a reply of the same size as the server's, made in advance.
+struct Echo;
+
+#[tonic::async_trait]
+impl Perturb for Echo {
+    type SessionStream = Pin<Box<dyn Stream<Item = Result<SessionResponse, Status>> + Send>>;
+
+    async fn list_environments(
+        &self,
+        _: Request<proto::ListEnvironmentsRequest>,
+    ) -> Result<Response<proto::ListEnvironmentsResponse>, Status> {
+        Err(Status::unimplemented("this is an echo"))
+    }
+
+    async fn session(
+        &self,
+        requests: Request<Streaming<SessionRequest>>,
+    ) -> Result<Response<Self::SessionStream>, Status> {
+        let reply = proto::Stepped {
+            observations: Bytes::from(vec![0; 256 * 16]),
+            rewards: Bytes::from(vec![0; 256 * 4]),
+            terminated: Bytes::from(vec![0; 256]),
+            truncated: Bytes::from(vec![0; 256]),
+            ..Default::default()
+        };
+        let responses = requests.into_inner().map(move |request| {
+            let response = match request?.request {
+                Some(Ask::Open(_)) => Answer::Opened(proto::Opened::default()),
+                _ => Answer::Stepped(reply.clone()),
+            };
+            Ok(SessionResponse { response: Some(response) })
+        });
+        Ok(Response::new(Box::pin(responses)))
+    }
+}
+
+/// Answers on the socket until it is killed.
+pub(crate) async fn serve(socket: &Path) -> Result<(), Failure> {
+    let listener = UnixListener::bind(socket)?;
+    println!("listening");
+    Ok(Server::builder()
+        .add_service(PerturbServer::new(Echo))
+        .serve_with_incoming(UnixListenerStream::new(listener))
+        .await?)
+}

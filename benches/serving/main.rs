@@ -1,0 +1,141 @@
+//! What serving costs, each figure beside its yardstick of the same run:
+//!
+//! - CartPole, batch 256, over a Unix socket, against a bare tonic echo of the same payload;
+//! - Hopper and HalfCheetah, batches of 64, 256 and 1024, two workers, against MuJoCo's timesteps alone ([`robots`]);
+//! - the round trip of one environment, and the memory of one Hopper;
+//! - pictures of each environment, 480 × 480 pixels, and what the server's memory grows by with them.
+//!
+//! Servers are processes of their own: `perturb-server`, and this program with the argument `echo` and a socket.
+
+mod client;
+mod echo;
+#[cfg(feature = "mujoco")]
+mod robots;
+
+use client::{Client, Process};
+use perturb::tasks;
+use std::{env, time::Instant};
+
+type Failure = Box<dyn std::error::Error>;
+
+/// Yardstick and served loop take turns, in short rounds, so that a busy neighbour disturbs both; medians are printed.
+const ROUNDS: usize = 25;
+
+fn main() -> Result<(), Failure> {
+    let arguments: Vec<String> = env::args().collect();
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    if let [_, kind, socket, ..] = arguments.as_slice()
+        && kind == "echo"
+    {
+        return runtime.block_on(echo::serve(socket.as_ref()));
+    }
+    // Cargo adds --bench; any other argument selects figures by a part of their name.
+    let filter = arguments.iter().skip(1).find(|argument| !argument.starts_with('-'));
+    let wanted = |id: &str| filter.is_none_or(|filter| id.contains(filter.as_str()));
+    runtime.block_on(async {
+        if wanted("step/CartPole/256") {
+            classic().await?;
+        }
+        #[cfg(feature = "mujoco")]
+        for (spec, make) in [
+            (&tasks::hopper::SPEC, tasks::hopper::hopper as robots::Make),
+            (&tasks::half_cheetah::SPEC, tasks::half_cheetah::half_cheetah),
+        ] {
+            for batch in [64, 256, 1024] {
+                if wanted(&format!("step/{}/{batch}", spec.name)) {
+                    robots::served(spec, make, batch).await?;
+                }
+            }
+        }
+        if wanted("round_trip/CartPole/1") {
+            round_trip().await?;
+        }
+        if wanted("memory/Hopper") {
+            memory().await?;
+        }
+        for name in tasks::catalogue().names() {
+            if wanted(&format!("render/{name}/480")) {
+                pictures(name).await?;
+            }
+        }
+        Ok(())
+    })
+}
+
+/// (a) CartPole in batches of 256 against the echo.
+async fn classic() -> Result<(), Failure> {
+    const BATCH: usize = 256;
+    const TRIPS: usize = 800;
+    let (server, echo) = (Process::server(1)?, Process::echo()?);
+    let mut served = Client::open(&server.socket, "CartPole", BATCH).await?;
+    let mut bare = Client::open(&echo.socket, "CartPole", BATCH).await?;
+    let (mut ratios, mut steps) = (Vec::new(), Vec::new());
+    for _ in 0..ROUNDS {
+        let echoed = TRIPS as f64 / bare.run(TRIPS).await?;
+        let stepped = TRIPS as f64 / served.run(TRIPS).await?;
+        ratios.push(stepped / echoed);
+        steps.push(stepped * BATCH as f64);
+    }
+    println!("step/CartPole/256      {:>12.0} env steps/s over a Unix socket", median(&mut steps));
+    println!("step/CartPole/256      {:>12.2} of a bare echo's round trips x 256 (at least 0.5)", median(&mut ratios));
+    Ok(())
+}
+
+/// (b) One environment.
+async fn round_trip() -> Result<(), Failure> {
+    const TRIPS: usize = 20_000;
+    let server = Process::server(1)?;
+    let mut client = Client::open(&server.socket, "CartPole", 1).await?;
+    client.run(TRIPS / 10).await?;
+    let mut micros = Vec::with_capacity(TRIPS);
+    for _ in 0..TRIPS {
+        micros.push(client.run(1).await? * 1e6);
+    }
+    micros.sort_by(f64::total_cmp);
+    let at = |q: f64| micros[(q * (TRIPS - 1) as f64) as usize];
+    println!("round_trip/CartPole/1  {:>12.1} us p50, {:.1} us p99", at(0.5), at(0.99));
+    Ok(())
+}
+
+/// (c) Resident memory of a Hopper, stepped so that its pages are in use.
+async fn memory() -> Result<(), Failure> {
+    const BATCH: usize = 2000;
+    if tasks::catalogue().find("Hopper").is_err() {
+        return Ok(());
+    }
+    let server = Process::server(2)?;
+    Client::open(&server.socket, "Hopper", 1).await?.run(10).await?;
+    let before = server.resident()?;
+    let mut client = Client::open(&server.socket, "Hopper", BATCH).await?;
+    client.run(50).await?;
+    let each = (server.resident()? - before) / BATCH as f64;
+    println!("memory/Hopper           {:>12.1} kB for each environment (at most 4)", each / 1e3);
+    Ok(())
+}
+
+/// (d) Pictures of one environment, each asked for after the last came.
+async fn pictures(name: &'static str) -> Result<(), Failure> {
+    const PICTURES: usize = 10;
+    let server = Process::server(1)?;
+    let mut client = Client::open(&server.socket, name, 1).await?;
+    client.run(10).await?;
+    let before = server.resident()?;
+    client.draw().await?; // the first one loads the driver
+    let mut rates = Vec::new();
+    for _ in 0..ROUNDS {
+        let start = Instant::now();
+        for _ in 0..PICTURES {
+            client.draw().await?;
+        }
+        rates.push(PICTURES as f64 / start.elapsed().as_secs_f64());
+    }
+    let id = format!("render/{name}/480");
+    let grown = (server.resident()? - before) / 1e6;
+    println!("{id:<22} {:>12.0} pictures/s over a Unix socket; {grown:.0} MB more memory", median(&mut rates));
+    Ok(())
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}

@@ -1,0 +1,158 @@
+//! Acting with the recurrent network; the equations are in the learner's `rc.rs`.
+
+use pulp::Simd;
+
+use crate::kernel::{Kernel, Rows, run};
+use crate::math::{sigmoid, tanh};
+use crate::perceptron::{Layer, Perceptron, take};
+use crate::spec::PolicySpec;
+
+/// Hidden layers, an LSTM and two heads, with the memory of every environment.
+#[derive(Clone, Debug)]
+pub(crate) struct Recurrent {
+    observation_size: usize,
+    /// X: numbers that enter the LSTM from below.
+    hidden_size: usize,
+    /// H.
+    width: usize,
+    hidden: Perceptron,
+    /// From x and h together, `[X + H]`, to i, f, g and o, `[4H]`.
+    gates: Layer,
+    policy: Layer,
+    value: Layer,
+    /// [max_batch, 2H]: h, then c, of every environment.
+    memory: Vec<f32>,
+    // Rows of a batch.
+    /// [max_batch, O].
+    observations: Rows,
+    /// For each hidden layer.
+    hidden_layers: Vec<Rows>,
+    /// [max_batch, X + H].
+    inputs: Rows,
+    /// [max_batch, 4H].
+    sums: Rows,
+    /// [max_batch, 2H]: the memory after the step.
+    next: Rows,
+    /// [max_batch, n or A].
+    outputs: Rows,
+    /// [max_batch, 1].
+    values: Rows,
+}
+
+impl Recurrent {
+    pub(crate) fn new(spec: &PolicySpec, width: usize, max_batch: usize) -> Self {
+        let (hidden_size, n_outputs) = (spec.hidden_size(), spec.action.outputs());
+        let rows = |length| Rows::new(max_batch, length);
+        let hidden = Perceptron::new(&spec.hidden_layers(), true);
+        Recurrent {
+            observation_size: spec.observation_size,
+            hidden_size,
+            width,
+            hidden_layers: hidden.room(max_batch),
+            hidden,
+            gates: Layer::new(hidden_size + width, 4 * width),
+            policy: Layer::new(width, n_outputs),
+            value: Layer::new(width, 1),
+            memory: vec![0.0; max_batch * 2 * width],
+            observations: rows(spec.observation_size),
+            inputs: rows(hidden_size + width),
+            sums: rows(4 * width),
+            next: rows(2 * width),
+            outputs: rows(n_outputs),
+            values: rows(1),
+        }
+    }
+
+    /// Takes over weights in the order of [`PolicySpec::layout`] from the front of `numbers`, which move on.
+    pub(crate) fn load(&mut self, numbers: &mut &[f32]) {
+        self.hidden.load(numbers);
+        self.gates.load_inputs(0, take(numbers, 4 * self.width * self.hidden_size));
+        self.gates.load_inputs(self.hidden_size, take(numbers, 4 * self.width * self.width));
+        self.gates.load_biases(take(numbers, 4 * self.width));
+        self.policy.load(numbers);
+        self.value.load(numbers);
+    }
+
+    /// One step of environments 0 … `n_envs`-1, which remember it: rows of the policy's outputs and of the values.
+    pub(crate) fn advance(&mut self, observations: &[f32], n_envs: usize) -> (&Rows, &Rows) {
+        self.step(observations, 0..n_envs);
+        for (n, memory) in self.memory.chunks_exact_mut(2 * self.width).take(n_envs).enumerate() {
+            memory.copy_from_slice(&self.next.row(n)[..2 * self.width]);
+        }
+        (&self.outputs, &self.values)
+    }
+
+    /// Rows of the values of `observations` in `environments`; memories stay.
+    pub(crate) fn values(&mut self, observations: &[f32], environments: impl ExactSizeIterator<Item = usize>) -> &Rows {
+        self.step(observations, environments);
+        &self.values
+    }
+
+    pub(crate) fn forget(&mut self, environment: usize) {
+        self.memory[environment * 2 * self.width..][..2 * self.width].fill(0.0);
+    }
+
+    pub(crate) fn memory(&self) -> &[f32] {
+        &self.memory
+    }
+
+    /// The same, to be overwritten.
+    pub(crate) fn memory_mut(&mut self) -> &mut [f32] {
+        &mut self.memory
+    }
+
+    /// Computes `next`, outputs and values from `observations` and the memories of `environments`.
+    fn step(&mut self, observations: &[f32], environments: impl ExactSizeIterator<Item = usize>) {
+        let n = environments.len();
+        self.observations.copy(observations, self.observation_size);
+        for (row, environment) in environments.enumerate() {
+            let memory = &self.memory[environment * 2 * self.width..][..2 * self.width];
+            self.inputs.row_mut(row)[self.hidden_size..][..self.width].copy_from_slice(&memory[..self.width]);
+            self.next.row_mut(row)[..memory.len()].copy_from_slice(memory);
+        }
+        run(Step { network: self, n });
+    }
+}
+
+/// A step of `n` environments, whose rows are filled.
+struct Step<'a> {
+    network: &'a mut Recurrent,
+    n: usize,
+}
+
+impl Kernel for Step<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let (network, n) = (self.network, self.n);
+        network.hidden.forward(simd, &network.observations, n, &mut network.hidden_layers);
+        let x = network.hidden_layers.last().unwrap_or(&network.observations);
+        for row in 0..n {
+            network.inputs.row_mut(row)[..network.hidden_size].copy_from_slice(&x.row(row)[..network.hidden_size]);
+        }
+        network.gates.apply(simd, &network.inputs, n, &mut network.sums);
+        for row in 0..n {
+            let (h, c) = network.next.row_mut(row)[..2 * network.width].split_at_mut(network.width);
+            cell(&mut network.sums.row_mut(row)[..4 * network.width], h, c);
+        }
+        network.policy.apply(simd, &network.next, n, &mut network.outputs);
+        network.value.apply(simd, &network.next, n, &mut network.values);
+    }
+}
+
+/// Replaces c' by c and what is in `h` by h; `sums` are i, f, g and o, and serve as room.
+#[inline(always)]
+fn cell(sums: &mut [f32], h: &mut [f32], c: &mut [f32]) {
+    let width = c.len();
+    let (input_and_forget, rest) = sums.split_at_mut(2 * width);
+    let (candidate, output) = rest.split_at_mut(width);
+    input_and_forget.iter_mut().for_each(|x| *x = sigmoid(*x));
+    output.iter_mut().for_each(|x| *x = sigmoid(*x));
+    candidate.iter_mut().for_each(|x| *x = tanh(*x));
+    let (input, forget) = input_and_forget.split_at(width);
+    for (((c, f), i), g) in c.iter_mut().zip(forget).zip(input).zip(&*candidate) {
+        *c = f * *c + i * g;
+    }
+    for ((h, o), c) in h.iter_mut().zip(&*output).zip(&*c) {
+        *h = o * tanh(*c);
+    }
+}

@@ -1,0 +1,81 @@
+//! What can go wrong with a policy's arrays and numbers.
+
+/// A failure of a policy, a normaliser or a gradient step.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// A part of a policy's shape is empty.
+    #[error("{name} is 0, but must be at least 1")]
+    Empty {
+        /// The part.
+        name: &'static str,
+    },
+    /// An array has the wrong number of elements.
+    #[error("{name} has {got} elements, expected {expected}")]
+    Length {
+        /// The array, with its axes, e.g. "observations `[N, O]`".
+        name: &'static str,
+        /// Elements that were given.
+        got: usize,
+        /// Elements that were expected.
+        expected: usize,
+    },
+    /// Saved arrays do not fit: one is missing, superfluous, misnamed or has another shape.
+    #[error("array {position} is {got}, expected {expected}; were these saved with other settings?")]
+    Arrays {
+        /// Place in the list.
+        position: usize,
+        /// Name and shape that were found, or "missing".
+        got: String,
+        /// Name and shape that were expected, or "nothing".
+        expected: String,
+    },
+    /// A number that must be finite is not.
+    #[error("{what} became {value} at update {update}; lower the learning rate, or look for very large rewards")]
+    NotFinite {
+        /// What became infinite or NaN, e.g. "the loss".
+        what: &'static str,
+        /// Its value: NaN, inf or -inf.
+        value: f64,
+        /// Index of the gradient step, from 0.
+        update: u64,
+    },
+    /// A policy gave a log-probability or a value that is infinite or NaN.
+    #[error(
+        "the policy's output in environment {environment} is not finite; its weights or observation hold NaN or inf"
+    )]
+    PolicyOutput {
+        /// Which of the N environments.
+        environment: usize,
+    },
+    /// A gradient of no samples was asked for.
+    #[error("a minibatch is empty, but must have at least 1 sample")]
+    NoSamples,
+    /// The system starts no more threads.
+    #[error("{wanted} threads cannot be started: {reason}; ask for fewer")]
+    Threads {
+        /// How many were to be started.
+        wanted: usize,
+        /// What the system says.
+        reason: String,
+    },
+    /// An input that must be finite is not.
+    #[error("{name} hold {value}; the environment's numbers must be finite")]
+    Input {
+        /// The array, with its axes.
+        name: &'static str,
+        /// The first such element.
+        value: f32,
+    },
+}
+
+/// A result with this module's [`Error`].
+pub type Result<T> = std::result::Result<T, Error>;
+
+/// `Ok` if a slice has the expected length.
+///
+/// # Errors
+/// [`Error::Length`] otherwise.
+pub fn check_length(name: &'static str, got: usize, expected: usize) -> Result<()> {
+    if got == expected { Ok(()) } else { Err(Error::Length { name, got, expected }) }
+}

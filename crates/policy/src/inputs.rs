@@ -1,0 +1,162 @@
+//! What a policy gets to see.
+
+use crate::act::Acts;
+use crate::error::{Result, check_length};
+use crate::spec::ActionKind;
+
+/// Makes a policy's inputs of observations: these as they are or, for RL², each with what the policy did in the step
+/// before and what came of it, (s_t, a_{t-1}, r_{t-1}, d_{t-1}), Duan et al. (2016), arXiv:1611.02779, section 2.2:
+///
+/// - s_t `[O]`: the observation, normalised;
+/// - a_{t-1}: one-hot `[n]` if actions are discrete, else as sampled `[A]`;
+/// - r_{t-1}: the reward, normalised;
+/// - d_{t-1}: 1 if it ended an episode, else 0.
+///
+/// The last three are 0 at the start of a trial.
+#[derive(Clone, Debug)]
+pub struct Inputs {
+    observation_size: usize,
+    action: ActionKind,
+    /// `[N, E]` what stands beside the observations, E = 0 if nothing does.
+    last: Vec<f32>,
+    /// E.
+    extra: usize,
+    rows: Vec<f32>,
+}
+
+impl Inputs {
+    /// Inputs of N = `n_envs` environments at the start of a trial. `with_outcomes` adds the last action, reward and done
+    /// flag.
+    pub fn new(observation_size: usize, action: ActionKind, n_envs: usize, with_outcomes: bool) -> Self {
+        let extra = if with_outcomes { action.outputs() + 2 } else { 0 };
+        Inputs { observation_size, action, last: vec![0.0; n_envs * extra], extra, rows: Vec::new() }
+    }
+
+    /// I: numbers in an input, O + E.
+    pub fn size(&self) -> usize {
+        self.observation_size + self.extra
+    }
+
+    /// The inputs `[N, I]` of `observations` `[N, O]`.
+    pub fn of<'a>(&'a mut self, observations: &'a [f32]) -> &'a [f32] {
+        let n_envs = observations.len() / self.observation_size;
+        self.rows(observations, 0..n_envs, false)
+    }
+
+    /// The inputs `[K, I]` of final observations `[K, O]` of `environments` `[K]`: those after the step that was remembered
+    /// last, as if no episode had ended.
+    pub fn of_finals<'a>(&'a mut self, observations: &'a [f32], environments: &[usize]) -> &'a [f32] {
+        self.rows(observations, environments.iter().copied(), true)
+    }
+
+    fn rows<'a>(
+        &'a mut self,
+        observations: &'a [f32],
+        environments: impl Iterator<Item = usize>,
+        unended: bool,
+    ) -> &'a [f32] {
+        if self.extra == 0 {
+            return observations;
+        }
+        self.rows.clear();
+        for (observation, environment) in observations.chunks_exact(self.observation_size).zip(environments) {
+            self.rows.extend_from_slice(observation);
+            self.rows.extend_from_slice(&self.last[environment * self.extra..][..self.extra]);
+            if let (true, Some(done)) = (unended, self.rows.last_mut()) {
+                *done = 0.0;
+            }
+        }
+        &self.rows
+    }
+
+    /// Remembers what was done in a step and what came of it: normalised `rewards` `[N]`, and `done` `[N]` where an episode
+    /// ended.
+    ///
+    /// # Errors
+    /// Lengths that do not fit.
+    pub fn remember(&mut self, acts: &Acts, rewards: &[f32], done: &[bool]) -> Result<()> {
+        if self.extra == 0 {
+            return Ok(());
+        }
+        let (n_envs, width) = (self.last.len() / self.extra, self.action.width());
+        check_length("actions [N, A]", acts.actions.len(), n_envs * width)?;
+        check_length("rewards [N]", rewards.len(), n_envs)?;
+        check_length("done [N]", done.len(), n_envs)?;
+        let rows = self.last.chunks_exact_mut(self.extra).zip(acts.actions.chunks_exact(width));
+        for ((row, action), (reward, done)) in rows.zip(rewards.iter().zip(done)) {
+            let (chosen, outcome) = row.split_at_mut(self.extra - 2);
+            match self.action {
+                ActionKind::Continuous { .. } => chosen.copy_from_slice(action),
+                ActionKind::Discrete { .. } => {
+                    for (j, hot) in chosen.iter_mut().enumerate() {
+                        *hot = f32::from(u8::from(j == action[0] as usize));
+                    }
+                }
+            }
+            outcome.copy_from_slice(&[*reward, f32::from(u8::from(*done))]);
+        }
+        Ok(())
+    }
+
+    /// A new trial begins in `environment`.
+    pub fn forget(&mut self, environment: usize) {
+        self.last[environment * self.extra..][..self.extra].fill(0.0);
+    }
+
+    /// `[N, E]` what stands beside the next observations.
+    pub fn outcomes(&self) -> &[f32] {
+        &self.last
+    }
+
+    /// Replaces it by what [`Inputs::outcomes`] gave.
+    ///
+    /// # Errors
+    /// Another length.
+    pub fn restore(&mut self, outcomes: &[f32]) -> Result<()> {
+        check_length("outcomes [N, E]", outcomes.len(), self.last.len())?;
+        self.last.copy_from_slice(outcomes);
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const DISCRETE: ActionKind = ActionKind::Discrete { n: 3 };
+
+    fn acts(kind: ActionKind, actions: &[f32]) -> Acts {
+        Acts { actions: actions.to_vec(), ..Acts::new(kind, 2) }
+    }
+
+    #[test]
+    fn observations_alone_are_passed_on() {
+        let mut inputs = Inputs::new(2, DISCRETE, 2, false);
+        inputs.remember(&acts(DISCRETE, &[1.0, 2.0]), &[0.5, 0.5], &[false, true]).unwrap();
+        inputs.forget(1);
+        assert_eq!((inputs.size(), inputs.of(&[1.0, 2.0, 3.0, 4.0])), (2, &[1.0, 2.0, 3.0, 4.0][..]));
+    }
+
+    #[test]
+    fn an_input_has_the_last_action_reward_and_done_flag_beside_the_observation() {
+        let mut inputs = Inputs::new(1, DISCRETE, 2, true);
+        assert_eq!(inputs.size(), 1 + 3 + 1 + 1);
+        assert_eq!(inputs.of(&[7.0, 8.0]), [7.0, 0.0, 0.0, 0.0, 0.0, 0.0, 8.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+        inputs.remember(&acts(DISCRETE, &[2.0, 0.0]), &[0.5, -0.5], &[false, true]).unwrap();
+        assert_eq!(inputs.of(&[7.0, 8.0]), [7.0, 0.0, 0.0, 1.0, 0.5, 0.0, 8.0, 1.0, 0.0, 0.0, -0.5, 1.0]);
+        assert_eq!(inputs.of_finals(&[9.0], &[1]), [9.0, 1.0, 0.0, 0.0, -0.5, 0.0], "nothing has ended");
+        inputs.forget(1);
+        assert_eq!(inputs.of(&[7.0, 8.0])[6..], [8.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+        assert_eq!(inputs.of(&[7.0, 8.0])[..6], [7.0, 0.0, 0.0, 1.0, 0.5, 0.0], "the other's trial goes on");
+
+        let kind = ActionKind::Continuous { size: 2 };
+        let mut inputs = Inputs::new(1, kind, 2, true);
+        inputs.remember(&acts(kind, &[0.1, 0.2, 0.3, 0.4]), &[1.0, 2.0], &[true, false]).unwrap();
+        assert_eq!(inputs.of(&[7.0, 8.0]), [7.0, 0.1, 0.2, 1.0, 1.0, 8.0, 0.3, 0.4, 2.0, 0.0]);
+        let saved = inputs.outcomes().to_vec();
+        inputs.forget(0);
+        inputs.restore(&saved).unwrap();
+        assert_eq!(inputs.of(&[7.0, 8.0])[..5], [7.0, 0.1, 0.2, 1.0, 1.0]);
+        assert!(inputs.restore(&[1.0]).is_err());
+    }
+}

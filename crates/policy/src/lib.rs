@@ -1,0 +1,34 @@
+//! A policy as portable arithmetic, the same bytes on every processor: what it is ([`PolicySpec`], [`Weights`]), how it acts
+//! ([`Actor`]), what stands between an environment and it ([`Inputs`], the normalisers), and how a feed-forward one learns
+//! ([`Objective`], [`Differentiator`], [`Descent`]). Plain f32 loops, without libtorch.
+#![forbid(unsafe_code)]
+#![deny(clippy::disallowed_methods)]
+
+mod act;
+mod act_ff;
+mod act_rc;
+mod differentiator;
+mod error;
+mod initial;
+mod inputs;
+mod kernel;
+pub mod math;
+mod normaliser;
+mod objective;
+mod optimiser;
+mod perceptron;
+pub mod random;
+mod sample;
+mod spec;
+mod weights;
+
+pub use act::{Actor, Acts, Streams};
+pub use differentiator::{Differentiator, Samples};
+pub use error::{Error, Result, check_length};
+pub use initial::initial_weights;
+pub use inputs::Inputs;
+pub use normaliser::{ObservationNormaliser, RewardNormaliser, RunningMoments};
+pub use objective::{Acting, Losses, Objective, Surrogate};
+pub use optimiser::{Adam, Descent, Optimiser, RmsProp};
+pub use spec::{ActionKind, PolicySpec};
+pub use weights::{NamedArray, Weights, check_arrays};

@@ -1,0 +1,255 @@
+//! Running normalisation of observations and rewards, as stable-baselines3's VecNormalize.
+//!
+//! In training, call `update` and then `normalise`; in testing only `normalise`, which changes nothing. All state is
+//! f64 and serde-serialisable, and is part of a checkpoint.
+//!
+//! The reference starts its variances from a prior of 1 with the weight of 10⁻⁴ samples. Here there is none: the
+//! statistics are exactly those of the data, and a variance of fewer than two samples counts as 1.
+
+use serde::{Deserialize, Serialize};
+
+use crate::error::{Error, Result, check_length};
+
+/// Normalised numbers are clipped to ±10.
+const CLIP: f64 = 10.0;
+/// Added to variances, so that constants are not divided by 0.
+const EPSILON: f64 = 1e-8;
+
+/// Mean and variance of the vectors seen so far, in f64.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunningMoments {
+    count: u64,
+    mean: Vec<f64>,
+    /// Sums of squared distances from the mean.
+    squares: Vec<f64>,
+}
+
+impl RunningMoments {
+    /// Nothing seen yet of vectors of `size` numbers.
+    pub fn new(size: usize) -> Self {
+        RunningMoments { count: 0, mean: vec![0.0; size], squares: vec![0.0; size] }
+    }
+
+    /// The moments of `rows` [N, size] alone, in two passes.
+    fn of(rows: &[f64], size: usize) -> Self {
+        let count = rows.len() / size;
+        let mut moments = RunningMoments::new(size);
+        moments.count = count as u64;
+        for i in 0..size {
+            let column = || rows.iter().skip(i).step_by(size);
+            let mean = column().sum::<f64>() / count as f64;
+            moments.mean[i] = mean;
+            moments.squares[i] = column().map(|x| (x - mean) * (x - mean)).sum();
+        }
+        moments
+    }
+
+    /// Takes in what `other` has seen, so that the result is that of having seen both, in any order, up to rounding
+    /// (Chan, Golub and LeVeque, 1979): with δ = mean_b - mean_a,
+    /// mean = mean_a + δ n_b/n and squares = squares_a + squares_b + δ² n_a n_b/n.
+    pub fn merge(&mut self, other: &RunningMoments) -> Result<()> {
+        check_length("moments", other.mean.len(), self.mean.len())?;
+        if other.count == 0 {
+            return Ok(());
+        }
+        let (a, b) = (self.count as f64, other.count as f64);
+        let total = a + b;
+        for i in 0..self.mean.len() {
+            let delta = other.mean[i] - self.mean[i];
+            self.mean[i] += delta * b / total;
+            self.squares[i] += other.squares[i] + delta * delta * a * b / total;
+        }
+        self.count += other.count;
+        Ok(())
+    }
+
+    /// Whether these can be moments of vectors of `size` numbers; says what is wrong if they cannot.
+    fn check(&self, size: usize) -> std::result::Result<(), String> {
+        for (name, numbers) in [("mean", &self.mean), ("squares", &self.squares)] {
+            if numbers.len() != size {
+                return Err(format!("{name} has {} numbers, expected {size}", numbers.len()));
+            }
+            if let Some(x) = numbers.iter().find(|x| !x.is_finite()) {
+                return Err(format!("{name} holds {x}"));
+            }
+        }
+        if let Some(x) = self.squares.iter().find(|x| **x < 0.0) {
+            return Err(format!("squares holds {x}, which no sum of squares can be"));
+        }
+        if self.count == 0 && self.mean.iter().chain(&self.squares).any(|&x| x != 0.0) {
+            return Err("count is 0, but there are statistics".into());
+        }
+        Ok(())
+    }
+
+    /// Number of vectors seen.
+    pub fn count(&self) -> u64 {
+        self.count
+    }
+
+    /// Means, 0 before anything was seen.
+    pub fn mean(&self) -> &[f64] {
+        &self.mean
+    }
+
+    /// Population variance (divided by the count) of element `i`; 1 if fewer than two vectors were seen.
+    pub fn variance(&self, i: usize) -> f64 {
+        if self.count < 2 { 1.0 } else { self.squares[i] / self.count as f64 }
+    }
+}
+
+/// Normalises observations: (x - mean)/√(variance + 10⁻⁸) of every element, clipped to ±10.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ObservationNormaliser {
+    moments: RunningMoments,
+}
+
+impl ObservationNormaliser {
+    /// Nothing seen yet of observations of O = `observation_size` numbers.
+    pub fn new(observation_size: usize) -> Self {
+        ObservationNormaliser { moments: RunningMoments::new(observation_size) }
+    }
+
+    /// The statistics.
+    pub fn moments(&self) -> &RunningMoments {
+        &self.moments
+    }
+
+    /// Whether this can normalise observations of `observation_size` numbers; says what is wrong if it cannot.
+    pub fn check(&self, observation_size: usize) -> std::result::Result<(), String> {
+        self.moments.check(observation_size)
+    }
+
+    /// Adds `observations` `[N, O]` to the statistics. Infinite numbers and NaN are refused and change nothing.
+    pub fn update(&mut self, observations: &[f32]) -> Result<()> {
+        let size = self.moments.mean.len();
+        check_length("observations [N, O]", observations.len(), observations.len() / size * size)?;
+        check_finite("observations [N, O]", observations)?;
+        if observations.is_empty() {
+            return Ok(());
+        }
+        let rows: Vec<f64> = observations.iter().map(|&x| f64::from(x)).collect();
+        self.moments.merge(&RunningMoments::of(&rows, size))
+    }
+
+    /// Normalises `observations` `[N, O]` in place. The statistics stay.
+    pub fn normalise(&self, observations: &mut [f32]) -> Result<()> {
+        let size = self.moments.mean.len();
+        check_length("observations [N, O]", observations.len(), observations.len() / size * size)?;
+        for i in 0..size {
+            let (mean, scale) = (self.moments.mean[i], scale(self.moments.variance(i)));
+            for x in observations.iter_mut().skip(i).step_by(size) {
+                *x = ((f64::from(*x) - mean) * scale).clamp(-CLIP, CLIP) as f32;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Normalises rewards: divides them by the standard deviation of the discounted returns R_t = γ R_{t-1} + r_t that every
+/// environment has had so far (Engstrom et al., 2020, arXiv:2005.12729), and clips to ±10. Their mean is kept.
+///
+/// R starts at 0 in every episode, or trial, as in stable-baselines3; the reference lets it run on.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RewardNormaliser {
+    gamma: f64,
+    /// `[N]` R of the running episodes.
+    returns: Vec<f64>,
+    moments: RunningMoments,
+}
+
+impl RewardNormaliser {
+    /// Nothing seen yet of N = `n_envs` environments; `gamma` is the discount factor per step.
+    pub fn new(n_envs: usize, gamma: f64) -> Self {
+        RewardNormaliser { gamma, returns: vec![0.0; n_envs], moments: RunningMoments::new(1) }
+    }
+
+    /// The statistics of the discounted returns.
+    pub fn moments(&self) -> &RunningMoments {
+        &self.moments
+    }
+
+    /// Whether this is that of a training of `n_envs` environments with `gamma`; says what is wrong if it is not.
+    pub fn fits(&self, n_envs: usize, gamma: f64) -> std::result::Result<(), String> {
+        if self.returns.len() != n_envs {
+            return Err(format!("returns has {} numbers, expected {n_envs}", self.returns.len()));
+        }
+        if self.gamma.to_bits() != gamma.to_bits() {
+            return Err(format!("gamma is {}, but {gamma} in the configuration", self.gamma));
+        }
+        Ok(())
+    }
+
+    /// Whether this can normalise rewards; says what is wrong if it cannot.
+    pub fn check(&self) -> std::result::Result<(), String> {
+        if !(0.0..=1.0).contains(&self.gamma) {
+            return Err(format!("gamma is {}, but must be between 0 and 1", self.gamma));
+        }
+        if let Some(x) = self.returns.iter().find(|x| !x.is_finite()) {
+            return Err(format!("returns holds {x}"));
+        }
+        self.moments.check(1)
+    }
+
+    /// Adds a step's `rewards` `[N]` to the statistics. Where `done` `[N]`, at the end of an episode or, with trials, of a
+    /// trial, the discounted return starts again from 0 in the next step. Infinite numbers and NaN are refused and change nothing.
+    pub fn update(&mut self, rewards: &[f32], done: &[bool]) -> Result<()> {
+        self.update_active(rewards, done, None)
+    }
+
+    /// The same with the `active` `[N]` environments alone; what the others bring is passed over.
+    pub fn update_active(&mut self, rewards: &[f32], done: &[bool], active: Option<&[bool]>) -> Result<()> {
+        check_length("rewards [N]", rewards.len(), self.returns.len())?;
+        check_length("done [N]", done.len(), self.returns.len())?;
+        check_length("active [N]", active.map_or(rewards.len(), <[bool]>::len), self.returns.len())?;
+        check_finite("rewards [N]", rewards)?;
+        if rewards.is_empty() {
+            return Ok(());
+        }
+        for (sum, &reward) in self.returns.iter_mut().zip(rewards) {
+            *sum = *sum * self.gamma + f64::from(reward);
+        }
+        match active.filter(|active| active.contains(&false)) {
+            None => self.moments.merge(&RunningMoments::of(&self.returns, 1))?,
+            Some(active) => {
+                let counted = self.returns.iter().zip(active).filter(|(_, active)| **active);
+                let counted: Vec<f64> = counted.map(|(sum, _)| *sum).collect();
+                if !counted.is_empty() {
+                    self.moments.merge(&RunningMoments::of(&counted, 1))?;
+                }
+            }
+        }
+        for (sum, _) in self.returns.iter_mut().zip(done).filter(|(_, done)| **done) {
+            *sum = 0.0;
+        }
+        Ok(())
+    }
+
+    /// Starts the discounted returns of all environments again from 0, as after a reset of the environments from
+    /// outside. The statistics stay.
+    pub fn reset_returns(&mut self) {
+        self.returns.fill(0.0);
+    }
+
+    /// Normalises `rewards` in place. The statistics stay.
+    pub fn normalise(&self, rewards: &mut [f32]) {
+        let scale = scale(self.moments.variance(0));
+        for reward in rewards {
+            *reward = (f64::from(*reward) * scale).clamp(-CLIP, CLIP) as f32;
+        }
+    }
+}
+
+fn scale(variance: f64) -> f64 {
+    1.0 / (variance + EPSILON).sqrt()
+}
+
+fn check_finite(name: &'static str, numbers: &[f32]) -> Result<()> {
+    match numbers.iter().find(|x| !x.is_finite()) {
+        Some(&value) => Err(Error::Input { name, value }),
+        None => Ok(()),
+    }
+}

@@ -1,0 +1,253 @@
+//! What an update minimises, and its derivatives by a policy's outputs.
+
+use crate::math::{exp, ln};
+use crate::sample::{LOG_TAU, greatest_and_total};
+use crate::spec::ActionKind;
+
+/// The policy's part of a loss.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Surrogate {
+    /// The policy gradient's: -1/B Σ_b advantage_b log π(a_b | s_b). Mnih et al. (2016), arXiv:1602.01783.
+    PolicyGradient,
+    /// PPO's clipped one, Schulman et al. (2017), arXiv:1707.06347, equation 7, negated: with the ratio
+    /// ρ_b = π(a_b | s_b)/π_old(a_b | s_b),
+    ///
+    /// 1/B Σ_b max(-advantage_b ρ_b, -advantage_b clip(ρ_b, 1 - range, 1 + range)).
+    Clipped {
+        /// Half the width of the interval around 1.
+        range: f64,
+    },
+}
+
+/// A loss over B samples: surrogate - `ent_coef` · mean entropy + `vf_coef` · value loss + `kl_coef` · mean KL(π_old ‖ π).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Objective {
+    /// The policy's part.
+    pub surrogate: Surrogate,
+    /// Whether advantages are brought to mean 0 and standard deviation 1 before: (advantage_b - mean)/(standard deviation +
+    /// 10⁻⁸), the population's as in the reference (stable-baselines3: the sample's). A single advantage becomes 0.
+    pub normalize_advantages: bool,
+    /// Weight of the entropy, per nat.
+    pub ent_coef: f64,
+    /// Weight of the value loss.
+    pub vf_coef: f64,
+    /// How far a value may move from the rollout's to its own advantage: the value loss is
+    /// 1/B Σ_b max((V_b - R_b)², (V_b' - R_b)²), V_b' = old_b + clip(V_b - old_b, -range, range), not in the paper on PPO, but
+    /// in the reference; the unit is that of the normalised rewards. None: 1/B Σ_b (V_b - R_b)², without the further ½ of
+    /// some versions of the reference.
+    pub value_clip_range: Option<f64>,
+    /// Weight of the divergence from the acting policy, per nat.
+    pub kl_coef: f64,
+}
+
+/// What the parts of a loss came to, as means over samples.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Losses {
+    /// The surrogate.
+    pub policy: f64,
+    /// The value loss, before `vf_coef`.
+    pub value: f64,
+    /// Entropy of the action distributions, nats.
+    pub entropy: f64,
+    /// The sum that is minimised.
+    pub total: f64,
+    /// Estimate of the KL divergence of the new from the acting policy, in nats: 1/B Σ_b (ρ_b - 1 - log ρ_b), which is not
+    /// negative but for rounding (as stable-baselines3; the reference logs 1/B Σ_b ½ log² ρ_b, which is the same to second order). 0 without
+    /// ratios.
+    pub approx_kl: f64,
+    /// Share of samples whose ratio is outside 1 ± range; 0 without ratios.
+    pub clip_fraction: f64,
+    /// KL(π_old ‖ π), nats; 0 where the acting distributions are not given.
+    pub kl_divergence: f64,
+}
+
+impl Losses {
+    /// These sums over `n` samples as means, with the total of `objective`.
+    pub(crate) fn means(self, n: usize, objective: &Objective) -> Self {
+        let mut means = self;
+        let parts = [
+            &mut means.policy,
+            &mut means.value,
+            &mut means.entropy,
+            &mut means.approx_kl,
+            &mut means.clip_fraction,
+            &mut means.kl_divergence,
+        ];
+        parts.into_iter().for_each(|sum| *sum /= n as f64);
+        let Objective { ent_coef, vf_coef, kl_coef, .. } = objective;
+        means.total = means.policy - ent_coef * means.entropy + vf_coef * means.value + kl_coef * means.kl_divergence;
+        means
+    }
+}
+
+impl std::ops::AddAssign for Losses {
+    fn add_assign(&mut self, other: Losses) {
+        self.policy += other.policy;
+        self.value += other.value;
+        self.entropy += other.entropy;
+        self.total += other.total;
+        self.approx_kl += other.approx_kl;
+        self.clip_fraction += other.clip_fraction;
+        self.kl_divergence += other.kl_divergence;
+    }
+}
+
+/// The distributions of the policy that acted, at B samples.
+#[derive(Clone, Copy, Debug)]
+pub struct Acting<'a> {
+    /// `[B, n]` logits, or `[B, A]` means.
+    pub outputs: &'a [f32],
+    /// `[A]` log standard deviations of continuous actions.
+    pub log_std: &'a [f32],
+}
+
+/// One sample.
+pub(crate) struct Sample<'a> {
+    pub(crate) action: &'a [f32],
+    pub(crate) old_log_prob: f32,
+    pub(crate) old_value: f32,
+    /// As it counts, normalised if it is to be.
+    pub(crate) advantage: f32,
+    pub(crate) return_: f32,
+    /// The acting policy's logits or means, and log standard deviations.
+    pub(crate) acting: Option<(&'a [f32], &'a [f32])>,
+}
+
+/// The deviations of continuous actions, which are the same at every sample. Empty for discrete ones.
+#[derive(Clone, Debug)]
+pub(crate) struct Gaussian {
+    /// `[A]` log σ.
+    pub(crate) log_std: Vec<f32>,
+    /// `[A]` 1/σ.
+    inverse_std: Vec<f32>,
+}
+
+impl Gaussian {
+    pub(crate) fn new(size: usize) -> Self {
+        Gaussian { log_std: vec![0.0; size], inverse_std: vec![1.0; size] }
+    }
+
+    pub(crate) fn load(&mut self, log_std: &[f32]) {
+        self.log_std.copy_from_slice(log_std);
+        self.inverse_std.iter_mut().zip(log_std).for_each(|(inverse, log_std)| *inverse = exp(-log_std));
+    }
+}
+
+/// The policy at one sample, and where the derivatives of the loss by its outputs go.
+pub(crate) struct Outputs<'a> {
+    /// `[n]` logits, or `[A]` means.
+    pub(crate) head: &'a [f32],
+    pub(crate) gaussian: &'a Gaussian,
+    pub(crate) value: f32,
+    /// As `head`; replaced.
+    pub(crate) by_head: &'a mut [f32],
+    /// `[A]`, by log σ; added to.
+    pub(crate) by_log_std: &'a mut [f32],
+    /// Replaced.
+    pub(crate) by_value: &'a mut f32,
+}
+
+impl Objective {
+    /// The losses of one of `n` samples, not divided by `n`; the derivatives are.
+    #[inline(always)]
+    pub(crate) fn differentiate(
+        &self,
+        kind: ActionKind,
+        sample: &Sample<'_>,
+        outputs: Outputs<'_>,
+        n: usize,
+    ) -> Losses {
+        let share = 1.0 / n as f32;
+        let Outputs { head, gaussian, value, by_head, by_log_std, by_value } = outputs;
+        let (value_loss, by) = self.value_loss(value, sample);
+        *by_value = share * self.vf_coef as f32 * by;
+        let by_entropy = -share * self.ent_coef as f32;
+        let by_divergence = share * self.kl_coef as f32;
+        let mut losses = Losses { value: f64::from(value_loss), ..Losses::default() };
+        match kind {
+            ActionKind::Discrete { .. } => {
+                let (greatest, total) = greatest_and_total(head);
+                let log_total = ln(total);
+                let log_prob = |logit: f32| logit - greatest - log_total;
+                let chosen = sample.action[0] as usize;
+                let by_log_prob = share * self.policy_loss(log_prob(head[chosen]), sample, &mut losses);
+                by_head.iter_mut().zip(head).for_each(|(p, &logit)| *p = exp(log_prob(logit)));
+                let entropy = -by_head.iter().zip(head).map(|(p, &logit)| p * log_prob(logit)).sum::<f32>();
+                losses.entropy = f64::from(entropy);
+                for (j, (by, &logit)) in by_head.iter_mut().zip(head).enumerate() {
+                    let (p, hit) = (*by, if j == chosen { 1.0 } else { 0.0 });
+                    *by = by_log_prob * (hit - p) - by_entropy * p * (log_prob(logit) + entropy);
+                }
+                if let Some((acting, _)) = sample.acting {
+                    let (greatest, total) = greatest_and_total(acting);
+                    let log_total = ln(total);
+                    for ((by, &logit), &acting) in by_head.iter_mut().zip(head).zip(acting) {
+                        let old = acting - greatest - log_total;
+                        losses.kl_divergence += f64::from(exp(old) * (old - log_prob(logit)));
+                        *by += by_divergence * (exp(log_prob(logit)) - exp(old));
+                    }
+                }
+            }
+            ActionKind::Continuous { .. } => {
+                let size = head.len() as f32;
+                let mut log_prob = -0.5 * LOG_TAU * size;
+                let mut entropy = 0.5 * (1.0 + LOG_TAU) * size;
+                let Gaussian { log_std, inverse_std } = gaussian;
+                for (((action, mean), log_std), scale) in sample.action.iter().zip(head).zip(log_std).zip(inverse_std) {
+                    let distance = (action - mean) * scale;
+                    log_prob -= 0.5 * distance * distance + log_std;
+                    entropy += log_std;
+                }
+                let by_log_prob = share * self.policy_loss(log_prob, sample, &mut losses);
+                losses.entropy = f64::from(entropy);
+                for i in 0..head.len() {
+                    let (action, mean, log_std, scale) = (sample.action[i], head[i], log_std[i], inverse_std[i]);
+                    let (by_mean, by_log_std) = (&mut by_head[i], &mut by_log_std[i]);
+                    let distance = (action - mean) * scale;
+                    *by_mean = by_log_prob * distance * scale;
+                    *by_log_std += by_log_prob * (distance * distance - 1.0) + by_entropy;
+                    if let Some((means, log_stds)) = sample.acting {
+                        let (shift, old) = ((means[i] - mean) * scale, exp(log_stds[i] - log_std));
+                        let spread = old * old + shift * shift;
+                        losses.kl_divergence += f64::from(log_std - log_stds[i] + 0.5 * spread - 0.5);
+                        *by_mean -= by_divergence * shift * scale;
+                        *by_log_std += by_divergence * (1.0 - spread);
+                    }
+                }
+            }
+        }
+        losses
+    }
+
+    /// The value loss of a sample, and its derivative by the value.
+    #[inline(always)]
+    fn value_loss(&self, value: f32, sample: &Sample<'_>) -> (f32, f32) {
+        let error = value - sample.return_;
+        let free = (error * error, 2.0 * error);
+        let Some(range) = self.value_clip_range else { return free };
+        let moved = value - sample.old_value;
+        let error = sample.old_value + moved.clamp(-range as f32, range as f32) - sample.return_;
+        let clipped = error * error;
+        // Where nothing is clipped the two are one, but for rounding.
+        if free.0 >= clipped || moved.abs() <= range as f32 { free } else { (clipped, 0.0) }
+    }
+
+    /// The derivative of a sample's surrogate by its log-probability; what it comes to goes into `losses`.
+    #[inline(always)]
+    fn policy_loss(&self, log_prob: f32, sample: &Sample<'_>, losses: &mut Losses) -> f32 {
+        let Surrogate::Clipped { range } = self.surrogate else {
+            losses.policy = f64::from(-sample.advantage * log_prob);
+            return -sample.advantage;
+        };
+        let log_ratio = log_prob - sample.old_log_prob;
+        let ratio = exp(log_ratio);
+        let free = -sample.advantage * ratio;
+        let clipped = -sample.advantage * ratio.clamp((1.0 - range) as f32, (1.0 + range) as f32);
+        losses.approx_kl = f64::from(ratio - 1.0 - log_ratio);
+        losses.clip_fraction = f64::from(u8::from((ratio - 1.0).abs() > range as f32));
+        // The two are equal where nothing is clipped. NaN is passed on.
+        let (loss, derivative) = if clipped > free { (clipped, 0.0) } else { (free, free) };
+        losses.policy = f64::from(loss);
+        derivative
+    }
+}

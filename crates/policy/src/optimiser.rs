@@ -1,0 +1,272 @@
+//! Optimisers over a policy's P weights as one array.
+
+use pulp::Simd;
+
+use crate::error::{Error, Result};
+use crate::kernel::{Kernel, run};
+use crate::weights::{NamedArray, check_arrays};
+
+/// Numbers that are summed side by side; the order of a sum is fixed by it.
+const SUMS: usize = 8;
+
+/// What turns a gradient into a step.
+#[derive(Clone, Debug)]
+pub enum Optimiser {
+    /// RMSProp.
+    RmsProp(RmsProp),
+    /// Adam.
+    Adam(Adam),
+}
+
+/// RMSProp (Hinton, 2012, lecture 6e) as TensorFlow's and so the reference's: for i = 0 … P-1,
+///
+/// s_i ← α s_i + (1 - α) g_i²,
+/// w_i ← w_i - η g_i/√(s_i + ε),
+///
+/// where s starts at 1 and ε is inside the root. libtorch's starts s at 0 and adds ε outside, which makes the first
+/// steps ten times as long: A2C is known to be less stable with it.
+#[derive(Clone, Debug)]
+pub struct RmsProp {
+    alpha: f32,
+    epsilon: f32,
+    mean_square: Vec<f32>,
+}
+
+/// Adam, Kingma and Ba (2015), arXiv:1412.6980, algorithm 1, with β₁ = 0.9 and β₂ = 0.999: for i = 0 … P-1 and
+/// t = 1, 2, …,
+///
+/// m_i ← β₁ m_i + (1 - β₁) g_i,
+/// v_i ← β₂ v_i + (1 - β₂) g_i²,
+/// w_i ← w_i - η/(1 - β₁ᵗ) m_i/(√(v_i/(1 - β₂ᵗ)) + ε).
+///
+/// As libtorch's. TensorFlow's, the reference's, adds ε to √v_i before the correction instead, so that its ε is larger
+/// by up to √1000 in the first steps; with ε = 1e-5 this matters only to weights whose gradient is that small.
+#[derive(Clone, Debug)]
+pub struct Adam {
+    epsilon: f32,
+    mean: Vec<f32>,
+    mean_square: Vec<f32>,
+}
+
+const BETA_1: f64 = 0.9;
+const BETA_2: f64 = 0.999;
+
+impl Optimiser {
+    /// RMSProp with decay α and ε for `n_weights`.
+    pub fn rms_prop(alpha: f64, epsilon: f64, n_weights: usize) -> Self {
+        let mean_square = vec![1.0; n_weights];
+        Optimiser::RmsProp(RmsProp { alpha: alpha as f32, epsilon: epsilon as f32, mean_square })
+    }
+
+    /// Adam with ε for `n_weights`.
+    pub fn adam(epsilon: f64, n_weights: usize) -> Self {
+        let (mean, mean_square) = (vec![0.0; n_weights], vec![0.0; n_weights]);
+        Optimiser::Adam(Adam { epsilon: epsilon as f32, mean, mean_square })
+    }
+
+    /// One step on `weights` `[P]` against `gradient` `[P]`; `update` counts the steps before this one.
+    fn step(&mut self, update: u64, learning_rate: f64, weights: &mut [f32], gradient: &[f32]) {
+        match self {
+            Optimiser::RmsProp(state) => run(RmsPropStep { state, learning_rate, weights, gradient }),
+            Optimiser::Adam(state) => run(AdamStep { state, update, learning_rate, weights, gradient }),
+        }
+    }
+
+    /// The running averages, by name, each `[P]`.
+    fn averages(&self) -> Vec<(&'static str, &[f32])> {
+        match self {
+            Optimiser::RmsProp(state) => vec![("mean_square", &state.mean_square)],
+            Optimiser::Adam(state) => vec![("mean", &state.mean), ("mean_square", &state.mean_square)],
+        }
+    }
+
+    /// The same, to be overwritten.
+    fn averages_mut(&mut self) -> Vec<(&'static str, &mut [f32])> {
+        match self {
+            Optimiser::RmsProp(state) => vec![("mean_square", &mut state.mean_square)],
+            Optimiser::Adam(state) => vec![("mean", &mut state.mean), ("mean_square", &mut state.mean_square)],
+        }
+    }
+}
+
+struct RmsPropStep<'a> {
+    state: &'a mut RmsProp,
+    learning_rate: f64,
+    weights: &'a mut [f32],
+    gradient: &'a [f32],
+}
+
+impl Kernel for RmsPropStep<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let RmsProp { alpha, epsilon, mean_square } = self.state;
+        let (alpha, epsilon, learning_rate) = (*alpha, *epsilon, self.learning_rate as f32);
+        for ((w, s), g) in self.weights.iter_mut().zip(mean_square).zip(self.gradient) {
+            *s = alpha * *s + (1.0 - alpha) * g * g;
+            *w -= learning_rate * g / (*s + epsilon).sqrt();
+        }
+    }
+}
+
+struct AdamStep<'a> {
+    state: &'a mut Adam,
+    update: u64,
+    learning_rate: f64,
+    weights: &'a mut [f32],
+    gradient: &'a [f32],
+}
+
+impl Kernel for AdamStep<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let t = (self.update + 1) as f64;
+        let step_size = (self.learning_rate / (1.0 - libm::pow(BETA_1, t))) as f32;
+        let root_correction = (1.0 / (1.0 - libm::pow(BETA_2, t)).sqrt()) as f32;
+        let (beta_1, rest_1) = (BETA_1 as f32, (1.0 - BETA_1) as f32);
+        let (beta_2, rest_2) = (BETA_2 as f32, (1.0 - BETA_2) as f32);
+        let Adam { epsilon, mean, mean_square } = self.state;
+        let epsilon = *epsilon;
+        for ((w, (m, v)), g) in self.weights.iter_mut().zip(mean.iter_mut().zip(mean_square)).zip(self.gradient) {
+            *m = beta_1 * *m + rest_1 * g;
+            *v = beta_2 * *v + rest_2 * g * g;
+            *w -= step_size * *m / (v.sqrt() * root_correction + epsilon);
+        }
+    }
+}
+
+/// Takes gradient steps: clipping by global norm, then the optimiser.
+#[derive(Clone, Debug)]
+pub struct Descent {
+    optimiser: Optimiser,
+    max_grad_norm: f64,
+    n_updates: u64,
+    /// `[P]`.
+    gradient: Vec<f32>,
+}
+
+impl Descent {
+    /// Fresh, for `n_weights`; gradients longer than `max_grad_norm` are scaled down to it.
+    pub fn new(optimiser: Optimiser, max_grad_norm: f64, n_weights: usize) -> Self {
+        Descent { optimiser, max_grad_norm, n_updates: 0, gradient: vec![0.0; n_weights] }
+    }
+
+    /// Gradient steps so far.
+    pub fn n_updates(&self) -> u64 {
+        self.n_updates
+    }
+
+    /// `[P]` where the gradient of the next step goes.
+    pub fn gradient_mut(&mut self) -> &mut [f32] {
+        &mut self.gradient
+    }
+
+    /// One step of `weights` `[P]` down the gradient of a loss that came to `loss`. Gives the gradient's global norm before
+    /// clipping.
+    ///
+    /// Clipping scales the whole gradient by max_grad_norm/norm where norm > max_grad_norm, exactly, as TensorFlow's
+    /// `clip_by_global_norm`; libtorch adds 1e-6 to the norm.
+    ///
+    /// # Errors
+    /// [`Error::NotFinite`] for a loss or a gradient that is not; nothing was changed then.
+    pub fn step(&mut self, loss: f64, weights: &mut [f32], learning_rate: f64) -> Result<f64> {
+        self.check_finite("the loss", loss)?;
+        let mut norm = 0.0;
+        run(Norm { gradient: &self.gradient, norm: &mut norm });
+        self.check_finite("the norm of the gradient", norm)?;
+        if norm > self.max_grad_norm {
+            let scale = (self.max_grad_norm / norm) as f32;
+            self.gradient.iter_mut().for_each(|g| *g *= scale);
+        }
+        self.optimiser.step(self.n_updates, learning_rate, weights, &self.gradient);
+        self.n_updates += 1;
+        Ok(norm)
+    }
+
+    fn check_finite(&self, what: &'static str, value: f64) -> Result<()> {
+        if value.is_finite() { Ok(()) } else { Err(Error::NotFinite { what, value, update: self.n_updates }) }
+    }
+
+    /// The running averages as named arrays, each `[P]`.
+    pub fn state(&self) -> Vec<NamedArray> {
+        let array = |(name, data): (&str, &[f32])| NamedArray {
+            name: name.to_owned(),
+            shape: vec![data.len()],
+            data: data.to_vec(),
+        };
+        self.optimiser.averages().into_iter().map(array).collect()
+    }
+
+    /// Goes on from a saved state.
+    ///
+    /// # Errors
+    /// [`Error::Arrays`] if it is another optimiser's.
+    pub fn load_state(&mut self, n_updates: u64, arrays: &[NamedArray]) -> Result<()> {
+        let size = self.gradient.len();
+        let mut averages = self.optimiser.averages_mut();
+        let layout: Vec<_> = averages.iter().map(|(name, _)| ((*name).to_owned(), vec![size])).collect();
+        check_arrays(arrays, &layout)?;
+        for ((_, average), array) in averages.iter_mut().zip(arrays) {
+            average.copy_from_slice(&array.data);
+        }
+        self.n_updates = n_updates;
+        Ok(())
+    }
+}
+
+/// √ Σ_i g_i² in f64, in [`SUMS`] sums side by side.
+struct Norm<'a> {
+    gradient: &'a [f32],
+    norm: &'a mut f64,
+}
+
+impl Kernel for Norm<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let mut sums = [0.0f64; SUMS];
+        let (chunks, rest) = self.gradient.as_chunks::<SUMS>();
+        for chunk in chunks {
+            for lane in 0..SUMS {
+                sums[lane] += f64::from(chunk[lane]) * f64::from(chunk[lane]);
+            }
+        }
+        for (sum, &g) in sums.iter_mut().zip(rest) {
+            *sum += f64::from(g) * f64::from(g);
+        }
+        *self.norm = sums.iter().sum::<f64>().sqrt();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WEIGHTS: [f32; 3] = [1.0, -2.0, 0.5];
+
+    #[test]
+    fn long_gradients_are_scaled_to_the_largest_norm_and_short_ones_left_alone() {
+        let gradient = [3.0f32, 0.0, -4.0];
+        for (largest, scale) in [(0.5, 0.1), (5.0, 1.0), (10.0, 1.0)] {
+            let step = |largest, gradient: [f32; 3]| {
+                // With α 0 and a large ε a step is the gradient over 1000, but for ε's share.
+                let mut descent = Descent::new(Optimiser::rms_prop(0.0, 1e6, 3), largest, 3);
+                descent.gradient_mut().copy_from_slice(&gradient);
+                let mut weights = WEIGHTS;
+                (descent.step(1.0, &mut weights, 1.0).expect("a step"), weights)
+            };
+            let (norm, weights) = step(largest, gradient);
+            assert_eq!(norm, 5.0);
+            assert_eq!(weights, step(f64::INFINITY, gradient.map(|g| g * scale)).1);
+        }
+    }
+
+    #[test]
+    fn what_is_not_finite_changes_nothing() {
+        for (loss, entry) in [(f64::NAN, 1.0), (1.0, f32::INFINITY), (1.0, f32::NAN)] {
+            let mut descent = Descent::new(Optimiser::adam(1e-5, 3), 0.5, 3);
+            descent.gradient_mut()[1] = entry;
+            let (before, mut weights) = (descent.state(), WEIGHTS);
+            assert!(matches!(descent.step(loss, &mut weights, 1.0), Err(Error::NotFinite { update: 0, .. })));
+            assert_eq!((weights, descent.state(), descent.n_updates()), (WEIGHTS, before, 0));
+        }
+    }
+}

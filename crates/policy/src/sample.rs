@@ -1,0 +1,98 @@
+//! Sampling actions.
+//!
+//! Categorical over logits l_j, j = 0 … n-1: log π(a) = l_a - log Σ_j exp l_j.
+//! Diagonal Gaussian with means μ_i and log standard deviations log σ_i, i = 0 … A-1:
+//! log π(a) = -½ Σ_i ((a_i - μ_i)/σ_i)² - Σ_i log σ_i - ½ A log 2π.
+
+use rand_chacha::ChaCha8Rng;
+
+use crate::math::{exp, ln};
+use crate::random::{normal, uniform};
+
+/// log 2π.
+pub(crate) const LOG_TAU: f32 = 1.837_877_1;
+
+/// The greatest of `logits`, and the sum of their exponentials relative to it: a log-probability is
+/// l_j - greatest - log total.
+pub(crate) fn greatest_and_total(logits: &[f32]) -> (f32, f32) {
+    let greatest = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    (greatest, logits.iter().map(|logit| exp(logit - greatest)).sum())
+}
+
+/// Draws from the categorical distribution of `logits` by inverting the cumulative sum; one uniform number a draw.
+/// Gives the choice and its log-probability.
+pub(crate) fn sample_categorical(logits: &[f32], rng: &mut ChaCha8Rng) -> (usize, f32) {
+    let (greatest, total) = greatest_and_total(logits);
+    let target = uniform(rng) * f64::from(total);
+    let mut choice = logits.len() - 1; // where rounding leaves target at the total
+    let mut sum = 0.0f32;
+    for (j, logit) in logits.iter().enumerate() {
+        sum += exp(logit - greatest);
+        if f64::from(sum) > target {
+            choice = j;
+            break;
+        }
+    }
+    (choice, logits[choice] - greatest - ln(total))
+}
+
+/// Draws an action `[A]` from the Gaussian of `means` `[A]` and `log_std` `[A]` into `action`; two uniform numbers an
+/// element. Gives the log-density.
+pub(crate) fn sample_gaussian(means: &[f32], log_std: &[f32], rng: &mut ChaCha8Rng, action: &mut [f32]) -> f32 {
+    let mut log_prob = -0.5 * LOG_TAU * means.len() as f32;
+    for ((action, mean), log_std) in action.iter_mut().zip(means).zip(log_std) {
+        let noise = normal(rng) as f32;
+        *action = mean + exp(*log_std) * noise;
+        log_prob -= 0.5 * noise * noise + log_std;
+    }
+    log_prob
+}
+
+#[cfg(test)]
+#[allow(clippy::disallowed_methods)] // what it is compared with
+mod tests {
+    use super::*;
+    use crate::random::{Purpose, stream};
+
+    #[test]
+    fn choices_are_as_frequent_as_their_probabilities() {
+        let logits = [0.3f32, -1.2, 1.1];
+        let total: f64 = logits.iter().map(|&l| f64::from(l).exp()).sum();
+        let mut rng = stream(5, Purpose::Actions);
+        let (mut counts, draws) = ([0u32; 3], 100_000);
+        for _ in 0..draws {
+            let (choice, log_prob) = sample_categorical(&logits, &mut rng);
+            counts[choice] += 1;
+            let expected = f64::from(logits[choice]) - total.ln();
+            assert!((f64::from(log_prob) - expected).abs() < 1e-6, "f32 rounding of numbers up to 4");
+        }
+        for (count, &logit) in counts.iter().zip(&logits) {
+            let p = f64::from(logit).exp() / total;
+            // Four standard deviations of a binomial share; the seed is fixed.
+            let tolerance = 4.0 * (p * (1.0 - p) / f64::from(draws)).sqrt();
+            assert!((f64::from(*count) / f64::from(draws) - p).abs() < tolerance, "{counts:?}");
+        }
+    }
+
+    #[test]
+    fn samples_have_the_mean_and_deviation_of_their_gaussian() {
+        let (means, log_std) = ([0.5f32, -2.0], [0.3f32, -1.0]);
+        let mut rng = stream(6, Purpose::Actions);
+        let (draws, mut sums, mut squares, mut product) = (100_000, [0.0; 2], [0.0; 2], 0.0);
+        for _ in 0..draws {
+            let mut action = [0.0; 2];
+            sample_gaussian(&means, &log_std, &mut rng, &mut action);
+            let z: [f64; 2] = std::array::from_fn(|i| f64::from(action[i] - means[i]) / f64::from(log_std[i]).exp());
+            for i in 0..2 {
+                sums[i] += z[i] / f64::from(draws);
+                squares[i] += z[i] * z[i] / f64::from(draws);
+            }
+            product += z[0] * z[1] / f64::from(draws);
+        }
+        // Four standard errors: 1/√draws of a mean and a covariance, √2/√draws of a variance.
+        for i in 0..2 {
+            assert!(sums[i].abs() < 0.0127 && (squares[i] - 1.0).abs() < 0.018, "{sums:?} {squares:?}");
+        }
+        assert!(product.abs() < 0.0127, "{product}");
+    }
+}

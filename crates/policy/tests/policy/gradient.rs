@@ -1,0 +1,232 @@
+//! Gradients: what must hold whatever computes them.
+
+use std::f64::consts::TAU;
+
+use perturb_policy::random::{Purpose, normal, stream};
+use perturb_policy::{
+    Acting, ActionKind, Differentiator, Error, Objective, PolicySpec, Samples, Surrogate, initial_weights,
+};
+use rstest::rstest;
+
+const O: usize = 5;
+
+fn numbers(n: usize, seed: u64) -> Vec<f32> {
+    let mut rng = stream(seed, Purpose::Weights);
+    (0..n).map(|_| normal(&mut rng) as f32).collect()
+}
+
+const OBJECTIVE: Objective = Objective {
+    surrogate: Surrogate::Clipped { range: 0.2 },
+    normalize_advantages: true,
+    ent_coef: 0.01,
+    vf_coef: 0.5,
+    value_clip_range: Some(0.2),
+    kl_coef: 0.0,
+};
+
+/// The gradient over `n` samples by `threads` threads.
+fn gradient(action: ActionKind, n: usize, threads: usize) -> Vec<f32> {
+    let spec = PolicySpec::feed_forward(O, action);
+    let weights = initial_weights(&spec, &mut stream(1, Purpose::Weights));
+    let weights: Vec<f32> = weights.iter().flat_map(|array| array.data.clone()).collect();
+    let actions = numbers(n * action.width(), 2);
+    let actions: Vec<f32> = match action {
+        ActionKind::Discrete { .. } => actions.iter().map(|x| f32::from(u8::from(*x > 0.0))).collect(),
+        ActionKind::Continuous { .. } => actions,
+    };
+    let samples = Samples {
+        observations: &numbers(n * O, 3),
+        actions: &actions,
+        old_log_probs: &numbers(n, 4),
+        old_values: &numbers(n, 5),
+        advantages: &numbers(n, 6),
+        returns: &numbers(n, 7),
+        acting: None,
+    };
+    let mut network = Differentiator::new(&spec, threads).expect("threads");
+    network.load(&weights).expect("weights that fit");
+    let mut gradient = vec![f32::NAN; spec.n_weights()];
+    let indices: Vec<u32> = (0..n as u32).collect();
+    network.gradient(&samples, &indices, &OBJECTIVE, &mut gradient).expect("a gradient");
+    gradient
+}
+
+#[rstest]
+fn the_number_of_threads_changes_no_byte(
+    #[values(ActionKind::Discrete { n: 2 }, ActionKind::Continuous { size: 3 })] action: ActionKind,
+    #[values(1, 64, 65, 200, 3000)] n: usize,
+) {
+    let one = gradient(action, n, 1);
+    assert!(one.iter().any(|&g| g != 0.0));
+    for threads in [2, 3, 16, 40] {
+        let bits = |gradient: &[f32]| gradient.iter().map(|g| g.to_bits()).collect::<Vec<_>>();
+        assert_eq!(bits(&one), bits(&gradient(action, n, threads)), "{threads} threads");
+    }
+}
+
+/// A perceptron in f64, whose weights are taken from the front of `weights`.
+fn perceptron(spec: &PolicySpec, weights: &mut &[f64], x: &[f32], outputs: usize) -> Vec<f64> {
+    let mut layers = spec.hidden_layers();
+    layers.push((spec.hidden_size(), outputs));
+    let depth = layers.len();
+    let mut x: Vec<f64> = x.iter().map(|&x| f64::from(x)).collect();
+    for (i, (inputs, outputs)) in layers.into_iter().enumerate() {
+        let (matrix, rest) = weights.split_at(inputs * outputs);
+        let (biases, rest) = rest.split_at(outputs);
+        *weights = rest;
+        let sums =
+            matrix.chunks(inputs).zip(biases).map(|(row, b)| b + row.iter().zip(&x).map(|(w, x)| w * x).sum::<f64>());
+        x = sums.map(|sum| if i + 1 < depth { sum.tanh() } else { sum }).collect();
+    }
+    x
+}
+
+fn log_softmax(logits: &[f64]) -> Vec<f64> {
+    let total = logits.iter().map(|l| l.exp()).sum::<f64>().ln();
+    logits.iter().map(|l| l - total).collect()
+}
+
+/// Log-probability, entropy and divergence from the acting policy, by the textbook's formulas.
+fn distribution(
+    action: ActionKind,
+    head: &[f64],
+    log_std: &[f64],
+    taken: &[f32],
+    acting: (&[f32], &[f32]),
+) -> [f64; 3] {
+    let old: Vec<f64> = acting.0.iter().map(|&x| f64::from(x)).collect();
+    match action {
+        ActionKind::Discrete { .. } => {
+            let (new, old) = (log_softmax(head), log_softmax(&old));
+            let entropy = -new.iter().map(|l| l.exp() * l).sum::<f64>();
+            let divergence = old.iter().zip(&new).map(|(p, q)| p.exp() * (p - q)).sum();
+            [new[taken[0] as usize], entropy, divergence]
+        }
+        ActionKind::Continuous { size } => {
+            let mut sums = [0.0; 3];
+            for i in 0..size {
+                let (std, old_std) = (log_std[i].exp(), f64::from(acting.1[i]).exp());
+                let distance = (f64::from(taken[i]) - head[i]) / std;
+                sums[0] -= 0.5 * distance * distance + log_std[i] + 0.5 * TAU.ln();
+                sums[1] += 0.5 * (1.0 + TAU.ln()) + log_std[i];
+                let spread = old_std.powi(2) + (old[i] - head[i]).powi(2);
+                sums[2] += (std / old_std).ln() + spread / (2.0 * std * std) - 0.5;
+            }
+            sums
+        }
+    }
+}
+
+/// The total of `objective` over all `samples`, in f64.
+fn total(spec: &PolicySpec, weights: &[f64], samples: &Samples<'_>, objective: &Objective) -> f64 {
+    let n = samples.returns.len();
+    let advantages: Vec<f64> = samples.advantages.iter().map(|&x| f64::from(x)).collect();
+    let mean = advantages.iter().sum::<f64>() / n as f64;
+    let deviation = (advantages.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / n as f64).sqrt();
+    let (acting, width) = (samples.acting.expect("acting distributions"), spec.action.width());
+    let sample = |b: usize| {
+        let (mut rest, observation) = (weights, &samples.observations[b * O..][..O]);
+        let head = perceptron(spec, &mut rest, observation, spec.action.outputs());
+        let value = perceptron(spec, &mut rest, observation, 1)[0];
+        let old = &acting.outputs[b * head.len()..][..head.len()];
+        let taken = &samples.actions[b * width..][..width];
+        let [log_prob, entropy, divergence] = distribution(spec.action, &head, rest, taken, (old, acting.log_std));
+        let advantage =
+            if objective.normalize_advantages { (advantages[b] - mean) / (deviation + 1e-8) } else { advantages[b] };
+        let policy = match objective.surrogate {
+            Surrogate::PolicyGradient => -advantage * log_prob,
+            Surrogate::Clipped { range } => {
+                let ratio = (log_prob - f64::from(samples.old_log_probs[b])).exp();
+                (-advantage * ratio).max(-advantage * ratio.clamp(1.0 - range, 1.0 + range))
+            }
+        };
+        let (target, old) = (f64::from(samples.returns[b]), f64::from(samples.old_values[b]));
+        let clipped = objective.value_clip_range.map_or(value, |range| old + (value - old).clamp(-range, range));
+        let value_loss = (value - target).powi(2).max((clipped - target).powi(2));
+        policy - objective.ent_coef * entropy + objective.vf_coef * value_loss + objective.kl_coef * divergence
+    };
+    (0..n).map(sample).sum::<f64>() / n as f64
+}
+
+#[rstest]
+fn gradients_are_finite_differences(
+    // The second has more outputs than are computed side by side.
+    #[values(ActionKind::Discrete { n: 3 }, ActionKind::Discrete { n: 19 }, ActionKind::Continuous { size: 2 })]
+    action: ActionKind,
+    #[values(&[], &[7], &[5, 18])] hidden: &[usize],
+    #[values(Objective { kl_coef: 0.7, ..OBJECTIVE }, Objective { surrogate: Surrogate::PolicyGradient,
+        normalize_advantages: false, value_clip_range: None, ..OBJECTIVE })]
+    objective: Objective,
+    #[values(1, 70)] n: usize,
+) {
+    let spec = PolicySpec { observation_size: O, action, hidden: hidden.to_vec(), lstm: None };
+    let weights: Vec<f32> = numbers(spec.n_weights(), 1).iter().map(|x| 0.5 * x).collect();
+    let actions: Vec<f32> = match action {
+        ActionKind::Discrete { n: choices } => (0..n).map(|b| (b % choices) as f32).collect(),
+        ActionKind::Continuous { size } => numbers(n * size, 2),
+    };
+    let near = |numbers: Vec<f32>| numbers.iter().map(|x| 0.3 * x).collect::<Vec<f32>>();
+    let (outputs, log_std) = (numbers(n * action.outputs(), 8), near(numbers(action.outputs(), 9)));
+    let log_std = if matches!(action, ActionKind::Discrete { .. }) { &[][..] } else { &log_std };
+    let samples = Samples {
+        observations: &numbers(n * O, 3),
+        actions: &actions,
+        old_log_probs: &numbers(n, 4).iter().map(|x| x - 1.5).collect::<Vec<f32>>(),
+        old_values: &numbers(n, 5),
+        advantages: &numbers(n, 6),
+        returns: &numbers(n, 7),
+        acting: Some(Acting { outputs: &outputs, log_std }),
+    };
+    let mut network = Differentiator::new(&spec, 1).expect("threads");
+    network.load(&weights).expect("weights that fit");
+    let mut gradient = vec![f32::NAN; weights.len()];
+    let indices: Vec<u32> = (0..n as u32).rev().collect();
+    let losses = network.gradient(&samples, &indices, &objective, &mut gradient).expect("a gradient");
+    let exact: Vec<f64> = weights.iter().map(|&w| f64::from(w)).collect();
+    let expected = total(&spec, &exact, &samples, &objective);
+    assert!((losses.total - expected).abs() < 1e-5 * expected.abs().max(1.0), "{} {expected}", losses.total);
+    let (mut distance, mut size) = (0.0, 0.0);
+    for (k, &got) in gradient.iter().enumerate() {
+        let at = |step: f64| {
+            let mut weights = exact.clone();
+            weights[k] += step;
+            total(&spec, &weights, &samples, &objective)
+        };
+        let slope = (at(1e-6) - at(-1e-6)) / 2e-6;
+        distance += (slope - f64::from(got)).powi(2);
+        size += slope * slope;
+    }
+    // f32 sums; a kink within 1e-6 of a weight would show as more.
+    assert!(distance.sqrt() < 1e-5 * size.sqrt(), "off by {:e} of {:e}", distance.sqrt(), size.sqrt());
+}
+
+#[test]
+fn lengths_that_do_not_fit_are_refused() {
+    let spec = PolicySpec::feed_forward(O, ActionKind::Discrete { n: 2 });
+    let mut network = Differentiator::new(&spec, 1).expect("threads");
+    assert!(matches!(network.load(&[0.0; 3]), Err(Error::Length { name: "weights [P]", got: 3, .. })));
+    let samples = Samples {
+        observations: &[0.0; 2 * O],
+        actions: &[0.0; 2],
+        old_log_probs: &[0.0; 2],
+        old_values: &[0.0; 2],
+        advantages: &[0.0; 2],
+        returns: &[0.0; 2],
+        acting: None,
+    };
+    let mut gradient = vec![0.0; spec.n_weights()];
+    let wrong = [
+        Samples { observations: &[0.0; O], ..samples },
+        Samples { actions: &[0.0; 3], ..samples },
+        Samples { old_log_probs: &[0.0; 1], ..samples },
+        Samples { old_values: &[0.0; 1], ..samples },
+        Samples { advantages: &[0.0; 1], ..samples },
+    ];
+    for samples in wrong {
+        let result = network.gradient(&samples, &[0], &OBJECTIVE, &mut gradient);
+        assert!(matches!(result, Err(Error::Length { .. })), "{result:?}");
+    }
+    assert_eq!(network.gradient(&samples, &[], &OBJECTIVE, &mut gradient), Err(Error::NoSamples));
+    let result = network.gradient(&samples, &[0], &OBJECTIVE, &mut [0.0; 3]);
+    assert!(matches!(result, Err(Error::Length { name: "gradient [P]", got: 3, .. })), "{result:?}");
+}

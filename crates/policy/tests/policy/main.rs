@@ -1,0 +1,6 @@
+//! The tests of policies as arithmetic, one program.
+#![allow(clippy::disallowed_methods)] // of references
+
+mod acting;
+mod gradient;
+mod normaliser;

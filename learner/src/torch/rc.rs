@@ -1,0 +1,200 @@
+//! The recurrent network on libtorch, with its own back-propagation through time.
+//!
+//! For step t = 0 … L-1 of each of M sequences, with x_t the last hidden layer's output and (h_{-1}, c_{-1}) the initial
+//! memory:
+//!
+//! (h', c') = (h_{t-1}, c_{t-1}), or 0 where an episode starts at t,
+//! (i, f, g, o) = W_x x_t + W_h h' + b, four blocks of H rows in this order, which is torch's,
+//! c_t = σ(f) c' + σ(i) tanh g,
+//! h_t = σ(o) tanh c_t.
+//!
+//! Hochreiter and Schmidhuber (1997), with the forget gate of Gers et al. (2000). Torch has two biases, of which only the
+//! sum matters; here is one. Two linear heads give logits or means, and V(s), from h_t.
+//!
+//! **Two stages.** libtorch would multiply out the gradients of W_h and W_x once a step, with M rows each time. Instead
+//! the loop over time runs without libtorch's graph and keeps the gates; h becomes an input of the heads' graph. Back
+//! through that graph comes ∂loss/∂h_t; then one loop backwards in time makes of it the gates' deltas
+//! D_t = ∂loss/∂(W_x x_t + W_h h' + b), with δ_t = ∂loss/∂h_t + W_hᵀ D_{t+1} and e_t = ∂loss/∂c_t in all:
+//!
+//! e_t = δ_t σ(o) (1 - tanh² c_t) + e_{t+1} σ(f)_{t+1},
+//! D_t = (e_t tanh g σ'(i), e_t c' σ'(f), e_t σ(i) tanh'(g), δ_t tanh c_t σ'(o)),
+//!
+//! where nothing flows back over an episode's start. The gradient of W_h is then one product Dᵀ h' over all L·M rows,
+//! and those of W_x, b and the layers below come from libtorch, as the gradient of Σ D · (W_x x + b) with D constant.
+
+use tch::{Kind, Tensor};
+
+use perturb_policy::PolicySpec;
+
+use super::Sequences;
+use super::ff::perceptron;
+use crate::error::Result;
+
+/// The weights by their places, in the order of [`PolicySpec::layout`].
+struct Places {
+    /// W_x `[4H, X]`; all before it are hidden layers.
+    input: usize,
+    /// W_h `[4H, H]`.
+    recurrent: usize,
+    /// b `[4H]`.
+    bias: usize,
+    /// Weight and bias of the policy's head, then of the value's; all after it belongs to the heads' graph too.
+    heads: usize,
+}
+
+impl Places {
+    fn of(spec: &PolicySpec) -> Self {
+        let input = 2 * spec.hidden.len();
+        Places { input, recurrent: input + 1, bias: input + 2, heads: input + 3 }
+    }
+}
+
+/// What the second stage needs of the first.
+#[derive(Debug)]
+pub(super) struct Tape {
+    /// W_x x + b `[L·M, 4H]`, with a graph to the layers below.
+    driven: Tensor,
+    /// h `[L·M, H]`, where the heads' graph begins.
+    hidden: Tensor,
+    /// σ(i), σ(f), tanh g, σ(o) `[L, M, 4H]`.
+    gates: Tensor,
+    /// c `[L, M, H]`.
+    cells: Tensor,
+    /// h' `[L, M, H]`.
+    hidden_before: Tensor,
+    /// c' `[L, M, H]`.
+    cells_before: Tensor,
+    /// `[L, M, 1]`: 0 where an episode starts, else 1.
+    keep: Tensor,
+}
+
+/// Gives the policy's outputs [B, n or A] and the values `[B]` over `sequences`, B = L·M, and the tape; `plain` leaves all
+/// to libtorch, for comparison, and gives none.
+pub(super) fn forward(
+    spec: &PolicySpec,
+    leaves: &[Tensor],
+    sequences: &Sequences,
+    plain: bool,
+) -> (Tensor, Tensor, Option<Tape>) {
+    let places = Places::of(spec);
+    let (input, recurrent) = (&leaves[places.input], &leaves[places.recurrent]);
+    let x = perceptron(&leaves[..places.input], &sequences.flat_observations(), true);
+    let driven = x.linear(input, Some(&leaves[places.bias]));
+    let (hidden, tape) = if plain {
+        (unrolled(&driven, recurrent, sequences), None)
+    } else {
+        let tape = tch::no_grad(|| run(driven, &recurrent.detach(), sequences));
+        let hidden = tape.hidden.set_requires_grad(true);
+        (hidden, Some(tape))
+    };
+    let heads = &leaves[places.heads..];
+    let outputs = hidden.linear(&heads[0], Some(&heads[1]));
+    let values = hidden.linear(&heads[2], Some(&heads[3])).squeeze_dim(1);
+    (outputs, values, tape)
+}
+
+/// The loop over time, for autograd: h `[L·M, H]`.
+fn unrolled(driven: &Tensor, recurrent: &Tensor, sequences: &Sequences) -> Tensor {
+    let (steps, count, width) = (sequences.n_steps(), sequences.count(), recurrent.size()[1]);
+    let keep = sequences.keep();
+    let (mut h, mut c) = sequences.initial_memory(width);
+    let driven = driven.view((steps, count, 4 * width));
+    let hidden: Vec<Tensor> = (0..steps)
+        .map(|t| {
+            let keep = keep.select(0, t);
+            let sums = driven.select(0, t) + (&h * &keep).linear::<Tensor>(recurrent, None);
+            let gates = sums.chunk(4, 1);
+            c = &c * keep * gates[1].sigmoid() + gates[0].sigmoid() * gates[2].tanh();
+            h = gates[3].sigmoid() * c.tanh();
+            h.shallow_clone()
+        })
+        .collect();
+    Tensor::cat(&hidden, 0)
+}
+
+/// The loop over time, without a graph.
+fn run(driven: Tensor, recurrent: &Tensor, sequences: &Sequences) -> Tape {
+    let (steps, count, width) = (sequences.n_steps(), sequences.count(), recurrent.size()[1]);
+    let keep = sequences.keep();
+    let starts = sequences.steps_with_starts();
+    let transposed = recurrent.tr();
+    let (mut h, mut c) = sequences.initial_memory(width);
+    let gates = driven.detach().copy().view((steps, count, 4 * width));
+    let (mut hidden, mut hidden_before) = (Vec::with_capacity(starts.len()), Vec::with_capacity(starts.len()));
+    let (mut cells, mut cells_before) = (Vec::with_capacity(starts.len()), Vec::with_capacity(starts.len()));
+    for (t, &any_start) in (0..steps).zip(&starts) {
+        if any_start {
+            let keep = keep.select(0, t);
+            (h, c) = (h * &keep, c * keep);
+        }
+        let gate = |from: i64, blocks: i64| gates.select(0, t).narrow(1, from * width, blocks * width);
+        let _ = gates.select(0, t).addmm_(&h, &transposed);
+        let _ = gate(0, 2).sigmoid_();
+        let _ = gate(2, 1).tanh_();
+        let _ = gate(3, 1).sigmoid_();
+        let next = (gate(1, 1) * &c).addcmul_(&gate(0, 1), &gate(2, 1));
+        hidden_before.push(std::mem::replace(&mut h, gate(3, 1) * next.tanh()));
+        cells_before.push(std::mem::replace(&mut c, next));
+        hidden.push(h.shallow_clone());
+        cells.push(c.shallow_clone());
+    }
+    Tape {
+        driven,
+        hidden: Tensor::cat(&hidden, 0),
+        gates,
+        cells: Tensor::stack(&cells, 0),
+        hidden_before: Tensor::stack(&hidden_before, 0),
+        cells_before: Tensor::stack(&cells_before, 0),
+        keep,
+    }
+}
+
+/// The gradients of `loss` in all `leaves`, in order.
+pub(super) fn backward(spec: &PolicySpec, leaves: &[Tensor], loss: &Tensor, tape: &Tape) -> Result<Vec<Tensor>> {
+    let places = Places::of(spec);
+    let heads: Vec<&Tensor> = leaves[places.heads..].iter().chain([&tape.hidden]).collect();
+    let mut of_heads = Tensor::f_run_backward(&[loss], &heads, false, false)?;
+    let of_hidden = of_heads.remove(of_heads.len() - 1);
+
+    let (deltas, of_recurrent) = tch::no_grad(|| {
+        let deltas = deltas(&leaves[places.recurrent].detach(), &of_hidden, tape);
+        let width = tape.hidden.size()[1];
+        let of_recurrent = deltas.tr().mm(&tape.hidden_before.view((-1, width)));
+        (deltas, of_recurrent)
+    });
+
+    let below: Vec<&Tensor> = leaves[..places.recurrent].iter().chain([&leaves[places.bias]]).collect();
+    let mut gradients = Tensor::f_run_backward(&[(&tape.driven * deltas).sum(Kind::Float)], &below, false, false)?;
+    gradients.insert(places.recurrent, of_recurrent);
+    gradients.append(&mut of_heads);
+    Ok(gradients)
+}
+
+/// D `[L·M, 4H]` from ∂loss/∂h `[L·M, H]`, the loop backwards in time.
+fn deltas(recurrent: &Tensor, of_hidden: &Tensor, tape: &Tape) -> Tensor {
+    let [steps, count, width] = [0, 1, 2].map(|axis: usize| tape.cells.size()[axis]);
+    let of_hidden = of_hidden.view((steps, count, width));
+    let block = |k: i64| tape.gates.narrow(2, k * width, width);
+    let (i, f, g, o) = (block(0), block(1), block(2), block(3));
+    let tanh_c = tape.cells.tanh();
+    let slope = |sigmoid: &Tensor| sigmoid * (1f64 - sigmoid);
+    let tanh_slope = |tanh: &Tensor| 1f64 - tanh.square();
+    // D_t = factors_t times (e_t, e_t, e_t, δ_t); becomes D in place.
+    let factors = [&g * slope(&i), &tape.cells_before * slope(&f), &i * tanh_slope(&g), &tanh_c * slope(&o)];
+    let deltas = Tensor::stack(&factors, 2); // [L, M, 4, H]
+    let hidden_to_cell = o * tanh_slope(&tanh_c);
+    let cell_to_cell = f * &tape.keep;
+
+    let mut later_h = of_hidden.select(0, 0).zeros_like();
+    let mut later_c = later_h.zeros_like();
+    for t in (0..steps).rev() {
+        let of_h = of_hidden.select(0, t) + later_h;
+        let of_c = later_c.addcmul(&of_h, &hidden_to_cell.select(0, t));
+        let delta = deltas.select(0, t);
+        let _ = delta.narrow(1, 0, 3).g_mul_(&of_c.unsqueeze(1));
+        let _ = delta.select(1, 3).g_mul_(&of_h);
+        later_h = delta.view((count, 4 * width)).mm(recurrent) * tape.keep.select(0, t);
+        later_c = of_c * cell_to_cell.select(0, t);
+    }
+    deltas.view((-1, 4 * width))
+}

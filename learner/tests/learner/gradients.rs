@@ -1,0 +1,259 @@
+//! Policies as plain arithmetic against libtorch: acting, gradients, updates.
+
+use perturb_learner::policy::Policy;
+use perturb_learner::torch::{Sequences, Targets, TorchPolicy, evaluate};
+use perturb_policy::random::{Purpose, normal, stream, uniform};
+use perturb_policy::{
+    Acting, ActionKind, Actor, Acts, Descent, Differentiator, Losses, Objective, Optimiser, PolicySpec, Samples,
+    Surrogate,
+};
+use rstest::rstest;
+use tch::Tensor;
+
+use super::common::moved;
+
+const DISCRETE: ActionKind = ActionKind::Discrete { n: 3 };
+const CONTINUOUS: ActionKind = ActionKind::Continuous { size: 6 };
+/// Numbers in an observation.
+const O: usize = 17;
+
+fn spec(action: ActionKind, hidden: &[usize]) -> PolicySpec {
+    PolicySpec { observation_size: O, action, hidden: hidden.to_vec(), lstm: None }
+}
+
+/// `n` numbers with this standard deviation.
+fn numbers(n: usize, deviation: f64, seed: u64) -> Vec<f32> {
+    let mut rng = stream(seed, Purpose::Weights);
+    (0..n).map(|_| (deviation * normal(&mut rng)) as f32).collect()
+}
+
+fn torch(spec: &PolicySpec, weights: &[f32]) -> TorchPolicy {
+    TorchPolicy::new(spec, weights).expect("a policy")
+}
+
+#[test]
+fn weights_survive_a_round_trip() {
+    let spec = spec(CONTINUOUS, &[64, 64]);
+    let weights = moved(&spec).weights();
+    assert_eq!(Policy::from_weights(spec, &weights).expect("a policy").weights(), weights);
+}
+
+/// Acting and learning compute the same function by other means: sums in another order, and a tanh that is off by up to
+/// 3e-7. Over two layers of 64 that grows to about 1e-6 of values and logits of order 1 to 10.
+const TOLERANCE: f32 = 1e-5;
+
+#[test]
+fn the_actor_agrees_with_libtorch() {
+    // Odd sizes too: layers and batches that are no multiples of the blocks.
+    for hidden in [vec![64, 64], vec![13], vec![], vec![9, 70, 5]] {
+        for action in [DISCRETE, CONTINUOUS] {
+            let spec = spec(action, &hidden);
+            let weights = moved(&spec);
+            let torch = torch(&spec, weights.flat_weights());
+            let mut actor = Actor::new(&spec, 64);
+            actor.load_flat(weights.flat_weights()).expect("weights that fit");
+            for n_envs in [1, 3, 7, 64] {
+                let observations = numbers(n_envs * O, 3.0, 4);
+                let mut acts = Acts::new(action, 0);
+                actor.act(&observations, &mut stream(2, Purpose::Actions), &mut acts).expect("actions");
+                let sequences =
+                    Sequences::new(&spec, 1, &observations, &vec![false; n_envs], &[]).expect("shapes that fit");
+                let evaluated = torch.evaluate(&sequences, &Tensor::of_slice(&acts.actions));
+                let (log_probs, values) = (Vec::<f32>::from(evaluated.log_probs), Vec::<f32>::from(evaluated.values));
+                for n in 0..n_envs {
+                    let (got, expected) = (acts.log_probs[n], log_probs[n]);
+                    assert!((got - expected).abs() < TOLERANCE, "{hidden:?} {n}: log π {got} {expected}");
+                    let (got, expected) = (acts.values[n], values[n]);
+                    assert!((got - expected).abs() < TOLERANCE, "{hidden:?} {n}: V {got} {expected}");
+                }
+            }
+        }
+    }
+}
+
+/// Samples of a policy that acted a little while ago.
+struct Data {
+    observations: Vec<f32>,
+    actions: Vec<f32>,
+    old_log_probs: Vec<f32>,
+    old_values: Vec<f32>,
+    advantages: Vec<f32>,
+    returns: Vec<f32>,
+    acting_outputs: Vec<f32>,
+    acting_log_std: Vec<f32>,
+}
+
+impl Data {
+    /// `n` samples of a policy that differs by some hundredths from the one of `weights`.
+    fn new(spec: &PolicySpec, weights: &[f32], n: usize) -> Self {
+        let old: Vec<f32> = weights.iter().zip(numbers(weights.len(), 0.02, 3)).map(|(w, x)| w + x).collect();
+        let observations = numbers(n * spec.observation_size, 1.0, 5);
+        let mut actor = Actor::new(spec, n);
+        actor.load_flat(&old).expect("weights that fit");
+        let mut acts = Acts::new(spec.action, n);
+        actor.act(&observations, &mut stream(6, Purpose::Actions), &mut acts).expect("actions");
+        let mut network = Differentiator::new(spec, 1).expect("threads");
+        network.load(&old).expect("weights that fit");
+        let mut acting_outputs = Vec::new();
+        network.outputs(&observations, &mut acting_outputs).expect("outputs");
+        let acting_log_std = match spec.action {
+            ActionKind::Discrete { .. } => vec![],
+            ActionKind::Continuous { size } => old[old.len() - size..].to_vec(),
+        };
+        let returns = acts.values.iter().zip(numbers(n, 0.5, 7)).map(|(value, x)| value + x).collect();
+        Data {
+            observations,
+            actions: acts.actions,
+            old_log_probs: acts.log_probs,
+            old_values: acts.values,
+            advantages: numbers(n, 2.0, 8),
+            returns,
+            acting_outputs,
+            acting_log_std,
+        }
+    }
+
+    fn samples(&self) -> Samples<'_> {
+        Samples {
+            observations: &self.observations,
+            actions: &self.actions,
+            old_log_probs: &self.old_log_probs,
+            old_values: &self.old_values,
+            advantages: &self.advantages,
+            returns: &self.returns,
+            acting: Some(Acting { outputs: &self.acting_outputs, log_std: &self.acting_log_std }),
+        }
+    }
+
+    /// Losses and gradient by libtorch, of the samples at `indices`.
+    fn torch(&self, policy: &TorchPolicy, indices: &[u32], objective: &Objective) -> (Losses, Vec<f32>) {
+        let spec = policy.spec();
+        let pick = |data: &[f32], width: usize| -> Vec<f32> {
+            indices.iter().flat_map(|&i| data[i as usize * width..][..width].to_vec()).collect()
+        };
+        let one = |data: &[f32]| Tensor::of_slice(&pick(data, 1));
+        let sequences = Sequences::new(spec, 1, &pick(&self.observations, O), &vec![true; indices.len()], &[]);
+        let evaluated = policy.evaluate(
+            &sequences.expect("shapes that fit"),
+            &Tensor::of_slice(&pick(&self.actions, spec.action.width())),
+        );
+        let n_outputs = spec.action.outputs();
+        let targets = Targets {
+            old_log_probs: one(&self.old_log_probs),
+            old_values: one(&self.old_values),
+            advantages: one(&self.advantages),
+            returns: one(&self.returns),
+            acting: Some(evaluated.distributions.with(&pick(&self.acting_outputs, n_outputs), &self.acting_log_std)),
+        };
+        let (total, losses) = evaluate(objective, &evaluated, &targets).expect("a loss");
+        let mut gradient = vec![0.0; spec.n_weights()];
+        policy.gradient(&evaluated, &total, &mut gradient).expect("a gradient");
+        (losses, gradient)
+    }
+}
+
+fn a2c() -> Objective {
+    Objective {
+        surrogate: Surrogate::PolicyGradient,
+        normalize_advantages: false,
+        ent_coef: 0.01,
+        vf_coef: 0.5,
+        value_clip_range: None,
+        kl_coef: 0.0,
+    }
+}
+
+fn ppo() -> Objective {
+    Objective {
+        surrogate: Surrogate::Clipped { range: 0.02 }, // so near that many samples are clipped
+        normalize_advantages: true,
+        value_clip_range: Some(0.05),
+        kl_coef: 0.3,
+        ..a2c()
+    }
+}
+
+/// Whether each array's difference is at most 1e-5 of its norm, or the rounding of sums of order 1 that cancel out.
+#[track_caller]
+fn assert_arrays_close(spec: &PolicySpec, got: &[f32], expected: &[f32]) {
+    let norm = |numbers: &mut dyn Iterator<Item = f64>| numbers.map(|x| x * x).sum::<f64>().sqrt();
+    let mut start = 0;
+    for (name, shape) in spec.layout() {
+        let range = start..start + shape.iter().product::<usize>();
+        start = range.end;
+        let pairs = || got[range.clone()].iter().zip(&expected[range.clone()]);
+        let distance = norm(&mut pairs().map(|(a, b)| f64::from(a - b)));
+        let size = norm(&mut pairs().map(|(_, b)| f64::from(*b)));
+        assert!(distance <= 1e-5 * size + 1e-7, "{name}: off by {distance:e} of {size:e}");
+    }
+    assert_eq!((got.len(), expected.len()), (start, start));
+}
+
+#[rstest]
+fn gradients_agree_with_libtorch(
+    #[values(DISCRETE, CONTINUOUS)] action: ActionKind,
+    #[values(&[64, 64], &[13], &[], &[9, 70, 5])] hidden: &[usize],
+    #[values(a2c(), ppo())] objective: Objective,
+    #[values(2, 5, 80, 300)] n: usize,
+) {
+    let spec = spec(action, hidden);
+    let policy = moved(&spec);
+    let data = Data::new(&spec, policy.flat_weights(), n);
+    // Not all of them, and in another order.
+    let indices: Vec<u32> = (0..n as u32).rev().filter(|i| n < 10 || i % 7 != 0).collect();
+    let mut network = Differentiator::new(&spec, 2).expect("threads");
+    network.load(policy.flat_weights()).expect("weights that fit");
+    let mut gradient = vec![f32::NAN; spec.n_weights()];
+    let losses = network.gradient(&data.samples(), &indices, &objective, &mut gradient).expect("a gradient");
+    let (expected, reference) = data.torch(&torch(&spec, policy.flat_weights()), &indices, &objective);
+    assert_arrays_close(&spec, &gradient, &reference);
+    let pairs = [
+        (losses.policy, expected.policy),
+        (losses.value, expected.value),
+        (losses.entropy, expected.entropy),
+        (losses.total, expected.total),
+        (losses.approx_kl, expected.approx_kl),
+        (losses.clip_fraction, expected.clip_fraction),
+        (losses.kl_divergence, expected.kl_divergence),
+    ];
+    for (i, (got, expected)) in pairs.into_iter().enumerate() {
+        // libtorch's losses are f32 of order 1 to 10.
+        assert!((got - expected).abs() < 1e-5 * (1.0 + expected.abs()), "loss {i}: {got} {expected}");
+    }
+    assert!(objective == a2c() || n < 300 || losses.clip_fraction > 0.01, "some are clipped: {losses:?}");
+}
+
+#[rstest]
+#[case(a2c(), Optimiser::rms_prop(0.99, 1e-5, spec(DISCRETE, &[64, 64]).n_weights()), DISCRETE, 7e-3)]
+#[case(ppo(), Optimiser::adam(1e-5, spec(DISCRETE, &[64, 64]).n_weights()), DISCRETE, 3e-4)]
+#[case(a2c(), Optimiser::rms_prop(0.99, 1e-5, spec(CONTINUOUS, &[64, 64]).n_weights()), CONTINUOUS, 7e-3)]
+#[case(ppo(), Optimiser::adam(1e-5, spec(CONTINUOUS, &[64, 64]).n_weights()), CONTINUOUS, 3e-4)]
+fn ten_updates_agree_with_libtorch(
+    #[case] objective: Objective,
+    #[case] optimiser: Optimiser,
+    #[case] action: ActionKind,
+    #[case] learning_rate: f64,
+) {
+    let spec = spec(action, &[64, 64]);
+    let begin = moved(&spec).flat_weights().to_vec();
+    let data = Data::new(&spec, &begin, 128);
+    let mut rng = stream(12, Purpose::Minibatches);
+    let minibatches: Vec<Vec<u32>> =
+        (0..10).map(|_| (0..64).map(|_| (128.0 * uniform(&mut rng)) as u32).collect()).collect();
+    let descent = || Descent::new(optimiser.clone(), 0.5, spec.n_weights());
+    let (mut own, mut own_descent, mut network) =
+        (begin.clone(), descent(), Differentiator::new(&spec, 2).expect("threads"));
+    let (mut reference, mut reference_descent) = (begin.clone(), descent());
+    for indices in &minibatches {
+        network.load(&own).expect("weights that fit");
+        let gradient = own_descent.gradient_mut();
+        let losses = network.gradient(&data.samples(), indices, &objective, gradient).expect("a gradient");
+        own_descent.step(losses.total, &mut own, learning_rate).expect("a step");
+        let (losses, gradient) = data.torch(&torch(&spec, &reference), indices, &objective);
+        reference_descent.gradient_mut().copy_from_slice(&gradient);
+        reference_descent.step(losses.total, &mut reference, learning_rate).expect("a step");
+    }
+    assert_arrays_close(&spec, &own, &reference);
+    let moved = own.iter().zip(&begin).filter(|(new, old)| new != old).count();
+    assert!(moved > begin.len() * 9 / 10, "{moved}");
+}

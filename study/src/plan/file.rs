@@ -1,0 +1,153 @@
+//! An experiment file as it is written, and what is refused before it is expanded.
+
+use std::collections::BTreeMap;
+
+use serde::Deserialize;
+use toml::Table;
+
+use super::distinct;
+use crate::Version;
+use crate::success::Threshold;
+use crate::value_error::{ValueError, require};
+
+/// Settings that the plan itself decides for each cell.
+const OWN_KEYS: [&str; 6] = ["environment", "version", "parameters", "algorithm", "architecture", "seed"];
+/// The most cells of a plan.
+const MOST_CELLS: usize = 1_000_000;
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct File {
+    pub(super) environments: Vec<String>,
+    #[serde(default = "all_versions")]
+    pub(super) versions: Vec<String>,
+    #[serde(default = "one")]
+    pub(super) runs: u32,
+    #[serde(default = "one")]
+    pub(super) seed: u64,
+    #[serde(default = "a_thousand")]
+    pub(super) test_episodes: u64,
+    #[serde(default = "all_versions")]
+    pub(super) test_versions: Vec<String>,
+    #[serde(default)]
+    pub(super) sets: BTreeMap<String, Table>,
+    #[serde(default)]
+    pub(super) success: BTreeMap<String, Threshold>,
+    #[serde(default)]
+    pub(super) settings: Table,
+    pub(super) algorithm: Vec<Block>,
+}
+
+/// A table `[[algorithm]]`.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Block {
+    pub(super) name: String,
+    pub(super) architectures: Vec<String>,
+    environments: Option<Vec<String>>,
+    versions: Option<Vec<String>>,
+    #[serde(default)]
+    pub(super) settings: Table,
+    #[serde(default)]
+    pub(super) grid: Table,
+}
+
+fn all_versions() -> Vec<String> {
+    Version::ALL.map(|version| version.to_string()).to_vec()
+}
+
+fn one<T: From<u8>>() -> T {
+    T::from(1)
+}
+
+fn a_thousand() -> u64 {
+    1000
+}
+
+impl File {
+    /// Those of the file itself, then those that only its tables name.
+    pub(super) fn all_environments(&self) -> Vec<&str> {
+        let own = self.algorithm.iter().flat_map(|block| block.environments.iter().flatten());
+        distinct(self.environments.iter().chain(own).map(String::as_str))
+    }
+
+    pub(super) fn environments_of<'a>(&'a self, block: &'a Block) -> &'a [String] {
+        block.environments.as_ref().unwrap_or(&self.environments)
+    }
+
+    pub(super) fn versions_of<'a>(&'a self, block: &'a Block) -> &'a [String] {
+        block.versions.as_ref().unwrap_or(&self.versions)
+    }
+
+    /// Refuses what does not depend on a table `[[algorithm]]`.
+    pub(super) fn check(&self) -> Result<(), ValueError> {
+        let most = i64::MAX as u64 - u64::from(u32::MAX);
+        require(self.runs > 0, "runs", self.runs, "at least 1")?;
+        require(self.seed <= most, "seed", self.seed, format!("at most {most}"))?;
+        require(self.test_episodes > 0, "test_episodes", self.test_episodes, "at least 1")?;
+        require(!self.algorithm.is_empty(), "algorithm", "empty", "one or more tables [[algorithm]]")?;
+        check_list("environments", &self.environments)?;
+        check_list("versions", &self.versions)?;
+        check_list("test_versions", &self.test_versions)?;
+        let environments = self.all_environments();
+        self.success.keys().try_for_each(|name| {
+            let known = environments.contains(&name.as_str());
+            require(known, "[success]", format!("`{name}`"), format!("one of {}", environments.join(", ")))
+        })
+    }
+
+    /// Refuses what `block`, which is called `name` in refusals, has beside its grid; `before` cells stand before its own.
+    pub(super) fn check_block(&self, name: &str, block: &Block, before: usize) -> Result<(), ValueError> {
+        let environments = self.environments_of(block);
+        let key = format!("{name}: environments");
+        check_list(&key, environments)?;
+        for environment in environments {
+            require(is_plain(environment), &key, format!("`{environment}`"), "names of letters, digits and _")?;
+        }
+        check_list(&format!("{name}: versions"), self.versions_of(block))?;
+        check_list(&format!("{name}: architectures"), &block.architectures)?;
+        self.check_keys(name, block)?;
+        self.check_size(name, block, before)
+    }
+
+    /// Settings belong to trainings, not to the plan, and stand in one place.
+    fn check_keys(&self, name: &str, block: &Block) -> Result<(), ValueError> {
+        let expected =
+            "left out: the plan's own keys decide it (environments, versions, sets, name, architectures, seed)";
+        for (table, settings) in [
+            ("[settings]".to_owned(), &self.settings),
+            (format!("{name}: [algorithm.settings]"), &block.settings),
+            (format!("{name}: [algorithm.grid]"), &block.grid),
+        ] {
+            for (key, value) in settings {
+                require(!OWN_KEYS.contains(&key.as_str()), format!("{table} {key}"), value, expected)?;
+            }
+        }
+        block.settings.keys().try_for_each(|key| {
+            let expected = "in one of [algorithm.settings] and [algorithm.grid] only";
+            require(!block.grid.contains_key(key), format!("{name}: {key}"), "in both", expected)
+        })
+    }
+
+    /// Refuses more cells than anybody can do, before they fill the memory.
+    fn check_size(&self, name: &str, block: &Block, before: usize) -> Result<(), ValueError> {
+        let lists = [self.environments_of(block), self.versions_of(block), &block.architectures].map(<[_]>::len);
+        let values = block.grid.values().map(|values| values.as_array().map_or(1, Vec::len));
+        let cells = lists.into_iter().chain([self.runs as usize]).chain(values).fold(1, usize::saturating_mul);
+        let cells = cells.saturating_add(before);
+        let what =
+            format!("{name}: the number of cells up to here, every combination of [algorithm.grid] in each run,");
+        require(cells <= MOST_CELLS, what, cells, format!("at most {MOST_CELLS}"))
+    }
+}
+
+/// A list must name something, and nothing twice.
+fn check_list(key: &str, list: &[String]) -> Result<(), ValueError> {
+    require(!list.is_empty(), key, "empty", "a list of at least one name")?;
+    require(distinct(list.iter()).len() == list.len(), key, list.join(", "), "a list without repetitions")
+}
+
+/// Whether a name is one that can stand in a cell's id.
+pub(super) fn is_plain(name: &str) -> bool {
+    name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
+}
