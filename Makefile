@@ -17,12 +17,19 @@ PROGRAMS := $(TARGET)/release
 VENV := $(TARGET)/python
 # The Python package whose compliance cases `make test` runs.
 DM_ENV_RPC := $(TARGET)/dm_env_rpc
+# What perturb's training is compared with. PUREJAXRL is an address that git can clone, or where GitHub is out of reach the
+# path of a clone.
+PEERS := $(TARGET)/peers
+PUREJAXRL ?= https://github.com/luchris429/purejaxrl
+PUREJAXRL_COMMIT := 31756b197773a52db763fdbe6d635e4b46522a73
 
-# Arguments of `make demo`, `make bench` and `make all-pairs`, e.g. make demo DEMO_ARGS="--episodes 200 --test-episodes 50",
+# Arguments of `make demo`, `make bench`, `make bench-peers` and `make all-pairs`, e.g.
+# make demo DEMO_ARGS="--episodes 200 --test-episodes 50", make bench-peers PEERS_ARGS="--rounds 1 HalfCheetah",
 # make all-pairs ALL_PAIRS_ARGS="20 /tmp/runs": episodes, directory.
 DEMO_ARGS ?=
 ALL_PAIRS_ARGS ?=
 BENCH_ARGS ?=
+PEERS_ARGS ?=
 # More arguments for `docker build`, e.g. make docker DOCKER_ARGS="--build-arg RENDERING=1".
 DOCKER_ARGS ?=
 # What the images are made from.
@@ -56,8 +63,8 @@ missing=; \
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help deps opengl toolchain build demo all-pairs report-check test slurm-test qemu-test slurm-acceptance lint bench audit \
-	cargo-deny python-test python-wheel python-acceptance \
+.PHONY: help deps opengl toolchain build demo all-pairs report-check test slurm-test qemu-test slurm-acceptance lint bench \
+	bench-peers audit cargo-deny python-test python-wheel python-acceptance \
 	python-venv docker docker-base docker-test
 
 help: ## this list
@@ -112,6 +119,9 @@ lint: deps cargo-deny ## check formatting, clippy, documentation and dependencie
 bench: build opengl ## measure throughput, latency and memory
 	cargo bench --workspace --locked --bench '*' -- $(BENCH_ARGS)
 
+bench-peers: build $(PEERS)/installed ## measure training beside PureJaxRL and stable-baselines3; gigabytes, minutes
+	$(PEERS)/bin/python benches/peers/compare.py --perturb $(PROGRAMS)/perturb --purejaxrl $(PEERS)/purejaxrl $(PEERS_ARGS)
+
 audit: toolchain cargo-deny ## look the dependencies up in the RustSec database, which is downloaded from GitHub
 	cargo deny --locked check advisories
 
@@ -125,6 +135,8 @@ python-test python-wheel python-acceptance: export PERTURB_SERVER := $(abspath $
 
 python-test: $(VENV)/installed opengl ## lint, type-check and test the Python package
 	cd python && $(abspath $(VENV))/bin/ruff check . && $(abspath $(VENV))/bin/ruff format --check .
+	$(VENV)/bin/ruff check --config python/pyproject.toml benches/peers
+	$(VENV)/bin/ruff format --check --config python/pyproject.toml benches/peers
 	cd python && $(abspath $(VENV))/bin/mypy
 	cd python && $(abspath $(VENV))/bin/pytest -q
 
@@ -154,6 +166,13 @@ $(VENV)/installed: python/requirements-dev.txt python/pyproject.toml python/hatc
 $(DM_ENV_RPC)/installed: tests/server/dm_env_rpc/requirements.txt | python-venv
 	python3 -m venv $(DM_ENV_RPC)
 	$(DM_ENV_RPC)/bin/pip install -q --disable-pip-version-check -r $<
+	touch $@
+
+$(PEERS)/installed: benches/peers/requirements.txt | python-venv
+	python3 -m venv $(PEERS)
+	$(PEERS)/bin/pip install -q --disable-pip-version-check -r $<
+	[ -d $(PEERS)/purejaxrl ] || git clone -q $(PUREJAXRL) $(PEERS)/purejaxrl
+	git -C $(PEERS)/purejaxrl checkout -q $(PUREJAXRL_COMMIT)
 	touch $@
 
 # Debian keeps what fills a new environment in a package of its own.

@@ -65,6 +65,14 @@ impl Client {
         Ok(last)
     }
 
+    /// Has the server play. Returns the seconds.
+    pub(crate) async fn act(&mut self, request: proto::Act, steps: u32) -> Result<f64, Failure> {
+        let start = Instant::now();
+        let acted = self.session.ask(request).await?;
+        assert_eq!((acted.steps, acted.values.len()), (steps, 4 * self.batch * steps as usize));
+        Ok(start.elapsed().as_secs_f64())
+    }
+
     /// Asks for a picture and waits for it.
     pub(crate) async fn draw(&mut self) -> Result<(), Failure> {
         let picture = self.session.ask(proto::Render::default()).await?;

@@ -3,10 +3,12 @@
 //! - CartPole, batch 256, over a Unix socket, against a bare tonic echo of the same payload;
 //! - Hopper and HalfCheetah, batches of 64, 256 and 1024, two workers, against MuJoCo's timesteps alone ([`robots`]);
 //! - the round trip of one environment, and the memory of one Hopper;
+//! - CartPole, 8 environments that the server plays with a policy, against computing its actions alone ([`acting`]);
 //! - pictures of each environment, 480 × 480 pixels, and what the server's memory grows by with them.
 //!
 //! Servers are processes of their own: `perturb-server`, and this program with the argument `echo` and a socket.
 
+mod acting;
 mod client;
 mod echo;
 #[cfg(feature = "mujoco")]
@@ -49,6 +51,11 @@ fn main() -> Result<(), Failure> {
         }
         if wanted("round_trip/CartPole/1") {
             round_trip().await?;
+        }
+        for lstm in [None, Some(256)] {
+            if wanted(acting::id(lstm)) {
+                acting::played(lstm).await?;
+            }
         }
         if wanted("memory/Hopper") {
             memory().await?;

@@ -20,8 +20,12 @@ pub struct Policy {
     calculus: Calculus,
 }
 
+/// Where gradients of feed-forward policies of one shape are computed.
+pub type Room = Box<Differentiator>;
+
 enum Calculus {
-    FeedForward(Box<Differentiator>),
+    /// Whether the room has the weights as they are now.
+    FeedForward(Room, bool),
     Recurrent(TorchPolicy),
 }
 
@@ -71,12 +75,10 @@ impl Policy {
         spec.check(weights)?;
         let weights: Vec<f32> = weights.iter().flat_map(|array| array.data.iter().copied()).collect();
         let calculus = match spec.lstm {
-            None => Calculus::FeedForward(Box::new(Differentiator::new(&spec, 1)?)),
+            None => Calculus::FeedForward(Box::new(Differentiator::new(&spec, 1)?), false),
             Some(_) => Calculus::Recurrent(TorchPolicy::new(&spec, &weights)?),
         };
-        let mut policy = Policy { spec, weights, calculus };
-        policy.take_over()?;
-        Ok(policy)
+        Ok(Policy { spec, weights, calculus })
     }
 
     /// Computes gradients of feed-forward policies with `threads` threads, at least 1. Their number changes no byte.
@@ -84,18 +86,28 @@ impl Policy {
     /// # Errors
     /// Threads that cannot be started.
     pub fn with_threads(self, threads: usize) -> Result<Self> {
-        let Calculus::FeedForward(_) = self.calculus else { return Ok(self) };
-        let calculus = Calculus::FeedForward(Box::new(Differentiator::new(&self.spec, threads)?));
-        let mut policy = Policy { calculus, ..self };
-        policy.take_over()?;
-        Ok(policy)
+        let Calculus::FeedForward(..) = self.calculus else { return Ok(self) };
+        let calculus = Calculus::FeedForward(Box::new(Differentiator::new(&self.spec, threads)?), false);
+        Ok(Policy { calculus, ..self })
     }
 
-    /// Has the calculus use the weights as they are now.
-    fn take_over(&mut self) -> Result<()> {
-        match &mut self.calculus {
-            Calculus::FeedForward(networks) => Ok(networks.load(&self.weights)?),
-            Calculus::Recurrent(networks) => networks.load(&self.weights),
+    /// A room like the one in which this policy computes gradients; `None` if it is recurrent.
+    ///
+    /// # Errors
+    /// Those of [`Differentiator::new`].
+    pub fn room(&self) -> Result<Option<Room>> {
+        match self.calculus {
+            Calculus::FeedForward(..) => Ok(Some(Box::new(Differentiator::new(&self.spec, 1)?))),
+            Calculus::Recurrent(_) => Ok(None),
+        }
+    }
+
+    /// Exchanges the room for another one. Policies of one shape that learn by turns in the same room find it in the
+    /// processor's caches.
+    pub fn change_room(&mut self, other: &mut Room) {
+        if let Calculus::FeedForward(room, is_current) = &mut self.calculus {
+            std::mem::swap(room, other);
+            *is_current = false;
         }
     }
 
@@ -172,7 +184,8 @@ impl Policy {
     /// A batch of other observations.
     pub fn remember_acting(&mut self, batch: &mut Batch<'_>) -> Result<()> {
         match (&mut self.calculus, &mut batch.0) {
-            (Calculus::FeedForward(networks), Data::FeedForward { samples, acting, .. }) => {
+            (Calculus::FeedForward(networks, is_current), Data::FeedForward { samples, acting, .. }) => {
+                take_over(networks, is_current, &self.weights)?;
                 let mut outputs = Vec::new();
                 networks.outputs(samples.observations, &mut outputs)?;
                 *acting = Some(ActingOutputs { outputs, log_std: self.log_std().to_vec() });
@@ -198,7 +211,10 @@ impl Policy {
     ) -> Result<(Losses, f64)> {
         let losses = self.gradient(batch, sequences, objective, descent.gradient_mut())?;
         let norm = descent.step(losses.total, &mut self.weights, learning_rate)?;
-        self.take_over()?;
+        match &mut self.calculus {
+            Calculus::FeedForward(_, is_current) => *is_current = false,
+            Calculus::Recurrent(networks) => networks.load(&self.weights)?,
+        }
         Ok((losses, norm))
     }
 
@@ -214,7 +230,8 @@ impl Policy {
         gradient: &mut [f32],
     ) -> Result<Losses> {
         match (&mut self.calculus, &batch.0) {
-            (Calculus::FeedForward(networks), Data::FeedForward { samples, acting, .. }) => {
+            (Calculus::FeedForward(networks, is_current), Data::FeedForward { samples, acting, .. }) => {
+                take_over(networks, is_current, &self.weights)?;
                 let acting =
                     acting.as_ref().map(|acting| Acting { outputs: &acting.outputs, log_std: &acting.log_std });
                 Ok(networks.gradient(&Samples { acting, ..*samples }, sequences, objective, gradient)?)
@@ -231,4 +248,12 @@ impl Policy {
             _ => unreachable!("a batch is made by a policy of its architecture"),
         }
     }
+}
+
+/// Has `room` use `weights`, if it does not.
+fn take_over(room: &mut Room, is_current: &mut bool, weights: &[f32]) -> Result<()> {
+    if !std::mem::replace(is_current, true) {
+        room.load(weights)?;
+    }
+    Ok(())
 }

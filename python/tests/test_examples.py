@@ -41,6 +41,14 @@ def test_the_sweep_shows_which_poles_stay_up(server: str) -> None:
     assert steps[4] == 200
 
 
+def test_a_policy_that_the_server_plays_is_the_one_that_numpy_computes(server: str) -> None:
+    output = run("act.py", "--server", server)
+    assert output.startswith("200 steps of 8 environments, finished: True\n")
+    assert int(re.findall(r"(\d+) episodes ended", output)[0]) >= 8
+    # float32 rounding of sums of 64 numbers, and the server's own tanh
+    assert float(re.findall(r"at most (\S+)", output)[0]) < 1e-5
+
+
 def test_the_gallery_has_a_picture_of_every_environment(server: str, tmp_path: Path) -> None:
     files = run("gallery.py", "--server", server, "--out", str(tmp_path)).split()
     assert [Path(file).name for file in files] == [f"{name}.png" for name in CATALOGUE]

@@ -1,12 +1,14 @@
 //! A session's environments: requests in, gathered replies out.
 
 use super::{
-    Autoreset, Error, Pool,
+    Autoreset, Error, Play, Played, Pool, Turn,
+    bytes::{put, put_actions},
+    round::Round,
     shard::{Command, Shard, SlotReset},
-    workers::{Job, Shared, lock},
+    workers::{Job, Permit, Shared, lock},
 };
 use crate::{
-    env::{ActionSpace, Distribution, EnvironmentSpec, EpisodeEnd, EpisodeStart, Settings},
+    env::{Distribution, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings},
     scene::Scene,
 };
 use bytes::{Bytes, BytesMut};
@@ -27,16 +29,37 @@ const LEAST_SHARE: f64 = 10.0;
 pub struct BatchSettings {
     /// The environment.
     pub spec: &'static EnvironmentSpec,
-    /// N, at least 1.
-    pub size: usize,
-    /// Fixes all randomness; `environment_index` is that of slot 0, and slot N-1's fits a u32.
-    pub episodes: Settings,
+    /// Its slots, at least one group.
+    pub groups: Vec<SlotGroup>,
     /// What happens to ended episodes.
     pub autoreset: Autoreset,
     /// Whether episodes carry receipts.
     pub receipts: bool,
     /// Whether steps report the reward's terms.
     pub reward_terms: bool,
+}
+
+/// Successive slots with settings of their own.
+#[derive(Debug, Clone)]
+pub struct SlotGroup {
+    /// How many, at least 1.
+    pub size: usize,
+    /// Fixes all randomness; `environment_index` is that of the group's first slot, and its last slot's fits a u32.
+    pub episodes: Settings,
+}
+
+impl BatchSettings {
+    /// N, when the batch is opened.
+    pub fn size(&self) -> usize {
+        self.groups.iter().map(|group| group.size).sum()
+    }
+
+    /// Episodes in a trial, if all groups have as many.
+    pub fn episodes_per_trial(&self) -> Option<u32> {
+        let mut each = self.groups.iter().map(|group| group.episodes.episodes_per_trial);
+        let first = each.next()?;
+        each.all(|other| other == first).then_some(first)
+    }
 }
 
 /// One environment's part of a reset: a new episode, or with a seed or distributions a new trial.
@@ -76,12 +99,17 @@ pub struct Stepped {
 /// A batch of environments. Dropping it frees them at once, or as soon as the shards under way have finished.
 pub struct Batch {
     settings: BatchSettings,
+    /// N.
+    size: usize,
     shard_size: usize,
     job: Arc<Job>,
     workers: Arc<Shared>,
+    n_workers: usize,
     buffer: BytesMut,
     /// A request has been handed to the workers and its end not been waited for.
     under_way: bool,
+    /// The policy that plays, until somebody else changes the environments.
+    play: Option<Box<Play>>,
 }
 
 impl Batch {
@@ -91,17 +119,24 @@ impl Batch {
     /// # Errors
     /// [`Error::Full`], or [`Error::Environment`] if a model cannot be loaded.
     pub async fn open(pool: &Pool, settings: BatchSettings) -> Result<(Self, Bytes, Vec<(u32, EpisodeStart)>), Error> {
-        let workers = pool.queue();
-        let permit = workers.reserve(settings.size)?;
-        let shard_size = shard_size(settings.spec, settings.size, pool.workers());
-        let shard = |first: usize| {
-            let size = shard_size.min(settings.size - first);
-            let BatchSettings { spec, ref episodes, autoreset, receipts, .. } = settings;
-            Mutex::new(Shard::new(spec, episodes, (first, size), autoreset, receipts))
+        let (workers, size) = (pool.queue(), settings.size());
+        let permit = Arc::new(workers.reserve(size)?);
+        let shard_size = shard_size(settings.spec, size, pool.workers());
+        let BatchSettings { spec, ref groups, autoreset, receipts, .. } = settings;
+        let parts = cut(groups, shard_size).into_iter().enumerate();
+        let shard = |(i, part)| Mutex::new(Shard::new(spec, part, i * shard_size, autoreset, receipts));
+        let job = job(spec, parts.map(shard).collect(), pool.workers(), permit, size);
+        let mut batch = Self {
+            settings,
+            size,
+            shard_size,
+            job,
+            workers,
+            n_workers: pool.workers(),
+            buffer: BytesMut::new(),
+            under_way: false,
+            play: None,
         };
-        let shards = (0..settings.size).step_by(shard_size).map(shard).collect();
-        let job = Arc::new(Job::new(shards, pool.workers(), permit, settings.spec.step_cost * settings.size as f64));
-        let mut batch = Self { settings, shard_size, job, workers, buffer: BytesMut::new(), under_way: false };
         batch.run().await?;
         batch.check_failures()?;
         let observations = batch.all_observations();
@@ -114,6 +149,11 @@ impl Batch {
         &self.settings
     }
 
+    /// N: the number of environments, without those that were released.
+    pub fn size(&self) -> usize {
+        self.size
+    }
+
     /// Advances every environment by one step. Discrete actions are i32 `[N]`, each a choice of the space; continuous
     /// ones f32 `[N, A]`, finite: the caller has checked them.
     ///
@@ -123,9 +163,60 @@ impl Batch {
         if self.settings.autoreset == Autoreset::Disabled {
             self.refuse_ended()?;
         }
-        self.put_actions(actions);
+        self.play = None;
+        put_actions(&self.job.shards, actions);
         self.run().await?;
         Ok(self.gather())
+    }
+
+    /// Has a policy play. Without a new one, that of before goes on; without a new task, with what is left of its own.
+    /// The caller has checked that there is one, that the task before is done where another begins, that the mode is
+    /// [`Autoreset::SameStep`], and that policy and weights fit.
+    ///
+    /// # Errors
+    /// [`Error::Policy`] if numbers are not finite, [`Error::Defect`]; after both another policy must be given.
+    pub async fn act(&mut self, turn: Turn) -> Result<Played, Error> {
+        let round = Box::new(Round::new(turn, self.play.take()));
+        self.under_way = true;
+        let round = self.workers.play(&self.job, round).await;
+        self.under_way = false;
+        let (play, played) = round?.finish()?;
+        self.play = play;
+        Ok(played)
+    }
+
+    /// The policy that plays.
+    pub fn play(&self) -> Option<&Play> {
+        self.play.as_deref()
+    }
+
+    /// Frees environments, in order of slots; at least one stays. The others are numbered anew and keep everything else.
+    ///
+    /// # Errors
+    /// [`Error::Defect`].
+    pub fn release(&mut self, slots: &[usize]) -> Result<(), Error> {
+        if self.job.failed() {
+            return Err(Error::Defect);
+        }
+        self.play = None;
+        let mut leaves = vec![false; self.size];
+        slots.iter().for_each(|&slot| leaves[slot] = true);
+        let mut all = self.job.shards.iter().flat_map(|shard| lock(shard).take_slots()).collect::<Vec<Episodes>>();
+        let mut slot = 0..;
+        all.retain(|_| slot.next().is_some_and(|slot: usize| !leaves[slot]));
+        self.size = all.len();
+        self.shard_size = shard_size(self.settings.spec, self.size, self.n_workers);
+        let BatchSettings { spec, autoreset, receipts, .. } = self.settings;
+        let mut shards = Vec::new();
+        for first in (0..self.size).step_by(self.shard_size) {
+            let part: Vec<Episodes> = all.drain(..self.shard_size.min(all.len())).collect();
+            let size = part.len();
+            shards.push(Mutex::new(Shard::of(spec, part, (first, size), autoreset, receipts)));
+        }
+        let permit = Arc::clone(&self.job.permit);
+        permit.give_back(slots.len());
+        self.job = job(spec, shards, self.n_workers, permit, self.size);
+        Ok(())
     }
 
     /// Begins new episodes, in order of slots. Returns their first observations, f32 `[M, O]`, and, with receipts, the
@@ -145,6 +236,7 @@ impl Batch {
             };
             Command::Reset(entries.into_iter().map(local).collect())
         });
+        self.play = None;
         self.run().await?;
         Ok((self.observations(&slots), self.collect(|shard| &mut shard.started)))
     }
@@ -178,6 +270,7 @@ impl Batch {
             self.check_failures()?;
             return Err(refused);
         }
+        self.play = None;
         Ok(self.observations(&slots))
     }
 
@@ -187,11 +280,13 @@ impl Batch {
     }
 
     /// Waits for the end of a request whose future was dropped before it was ready. To be called before the next one,
-    /// then; the workers still run it, and another would mix with it.
+    /// then; the workers still run it, and another would mix with it. A policy that plays ends with its present step.
     pub async fn settle(&mut self) {
         if self.under_way {
+            self.job.halted.store(true, Ordering::Relaxed);
             // Whether it failed the next request will tell.
             let _ = self.workers.wait(&self.job).await;
+            self.job.take_round();
             self.under_way = false;
         }
     }
@@ -233,20 +328,6 @@ impl Batch {
         ended.truncate(SHOWN);
         let more = if more > 0 { format!(" and {more} more") } else { String::new() };
         Err(Error::Ended { slots: ended.join(", ") + &more })
-    }
-
-    fn put_actions(&self, actions: &[u8]) {
-        let width = match self.settings.spec.action {
-            ActionSpace::Discrete(_) => 4,
-            ActionSpace::Continuous(channels) => 4 * channels.len(),
-        };
-        for shard in &self.job.shards {
-            let mut shard = lock(shard);
-            let part = &actions[width * shard.first_slot..][..width * shard.size];
-            let words = part.as_chunks::<4>().0;
-            shard.choices.iter_mut().zip(words).for_each(|(to, from)| *to = u32::from_le_bytes(*from));
-            shard.vectors.iter_mut().zip(words).for_each(|(to, from)| *to = f32::from_le_bytes(*from));
-        }
     }
 
     /// One list for each shard, by the slot that `slot_of` reads from an entry.
@@ -326,12 +407,37 @@ impl Drop for Batch {
     }
 }
 
-/// Appends little-endian f32.
-fn put(buffer: &mut BytesMut, values: &[f32]) {
-    let start = buffer.len();
-    buffer.resize(start + 4 * values.len(), 0);
-    let words = buffer[start..].as_chunks_mut::<4>().0;
-    words.iter_mut().zip(values).for_each(|(to, from)| *to = from.to_le_bytes());
+/// The job of a batch of `size` environments.
+fn job(
+    spec: &EnvironmentSpec,
+    shards: Vec<Mutex<Shard>>,
+    workers: usize,
+    permit: Arc<Permit>,
+    size: usize,
+) -> Arc<Job> {
+    Arc::new(Job::new(shards, workers, permit, spec.step_cost * size as f64))
+}
+
+/// Cuts groups into parts of `size` slots, the last of which may have fewer.
+fn cut(groups: &[SlotGroup], size: usize) -> Vec<Vec<SlotGroup>> {
+    let (mut parts, mut part, mut room) = (Vec::new(), Vec::new(), size);
+    for group in groups {
+        let mut rest = group.clone();
+        while rest.size > 0 {
+            let taken = rest.size.min(room);
+            part.push(SlotGroup { size: taken, ..rest.clone() });
+            rest.size -= taken;
+            // Of an empty rest the index is never used, and may be one too many.
+            rest.episodes.environment_index = rest.episodes.environment_index.wrapping_add(taken as u32);
+            room -= taken;
+            if room == 0 {
+                parts.push(std::mem::take(&mut part));
+                room = size;
+            }
+        }
+    }
+    parts.extend((!part.is_empty()).then_some(part));
+    parts
 }
 
 /// Environments in a shard: by cost, but so many shards that every worker has one, if a shard is worth a wake-up.

@@ -4,12 +4,20 @@
 //! workers' queue; a worker takes one shard of the batch at the queue's head and puts the batch back at its tail if
 //! shards remain, so that batches of different sessions take turns, whatever their sizes. The last shard to finish wakes
 //! the session, which gathers the outputs into one reply. Which worker ran which shard cannot be seen from outside.
+//!
+//! Where a policy plays, the last shard's worker gathers them itself, computes the next actions and puts the batch back
+//! into the queue; only the end of such a round wakes the session.
 
 mod batch;
+mod bytes;
+mod play;
+mod round;
 mod shard;
 mod workers;
 
-pub use batch::{Batch, BatchSettings, ResetEntry, Stepped};
+pub use batch::{Batch, BatchSettings, ResetEntry, SlotGroup, Stepped};
+pub use play::{Play, Policy, PolicyRole};
+pub use round::{EndedAt, Played, Turn};
 pub use shard::Autoreset;
 pub use workers::Pool;
 
@@ -42,6 +50,9 @@ pub enum Error {
         /// The first few, separated by commas.
         slots: String,
     },
+    /// What a policy is computed of, or computes, is not finite.
+    #[error("the policy's play has ended: {0}; hand over another policy")]
+    Policy(#[from] perturb_policy::Error),
     /// A worker panicked: a defect of the server. The batch is lost.
     #[error("the simulation failed from a defect of the server; open a new session, and report what its log says")]
     Defect,

@@ -1,5 +1,6 @@
 //! A part of a batch: what one worker runs at a time.
 
+use super::batch::SlotGroup;
 use crate::{
     env::{self, Action, ActionSpace, Distribution, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings},
     scene::Scene,
@@ -23,6 +24,8 @@ pub(super) enum Command {
     Open,
     Step,
     Reset(Vec<SlotReset>),
+    /// Begins the next episode everywhere.
+    ResetAll,
     Snapshot(Vec<usize>),
     /// Restores all, keeping what was there for [`Command::RollBack`].
     Restore(Vec<(usize, Bytes)>),
@@ -38,12 +41,20 @@ pub(super) struct SlotReset {
     pub(super) state: Option<Vec<f64>>,
 }
 
+impl SlotReset {
+    /// The next episode.
+    pub(super) fn next(slot: usize) -> Self {
+        Self { slot, seed: None, distributions: None, state: None }
+    }
+}
+
 /// Environments of neighbouring slots with their inputs and outputs. `n` is their number.
 pub(super) struct Shard {
     pub(super) first_slot: usize,
     pub(super) size: usize,
     spec: &'static EnvironmentSpec,
-    settings: Settings,
+    /// The environments that [`Command::Open`] makes.
+    groups: Vec<SlotGroup>,
     autoreset: Autoreset,
     receipts: bool,
     pub(super) command: Command,
@@ -75,10 +86,23 @@ pub(super) struct Shard {
 }
 
 impl Shard {
-    /// A shard whose environments are yet to be made by [`Command::Open`].
+    /// A shard of slots from `first_slot` on, whose environments are yet to be made by [`Command::Open`].
     pub(super) fn new(
         spec: &'static EnvironmentSpec,
-        settings: &Settings,
+        groups: Vec<SlotGroup>,
+        first_slot: usize,
+        autoreset: Autoreset,
+        receipts: bool,
+    ) -> Self {
+        let size = groups.iter().map(|group| group.size).sum();
+        Self { groups, command: Command::Open, ..Self::of(spec, Vec::new(), (first_slot, size), autoreset, receipts) }
+    }
+
+    /// A shard of `size` slots from `first_slot` on with these environments; its outputs are unknown yet but for the
+    /// observations.
+    pub(super) fn of(
+        spec: &'static EnvironmentSpec,
+        slots: Vec<Episodes>,
         (first_slot, size): (usize, usize),
         autoreset: Autoreset,
         receipts: bool,
@@ -87,15 +111,15 @@ impl Shard {
             ActionSpace::Discrete(_) => (size, 0),
             ActionSpace::Continuous(channels) => (0, size * channels.len()),
         };
-        Self {
+        let mut shard = Self {
             first_slot,
             size,
             spec,
-            settings: settings.clone(),
+            groups: Vec::new(),
             autoreset,
             receipts,
-            command: Command::Open,
-            slots: Vec::new(),
+            command: Command::Step,
+            slots,
             backups: Vec::new(),
             choices: vec![0; choices],
             vectors: vec![0.0; vectors],
@@ -110,7 +134,19 @@ impl Shard {
             snapshots: Vec::new(),
             failure: None,
             terms: vec![0.0; spec.reward_terms.len()],
-        }
+        };
+        (0..shard.slots.len()).for_each(|slot| shard.observe(slot));
+        shard
+    }
+
+    /// Gives its environments away.
+    pub(super) fn take_slots(&mut self) -> Vec<Episodes> {
+        std::mem::take(&mut self.slots)
+    }
+
+    /// The index of each environment, and its present trial's.
+    pub(super) fn trials(&self) -> impl Iterator<Item = (u32, u64)> {
+        self.slots.iter().map(|episodes| (episodes.id().environment_index, episodes.id().trial_index))
     }
 
     /// The slots of the batch whose episodes have ended.
@@ -140,6 +176,7 @@ impl Shard {
             Command::Step => self.step(),
             Command::Open => self.open(),
             Command::Reset(resets) => resets.iter().for_each(|reset| self.reset(reset)),
+            Command::ResetAll => (0..self.size).for_each(|slot| self.reset(&SlotReset::next(slot))),
             Command::Snapshot(slots) => self.snapshots.extend(slots.iter().map(|&slot| self.slots[slot].snapshot())),
             Command::Restore(entries) => self.restore(&entries),
             Command::RollBack => self.roll_back(),
@@ -147,21 +184,24 @@ impl Shard {
     }
 
     fn open(&mut self) {
-        for slot in 0..self.size {
-            match (self.spec.make)() {
-                Ok(environment) => {
-                    // The batch has checked that the last index fits.
-                    let environment_index = self.settings.environment_index + (self.first_slot + slot) as u32;
-                    let settings = Settings { environment_index, ..self.settings.clone() };
-                    self.slots.push(Episodes::new(environment, settings));
+        for group in std::mem::take(&mut self.groups) {
+            for i in 0..group.size {
+                match (self.spec.make)() {
+                    Ok(environment) => {
+                        // Whoever opened has checked that the last index fits.
+                        let environment_index = group.episodes.environment_index + i as u32;
+                        let settings = Settings { environment_index, ..group.episodes.clone() };
+                        self.slots.push(Episodes::new(environment, settings));
+                    }
+                    Err(error) => {
+                        self.failure = Some(error);
+                        return;
+                    }
                 }
-                Err(error) => {
-                    self.failure = Some(error);
-                    return;
-                }
+                let slot = self.slots.len() - 1;
+                self.note_start(slot);
+                self.observe(slot);
             }
-            self.note_start(slot);
-            self.observe(slot);
         }
     }
 

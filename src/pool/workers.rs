@@ -1,6 +1,6 @@
 //! The worker threads and their queue.
 
-use super::{Error, shard::Shard};
+use super::{Error, round::Round, shard::Shard};
 use std::{
     collections::VecDeque,
     io,
@@ -39,6 +39,7 @@ impl Pool {
             queue: Mutex::new(Queue { jobs: VecDeque::with_capacity(1024), sleeping: 0, closed: false }),
             waiting: AtomicUsize::new(0),
             ready: Condvar::new(),
+            closing: AtomicBool::new(false),
             used: AtomicUsize::new(0),
             max_environments,
         });
@@ -68,6 +69,7 @@ impl Pool {
 
 impl Drop for Pool {
     fn drop(&mut self) {
+        self.shared.closing.store(true, Ordering::Relaxed);
         lock(&self.shared.queue).closed = true;
         self.shared.ready.notify_all();
         for thread in self.threads.drain(..) {
@@ -83,12 +85,14 @@ pub(super) struct Shared {
     /// Jobs in the queue, to be looked at without its lock.
     waiting: AtomicUsize,
     ready: Condvar,
+    /// The pool ends: rounds end with their present step.
+    closing: AtomicBool,
     used: AtomicUsize,
     max_environments: usize,
 }
 
 struct Queue {
-    /// Jobs with the number of their shards that nobody has taken, which is never 0.
+    /// Jobs with the number of their parts, shards or a round's beginning, that nobody has taken, which is never 0.
     jobs: VecDeque<(Arc<Job>, usize)>,
     /// Workers that wait for `ready`.
     sleeping: usize,
@@ -101,7 +105,7 @@ impl Shared {
         let limit = self.max_environments;
         let fits = |used: usize| used.checked_add(requested).filter(|&sum| sum <= limit);
         match self.used.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits) {
-            Ok(_) => Ok(Permit { shared: Arc::clone(self), count: requested }),
+            Ok(_) => Ok(Permit { shared: Arc::clone(self), count: AtomicUsize::new(requested) }),
             Err(used) => Err(Error::Full { requested, used, limit }),
         }
     }
@@ -109,11 +113,20 @@ impl Shared {
     /// Runs every shard of the job on the workers and waits for the last.
     pub(super) async fn run(&self, job: &Arc<Job>) -> Result<(), Error> {
         job.prepare();
-        self.push(job); // its lock publishes the job's counters
+        let shards = job.shards.len();
+        self.push(job, shards, shards); // its lock publishes the job's counters
         self.wait(job).await
     }
 
-    /// Waits for the last shard of a job that was pushed.
+    /// Runs a round on the workers: its beginning, and whatever steps it wants. Gives it back at its end.
+    pub(super) async fn play(&self, job: &Arc<Job>, round: Box<Round>) -> Result<Box<Round>, Error> {
+        job.prepare_round(round);
+        self.push(job, 1, 1);
+        self.wait(job).await?;
+        job.take_round().ok_or(Error::Defect)
+    }
+
+    /// Waits for the end of a job that was pushed.
     pub(super) async fn wait(&self, job: &Arc<Job>) -> Result<(), Error> {
         // A job that is nearly done is worth more polls than a sleep: being woken costs more than many steps.
         for _ in 0..job.patience {
@@ -126,22 +139,22 @@ impl Shared {
         if job.failed() { Err(Error::Defect) } else { Ok(()) }
     }
 
-    fn push(&self, job: &Arc<Job>) {
-        let shards = job.shards.len();
+    /// Puts a job of so many parts at the queue's tail, and wakes no more than `helpers` workers for them.
+    fn push(&self, job: &Arc<Job>, parts: usize, helpers: usize) {
         let mut queue = lock(&self.queue);
-        queue.jobs.push_back((Arc::clone(job), shards));
+        queue.jobs.push_back((Arc::clone(job), parts));
         self.waiting.store(queue.jobs.len(), Ordering::Release);
         let sleeping = queue.sleeping;
         drop(queue);
         // A wake-up is a system call, also when nobody sleeps.
-        match sleeping.min(shards) {
+        match sleeping.min(helpers) {
             0 => {}
             1 => self.ready.notify_one(),
             _ => self.ready.notify_all(),
         }
     }
 
-    /// The job at the queue's head, one shard of which is now the caller's. If shards remain the job goes to the tail,
+    /// The job at the queue's head, one part of which is now the caller's. If parts remain the job goes to the tail,
     /// where others find it.
     fn pop(&self) -> Option<Arc<Job>> {
         for _ in 0..YIELDS_BEFORE_SLEEP {
@@ -152,9 +165,9 @@ impl Shared {
         }
         let mut queue = lock(&self.queue);
         loop {
-            if let Some((job, shards)) = queue.jobs.pop_front() {
-                if shards > 1 {
-                    queue.jobs.push_back((Arc::clone(&job), shards - 1));
+            if let Some((job, parts)) = queue.jobs.pop_front() {
+                if parts > 1 {
+                    queue.jobs.push_back((Arc::clone(&job), parts - 1));
                 }
                 self.waiting.store(queue.jobs.len(), Ordering::Release);
                 return Some(job);
@@ -170,8 +183,25 @@ impl Shared {
 
     fn work(&self, worker: usize) {
         while let Some(job) = self.pop() {
-            job.run(job.claim(worker));
+            if job.run_part(worker) {
+                self.conduct(&job);
+            }
         }
+    }
+
+    /// A job's last part has ended: its session is told, unless a round wants another step.
+    fn conduct(&self, job: &Arc<Job>) {
+        while job.conduct(self.closing.load(Ordering::Relaxed)) {
+            job.prepare();
+            let shards = job.shards.len();
+            if shards > 1 || self.waiting.load(Ordering::Acquire) > 0 {
+                // Others have their turn first. One part is this worker's, which is awake.
+                return self.push(job, shards, shards - 1);
+            }
+            // Nobody waits: through the queue an idle worker would snatch a job that is in this one's cache.
+            job.run(0);
+        }
+        job.done.notify_one();
     }
 }
 
@@ -181,31 +211,40 @@ pub(super) struct Job {
     /// For each worker the shards that it takes first, and the next of them. A worker that meets the same environments
     /// again finds them in its core's cache; one that is done helps the others.
     ranges: Vec<(Range<usize>, AtomicUsize)>,
-    /// Shards that have not finished.
+    /// Parts that have not finished.
     left: AtomicUsize,
+    /// What decides between two steps whether and how there is another, while a policy plays.
+    round: Mutex<Option<Box<Round>>>,
+    /// The part that is to run next is the beginning of the round, not a shard.
+    begins: AtomicBool,
     done: Notify,
     /// The session is gone: what has not run need not.
     pub(super) abandoned: AtomicBool,
+    /// Nobody waits for the round any more: it ends with its present step.
+    pub(super) halted: AtomicBool,
     failed: AtomicBool,
     /// How often the session looks whether a request is done before it sleeps until then.
     patience: usize,
-    _permit: Permit,
+    pub(super) permit: Arc<Permit>,
 }
 
 impl Job {
     /// A job of these shards for so many workers. One that takes about `cost` µs and is short is worth waiting for awake.
-    pub(super) fn new(shards: Vec<Mutex<Shard>>, workers: usize, permit: Permit, cost: f64) -> Self {
+    pub(super) fn new(shards: Vec<Mutex<Shard>>, workers: usize, permit: Arc<Permit>, cost: f64) -> Self {
         let bound = |worker: usize| worker * shards.len() / workers;
         let range = |worker: usize| (bound(worker)..bound(worker + 1), AtomicUsize::new(0));
         Self {
             ranges: (0..workers).map(range).collect(),
             shards,
             left: AtomicUsize::new(0),
+            round: Mutex::new(None),
+            begins: AtomicBool::new(false),
             done: Notify::new(),
             abandoned: AtomicBool::new(false),
+            halted: AtomicBool::new(false),
             failed: AtomicBool::new(false),
             patience: if cost <= SHORT { POLLS } else { 0 },
-            _permit: permit,
+            permit,
         }
     }
 
@@ -235,7 +274,48 @@ impl Job {
         }
     }
 
-    fn run(&self, index: usize) {
+    /// Makes the beginning of a round ready to be taken.
+    fn prepare_round(&self, round: Box<Round>) {
+        *lock(&self.round) = Some(round);
+        self.halted.store(false, Ordering::Relaxed);
+        self.begins.store(true, Ordering::Relaxed);
+        self.left.store(1, Ordering::Relaxed);
+    }
+
+    /// The round, when it has ended or will never be run.
+    pub(super) fn take_round(&self) -> Option<Box<Round>> {
+        lock(&self.round).take()
+    }
+
+    /// Runs a part that the caller has from the queue; whether it was the last.
+    fn run_part(&self, worker: usize) -> bool {
+        // The beginning of a round is its job's only part.
+        if self.begins.swap(false, Ordering::Relaxed) {
+            self.left.store(0, Ordering::Release);
+            return true;
+        }
+        self.run(self.claim(worker))
+    }
+
+    /// Has the round, if there is one, take what a step brought; whether there is to be another. None is if the pool is
+    /// `closing`.
+    fn conduct(&self, closing: bool) -> bool {
+        if self.failed() || self.abandoned.load(Ordering::Relaxed) {
+            return false;
+        }
+        let mut round = lock(&self.round);
+        let Some(round) = round.as_mut() else { return false };
+        let halted = closing || self.halted.load(Ordering::Relaxed);
+        let conduct = AssertUnwindSafe(|| round.conduct(&self.shards, halted));
+        catch_unwind(conduct).unwrap_or_else(|_| {
+            tracing::error!("a worker panicked while a policy played; the batch is lost");
+            self.failed.store(true, Ordering::Relaxed);
+            false
+        })
+    }
+
+    /// Runs a shard; whether it was the last.
+    fn run(&self, index: usize) -> bool {
         if !self.abandoned.load(Ordering::Relaxed) {
             let run = AssertUnwindSafe(|| lock(&self.shards[index]).run());
             if catch_unwind(run).is_err() {
@@ -243,22 +323,28 @@ impl Job {
                 self.failed.store(true, Ordering::Relaxed);
             }
         }
-        // Release: the session that sees 0 sees what every shard wrote.
-        if self.left.fetch_sub(1, Ordering::AcqRel) == 1 {
-            self.done.notify_one();
-        }
+        // Release: who sees 0 sees what every shard wrote.
+        self.left.fetch_sub(1, Ordering::AcqRel) == 1
     }
 }
 
 /// A part of the pool's budget of environments.
 pub(super) struct Permit {
     shared: Arc<Shared>,
-    count: usize,
+    count: AtomicUsize,
+}
+
+impl Permit {
+    /// Gives back so many environments, which must not be more than there are.
+    pub(super) fn give_back(&self, count: usize) {
+        self.count.fetch_sub(count, Ordering::Relaxed);
+        self.shared.used.fetch_sub(count, Ordering::Relaxed);
+    }
 }
 
 impl Drop for Permit {
     fn drop(&mut self) {
-        self.shared.used.fetch_sub(self.count, Ordering::Relaxed);
+        self.shared.used.fetch_sub(*self.count.get_mut(), Ordering::Relaxed);
     }
 }
 

@@ -6,7 +6,7 @@ use crate::{
         self, Achievement, ActionSpace, Catalogue, Channel, Comparison, Distribution, EnvironmentSpec, EpisodeEnd,
         EpisodeId, EpisodeStart, Parameter, Receipt, Settings, Success, Version, resolve,
     },
-    pool::{Autoreset, BatchSettings, ResetEntry, Stepped},
+    pool::{Autoreset, Batch, BatchSettings, ResetEntry, SlotGroup, Stepped},
     proto,
     render::Size,
 };
@@ -14,13 +14,9 @@ use bytes::Bytes;
 use perturb_protocol::limits::{PICTURE_PIXELS, USUAL_PICTURE_PIXELS};
 use std::{collections::HashMap, sync::Arc};
 
-/// Checks an `open`.
-pub fn open(catalogue: &Catalogue, request: proto::Open) -> Result<BatchSettings, Refusal> {
+/// Checks an `open` of at most `most` environments.
+pub fn open(catalogue: &Catalogue, most: usize, request: proto::Open) -> Result<BatchSettings, Refusal> {
     let spec = catalogue.find(&request.environment)?;
-    let version = Version::from_proto(request.version()).ok_or_else(|| {
-        let expected = "VERSION_DEFAULT (1), VERSION_RANDOM (2) or VERSION_EXTREME (3)";
-        Refusal::value("open.version", request.version, expected)
-    })?;
     let autoreset = match request.autoreset_mode() {
         proto::AutoresetMode::NextStep => Autoreset::NextStep,
         proto::AutoresetMode::SameStep => Autoreset::SameStep,
@@ -30,29 +26,75 @@ pub fn open(catalogue: &Catalogue, request: proto::Open) -> Result<BatchSettings
             return Err(Refusal::value("open.autoreset_mode", request.autoreset_mode, expected));
         }
     };
-    if request.batch_size == 0 {
-        return Err(Refusal::value("open.batch_size", 0, "at least 1"));
+    let (receipts, reward_terms) = (request.receipts, request.reward_terms);
+    let groups = if request.groups.is_empty() {
+        vec![group(spec, "open", "open.batch_size", single(request))?]
+    } else {
+        check_no_single(&request)?;
+        // Before anything is made of them: each has one environment at least.
+        if request.groups.len() > most {
+            let got = format!("{} groups", request.groups.len());
+            return Err(Refusal::value("open.groups", got, format!("at most {most}, as this server has environments")));
+        }
+        let numbered = request.groups.into_iter().enumerate();
+        let named = |i, slots| group(spec, &format!("open.groups[{i}]"), &format!("open.groups[{i}].size"), slots);
+        numbered.map(|(i, slots)| named(i, slots)).collect::<Result<_, _>>()?
+    };
+    Ok(BatchSettings { spec, groups, autoreset, receipts, reward_terms })
+}
+
+/// An `open` without groups as one group.
+fn single(request: proto::Open) -> proto::SlotGroup {
+    let proto::Open { version, parameters, batch_size, seed, first_environment_index, episodes_per_trial, .. } =
+        request;
+    proto::SlotGroup { size: batch_size, version, parameters, seed, first_environment_index, episodes_per_trial }
+}
+
+/// Refuses groups beside what they are in place of.
+fn check_no_single(request: &proto::Open) -> Result<(), Refusal> {
+    let given = [
+        ("open.version", request.version != 0),
+        ("open.parameters", !request.parameters.is_empty()),
+        ("open.batch_size", request.batch_size != 0),
+        ("open.seed", request.seed != 0),
+        ("open.first_environment_index", request.first_environment_index != 0),
+        ("open.episodes_per_trial", request.episodes_per_trial != 0),
+    ];
+    match given.into_iter().find(|(_, given)| *given) {
+        Some((field, _)) => Err(Refusal::value(field, "given beside open.groups", "it in each group alone")),
+        None => Ok(()),
     }
-    let first = request.first_environment_index;
-    if first.checked_add(request.batch_size - 1).is_none() {
-        let got = format!("{first} for a batch of {}", request.batch_size);
-        return Err(Refusal::value("open.first_environment_index", got, "the last environment's index below 2^32"));
+}
+
+/// Checks a group, whose fields are those of `path`.
+fn group(
+    spec: &'static EnvironmentSpec,
+    path: &str,
+    size_field: &str,
+    group: proto::SlotGroup,
+) -> Result<SlotGroup, Refusal> {
+    let version = Version::from_proto(group.version()).ok_or_else(|| {
+        let expected = "VERSION_DEFAULT (1), VERSION_RANDOM (2) or VERSION_EXTREME (3)";
+        Refusal::value(format!("{path}.version"), group.version, expected)
+    })?;
+    if group.size == 0 {
+        return Err(Refusal::value(size_field.to_owned(), 0, "at least 1"));
+    }
+    let first = group.first_environment_index;
+    if first.checked_add(group.size - 1).is_none() {
+        let (field, got) =
+            (format!("{path}.first_environment_index"), format!("{first} for a batch of {}", group.size));
+        return Err(Refusal::value(field, got, "the last environment's index below 2^32"));
     }
     let mut distributions = spec.distributions(version);
-    override_parameters(spec, &mut distributions, &request.parameters)?;
-    Ok(BatchSettings {
-        spec,
-        size: request.batch_size as usize,
-        episodes: Settings {
-            seed: request.seed,
-            environment_index: first,
-            distributions,
-            episodes_per_trial: request.episodes_per_trial.max(1),
-        },
-        autoreset,
-        receipts: request.receipts,
-        reward_terms: request.reward_terms,
-    })
+    override_parameters(spec, &mut distributions, &group.parameters)?;
+    let episodes = Settings {
+        seed: group.seed,
+        environment_index: first,
+        distributions,
+        episodes_per_trial: group.episodes_per_trial.max(1),
+    };
+    Ok(SlotGroup { size: group.size as usize, episodes })
 }
 
 /// Replaces the distributions of the parameters that are named.
@@ -116,14 +158,10 @@ pub fn mask(field: &'static str, size: usize, mask: &[u8]) -> Result<Vec<usize>,
     Ok((0..size).filter(|&slot| mask[slot] == 1).collect())
 }
 
-/// Checks a `reset` of a batch. `in_force` tells the distributions of a slot.
-pub fn reset(
-    settings: &BatchSettings,
-    request: proto::Reset,
-    in_force: impl Fn(usize) -> Vec<Distribution>,
-) -> Result<Vec<ResetEntry>, Refusal> {
-    let spec = settings.spec;
-    let slots = mask("reset.mask", settings.size, &request.mask)?;
+/// Checks a `reset` of a batch.
+pub fn reset(batch: &Batch, request: proto::Reset) -> Result<Vec<ResetEntry>, Refusal> {
+    let spec = batch.settings().spec;
+    let slots = mask("reset.mask", batch.size(), &request.mask)?;
     if !request.seeds.is_empty() && request.seeds.len() != slots.len() {
         let expected = format!("one for each of the {} selected environments, or none", slots.len());
         return Err(Refusal::value("reset.seeds", format!("{} seeds", request.seeds.len()), expected));
@@ -135,7 +173,7 @@ pub fn reset(
     for (i, slot) in slots.into_iter().enumerate() {
         let mut distributions = None;
         if !request.parameters.is_empty() {
-            let old = in_force(slot);
+            let old = batch.distributions(slot);
             if old != edited.0 {
                 let mut new = old.clone();
                 override_parameters(spec, &mut new, &request.parameters)?;
@@ -167,6 +205,18 @@ fn states(spec: &EnvironmentSpec, bytes: &Bytes, selected: usize) -> Result<Vec<
         }
     }
     Ok(numbers.chunks_exact(n).map(<[f64]>::to_vec).collect())
+}
+
+/// The slots that a `release` frees.
+pub fn release(size: usize, request: &proto::Release) -> Result<Vec<usize>, Refusal> {
+    const FIELD: &str = "release.mask";
+    let slots = mask(FIELD, size, &request.mask)?;
+    let expected = "at least one environment that goes and one that stays; end the stream to free all";
+    match slots.len() {
+        0 => Err(Refusal::value(FIELD, "without a selected environment", expected)),
+        all if all == size => Err(Refusal::value(FIELD, format!("all of the {size} environments"), expected)),
+        _ => Ok(slots),
+    }
 }
 
 /// Pairs a restore's snapshots with their slots.
@@ -292,7 +342,7 @@ pub fn started(episodes: Vec<(u32, EpisodeStart)>) -> Vec<proto::EpisodeStart> {
     episodes.into_iter().map(start).collect()
 }
 
-fn ended((slot, end): (u32, EpisodeEnd)) -> proto::EpisodeEnd {
+pub(super) fn ended((slot, end): (u32, EpisodeEnd)) -> proto::EpisodeEnd {
     proto::EpisodeEnd {
         slot,
         episode: Some(episode(end.id)),

@@ -4,12 +4,13 @@
 //! - [`conversation`]: the transport of a session.
 //! - [`requests`]: spans and counts of requests, a layer between the two.
 //! - [`session`]: the legal order of a session's requests.
-//! - [`convert`]: the protocol to the domain and back, with all validation.
+//! - [`convert`]: the protocol to the domain and back, with all validation; [`acting`]: that of policies.
 //! - [`status`]: every refusal, and its gRPC code.
 //! - [`dm_env_rpc`]: the same environments by DeepMind's protocol.
 //! - [`listen`] and [`drain`]: how it begins and how it ends.
 //! - [`probe`]: asking another process's server for its health.
 
+pub mod acting;
 pub mod conversation;
 pub mod convert;
 pub mod dm_env_rpc;

@@ -1,6 +1,6 @@
 //! One session: the legal order of its requests, each answered once.
 
-use super::{conversation::Dialogue, convert, requests::Observed, status::Refusal};
+use super::{acting, conversation::Dialogue, convert, requests::Observed, status::Refusal};
 use crate::{
     env::Catalogue,
     pool::{Batch, Pool},
@@ -38,45 +38,63 @@ impl Session {
             return Err(Refusal::AlreadyOpen);
         }
         let autoreset_mode = request.autoreset_mode;
-        let settings = convert::open(&self.shared.catalogue, request)?;
+        let most = self.shared.listing.max_batch_size as usize;
+        let settings = convert::open(&self.shared.catalogue, most, request)?;
         let environment =
             self.shared.listing.environments.iter().find(|entry| entry.name == settings.spec.name).cloned();
         let (batch, observations, started) = Batch::open(&self.shared.pool, settings).await?;
         self.batch = Some(batch);
-        Ok(proto::Opened { environment, observations, started: convert::started(started), autoreset_mode })
+        let started = convert::started(started);
+        Ok(proto::Opened { environment, observations, started, autoreset_mode, acts: true })
     }
 
     async fn step(&mut self, request: proto::Step) -> Result<proto::Stepped, Refusal> {
         let batch = self.opened("step")?;
-        convert::actions(batch.settings().spec, batch.settings().size, &request.actions)?;
+        convert::actions(batch.settings().spec, batch.size(), &request.actions)?;
         Ok(convert::stepped(batch.step(&request.actions).await?))
     }
 
     async fn reset(&mut self, request: proto::Reset) -> Result<proto::ResetDone, Refusal> {
         let batch = self.opened("reset")?;
-        let entries = convert::reset(batch.settings(), request, |slot| batch.distributions(slot))?;
+        let entries = convert::reset(batch, request)?;
         let (observations, started) = batch.reset(entries).await?;
         Ok(proto::ResetDone { observations, started: convert::started(started) })
     }
 
     async fn snapshot(&mut self, request: proto::Snapshot) -> Result<proto::Snapshotted, Refusal> {
         let batch = self.opened("snapshot")?;
-        let slots = convert::mask("snapshot.mask", batch.settings().size, &request.mask)?;
+        let slots = convert::mask("snapshot.mask", batch.size(), &request.mask)?;
         Ok(proto::Snapshotted { snapshots: batch.snapshot(slots).await? })
     }
 
     async fn restore(&mut self, request: proto::Restore) -> Result<proto::Restored, Refusal> {
         let batch = self.opened("restore")?;
-        let entries = convert::restore(batch.settings().size, request)?;
+        let entries = convert::restore(batch.size(), request)?;
         Ok(proto::Restored { observations: batch.restore(entries).await? })
     }
 
     async fn render(&mut self, request: proto::Render) -> Result<proto::Rendered, Refusal> {
         let batch = self.opened("render")?;
-        let (slot, size) = convert::render(batch.settings().size, request)?;
+        let (slot, size) = convert::render(batch.size(), request)?;
         let scene = batch.scene(slot)?.ok_or(Refusal::NothingToDraw { slot })?;
         let pixels = self.shared.renderer.draw(scene, size).await?;
         Ok(proto::Rendered { pixels, width: size.width.into(), height: size.height.into() })
+    }
+
+    fn release(&mut self, request: &proto::Release) -> Result<proto::Released, Refusal> {
+        let batch = self.opened("release")?;
+        batch.release(&convert::release(batch.size(), request)?)?;
+        Ok(proto::Released {})
+    }
+
+    async fn act(&mut self, request: proto::Act) -> Result<proto::Acted, Refusal> {
+        let batch = self.opened("act")?;
+        let turn = acting::turn(batch, request)?;
+        Ok(acting::acted(batch.act(turn).await?))
+    }
+
+    fn save_player(&mut self) -> Result<proto::PlayerSaved, Refusal> {
+        acting::saved(self.opened("save_player")?)
     }
 
     fn opened(&mut self, request: &'static str) -> Result<&mut Batch, Refusal> {
@@ -100,6 +118,9 @@ impl Dialogue for Session {
             Some(Request::Snapshot(snapshot)) => self.snapshot(snapshot).await.map(Response::Snapshot),
             Some(Request::Restore(restore)) => self.restore(restore).await.map(Response::Restore),
             Some(Request::Render(render)) => self.render(render).await.map(Response::Render),
+            Some(Request::Release(release)) => self.release(&release).map(Response::Release),
+            Some(Request::Act(act)) => self.act(act).await.map(Response::Act),
+            Some(Request::SavePlayer(_)) => self.save_player().map(Response::SavePlayer),
             None => Err(Refusal::value("request", "empty or of a kind this server does not know", "open, step, …")),
         };
         proto::SessionResponse { response: Some(response.unwrap_or_else(|refusal| Response::Error(refusal.into()))) }
@@ -107,7 +128,8 @@ impl Dialogue for Session {
 }
 
 impl Observed for Session {
-    const KINDS: &'static [&'static str] = &["open", "step", "reset", "snapshot", "restore", "render", "unknown"];
+    const KINDS: &'static [&'static str] =
+        &["open", "step", "reset", "snapshot", "restore", "render", "release", "act", "save_player", "unknown"];
 
     fn kind(request: &Self::Request) -> &'static str {
         match request.request {
@@ -117,6 +139,9 @@ impl Observed for Session {
             Some(Request::Snapshot(_)) => "snapshot",
             Some(Request::Restore(_)) => "restore",
             Some(Request::Render(_)) => "render",
+            Some(Request::Release(_)) => "release",
+            Some(Request::Act(_)) => "act",
+            Some(Request::SavePlayer(_)) => "save_player",
             None => "unknown",
         }
     }

@@ -4,7 +4,7 @@ use crate::{env, pool, proto, render};
 use std::borrow::Cow;
 use tonic::{Code, Status};
 
-/// Why a request was refused. It changed nothing.
+/// Why a request was refused. It changed nothing, but for an act that failed on its way.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Refusal {
@@ -42,6 +42,16 @@ pub enum Refusal {
     /// A second `open`.
     #[error("open came on a session that is open already; use reset, or start another session")]
     AlreadyOpen,
+    /// A request that cannot come now.
+    #[error("{request} came {when}; {advice}")]
+    Order {
+        /// The request.
+        request: &'static str,
+        /// When it came.
+        when: Cow<'static, str>,
+        /// What to do.
+        advice: &'static str,
+    },
     /// The server is full of sessions.
     #[error("all of this server's {limit} sessions are in use; close one, or try again later")]
     TooManySessions {
@@ -125,8 +135,10 @@ impl Refusal {
             Self::Pool(pool::Error::Ended { .. })
             | Self::NotOpen { .. }
             | Self::AlreadyOpen
+            | Self::Order { .. }
             | Self::Render(render::Error::Missing { .. })
             | Self::NothingToDraw { .. } => Code::FailedPrecondition,
+            Self::Pool(pool::Error::Policy(_)) => Code::InvalidArgument,
             Self::Pool(pool::Error::Defect) | Self::Render(render::Error::Failed { .. } | render::Error::Defect) => {
                 Code::Internal
             }

@@ -1,16 +1,20 @@
 //! What a plan costs, from short measurements.
 //!
 //! A step costs what its environment costs plus what its method costs. So each environment is measured with one
-//! method, and each method in one environment; the other pairs follow.
+//! method, and each method in one environment, in groups as large as those of a run; the other pairs follow. How many
+//! steps there are depends on what is learned, so that only the most can be said beforehand; what cells of the same
+//! environment and method took, which are done, says it better: [`Taken`].
 
 use std::collections::HashMap;
 use std::iter::Sum;
 
-use super::plan::{Cell, Plan, distinct};
+use super::folder::Folder;
+use super::plan::{Cell, Grouping, Plan, distinct};
+use super::scheduler::Times;
 use crate::Method;
 use crate::settings::{TrainConfig, Wrapper};
 
-/// Seconds that a step of one environment takes, with all that belongs to it.
+/// Seconds of a process that a step of one environment takes, with all that belongs to it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Speed {
     /// With rollouts and updates.
@@ -19,18 +23,20 @@ pub struct Speed {
     pub testing: f64,
 }
 
-/// A training that was measured.
+/// A group of trainings that was measured.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Measurement {
     /// By its name in the catalogue.
     pub environment: String,
     /// What learned.
     pub method: Method,
+    /// How many trainings there were.
+    pub cells: usize,
     /// How fast it was.
     pub speed: Speed,
 }
 
-/// What cells cost at most: if every episode goes on to the step limit, and on one core.
+/// What cells cost at most, if every episode goes on to the step limit. Seconds are those of processes.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Estimate {
     /// Of EPOpt, also those that it does not learn from.
@@ -61,21 +67,58 @@ impl Sum for Estimate {
     }
 }
 
-/// The trainings to measure: of each environment with its first method, and of each method in its first environment,
-/// the one in the middle of the grid.
-pub fn representatives(plan: &Plan) -> Vec<&Cell> {
-    let pairs = distinct(plan.cells.iter().map(pair));
+/// The groups of trainings to measure for `cells`, places in the plan: of each environment with its first method, and of
+/// each method in its first environment, as many cells as are in a group of a run, evenly from all over the grid. The
+/// one in its middle is the first.
+pub fn representatives<'a>(plan: &'a Plan, cells: &[usize], grouping: Grouping) -> Vec<Vec<&'a Cell>> {
+    let groups = plan.groups(cells, grouping);
+    let pair_at = |&cell: &usize| pair(&plan.cells[cell]);
     let mut chosen: Vec<(&str, Method)> = Vec::new();
-    for pair in pairs {
+    for pair in distinct(cells.iter().map(pair_at)) {
         if chosen.iter().all(|known| known.0 != pair.0) || chosen.iter().all(|known| known.1 != pair.1) {
             chosen.push(pair);
         }
     }
-    let middle = |wanted: &(&str, Method)| {
-        let cells: Vec<&Cell> = plan.cells.iter().filter(|cell| cell.run == 1 && pair(cell) == *wanted).collect();
-        cells.get(cells.len() / 2).copied()
+    let group_of = |wanted: &(&str, Method)| {
+        let of_pair: Vec<usize> = cells.iter().copied().filter(|cell| pair_at(cell) == *wanted).collect();
+        let middle = of_pair[of_pair.len() / 2];
+        let together = groups.iter().find(|group| group.contains(&middle)).map_or(1, Vec::len).min(of_pair.len());
+        let place = |number: usize| of_pair[(2 * number + 1) * of_pair.len() / (2 * together)];
+        let mut group: Vec<&Cell> = (0..together).map(|number| &plan.cells[place(number)]).collect();
+        group.rotate_left(together / 2);
+        group
     };
-    chosen.iter().filter_map(middle).collect()
+    chosen.iter().map(group_of).collect()
+}
+
+/// What cells took that are done.
+#[derive(Debug)]
+pub struct Taken<'a> {
+    times: Times<'a>,
+}
+
+impl<'a> Taken<'a> {
+    /// The cells of `plan` that are done in `folder`.
+    pub fn read(plan: &'a Plan, folder: &Folder) -> Self {
+        let mut times = Times::default();
+        for cell in &plan.cells {
+            let place = folder.cell(&cell.id);
+            if let Some(timing) = place.timing().filter(|_| place.is_settled(false)) {
+                times.add(cell, timing.seconds);
+            }
+        }
+        Self { times }
+    }
+
+    /// The mean of those of the same environment and method as `cell`, s of a process; `None` if there are none.
+    pub fn seconds(&self, cell: &Cell) -> Option<f64> {
+        self.times.of_pair(cell)
+    }
+
+    /// How many there are.
+    pub fn cells(&self) -> usize {
+        self.times.cells()
+    }
 }
 
 fn pair(cell: &Cell) -> (&str, Method) {
@@ -146,22 +189,43 @@ mod tests {
 
     fn measured(environment: &str, method: &Method, training: f64) -> Measurement {
         let speed = Speed { training, testing: training / 4.0 };
-        Measurement { environment: environment.into(), method: method.clone(), speed }
+        Measurement { environment: environment.into(), method: method.clone(), cells: 1, speed }
     }
 
     #[test]
     fn each_environment_and_each_method_is_measured_once() {
         let plan = plan();
-        let chosen: Vec<String> = representatives(&plan)
-            .iter()
-            .map(|cell| format!("{} {}", cell.config.common.environment, cell.method()))
-            .collect();
-        assert_eq!(chosen, ["CartPole a2c ff", "CartPole a2c rc", "CartPole ppo ff", "Hopper a2c ff"]);
-        assert_eq!(
-            representatives(&plan)[0].config.table()["n_steps"].as_integer(),
-            Some(10),
-            "the middle of the grid"
-        );
+        let all: Vec<usize> = (0..plan.cells.len()).collect();
+        let chosen = |cells: &[usize], most| -> Vec<(String, Vec<i64>)> {
+            let groups = representatives(&plan, cells, Grouping { most, at_a_time: 1 });
+            let steps = |cell: &&Cell| cell.config.table()["n_steps"].as_integer().unwrap_or_default();
+            let name = |cell: &Cell| format!("{} {}", cell.config.common.environment, cell.method());
+            groups.iter().map(|group| (name(group[0]), group.iter().map(steps).collect())).collect()
+        };
+        let names: Vec<String> = chosen(&all, 1).into_iter().map(|(name, _)| name).collect();
+        assert_eq!(names, ["CartPole a2c ff", "CartPole a2c rc", "CartPole ppo ff", "Hopper a2c ff"]);
+        assert_eq!(chosen(&all, 1)[0].1, [10], "the middle of the grid");
+        // Of CartPole with FF there are nine cells of A2C and three of PPO: groups of six.
+        assert_eq!(chosen(&all, 6)[0].1, [10, 15, 15, 5, 5, 10], "all over the grid");
+        assert_eq!(chosen(&all, 6)[2].1.len(), 3, "there are no more");
+        assert_eq!(chosen(&[18, 19], 36), [("CartPole ppo ff".to_owned(), vec![128, 128])], "those that are asked for");
+    }
+
+    #[test]
+    fn what_cells_took_says_what_others_of_the_same_kind_take() {
+        let plan = plan();
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(directory.path());
+        for (cell, seconds, done) in [(0, 10.0, true), (1, 20.0, true), (2, 900.0, false)] {
+            let place = folder.cell(&plan.cells[cell].id);
+            place.write_timing(&crate::Timing { seconds }).unwrap();
+            if done {
+                std::fs::write(place.path().join("result.json"), "x").unwrap();
+            }
+        }
+        let taken = Taken::read(&plan, &folder);
+        assert_eq!(taken.cells(), 2, "a cell without a result took more");
+        assert_eq!((taken.seconds(&plan.cells[5]), taken.seconds(&plan.cells[18])), (Some(15.0), None));
     }
 
     #[test]

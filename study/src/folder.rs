@@ -132,7 +132,8 @@ pub struct Failure {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Timing {
-    /// Seconds from the beginning to the result, without what an attempt took that was broken off.
+    /// Seconds from the beginning to the result, without what an attempt took that was broken off. Where a process does
+    /// several cells at a time, each moment counts as its part of it: the seconds of all cells add up to the process's.
     pub seconds: f64,
 }
 

@@ -34,7 +34,7 @@ pub mod table;
 mod value_error;
 mod verify;
 
-pub use cost::{Estimate, Measurement, Speed, estimates, representatives};
+pub use cost::{Estimate, Measurement, Speed, Taken, estimates, representatives};
 pub use curves::{Curve, EnvironmentCurves, Point, curves_table, read_curves};
 pub use folder::{CellFolder, CellResult, CellState, Failure, FailureMark, Folder, FolderError, Timing, Training};
 pub use heatmap::{Axis, Heatmap, HeatmapOptions, HeatmapPoint, MOST_POINTS, heatmap_table};
@@ -43,7 +43,7 @@ pub use heatmaps::{
 };
 pub use means::{geometric_mean, mean, wilson};
 pub use paper::Method;
-pub use plan::{Cell, Counts, Plan, PlanError, Tests, TrainedOn};
+pub use plan::{Cell, Counts, Grouping, Plan, PlanError, Tests, TrainedOn};
 pub use results::{Counters, TestResult};
 pub use scenarios::{Metric, Scenario, Version};
 pub use selection::{MethodResults, Results, Selected, SelectedRun, average, interquartile};

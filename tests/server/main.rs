@@ -3,6 +3,7 @@
 
 mod common;
 
+mod acting;
 mod catalogue;
 mod conformance;
 mod determinism;
@@ -10,6 +11,7 @@ mod distributions;
 mod dm_env_rpc;
 mod drawing;
 mod faults;
+mod groups;
 mod lifecycle;
 #[cfg(feature = "mujoco")]
 mod locomotion;

@@ -4,7 +4,7 @@ use crate::common::{self, action_bytes, floats, observe, step};
 use bytes::Bytes;
 use perturb::{
     env::{Distribution, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings, Version},
-    pool::{Autoreset, Batch, BatchSettings, Error, Pool, ResetEntry, Stepped},
+    pool::{Autoreset, Batch, BatchSettings, Error, Pool, ResetEntry, SlotGroup, Stepped},
     tasks,
 };
 use rstest::rstest;
@@ -20,7 +20,8 @@ const MODES: [Autoreset; 3] = [Autoreset::NextStep, Autoreset::SameStep, Autores
 
 fn batch_settings(spec: &'static EnvironmentSpec, size: usize, autoreset: Autoreset) -> BatchSettings {
     let episodes = common::settings(spec, Version::R, 17, 100, 2);
-    BatchSettings { spec, size, episodes, autoreset, receipts: true, reward_terms: true }
+    let groups = vec![SlotGroup { size, episodes }];
+    BatchSettings { spec, groups, autoreset, receipts: true, reward_terms: true }
 }
 
 /// Random actions for slots whose environments have the indices from `first` on.
@@ -56,11 +57,11 @@ struct Model {
 impl Model {
     fn new(settings: &BatchSettings) -> Self {
         let model = |slot| {
-            let environment_index = settings.episodes.environment_index + slot as u32;
-            let settings_of_slot = Settings { environment_index, ..settings.episodes.clone() };
+            let environment_index = settings.groups[0].episodes.environment_index + slot as u32;
+            let settings_of_slot = Settings { environment_index, ..settings.groups[0].episodes.clone() };
             Episodes::new((settings.spec.make)().unwrap(), settings_of_slot)
         };
-        Self { models: (0..settings.size).map(model).collect(), autoreset: settings.autoreset }
+        Self { models: (0..settings.size()).map(model).collect(), autoreset: settings.autoreset }
     }
 
     fn step(&mut self, actions: &[u8]) -> Stepped {
@@ -324,7 +325,7 @@ async fn bytes_do_not_depend_on_how_a_batch_is_split() {
                 let mut first = 100;
                 for &part in split {
                     let mut settings = batch_settings(spec, part, mode);
-                    settings.episodes.environment_index = first;
+                    settings.groups[0].episodes.environment_index = first;
                     batches.push((first, part, Batch::open(&pool, settings).await.unwrap().0));
                     first += part as u32;
                 }
@@ -377,7 +378,7 @@ async fn small_batches_finish_before_a_large_one_that_came_first() {
         let mut steps: Vec<_> = Vec::new();
         for (id, batch) in batches.iter_mut().enumerate() {
             let waker = Waker::from(Arc::new(Bell { id, rung: Arc::clone(&rung) }));
-            let part = &actions[..4 * batch.settings().size];
+            let part = &actions[..4 * batch.size()];
             let mut step = Box::pin(batch.step(part));
             if step.as_mut().poll(&mut Context::from_waker(&waker)).is_ready() {
                 rung.lock().unwrap().push(id);
@@ -534,8 +535,10 @@ async fn a_reset_touches_the_selected_slots_only_and_goes_on_with_their_trials()
         // Trials have two episodes: the parameters stay for the second and change for the third.
         assert_eq!(ids(&started), [(1, 0, 1, 1), (3, 0, 1, 1)]);
         let opened = |slot: u32| {
-            let settings =
-                Settings { environment_index: 100 + slot, ..batch_settings(spec, 4, Autoreset::SameStep).episodes };
+            let settings = Settings {
+                environment_index: 100 + slot,
+                ..batch_settings(spec, 4, Autoreset::SameStep).groups[0].episodes.clone()
+            };
             Episodes::new((spec.make)().unwrap(), settings)
         };
         assert_eq!(started[0].1.receipt, Some(opened(1).receipt()));
@@ -573,7 +576,7 @@ async fn seeds_restart_the_counts_and_keep_the_index() {
         let (first, started) = batch.reset(vec![seeded(0, u64::MAX), seeded(2, 5)]).await.unwrap();
         assert_eq!(ids(&started), [(0, 0, 0, 0), (2, 0, 0, 0)]);
         for (k, (slot, seed)) in [(0, u64::MAX), (2, 5)].into_iter().enumerate() {
-            let settings = batch_settings(spec, 4, Autoreset::SameStep).episodes;
+            let settings = batch_settings(spec, 4, Autoreset::SameStep).groups[0].episodes.clone();
             let settings = Settings { seed, environment_index: 100 + slot, ..settings };
             let fresh = Episodes::new((spec.make)().unwrap(), settings);
             assert_eq!(started[k].1, fresh.started(true));

@@ -4,7 +4,7 @@ use crate::common::{self, action_bytes, episodes, observe, play, start_line, ste
 use bytes::Bytes;
 use perturb::{
     env::{Distribution, EnvironmentSpec, Episodes, Error, Interval, Version},
-    pool::{self, Autoreset, Batch, BatchSettings, Pool, ResetEntry, Stepped},
+    pool::{self, Autoreset, Batch, BatchSettings, Pool, ResetEntry, SlotGroup, Stepped},
     tasks,
 };
 use proptest::prelude::*;
@@ -357,7 +357,8 @@ proptest! {
 
 fn batch_settings(spec: &'static EnvironmentSpec, seed: u64, size: usize, autoreset: Autoreset) -> BatchSettings {
     let episodes = common::settings(spec, Version::R, seed, 0, 2);
-    BatchSettings { spec, size, episodes, autoreset, receipts: true, reward_terms: true }
+    let groups = vec![SlotGroup { size, episodes }];
+    BatchSettings { spec, groups, autoreset, receipts: true, reward_terms: true }
 }
 
 fn actions(spec: &EnvironmentSpec, size: usize, t: u64) -> Vec<u8> {
@@ -365,7 +366,7 @@ fn actions(spec: &EnvironmentSpec, size: usize, t: u64) -> Vec<u8> {
 }
 
 async fn run(batch: &mut Batch, steps: std::ops::Range<u64>) -> Vec<Stepped> {
-    let (spec, size) = (batch.settings().spec, batch.settings().size);
+    let (spec, size) = (batch.settings().spec, batch.size());
     let mut all = Vec::new();
     for t in steps {
         all.push(batch.step(&actions(spec, size, t)).await.unwrap());

@@ -12,7 +12,7 @@ use perturb_study::scheduler::slurm::TimeLimit;
 use perturb_study::sets::Assignment;
 use perturb_study::settings::{Architecture, Settings};
 use perturb_study::success::Threshold;
-use perturb_study::{MOST_POINTS, Version};
+use perturb_study::{Grouping, MOST_POINTS, Version};
 
 use crate::video::PIXELS;
 
@@ -62,6 +62,17 @@ pub(super) struct ServerArgs {
     /// Physics threads of the server that perturb starts itself [default: one a core].
     #[arg(long, value_name = "N", value_parser = at_least_one)]
     pub(super) workers: Option<usize>,
+}
+
+/// Where trained and tested policies play.
+#[derive(Args, Clone, Debug)]
+pub(super) struct PlayArgs {
+    #[command(flatten)]
+    pub(super) server: ServerArgs,
+    /// Where actions are chosen, which changes no byte: at the server, if it can, for a whole rollout at a time; or here, at
+    /// every step.
+    #[arg(long, value_name = "WHERE", default_value = "server", value_parser = ["server", "client"])]
+    pub(super) act: String,
 }
 
 #[derive(Args, Debug)]
@@ -127,7 +138,7 @@ pub(super) struct TrainArgs {
     )]
     pub(super) resume: Option<PathBuf>,
     #[command(flatten)]
-    pub(super) server: ServerArgs,
+    pub(super) play: PlayArgs,
 }
 
 #[derive(Args, Debug)]
@@ -159,7 +170,7 @@ pub(super) struct EvaluateArgs {
     #[arg(long, value_name = "FILE")]
     pub(super) json: Option<PathBuf>,
     #[command(flatten)]
-    pub(super) server: ServerArgs,
+    pub(super) play: PlayArgs,
 }
 
 /// Parameters beside those of the versions.
@@ -235,9 +246,19 @@ pub(super) struct PlanArgs {
     /// List --cells or --missing as JSON, and nothing else.
     #[arg(long)]
     pub(super) json: bool,
-    /// Seconds that each measured training takes; 0 measures nothing and gives no estimate.
+    /// Seconds that each group of trainings is measured; 0 measures nothing.
     #[arg(long, value_name = "SECONDS", default_value_t = 3)]
     pub(super) measure: u64,
+    /// Estimate from what cells took that are done in this folder, where there are any of the same environment and
+    /// method, e.g. a random tenth.
+    #[arg(long, value_name = "DIR")]
+    pub(super) from: Option<PathBuf>,
+    /// The --jobs of the run [default: one a core].
+    #[arg(long, value_name = "N", value_parser = at_least_one)]
+    pub(super) jobs: Option<usize>,
+    /// The --group of the run.
+    #[arg(long, value_name = "N", default_value_t = Grouping::USUAL, value_parser = at_least_one)]
+    pub(super) group: usize,
     #[command(flatten)]
     pub(super) server: ServerArgs,
 }
@@ -249,9 +270,14 @@ pub(super) struct RunArgs {
     /// Directory of the results; what is done there already is kept.
     #[arg(long, value_name = "DIR")]
     pub(super) out: PathBuf,
-    /// Trainings at a time [default: one a core; with --engine, one in each of its jobs].
+    /// Processes at a time, each of which does a group of cells [default: one a core; with --engine, one in each of its
+    /// jobs].
     #[arg(long, value_name = "N", value_parser = at_least_one)]
     pub(super) jobs: Option<usize>,
+    /// The most cells of one environment and architecture that a process does together; 1 for each by itself. It changes
+    /// no result.
+    #[arg(long, value_name = "N", default_value_t = Grouping::USUAL, value_parser = at_least_one)]
+    pub(super) group: usize,
     /// Try cells again that have failed.
     #[arg(long)]
     pub(super) retry_failed: bool,
@@ -264,8 +290,9 @@ pub(super) struct RunArgs {
     /// Print what happens to each cell as JSON lines.
     #[arg(long, conflicts_with = "engine")]
     pub(super) json: bool,
-    /// Do the cell that a line of standard input names; stop when standard input is closed.
-    #[arg(long, hide = true, requires = "server", conflicts_with_all = ["cell", "jobs", "engine", "retry_failed", "html"])]
+    /// Do the cells that a line of standard input names; stop when standard input is closed.
+    #[arg(long, hide = true, requires = "server",
+        conflicts_with_all = ["cell", "jobs", "group", "engine", "retry_failed", "html"])]
     pub(super) worker: bool,
     #[command(flatten)]
     pub(super) engine: EngineArgs,
@@ -289,7 +316,7 @@ pub(super) struct EngineArgs {
     /// Jobs that may run at a time [default: as many as there is room for].
     #[arg(long, value_name = "N", requires = "engine", value_parser = clap::value_parser!(u32).range(1..))]
     pub(super) array_limit: Option<u32>,
-    /// Cells that a job does, one after the other [default: as many as take some minutes].
+    /// Cells that a job does, of one environment and architecture [default: as many as take some minutes].
     #[arg(long, value_name = "N", requires = "engine", value_parser = at_least_one)]
     pub(super) cells_per_job: Option<usize>,
 }
@@ -364,7 +391,7 @@ pub(super) struct HeatmapArgs {
     #[arg(long, value_name = "PATH")]
     pub(super) out: Option<PathBuf>,
     #[command(flatten)]
-    pub(super) server: ServerArgs,
+    pub(super) play: PlayArgs,
 }
 
 #[derive(Args, Debug)]
@@ -424,7 +451,7 @@ mod tests {
         let refused: Vec<&str> =
             train.get_arg_conflicts_with(of("resume")).iter().map(|argument| argument.get_id().as_str()).collect();
         for argument in train.get_arguments().map(|argument| argument.get_id().as_str()) {
-            let accepted = ["resume", "server", "workers", "threads", "help"].contains(&argument);
+            let accepted = ["resume", "server", "workers", "act", "threads", "help"].contains(&argument);
             assert_ne!(refused.contains(&argument), accepted, "--{argument}");
         }
     }

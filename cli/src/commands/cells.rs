@@ -6,7 +6,7 @@ use super::error::{CommandError, Result};
 use super::report;
 use super::signal_code;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::scheduler::{Announcement, Backend, RunEnd, run as run_cells, write_line};
+use perturb_study::scheduler::{Announcement, Backend, RunEnd, run as run_plan, write_line};
 use perturb_study::{Folder, Plan};
 use std::process::ExitCode;
 
@@ -26,7 +26,7 @@ pub(super) fn do_cells(
         Announcement::Line(line) if args.json => write_line(&mut std::io::stdout(), line),
         Announcement::Line(_) => {}
     };
-    let end = run_cells(plan, folder, backend, args.retry_failed, stop, &mut report);
+    let end = run_plan(plan, folder, backend, args.retry_failed, stop, &mut report);
     drop(display);
     let failed = match end? {
         RunEnd::Finished { failed } => failed,

@@ -11,8 +11,8 @@ use perturb_study::scheduler::Status;
 
 /// How often a plain line is printed.
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
-/// Of so many cells in work a terminal shows what is being done.
-const MOST_CELLS: usize = 8;
+/// Of so many groups of cells in work a terminal shows what is being done.
+const MOST_GROUPS: usize = 8;
 
 /// The episodes of a training or a test, or the cells of a run.
 pub(super) struct Display {
@@ -62,16 +62,15 @@ impl Display {
         self.show(episodes, "");
     }
 
-    /// How far a run is, and on a terminal what is done with its cells.
+    /// How far a run is, and on a terminal what is done with its groups of cells.
     pub(super) fn cells(&mut self, status: &Status) {
         let Status { done, failed, running, doing, remaining, .. } = status;
         let left = remaining.map_or_else(String::new, |left| format!(", {} left", duration(left.as_secs_f64())));
         let lost = if *failed > 0 { format!(", {failed} failed") } else { String::new() };
         if let Some(bar) = &self.bar {
-            let mut in_work: Vec<String> =
-                running.iter().take(MOST_CELLS).map(|(cell, event)| format!("  {cell}: {event}")).collect();
-            if running.len() > MOST_CELLS {
-                in_work.push(format!("  and {} more", running.len() - MOST_CELLS));
+            let mut in_work: Vec<String> = running.iter().take(MOST_GROUPS).map(|group| format!("  {group}")).collect();
+            if running.len() > MOST_GROUPS {
+                in_work.push(format!("  and {} more", running.len() - MOST_GROUPS));
             }
             bar.set_prefix(in_work.join("\n"));
         }

@@ -5,6 +5,7 @@ use std::io::ErrorKind;
 use perturb_learner::checkpoint::CheckpointError;
 use perturb_learner::client::ClientError;
 use perturb_learner::evaluation::{AuditError, HeatmapError, TestError};
+use perturb_learner::measure::MeasureError;
 use perturb_learner::training::{RunDirectoryError, TrainError};
 use perturb_study::files::FileError;
 use perturb_study::plot::PlotError;
@@ -50,6 +51,8 @@ pub(super) enum CommandError {
     Folder(#[from] FolderError),
     #[error(transparent)]
     Heatmap(#[from] HeatmapError),
+    #[error(transparent)]
+    Measure(#[from] MeasureError),
     #[error(transparent)]
     Option(#[from] OptionError),
     #[error(transparent)]

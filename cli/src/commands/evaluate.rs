@@ -7,7 +7,7 @@ use serde_json::{Map, Value, json};
 use super::args::EvaluateArgs;
 use super::display::Display;
 use super::error::{Result, system};
-use super::{servers, sets};
+use super::{playing_servers, sets};
 use perturb_learner::checkpoint::{Checkpoint, State};
 use perturb_learner::evaluation::{TestOptions, Tester};
 use perturb_study::TestResult;
@@ -22,7 +22,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
     let sets = sets::tested(&args.versions, &args.set)?;
     let seed = args.seed.unwrap_or(checkpoint.state.config.common.seed);
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let servers = servers(&args.server)?;
+    let servers = playing_servers(&args.play)?;
     let (state, config) = (&checkpoint.state, &checkpoint.state.config);
     let common = &config.common;
     let options = TestOptions { episodes: args.episodes, seed, success: args.success.clone() };

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use super::args::HeatmapArgs;
 use super::display::Display;
 use super::error::{CommandError, Result, system};
-use super::{servers, sets};
+use super::{playing_servers, sets};
 use perturb_learner::checkpoint::{Checkpoint, State};
 use perturb_learner::client::Servers;
 use perturb_learner::evaluation::{heatmap, heatmap_again};
@@ -34,7 +34,7 @@ fn of_checkpoint(args: &HeatmapArgs, path: &Path) -> Result<()> {
     let checkpoint = Checkpoint::load(path)?;
     let state = &checkpoint.state;
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let servers = servers(&args.server)?;
+    let servers = playing_servers(&args.play)?;
     let environment = servers.environment(&state.config.common.environment)?;
     let parameters = match (&args.x, &args.y) {
         (Some(x), Some(y)) => [x.clone(), y.clone()],
@@ -108,7 +108,7 @@ fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<()> {
         };
         let servers = match &mut servers_of_all {
             Some(servers) => servers,
-            none => none.insert(servers(&args.server)?),
+            none => none.insert(playing_servers(&args.play)?),
         };
         let Some(parameters) = usual_axes(&servers.environment(place.environment)?) else {
             eprintln!("{place}: it is not known which parameters to show");

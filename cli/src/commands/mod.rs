@@ -28,9 +28,9 @@ use std::process::ExitCode;
 
 use clap::Parser;
 
-use args::{Cli, Command, ServerArgs};
+use args::{Cli, Command, PlayArgs, ServerArgs};
 use error::{CommandError, Result};
-use perturb_learner::client::Servers;
+use perturb_learner::client::{ActAt, Servers};
 
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
@@ -81,6 +81,12 @@ fn servers(args: &ServerArgs) -> Result<Servers> {
     }
     refuse_workers(args)?;
     Ok(Servers::connect(&args.server)?)
+}
+
+/// The same, for those that play.
+fn playing_servers(args: &PlayArgs) -> Result<Servers> {
+    let act = if args.act == "client" { ActAt::Client } else { ActAt::Server };
+    Ok(servers(&args.server)?.with_act(act))
 }
 
 /// One a core, if nothing is asked for.

@@ -8,12 +8,12 @@ use serde_json::json;
 
 use super::args::PlanArgs;
 use super::error::{CommandError, Result};
-use super::servers;
+use super::{cores, servers};
 use perturb_learner::client::Servers;
 use perturb_learner::measure::measure;
 use perturb_study::scheduler::count;
 use perturb_study::table::Table;
-use perturb_study::{Cell, Estimate, Folder, Measurement, Plan, estimates, representatives};
+use perturb_study::{Cell, Estimate, Folder, Grouping, Measurement, Plan, Taken, estimates, representatives};
 
 pub(super) fn run(args: &PlanArgs) -> Result<()> {
     let plan = Plan::load(&args.file)?;
@@ -48,23 +48,96 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
         grouped(counts.all_pairs),
         count(counts.runs as usize, "run")
     )?;
-    if args.measure == 0 {
-        return Ok(());
+    let grouping = Grouping { most: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
+    let all: Vec<usize> = (0..plan.cells.len()).collect();
+    let groups = plan.groups(&all, grouping);
+    writeln!(out, "{}", groups_line(&groups, grouping))?;
+    let grouping = Grouping { at_a_time: grouping.at_a_time.min(groups.len()), ..grouping };
+    let taken = args.from.as_deref().map(|path| (Folder::new(path), Taken::read(&plan, &Folder::new(path))));
+    estimate(args, &plan, grouping, taken.as_ref(), &mut out)
+}
+
+/// "24 cells in 4 groups of 5 to 7, 2 at a time".
+fn groups_line(groups: &[Vec<usize>], Grouping { at_a_time, .. }: Grouping) -> String {
+    let sizes = || groups.iter().map(Vec::len);
+    let (least, most) = (sizes().min().unwrap_or_default(), sizes().max().unwrap_or_default());
+    let sizes_shown = if least == most { most.to_string() } else { format!("{least} to {most}") };
+    let number = if groups.len() == 1 { "1 group".into() } else { format!("{} groups", grouped(groups.len())) };
+    format!("{} cells in {number} of {sizes_shown}, {} at a time", grouped(sizes().sum()), at_a_time.min(groups.len()))
+}
+
+/// Prints what the plan costs: as cells took that are done, otherwise at most, by measurements.
+fn estimate(
+    args: &PlanArgs,
+    plan: &Plan,
+    grouping: Grouping,
+    taken: Option<&(Folder, Taken<'_>)>,
+    out: &mut impl Write,
+) -> Result<()> {
+    let as_others = |cell: &Cell| taken.and_then(|(_, taken)| taken.seconds(cell));
+    let (known, unknown): (Vec<usize>, Vec<usize>) =
+        (0..plan.cells.len()).partition(|&cell| as_others(&plan.cells[cell]).is_some());
+    let mut seconds: Vec<Option<f64>> = plan.cells.iter().map(as_others).collect();
+    if let Some((folder, taken)) = taken {
+        let known_seconds: f64 = seconds.iter().flatten().sum();
+        writeln!(
+            out,
+            "\nas those of the same environment and method took of {} in {}: {}, {}",
+            count(taken.cells(), "cell"),
+            folder.path().display(),
+            cells(known.len()),
+            duration(known_seconds)
+        )?;
     }
-    let servers = servers(&args.server)?;
-    let limits = step_limits(&servers, &plan)?;
-    let representatives = representatives(&plan);
+    if args.measure == 0 && taken.is_some() && !unknown.is_empty() {
+        writeln!(out, "not measured: {}", cells(unknown.len()))?;
+    }
+    if args.measure > 0 && !unknown.is_empty() {
+        let servers = servers(&args.server)?;
+        let limits = step_limits(&servers, plan)?;
+        let measurements = measurements(args, plan, grouping, &unknown, &servers, out)?;
+        let estimates = estimates(plan, &measurements, &limits);
+        unknown.iter().for_each(|&cell| seconds[cell] = Some(estimates[cell].seconds()));
+        print_most(out, unknown.len(), &unknown.iter().map(|&cell| estimates[cell]).sum())?;
+    }
+    if seconds.iter().all(Option::is_some) {
+        let jobs = grouping.at_a_time;
+        let total = |cells: &mut dyn Iterator<Item = usize>| {
+            let seconds: f64 = cells.filter_map(|cell| seconds[cell]).sum();
+            format!("{}, {} with --jobs {jobs}", duration(seconds), duration(seconds / jobs as f64))
+        };
+        writeln!(out, "\nin all: {}", total(&mut (0..seconds.len())))?;
+        if let Some((folder, _)) = taken {
+            let left = |&cell: &usize| !folder.cell(&plan.cells[cell].id).is_settled(true);
+            let left: Vec<usize> = (0..seconds.len()).filter(left).collect();
+            writeln!(out, "what is left there, {}: {}", cells(left.len()), total(&mut left.iter().copied()))?;
+        }
+    }
+    Ok(())
+}
+
+/// Measures the representatives of `cells`, and prints how fast they were.
+fn measurements(
+    args: &PlanArgs,
+    plan: &Plan,
+    grouping: Grouping,
+    cells: &[usize],
+    servers: &Servers,
+    out: &mut impl Write,
+) -> Result<Vec<Measurement>> {
+    let groups = representatives(plan, cells, grouping);
+    let jobs = grouping.at_a_time;
     writeln!(
         out,
-        "\nmeasured: {} trainings for some {} s each, one after the other, with the settings in the middle of their grid",
-        representatives.len(),
-        args.measure
+        "\nmeasured: {} for some {} s each, with settings from all over their grid, in {}",
+        count(groups.len(), "group"),
+        args.measure,
+        if jobs == 1 { "1 process".to_owned() } else { format!("{jobs} processes at once, steps/s of each") }
     )?;
-    let measure_one = |cell| measure(&servers, cell, Duration::from_secs(args.measure));
-    let measurements: Vec<Measurement> = representatives.into_iter().map(measure_one).collect::<Result<_, _>>()?;
+    let measure_one = |group: Vec<&Cell>| measure(servers, &group, jobs, Duration::from_secs(args.measure));
+    let measurements: Vec<Measurement> = groups.into_iter().map(measure_one).collect::<Result<_, _>>()?;
     writeln!(out, "{}", speeds(&measurements).to_text())?;
-    let estimate: Estimate = estimates(&plan, &measurements, &limits).into_iter().sum();
-    Ok(print_estimate(&mut out, &plan, &estimate)?)
+    Ok(measurements)
 }
 
 /// The step limits of the plan's environments. Refuses plans that do not fit them.
@@ -82,27 +155,29 @@ fn speeds(measurements: &[Measurement]) -> Table {
     Table::of("", measurements)
         .text("environment", |measured| &measured.environment)
         .text("method", |measured| &measured.method)
+        .number("cells", |measured| measured.cells)
         .number("steps/s training", |measured| per_second(measured.speed.training))
         .number("steps/s testing", |measured| per_second(measured.speed.testing))
         .build()
 }
 
-fn print_estimate(out: &mut impl Write, plan: &Plan, estimate: &Estimate) -> std::io::Result<()> {
-    let steps = |number: f64| format!("{number:.2e}");
+fn print_most(out: &mut impl Write, number: usize, estimate: &Estimate) -> std::io::Result<()> {
     writeln!(
         out,
-        "\nat most, if every episode of {} cells lasts until the step limit: {} steps of training, {} of testing",
-        grouped(plan.cells.len()),
-        steps(estimate.training_steps),
-        steps(estimate.testing_steps)
-    )?;
-    writeln!(
-        out,
-        "which takes {} as measured: {} of training, {} of testing; with two jobs on as many free cores half of it",
+        "\nat most, if every episode lasts until the step limit: {}, {:.2e} steps of training, {:.2e} of testing,\n\
+         which take {} as measured: {} of training, {} of testing",
+        cells(number),
+        estimate.training_steps,
+        estimate.testing_steps,
         duration(estimate.seconds()),
         duration(estimate.training_seconds),
         duration(estimate.testing_seconds)
     )
+}
+
+/// "1 cell", "1 200 cells".
+fn cells(number: usize) -> String {
+    if number == 1 { "1 cell".into() } else { format!("{} cells", grouped(number)) }
 }
 
 /// A number with its digits in groups of three.
@@ -139,6 +214,16 @@ mod tests {
     fn digits_stand_in_groups_of_three() {
         let shown = [0, 12, 183, 3294, 9882, 49_410, 1_234_567].map(grouped);
         assert_eq!(shown, ["0", "12", "183", "3 294", "9 882", "49 410", "1 234 567"]);
+    }
+
+    #[test]
+    fn groups_are_said_in_a_line() {
+        let line = |sizes: &[usize], at_a_time| {
+            let groups: Vec<Vec<usize>> = sizes.iter().map(|&size| vec![0; size]).collect();
+            groups_line(&groups, Grouping { most: 36, at_a_time })
+        };
+        assert_eq!(line(&[36, 35, 36, 1], 2), "108 cells in 4 groups of 1 to 36, 2 at a time");
+        assert_eq!(line(&[3], 8), "3 cells in 1 group of 3, 1 at a time");
     }
 
     #[test]

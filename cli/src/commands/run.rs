@@ -10,11 +10,11 @@ use super::cells::do_cells;
 use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
 use super::{cores, refuse_workers, single_thread, slurm};
-use perturb_learner::cell::run_cell;
+use perturb_learner::cell::{CellOrder, run_cells};
 use perturb_learner::client::{Address, PrivateServer, Servers};
 use perturb_study::interrupt::StopFlag;
-use perturb_study::scheduler::{CellEvent, Local, Order, Teller};
-use perturb_study::{Cell, Folder, Plan};
+use perturb_study::scheduler::{CellEvent, Local, Order, OrderedCell, Teller};
+use perturb_study::{Cell, Folder, Grouping, Plan};
 
 pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
     let folder = Folder::new(&args.out);
@@ -29,13 +29,15 @@ pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
     if args.cell.is_empty() {
         return all_cells(args, &plan, &folder, &stop);
     }
-    let cells = args.cell.iter().map(|name| find(args, &plan, name)).collect::<Result<_>>()?;
+    let mut cells = args.cell.iter().map(|name| find(args, &plan, name).cloned()).collect::<Result<Vec<Cell>>>()?;
+    cells.sort_by_key(|cell| cell.index);
+    cells.dedup_by_key(|cell| cell.index); // named by index and by id
     all_cells(args, &Plan { cells, ..plan }, &folder, &stop)
 }
 
 /// The cell with this index or id.
-fn find(args: &RunArgs, plan: &Plan, name: &str) -> Result<Cell> {
-    plan.find(name).cloned().ok_or_else(|| {
+fn find<'a>(args: &RunArgs, plan: &'a Plan, name: &str) -> Result<&'a Cell> {
+    plan.find(name).ok_or_else(|| {
         CommandError::Usage(format!(
             "{} has no cell `{name}`: give an index from 0 to {}, or an id that `perturb plan --cells` prints",
             args.plan.display(),
@@ -44,30 +46,43 @@ fn find(args: &RunArgs, plan: &Plan, name: &str) -> Result<Cell> {
     })
 }
 
-/// Does the cell of the order on standard input, as a process that another one started for it.
+/// Does the cells of the order on standard input, as a process that another one started for them.
 fn work(args: &RunArgs, folder: &Folder, stop: &StopFlag) -> Result<ExitCode> {
     let mut text = String::new();
     std::io::stdin().lock().read_line(&mut text).map_err(system("read the order"))?;
     let order: Order = serde_json::from_str(&text)
         .map_err(|error| CommandError::Usage(format!("the order is not understood: {error}")))?;
     stop_with_input(stop)?;
-    let mut teller = Teller::new(&order.cell, std::io::stdout());
-    let plan = Plan::load(&args.plan).map_err(CommandError::from);
-    let cell = match plan.and_then(|plan| find(args, &plan, &order.cell)) {
-        Ok(cell) => cell,
-        Err(error) => {
-            teller.tell(CellEvent::Refused { reason: error.to_string() });
-            return Ok(ExitCode::SUCCESS);
+    let mut teller = Teller::new(order.cells.len(), std::io::stdout());
+    let plan = Plan::load(&args.plan);
+    let mut orders = Vec::new();
+    for OrderedCell { cell: id, retry } in &order.cells {
+        let cell = match &plan {
+            Ok(plan) => find(args, plan, id).map_err(|error| error.to_string()),
+            Err(error) => Err(error.to_string()),
+        };
+        match cell {
+            Ok(cell) => orders.push(CellOrder { cell, folder: folder.cell(&cell.id), retry: *retry }),
+            Err(reason) => {
+                teller.tell(id, CellEvent::Refused { reason });
+                return Ok(ExitCode::SUCCESS);
+            }
         }
-    };
-    let ended = match Servers::connect_to_one(&args.server.server, order.turn) {
+    }
+    let mut tell = |cell: &Cell, event| teller.tell(&cell.id, event);
+    match Servers::connect_to_one(&args.server.server, order.turn) {
         Ok(servers) => {
-            servers.addresses().for_each(|address| teller.tell(CellEvent::Server { address: address.to_string() }));
-            run_cell(&servers, &cell, &folder.cell(&cell.id), order.retry, stop, &mut |event| teller.tell(event))
+            for order in &orders {
+                let addresses = servers.addresses().map(ToString::to_string);
+                addresses.for_each(|address| tell(order.cell, CellEvent::Server { address }));
+            }
+            run_cells(&servers, &orders, stop, &mut tell);
         }
-        Err(error) => Ok(CellEvent::LostServer { reason: error.to_string() }),
-    };
-    teller.tell(ended.unwrap_or_else(|error| CellEvent::Failed { reason: error.to_string() }));
+        Err(error) => {
+            let reason = error.to_string();
+            orders.iter().for_each(|order| tell(order.cell, CellEvent::LostServer { reason: reason.clone() }));
+        }
+    }
     Ok(ExitCode::SUCCESS)
 }
 
@@ -85,7 +100,7 @@ fn stop_with_input(stop: &StopFlag) -> Result<()> {
 
 /// Does all cells in worker processes.
 fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> Result<ExitCode> {
-    let jobs = args.jobs.unwrap_or_else(cores).min(plan.cells.len());
+    let grouping = Grouping { most: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
     let (local, addresses) = shared_servers(args)?;
     let local = local.map(Mutex::new);
     let (servers, troubles) = Servers::connect_to_some(&addresses)?;
@@ -98,7 +113,7 @@ fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> R
         let status = local.as_ref()?.lock().ok()?.exit_status()?;
         Some(format!("the private server ended with {status}"))
     };
-    do_cells(args, plan, folder, &mut Local::new(plan, folder, jobs, &command, &server_ended), stop)
+    do_cells(args, plan, folder, &mut Local::new(plan, folder, grouping, &command, &server_ended), stop)
 }
 
 /// The servers that all workers share.

@@ -11,10 +11,11 @@ use super::refuse_workers;
 use perturb_learner::client::{Address, Servers};
 use perturb_learner::measure::measure;
 use perturb_study::interrupt::StopFlag;
+use perturb_study::scheduler::count;
 use perturb_study::scheduler::slurm::{Jobs, Slurm, SlurmOptions, Task};
-use perturb_study::{Estimate, Folder, Plan, estimates, representatives};
+use perturb_study::{Estimate, Folder, Grouping, Plan, estimates, representatives};
 
-/// How long each measured training takes.
+/// How long each group of trainings is measured.
 const MEASURE: Duration = Duration::from_secs(2);
 /// How often Slurm is asked: its controller has others to answer too.
 const QUEUE_INTERVAL: Duration = Duration::from_secs(15);
@@ -29,7 +30,8 @@ pub(super) fn run(args: &RunArgs, plan: &Plan, stop: &StopFlag) -> Result<ExitCo
     // Which environments there are, and what they cost, is found out here: servers that jobs share may be out of reach.
     let servers = || Servers::local(args.server.workers);
     step_limits(&servers()?, plan)?;
-    let costs = || Ok(costs(&servers()?, plan, stop)?);
+    let grouping = Grouping { most: args.group, at_a_time: options.task.jobs };
+    let costs = || Ok(costs(&servers()?, plan, grouping, stop)?);
     do_cells(args, plan, &folder, &mut Jobs::new(plan, &folder, &slurm, &options, &costs, stop), stop)
 }
 
@@ -42,6 +44,7 @@ fn options(args: &RunArgs) -> Result<SlurmOptions> {
     let task = Task {
         program: std::env::current_exe().map_err(system("find out where this program is"))?,
         jobs,
+        group: args.group,
         workers: args.server.workers.unwrap_or(jobs),
         servers: named.iter().map(Address::to_string).collect(),
     };
@@ -57,15 +60,16 @@ fn options(args: &RunArgs) -> Result<SlurmOptions> {
 }
 
 /// What each cell may cost, from a short measurement here.
-fn costs(servers: &Servers, plan: &Plan, stop: &StopFlag) -> Result<Vec<f64>> {
-    let representatives = representatives(plan);
-    eprintln!("measuring what cells cost: {} trainings for {} s each", representatives.len(), MEASURE.as_secs());
+fn costs(servers: &Servers, plan: &Plan, grouping: Grouping, stop: &StopFlag) -> Result<Vec<f64>> {
+    let all: Vec<usize> = (0..plan.cells.len()).collect();
+    let groups = representatives(plan, &all, grouping);
+    eprintln!("measuring what cells cost: {} for {} s each", count(groups.len(), "group"), MEASURE.as_secs());
     let mut measurements = Vec::new();
-    for cell in representatives {
+    for group in groups {
         if stop.signal().is_some() {
             return Err(CommandError::Failed("stopped".into()));
         }
-        measurements.push(measure(servers, cell, MEASURE)?);
+        measurements.push(measure(servers, &group, grouping.at_a_time, MEASURE)?);
     }
     let limits = step_limits(servers, plan)?;
     Ok(estimates(plan, &measurements, &limits).iter().map(Estimate::seconds).collect())

@@ -9,7 +9,7 @@ use toml::{Table, Value};
 use super::args::TrainArgs;
 use super::display::Display;
 use super::error::{CommandError, Result, system};
-use super::{servers, sets, signal_code, threads};
+use super::{playing_servers, sets, signal_code, threads};
 use perturb_learner::logging::{EpisodeFigures, Progress, TimeShares};
 use perturb_learner::training::{Outcome, RunDirectory, resume, train};
 use perturb_study::Version;
@@ -29,7 +29,7 @@ fn begin(args: &TrainArgs, out: &Path) -> Result<ExitCode> {
     let config = TrainConfig::load(args.config.as_deref(), &args.set, flags(args)?)?;
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let directory = RunDirectory::choose(out, args.overwrite)?;
-    let servers = servers(&args.server)?;
+    let servers = playing_servers(&args.play)?;
     let environment = servers.environment(&config.common.environment)?; // its refusal lists the names
     perturb_study::sets::check("--parameters", &config.common.parameters, &environment)?;
     let mut display = Display::of_episodes(describe(&config), config.common.episodes);
@@ -51,7 +51,7 @@ fn go_on(args: &TrainArgs, path: &Path) -> Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     eprintln!("{}: going on after {done} of {budget} episodes", describe(&config));
-    let servers = servers(&args.server)?;
+    let servers = playing_servers(&args.play)?;
     let mut display = Display::of_episodes(describe(&config), budget);
     let report = |progress: &Progress| display.training(progress);
     let outcome = resume(&servers, &directory, (checkpoint, state), threads(args.threads), &stop, report)?;

@@ -6,8 +6,9 @@ use super::panel::{Panel, Shown, ShownEnding, parameter};
 use super::{VideoError, VideoFile, VideoWriter};
 use perturb_learner::checkpoint::{Checkpoint, EnvironmentSummary, State};
 use perturb_learner::client::{BegunEpisode, ClientError, OpenOptions, Picture, Servers, Single, StepReply};
-use perturb_learner::evaluation::{Agent, TestError, check_unchanged, open_options};
+use perturb_learner::evaluation::{TestError, check_unchanged, open_options, player};
 use perturb_learner::proto;
+use perturb_policy::{Ended, Player};
 use perturb_study::interrupt::StopFlag;
 use perturb_study::sets::TestSet;
 
@@ -116,7 +117,8 @@ struct Film<'a> {
     state: &'a State,
     single: Single<'a>,
     environment: proto::Environment,
-    agent: Agent<'a>,
+    player: Player,
+    ended: Vec<Ended>,
     reply: StepReply,
     begun: BegunEpisode,
     panel: Panel,
@@ -141,6 +143,8 @@ impl<'a> Film<'a> {
         check_unchanged(checkpoint, EnvironmentSummary::of(single.environment()))?;
         let environment = single.environment().clone();
         options.set.check(&environment).map_err(TestError::Value)?;
+        let mut player = player(checkpoint, 1, open.seed).map_err(TestError::Numbers)?;
+        player.begin(&reply.observations, None).map_err(TestError::Numbers)?;
         let title = (
             format!("{} {}", environment.name, options.set.name),
             format!("{}, trained on {}", state.config.method(), state.config.common.trained_on()),
@@ -150,7 +154,8 @@ impl<'a> Film<'a> {
             options,
             state,
             single,
-            agent: Agent::new(checkpoint, 1, open.seed).map_err(TestError::Numbers)?,
+            player,
+            ended: Vec::new(),
             reply,
             shown: Shown::default(),
             last: None,
@@ -169,7 +174,7 @@ impl<'a> Film<'a> {
     /// Asks for what follows the present state, and for a picture of that.
     fn request_next(&mut self) -> Result<Next, VideoError> {
         let next = if self.shown.ending.is_none() {
-            let action = self.agent.act(&mut self.reply.observations).map_err(TestError::Numbers)?;
+            let action = self.player.act().map_err(TestError::Numbers)?;
             self.single.request_step(action)?;
             Next::Step
         } else if (self.footage.episodes.len() as u64) < self.options.episodes {
@@ -214,16 +219,12 @@ impl<'a> Film<'a> {
         let asked = Instant::now();
         self.single.stepped(&mut self.reply)?;
         self.footage.waiting += asked.elapsed();
-        let Self { reply, shown, .. } = self;
+        let Self { reply, shown, player, ended, .. } = self;
+        player.observe(&reply.all().outcome(ended), None).map_err(TestError::Numbers)?;
         shown.step += 1;
         shown.time = f64::from(shown.step) * self.environment.control_timestep;
         shown.episode_return += f64::from(reply.rewards[0]);
-        let end = reply.ended.pop();
-        self.agent.remember(&mut reply.rewards, &[end.is_some()]).map_err(TestError::Numbers)?;
-        let Some(end) = end else { return Ok(()) };
-        if end.episode_in_trial + 1 == self.state.config.settings.episodes_per_trial() {
-            self.agent.begin_trial(0, self.begun.trial_index);
-        }
+        let Some(end) = reply.ended.pop() else { return Ok(()) };
         shown.episode_return = end.episode_return;
         let truncated = reply.truncated[0];
         shown.ending = Some(ShownEnding { success: end.success, terminated: end.terminated, truncated });
@@ -241,6 +242,7 @@ impl<'a> Film<'a> {
     fn begin(&mut self) -> Result<(), VideoError> {
         let asked = Instant::now();
         self.begun = self.single.begun(&mut self.reply.observations)?;
+        self.player.see(0, &self.reply.observations).map_err(TestError::Numbers)?;
         self.footage.waiting += asked.elapsed();
         self.announce();
         Ok(())

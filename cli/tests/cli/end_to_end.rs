@@ -8,13 +8,14 @@ use crate::common::{
     addresses, child_server, config, is_running, kill, perturb, read, refusal, run, server, stderr, wait_for,
 };
 use insta::assert_snapshot;
+use perturb_learner::algorithm::Experience;
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers, Session, StepReply};
 use perturb_learner::evaluation::test;
 use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Collector, Normalisers, Rollout};
 use perturb_learner::torch::{Sequences, TorchPolicy};
-use perturb_policy::{ActionKind, Inputs, PolicySpec};
+use perturb_policy::{ActionKind, Inputs, Player, PolicySpec, Role};
 use perturb_study::Version;
 use perturb_study::interrupt::StopFlag;
 use rstest::rstest;
@@ -130,17 +131,19 @@ fn pendulums() -> OpenOptions {
 /// Pendulum's episodes have 200 steps, so that two rollouts of 150 hold one end, and begin in the middle of an episode.
 fn two_rollouts(servers: &Servers) -> (Policy, [Rollout; 2]) {
     let mut observations = Vec::new();
-    let session = Session::open(servers, &pendulums(), &mut observations).expect("a session");
+    let mut session = Session::open(servers, &pendulums(), &mut observations).expect("a session");
     let size = session.observation_size();
     let action = ActionKind::Continuous { size: 1 };
     let spec = PolicySpec { observation_size: size, action, hidden: vec![16], lstm: Some(8) };
     let policy = Policy::new(spec.clone(), 1).expect("a policy");
-    let none = Normalisers { observations: None, rewards: None };
-    let mut collector = Collector::new(session, observations, &spec, Inputs::new(size, action, N_ENVS, false), none, 1)
-        .expect("a collector");
+    let inputs = Inputs::new(size, action, N_ENVS, false);
+    let mut player = Player::new(&spec, inputs, N_ENVS, 1, Normalisers::default(), Role::training(1));
+    player.begin(&observations, None).expect("observations");
+    let mut collector = Collector::new(player);
     let rollouts = [(); 2].map(|()| {
         let mut rollout = Rollout::new(N_STEPS, N_ENVS, size, 1);
-        collector.collect(policy.flat_weights(), &mut rollout, |_| {}).expect("a rollout");
+        let steps = Experience::Steps(N_STEPS);
+        collector.collect(&mut session, policy.flat_weights(), steps, &mut rollout, |_| {}).expect("a rollout");
         rollout
     });
     (policy, rollouts)
@@ -257,7 +260,7 @@ fn a_refused_request_is_told_in_the_servers_words_and_the_session_lives_on() {
     assert!(error.contains("refused a step") && error.contains('9'), "{error}");
     session.step(&[1, 0, 0, 0, 0, 0, 0, 0], &mut reply).expect("a step");
     assert_eq!(reply.rewards, [1.0, 1.0]);
-    session.reset(&mut observations).expect("a reset");
+    session.reset(0..2, &mut observations).expect("a reset");
     assert!(observations.iter().all(|x| x.abs() <= 0.05), "CartPole starts near 0");
 
     let wrong = OpenOptions { environment: "CartPool".into(), ..options };

@@ -172,24 +172,24 @@ fn snapshots_bring_a_batch_back_on_any_number_of_servers() {
         };
         let (mut first, _) = open(&one);
         let before = steps(&mut first, 0..100);
-        let snapshots = first.snapshot().expect("snapshots");
+        let snapshots = first.snapshot(0..n).expect("snapshots");
         assert_eq!(snapshots.len(), n);
         let expected = steps(&mut first, 100..300);
         assert!(expected.iter().any(|(.., ended)| !ended.is_empty()), "{environment}: new episodes are drawn");
 
         for servers in [&one, &two] {
-            let (mut other, mut observations) = open(servers);
-            other.restore(&snapshots, &mut observations).expect("the environments are back");
+            let (mut other, _) = open(servers);
+            let observations = other.restore(0..n, &snapshots).expect("the environments are back");
             assert_eq!(observations, before[99].0);
-            assert_eq!(other.snapshot().expect("snapshots"), snapshots);
+            assert_eq!(other.snapshot(0..n).expect("snapshots"), snapshots);
             assert_eq!(steps(&mut other, 100..300), expected);
-            let error = other.restore(&snapshots[1..], &mut observations).expect_err("one is missing");
+            let error = other.restore(0..n, &snapshots[1..]).expect_err("one is missing");
             assert!(matches!(error, ClientError::Snapshots { got: 4, expected: 5 }), "{error}");
         }
         let wrong = OpenOptions { environment: "Pendulum".into(), ..options.clone() };
         let mut observations = Vec::new();
         let mut other = Session::open(&two, &wrong, &mut observations).expect("a session");
-        let error = other.restore(&snapshots, &mut observations).expect_err("of another environment").to_string();
+        let error = other.restore(0..n, &snapshots).expect_err("of another environment").to_string();
         assert!(error.contains("refused to restore snapshots") && error.contains(environment), "{error}");
     }
 }

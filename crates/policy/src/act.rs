@@ -130,7 +130,8 @@ impl Actor {
                 }
                 ActionKind::Continuous { .. } => sample_gaussian(head, &self.log_std, rng, action),
             };
-            if !(log_prob.is_finite() && out.values[n].is_finite()) {
+            let finite = action.iter().all(|x| x.is_finite()) && log_prob.is_finite() && out.values[n].is_finite();
+            if !finite {
                 return Err(Error::PolicyOutput { environment: n });
             }
             out.log_probs[n] = log_prob;

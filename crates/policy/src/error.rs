@@ -59,6 +59,14 @@ pub enum Error {
         /// What the system says.
         reason: String,
     },
+    /// Statistics that none can be.
+    #[error("the statistics of {name} cannot be right: {reason}")]
+    Statistics {
+        /// Of what.
+        name: &'static str,
+        /// What is wrong.
+        reason: String,
+    },
     /// An input that must be finite is not.
     #[error("{name} hold {value}; the environment's numbers must be finite")]
     Input {

@@ -32,6 +32,11 @@ impl Inputs {
         Inputs { observation_size, action, last: vec![0.0; n_envs * extra], extra, rows: Vec::new() }
     }
 
+    /// O.
+    pub fn observation_size(&self) -> usize {
+        self.observation_size
+    }
+
     /// I: numbers in an input, O + E.
     pub fn size(&self) -> usize {
         self.observation_size + self.extra

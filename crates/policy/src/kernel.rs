@@ -14,6 +14,9 @@ pub(crate) const LANES: usize = 16;
 /// Numbers side by side.
 pub(crate) type Lane = [f32; LANES];
 
+/// A sum's start where there is none.
+const ZERO: Lane = [0.0; LANES];
+
 /// Work that is compiled for every kind of vector unit.
 pub(crate) trait Kernel {
     /// Does it with vectors of `simd`. To be inlined.
@@ -123,8 +126,13 @@ impl Matrix {
     pub(crate) fn load(&mut self, first: usize, matrix: &[f32], outputs: usize) {
         let inputs = matrix.len() / outputs;
         for (block, lanes) in matrix.chunks(LANES * inputs).zip(self.data.chunks_exact_mut(self.inputs)) {
+            let lanes = &mut lanes[first..][..inputs];
+            let tiled = if block.len() == LANES * inputs { inputs / 4 * 4 } else { 0 };
+            for (tile, lanes) in lanes[..tiled].as_chunks_mut::<4>().0.iter_mut().enumerate() {
+                transpose(block, inputs, 4 * tile, lanes);
+            }
             // In the order of writing.
-            for (i, lane) in lanes[first..].iter_mut().take(inputs).enumerate() {
+            for (i, lane) in lanes.iter_mut().enumerate().skip(tiled) {
                 lane.iter_mut().zip(block[i..].iter().step_by(inputs)).for_each(|(x, weight)| *x = *weight);
             }
         }
@@ -144,7 +152,7 @@ impl Matrix {
     #[inline(always)]
     pub(crate) fn apply<S: Simd>(&self, simd: S, from: &Rows, n: usize, start: Option<&[Lane]>, to: &mut Rows) {
         for (column, weights) in self.data.chunks_exact(self.inputs).enumerate() {
-            let start = start.map_or(&[0.0; LANES], |start| &start[column]);
+            let start = start.map_or(&ZERO, |start| &start[column]);
             let mut row = 0;
             while row + 8 <= n {
                 product::<S, 8>(simd, from, row, weights, start, to, column);
@@ -154,10 +162,65 @@ impl Matrix {
                 product::<S, 4>(simd, from, row, weights, start, to, column);
                 row += 4;
             }
-            while row < n {
-                product::<S, 1>(simd, from, row, weights, start, to, column);
-                row += 1;
+        }
+        for row in n / 4 * 4..n {
+            let columns = self.data.len() / self.inputs;
+            let mut column = 0;
+            while column + 4 <= columns {
+                self.row_product::<S, 4>(simd, from, row, start, to, column);
+                column += 4;
             }
+            while column < columns {
+                self.row_product::<S, 1>(simd, from, row, start, to, column);
+                column += 1;
+            }
+        }
+    }
+
+    /// One row, `C` columns at once: sums that do not wait for each other.
+    #[inline(always)]
+    fn row_product<S: Simd, const C: usize>(
+        &self,
+        simd: S,
+        from: &Rows,
+        row: usize,
+        start: Option<&[Lane]>,
+        to: &mut Rows,
+        column: usize,
+    ) {
+        let inputs = &from.row(row)[..self.inputs];
+        let weights: [&[S::f32s]; C] = std::array::from_fn(|c| {
+            let lanes = &self.data[(column + c) * self.inputs..][..self.inputs];
+            S::as_simd_f32s(lanes.as_flattened()).0
+        });
+        let start: [&[S::f32s]; C] =
+            std::array::from_fn(|c| S::as_simd_f32s(start.map_or(&ZERO, |start| &start[column + c])).0);
+        let vectors = start[0].len();
+        for vector in 0..vectors {
+            let mut sums: [S::f32s; C] = std::array::from_fn(|c| start[c][vector]);
+            for (i, input) in inputs.iter().enumerate() {
+                let input = simd.splat_f32s(*input);
+                for c in 0..C {
+                    sums[c] = simd.add_f32s(sums[c], simd.mul_f32s(input, weights[c][i * vectors + vector]));
+                }
+            }
+            for (c, sum) in sums.into_iter().enumerate() {
+                S::as_mut_simd_f32s(&mut to.data[row * to.width + column + c]).0[vector] = sum;
+            }
+        }
+    }
+}
+
+/// Four columns of a block of [`LANES`] rows of `width` numbers, from column `first` on.
+fn transpose(block: &[f32], width: usize, first: usize, columns: &mut [Lane; 4]) {
+    for k in (0..LANES).step_by(4) {
+        let row = |r: usize| match block[(k + r) * width + first..] {
+            [a, b, c, d, ..] => [a, b, c, d],
+            _ => [0.0; 4], // there are four
+        };
+        let rows = [row(0), row(1), row(2), row(3)];
+        for (i, column) in columns.iter_mut().enumerate() {
+            column[k..k + 4].copy_from_slice(&[rows[0][i], rows[1][i], rows[2][i], rows[3][i]]);
         }
     }
 }

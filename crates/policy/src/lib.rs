@@ -1,6 +1,6 @@
 //! A policy as portable arithmetic, the same bytes on every processor: what it is ([`PolicySpec`], [`Weights`]), how it acts
-//! ([`Actor`]), what stands between an environment and it ([`Inputs`], the normalisers), and how a feed-forward one learns
-//! ([`Objective`], [`Differentiator`], [`Descent`]). Plain f32 loops, without libtorch.
+//! ([`Actor`]), what stands between an environment and it ([`Inputs`], [`Normalisers`]), how it plays ([`Player`]), and how
+//! a feed-forward one learns ([`Objective`], [`Differentiator`], [`Descent`]). Plain f32 loops, without libtorch.
 #![forbid(unsafe_code)]
 #![deny(clippy::disallowed_methods)]
 
@@ -14,12 +14,15 @@ mod inputs;
 mod kernel;
 pub mod math;
 mod normaliser;
+mod normalisers;
 mod objective;
 mod optimiser;
 mod perceptron;
+mod player;
 pub mod random;
 mod sample;
 mod spec;
+mod task;
 mod weights;
 
 pub use act::{Actor, Acts, Streams};
@@ -28,7 +31,10 @@ pub use error::{Error, Result, check_length};
 pub use initial::initial_weights;
 pub use inputs::Inputs;
 pub use normaliser::{ObservationNormaliser, RewardNormaliser, RunningMoments};
+pub use normalisers::{Normalisers, Statistics};
 pub use objective::{Acting, Losses, Objective, Surrogate};
 pub use optimiser::{Adam, Descent, Optimiser, RmsProp};
+pub use player::{Ended, Outcome, Player, PlayerState, Role, RolloutStep, TrialStreams};
 pub use spec::{ActionKind, PolicySpec};
+pub use task::{Dues, Task};
 pub use weights::{NamedArray, Weights, check_arrays};

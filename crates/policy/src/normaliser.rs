@@ -31,18 +31,27 @@ impl RunningMoments {
         RunningMoments { count: 0, mean: vec![0.0; size], squares: vec![0.0; size] }
     }
 
-    /// The moments of `rows` [N, size] alone, in two passes.
-    fn of(rows: &[f64], size: usize) -> Self {
-        let count = rows.len() / size;
-        let mut moments = RunningMoments::new(size);
-        moments.count = count as u64;
-        for i in 0..size {
-            let column = || rows.iter().skip(i).step_by(size);
-            let mean = column().sum::<f64>() / count as f64;
-            moments.mean[i] = mean;
-            moments.squares[i] = column().map(|x| (x - mean) * (x - mean)).sum();
+    /// The moments with these numbers, as they were saved.
+    pub fn from_parts(count: u64, mean: Vec<f64>, squares: Vec<f64>) -> Self {
+        RunningMoments { count, mean, squares }
+    }
+
+    /// Takes in `rows` of `size` numbers: their own moments, in two passes, and then these merged.
+    fn take<'a>(&mut self, rows: impl Iterator<Item = &'a [f32]> + Clone) {
+        let count = rows.clone().count();
+        for i in 0..self.mean.len() {
+            self.take_column(i, count, rows.clone().map(|row| f64::from(row[i])));
         }
-        moments
+        self.count += count as u64;
+    }
+
+    /// Takes in element `i` of `count` vectors, which are yet to be counted.
+    fn take_column(&mut self, i: usize, count: usize, column: impl Iterator<Item = f64> + Clone) {
+        if count > 0 {
+            let mean = column.clone().sum::<f64>() / count as f64;
+            let squares = column.map(|x| (x - mean) * (x - mean)).sum();
+            self.merge_element(i, count as u64, mean, squares);
+        }
     }
 
     /// Takes in what `other` has seen, so that the result is that of having seen both, in any order, up to rounding
@@ -53,15 +62,18 @@ impl RunningMoments {
         if other.count == 0 {
             return Ok(());
         }
-        let (a, b) = (self.count as f64, other.count as f64);
-        let total = a + b;
         for i in 0..self.mean.len() {
-            let delta = other.mean[i] - self.mean[i];
-            self.mean[i] += delta * b / total;
-            self.squares[i] += other.squares[i] + delta * delta * a * b / total;
+            self.merge_element(i, other.count, other.mean[i], other.squares[i]);
         }
         self.count += other.count;
         Ok(())
+    }
+
+    fn merge_element(&mut self, i: usize, count: u64, mean: f64, squares: f64) {
+        let (a, b) = (self.count as f64, count as f64);
+        let delta = mean - self.mean[i];
+        self.mean[i] += delta * b / (a + b);
+        self.squares[i] += squares + delta * delta * a * b / (a + b);
     }
 
     /// Whether these can be moments of vectors of `size` numbers; says what is wrong if they cannot.
@@ -88,6 +100,11 @@ impl RunningMoments {
         self.count
     }
 
+    /// Sums of squared distances from the mean.
+    pub fn squares(&self) -> &[f64] {
+        &self.squares
+    }
+
     /// Means, 0 before anything was seen.
     pub fn mean(&self) -> &[f64] {
         &self.mean
@@ -112,6 +129,11 @@ impl ObservationNormaliser {
         ObservationNormaliser { moments: RunningMoments::new(observation_size) }
     }
 
+    /// One with these statistics.
+    pub fn from_moments(moments: RunningMoments) -> Self {
+        ObservationNormaliser { moments }
+    }
+
     /// The statistics.
     pub fn moments(&self) -> &RunningMoments {
         &self.moments
@@ -124,14 +146,23 @@ impl ObservationNormaliser {
 
     /// Adds `observations` `[N, O]` to the statistics. Infinite numbers and NaN are refused and change nothing.
     pub fn update(&mut self, observations: &[f32]) -> Result<()> {
+        self.update_active(observations, None)
+    }
+
+    /// The same with the `active` `[N]` environments alone; what the others bring is passed over.
+    pub fn update_active(&mut self, observations: &[f32], active: Option<&[bool]>) -> Result<()> {
         let size = self.moments.mean.len();
         check_length("observations [N, O]", observations.len(), observations.len() / size * size)?;
         check_finite("observations [N, O]", observations)?;
-        if observations.is_empty() {
-            return Ok(());
+        let rows = observations.chunks_exact(size);
+        match active.filter(|active| active.contains(&false)) {
+            None => self.moments.take(rows),
+            Some(active) => {
+                check_length("active [N]", active.len(), observations.len() / size)?;
+                self.moments.take(rows.zip(active).filter(|(_, active)| **active).map(|(row, _)| row));
+            }
         }
-        let rows: Vec<f64> = observations.iter().map(|&x| f64::from(x)).collect();
-        self.moments.merge(&RunningMoments::of(&rows, size))
+        Ok(())
     }
 
     /// Normalises `observations` `[N, O]` in place. The statistics stay.
@@ -170,6 +201,21 @@ impl RewardNormaliser {
     /// The statistics of the discounted returns.
     pub fn moments(&self) -> &RunningMoments {
         &self.moments
+    }
+
+    /// One that goes on from saved numbers: `gamma`, R `[N]` and the statistics.
+    pub fn from_parts(gamma: f64, returns: Vec<f64>, moments: RunningMoments) -> Self {
+        RewardNormaliser { gamma, returns, moments }
+    }
+
+    /// The discount factor per step.
+    pub fn gamma(&self) -> f64 {
+        self.gamma
+    }
+
+    /// `[N]` R of the running episodes.
+    pub fn returns(&self) -> &[f64] {
+        &self.returns
     }
 
     /// Whether this is that of a training of `n_envs` environments with `gamma`; says what is wrong if it is not.
@@ -212,16 +258,11 @@ impl RewardNormaliser {
         for (sum, &reward) in self.returns.iter_mut().zip(rewards) {
             *sum = *sum * self.gamma + f64::from(reward);
         }
-        match active.filter(|active| active.contains(&false)) {
-            None => self.moments.merge(&RunningMoments::of(&self.returns, 1))?,
-            Some(active) => {
-                let counted = self.returns.iter().zip(active).filter(|(_, active)| **active);
-                let counted: Vec<f64> = counted.map(|(sum, _)| *sum).collect();
-                if !counted.is_empty() {
-                    self.moments.merge(&RunningMoments::of(&counted, 1))?;
-                }
-            }
-        }
+        let counts = |i: &usize| active.is_none_or(|active| active[*i]);
+        let counted = (0..rewards.len()).filter(counts);
+        let count = counted.clone().count();
+        self.moments.take_column(0, count, counted.map(|i| self.returns[i]));
+        self.moments.count += count as u64;
         for (sum, _) in self.returns.iter_mut().zip(done).filter(|(_, done)| **done) {
             *sum = 0.0;
         }

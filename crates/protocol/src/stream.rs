@@ -64,6 +64,9 @@ requests! {
     Snapshot => Snapshotted, Snapshot, Snapshot, "a snapshot";
     Restore => Restored, Restore, Restore, "to restore snapshots";
     Render => Rendered, Render, Render, "a picture";
+    Release => Released, Release, Release, "to release environments";
+    Act => Acted, Act, Act, "to act";
+    SavePlayer => PlayerSaved, SavePlayer, SavePlayer, "to save a player";
 }
 
 /// One session. Requests may be sent ahead; replies are taken in the order of their requests.

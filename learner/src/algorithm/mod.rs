@@ -16,7 +16,7 @@ use crate::error::Result;
 use crate::policy::Policy;
 use crate::rollout::{self, Estimates, Rollout};
 use perturb_policy::NamedArray;
-use perturb_policy::check_length;
+use perturb_policy::{Task, check_length};
 
 /// What an update learns from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -25,6 +25,16 @@ pub enum Experience {
     Steps(usize),
     /// So many complete episodes, each in a freshly drawn environment.
     Episodes(usize),
+}
+
+impl Experience {
+    /// What is to be played in N = `n_envs` environments.
+    pub fn task(self, n_envs: usize) -> Task {
+        match self {
+            Self::Steps(count) => Task::steps(count),
+            Self::Episodes(count) => Task::episodes(count, n_envs),
+        }
+    }
 }
 
 /// Learns from rollouts.

@@ -14,6 +14,7 @@ use super::{JSON, Result};
 use crate::algorithm::AlgorithmState;
 use crate::logging::{EpisodeFigures, LogLengths, TimeShares};
 use crate::rollout::CollectorState;
+use perturb_policy::PlayerState;
 
 pub(super) const PREFIX: &str = "resume-";
 
@@ -62,7 +63,7 @@ impl ResumeState {
         let file = arrays.file.clone();
         let mut algorithm = self.algorithm.clone();
         algorithm.optimiser.iter_mut().for_each(|array| array.data.clear());
-        let (actions, history) = (self.collector.actions.clone(), self.history.clone());
+        let (actions, history) = (self.collector.player.actions.clone(), self.history.clone());
         let value = serde_json::to_value(Document { arrays, algorithm, actions, history });
         Ok((file, value.map_err(|error| damaged(directory, error.to_string()))?))
     }
@@ -78,7 +79,8 @@ impl ResumeState {
     }
 
     fn encode(&self) -> std::result::Result<Vec<u8>, String> {
-        let CollectorState { snapshots, observations, starts, outcomes, memory, actions: _ } = &self.collector;
+        let CollectorState { snapshots, player } = &self.collector;
+        let PlayerState { observations, starts, outcomes, memory, actions: _ } = player;
         let num_envs = starts.len();
         let rows = |data: &[f32]| vec![num_envs, data.len() / num_envs.max(1)];
         let mut arrays = vec![
@@ -103,14 +105,15 @@ impl Document {
         for array in &mut self.algorithm.optimiser {
             array.data = arrays.f32(&optimiser(&array.name))?.data;
         }
-        let collector = CollectorState {
-            snapshots: cut(arrays.u8("snapshots")?, &arrays.u64("snapshot_lengths")?)?,
+        let player = PlayerState {
             observations: arrays.f32("observations")?.data,
             starts: arrays.u8("starts")?.iter().map(|&start| start != 0).collect(),
             outcomes: arrays.f32("outcomes")?.data,
             memory: arrays.f32("memory")?.data,
             actions: self.actions,
         };
+        let snapshots = cut(arrays.u8("snapshots")?, &arrays.u64("snapshot_lengths")?)?;
+        let collector = CollectorState { snapshots, player };
         Ok(ResumeState { collector, algorithm: self.algorithm, history: self.history })
     }
 }

@@ -9,6 +9,7 @@ use crate::logging::{EpisodeFigures, LogLengths, TimeShares};
 use crate::policy::Policy;
 use crate::rollout::CollectorState;
 use perturb_policy::NamedArray;
+use perturb_policy::PlayerState;
 use perturb_policy::random::{Purpose, stream};
 
 fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
@@ -50,11 +51,13 @@ fn resume_state(seed: u64) -> ResumeState {
     ResumeState {
         collector: CollectorState {
             snapshots: vec![Bytes::from_static(b"\0one"), Bytes::from(vec![255; seed as usize])],
-            observations: vec![0.1, f32::MIN_POSITIVE, -3.0, 1e-7, 10.0, seed as f32],
-            starts: vec![true, false],
-            outcomes: vec![0.5; 6],
-            memory: if recurrent { vec![0.25; 12] } else { vec![] },
-            actions: rng.clone(),
+            player: PlayerState {
+                observations: vec![0.1, f32::MIN_POSITIVE, -3.0, 1e-7, 10.0, seed as f32],
+                starts: vec![true, false],
+                outcomes: vec![0.5; 6],
+                memory: if recurrent { vec![0.25; 12] } else { vec![] },
+                actions: rng.clone(),
+            },
         },
         algorithm: AlgorithmState {
             n_updates: 1 << 40,
@@ -100,7 +103,7 @@ fn what_resuming_needs_is_saved_and_loaded_bit_for_bit() {
         saved.save(directory.path(), Some(&state)).unwrap();
         let (loaded, mut loaded_state) = Checkpoint::load_with_resume(directory.path()).unwrap();
         assert_eq!((&loaded, &loaded_state), (&saved, &state));
-        assert_eq!(loaded_state.collector.actions.next_u64(), state.collector.actions.clone().next_u64());
+        assert_eq!(loaded_state.collector.player.actions.next_u64(), state.collector.player.actions.clone().next_u64());
     }
 }
 

@@ -5,11 +5,18 @@
 //! single-threaded tokio runtime inside [`Servers`] runs on the caller's thread, while a call waits. A hand-over to another thread would double a step's latency.
 //! Long computations between two calls belong into [`Servers::keep_alive_during`].
 
+pub mod acting;
+mod options;
+mod part;
+mod reply;
 mod servers;
 mod session;
 mod single;
 
+pub use acting::{ActAt, Played};
+pub use options::OpenOptions;
 pub use perturb_protocol::{Address, AddressError, ClientError, PrivateServer};
+pub use reply::{EndedEpisode, StepReply, StepSlice};
 pub use servers::Servers;
-pub use session::{EndedEpisode, OpenOptions, Session, StepReply};
+pub use session::Session;
 pub use single::{BegunEpisode, Picture, Single};

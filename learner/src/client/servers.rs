@@ -10,6 +10,7 @@ use tokio::sync::oneshot;
 
 use perturb_protocol::{Address, ClientError, Connection, Machines, PrivateServer, first_of, machines};
 
+use super::acting::ActAt;
 use crate::proto;
 
 /// Connections to servers, all of which serve the same environments.
@@ -19,9 +20,20 @@ pub struct Servers {
     connections: Vec<Connection>,
     runtime: Runtime,
     local: Option<Mutex<PrivateServer>>,
+    act: ActAt,
 }
 
 impl Servers {
+    /// The same, with actions chosen there.
+    pub fn with_act(self, act: ActAt) -> Self {
+        Self { act, ..self }
+    }
+
+    /// Where actions are chosen.
+    pub(super) fn act(&self) -> ActAt {
+        self.act
+    }
+
     /// Starts a private server with so many physics threads (`None`: one a core), and connects to it.
     ///
     /// # Errors
@@ -42,7 +54,7 @@ impl Servers {
         let runtime = runtime()?;
         let one = |address| async move { any_of(address, machines(address).await?.into_order(own_turn())).await };
         let connections = addresses.iter().map(|address| runtime.block_on(one(address))).collect::<Result<_, _>>()?;
-        Ok(Self { connections, runtime, local: None })
+        Ok(Self { connections, runtime, local: None, act: ActAt::default() })
     }
 
     /// Connects to one server of `addresses`, where every machine that a name stands for counts: to number `turn`, counted
@@ -63,7 +75,7 @@ impl Servers {
                 }
             }
         })?;
-        Ok(Self { connections: vec![connection], runtime, local: None })
+        Ok(Self { connections: vec![connection], runtime, local: None, act: ActAt::default() })
     }
 
     /// Connects to all servers of `addresses` that take sessions, where every machine that a name stands for counts, and
@@ -93,7 +105,7 @@ impl Servers {
         if connections.is_empty() {
             return Err(ClientError::of_all(errors));
         }
-        Ok((Self { connections, runtime, local: None }, errors))
+        Ok((Self { connections, runtime, local: None, act: ActAt::default() }, errors))
     }
 
     /// Where the servers are, one address for each connection.

@@ -4,8 +4,10 @@ use tonic::Code;
 
 use perturb_protocol::{Ask, ClientError};
 
+use super::options::OpenOptions;
+use super::part::Part;
+use super::reply::StepReply;
 use super::servers::Servers;
-use super::session::{OpenOptions, Part, StepReply, open_part};
 use crate::proto::{self, AutoresetMode};
 
 /// An episode that began.
@@ -59,7 +61,7 @@ impl<'a> Single<'a> {
             let source = std::io::ErrorKind::NotConnected.into();
             return Err(ClientError::System { action: "open an environment", source });
         };
-        let opening = open_part(connection, options, 0..1, AutoresetMode::Disabled);
+        let opening = Part::open(connection, std::slice::from_ref(options), 0..1, AutoresetMode::Disabled);
         let (part, opened) = servers.runtime().block_on(opening).map_err(|error| servers.explain(error))?;
         let environment = opened.environment.unwrap_or_default();
         observation.resize(environment.observation.len(), 0.0);

@@ -6,8 +6,9 @@ use perturb_protocol::Version;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::{EpisodeRecord, Records};
 
-use super::agent::Agent;
-use super::test::{TestError, Trials, check_unchanged, ending};
+use super::player;
+use super::test::{TestError, check_unchanged, ending};
+use super::trials::Trials;
 use crate::checkpoint::{Checkpoint, EnvironmentSummary};
 use crate::client::{EndedEpisode, OpenOptions, Servers, Session};
 
@@ -76,7 +77,10 @@ pub fn audit(
         if running.is_empty() {
             return Ok(audit);
         }
-        for end in replay.trials.step(stop)? {
+        if let Some(signal) = stop.signal() {
+            return Err(TestError::Stopped { signal }.into());
+        }
+        for end in replay.trials.step()? {
             let Some(recorded) = running.remove(&end.slot) else { continue };
             audit.episodes += 1;
             audit.different.extend(difference(recorded, &end));
@@ -121,9 +125,9 @@ impl<'a> Replay<'a> {
         let mut observations = Vec::new();
         let session = Session::open(servers, &options, &mut observations)?;
         check_unchanged(checkpoint, EnvironmentSummary::of(session.environment()))?;
-        let agent = Agent::new(checkpoint, num_envs, 0)?;
+        let player = player(checkpoint, num_envs, 0)?;
         Ok(Self {
-            trials: Trials::new(session, agent, observations, about.episodes_per_trial),
+            trials: Trials::begin(session, player, &observations)?,
             names: about.parameters.iter().map(|parameter| parameter.name.clone()).collect(),
             episodes_per_trial: about.episodes_per_trial.into(),
         })
@@ -131,15 +135,16 @@ impl<'a> Replay<'a> {
 
     /// Brings the environment of `slot` to the start of the trial that `episode` is the last one of.
     fn begin(&mut self, slot: usize, episode: &EpisodeRecord) -> Result<(), TestError> {
-        let Trials { session, agent, reply, .. } = &mut self.trials;
+        let Trials { session, player, .. } = &mut self.trials;
+        let mut observation = vec![0.0; session.observation_size()];
         let values = self.names.iter().map(String::as_str).zip(episode.requested.iter().copied());
-        session.reset_with(slot, &values.collect::<Vec<_>>(), episode.seed, &mut reply.observations)?;
+        session.reset_with(slot, &values.collect::<Vec<_>>(), episode.seed, &mut observation)?;
         let trial = episode.episode_index / self.episodes_per_trial;
         for _ in 0..trial * self.episodes_per_trial {
-            session.reset_one(slot, &mut reply.observations)?;
+            session.reset_one(slot, &mut observation)?;
         }
-        agent.begin_trial_of(slot, episode.seed, trial);
-        Ok(())
+        player.begin_trial(slot, episode.seed, trial);
+        Ok(player.see(slot, &observation)?)
     }
 }
 

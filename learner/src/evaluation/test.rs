@@ -9,9 +9,10 @@ use perturb_study::success::Threshold;
 use perturb_study::{TestResult, ValueError};
 use rand::Rng;
 
-use super::agent::Agent;
+use super::player;
+use super::trials::{RemoteTrials, Trials};
 use crate::checkpoint::{Checkpoint, EnvironmentSummary, State};
-use crate::client::{ClientError, EndedEpisode, OpenOptions, Servers, Session, StepReply};
+use crate::client::{ClientError, EndedEpisode, OpenOptions, Servers, Session};
 
 /// The most environments that are tested together, unless a set has more contexts.
 const MOST_ENVS: usize = 100;
@@ -192,23 +193,35 @@ impl<'a> Tester<'a> {
         };
         let mut observations = Vec::new();
         let mut session = Session::open(self.servers, &options, &mut observations)?;
+        let size = session.observation_size();
         for slot in 0..quotas.len() {
             let context: Vec<(&str, f64)> =
                 contexts[slot % contexts.len()].iter().map(|(name, value)| (name.as_str(), *value)).collect();
             if !context.is_empty() {
-                session.reset_with(slot, &context, test.seed, &mut observations)?;
+                let row = &mut observations[slot * size..][..size];
+                session.reset_with(slot, &context, test.seed, row)?;
             }
         }
-        let agent = Agent::new(self.checkpoint, quotas.len(), test.seed)?;
-        let mut trials = Trials::new(session, agent, observations, self.about.episodes_per_trial);
-        let mut counted: Vec<EndedEpisode> = Vec::new();
+        let player = player(self.checkpoint, quotas.len(), test.seed)?;
         let episodes: u64 = quotas.iter().sum();
+        let mut trials: Box<dyn FnMut() -> Result<Vec<EndedEpisode>, TestError>> = if session.acts() {
+            let mut remote = RemoteTrials::new(session, &player, self.checkpoint);
+            Box::new(move || remote.play())
+        } else {
+            let mut trials = Trials::begin(session, player, &observations)?;
+            Box::new(move || trials.step())
+        };
+        let mut counted: Vec<EndedEpisode> = Vec::new();
         while (counted.len() as u64) < episodes {
+            if let Some(signal) = stop.signal() {
+                return Err(TestError::Stopped { signal });
+            }
             // Environments that are done go on, unseen: they cost less than a smaller batch would save.
-            let ended = trials.step(stop)?;
+            let ended = trials()?;
             counted.extend(ended.into_iter().filter(|end| end.trial_index < quotas[end.slot]));
             report(counted.len() as u64);
         }
+        drop(trials);
         counted.sort_by_key(|end| (end.environment_index, end.episode_index));
         let asked: Vec<Vec<Distribution>> = contexts.iter().map(|context| self.asked(&test.set, context)).collect();
         for end in &counted {
@@ -289,41 +302,6 @@ pub(super) fn ending(end: &EndedEpisode) -> Ending {
         (true, _) => Ending::Diverged,
         (false, true) => Ending::Terminated,
         (false, false) => Ending::Truncated,
-    }
-}
-
-/// A policy that plays trials in the environments of a session.
-pub(super) struct Trials<'a> {
-    pub(super) session: Session<'a>,
-    pub(super) agent: Agent<'a>,
-    pub(super) reply: StepReply,
-    /// `[N]` where an episode has just ended.
-    done: Vec<bool>,
-    episodes_per_trial: u32,
-}
-
-impl<'a> Trials<'a> {
-    /// In the environments of `session`, which are at their first `observations` `[N, O]`.
-    pub(super) fn new(session: Session<'a>, agent: Agent<'a>, observations: Vec<f32>, episodes_per_trial: u32) -> Self {
-        let done = vec![false; session.num_envs()];
-        let reply = StepReply { observations, ..StepReply::default() };
-        Self { session, agent, reply, done, episodes_per_trial }
-    }
-
-    /// A step in all environments; gives the episodes that ended a trial in it.
-    pub(super) fn step(&mut self, stop: &StopFlag) -> Result<Vec<EndedEpisode>, TestError> {
-        if let Some(signal) = stop.signal() {
-            return Err(TestError::Stopped { signal });
-        }
-        let Self { session, agent, reply, done, episodes_per_trial } = self;
-        session.step(agent.act(&mut reply.observations)?, reply)?;
-        done.fill(false);
-        reply.ended.iter().for_each(|end| done[end.slot] = true);
-        agent.remember(&mut reply.rewards, done)?;
-        let ended: Vec<EndedEpisode> =
-            reply.ended.drain(..).filter(|end| end.episode_in_trial + 1 == *episodes_per_trial).collect();
-        ended.iter().for_each(|end| agent.begin_trial(end.slot, end.trial_index + 1));
-        Ok(ended)
     }
 }
 

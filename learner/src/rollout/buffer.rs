@@ -2,30 +2,7 @@
 
 use super::advantage::Trajectories;
 use crate::error::{Error, Result};
-use perturb_policy::check_length;
-
-/// One step of N environments, as it is pushed.
-#[derive(Clone, Copy, Debug)]
-pub struct RolloutStep<'a> {
-    /// `[N, O]` observations s_t that the actions were chosen on, normalised.
-    pub observations: &'a [f32],
-    /// `[N]` whether s_t is the first that the policy remembers: its memory was emptied before it.
-    pub starts: &'a [bool],
-    /// `[N, A]` actions, as in [`Acts`](perturb_policy::Acts).
-    pub actions: &'a [f32],
-    /// `[N]` log-probabilities of the actions under the acting policy.
-    pub log_probs: &'a [f32],
-    /// `[N]` V(s_t).
-    pub values: &'a [f32],
-    /// `[N]` rewards r_t that the actions brought, normalised.
-    pub rewards: &'a [f32],
-    /// `[N]` whether the task ended the episode.
-    pub terminated: &'a [bool],
-    /// `[N]` whether the time limit ended it.
-    pub truncated: &'a [bool],
-    /// `[N]` V(final observation) where truncated; ignored elsewhere.
-    pub truncation_values: &'a [f32],
-}
+use perturb_policy::{RolloutStep, check_length};
 
 /// A complete episode in a rollout.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -137,12 +114,13 @@ impl Rollout {
         self.lengths = None;
     }
 
-    /// Appends a step. A wrong length, or a step too many, changes nothing.
+    /// Appends a step, or several, whose arrays are `[T, N, …]`. A wrong length, or a step too many, changes nothing.
     pub fn push(&mut self, step: RolloutStep<'_>) -> Result<()> {
-        if self.is_full() {
+        let steps = (step.rewards.len() / self.n_envs).max(1);
+        if self.wanted.is_some_and(|wanted| self.len + steps > wanted) {
             return Err(Error::RolloutLength { got: self.len, expected: self.n_steps(), what: "a step was pushed" });
         }
-        let n = self.n_envs;
+        let n = steps * self.n_envs;
         check_length("observations [N, O]", step.observations.len(), n * self.observation_size)?;
         check_length("starts [N]", step.starts.len(), n)?;
         check_length("actions [N, A]", step.actions.len(), n * self.action_width)?;
@@ -161,7 +139,7 @@ impl Rollout {
         self.terminated.extend_from_slice(step.terminated);
         self.truncated.extend_from_slice(step.truncated);
         self.truncation_values.extend_from_slice(step.truncation_values);
-        self.len += 1;
+        self.len += steps;
         Ok(())
     }
 
@@ -215,13 +193,13 @@ impl Rollout {
         self.wanted.unwrap_or(self.len)
     }
 
-    /// Notes that the last step that was pushed ended an episode of which the rollout has every step.
+    /// Notes that the last of `end` steps ended an episode of which the rollout has every step.
     ///
     /// # Errors
     /// One that the rollout does not hold: without steps, longer than the rollout, of an environment that is not there.
-    pub fn note_episode(&mut self, environment: usize, length: usize, episode_return: f64) -> Result<()> {
-        self.check_episode(environment, self.len, length)?;
-        self.episodes.push(Span { environment, start: self.len - length, length, episode_return });
+    pub fn note_episode(&mut self, environment: usize, end: usize, length: usize, episode_return: f64) -> Result<()> {
+        self.check_episode(environment, end, length)?;
+        self.episodes.push(Span { environment, start: end - length, length, episode_return });
         Ok(())
     }
 

@@ -3,9 +3,10 @@
 mod advantage;
 mod buffer;
 mod collector;
-mod normalisers;
+mod remote;
 
 pub use advantage::{Estimates, Trajectories, explained_variance, gae, n_step_returns};
-pub use buffer::{Rollout, RolloutStep, Span};
-pub use collector::{CollectError, Collector, CollectorState, Times};
-pub use normalisers::Normalisers;
+pub use buffer::{Rollout, Span};
+pub use collector::{CollectError, Collector, CollectorState};
+pub use perturb_policy::{Normalisers, RolloutStep};
+pub use remote::RemoteCollector;

@@ -90,6 +90,15 @@ pub struct LastCheckpoint {
 }
 
 impl TrainError {
+    /// Whether a server had no room for the environments.
+    pub fn is_for_want_of_room(&self) -> bool {
+        match self {
+            Self::Client(ClientError::Refused { code, .. }) => *code == tonic::Code::ResourceExhausted,
+            Self::Restore { source, .. } | Self::Failed { source, .. } => source.is_for_want_of_room(),
+            _ => false,
+        }
+    }
+
     /// Whether the same may go well later or with another server, see [`ClientError::can_be_retried`].
     pub fn can_be_retried(&self) -> bool {
         match self {

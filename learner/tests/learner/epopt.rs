@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, HashSet};
 
 use crate::common::{bases, connect, contents, moved, options, server};
-use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Epopt, Ppo, Selection, UpdateStats};
+use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Epopt, Experience, Ppo, Selection, UpdateStats};
 use perturb_learner::client::{EndedEpisode, PrivateServer, Session};
 use perturb_learner::error::Error;
 use perturb_learner::policy::Policy;
@@ -12,7 +12,9 @@ use perturb_learner::rollout::{
 };
 use perturb_learner::torch::{Sequences, TorchPolicy};
 use perturb_policy::random::{Purpose, normal, stream, uniform};
-use perturb_policy::{ActionKind, Actor, Acts, Inputs, ObservationNormaliser, PolicySpec, RewardNormaliser};
+use perturb_policy::{
+    ActionKind, Actor, Acts, Inputs, ObservationNormaliser, Player, PolicySpec, RewardNormaliser, Role,
+};
 use perturb_study::settings::{A2cConfig, EpoptConfig, PpoConfig};
 use proptest::prelude::*;
 use rand_chacha::ChaCha8Rng;
@@ -65,7 +67,9 @@ fn play(policy: &Policy, lengths: &[Vec<usize>], returns: &[Vec<f64>], mut rollo
         };
         rollout.push(step).expect("a step that fits");
         for n in (0..n_envs).filter(|&n| ended[n]) {
-            rollout.note_episode(n, ages[n], returns[n][episodes[n]]).expect("an episode of the rollout");
+            rollout
+                .note_episode(n, rollout.len(), ages[n], returns[n][episodes[n]])
+                .expect("an episode of the rollout");
             (episodes[n], ages[n]) = (episodes[n] + 1, 0);
             actor.forget(n);
         }
@@ -220,7 +224,7 @@ fn coded(lengths: &[Vec<usize>]) -> Rollout {
         rollout.push(step).expect("a step that fits");
         for n in (0..n_envs).filter(|&n| ended(n)) {
             let k = ends[n].iter().position(|&end| end == t + 1).expect("its number");
-            rollout.note_episode(n, lengths[n][k], 0.0).expect("an episode of the rollout");
+            rollout.note_episode(n, rollout.len(), lengths[n][k], 0.0).expect("an episode of the rollout");
         }
     }
     rollout.finish(&vec![99.0; n_envs]).expect("values that fit");
@@ -358,7 +362,7 @@ fn episodes_that_a_rollout_does_not_hold_are_refused() {
         assert!(matches!(result, Err(Error::Episode { n_envs: 2, n_steps: 6, .. })), "{wrong:?}: {result:?}");
     }
     for (environment, length) in [(2, 1), (0, 7), (0, 0)] {
-        let result = rollout.note_episode(environment, length, 0.0);
+        let result = rollout.note_episode(environment, rollout.len(), length, 0.0);
         assert!(matches!(result, Err(Error::Episode { .. })), "{environment} {length}: {result:?}");
     }
     let policy = moved(&spec(DISCRETE, None));
@@ -482,7 +486,8 @@ fn blind(input_size: usize) -> Policy {
 fn collect(servers: &[PrivateServer], normalised: bool) -> (Vec<(Rollout, Vec<EndedEpisode>)>, Normalisers) {
     let servers = connect(servers);
     let mut observations = Vec::new();
-    let session = Session::open(&servers, &options("CartPole", CARTPOLES, 1), &mut observations).expect("a session");
+    let mut session =
+        Session::open(&servers, &options("CartPole", CARTPOLES, 1), &mut observations).expect("a session");
     let size = session.observation_size();
     let policy = blind(size);
     let inputs = Inputs::new(size, policy.spec().action, CARTPOLES, false);
@@ -490,16 +495,19 @@ fn collect(servers: &[PrivateServer], normalised: bool) -> (Vec<(Rollout, Vec<En
         observations: normalised.then(|| ObservationNormaliser::new(size)),
         rewards: normalised.then(|| RewardNormaliser::new(CARTPOLES, 0.9)),
     };
-    let mut collector =
-        Collector::new(session, observations, policy.spec(), inputs, normalisers, 1).expect("a collector");
+    let mut player = Player::new(policy.spec(), inputs, CARTPOLES, 1, normalisers, Role::training(1));
+    player.begin(&observations, None).expect("observations");
+    let mut collector = Collector::new(player);
     let mut collected = Vec::new();
     for _ in 0..2 {
         let (mut rollout, mut ended) = (Rollout::of_episodes(CARTPOLES, size, 1), Vec::new());
         let on_episode = |episode: &EndedEpisode| ended.push(episode.clone());
-        collector.collect_episodes(policy.flat_weights(), COUNT, &mut rollout, on_episode).expect("a rollout");
+        let episodes = Experience::Episodes(COUNT);
+        let weights = policy.flat_weights();
+        collector.collect(&mut session, weights, episodes, &mut rollout, on_episode).expect("a rollout");
         collected.push((rollout, ended));
     }
-    (collected, collector.normalisers().clone())
+    (collected, collector.player().normalisers().clone())
 }
 
 #[test]
@@ -620,7 +628,7 @@ fn pull(policy: &Policy, rng: &mut ChaCha8Rng, episodes: usize) -> Rollout {
         };
         rollout.push(step).expect("a step that fits");
         for (n, reward) in rewards.into_iter().enumerate() {
-            rollout.note_episode(n, 1, f64::from(reward)).expect("an episode");
+            rollout.note_episode(n, rollout.len(), 1, f64::from(reward)).expect("an episode");
         }
     }
     rollout.finish(&[0.0; ENVS]).expect("a finished rollout");

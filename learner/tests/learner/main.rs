@@ -9,3 +9,4 @@ mod learning;
 mod losses;
 mod recurrent;
 mod rl2;
+mod together;

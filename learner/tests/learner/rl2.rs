@@ -2,7 +2,7 @@
 //! learn.
 
 use crate::common::{bases, connect, contents, moved, options, server};
-use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
+use perturb_learner::algorithm::{A2c, Algorithm, Experience, Ppo};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{EndedEpisode, OpenOptions, Servers, Session, StepReply};
 use perturb_learner::evaluation::test;
@@ -10,7 +10,7 @@ use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Collector, Normalisers, Rollout, RolloutStep, gae};
 use perturb_learner::training::{RunDirectory, train};
 use perturb_policy::random::{Purpose, stream, uniform};
-use perturb_policy::{ActionKind, Actor, Acts, Inputs, PolicySpec};
+use perturb_policy::{ActionKind, Actor, Acts, Inputs, Player, PolicySpec, Role};
 use perturb_study::Version;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::settings::{self, A2cConfig, PpoConfig, TrainConfig};
@@ -26,12 +26,14 @@ fn policy(observation_size: usize, action: ActionKind) -> Policy {
     moved(&PolicySpec { observation_size, action, hidden: vec![8], lstm: Some(6) })
 }
 
-fn collector<'a>(servers: &'a Servers, options: &OpenOptions, policy: &Policy) -> Collector<'a> {
+fn collector<'a>(servers: &'a Servers, options: &OpenOptions, policy: &Policy) -> (Session<'a>, Collector) {
     let mut observations = Vec::new();
     let session = Session::open(servers, options, &mut observations).expect("a session");
     let inputs = Inputs::new(session.observation_size(), policy.spec().action, options.num_envs, true);
-    let none = Normalisers { observations: None, rewards: None };
-    Collector::new(session, observations, policy.spec(), inputs, none, 1).expect("a collector")
+    let (n, trial, none) = (options.num_envs, options.episodes_per_trial, Normalisers::default());
+    let mut player = Player::new(policy.spec(), inputs, n, trial, none, Role::training(1));
+    player.begin(&observations, None).expect("observations");
+    (session, Collector::new(player))
 }
 
 fn as_bits(flag: bool) -> f32 {
@@ -119,8 +121,10 @@ fn a_trial_of_one_episode_is_a_recurrent_policy_with_longer_inputs() {
         let policy = policy(size, action);
         let expected = extended_by_hand(&servers, &options, &policy, n_steps);
         let mut rollout = Rollout::new(n_steps, N_ENVS, policy.spec().observation_size, 1);
-        let mut collector = collector(&servers, &options, &policy);
-        collector.collect(policy.flat_weights(), &mut rollout, |_| {}).expect("a rollout");
+        let (mut session, mut collector) = collector(&servers, &options, &policy);
+        collector
+            .collect(&mut session, policy.flat_weights(), Experience::Steps(n_steps), &mut rollout, |_| {})
+            .expect("a rollout");
         assert!(rollout.starts()[N_ENVS..].contains(&true), "an episode has ended");
         assert_eq!(contents(&rollout), contents(&expected), "{environment}");
         for which in 0..2 {
@@ -146,12 +150,13 @@ impl Steps {
         let server = [server()];
         let servers = connect(&server);
         let options = options(environment, N_ENVS, episodes_per_trial);
-        let mut collector = collector(&servers, &options, policy);
+        let (mut session, mut collector) = collector(&servers, &options, policy);
         let mut steps = Steps { rollouts: Vec::new(), ended: Vec::new() };
         for t in 0..n_steps {
             let mut rollout = Rollout::new(1, N_ENVS, policy.spec().observation_size, 1);
             let on_episode = |episode: &EndedEpisode| steps.ended.push((t, episode.clone()));
-            collector.collect(policy.flat_weights(), &mut rollout, on_episode).expect("a rollout");
+            let one = Experience::Steps(1);
+            collector.collect(&mut session, policy.flat_weights(), one, &mut rollout, on_episode).expect("a rollout");
             steps.rollouts.push(rollout);
         }
         steps
@@ -220,10 +225,11 @@ fn advantages_run_across_the_episodes_of_a_trial() {
     let servers = connect(&server);
     let policy = policy(4, TWO);
     let mut rollout = Rollout::new(150, N_ENVS, policy.spec().observation_size, 1);
-    let mut collector = collector(&servers, &options("CartPole", N_ENVS, 2), &policy);
+    let (mut session, mut collector) = collector(&servers, &options("CartPole", N_ENVS, 2), &policy);
     let mut lengths: [Vec<(u32, u32)>; N_ENVS] = Default::default();
     let on_episode = |end: &EndedEpisode| lengths[end.slot].push((end.length, end.episode_in_trial));
-    collector.collect(policy.flat_weights(), &mut rollout, on_episode).expect("a rollout");
+    let steps = Experience::Steps(150);
+    collector.collect(&mut session, policy.flat_weights(), steps, &mut rollout, on_episode).expect("a rollout");
     let trajectories = rollout.trajectories().expect("a finished rollout");
     let (gamma, values) = (0.9, rollout.values());
     let one_step = gae(&trajectories, gamma, 0.0, true).advantages;

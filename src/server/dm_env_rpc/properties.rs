@@ -108,11 +108,7 @@ fn of_world(joined: &Joined, episode: EpisodeId, receipt: Option<&Receipt>) -> V
         new("environment_index", "fixes randomness together with the seed", uint32(episode.environment_index)),
         new("trial_index", "counts trials from 0", uint64(episode.trial_index)),
         new("episode_index", "counts episodes from 0", uint64(episode.episode_index)),
-        new(
-            "episodes_per_trial",
-            "episodes with the same parameters",
-            uint32(runner.settings().episodes.episodes_per_trial),
-        ),
+        new("episodes_per_trial", "episodes with the same parameters", uint32(runner.episodes().episodes_per_trial)),
         new("step_limit", "an episode is INTERRUPTED after so many steps", uint32(spec.step_limit)),
         new("control_timestep", "simulated seconds in a step", double(spec.control_timestep)),
         Property::folder(PARAMETERS, "what was drawn or given for the episode; writing a parameter fixes it"),

@@ -1,7 +1,7 @@
 //! A world's episodes, one after the other, on the pool: a batch of one environment.
 
 use crate::{
-    env::{Distribution, EnvironmentSpec, EpisodeStart, Version},
+    env::{Distribution, EnvironmentSpec, EpisodeStart, Settings, Version},
     pool::{Batch, BatchSettings, Pool, ResetEntry, Stepped},
     proto::dm_env_rpc::v1::EnvironmentStateType as State,
     server::status::Refusal,
@@ -63,19 +63,19 @@ impl Runner {
     /// # Errors
     /// If the pool is full or a model cannot be loaded.
     pub(super) async fn open(pool: &Pool, settings: BatchSettings, version: Version) -> Result<Self, Refusal> {
-        let seed = settings.episodes.seed;
         let (batch, first, started) = Batch::open(pool, settings).await?;
+        let seed = batch.settings().groups[0].episodes.seed;
         Ok(Self { batch, phase: Phase::Unseen, first, start: only(started), seed, version })
     }
 
-    /// What it was made with.
-    pub(super) fn settings(&self) -> &BatchSettings {
-        self.batch.settings()
+    /// What its episodes were fixed by when it was made.
+    pub(super) fn episodes(&self) -> &Settings {
+        &self.batch.settings().groups[0].episodes
     }
 
     /// Its environment.
     pub(super) fn spec(&self) -> &'static EnvironmentSpec {
-        self.settings().spec
+        self.batch.settings().spec
     }
 
     /// The episode that was begun last, with its receipt.

@@ -3,7 +3,7 @@
 use super::tensors;
 use crate::{
     env::{self, Catalogue, Distribution, EnvironmentSpec, Version, resolve, shorten},
-    pool::{Autoreset, BatchSettings},
+    pool::{Autoreset, BatchSettings, SlotGroup},
     proto::dm_env_rpc::v1::Tensor,
     server::status::Refusal,
 };
@@ -57,7 +57,13 @@ pub(super) fn create(catalogue: &Catalogue, settings: &Settings) -> Result<(Batc
     };
     // An agent's step after the end begins the next episode by a reset.
     let autoreset = Autoreset::Disabled;
-    let batch = BatchSettings { spec, size: 1, episodes, autoreset, receipts: true, reward_terms: false };
+    let batch = BatchSettings {
+        spec,
+        groups: vec![SlotGroup { size: 1, episodes }],
+        autoreset,
+        receipts: true,
+        reward_terms: false,
+    };
     Ok((batch, version))
 }
 

@@ -40,7 +40,7 @@ impl World {
     pub(super) fn new(name: String, runner: &Runner) -> Self {
         let wanted = Wanted {
             version: runner.version(),
-            distributions: runner.settings().episodes.distributions.clone(),
+            distributions: runner.episodes().distributions.clone(),
             new_distributions: false,
             seed: None,
             interruption: false,

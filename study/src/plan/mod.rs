@@ -6,6 +6,7 @@
 
 mod expansion;
 mod file;
+mod groups;
 mod sets;
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
@@ -21,6 +22,7 @@ use crate::success::{Criterion, Threshold};
 use crate::value_error::ValueError;
 use crate::{AnyError, Method, Version};
 use file::File;
+pub use groups::Grouping;
 
 /// Everything that an experiment file asks for.
 #[derive(Clone, Debug)]

@@ -1,5 +1,6 @@
 //! What a worker is told and what it tells: one JSON object a line, on its standard input and output.
 
+use std::collections::HashMap;
 use std::fs::File;
 use std::io::Write;
 use std::os::unix::fs::FileExt;
@@ -11,19 +12,28 @@ use serde::{Deserialize, Serialize};
 use super::count;
 use crate::folder::FailureMark;
 
-/// How often a worker says how far it is.
+/// How often a worker says how far a cell is, …
 const INTERVAL: Duration = Duration::from_secs(1);
+/// … times the number of its cells, but not more than this.
+const MOST_INTERVALS: u32 = 10;
 
 /// The only line that a worker reads. It stops when its standard input is closed, which also happens when the process
 /// that started it dies, however it dies.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Order {
-    /// The cell's id.
-    pub cell: String,
-    /// The failure that it may forget, and no other.
-    pub retry: Option<FailureMark>,
+    /// The cells of a group, at least one.
+    pub cells: Vec<OrderedCell>,
     /// Which of several servers it should take, counted around.
     pub turn: usize,
+}
+
+/// A cell of an [`Order`].
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct OrderedCell {
+    /// Its id.
+    pub cell: String,
+    /// The failure that may be forgotten, and no other.
+    pub retry: Option<FailureMark>,
 }
 
 /// A line that a worker writes, `{"cell": "…", "event": "training", …}`.
@@ -36,7 +46,7 @@ pub struct Line {
     pub event: CellEvent,
 }
 
-/// What happens to a cell. All but the first three end an attempt, and are a worker's last line.
+/// What happens to a cell. All but the first three end an attempt, and are a worker's last line about the cell.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 #[expect(missing_docs, reason = "the variants say what their fields are")]
@@ -60,12 +70,18 @@ pub enum CellEvent {
     Stopped { signal: i32 },
     /// The order makes no sense to the worker.
     Refused { reason: String },
-    /// The worker ended without a last line, in this way: said by whoever started it.
+    /// The worker ended without a last line about the cell, in this way: said by whoever started it.
     Killed { reason: String },
 }
 
 impl CellEvent {
-    pub(super) fn is_last(&self) -> bool {
+    /// Whether a cell's turn has come: a server is there for a whole group from the beginning.
+    pub(super) fn is_a_turn(&self) -> bool {
+        !matches!(self, Self::Server { .. })
+    }
+
+    /// Whether it ends an attempt.
+    pub fn is_last(&self) -> bool {
         !matches!(self, Self::Server { .. } | Self::Training { .. } | Self::Testing { .. })
     }
 
@@ -96,27 +112,30 @@ impl std::fmt::Display for CellEvent {
     }
 }
 
-/// Writes a cell's lines.
+/// Writes the lines of a group's cells.
 pub struct Teller<W> {
-    cell: String,
     out: W,
-    last: Option<(CellEvent, Instant)>,
+    interval: Duration,
+    /// The last line about each cell.
+    last: HashMap<String, (CellEvent, Instant)>,
 }
 
 impl<W: Write> Teller<W> {
-    /// Of the cell with this id.
-    pub fn new(cell: &str, out: W) -> Self {
-        Self { cell: cell.to_owned(), out, last: None }
+    /// Of so many cells.
+    pub fn new(cells: usize, out: W) -> Self {
+        let intervals = cells.clamp(1, MOST_INTERVALS as usize) as u32;
+        Self { out, interval: INTERVAL * intervals, last: HashMap::new() }
     }
 
-    /// Writes a line, unless it says hardly more than one of a moment ago.
-    pub fn tell(&mut self, event: CellEvent) {
-        let said = |(last, time): &(CellEvent, Instant)| time.elapsed() < INTERVAL && last.stage() == event.stage();
-        if event.stage().is_some() && self.last.as_ref().is_some_and(said) {
+    /// Writes a line about the cell with this id, unless it says hardly more than one of a moment ago.
+    pub fn tell(&mut self, cell: &str, event: CellEvent) {
+        let said =
+            |(last, time): &(CellEvent, Instant)| time.elapsed() < self.interval && last.stage() == event.stage();
+        if event.stage().is_some() && self.last.get(cell).is_some_and(said) {
             return;
         }
-        self.last = Some((event.clone(), Instant::now()));
-        write_line(&mut self.out, &Line { cell: self.cell.clone(), event });
+        self.last.insert(cell.to_owned(), (event.clone(), Instant::now()));
+        write_line(&mut self.out, &Line { cell: cell.to_owned(), event });
     }
 }
 
@@ -182,16 +201,20 @@ mod tests {
     #[test]
     fn how_far_it_is_is_said_once_a_second_but_each_checkpoint_at_once() {
         let mut out = Vec::new();
-        let mut teller = Teller::new("a", &mut out);
+        let mut teller = Teller::new(1, &mut out);
         let training = |episodes, saved| CellEvent::Training { episodes, timesteps: 10 * episodes, saved };
         for (episodes, saved) in [(0, 0), (1, 0), (2, 20), (3, 20)] {
-            teller.tell(training(episodes, saved));
+            teller.tell("a", training(episodes, saved));
         }
-        teller.tell(CellEvent::Testing { set: "D".into(), episodes: 1 });
-        teller.tell(CellEvent::Testing { set: "R".into(), episodes: 1 });
-        teller.last = teller.last.map(|(last, time)| (last, time.checked_sub(INTERVAL).unwrap()));
-        teller.tell(CellEvent::Testing { set: "R".into(), episodes: 2 });
-        teller.tell(CellEvent::Done);
+        let testing = |set: &str, episodes| CellEvent::Testing { set: set.into(), episodes };
+        teller.tell("a", testing("D", 1));
+        teller.tell("a", testing("R", 1));
+        teller.tell("b", testing("R", 1));
+        let (_, time) = teller.last.get_mut("a").unwrap();
+        *time = time.checked_sub(INTERVAL).unwrap();
+        teller.tell("a", testing("R", 2));
+        teller.tell("b", testing("R", 2));
+        teller.tell("a", CellEvent::Done);
         let words: Vec<String> = String::from_utf8(out).unwrap().lines().map(|line| line.replace('"', "")).collect();
         assert_eq!(
             words,
@@ -200,10 +223,17 @@ mod tests {
                 "{cell:a,event:training,episodes:2,timesteps:20,saved:20}",
                 "{cell:a,event:testing,set:D,episodes:1}",
                 "{cell:a,event:testing,set:R,episodes:1}",
+                "{cell:b,event:testing,set:R,episodes:1}",
                 "{cell:a,event:testing,set:R,episodes:2}",
                 "{cell:a,event:done}",
             ]
         );
+    }
+
+    #[test]
+    fn of_many_cells_less_is_said_about_each() {
+        let seconds = |cells| Teller::new(cells, Vec::new()).interval.as_secs();
+        assert_eq!([0, 1, 4, 36].map(seconds), [1, 1, 4, 10]);
     }
 
     #[test]

@@ -1,57 +1,60 @@
-//! Cells in processes of this machine, one in each.
+//! Cells in processes of this machine, a group in each.
 
+use std::collections::{BTreeMap, HashSet};
 use std::fs::File;
+use std::io::Write;
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::Instant;
 
 use super::event::{last_words, read_lines, write_line};
-use super::{Backend, CellEvent, News, Offer, Order, Result};
-use crate::files::{create_folder, io};
+use super::{Backend, CellEvent, News, Offer, Order, OrderedCell, Result};
+use crate::files::{FileError, create_folder, io};
 use crate::folder::Folder;
-use crate::plan::Plan;
+use crate::plan::{Grouping, Plan};
 
-/// Worker processes, each of which takes the lock of its cell itself.
+/// Worker processes, each of which takes the locks of its cells itself.
 pub struct Local<'a> {
     plan: &'a Plan,
     folder: &'a Folder,
-    jobs: usize,
+    grouping: Grouping,
     command: &'a dyn Fn() -> Command,
     server_ended: &'a dyn Fn() -> Option<String>,
     workers: Vec<Worker>,
 }
 
 struct Worker {
-    cell: usize,
+    /// The cells without a last line: their places in the plan, by id.
+    cells: BTreeMap<String, usize>,
+    /// Those whose turn has come.
+    begun: HashSet<usize>,
     child: Child,
     events: File,
     /// Up to where they were read.
     offset: u64,
-    last: Option<CellEvent>,
     log: PathBuf,
-    /// Where its words begin in the cell's log, in bytes.
+    /// Where its words begin in the log, in bytes.
     log_start: u64,
 }
 
 impl<'a> Local<'a> {
-    /// `jobs` workers at a time, at least 1, started by `command`; each reads an [`Order`] and writes
+    /// `grouping.at_a_time` workers, started by `command`; each reads an [`Order`] and writes
     /// [`Line`](super::Line)s. `server_ended` says how the server that they share ended, if it has.
     pub fn new(
         plan: &'a Plan,
         folder: &'a Folder,
-        jobs: usize,
+        grouping: Grouping,
         command: &'a dyn Fn() -> Command,
         server_ended: &'a dyn Fn() -> Option<String>,
     ) -> Self {
-        Self { plan, folder, jobs, command, server_ended, workers: Vec::new() }
+        Self { plan, folder, grouping, command, server_ended, workers: Vec::new() }
     }
 
-    fn start(&self, offer: &Offer) -> Result<Worker> {
-        let cell = &self.plan.cells[offer.cell];
-        let place = self.folder.cell(&cell.id);
-        create_folder(place.path())?;
-        let path = place.log();
-        let log = File::options().create(true).append(true).open(&path).map_err(io("open", &path))?;
+    fn start(&self, group: &[Offer]) -> Result<Option<Worker>> {
+        let Some(first) = group.first() else { return Ok(None) };
+        let cells: Vec<OrderedCell> =
+            group.iter().map(|offer| OrderedCell { cell: self.id(offer.cell).into(), retry: offer.retry }).collect();
+        let (log, path) = self.open_logs(group)?;
         let log_start = log.metadata().map_err(io("read", &path))?.len();
         let mut command = (self.command)();
         let program = PathBuf::from(command.get_program());
@@ -62,30 +65,77 @@ impl<'a> Local<'a> {
             Ok((child, events))
         };
         let (mut child, events) = start().map_err(io("start a worker process of", &program))?;
-        let order = Order { cell: cell.id.clone(), retry: offer.retry, turn: cell.index + offer.lost_servers };
+        let order = Order { cells, turn: self.first_turn().wrapping_add(first.group + first.lost_servers) };
         if let Some(input) = &mut child.stdin {
             write_line(input, &order);
         }
-        Ok(Worker { cell: offer.cell, child, events, offset: 0, last: None, log: path, log_start })
+        let cells = group.iter().map(|offer| (self.id(offer.cell).to_owned(), offer.cell)).collect();
+        Ok(Some(Worker { cells, begun: HashSet::new(), child, events, offset: 0, log: path, log_start }))
+    }
+
+    /// The log of a group, which is that of its first cell; the others' say so.
+    fn open_logs(&self, group: &[Offer]) -> Result<(File, PathBuf), FileError> {
+        let open = |offer: &Offer| {
+            let place = self.folder.cell(self.id(offer.cell));
+            create_folder(place.path())?;
+            let path = place.log();
+            let log = File::options().create(true).append(true).open(&path).map_err(io("open", &path))?;
+            Ok((log, path))
+        };
+        let first = open(&group[0])?;
+        for offer in &group[1..] {
+            let (mut log, path) = open(offer)?;
+            let first = self.id(group[0].cell);
+            writeln!(log, "done together with {first}: see ../{first}/log.txt").map_err(io("write", &path))?;
+        }
+        Ok(first)
+    }
+
+    /// Runs of single cells, as a cluster's jobs are, do not all begin with the same of several servers.
+    fn first_turn(&self) -> usize {
+        self.plan.cells.first().map_or(0, |cell| crc32c::crc32c(cell.id.as_bytes()) as usize)
+    }
+
+    fn id(&self, cell: usize) -> &'a str {
+        &self.plan.cells[cell].id
     }
 }
 
 impl Worker {
-    /// What it has said since the last call, and whether it has ended.
-    fn news(&mut self) -> std::io::Result<(Vec<CellEvent>, bool)> {
+    /// What it has said about its cells since the last call, and whether it has ended.
+    fn news(&mut self) -> std::io::Result<(Vec<News>, bool)> {
         let status = self.child.try_wait()?; // before its words are read, so that they are the last
-        let mut events: Vec<CellEvent> =
-            read_lines(&self.events, &mut self.offset)?.into_iter().map(|line| line.event).collect();
-        self.last = events.last().cloned().or(self.last.take());
-        if let Some(status) = status.filter(|_| !self.last.as_ref().is_some_and(CellEvent::is_last)) {
-            let words = last_words(&self.log, self.log_start).map_or_else(String::new, |words| format!(": {words}"));
-            events.push(CellEvent::Killed { reason: format!("its process ended with {status}{words}") });
+        let mut news = Vec::new();
+        for line in read_lines(&self.events, &mut self.offset)? {
+            let Some(&cell) = self.cells.get(&line.cell) else { continue };
+            if line.event.is_a_turn() {
+                self.begun.insert(cell);
+            }
+            if line.event.is_last() {
+                self.cells.remove(&line.cell);
+            }
+            news.push(News::Event(cell, line.event));
         }
-        Ok((events, status.is_some()))
+        if let Some(status) = status.filter(|_| !self.cells.is_empty()) {
+            let words = last_words(&self.log, self.log_start).map_or_else(String::new, |words| format!(": {words}"));
+            let reason = format!("its process ended with {status}{words}");
+            let mut killed: Vec<usize> = std::mem::take(&mut self.cells).into_values().collect();
+            killed.sort_unstable();
+            news.extend(killed.into_iter().map(|cell| match self.begun.is_empty() || self.begun.contains(&cell) {
+                true => News::Event(cell, CellEvent::Killed { reason: reason.clone() }),
+                // A process that did other cells is no fault of one that had no turn.
+                false => News::Returned(cell),
+            }));
+        }
+        Ok((news, status.is_some()))
     }
 }
 
 impl Backend for Local<'_> {
+    fn grouping(&self) -> Grouping {
+        self.grouping
+    }
+
     fn convicts(&self) -> bool {
         true
     }
@@ -93,8 +143,8 @@ impl Backend for Local<'_> {
     fn poll(&mut self, _now: Instant) -> Result<Vec<News>> {
         let mut news = Vec::new();
         for mut worker in std::mem::take(&mut self.workers) {
-            let (events, ended) = worker.news().map_err(io("read what is told about", &worker.log))?;
-            news.extend(events.into_iter().map(|event| News::Event(worker.cell, event)));
+            let (said, ended) = worker.news().map_err(io("read what is told about", &worker.log))?;
+            news.extend(said);
             if !ended {
                 self.workers.push(worker);
             }
@@ -104,22 +154,25 @@ impl Backend for Local<'_> {
     }
 
     fn room(&self) -> usize {
-        self.jobs.saturating_sub(self.workers.len())
+        self.grouping.at_a_time.saturating_sub(self.workers.len())
     }
 
-    fn begin(&mut self, offers: &[Offer]) -> Result<Vec<usize>> {
-        for offer in offers {
-            let worker = self.start(offer)?;
-            self.workers.push(worker);
+    fn begin(&mut self, groups: &[Vec<Offer>]) -> Result<Vec<usize>> {
+        for group in groups {
+            let worker = self.start(group)?;
+            self.workers.extend(worker);
         }
-        Ok(offers.iter().map(|offer| offer.cell).collect())
+        Ok(groups.iter().flatten().map(|offer| offer.cell).collect())
     }
 
     fn load(&self) -> (String, usize) {
-        (format!("{} running", self.workers.len()), self.jobs)
+        let cells: usize = self.workers.iter().map(|worker| worker.cells.len()).sum();
+        let processes = self.workers.len();
+        let shown = if processes == 1 { "1 process".to_owned() } else { format!("{processes} processes") };
+        (format!("{cells} in {shown}"), processes.max(1))
     }
 
-    /// Asks all workers to stop, and waits for them. They finish their iteration first.
+    /// Asks all workers to stop, and waits for them. They finish their iterations first.
     fn stop(&mut self) -> Vec<String> {
         for worker in &mut self.workers {
             drop(worker.child.stdin.take());
@@ -151,15 +204,25 @@ mod tests {
         lines: Vec<Line>,
     }
 
-    /// Runs with a shell script as a worker.
+    /// Runs with a shell script as a worker of one cell.
     fn run_script(folder: &Folder, script: &str, stop: &StopFlag, server_ended: &dyn Fn() -> Option<String>) -> Ran {
+        run_grouped(Grouping { most: 1, at_a_time: 2 }, folder, script, stop, server_ended)
+    }
+
+    fn run_grouped(
+        grouping: Grouping,
+        folder: &Folder,
+        script: &str,
+        stop: &StopFlag,
+        server_ended: &dyn Fn() -> Option<String>,
+    ) -> Ran {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let command = || {
             let mut command = Command::new("sh");
             command.arg("-c").arg(format!("{BEGIN} {script}")).current_dir(folder.path());
             command
         };
-        let mut local = Local::new(&plan, folder, 2, &command, server_ended);
+        let mut local = Local::new(&plan, folder, grouping, &command, server_ended);
         let mut lines = Vec::new();
         let mut report = |report: Announcement<'_>| {
             if let Announcement::Line(line) = report {
@@ -185,7 +248,9 @@ mod tests {
         assert_eq!(ran.end.unwrap(), RunEnd::Finished { failed: Vec::new() });
         for (turn, id) in ids.iter().enumerate() {
             let orders = std::fs::read_to_string(folder.cell(id).path().join("orders")).unwrap();
-            assert_eq!(orders, format!("{{\"cell\":\"{id}\",\"retry\":null,\"turn\":{turn}}}\n"));
+            let order: Order = serde_json::from_str(&orders).unwrap();
+            assert_eq!(order.cells, [OrderedCell { cell: id.clone(), retry: None }]);
+            assert_eq!(order.turn, crc32c::crc32c(ids[0].as_bytes()) as usize + turn, "they go around the servers");
             let events: Vec<String> = ran.lines.iter().filter(|line| line.cell == *id).map(said).collect();
             assert_eq!(events, [r#"{"event":"server","address":"unix:/x"}"#, r#"{"event":"done"}"#]);
         }
@@ -208,6 +273,44 @@ mod tests {
             let failure = std::fs::read_to_string(folder.cell(id).path().join("failure.json")).unwrap();
             assert!(failure.contains(&format!("its process ended with {how}; {recorded}")), "{failure}");
         }
+    }
+
+    #[test]
+    fn a_worker_does_a_group_and_takes_only_the_cells_in_work_with_it() {
+        let (.., ids) = place();
+        let [first, second] = &ids;
+        // Done with the first, the worker dies; the second is begun again, and where its log was then is said.
+        let script = format!(
+            r#"case "$order" in
+                *{first}*) echo x >result.json; say '"done"'; id={second}; say '"server","address":"unix:/x"'
+                    [ -z "$WORKED" ] || say '"testing","set":"D","episodes":1'; echo "lost" >&2; kill -9 $$ ;;
+                *) echo x >result.json; say '"done"' ;;
+            esac"#
+        );
+        for turn in [false, true] {
+            let (_directory, folder, _) = place();
+            let script = format!("WORKED={}; {script}", if turn { "1" } else { "" });
+            let grouping = Grouping { most: 2, at_a_time: 1 };
+            let ran = run_grouped(grouping, &folder, &script, &StopFlag::default(), &|| None);
+            assert_eq!(ran.end.unwrap(), RunEnd::Finished { failed: Vec::new() });
+            let events = ran.lines.iter().map(|line| (&*line.cell, line.event.to_string()));
+            let killed = || "its process ended with signal: 9 (SIGKILL): lost".to_owned();
+            let mut expected = vec![(&**first, "done".to_owned()), (second, "on unix:/x".to_owned())];
+            if turn {
+                expected.extend([(&**second, "1 test episode on D".to_owned()), (second, killed())]);
+            }
+            expected.push((second, "done".to_owned()));
+            assert_eq!(events.collect::<Vec<_>>(), expected);
+            logs_of_a_group(&folder, &ids);
+        }
+    }
+
+    #[track_caller]
+    fn logs_of_a_group(folder: &Folder, [first, second]: &[String; 2]) {
+        let read = |id: &String, name: &str| std::fs::read_to_string(folder.cell(id).path().join(name)).unwrap();
+        let order: Order = serde_json::from_str(&read(first, "orders")).unwrap();
+        assert_eq!(order.cells.iter().map(|ordered| &ordered.cell).collect::<Vec<_>>(), [first, second]);
+        assert_eq!(read(second, "log.txt"), format!("done together with {first}: see ../{first}/log.txt\n"));
     }
 
     #[test]

@@ -1,25 +1,28 @@
 //! Doing the cells of a plan: on this machine, or on a cluster.
 //!
-//! [`run()`] is one state machine over a [`Backend`] that begins cells and tells what becomes of them: [`Local`] in
-//! processes of this machine, [`slurm`] in jobs. Whatever is told, the folder says what is done: a cell is settled when
-//! its result is there, or a failure that counts. So several runs, of both kinds, may share a folder.
+//! [`run()`] is one state machine over a [`Backend`] that begins groups of cells and tells what becomes of each cell:
+//! [`Local`] in processes of this machine, [`slurm`] in jobs. Whatever is told, the folder says what is done: a cell is
+//! settled when its result is there, or a failure that counts. So several runs, of both kinds, may share a folder.
 
 mod event;
 mod local;
+mod running;
 pub mod slurm;
 mod times;
 
-use std::collections::VecDeque;
+use std::collections::{HashMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use crate::files::FileError;
 use crate::folder::{Failure, FailureMark, Folder};
 use crate::interrupt::StopFlag;
-use crate::plan::Plan;
-pub use event::{CellEvent, Line, Order, Teller, write_line};
+use crate::plan::{Grouping, Plan};
+pub use event::{CellEvent, Line, Order, OrderedCell, Teller, write_line};
 pub use local::Local;
+use running::Running;
+pub use running::RunningGroup;
 use slurm::SlurmError;
-use times::Times;
+pub(crate) use times::Times;
 
 /// How often in a row a cell may be broken off without getting any further.
 pub const MOST_ATTEMPTS: u32 = 3;
@@ -37,6 +40,8 @@ const TICK: Duration = Duration::from_millis(50);
 
 /// What does cells.
 pub trait Backend {
+    /// How cells are to be put into groups.
+    fn grouping(&self) -> Grouping;
     /// Whether a cell that is broken off too often has failed. If not, its machines may be to blame: nothing is
     /// recorded, and the next run tries again.
     fn convicts(&self) -> bool;
@@ -45,14 +50,15 @@ pub trait Backend {
     /// # Errors
     /// The run cannot go on.
     fn poll(&mut self, now: Instant) -> Result<Vec<News>>;
-    /// How many cells it would take now.
+    /// How many groups it would take now.
     fn room(&self) -> usize;
-    /// Begins with some of `offers`, and gives the cells that it took: these, and those that it has in work already.
+    /// Begins with some of `groups`, none of them empty, and gives the cells that it took: these, and those that it has
+    /// in work already.
     ///
     /// # Errors
     /// The run cannot go on.
-    fn begin(&mut self, offers: &[Offer]) -> Result<Vec<usize>>;
-    /// What it is doing, in a few words, and how many cells at a time.
+    fn begin(&mut self, groups: &[Vec<Offer>]) -> Result<Vec<usize>>;
+    /// What it is doing, in a few words, and how many groups at a time.
     fn load(&self) -> (String, usize);
     /// Ends all that cannot go on without this process, and names what can.
     fn stop(&mut self) -> Vec<String>;
@@ -65,11 +71,11 @@ pub struct Offer {
     pub cell: usize,
     /// The failure that is forgiven it.
     pub retry: Option<FailureMark>,
-    /// How often it was broken off without getting any further.
-    pub attempts: u32,
+    /// The number of its group in this run, also if it is offered alone.
+    pub group: usize,
     /// How many servers it has lost.
     pub lost_servers: usize,
-    /// What other cells of its kind took, s; `None` before the first.
+    /// What other cells of its environment and learner took, s; `None` before the first.
     pub seconds: Option<f64>,
 }
 
@@ -106,8 +112,8 @@ pub struct Status {
     pub done: usize,
     /// Cells with a failure that counts.
     pub failed: usize,
-    /// The ids of cells in work, and what is being done.
-    pub running: Vec<(String, CellEvent)>,
+    /// What is being done.
+    pub running: Vec<RunningGroup>,
     /// What the backend is doing, in a few words.
     pub doing: String,
     /// How long it may take, by what finished cells took; `None` before the first.
@@ -195,15 +201,20 @@ pub fn run(
 #[derive(Debug, Default)]
 struct Tracked {
     phase: Phase,
+    /// The number of its group.
+    group: usize,
+    /// It was broken off without getting any further: done alone, it can take no others with it.
+    alone: bool,
     /// A failure that was there before this run and does not count. One that is recorded later does, whoever tried.
     forgiven: Option<FailureMark>,
     /// How often in a row it was broken off without getting any further.
     attempts: u32,
-    /// Steps of its training that are in a checkpoint.
+    /// Steps of its training that are in a checkpoint, and that were when the last attempt began its training.
     saved: u64,
+    saved_before: Option<u64>,
     lost_servers: usize,
     lost_in_a_row: u32,
-    /// When it was begun, …
+    /// When something first happened to it in this attempt: before its turn in a job, a cell takes no time; …
     begun: Option<Instant>,
     /// … had a server (looking for one, of which many may be silent, is not having one) …
     served: Option<Instant>,
@@ -248,17 +259,24 @@ impl<'a> Scheduler<'a> {
     ) -> Self {
         let forgiven = |id: &str| folder.cell(id).failure_mark().filter(|_| retry_failed);
         let cells = plan.cells.iter().map(|cell| Tracked { forgiven: forgiven(&cell.id), ..Tracked::default() });
-        Self {
+        let mut scheduler = Self {
             plan,
             folder,
             backend,
             report,
             cells: cells.collect(),
-            queue: (0..plan.cells.len()).collect(),
+            queue: VecDeque::new(),
             times: Times::default(),
             paused_until: None,
             look_at: None,
+        };
+        let left: Vec<usize> = (0..plan.cells.len()).filter(|&cell| !scheduler.settled(cell)).collect();
+        let groups = plan.groups(&left, scheduler.backend.grouping());
+        for (number, group) in groups.into_iter().enumerate() {
+            group.iter().for_each(|&cell| scheduler.cells[cell].group = number);
+            scheduler.queue.extend(group);
         }
+        scheduler
     }
 
     /// Takes note of what happened and begins what can be begun. At the end gives the ids of the cells that failed.
@@ -289,10 +307,14 @@ impl<'a> Scheduler<'a> {
         (self.report)(Announcement::Line(&line));
         let tracked = &mut self.cells[cell];
         tracked.last = Some(event.clone());
+        tracked.begun.get_or_insert(now);
         match event {
             CellEvent::Server { .. } => tracked.served = tracked.served.or(Some(now)),
-            CellEvent::Training { saved, .. } if saved > tracked.saved => {
-                (tracked.saved, tracked.attempts) = (saved, 0)
+            CellEvent::Training { saved, .. } => {
+                tracked.saved_before.get_or_insert(saved);
+                if saved > tracked.saved {
+                    (tracked.saved, tracked.attempts) = (saved, 0);
+                }
             }
             event if event.is_last() && !self.settled(cell) => self.conclude(cell, event, now)?,
             _ => {}
@@ -314,13 +336,15 @@ impl<'a> Scheduler<'a> {
                 if tracked.lost_in_a_row >= MOST_LOST_SERVERS {
                     return Err(RunError::NoServer(format!("{}: {reason}", self.id(cell))));
                 }
-                self.paused_until = Some(now + SERVER_PAUSE * (1 << (tracked.lost_in_a_row - 1)));
+                let pause = SERVER_PAUSE * (1 << (tracked.lost_in_a_row - 1));
+                self.paused_until = self.paused_until.max(Some(now + pause));
                 // At the front: if the servers are gone, the run ends soon, however many cells it has.
                 tracked.phase = Phase::Waiting;
                 self.queue.push_front(cell);
             }
             end => {
                 tracked.attempts += 1;
+                tracked.alone = tracked.saved_before.is_none_or(|before| tracked.saved <= before);
                 if tracked.attempts < MOST_ATTEMPTS {
                     self.wait(cell);
                 } else if self.backend.convicts() {
@@ -389,19 +413,33 @@ impl<'a> Scheduler<'a> {
         if self.paused_until.is_some_and(|end| now < end) {
             return Ok(());
         }
-        let mut offers = Vec::new();
+        let mut offers: Vec<Vec<Offer>> = Vec::new();
+        let mut places: HashMap<usize, usize> = HashMap::new();
         for cell in self.queue.clone() {
+            let Tracked { forgiven: retry, group, alone, lost_servers, .. } = self.cells[cell];
+            let place = places.get(&group).copied().filter(|_| !alone);
             // Another run may have done it meanwhile.
-            if offers.len() < room && !self.settled(cell) {
-                let Tracked { forgiven: retry, attempts, lost_servers, .. } = self.cells[cell];
-                let seconds = self.times.of_pair(&self.plan.cells[cell]);
-                offers.push(Offer { cell, retry, attempts, lost_servers, seconds });
+            if (place.is_none() && offers.len() >= room) || self.settled(cell) {
+                continue;
+            }
+            let seconds = self.times.of_pair(&self.plan.cells[cell]);
+            let offer = Offer { cell, retry, group, lost_servers, seconds };
+            match place {
+                Some(place) => offers[place].push(offer),
+                None => {
+                    if !alone {
+                        places.insert(group, offers.len());
+                    }
+                    offers.push(vec![offer]);
+                }
             }
         }
+        offers.iter_mut().for_each(|group| group.sort_by_key(|offer| offer.cell));
         if !offers.is_empty() {
             for cell in self.backend.begin(&offers)? {
                 let tracked = &mut self.cells[cell];
-                (tracked.phase, tracked.begun, tracked.served, tracked.last) = (Phase::Running, Some(now), None, None);
+                tracked.phase = Phase::Running;
+                (tracked.begun, tracked.served, tracked.last, tracked.saved_before) = (None, None, None, None);
             }
         }
         self.queue.retain(|&cell| self.cells[cell].phase == Phase::Waiting);
@@ -429,25 +467,27 @@ impl<'a> Scheduler<'a> {
     fn status(&self, now: Instant) -> Status {
         let (doing, at_a_time) = self.backend.load();
         let number = |phase| self.cells.iter().filter(|cell| cell.phase == phase).count();
-        let (mut running, mut left) = (Vec::new(), Vec::new());
+        let (mut running, mut left) = (Running::default(), Vec::new());
         for (tracked, cell) in self.cells.iter().zip(&self.plan.cells) {
             match (tracked.phase, &tracked.last, tracked.begun) {
                 (Phase::Running, Some(event), Some(begun)) => {
-                    running.push((cell.id.clone(), event.clone()));
+                    running.add(cell, (!tracked.alone).then_some(tracked.group), event);
                     left.push((cell, (now - begun).as_secs_f64()));
                 }
-                // Before its turn in a job, a cell takes no time.
                 (Phase::Waiting | Phase::Running, ..) => left.push((cell, 0.0)),
                 _ => {}
             }
         }
+        // The time of a process is shared by the cells that it does together.
+        let share = (at_a_time as f64 / running.cells() as f64).min(1.0);
+        let left = left.into_iter().map(|(cell, seconds)| (cell, seconds * share));
         Status {
             cells: self.cells.len(),
             done: number(Phase::Done),
             failed: number(Phase::Failed),
-            running,
+            running: running.groups,
             doing,
-            remaining: self.times.remaining(left.into_iter(), at_a_time),
+            remaining: self.times.remaining(left, at_a_time),
         }
     }
 

@@ -1,7 +1,5 @@
 //! The rules of the state machine, with a backend that follows a script and a clock of its own.
 
-use std::collections::HashMap;
-
 use rstest::rstest;
 use tempfile::TempDir;
 
@@ -54,16 +52,22 @@ fn done() -> Vec<Act> {
 struct Fake<'a, const CONVICTS: bool> {
     place: &'a Place,
     script: &'a dyn Fn(usize, usize) -> Vec<Act>,
-    jobs: usize,
+    grouping: Grouping,
     start: Instant,
     now: Instant,
-    running: Vec<(usize, VecDeque<Act>)>,
+    /// Groups of cells, and what they do still.
+    running: Vec<Vec<(usize, VecDeque<Act>)>>,
     /// For each attempt its cell, when it began, and how many servers the cell had lost.
     begun: Vec<(usize, u64, usize)>,
+    groups: Vec<Vec<usize>>,
     most_at_a_time: usize,
 }
 
 impl<const CONVICTS: bool> Backend for Fake<'_, CONVICTS> {
+    fn grouping(&self) -> Grouping {
+        self.grouping
+    }
+
     fn convicts(&self) -> bool {
         CONVICTS
     }
@@ -72,41 +76,49 @@ impl<const CONVICTS: bool> Backend for Fake<'_, CONVICTS> {
         self.now = now;
         let mut news = Vec::new();
         let place = self.place;
-        self.running.retain_mut(|(cell, acts)| {
-            match acts.pop_front() {
-                Some(Say(event) | Act::End(event)) => news.push(News::Event(*cell, event)),
-                Some(Wait(seconds)) if seconds > 1 => acts.push_front(Wait(seconds - 1)),
-                Some(Wait(_)) => {}
-                Some(Succeeds) => place.write(*cell, "result.json"),
-                Some(Fails) => place.fail(*cell),
-                Some(Return) => news.push(News::Returned(*cell)),
-                None => panic!("an attempt at cell {cell} has no end"),
-            }
-            !acts.is_empty()
-        });
+        for group in &mut self.running {
+            group.retain_mut(|(cell, acts)| {
+                match acts.pop_front() {
+                    Some(Say(event) | Act::End(event)) => news.push(News::Event(*cell, event)),
+                    Some(Wait(seconds)) if seconds > 1 => acts.push_front(Wait(seconds - 1)),
+                    Some(Wait(_)) => {}
+                    Some(Succeeds) => place.write(*cell, "result.json"),
+                    Some(Fails) => place.fail(*cell),
+                    Some(Return) => news.push(News::Returned(*cell)),
+                    None => panic!("an attempt at cell {cell} has no end"),
+                }
+                !acts.is_empty()
+            });
+        }
+        self.running.retain(|group| !group.is_empty());
         Ok(news)
     }
 
     fn room(&self) -> usize {
-        self.jobs - self.running.len()
+        self.grouping.at_a_time - self.running.len()
     }
 
-    fn begin(&mut self, offers: &[Offer]) -> Result<Vec<usize>> {
-        for offer in offers {
-            // As a worker does.
-            if let Some(failure) = offer.retry {
-                self.place.folder.cell(self.place.id(offer.cell)).forgive(failure).unwrap();
+    fn begin(&mut self, groups: &[Vec<Offer>]) -> Result<Vec<usize>> {
+        for group in groups {
+            let mut running = Vec::new();
+            for offer in group {
+                // As a worker does.
+                if let Some(failure) = offer.retry {
+                    self.place.folder.cell(self.place.id(offer.cell)).forgive(failure).unwrap();
+                }
+                self.begun.push((offer.cell, (self.now - self.start).as_secs(), offer.lost_servers));
+                let attempt = self.begun.iter().filter(|(cell, ..)| *cell == offer.cell).count();
+                running.push((offer.cell, (self.script)(offer.cell, attempt).into()));
             }
-            self.begun.push((offer.cell, (self.now - self.start).as_secs(), offer.lost_servers));
-            let attempt = self.begun.iter().filter(|(cell, ..)| *cell == offer.cell).count();
-            self.running.push((offer.cell, (self.script)(offer.cell, attempt).into()));
+            self.running.push(running);
+            self.groups.push(group.iter().map(|offer| offer.cell).collect());
         }
         self.most_at_a_time = self.most_at_a_time.max(self.running.len());
-        Ok(offers.iter().map(|offer| offer.cell).collect())
+        Ok(groups.iter().flatten().map(|offer| offer.cell).collect())
     }
 
     fn load(&self) -> (String, usize) {
-        (format!("{} running", self.running.len()), self.jobs)
+        (format!("{} running", self.running.len()), self.grouping.at_a_time)
     }
 
     fn stop(&mut self) -> Vec<String> {
@@ -126,6 +138,7 @@ struct Place {
 struct Ran {
     end: Result<Vec<String>, String>,
     begun: Vec<(usize, u64, usize)>,
+    groups: Vec<Vec<usize>>,
     most_at_a_time: usize,
     notes: Vec<String>,
     statuses: Vec<Status>,
@@ -145,9 +158,13 @@ impl Ran {
 
 impl Place {
     fn new() -> Self {
+        Self::of(PLAN)
+    }
+
+    fn of(plan: &str) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let folder = Folder::new(directory.path());
-        Self { _directory: directory, folder, plan: Plan::parse("test", PLAN.into()).unwrap() }
+        Self { _directory: directory, folder, plan: Plan::parse("test", plan.into()).unwrap() }
     }
 
     fn id(&self, cell: usize) -> &str {
@@ -184,10 +201,21 @@ impl Place {
         retry_failed: bool,
         script: &dyn Fn(usize, usize) -> Vec<Act>,
     ) -> Ran {
+        self.run_in::<CONVICTS>(Grouping { most: 1, at_a_time: jobs }, retry_failed, script)
+    }
+
+    /// Runs to the end, in groups.
+    fn run_in<const CONVICTS: bool>(
+        &self,
+        grouping: Grouping,
+        retry_failed: bool,
+        script: &dyn Fn(usize, usize) -> Vec<Act>,
+    ) -> Ran {
         let start = Instant::now();
-        let (begun, running) = (Vec::new(), Vec::new());
+        let (begun, groups, running) = (Vec::new(), Vec::new(), Vec::new());
+        let (now, most_at_a_time) = (start, 0);
         let mut fake =
-            Fake::<CONVICTS> { place: self, script, jobs, start, now: start, running, begun, most_at_a_time: 0 };
+            Fake::<CONVICTS> { place: self, script, grouping, start, now, running, begun, groups, most_at_a_time };
         let (mut notes, mut statuses) = (Vec::new(), Vec::new());
         let mut report = |report: Announcement<'_>| match report {
             Announcement::Status(status) => statuses.push(status.clone()),
@@ -197,7 +225,8 @@ impl Place {
         let mut scheduler = Scheduler::new(&self.plan, &self.folder, &mut fake, retry_failed, &mut report);
         let end = (0..10_000).find_map(|second| scheduler.step(start + Duration::from_secs(second)).transpose());
         let end = end.expect("it ends").map_err(|error| error.to_string());
-        Ran { end, begun: fake.begun, most_at_a_time: fake.most_at_a_time, notes, statuses }
+        let Fake { begun, groups, most_at_a_time, .. } = fake;
+        Ran { end, begun, groups, most_at_a_time, notes, statuses }
     }
 }
 
@@ -377,8 +406,107 @@ fn the_status_says_what_is_done_with_each_cell() {
     let status = &ran.statuses[4];
     assert_eq!((status.cells, status.done, status.failed), (4, 1, 1));
     assert_eq!(status.doing, "2 running");
-    let running: HashMap<&str, String> =
-        status.running.iter().map(|(id, activity)| (id.as_str(), activity.to_string())).collect();
-    assert_eq!(running[place.id(1)], "1 episode of training");
-    assert_eq!(running[place.id(2)], "1 episode of training");
+    let running: Vec<String> = status.running.iter().map(ToString::to_string).collect();
+    assert_eq!(running, [1, 2].map(|cell| format!("{}: 1 episode of training", place.id(cell))));
+}
+
+/// Six cells of one kind, in groups of three.
+const GROUPS: &str = "environments = ['CartPole']\nversions = ['D']\nruns = 6
+    [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+const THREES: Grouping = Grouping { most: 3, at_a_time: 1 };
+
+#[test]
+fn cells_of_a_group_are_begun_together_and_settled_each_by_itself() {
+    let place = Place::of(GROUPS);
+    let script = |cell, _| match cell {
+        1 => vec![Fails, ends(CellEvent::Failed { reason: "NaN".into() })],
+        2 => vec![server(), saved(7), Wait(5), Succeeds, ends(CellEvent::Done)],
+        _ => done(),
+    };
+    let ran = place.run_in::<true>(THREES, false, &script);
+    assert_eq!(ran.groups, [vec![0, 1, 2], vec![3, 4, 5]]);
+    assert_eq!(
+        ran.begun.iter().map(|(_, time, _)| *time).collect::<Vec<_>>(),
+        [0, 0, 0, 9, 9, 9],
+        "when all have ended"
+    );
+    assert_eq!(ran.end, place.finished(&[1]));
+    let status = &ran.statuses[3];
+    assert_eq!((status.done, status.failed, status.running.len()), (1, 1, 1));
+}
+
+#[test]
+fn what_is_left_is_grouped_anew() {
+    let place = Place::of(GROUPS);
+    [0, 1, 4].iter().for_each(|&cell| place.write(cell, "result.json"));
+    assert_eq!(place.run_in::<true>(THREES, false, &|_, _| done()).groups, [vec![2, 3, 5]]);
+}
+
+#[test]
+fn a_cell_that_kills_its_process_convicts_only_itself() {
+    let place = Place::of(GROUPS);
+    // Nobody got any further: the killer is not known.
+    let script = |cell, attempt| if cell == 1 || (cell < 3 && attempt == 1) { vec![killed()] } else { done() };
+    let ran = place.run_in::<true>(THREES, false, &script);
+    assert_eq!(ran.groups, [vec![0, 1, 2], vec![3, 4, 5], vec![0], vec![1], vec![2], vec![1]]);
+    assert_eq!(ran.end, place.finished(&[1]));
+}
+
+#[test]
+fn cells_that_got_further_before_they_were_broken_off_stay_together() {
+    let place = Place::of(GROUPS);
+    let script = |cell, attempt| match (cell, attempt) {
+        (0 | 2, 1) => vec![saved(0), saved(50), killed()],
+        (1, 1) => vec![saved(40), Wait(1), killed()], // where it began
+        _ => done(),
+    };
+    let ran = place.run_in::<true>(THREES, false, &script);
+    assert_eq!(ran.groups, [vec![0, 1, 2], vec![3, 4, 5], vec![0, 2], vec![1]]);
+    assert_eq!(ran.end, place.finished(&[]));
+}
+
+#[test]
+fn a_server_that_a_group_loses_is_one_loss() {
+    let place = Place::of(GROUPS);
+    let ran = place.run_in::<true>(Grouping { most: 6, at_a_time: 1 }, false, &|_, attempt| match attempt {
+        1..=4 => vec![lost()],
+        _ => done(),
+    });
+    assert_eq!(ran.groups, vec![(0..6).collect::<Vec<_>>(); 5], "together again, in the same order");
+    assert_eq!(ran.times(), [0, 2, 5, 10, 19]);
+    assert_eq!(ran.end, place.finished(&[]));
+}
+
+#[test]
+fn a_group_goes_on_without_the_cells_that_others_work_on() {
+    let place = Place::of(GROUPS);
+    let lock = std::cell::Cell::new(place.folder.cell(place.id(1)).try_lock().unwrap());
+    let script = |cell, attempt| match (cell, attempt) {
+        (1, 1) => vec![ends(CellEvent::Busy)],
+        (3, 1) => {
+            drop(lock.take());
+            vec![Wait(30), Succeeds, ends(CellEvent::Done)]
+        }
+        _ => done(),
+    };
+    let ran = place.run_in::<true>(THREES, false, &script);
+    assert_eq!(ran.groups, [vec![0, 1, 2], vec![3, 4, 5], vec![1]]);
+    assert_eq!(ran.end, place.finished(&[]));
+}
+
+#[test]
+fn cells_of_a_group_share_the_time_of_its_process() {
+    let place = Place::of(GROUPS);
+    let script = |cell, _| match cell {
+        0..3 => done(),
+        _ => vec![server(), Wait(9), Succeeds, ends(CellEvent::Done)],
+    };
+    // Each took 10 s of its process.
+    place.plan.cells[..3].iter().for_each(|cell| {
+        place.folder.cell(&cell.id).write_timing(&crate::folder::Timing { seconds: 10.0 }).unwrap();
+    });
+    let ran = place.run_in::<true>(THREES, false, &script);
+    let left = |second: usize| ran.statuses[second].remaining.map(|left| left.as_secs());
+    // The second group begins at 2 s and is heard of a second later; 6 s after that, each of its cells has had 2 s.
+    assert_eq!((left(2), left(3), left(9)), (Some(30), Some(30), Some(24)));
 }

@@ -8,7 +8,7 @@ use crate::plan::Cell;
 
 /// What finished cells took.
 #[derive(Debug, Default)]
-pub(super) struct Times<'a> {
+pub(crate) struct Times<'a> {
     by_pair: HashMap<(&'a str, Method), Mean>,
     all: Mean,
 }
@@ -31,18 +31,23 @@ impl Mean {
 }
 
 impl<'a> Times<'a> {
-    pub(super) fn add(&mut self, cell: &'a Cell, seconds: f64) {
+    pub(crate) fn add(&mut self, cell: &'a Cell, seconds: f64) {
         self.by_pair.entry((&cell.config.common.environment, cell.method())).or_default().add(seconds);
         self.all.add(seconds);
     }
 
     /// What cells of the same environment and learner took; `None` before the first.
-    pub(super) fn of_pair(&self, cell: &Cell) -> Option<f64> {
+    pub(crate) fn of_pair(&self, cell: &Cell) -> Option<f64> {
         self.by_pair.get(&(cell.config.common.environment.as_str(), cell.method()))?.get()
     }
 
+    /// How many cells there are.
+    pub(crate) fn cells(&self) -> usize {
+        self.all.count as usize
+    }
+
     /// How long `cells`, which have run for so many seconds each, may still take, so many at a time.
-    pub(super) fn remaining<'c>(
+    pub(crate) fn remaining<'c>(
         &self,
         cells: impl Iterator<Item = (&'c Cell, f64)>,
         at_a_time: usize,

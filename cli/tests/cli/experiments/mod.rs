@@ -1,5 +1,6 @@
 //! Experiments with real worker processes and servers.
 
+mod groups;
 mod reports;
 mod running;
 
@@ -8,7 +9,7 @@ use std::path::PathBuf;
 use std::process::{Child, Command, Output};
 
 use crate::common::{is_running, kill, perturb, stderr, wait_for};
-use perturb_study::{CellResult, CellState, Folder, Plan};
+use perturb_study::{Cell, CellResult, CellState, Folder, Plan};
 use tempfile::TempDir;
 
 /// Eight cells of a second or so.
@@ -83,12 +84,15 @@ impl Experiment {
         }
     }
 
-    /// How often each cell's training was begun, or gone on with.
+    /// How often each cell's training was begun, or gone on with. The log of a group is that of its first cell.
     fn attempts(&self, name: &str) -> Vec<usize> {
         let folder = Folder::new(&self.out(name));
-        let log = |id: &str| std::fs::read_to_string(folder.cell(id).log()).unwrap_or_default();
-        let count = |log: String| log.matches("training begins").count() + log.matches("training goes on").count();
-        self.plan.cells.iter().map(|cell| count(log(&cell.id))).collect()
+        let log = |cell: &Cell| std::fs::read_to_string(folder.cell(&cell.id).log()).unwrap_or_default();
+        let logs: String = self.plan.cells.iter().map(log).collect();
+        let begins = |line: &&str| line.contains("training begins") || line.contains("training goes on");
+        let lines: Vec<&str> = logs.lines().filter(begins).collect();
+        let of = |cell: &Cell| lines.iter().filter(|line| line.contains(&format!("/{}/", cell.id))).count();
+        self.plan.cells.iter().map(of).collect()
     }
 }
 

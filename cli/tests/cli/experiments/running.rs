@@ -4,26 +4,27 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command};
 
 use super::{Experiment, PLAN, children, kill_all, succeeded};
-use crate::common::{is_running, kill, perturb, stderr, wait_for};
+use crate::common::{child_server, is_running, kill, perturb, stderr, wait_for};
 use perturb_learner::client::PrivateServer;
 use perturb_study::{CellResult, CellState, Counts, Folder, Plan};
 
 #[test]
-fn results_depend_neither_on_jobs_nor_on_kills() {
+fn results_depend_neither_on_jobs_nor_on_groups_nor_on_kills() {
     let experiment = Experiment::new(PLAN);
     let cells = experiment.plan.cells.len();
-    succeeded(&experiment.run("whole", &["--jobs", "1"]));
+    succeeded(&experiment.run("whole", &["--jobs", "1", "--group", "1"]));
     let whole = experiment.results("whole");
     assert_eq!(whole.len(), cells);
     assert_eq!(experiment.attempts("whole"), vec![1; cells]);
 
-    for done in [1, 2, 4] {
-        let child = experiment.command("killed", &["--jobs", "2"]).spawn().expect("started");
-        wait_for("a few results", || experiment.results("killed").len() >= done);
+    for (done, jobs, group) in [(0, "2", "36"), (2, "2", "1"), (4, "1", "3")] {
+        let child = experiment.command("killed", &["--jobs", jobs, "--group", group]).spawn().expect("started");
+        let begun = || experiment.attempts("killed").iter().sum::<usize>() > 0;
+        wait_for("a few results", || begun() && experiment.results("killed").len() >= done);
         kill_all(child);
         assert!(experiment.results("killed").len() < cells, "killed before the end");
     }
-    succeeded(&experiment.run("killed", &["--jobs", "3"]));
+    succeeded(&experiment.run("killed", &["--jobs", "1"]));
     assert_eq!(experiment.results("killed"), whole);
     let folder = Folder::new(&experiment.out("killed"));
     let unfinished = |id: &str| {
@@ -32,6 +33,29 @@ fn results_depend_neither_on_jobs_nor_on_kills() {
             .filter(|entry| entry.as_ref().is_ok_and(|entry| entry.file_name().to_string_lossy().starts_with(".tmp")))
     };
     assert!(experiment.plan.cells.iter().all(|cell| unfinished(&cell.id).count() == 0));
+}
+
+#[test]
+fn a_group_whose_process_is_killed_is_done_all_the_same() {
+    let experiment = Experiment::new(PLAN);
+    let cells = ["--cell", "0,1,2"];
+    succeeded(&experiment.run("whole", &[&cells[..], &["--group", "1"]].concat()));
+    let told = experiment.out("told.jsonl");
+    let mut command = experiment.command("out", &[&cells[..], &["--jobs", "1", "--json"]].concat());
+    let run = command.stdout(std::fs::File::create(&told).expect("a file")).spawn().expect("started");
+    let worker = || children(run.id()).into_iter().find(|&id| Some(id) != child_server(run.id()));
+    wait_for("a training", || experiment.attempts("out").iter().sum::<usize>() > 0);
+    kill("-KILL", worker().expect("a worker"));
+    succeeded(&run.wait_with_output().expect("ended"));
+    assert_eq!(experiment.results("out"), experiment.results("whole"));
+
+    let told = std::fs::read_to_string(told).expect("lines");
+    let killed = told.matches(r#""event":"killed","reason":"its process ended with signal: 9 (SIGKILL)"#).count();
+    assert!((1..=3).contains(&killed), "{told}");
+    let place = |cell: usize| Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[cell].id);
+    let first = &experiment.plan.cells[0].id;
+    let log = std::fs::read_to_string(place(2).log()).expect("a log");
+    assert!(log.starts_with(&format!("done together with {first}: see ../{first}/log.txt\n")), "{log}");
 }
 
 #[test]
@@ -310,17 +334,30 @@ fn plan_prints_the_papers_counts_and_an_estimate_from_measurements() {
         String::from_utf8(output.stdout).expect("text")
     };
     let paper = shipped("paper.toml").display().to_string();
-    let counts = "183 configurations, 3 294 trainings, 9 882 train/test pairs, 49 410 with 5 runs\n";
-    assert_eq!(printed(&["plan", &paper, "--measure", "0"]), counts);
+    let counts = "183 configurations, 3 294 trainings, 9 882 train/test pairs, 49 410 with 5 runs\n\
+                  16 470 cells in 468 groups of 34 to 36, 2 at a time\n";
+    assert_eq!(printed(&["plan", &paper, "--measure", "0", "--jobs", "2"]), counts);
 
     let experiment = Experiment::new(PLAN);
     let file = experiment.out("file.toml").display().to_string();
-    let text = printed(&["plan", &file, "--cells", "--measure", "1"]);
+    let text = printed(&["plan", &file, "--cells", "--measure", "1", "--jobs", "2"]);
     for cell in &experiment.plan.cells {
         assert!(text.contains(&format!("{:>6} {}\n", cell.index, cell.id)), "{text}");
     }
     assert!(text.contains("2 configurations, 8 trainings, 16 train/test pairs, 16 with 1 run"), "{text}");
     // 40 episodes of 200 steps in each of 8 trainings, 12 in each of 16 tests.
     assert!(text.contains("6.40e4 steps of training, 3.84e4 of testing"), "{text}");
-    assert!(text.contains("measured: 2 trainings") && text.contains("which takes"), "{text}");
+    assert!(text.contains("8 cells in 4 groups of 2, 2 at a time") && text.contains("measured: 2 groups"), "{text}");
+    assert!(text.contains("at most, if every episode") && text.contains(" with --jobs 2\n"), "{text}");
+
+    // Cells that are done say what others of their kind take.
+    succeeded(&experiment.run("out", &["--cell", "0"]));
+    let out = experiment.out("out").display().to_string();
+    let text = printed(&["plan", &file, "--measure", "1", "--from", &out]);
+    let from = format!("\nas those of the same environment and method took of 1 cell in {out}: 4 cells, ");
+    assert!(text.contains(&from) && text.contains("measured: 1 group for"), "{text}");
+    assert!(
+        text.contains("until the step limit: 4 cells") && text.contains("\nwhat is left there, 7 cells: "),
+        "{text}"
+    );
 }

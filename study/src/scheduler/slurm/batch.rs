@@ -21,17 +21,14 @@ pub(super) struct CellLoad {
     pub(super) cell: usize,
     /// How long it may take.
     pub(super) seconds: f64,
-    /// Whether it must have a job of its own: it was lost before, perhaps through its own fault, which should not cost
-    /// others their turn.
-    pub(super) alone: bool,
 }
 
-/// Puts `loads` into at most `most_jobs` jobs, in their order. If that is too few for jobs of so many seconds, jobs
-/// become longer; what still has no place is left out, for a later submission.
-pub(super) fn batches(loads: &[CellLoad], mut size: Size, most_jobs: usize) -> Vec<Vec<usize>> {
-    let all: f64 = loads.iter().map(|load| load.seconds).sum();
+/// Cuts `groups` into at most `most_jobs` jobs, in their order; a job's cells are of one group. If that is too few for
+/// jobs of so many seconds, jobs become longer; what still has no place is left out, for a later submission.
+pub(super) fn batches(groups: &[Vec<CellLoad>], mut size: Size, most_jobs: usize) -> Vec<Vec<usize>> {
+    let all: f64 = groups.iter().flatten().map(|load| load.seconds).sum();
     loop {
-        let mut jobs = fill(loads, size);
+        let mut jobs: Vec<Vec<usize>> = groups.iter().flat_map(|group| cut(group, size)).collect();
         match &mut size {
             Size::Seconds(seconds) if jobs.len() > most_jobs && *seconds < all => *seconds *= 1.5,
             _ => {
@@ -42,17 +39,16 @@ pub(super) fn batches(loads: &[CellLoad], mut size: Size, most_jobs: usize) -> V
     }
 }
 
-fn fill(loads: &[CellLoad], size: Size) -> Vec<Vec<usize>> {
+fn cut(group: &[CellLoad], size: Size) -> Vec<Vec<usize>> {
     let mut jobs: Vec<Vec<usize>> = Vec::new();
     let mut filling = 0.0;
-    let mut closed = true;
-    for load in loads {
+    for load in group {
         let (weight, room) = match size {
             Size::Cells(cells) => (1.0, cells as f64),
             Size::Seconds(seconds) => (load.seconds, seconds),
         };
         match jobs.last_mut() {
-            Some(job) if !closed && !load.alone && job.len() < MOST_CELLS_PER_JOB && filling + weight <= room => {
+            Some(job) if job.len() < MOST_CELLS_PER_JOB && filling + weight <= room => {
                 job.push(load.cell);
                 filling += weight;
             }
@@ -61,7 +57,6 @@ fn fill(loads: &[CellLoad], size: Size) -> Vec<Vec<usize>> {
                 filling = weight;
             }
         }
-        closed = load.alone;
     }
     jobs
 }
@@ -70,8 +65,9 @@ fn fill(loads: &[CellLoad], size: Size) -> Vec<Vec<usize>> {
 mod tests {
     use super::*;
 
-    fn loads(seconds: &[f64]) -> Vec<CellLoad> {
-        seconds.iter().enumerate().map(|(cell, &seconds)| CellLoad { cell, seconds, alone: false }).collect()
+    /// One group.
+    fn loads(seconds: &[f64]) -> Vec<Vec<CellLoad>> {
+        vec![seconds.iter().enumerate().map(|(cell, &seconds)| CellLoad { cell, seconds }).collect()]
     }
 
     #[test]
@@ -103,11 +99,11 @@ mod tests {
     }
 
     #[test]
-    fn a_cell_that_was_lost_has_a_job_of_its_own() {
-        let mut loads = loads(&[1.0; 5]);
-        loads[2].alone = true;
-        assert_eq!(batches(&loads, Size::Cells(9), 1000), [vec![0, 1], vec![2], vec![3, 4]]);
-        loads.iter_mut().for_each(|load| load.alone = true);
-        assert_eq!(batches(&loads, Size::Seconds(9.0), 3).len(), 3, "it ends, though they cannot be put together");
+    fn a_job_has_cells_of_one_group() {
+        let all = &loads(&[1.0; 6])[0];
+        let groups = [all[..2].to_vec(), all[2..3].to_vec(), all[3..].to_vec()];
+        assert_eq!(batches(&groups, Size::Cells(2), 1000), [vec![0, 1], vec![2], vec![3, 4], vec![5]]);
+        assert_eq!(batches(&groups, Size::Seconds(9.0), 1000), [vec![0, 1], vec![2], vec![3, 4, 5]]);
+        assert_eq!(batches(&groups, Size::Seconds(9.0), 2).len(), 2, "it ends, though they cannot be put together");
     }
 }

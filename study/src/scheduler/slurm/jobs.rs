@@ -18,7 +18,7 @@ use crate::AnyError;
 use crate::files::{Lock, create_folder, io};
 use crate::folder::Folder;
 use crate::interrupt::StopFlag;
-use crate::plan::{Plan, distinct};
+use crate::plan::{Grouping, Plan, distinct};
 
 /// The jobs of a folder in Slurm's queue. Those that are there when the process ends stay there.
 pub struct Jobs<'a> {
@@ -54,7 +54,7 @@ pub struct Jobs<'a> {
     news: Vec<News>,
 }
 
-/// Up to where it was read what a job tells, and about which cells that was.
+/// Up to where it was read what a job tells, and the cells whose turn has come by that.
 #[derive(Default)]
 struct Told {
     offset: u64,
@@ -158,7 +158,9 @@ impl<'a> Jobs<'a> {
         let told = self.told.entry((submission.number, index)).or_default();
         for line in read_lines(&file, &mut told.offset).map_err(io("read", &path))? {
             let Some(&cell) = self.places.get(&*line.cell) else { continue };
-            told.cells.insert(cell);
+            if line.event.is_a_turn() {
+                told.cells.insert(cell);
+            }
             // An attempt that ended is the job's own affair, as long as the job goes on.
             if !line.event.is_last() {
                 self.news.push(News::Event(cell, line.event));
@@ -248,13 +250,13 @@ impl<'a> Jobs<'a> {
         }
     }
 
-    /// Submits the cells of `offers`, as far as Slurm takes them, and gives these.
-    fn submit(&mut self, offers: &[&Offer]) -> Result<Vec<usize>> {
+    /// Submits the cells of `groups`, as far as Slurm takes them, and gives these.
+    fn submit(&mut self, groups: &[Vec<Offer>]) -> Result<Vec<usize>> {
         let most_jobs = match self.slurm.most_jobs(self.stop) {
             Ok(number) => number,
             Err(error) => return self.put_off(error.into()),
         };
-        let jobs = batches(&self.loads(offers)?, self.size(), most_jobs);
+        let jobs = batches(&self.loads(groups)?, self.size(), most_jobs);
         let cells = jobs.concat();
         let ids = jobs.iter().map(|job| job.iter().map(|&cell| self.id(cell).to_owned()).collect()).collect();
         let text = |path: &Path| Ok(script(&self.options.task, self.folder.path(), path)?);
@@ -300,17 +302,17 @@ impl<'a> Jobs<'a> {
     }
 
     /// How long each cell may take: as long as others of its kind took, or as measured.
-    fn loads(&mut self, offers: &[&Offer]) -> Result<Vec<CellLoad>> {
-        let needed = self.options.cells_per_job.is_none() && offers.iter().any(|offer| offer.seconds.is_none());
-        if needed && self.known_costs.is_none() {
+    fn loads(&mut self, groups: &[Vec<Offer>]) -> Result<Vec<Vec<CellLoad>>> {
+        let unknown = groups.iter().flatten().any(|offer| offer.seconds.is_none());
+        if self.options.cells_per_job.is_none() && unknown && self.known_costs.is_none() {
             self.known_costs = Some((self.costs)().map_err(SlurmError::Cost)?);
         }
         let known = self.known_costs.as_deref().unwrap_or_default();
-        let load = |&&Offer { cell, attempts, seconds, .. }: &&Offer| {
-            let seconds = seconds.or(known.get(cell).copied()).unwrap_or_default();
-            CellLoad { cell, seconds, alone: attempts > 0 }
+        let load = |&Offer { cell, seconds, .. }: &Offer| CellLoad {
+            cell,
+            seconds: seconds.or(known.get(cell).copied()).unwrap_or_default(),
         };
-        Ok(offers.iter().map(load).collect())
+        Ok(groups.iter().map(|group| group.iter().map(load).collect()).collect())
     }
 
     fn live(&self) -> impl Iterator<Item = &QueuedJob> {
@@ -330,6 +332,11 @@ impl<'a> Jobs<'a> {
 }
 
 impl Backend for Jobs<'_> {
+    /// A job has cells of one kind, and cuts them into groups itself.
+    fn grouping(&self) -> Grouping {
+        Grouping::BY_KIND
+    }
+
     fn convicts(&self) -> bool {
         false
     }
@@ -361,22 +368,28 @@ impl Backend for Jobs<'_> {
         if self.deciding.is_some() { usize::MAX } else { 0 }
     }
 
-    fn begin(&mut self, offers: &[Offer]) -> Result<Vec<usize>> {
+    fn begin(&mut self, groups: &[Vec<Offer>]) -> Result<Vec<usize>> {
         let queued = self.queued();
         let (mut taken, mut missing) = (Vec::new(), Vec::new());
-        for offer in offers {
-            let place = self.folder.cell(self.id(offer.cell));
-            match offer.retry {
-                // The job that had it then is through with it, also if it has others to do.
-                Some(failure) if place.failure_mark() == Some(failure) => {
-                    if place.forgive(failure)? {
-                        missing.push(offer);
+        for group in groups {
+            let mut left = Vec::new();
+            for offer in group {
+                let place = self.folder.cell(self.id(offer.cell));
+                match offer.retry {
+                    // The job that had it then is through with it, also if it has others to do.
+                    Some(failure) if place.failure_mark() == Some(failure) => {
+                        if place.forgive(failure)? {
+                            left.push(*offer);
+                        }
                     }
+                    _ if queued.contains(&offer.cell) => taken.push(offer.cell),
+                    // An earlier process submitted it: it must be missing from two answers.
+                    _ if self.answers == 1 && self.last.contains_key(&offer.cell) => {}
+                    _ => left.push(*offer),
                 }
-                _ if queued.contains(&offer.cell) => taken.push(offer.cell),
-                // An earlier process submitted it: it must be missing from two answers.
-                _ if self.answers == 1 && self.last.contains_key(&offer.cell) => {}
-                _ => missing.push(offer),
+            }
+            if !left.is_empty() {
+                missing.push(left);
             }
         }
         if !missing.is_empty() {

@@ -1,9 +1,9 @@
 //! Doing a plan's cells as jobs of Slurm, over a folder that all its nodes see.
 //!
 //! The folder says what is done, whatever Slurm says. Slurm is asked for one thing only: which of the cells without a
-//! result are still in its queue. The others are submitted, as an array whose jobs do several cells each. So a watching
-//! process remembers nothing that a later one would need, and what happens while nobody watches is noticed later: a
-//! node that was lost, a time limit, a job that was cancelled.
+//! result are still in its queue. The others are submitted, as an array whose jobs do several cells of one kind each, in
+//! groups. So a watching process remembers nothing that a later one would need, and what happens while nobody watches is
+//! noticed later: a node that was lost, a time limit, a job that was cancelled.
 //!
 //! ```text
 //! DIR/slurm/lock               locked while one of several watching processes decides and submits

@@ -28,8 +28,10 @@ pub struct SlurmOptions {
 pub struct Task {
     /// The program `perturb`, at a place that all nodes see.
     pub program: PathBuf,
-    /// Cells at a time, at least 1.
+    /// Groups of cells at a time, at least 1.
     pub jobs: usize,
+    /// The most cells in a group, at least 1.
+    pub group: usize,
     /// Physics threads of the server that the job starts on its node, at least 1; without meaning if there are `servers`.
     pub workers: usize,
     /// Addresses of servers that all jobs share; empty for a private one in each job.
@@ -37,7 +39,7 @@ pub struct Task {
 }
 
 impl Task {
-    /// The cores that a job asks for. A cell's training and its environments take turns, so that one does for both.
+    /// The cores that a job asks for. A group's trainings and their environments take turns, so that one does for both.
     pub fn cores(&self) -> usize {
         if self.servers.is_empty() { self.jobs.max(self.workers) } else { self.jobs }
     }
@@ -182,7 +184,7 @@ mod tests {
 
     #[test]
     fn a_job_asks_for_the_cores_that_it_uses() {
-        let task = Task { program: "/x".into(), jobs: 2, workers: 3, servers: Vec::new() };
+        let task = Task { program: "/x".into(), jobs: 2, group: 36, workers: 3, servers: Vec::new() };
         assert_eq!(task.cores(), 3);
         assert_eq!(Task { servers: vec!["a:1".into()], ..task }.cores(), 2);
     }

@@ -21,6 +21,11 @@ use crate::plan::Plan;
 const PLAN: &str = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 2
     [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
 
+/// As many of one kind.
+fn of_one_kind() -> Plan {
+    Plan::parse("test", PLAN.replace(", 'Hopper'", "").replace("runs = 2", "runs = 4")).unwrap()
+}
+
 /// Counts submissions, and puts their jobs into `queue`. `hook.sh`, if a test has written it, then knows the script as
 /// $script, the number as $number, and may change results and queue.
 const SBATCH: &str = r#"
@@ -46,7 +51,7 @@ pub(super) fn options() -> SlurmOptions {
         time: None,
         array_limit: None,
         cells_per_job: Some(1),
-        task: Task { program: "/bin/true".into(), jobs: 1, workers: 1, servers: Vec::new() },
+        task: Task { program: "/bin/true".into(), jobs: 1, group: 36, workers: 1, servers: Vec::new() },
         queue_interval: Duration::from_secs(15),
     }
 }
@@ -201,7 +206,7 @@ fn a_second_call_watches_and_submits_only_what_is_new() {
 #[test]
 fn what_slurm_lost_is_submitted_again() {
     let mut fake = Fake::new();
-    fake.options.cells_per_job = None;
+    (fake.options.cells_per_job, fake.plan) = (None, of_one_kind());
     let ids = fake.ids();
     // Each cell may take 100 s: three make a job. Its first one is done, then the node is lost; the other job vanishes.
     fake.hook(&format!(
@@ -221,6 +226,38 @@ fn what_slurm_lost_is_submitted_again() {
     let lost = "3 cells left Slurm's queue without a result (1_0 NODE_FAIL, 1_1 gone)";
     assert!(said.iter().any(|sentence| sentence == lost), "{said:?}");
     assert_eq!(fake.costs.get(), 1);
+}
+
+#[test]
+fn a_job_has_cells_of_one_kind() {
+    let mut fake = Fake::new();
+    fake.options.cells_per_job = Some(9);
+    let ids = fake.ids();
+    fake.hook("for cells in $(cat \"$submission/cells.txt\"); do done_ $cells; done");
+    assert_eq!(fake.run().unwrap(), finished());
+    assert_eq!(fake.submissions()[0].jobs, [ids[..2].to_vec(), ids[2..].to_vec()]);
+}
+
+#[test]
+fn a_job_that_got_further_until_its_time_was_up_is_submitted_as_it_was_and_another_in_single_cells() {
+    for (saved, again) in [(2, 1), (1, 2)] {
+        let mut fake = Fake::new();
+        (fake.options.cells_per_job, fake.plan) = (Some(2), of_one_kind());
+        let ids = fake.ids();
+        ids[2..].iter().for_each(|id| fake.finish(id));
+        fake.hook(&format!(
+            "[ $number -gt 1 ] || for id in {0} {1}; do
+                 says 0 $id training ',\"episodes\":1,\"timesteps\":1,\"saved\":1'
+                 says 0 $id training ',\"episodes\":2,\"timesteps\":2,\"saved\":{saved}'
+             done
+             echo \"$number|0|TIMEOUT|TimeLimit|n1|$name\" >queue
+             [ $number -lt 2 ] || for cells in $(cat \"$submission/cells.txt\"); do done_ $cells; done",
+            ids[0], ids[1]
+        ));
+        assert_eq!(fake.run().unwrap(), finished());
+        let jobs: Vec<usize> = fake.submissions().iter().map(|submission| submission.jobs.len()).collect();
+        assert_eq!(jobs, [1, again], "saved {saved}");
+    }
 }
 
 #[test]
@@ -362,7 +399,7 @@ fn failed_cells_are_tried_again_on_request_only() {
 #[test]
 fn a_cell_that_failed_in_an_array_of_before_is_tried_again_while_the_array_goes_on() {
     let mut fake = Fake::new();
-    fake.options.cells_per_job = Some(4);
+    (fake.options.cells_per_job, fake.plan) = (Some(4), of_one_kind());
     let ids = fake.ids();
     assert_eq!(fake.run_until("submitted 4 cells as Slurm job 1: 1 job").unwrap(), stopped(&["1"]));
     let failure = Failure { id: ids[0].clone(), reason: "NaN".into(), commit: "x".into() };

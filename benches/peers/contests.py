@@ -1,0 +1,120 @@
+"""What is compared: trainings that do the same work in perturb and in its peers, and how a peer is asked for them."""
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+
+# perturb's names and defaults; each contender translates them. A learning rate is constant.
+PPO = {
+    "learning_rate": 3e-4,
+    "n_epochs": 10,
+    "n_minibatches": 1,
+    "gamma": 0.99,
+    "gae_lambda": 0.95,
+    "clip_range": 0.2,
+    "clip_range_vf": 0.2,
+    "ent_coef": 0.0,
+    "vf_coef": 0.5,
+    "max_grad_norm": 0.5,
+    "adam_eps": 1e-5,
+}
+A2C = {
+    "learning_rate": 7e-4,
+    "gamma": 0.99,
+    "ent_coef": 0.01,
+    "vf_coef": 0.5,
+    "max_grad_norm": 0.5,
+    "rms_alpha": 0.99,
+    "rms_eps": 1e-5,
+}
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A program of this folder that trains as its first argument, a contest's index, says."""
+
+    name: str
+    script: str
+    # The process's variables beside those that it inherits.
+    environ: dict[str, str] = field(default_factory=dict)
+
+
+PUREJAXRL = Peer("PureJaxRL", "with_purejaxrl.py")
+# XLA without its newer runtime for CPUs, JAX's default: faster with networks as small as these.
+PUREJAXRL_WITHOUT_THUNKS = replace(
+    PUREJAXRL,
+    name="PureJaxRL, thunk runtime off",
+    environ={"XLA_FLAGS": "--xla_cpu_use_thunk_runtime=false"},
+)
+STABLE_BASELINES3 = Peer("stable-baselines3", "with_stable_baselines3.py")
+
+
+@dataclass(frozen=True)
+class Contest:
+    """One training: separate policy and value networks of 64 × 64 tanh units, from new weights to `steps`."""
+
+    algorithm: str
+    environment: str
+    num_envs: int
+    n_steps: int
+    iterations: int
+    peers: tuple[Peer, ...]
+    # Steps of the last episodes. Without learning CartPole's last some 20. HalfCheetah's end early in perturb, where it
+    # can fall, and never in Gymnasium.
+    least_length: float
+
+    @property
+    def name(self) -> str:
+        """As the ids of the other benches."""
+        return f"{self.algorithm}_ff/{self.environment}/{self.num_envs}x{self.n_steps}"
+
+    @property
+    def settings(self) -> dict[str, float]:
+        """The algorithm's."""
+        return PPO if self.algorithm == "ppo" else A2C
+
+    @property
+    def steps(self) -> int:
+        """Steps of all environments in one training."""
+        return self.iterations * self.num_envs * self.n_steps
+
+    @property
+    def updates(self) -> int:
+        """Steps of the optimiser in one training."""
+        return self.iterations * (PPO["n_epochs"] * PPO["n_minibatches"] if self.algorithm == "ppo" else 1)
+
+
+CONTESTS = [
+    Contest("ppo", "CartPole", 8, 128, iterations=200, peers=(PUREJAXRL, PUREJAXRL_WITHOUT_THUNKS), least_length=60),
+    # perturb logs every 100th iteration of A2C.
+    Contest("a2c", "CartPole", 16, 5, iterations=1500, peers=(STABLE_BASELINES3,), least_length=60),
+    Contest("ppo", "HalfCheetah", 8, 128, iterations=60, peers=(STABLE_BASELINES3,), least_length=100),
+]
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a training came to."""
+
+    steps: int
+    updates: int
+    # Mean of the last episodes.
+    episode_length: float
+    seconds: float
+
+    def rate(self, contest: Contest) -> float:
+        """Environment steps a second, of a training that did the contest's work and learned from it."""
+        assert self.steps == contest.steps, f"{self.steps} steps in place of {contest.steps}"
+        assert self.updates == contest.updates, f"{self.updates} updates in place of {contest.updates}"
+        assert self.episode_length >= contest.least_length, (
+            f"episodes last {self.episode_length} steps, expected {contest.least_length} or more"
+        )
+        return self.steps / self.seconds
+
+
+def serve(remark: str, train: Callable[[int], Training]) -> None:
+    """Trains once for every seed on standard input, so that a peer is imported and compiled once for all rounds."""
+    print(remark, flush=True)
+    for seed in sys.stdin:
+        print(json.dumps(asdict(train(int(seed)))), flush=True)

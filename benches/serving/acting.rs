@@ -1,0 +1,88 @@
+//! What it costs that the server plays, beside computing the policy's actions alone.
+
+use super::{
+    Failure, ROUNDS,
+    client::{Client, Process, SEED},
+    median,
+};
+use perturb::proto;
+use perturb_policy::{
+    ActionKind, Inputs, Normalisers, Outcome, Player, PolicySpec, Role, initial_weights,
+    random::{Purpose, stream},
+};
+use std::time::Instant;
+
+const BATCH: usize = 8;
+/// CartPole's.
+const OBSERVATION: usize = 4;
+const ACTION: ActionKind = ActionKind::Discrete { n: 2 };
+/// Steps in a reply.
+const STEPS: u32 = 1024;
+
+/// The figure's name.
+pub(crate) fn id(lstm: Option<usize>) -> &'static str {
+    if lstm.is_some() { "act/CartPole/8/RC" } else { "act/CartPole/8/FF" }
+}
+
+/// A policy of the paper's size in 8 CartPoles.
+pub(crate) async fn played(lstm: Option<usize>) -> Result<(), Failure> {
+    let spec = match lstm {
+        None => PolicySpec::feed_forward(OBSERVATION, ACTION),
+        Some(_) => PolicySpec::recurrent(OBSERVATION, ACTION),
+    };
+    let arrays = initial_weights(&spec, &mut stream(SEED, Purpose::Weights));
+    let weights: Vec<f32> = arrays.into_iter().flat_map(|array| array.data).collect();
+    let steps = if lstm.is_some() { STEPS / 16 } else { STEPS };
+
+    let server = Process::server(1)?;
+    let mut client = Client::open(&server.socket, "CartPole", BATCH).await?;
+    let mut request = proto::Act {
+        weights: weights.iter().flat_map(|x| x.to_le_bytes()).collect(),
+        task: Some(proto::act::Task::Steps(steps)),
+        ..Default::default()
+    };
+    let training = proto::RandomStream { key: vec![0; 32].into(), stream: 0, position: 0 };
+    let policy = proto::Policy {
+        hidden: spec.hidden.iter().map(|&width| width as u32).collect(),
+        lstm: spec.lstm.map_or(0, |width| width as u32),
+        role: Some(proto::policy::Role::Training(training)),
+        ..Default::default()
+    };
+    client.act(proto::Act { policy: Some(policy), ..request.clone() }, steps).await?;
+    request.weights.clear();
+    let mut player = alone(&spec, &weights)?;
+    let (mut each, mut computed) = (Vec::new(), Vec::new());
+    for _ in 0..ROUNDS {
+        each.push(client.act(request.clone(), steps).await? * 1e6 / f64::from(steps));
+        computed.push(compute(&mut player, steps)? * 1e6 / f64::from(steps));
+    }
+    let (each, computed) = (median(&mut each), median(&mut computed));
+    println!("{:<22} {each:>12.2} us a step of 8, of which {computed:.2} are the policy's", id(lstm));
+    Ok(())
+}
+
+fn alone(spec: &PolicySpec, weights: &[f32]) -> Result<Player, Failure> {
+    let inputs = Inputs::new(OBSERVATION, ACTION, BATCH, false);
+    let mut player = Player::new(spec, inputs, BATCH, 1, Normalisers::default(), Role::training(SEED));
+    player.load(weights)?;
+    player.begin(&[0.01; BATCH * OBSERVATION], None)?;
+    Ok(player)
+}
+
+/// Acts and observes the same again and again. Returns the seconds.
+fn compute(player: &mut Player, steps: u32) -> Result<f64, Failure> {
+    let outcome = Outcome {
+        observations: &[0.02; BATCH * OBSERVATION],
+        rewards: &[1.0; BATCH],
+        terminated: &[false; BATCH],
+        truncated: &[false; BATCH],
+        final_observations: &[],
+        ended: &[],
+    };
+    let start = Instant::now();
+    for _ in 0..steps {
+        assert_eq!(player.act()?.len(), 4 * BATCH);
+        player.observe(&outcome, None)?;
+    }
+    Ok(start.elapsed().as_secs_f64())
+}

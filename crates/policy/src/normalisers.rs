@@ -1,0 +1,77 @@
+//! What stands between an environment's numbers and a policy's.
+
+use crate::error::{Result, check_length};
+use crate::normaliser::{ObservationNormaliser, RewardNormaliser};
+
+/// Statistics; `None` where nothing is normalised.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Normalisers {
+    /// Of observations.
+    pub observations: Option<ObservationNormaliser>,
+    /// Of rewards.
+    pub rewards: Option<RewardNormaliser>,
+}
+
+/// What normalisers do with what comes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Statistics {
+    /// They take it in, and normalise it with the updated statistics, as stable-baselines3's VecNormalize in training.
+    Running,
+    /// They stay as they are.
+    Frozen,
+}
+
+impl Normalisers {
+    /// Normalises `observations` `[N, O]`, after running statistics have taken in those of the `active` `[N]`
+    /// environments, or all.
+    pub(crate) fn take_observations(
+        &mut self,
+        observations: &mut [f32],
+        statistics: Statistics,
+        active: Option<&[bool]>,
+    ) -> Result<()> {
+        let Some(normaliser) = &mut self.observations else { return Ok(()) };
+        if statistics == Statistics::Running {
+            normaliser.update_active(observations, active)?;
+        }
+        normaliser.normalise(observations)
+    }
+
+    /// Normalises a step's `rewards` `[N]`, after running statistics have taken in those of the `active` `[N]`
+    /// environments, or all. `done` `[N]`: where the discounted return ends.
+    pub(crate) fn take_rewards(
+        &mut self,
+        rewards: &mut [f32],
+        done: &[bool],
+        statistics: Statistics,
+        active: Option<&[bool]>,
+    ) -> Result<()> {
+        let Some(normaliser) = &mut self.rewards else { return Ok(()) };
+        if statistics == Statistics::Running {
+            normaliser.update_active(rewards, done, active)?;
+        }
+        normaliser.normalise(rewards);
+        Ok(())
+    }
+
+    /// Normalises final observations `[K, O]`; the statistics stay.
+    pub(crate) fn normalise(&self, observations: &mut [f32]) -> Result<()> {
+        self.observations.as_ref().map_or(Ok(()), |normaliser| normaliser.normalise(observations))
+    }
+
+    /// Whether these can normalise what N environments with observations of O numbers give.
+    ///
+    /// # Errors
+    /// [`Error::Statistics`](crate::Error::Statistics) with what is wrong; [`Error::Length`](crate::Error::Length).
+    pub fn check(&self, n_envs: usize, observation_size: usize) -> Result<()> {
+        let named = |name| move |reason| crate::error::Error::Statistics { name, reason };
+        if let Some(normaliser) = &self.observations {
+            normaliser.check(observation_size).map_err(named("observations"))?;
+        }
+        if let Some(normaliser) = &self.rewards {
+            normaliser.check().map_err(named("rewards"))?;
+            check_length("the discounted returns [N]", normaliser.returns().len(), n_envs)?;
+        }
+        Ok(())
+    }
+}

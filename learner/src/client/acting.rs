@@ -1,0 +1,191 @@
+//! Players and what servers played, between the protocol and the domain.
+
+use std::ops::Range;
+
+use bytes::Bytes;
+use perturb_policy::{
+    Normalisers, ObservationNormaliser, Player, PlayerState, PolicySpec, RewardNormaliser, Role, RunningMoments,
+};
+use perturb_protocol::ClientError;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
+
+use super::part::Part;
+use super::reply::EndedEpisode;
+use super::session::Session;
+use crate::proto;
+
+/// Where actions of trainings and tests are chosen, which changes no byte.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ActAt {
+    /// At the server, if it can: a line's delay is then paid once a rollout, not at each step. Trainings over several
+    /// servers, and several trainings together, choose theirs at the client all the same.
+    #[default]
+    Server,
+    /// At the client.
+    Client,
+}
+
+/// Steps that one server played in all its environments, with the episodes that ended in them.
+#[derive(Clone, Debug, Default)]
+pub struct Played {
+    /// As the protocol has them, `[T, N, …]`.
+    pub acted: proto::Acted,
+    /// In order of steps and slots, with the steps, 0 … T-1.
+    pub ended: Vec<(usize, EndedEpisode)>,
+}
+
+impl Session<'_> {
+    /// Has servers play: `request` makes what each is asked for, if anything, of its slots, and `take` gets these and each
+    /// one's reply. They compute at the same time.
+    ///
+    /// # Errors
+    /// [`ClientError::Refused`] with the server's sentence; [`ClientError::Protocol`] if the reply does not fit; the
+    /// failures of a connection.
+    pub fn play(
+        &mut self,
+        mut request: impl FnMut(Range<usize>) -> Option<proto::Act>,
+        mut take: impl FnMut(Range<usize>, Played) -> Result<(), String>,
+    ) -> Result<(), ClientError> {
+        self.exchange(
+            |part| request(part.range.clone()),
+            |part, acted: proto::Acted| {
+                let played = part.played(acted)?;
+                let expected = "arrays as the protocol describes them";
+                take(part.range.clone(), played).map_err(|got| part.stream.mismatch::<proto::Act>(got, expected.into()))
+            },
+        )
+    }
+
+    /// What stands beside the weights of the policy that a server plays; `None` if the batch is not on one server.
+    ///
+    /// # Errors
+    /// Those of [`Session::play`].
+    pub fn save_player(&mut self) -> Result<Option<(PlayerState, Normalisers)>, ClientError> {
+        let mut states = Vec::new();
+        self.exchange(
+            |_| Some(proto::SavePlayer {}),
+            |part, saved: proto::PlayerSaved| {
+                let mismatch = || {
+                    let expected = "what a later policy goes on from";
+                    part.stream.mismatch::<proto::SavePlayer>("an incomplete player".into(), expected.into())
+                };
+                states.push(saved_player(&saved).ok_or_else(mismatch)?);
+                Ok(())
+            },
+        )?;
+        Ok(states.pop().filter(|_| states.is_empty()))
+    }
+}
+
+impl Part {
+    /// Names the episodes that ended in a reply.
+    fn played(&self, mut acted: proto::Acted) -> Result<Played, ClientError> {
+        let mut ended = Vec::with_capacity(acted.ended.len());
+        for proto::EndedAt { step, end, terminated, .. } in std::mem::take(&mut acted.ended) {
+            let slot = end.as_ref().map_or(usize::MAX, |end| self.range.start.saturating_add(end.slot as usize));
+            let inside = self.range.contains(&slot) && step < acted.steps;
+            let episode = end.filter(|_| inside).and_then(|end| EndedEpisode::of(end, slot, terminated));
+            let Some(episode) = episode else {
+                let got = format!("an ended episode of slot {slot} in step {step}");
+                let expected = "a named episode with its receipt".into();
+                return Err(self.stream.mismatch::<proto::Act>(got, expected));
+            };
+            ended.push((step as usize, episode));
+        }
+        Ok(Played { acted, ended })
+    }
+}
+
+/// A player as the protocol has it, to begin where it is.
+pub fn policy(spec: &PolicySpec, player: &Player) -> proto::Policy {
+    let Normalisers { observations, rewards } = player.normalisers();
+    proto::Policy {
+        hidden: spec.hidden.iter().map(|&width| width as u32).collect(),
+        lstm: spec.lstm.map_or(0, |width| width as u32),
+        outcomes: spec.observation_size > player.observation_size(),
+        observations: observations.as_ref().map(|it| moments(it.moments())),
+        rewards: rewards.as_ref().map(|it| proto::RewardMoments {
+            gamma: it.gamma(),
+            returns: doubles(it.returns()),
+            moments: Some(moments(it.moments())),
+        }),
+        role: Some(match player.role() {
+            Role::Training(stream) => proto::policy::Role::Training(proto::RandomStream {
+                key: stream.get_seed().to_vec().into(),
+                stream: stream.get_stream(),
+                position: stream.get_word_pos() as u64,
+            }),
+            Role::Testing(trials) => proto::policy::Role::Testing(proto::TestStreams { seed: trials.seed() }),
+        }),
+        state: player.state().map(|state| proto::PlayerState {
+            observations: floats(&state.observations),
+            starts: state.starts.iter().map(|&start| u8::from(start)).collect(),
+            outcomes: floats(&state.outcomes),
+            memory: floats(&state.memory),
+        }),
+    }
+}
+
+/// The policy of a test, for one of several servers that has `n_envs` environments.
+pub fn for_server(policy: &proto::Policy, n_envs: usize) -> proto::Policy {
+    let mut policy = policy.clone();
+    if let Some(rewards) = &mut policy.rewards {
+        rewards.returns = doubles(&vec![0.0; n_envs]); // of no use where statistics are frozen
+    }
+    policy
+}
+
+fn moments(moments: &RunningMoments) -> proto::Moments {
+    proto::Moments { count: moments.count(), mean: doubles(moments.mean()), squares: doubles(moments.squares()) }
+}
+
+/// `None` if something is missing.
+fn saved_player(saved: &proto::PlayerSaved) -> Option<(PlayerState, Normalisers)> {
+    let (stream, state) = (saved.actions.as_ref()?, saved.state.as_ref()?);
+    let mut actions = ChaCha8Rng::from_seed(stream.key[..].try_into().ok()?);
+    actions.set_stream(stream.stream);
+    actions.set_word_pos(stream.position.into());
+    let moments = |it: &proto::Moments| {
+        Some(RunningMoments::from_parts(it.count, read_doubles(&it.mean)?, read_doubles(&it.squares)?))
+    };
+    let observations = match &saved.observations {
+        Some(it) => Some(ObservationNormaliser::from_moments(moments(it)?)),
+        None => None,
+    };
+    let rewards = match &saved.rewards {
+        Some(it) => {
+            let statistics = moments(it.moments.as_ref()?)?;
+            Some(RewardNormaliser::from_parts(it.gamma, read_doubles(&it.returns)?, statistics))
+        }
+        None => None,
+    };
+    let state = PlayerState {
+        observations: read_floats(&state.observations)?,
+        starts: state.starts.iter().map(|&start| start != 0).collect(),
+        outcomes: read_floats(&state.outcomes)?,
+        memory: read_floats(&state.memory)?,
+        actions,
+    };
+    Some((state, Normalisers { observations, rewards }))
+}
+
+/// Little-endian.
+pub fn floats(numbers: &[f32]) -> Bytes {
+    numbers.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>().into()
+}
+
+fn doubles(numbers: &[f64]) -> Bytes {
+    numbers.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>().into()
+}
+
+/// Little-endian numbers; `None` if bytes are left over.
+pub fn read_floats(bytes: &[u8]) -> Option<Vec<f32>> {
+    let (words, rest) = bytes.as_chunks::<4>();
+    rest.is_empty().then(|| words.iter().map(|word| f32::from_le_bytes(*word)).collect())
+}
+
+fn read_doubles(bytes: &[u8]) -> Option<Vec<f64>> {
+    let (words, rest) = bytes.as_chunks::<8>();
+    rest.is_empty().then(|| words.iter().map(|word| f64::from_le_bytes(*word)).collect())
+}

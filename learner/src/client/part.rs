@@ -1,0 +1,92 @@
+//! What one server owns of a batch.
+
+use std::ops::Range;
+
+use bytes::{Bytes, BytesMut};
+use perturb_protocol::{Ask, ClientError, Connection, Stream};
+
+use super::options::{OpenOptions, open_request};
+use super::reply::{EndedEpisode, StepReply};
+use crate::proto::{self, AutoresetMode};
+
+/// The part of a batch that one server owns.
+#[derive(Debug)]
+pub(super) struct Part {
+    pub(super) stream: Stream,
+    /// Its slots.
+    pub(super) range: Range<usize>,
+    /// Encoded actions; its memory comes back when a request has been sent.
+    pub(super) actions: BytesMut,
+    /// It owes a reply.
+    pub(super) asked: bool,
+}
+
+impl Part {
+    /// Opens the slots of `range`, counted over all `options`.
+    pub(super) async fn open(
+        connection: &Connection,
+        options: &[OpenOptions],
+        range: Range<usize>,
+        autoreset_mode: AutoresetMode,
+    ) -> Result<(Self, proto::Opened), ClientError> {
+        let open = open_request(options, range.clone(), autoreset_mode).ok_or_else(|| ClientError::Refused {
+            address: connection.address().clone(),
+            request: proto::Open::NAME,
+            code: tonic::Code::InvalidArgument,
+            message: format!("environments {range:?} are more than the protocol can number (2^32 - 1)"),
+        })?;
+        let (stream, opened) = Stream::open(connection, open).await?;
+        Ok((Self { stream, range, actions: BytesMut::new(), asked: false }, opened))
+    }
+
+    /// Those of `slots` that it owns.
+    pub(super) fn overlap(&self, slots: &Range<usize>) -> Range<usize> {
+        let start = slots.start.clamp(self.range.start, self.range.end);
+        start..slots.end.clamp(start, self.range.end)
+    }
+
+    /// A mask of those of `slots` that it owns; `None` if it owns none.
+    pub(super) fn mask(&self, slots: &Range<usize>) -> Option<Bytes> {
+        let own = self.overlap(slots);
+        (!own.is_empty()).then(|| self.range.clone().map(|slot| u8::from(own.contains(&slot))).collect())
+    }
+
+    /// Puts one server's reply in its place in the batch's.
+    pub(super) fn store(&self, stepped: proto::Stepped, size: usize, reply: &mut StepReply) -> Result<(), ClientError> {
+        let Range { start, end } = self.range;
+        self.decode("observations", &stepped.observations, &mut reply.observations[start * size..end * size])?;
+        self.decode("rewards", &stepped.rewards, &mut reply.rewards[start..end])?;
+        self.decode_flags("terminated", &stepped.terminated, &mut reply.terminated[start..end])?;
+        self.decode_flags("truncated", &stepped.truncated, &mut reply.truncated[start..end])?;
+        let first = reply.final_observations.len();
+        reply.final_observations.resize(first + stepped.ended.len() * size, 0.0);
+        let finals = &mut reply.final_observations[first..];
+        self.decode("final_observations", &stepped.final_observations, finals)?;
+        for end in stepped.ended {
+            let slot = start + end.slot as usize;
+            let named = self.range.contains(&slot).then(|| EndedEpisode::of(end, slot, reply.terminated[slot]));
+            let Some(ended) = named.flatten() else {
+                let expected = "a named episode with its receipt";
+                return Err(self.mismatch(format!("an ended episode of slot {slot}"), expected.into()));
+            };
+            reply.ended.push(ended);
+        }
+        Ok(())
+    }
+
+    fn decode(&self, field: &'static str, bytes: &Bytes, out: &mut [f32]) -> Result<(), ClientError> {
+        self.stream.decode::<proto::Step>(field, bytes, out)
+    }
+
+    fn decode_flags(&self, field: &'static str, bytes: &Bytes, out: &mut [bool]) -> Result<(), ClientError> {
+        if bytes.len() != out.len() {
+            return Err(self.mismatch(format!("{} bytes of {field}", bytes.len()), out.len().to_string()));
+        }
+        out.iter_mut().zip(bytes.iter()).for_each(|(out, byte)| *out = *byte != 0);
+        Ok(())
+    }
+
+    fn mismatch(&self, got: String, expected: String) -> ClientError {
+        self.stream.mismatch::<proto::Step>(got, expected)
+    }
+}

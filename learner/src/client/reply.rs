@@ -1,0 +1,145 @@
+//! What a step brings.
+
+use std::ops::Range;
+
+use perturb_policy::{Ended, Outcome};
+
+use crate::proto;
+
+/// An episode that ended, with the parameters that it ran with.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EndedEpisode {
+    /// Where in the session's batch, 0 … N-1.
+    pub slot: usize,
+    /// The environment's index: its place among those of its [`OpenOptions`], unless it was restored from elsewhere.
+    pub environment_index: u32,
+    /// Counts the environment's episodes from 0.
+    pub episode_index: u64,
+    /// Counts the environment's trials from 0.
+    pub trial_index: u64,
+    /// Counts the trial's episodes from 0.
+    pub episode_in_trial: u32,
+    /// The undiscounted sum of its rewards.
+    pub episode_return: f64,
+    /// Its number of steps.
+    pub length: u32,
+    /// Whether it was a success.
+    pub success: bool,
+    /// Whether the task ended it, as opposed to the step limit alone.
+    pub terminated: bool,
+    /// Whether the physics diverged.
+    pub diverged: bool,
+    /// What it achieved of what the environment's success rule compares; `None` if nothing.
+    pub achieved: Option<f64>,
+    /// The parameters that were drawn or given and what the physics had, in the catalogue's order.
+    pub receipt: proto::Receipt,
+}
+
+/// The outcome of a step, in buffers that are used again.
+#[derive(Clone, Debug, Default)]
+pub struct StepReply {
+    /// `[N, O]` observations; where an episode ended, the first one of the next.
+    pub observations: Vec<f32>,
+    /// `[N]` rewards.
+    pub rewards: Vec<f32>,
+    /// `[N]` whether the task ended the episode.
+    pub terminated: Vec<bool>,
+    /// `[N]` whether the step limit ended it.
+    pub truncated: Vec<bool>,
+    /// `[K, O]` last observations of the episodes that ended, in the order of `ended`.
+    pub final_observations: Vec<f32>,
+    /// The K episodes that ended, in order of slots.
+    pub ended: Vec<EndedEpisode>,
+}
+
+/// What a step brought to successive slots: the fields of [`StepReply`].
+#[derive(Clone, Copy, Debug)]
+pub struct StepSlice<'a> {
+    /// The first of the slots.
+    pub first_slot: usize,
+    /// `[n, O]`
+    pub observations: &'a [f32],
+    /// `[n]`
+    pub rewards: &'a [f32],
+    /// `[n]`
+    pub terminated: &'a [bool],
+    /// `[n]`
+    pub truncated: &'a [bool],
+    /// `[k, O]`
+    pub final_observations: &'a [f32],
+    /// `[k]`, whose slots are counted over the whole batch.
+    pub ended: &'a [EndedEpisode],
+}
+
+impl StepReply {
+    /// All of it.
+    pub fn all(&self) -> StepSlice<'_> {
+        self.slice(0..self.rewards.len())
+    }
+
+    /// What belongs to the slots of `range`.
+    pub fn slice(&self, range: Range<usize>) -> StepSlice<'_> {
+        let size = self.observations.len() / self.rewards.len().max(1);
+        let place = |slot| self.ended.partition_point(|end| end.slot < slot);
+        let ended = place(range.start)..place(range.end);
+        StepSlice {
+            first_slot: range.start,
+            observations: &self.observations[range.start * size..range.end * size],
+            rewards: &self.rewards[range.clone()],
+            terminated: &self.terminated[range.clone()],
+            truncated: &self.truncated[range],
+            final_observations: &self.final_observations[ended.start * size..ended.end * size],
+            ended: &self.ended[ended],
+        }
+    }
+
+    pub(super) fn resize(&mut self, num_envs: usize, observation_size: usize) {
+        self.observations.resize(num_envs * observation_size, 0.0);
+        self.rewards.resize(num_envs, 0.0);
+        self.terminated.resize(num_envs, false);
+        self.truncated.resize(num_envs, false);
+        self.final_observations.clear();
+        self.ended.clear();
+    }
+}
+
+impl<'a> StepSlice<'a> {
+    /// What a player of these slots takes; `ended` holds the ends meanwhile.
+    pub fn outcome(&self, ended: &'a mut Vec<Ended>) -> Outcome<'a> {
+        ended.clear();
+        ended.extend(self.ended.iter().map(|end| Ended {
+            slot: end.slot - self.first_slot,
+            trial_index: end.trial_index,
+            episode_in_trial: end.episode_in_trial,
+        }));
+        Outcome {
+            observations: self.observations,
+            rewards: self.rewards,
+            terminated: self.terminated,
+            truncated: self.truncated,
+            final_observations: self.final_observations,
+            ended,
+        }
+    }
+}
+
+impl EndedEpisode {
+    /// What a server says of an episode, whose slot is `slot` of the batch; `None` if it does not say all.
+    pub(super) fn of(end: proto::EpisodeEnd, slot: usize, terminated: bool) -> Option<Self> {
+        let (episode, receipt) = end.episode.zip(end.receipt)?;
+        Some(Self {
+            slot,
+            environment_index: episode.environment_index,
+            episode_index: episode.episode_index,
+            trial_index: episode.trial_index,
+            episode_in_trial: episode.episode_in_trial,
+            episode_return: end.r#return,
+            length: end.length,
+            success: end.success,
+            terminated,
+            diverged: end.diverged,
+            achieved: end.achieved,
+            receipt,
+        })
+    }
+}

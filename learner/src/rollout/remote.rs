@@ -1,0 +1,145 @@
+//! Collecting rollouts that a server plays.
+
+use super::{CollectError, Rollout};
+use crate::algorithm::Experience;
+use crate::client::{EndedEpisode, Played, Session, acting};
+use crate::proto;
+use perturb_policy::{ActionKind, Normalisers, Player, PlayerState, PolicySpec, RolloutStep};
+
+/// Fills rollouts with what a player does that plays at the server, to the bytes of a
+/// [`Collector`](super::Collector).
+#[derive(Debug)]
+pub struct RemoteCollector {
+    spec: PolicySpec,
+    /// Until the server has it.
+    player: Option<Player>,
+    arrays: Arrays,
+}
+
+/// A reply's arrays, decoded.
+#[derive(Debug, Default)]
+struct Arrays {
+    observations: Vec<f32>,
+    starts: Vec<bool>,
+    actions: Vec<f32>,
+    log_probs: Vec<f32>,
+    values: Vec<f32>,
+    rewards: Vec<f32>,
+    terminated: Vec<bool>,
+    truncated: Vec<bool>,
+    truncation_values: Vec<f32>,
+    last: Vec<f32>,
+}
+
+impl RemoteCollector {
+    /// Collects what `player` does from where it is, with a policy of `spec`.
+    pub fn new(spec: PolicySpec, player: Player) -> Self {
+        Self { spec, player: Some(player), arrays: Arrays::default() }
+    }
+
+    /// A rollout under the policy of `weights`; gives every episode that ended, and was to be collected, to `on_episode`.
+    ///
+    /// # Errors
+    /// [`CollectError`]; what was collected of this rollout is lost.
+    pub fn collect(
+        &mut self,
+        session: &mut Session<'_>,
+        weights: &[f32],
+        experience: Experience,
+        rollout: &mut Rollout,
+        mut on_episode: impl FnMut(&EndedEpisode),
+    ) -> Result<(), CollectError> {
+        let mut next = proto::Act {
+            policy: self.player.take().map(|player| acting::policy(&self.spec, &player)),
+            weights: acting::floats(weights),
+            task: Some(match experience {
+                Experience::Steps(count) => proto::act::Task::Steps(count as u32),
+                Experience::Episodes(count) => proto::act::Task::Episodes(count as u32),
+            }),
+            ..proto::Act::default()
+        };
+        let (mut first, mut finished) = (true, false);
+        while !finished {
+            let mut reply = Played::default();
+            let request = |_| Some(std::mem::take(&mut next));
+            session.play(request, |_, played| {
+                let memory = first.then(|| acting::read_floats(&played.acted.memory).ok_or("odd bytes of memory"));
+                if let Some(memory) = memory.transpose()? {
+                    rollout.begin(&memory);
+                }
+                self.arrays.decode(&played.acted, &self.spec)?;
+                reply = played;
+                Ok(())
+            })?;
+            let before = rollout.len();
+            rollout.push(self.arrays.steps())?;
+            for (step, episode) in &reply.ended {
+                if let Experience::Episodes(_) = experience {
+                    let (end, length) = (before + step + 1, episode.length as usize);
+                    rollout.note_episode(episode.slot, end, length, episode.episode_return)?;
+                }
+                on_episode(episode);
+            }
+            (first, finished) = (false, reply.acted.finished);
+        }
+        Ok(rollout.finish(&self.arrays.last)?)
+    }
+
+    /// What stands beside the weights after a rollout; `None` before the first.
+    ///
+    /// # Errors
+    /// [`CollectError::Client`].
+    pub fn state(&self, session: &mut Session<'_>) -> Result<Option<(PlayerState, Normalisers)>, CollectError> {
+        if self.player.is_some() { Ok(None) } else { Ok(session.save_player()?) }
+    }
+}
+
+impl Arrays {
+    /// Replaces all by those of a reply; says which does not fit.
+    fn decode(&mut self, acted: &proto::Acted, spec: &PolicySpec) -> Result<(), String> {
+        read(&mut self.observations, "observations", &acted.observations, f32::from_le_bytes)?;
+        if let ActionKind::Discrete { n } = spec.action {
+            read(&mut self.actions, "actions", &acted.actions, |word| i32::from_le_bytes(word) as f32)?;
+            if let Some(action) = self.actions.iter().find(|&&action| !(0.0..n as f32).contains(&action)) {
+                return Err(format!("action {action} of {n}"));
+            }
+        } else {
+            read(&mut self.actions, "actions", &acted.actions, f32::from_le_bytes)?;
+        }
+        read(&mut self.log_probs, "log_probs", &acted.log_probs, f32::from_le_bytes)?;
+        read(&mut self.values, "values", &acted.values, f32::from_le_bytes)?;
+        read(&mut self.rewards, "rewards", &acted.rewards, f32::from_le_bytes)?;
+        read(&mut self.truncation_values, "truncation_values", &acted.truncation_values, f32::from_le_bytes)?;
+        read(&mut self.last, "last_values", &acted.last_values, f32::from_le_bytes)?;
+        flags(&mut self.starts, &acted.starts);
+        flags(&mut self.terminated, &acted.terminated);
+        flags(&mut self.truncated, &acted.truncated);
+        Ok(())
+    }
+
+    fn steps(&self) -> RolloutStep<'_> {
+        RolloutStep {
+            observations: &self.observations,
+            starts: &self.starts,
+            actions: &self.actions,
+            log_probs: &self.log_probs,
+            values: &self.values,
+            rewards: &self.rewards,
+            terminated: &self.terminated,
+            truncated: &self.truncated,
+            truncation_values: &self.truncation_values,
+        }
+    }
+}
+
+fn read(out: &mut Vec<f32>, name: &str, bytes: &[u8], number: impl Fn([u8; 4]) -> f32) -> Result<(), String> {
+    let (words, rest) = bytes.as_chunks::<4>();
+    out.clear();
+    out.extend(words.iter().map(|word| number(*word)));
+    if rest.is_empty() { Ok(()) } else { Err(format!("{} bytes of {name}", bytes.len())) }
+}
+
+fn flags(out: &mut Vec<bool>, bytes: &[u8]) {
+    out.clear();
+    out.extend(bytes.iter().map(|&flag| flag != 0));
+}

@@ -1,0 +1,160 @@
+//! A training's bytes are its own: alone or in any group, stopped and resumed in another, and wherever actions are chosen.
+
+use std::path::Path;
+
+use perturb_learner::checkpoint::Checkpoint;
+use perturb_learner::client::{ActAt, PrivateServer, Servers};
+use perturb_learner::evaluation::{TestOptions, Tester};
+use perturb_learner::training::{Entry, RunDirectory, Start, train, train_together};
+use perturb_study::Version;
+use perturb_study::interrupt::StopFlag;
+use perturb_study::settings::TrainConfig;
+use rstest::rstest;
+
+use crate::common::{connect, server};
+
+/// Algorithms of all kinds, with batches of different sizes, versions and parameters.
+const TRAININGS: [&str; 5] = [
+    "algorithm = 'a2c'\nnum_envs = 1\nn_steps = 5\nseed = 3",
+    "algorithm = 'ppo'\nversion = 'R'\nnum_envs = 3\nn_steps = 16\nn_minibatches = 2\nn_epochs = 2\nseed = 3",
+    "algorithm = 'epopt-ppo'\nversion = 'E'\nnum_envs = 2\nepisodes_per_iteration = 3\nepsilon = 0.5\nfull_iterations = 1
+     n_epochs = 2\nseed = 4",
+    "algorithm = 'ppo'\narchitecture = 'rc'\nnum_envs = 2\nn_steps = 24\nn_minibatches = 2\nn_epochs = 1\nseed = 5",
+    "algorithm = 'rl2-a2c'\narchitecture = 'rc'\nversion = 'R'\nnum_envs = 2\nn_steps = 20\nseed = 6",
+];
+
+fn config(environment: &str, training: &str) -> TrainConfig {
+    let episodes = if environment == "CartPole" { 12 } else { 5 };
+    let text = format!("environment = '{environment}'\nepisodes = {episodes}\n{training}");
+    TrainConfig::from_table("the test", text.parse().expect("TOML")).expect("a configuration")
+}
+
+/// All that decides what a training does next, and what it has done.
+fn kept(directory: &Path) -> String {
+    let (checkpoint, resume) = Checkpoint::load_with_resume(directory).expect("a checkpoint");
+    let state = checkpoint.state;
+    assert!(resume.history.logs.monitor > 0);
+    format!(
+        "{:?} {:?} {:?} {:?} {:?} {:?} {:?}",
+        state.counters,
+        checkpoint.weights,
+        state.observation_normaliser,
+        state.reward_normaliser,
+        resume.collector,
+        resume.algorithm,
+        resume.history.recent
+    )
+}
+
+/// Trains in folders of these numbers, from where these are, until all end or one has had so many iterations.
+fn together(servers: &Servers, base: &Path, environment: &str, numbers: &[usize], most_iterations: u64) {
+    let directories: Vec<(RunDirectory, Start)> = numbers
+        .iter()
+        .map(|number| {
+            let path = base.join(number.to_string());
+            if path.exists() {
+                let (directory, checkpoint, state) = RunDirectory::resume(&path).expect("a run");
+                (directory, Start::Checkpoint(Box::new((checkpoint, state))))
+            } else {
+                let start = Start::Fresh(Box::new(config(environment, TRAININGS[*number])));
+                (RunDirectory::choose(&path, false).expect("a directory"), start)
+            }
+        })
+        .collect();
+    let entries = directories.iter().map(|(directory, start)| Entry { directory, start: start.clone() }).collect();
+    let (stop, mut ended) = (StopFlag::default(), vec![false; numbers.len()]);
+    train_together(
+        servers,
+        entries,
+        1,
+        &stop,
+        &mut |_, progress| {
+            if progress.iterations >= most_iterations {
+                stop.raise(15);
+            }
+        },
+        &mut |index, outcome| {
+            outcome.expect("an outcome");
+            ended[index] = true;
+        },
+    )
+    .expect("a session");
+    assert!(ended.iter().all(|&ended| ended));
+}
+
+fn alone(servers: &Servers, environment: &str) -> Vec<String> {
+    let base = tempfile::tempdir().expect("a directory");
+    let one = |training: &&str| {
+        let path = base.path().join("run");
+        let directory = RunDirectory::choose(&path, true).expect("a directory");
+        train(servers, &config(environment, training), &directory, 1, &StopFlag::default(), |_| {})
+            .expect("a training");
+        kept(&path)
+    };
+    TRAININGS.iter().map(one).collect()
+}
+
+#[rstest]
+fn the_bytes_of_a_training_are_its_own(#[values("CartPole", "Pendulum")] environment: &str) {
+    let private = [server(), server()];
+    let one = connect(&private[..1]);
+    let expected = alone(&connect(&private[..1]).with_act(ActAt::Client), environment);
+    assert!(alone(&one, environment) == expected, "acting at the server");
+    assert!(alone(&connect(&private), environment) == expected, "on two servers");
+
+    let base = tempfile::tempdir().expect("a directory");
+    let all = |base: &Path| (0..5).map(|number| kept(&base.join(number.to_string()))).collect::<Vec<_>>();
+    together(&one, base.path(), environment, &[0, 1, 2, 3, 4], u64::MAX);
+    assert!(all(base.path()) == expected, "together");
+
+    let base = tempfile::tempdir().expect("a directory");
+    together(&one, base.path(), environment, &[3, 1, 0], 1);
+    together(&connect(&private), base.path(), environment, &[2, 4], 1);
+    assert!(all(base.path()) != expected, "all are stopped before their ends");
+    together(&connect(&private), base.path(), environment, &[0, 4, 3], u64::MAX);
+    together(&one, base.path(), environment, &[1], u64::MAX);
+    together(&one, base.path(), environment, &[2], u64::MAX);
+    assert!(all(base.path()) == expected, "resumed in other groups");
+}
+
+#[rstest]
+fn one_that_fails_does_not_stop_the_others(#[values("CartPole", "Pendulum")] environment: &str) {
+    let private: [PrivateServer; 1] = [server()];
+    let servers = connect(&private);
+    let base = tempfile::tempdir().expect("a directory");
+    let bad = "algorithm = 'a2c'\nnum_envs = 2\nn_steps = 5\nlearning_rate = 1e30\nmax_grad_norm = 1e30\nseed = 1";
+    let good = config(environment, TRAININGS[0]);
+    let directories: Vec<RunDirectory> =
+        ["bad", "good"].map(|name| RunDirectory::choose(&base.path().join(name), false).expect("a directory")).into();
+    let starts = [config(environment, bad), good].map(|config| Start::Fresh(Box::new(config)));
+    let entries = directories.iter().zip(starts).map(|(directory, start)| Entry { directory, start }).collect();
+    let mut ends = vec![String::new(); 2];
+    let mut ended = |index: usize, outcome: Result<_, _>| {
+        ends[index] =
+            outcome.map_or_else(|error: perturb_learner::training::TrainError| error.to_string(), |_| "ok".into());
+    };
+    train_together(&servers, entries, 1, &StopFlag::default(), &mut |_, _| {}, &mut ended).expect("a session");
+    assert!(ends[0].contains("not finite") || ends[0].contains("became"), "{}", ends[0]);
+    assert_eq!(ends[1], "ok");
+    let expected = alone(&servers, environment).remove(0);
+    assert!(kept(&base.path().join("good")) == expected, "as if it had been alone");
+}
+
+#[rstest]
+fn tests_have_the_same_episodes_wherever_actions_are_chosen(#[values(0, 3, 4)] number: usize) {
+    let private = [server(), server()];
+    let one = connect(&private[..1]);
+    let base = tempfile::tempdir().expect("a directory");
+    together(&one, base.path(), "CartPole", &[number], u64::MAX);
+    let checkpoint = Checkpoint::load(&base.path().join(number.to_string())).expect("a checkpoint");
+    let episodes = |servers: &Servers| {
+        let options = TestOptions { episodes: 130, seed: 8, success: None };
+        let tester = Tester::new(servers, &checkpoint, options).expect("a tester");
+        let sets = [Version::D.into(), Version::E.into()];
+        tester.test(&sets, &StopFlag::default(), &mut |_, _| {}).expect("records").episodes
+    };
+    let expected = episodes(&connect(&private[..1]).with_act(ActAt::Client));
+    assert_eq!(expected.len(), 260);
+    assert!(episodes(&one) == expected);
+    assert!(episodes(&connect(&private)) == expected, "on two servers");
+}

@@ -1,0 +1,185 @@
+//! A policy that plays a batch.
+
+use super::{Error, bytes::put_actions, shard::Shard, workers::lock};
+use crate::env::EpisodeEnd;
+use perturb_policy::{Ended, Inputs, Normalisers, Outcome, Player, PlayerState, PolicySpec, Role, Task};
+use rand_chacha::ChaCha8Rng;
+use std::sync::Mutex;
+
+/// A policy that is yet to play, all of whose parts fit each other and the batch.
+#[derive(Debug, Clone)]
+pub struct Policy {
+    /// Its shape.
+    pub spec: PolicySpec,
+    /// Its inputs, fresh.
+    pub inputs: Inputs,
+    /// What numbers are normalised with.
+    pub normalisers: Normalisers,
+    /// Where its actions' randomness comes from.
+    pub role: PolicyRole,
+    /// What it goes on from, in training; none: a trial begins in every environment.
+    pub state: Option<PlayerState>,
+    /// All weights in a row, `[P]`, finite.
+    pub weights: Vec<f32>,
+    /// Episodes in a trial.
+    pub episodes_per_trial: u32,
+}
+
+/// Where actions' randomness comes from, and whether statistics run.
+#[derive(Debug, Clone)]
+#[allow(clippy::large_enum_variant)] // a policy has one
+pub enum PolicyRole {
+    /// One stream; statistics run.
+    Training(ChaCha8Rng),
+    /// A stream of each trial; statistics are frozen.
+    Testing {
+        /// With the environment's index and the trial's it fixes the stream.
+        seed: u64,
+    },
+}
+
+/// A policy at play, between two steps.
+pub struct Play {
+    player: Player,
+    pub(super) task: Task,
+    /// In a test.
+    seed: Option<u64>,
+    /// What the last step brought.
+    pub(super) step: Gathered,
+    spec: PolicySpec,
+}
+
+/// What a step of all environments brought; buffers are used again.
+#[derive(Default)]
+pub(super) struct Gathered {
+    observations: Vec<f32>,
+    rewards: Vec<f32>,
+    pub(super) terminated: Vec<bool>,
+    pub(super) truncated: Vec<bool>,
+    final_observations: Vec<f32>,
+    ended: Vec<Ended>,
+    /// The same with all that is known of them.
+    pub(super) ends: Vec<(u32, EpisodeEnd)>,
+}
+
+impl Play {
+    /// Has the policy begin in the environments of `shards`, at the start of a trial or from its saved state.
+    pub(super) fn begin(policy: Policy, shards: &[Mutex<Shard>]) -> Result<Self, Error> {
+        let Policy { spec, inputs, normalisers, role, state, weights, episodes_per_trial } = policy;
+        let trials: Vec<(u32, u64)> =
+            shards.iter().flat_map(|shard| lock(shard).trials().collect::<Vec<_>>()).collect();
+        let n_envs = trials.len();
+        let (role, seed) = match role {
+            PolicyRole::Training(stream) => (Role::Training(stream), None),
+            PolicyRole::Testing { seed } => (Role::testing_in(seed, trials.into_iter()), Some(seed)),
+        };
+        let player = Player::new(&spec, inputs, n_envs, episodes_per_trial, normalisers, role);
+        let mut play = Self { player, task: Task::steps(0), seed, step: Gathered::default(), spec };
+        play.player.load(&weights)?;
+        match state {
+            Some(state) => play.player.restore(&state)?,
+            None => {
+                play.step.gather_observations(shards);
+                play.player.begin(&play.step.observations, None)?;
+            }
+        }
+        Ok(play)
+    }
+
+    /// The policy's shape.
+    pub fn spec(&self) -> &PolicySpec {
+        &self.spec
+    }
+
+    /// What plays.
+    pub fn player(&self) -> &Player {
+        &self.player
+    }
+
+    /// What is played.
+    pub fn task(&self) -> &Task {
+        &self.task
+    }
+
+    /// Takes over weights `[P]`.
+    pub(super) fn load(&mut self, weights: &[f32]) -> Result<(), Error> {
+        Ok(self.player.load(weights)?)
+    }
+
+    /// Begins a task; whether all environments are to be reset before.
+    pub(super) fn begin_task(&mut self, task: Task) -> bool {
+        self.task = task;
+        matches!(self.task, Task::Episodes(_))
+    }
+
+    /// Begins the task's episodes in environments that were reset.
+    pub(super) fn begin_episodes(&mut self, shards: &[Mutex<Shard>]) -> Result<(), Error> {
+        let Self { player, task, seed, step, .. } = self;
+        step.gather_observations(shards);
+        player.begin(&step.observations, Some(task))?;
+        if let Some(seed) = *seed {
+            for shard in shards {
+                let shard = lock(shard);
+                let slots = shard.first_slot..;
+                slots.zip(shard.trials()).for_each(|(slot, (_, trial))| player.begin_trial(slot, seed, trial));
+            }
+        }
+        Ok(())
+    }
+
+    /// Chooses actions and gives them to the shards; returns them as they are on the wire.
+    pub(super) fn act(&mut self, shards: &[Mutex<Shard>]) -> Result<&[u8], Error> {
+        let actions = self.player.act()?;
+        put_actions(shards, actions);
+        Ok(actions)
+    }
+
+    /// Takes what came of the actions.
+    pub(super) fn observe(&mut self, shards: &[Mutex<Shard>]) -> Result<(), Error> {
+        let Self { player, task, step, .. } = self;
+        step.gather(shards);
+        task.advance(step.ended.iter().map(|end| end.slot));
+        Ok(player.observe(&step.outcome(), Some(task))?)
+    }
+
+    /// V of the present observations, `[N]`.
+    pub(super) fn last_values(&mut self) -> Result<&[f32], Error> {
+        Ok(self.player.last_values(&self.task)?)
+    }
+}
+
+impl Gathered {
+    fn gather_observations(&mut self, shards: &[Mutex<Shard>]) {
+        self.observations.clear();
+        shards.iter().for_each(|shard| self.observations.extend_from_slice(&lock(shard).observations));
+    }
+
+    fn gather(&mut self, shards: &[Mutex<Shard>]) {
+        self.observations.clear();
+        self.rewards.clear();
+        self.terminated.clear();
+        self.truncated.clear();
+        self.final_observations.clear();
+        self.ended.clear();
+        self.ends.clear();
+        for shard in shards {
+            let shard = &mut *lock(shard);
+            self.observations.extend_from_slice(&shard.observations);
+            self.rewards.extend_from_slice(&shard.rewards);
+            self.terminated.extend(shard.terminated.iter().map(|&flag| flag == 1));
+            self.truncated.extend(shard.truncated.iter().map(|&flag| flag == 1));
+            self.final_observations.extend_from_slice(&shard.final_observations);
+            self.ends.append(&mut shard.ended);
+        }
+        self.ended.extend(self.ends.iter().map(|(slot, end)| Ended {
+            slot: *slot as usize,
+            trial_index: end.id.trial_index,
+            episode_in_trial: end.id.episode_in_trial,
+        }));
+    }
+
+    fn outcome(&self) -> Outcome<'_> {
+        let Self { observations, rewards, terminated, truncated, final_observations, ended, .. } = self;
+        Outcome { observations, rewards, terminated, truncated, final_observations, ended }
+    }
+}

@@ -1,0 +1,244 @@
+//! A round: the steps of one reply that a policy plays, without a session in between.
+//!
+//! The worker that ends a step's last shard has the round take what came of it, choose the next actions and give them to
+//! the shards; then the job goes to the queue's tail, as that of any other step. The session is woken at the round's end.
+
+use super::{
+    Error,
+    bytes::{put, put_flags},
+    play::{Play, Policy},
+    shard::{Command, Shard},
+    workers::lock,
+};
+use crate::env::EpisodeEnd;
+use bytes::BytesMut;
+use perturb_policy::{RolloutStep, Task};
+use std::sync::Mutex;
+
+/// A round of about so many bytes ends: many gRPC libraries receive no more than 4 MiB.
+const MOST_BYTES: usize = 4_000_000;
+/// What an episode's end takes beside its receipt, in bytes; roughly.
+const END_BYTES: usize = 100;
+/// Room that is made beforehand where the number of steps is not known.
+const FIRST_ROOM: usize = 256;
+
+/// What is to be played in a round.
+#[derive(Debug, Clone)]
+pub struct Turn {
+    /// Whose turn it is now; none: the policy of before goes on.
+    pub policy: Option<Policy>,
+    /// New weights of the policy of before, `[P]`, finite; none: those that it has.
+    pub weights: Option<Vec<f32>>,
+    /// A new task; none: what is left of the one before.
+    pub task: Option<Task>,
+    /// The most steps, at least 1.
+    pub most_steps: usize,
+    /// Records nothing but the episodes that ended.
+    pub only_ended: bool,
+}
+
+/// What was played: T steps of N environments; arrays are little-endian, row-major `[T, N, …]`, as on the wire.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Played {
+    /// T.
+    pub steps: usize,
+    /// f32 `[T, N, I]`
+    pub observations: BytesMut,
+    /// u8 `[T, N]`
+    pub starts: BytesMut,
+    /// i32 `[T, N]` or f32 `[T, N, A]`
+    pub actions: BytesMut,
+    /// f32 `[T, N]`
+    pub log_probs: BytesMut,
+    /// f32 `[T, N]`
+    pub values: BytesMut,
+    /// f32 `[T, N]`
+    pub rewards: BytesMut,
+    /// u8 `[T, N]`
+    pub terminated: BytesMut,
+    /// u8 `[T, N]`
+    pub truncated: BytesMut,
+    /// f32 `[T, N]`
+    pub truncation_values: BytesMut,
+    /// The episodes that ended and count, in order of steps and slots.
+    pub ended: Vec<EndedAt>,
+    /// Whether nothing is left of the task.
+    pub finished: bool,
+    /// f32 `[N]`: V of the present observations, when finished.
+    pub last_values: BytesMut,
+    /// f32 `[N, S]`: what the policy remembered at the task's beginning, if it began in this round.
+    pub memory: BytesMut,
+    /// Of `ended`, roughly.
+    ended_bytes: usize,
+}
+
+/// An episode that ended.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EndedAt {
+    /// In which of the round's steps.
+    pub step: usize,
+    /// In which slot.
+    pub slot: u32,
+    /// What ended.
+    pub end: EpisodeEnd,
+    /// Whether the task ended it.
+    pub terminated: bool,
+    /// Whether the step limit ended it.
+    pub truncated: bool,
+}
+
+/// What a round waits for.
+enum Phase {
+    /// Its turn.
+    Begin,
+    /// All environments to be reset.
+    Reset,
+    /// A step.
+    Step,
+}
+
+/// The steps of one reply.
+pub(super) struct Round {
+    turn: Turn,
+    play: Option<Box<Play>>,
+    phase: Phase,
+    played: Played,
+    error: Option<Error>,
+}
+
+impl Round {
+    /// A round of the policy of before, if there is no new one.
+    pub(super) fn new(turn: Turn, play: Option<Box<Play>>) -> Self {
+        Self { turn, play, phase: Phase::Begin, played: Played::default(), error: None }
+    }
+
+    /// What came of it, with the policy at play unless it failed.
+    pub(super) fn finish(self) -> Result<(Option<Box<Play>>, Played), Error> {
+        self.error.map_or(Ok((self.play, self.played)), Err)
+    }
+
+    /// Takes what the shards did last and tells them what to do next; false at the round's end. It ends in any case when
+    /// it is `halted`.
+    pub(super) fn conduct(&mut self, shards: &[Mutex<Shard>], halted: bool) -> bool {
+        match self.advance(shards) {
+            Ok(goes_on) => goes_on && !halted,
+            Err(error) => {
+                self.error = Some(error);
+                false
+            }
+        }
+    }
+
+    fn advance(&mut self, shards: &[Mutex<Shard>]) -> Result<bool, Error> {
+        let Self { turn, play, phase, played, .. } = self;
+        if let Some(policy) = turn.policy.take() {
+            *play = Some(Box::new(Play::begin(policy, shards)?));
+        }
+        let play = play.as_mut().ok_or(Error::Defect)?;
+        match phase {
+            Phase::Begin => {
+                if let Some(weights) = turn.weights.take() {
+                    play.load(&weights)?;
+                }
+                let begins = turn.task.is_some();
+                if turn.task.take().is_some_and(|task| play.begin_task(task)) {
+                    shards.iter().for_each(|shard| lock(shard).command = Command::ResetAll);
+                    *phase = Phase::Reset;
+                    return Ok(true);
+                }
+                played.begin(play, begins, turn);
+            }
+            Phase::Reset => {
+                play.begin_episodes(shards)?;
+                played.begin(play, true, turn);
+            }
+            Phase::Step => {
+                play.observe(shards)?;
+                played.take(play, turn.only_ended);
+                if play.task().is_done() {
+                    played.finished = true;
+                    if !turn.only_ended {
+                        put(&mut played.last_values, play.last_values()?);
+                    }
+                    return Ok(false);
+                }
+                if played.steps >= turn.most_steps || played.size() >= MOST_BYTES {
+                    return Ok(false);
+                }
+            }
+        }
+        *phase = Phase::Step;
+        let actions = play.act(shards)?;
+        if !turn.only_ended {
+            played.actions.extend_from_slice(actions);
+        }
+        Ok(true)
+    }
+}
+
+impl Played {
+    /// Makes room for what the round will bring, and notes what the policy remembers where a task `begins`.
+    fn begin(&mut self, play: &Play, begins: bool, turn: &Turn) {
+        if turn.only_ended {
+            return;
+        }
+        if begins {
+            put(&mut self.memory, play.player().memory());
+        }
+        let (n_envs, spec) = (play.player().n_envs(), play.spec());
+        let step_bytes = n_envs * (4 * (spec.observation_size + spec.action.width() + 4) + 3);
+        let steps = match play.task() {
+            Task::Steps { left } => turn.most_steps.min(*left),
+            Task::Episodes(_) => turn.most_steps.min(FIRST_ROOM),
+        };
+        let steps = steps.min(MOST_BYTES / step_bytes + 1);
+        let room = |bytes: usize| BytesMut::with_capacity(steps * n_envs * bytes);
+        self.observations = room(4 * spec.observation_size);
+        self.actions = room(4 * spec.action.width());
+        for array in [&mut self.log_probs, &mut self.values, &mut self.rewards, &mut self.truncation_values] {
+            *array = room(4);
+        }
+        for array in [&mut self.starts, &mut self.terminated, &mut self.truncated] {
+            *array = room(1);
+        }
+    }
+
+    /// Takes over what a step brought.
+    fn take(&mut self, play: &mut Play, only_ended: bool) {
+        if !only_ended {
+            self.push(play.player().played());
+        }
+        let Play { task, step, .. } = play;
+        for (slot, end) in step.ends.drain(..).filter(|(slot, _)| task.counts(*slot as usize)) {
+            self.ended_bytes += end_bytes(&end);
+            let (terminated, truncated) = (step.terminated[slot as usize], step.truncated[slot as usize]);
+            self.ended.push(EndedAt { step: self.steps, slot, end, terminated, truncated });
+        }
+        self.steps += 1;
+    }
+
+    fn push(&mut self, step: RolloutStep<'_>) {
+        put(&mut self.observations, step.observations);
+        put_flags(&mut self.starts, step.starts);
+        put(&mut self.log_probs, step.log_probs);
+        put(&mut self.values, step.values);
+        put(&mut self.rewards, step.rewards);
+        put_flags(&mut self.terminated, step.terminated);
+        put_flags(&mut self.truncated, step.truncated);
+        put(&mut self.truncation_values, step.truncation_values);
+    }
+
+    /// In bytes, roughly, with another step.
+    fn size(&self) -> usize {
+        let arrays = [&self.observations, &self.actions, &self.log_probs, &self.values, &self.rewards];
+        let others = [&self.truncation_values, &self.starts, &self.terminated, &self.truncated];
+        let bytes: usize = arrays.into_iter().chain(others).map(|array| array.len()).sum();
+        bytes + bytes / self.steps.max(1) + self.ended_bytes + self.memory.len()
+    }
+}
+
+/// What an episode's end takes on the wire, roughly.
+fn end_bytes(end: &EpisodeEnd) -> usize {
+    let receipt = end.receipt.as_ref();
+    END_BYTES + receipt.map_or(0, |r| 8 * (r.requested.len() + r.applied.len()) + r.model_hash.len())
+}

@@ -1,0 +1,107 @@
+//! A policy that plays for long holds up nobody, and ends when nobody waits for it.
+
+use super::game::{PLAIN, SEED};
+use crate::common::{
+    self,
+    server::{Server, Session, until},
+};
+use perturb::{
+    env::Version,
+    pool::{Autoreset, Batch, BatchSettings, Policy, PolicyRole, Pool, SlotGroup, Turn},
+    proto::{act::Task as Asked, session_response::Response},
+    tasks,
+};
+use perturb_policy::{
+    ActionKind, Inputs, Normalisers, PolicySpec, Task,
+    random::{Purpose, stream},
+};
+use rstest::rstest;
+use std::{
+    future::Future,
+    pin::Pin,
+    task::{Context, Poll, Waker},
+};
+
+async fn mountain_cars(pool: &Pool, size: usize) -> Batch {
+    let spec = tasks::catalogue().find("MountainCar").unwrap();
+    let groups = vec![SlotGroup { size, episodes: common::settings(spec, Version::R, 1, 0, 1) }];
+    let autoreset = Autoreset::SameStep;
+    let settings = BatchSettings { spec, groups, autoreset, receipts: false, reward_terms: false };
+    Batch::open(pool, settings).await.unwrap().0
+}
+
+/// Steps without number, of which only the ends of episodes are recorded: seconds, until these are a reply's size.
+fn endless(size: usize) -> Turn {
+    let spec = PolicySpec::feed_forward(2, ActionKind::Discrete { n: 3 });
+    let policy = Policy {
+        inputs: Inputs::new(2, spec.action, size, false),
+        weights: vec![0.1; spec.n_weights()],
+        spec,
+        normalisers: Normalisers::default(),
+        role: PolicyRole::Training(stream(SEED, Purpose::Actions)),
+        state: None,
+        episodes_per_trial: 1,
+    };
+    let task = Some(Task::steps(usize::MAX));
+    Turn { policy: Some(policy), weights: None, task, most_steps: usize::MAX, only_ended: true }
+}
+
+fn poll<F: Future>(future: &mut Pin<Box<F>>) -> Poll<F::Output> {
+    future.as_mut().poll(&mut Context::from_waker(Waker::noop()))
+}
+
+#[rstest]
+#[tokio::test]
+async fn others_have_their_turns_while_a_policy_plays_and_its_environments_go_with_their_batch(
+    #[values(4, 2000)] size: usize,
+) {
+    let pool = Pool::new(1, 3000).unwrap();
+    let (mut played, mut stepped) = (mountain_cars(&pool, size).await, mountain_cars(&pool, 8).await);
+    let mut playing = Box::pin(played.act(endless(size)));
+    for _ in 0..20 {
+        assert!(poll(&mut playing).is_pending(), "it was played to its end before others had their turns");
+        stepped.step(&[0; 32]).await.unwrap();
+    }
+    drop(playing);
+    drop(played);
+    until("the played environments are free", async || pool.environments() == 8).await;
+}
+
+#[rstest]
+#[tokio::test]
+async fn a_play_that_nobody_waits_for_ends_and_the_batch_goes_on(#[values(4, 2000)] size: usize) {
+    let pool = Pool::new(2, size).unwrap();
+    let mut batch = mountain_cars(&pool, size).await;
+    let mut playing = Box::pin(batch.act(endless(size)));
+    assert!(poll(&mut playing).is_pending());
+    drop(playing);
+    batch.settle().await;
+    assert!(batch.play().is_none());
+    batch.step(&vec![0; 4 * size]).await.unwrap();
+    let short = Turn { task: Some(Task::steps(3)), ..endless(size) };
+    assert_eq!(batch.act(short).await.unwrap().steps, 3);
+}
+
+#[tokio::test]
+async fn a_pool_ends_while_a_policy_plays() {
+    let pool = Pool::new(2, 4).unwrap();
+    let mut batch = mountain_cars(&pool, 4).await;
+    let mut playing = Box::pin(batch.act(endless(4)));
+    assert!(poll(&mut playing).is_pending());
+    drop(pool);
+    let steps = playing.await.unwrap().steps;
+    assert!(steps < 1_000_000, "{steps}: a reply has room for the ends of two million");
+}
+
+#[tokio::test]
+async fn environments_of_a_client_that_goes_in_the_middle_of_a_play_are_freed() {
+    let server = Server::start(&["--max-envs", "5"]);
+    let (session, environment) = PLAIN.session(&server).await;
+    session.send(PLAIN.act(&environment, Asked::Steps(u32::MAX))).await;
+    drop(session);
+    until("the environments are free", async || {
+        let mut other = Session::connect(server.unix()).await;
+        matches!(other.answer(PLAIN.open()).await, Response::Opened(_))
+    })
+    .await;
+}
