@@ -11,7 +11,8 @@ use crate::proto;
 pub struct EndedEpisode {
     /// Where in the session's batch, 0 … N-1.
     pub slot: usize,
-    /// The environment's index: its place among those of its [`OpenOptions`], unless it was restored from elsewhere.
+    /// The environment's index: its place among those of its [`OpenOptions`](super::OpenOptions), unless it was
+    /// restored from elsewhere.
     pub environment_index: u32,
     /// Counts the environment's episodes from 0.
     pub episode_index: u64,
