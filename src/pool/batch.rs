@@ -165,7 +165,10 @@ impl Batch {
         }
         self.play = None;
         put_actions(&self.job.shards, actions);
-        self.run().await?;
+        self.under_way = true;
+        let stepped = self.workers.step(&self.job).await;
+        self.under_way = false;
+        stepped?;
         Ok(self.gather())
     }
 

@@ -18,7 +18,9 @@ use tokio::sync::Notify;
 /// is more than a step of many small environments.
 const YIELDS_BEFORE_SLEEP: usize = 200;
 
-/// A job of at most so many µs is short, …
+/// A job of at most so many µs is done by whoever asks: to have a worker do it takes longer.
+const TINY: f64 = 8.0;
+/// One of at most so many µs is short, …
 const SHORT: f64 = 50.0;
 /// … and looked after so often before its session sleeps, about twice that time.
 const POLLS: usize = 50;
@@ -110,6 +112,16 @@ impl Shared {
         }
     }
 
+    /// Steps the environments of every shard: here if that is soon done, else as [`Shared::run`].
+    pub(super) async fn step(&self, job: &Arc<Job>) -> Result<(), Error> {
+        if !job.is_tiny {
+            return self.run(job).await;
+        }
+        job.prepare();
+        (0..job.shards.len()).for_each(|shard| _ = job.run(shard));
+        job.result()
+    }
+
     /// Runs every shard of the job on the workers and waits for the last.
     pub(super) async fn run(&self, job: &Arc<Job>) -> Result<(), Error> {
         job.prepare();
@@ -136,7 +148,7 @@ impl Shared {
             tokio::task::yield_now().await;
         }
         job.done.notified().await;
-        if job.failed() { Err(Error::Defect) } else { Ok(()) }
+        job.result()
     }
 
     /// Puts a job of so many parts at the queue's tail, and wakes no more than `helpers` workers for them.
@@ -223,6 +235,8 @@ pub(super) struct Job {
     /// Nobody waits for the round any more: it ends with its present step.
     pub(super) halted: AtomicBool,
     failed: AtomicBool,
+    /// A step of all environments takes less than to wake a worker.
+    is_tiny: bool,
     /// How often the session looks whether a request is done before it sleeps until then.
     patience: usize,
     pub(super) permit: Arc<Permit>,
@@ -243,6 +257,7 @@ impl Job {
             abandoned: AtomicBool::new(false),
             halted: AtomicBool::new(false),
             failed: AtomicBool::new(false),
+            is_tiny: cost <= TINY,
             patience: if cost <= SHORT { POLLS } else { 0 },
             permit,
         }
@@ -251,6 +266,10 @@ impl Job {
     /// Whether a worker panicked on it, now or earlier.
     pub(super) fn failed(&self) -> bool {
         self.failed.load(Ordering::Relaxed)
+    }
+
+    fn result(&self) -> Result<(), Error> {
+        if self.failed() { Err(Error::Defect) } else { Ok(()) }
     }
 
     /// Makes every shard ready to be taken.

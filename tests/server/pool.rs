@@ -412,18 +412,36 @@ async fn wait_until(condition: impl Fn() -> bool) {
 }
 
 #[tokio::test]
+async fn a_step_that_is_soon_done_waits_for_no_worker() {
+    let pool = Pool::new(1, 41_000).unwrap();
+    let open = |name, size| {
+        Batch::open(&pool, batch_settings(tasks::catalogue().find(name).unwrap(), size, Autoreset::SameStep))
+    };
+    for (name, size, is_tiny) in [("CartPole", 1, true), ("CartPole", 150, true), ("CartPole", 600, false)] {
+        let (mut busy, ..) = open("Acrobot", 40_000).await.unwrap();
+        let (mut batch, ..) = open(name, size).await.unwrap();
+        let (long, actions) = (vec![0; 4 * 40_000], vec![0; 4 * size]);
+        let mut long = Box::pin(busy.step(&long));
+        let _ = poll_once(long.as_mut()).await; // the only worker has something to do for long
+        let mut step = Box::pin(batch.step(&actions));
+        assert_eq!(poll_once(step.as_mut()).await.is_ready(), is_tiny, "{size} of {name}");
+    }
+}
+
+#[tokio::test]
 async fn workers_that_fell_asleep_are_woken_for_every_job() {
     let pool = Pool::new(2, 1000).unwrap();
     let open = |name, size| {
         Batch::open(&pool, batch_settings(tasks::catalogue().find(name).unwrap(), size, Autoreset::SameStep))
     };
     let work = async {
-        let (mut small, ..) = open("CartPole", 1).await.unwrap();
-        let (mut other, ..) = open("CartPole", 1).await.unwrap();
+        // Too long to be done without workers.
+        let (mut small, ..) = open("Acrobot", 50).await.unwrap();
+        let (mut other, ..) = open("Acrobot", 50).await.unwrap();
         let (mut large, ..) = open("Acrobot", 900).await.unwrap(); // several shards
         for _ in 0..3 {
             tokio::time::sleep(Duration::from_millis(50)).await; // idle workers sleep much sooner
-            let (a, b) = tokio::join!(small.step(&[0; 4]), other.step(&[0; 4]));
+            let (a, b) = tokio::join!(small.step(&[0; 200]), other.step(&[0; 200]));
             assert!(a.is_ok() && b.is_ok());
             tokio::time::sleep(Duration::from_millis(50)).await;
             assert!(large.step(&[0; 3600]).await.is_ok());

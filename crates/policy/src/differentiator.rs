@@ -8,7 +8,7 @@ use crate::act_ff::network;
 use crate::error::{Error, Result, check_length};
 use crate::kernel::{Kernel, Rows, run};
 use crate::objective::{Acting, Gaussian, Losses, Objective, Outputs, Sample};
-use crate::perceptron::{Derivatives, Forward, Perceptron, Transposed};
+use crate::perceptron::{Derivatives, Forward, Give, Perceptron, Transposed};
 use crate::spec::{ActionKind, PolicySpec};
 
 /// Samples whose activations are kept at once: those of both networks stay in the processor's second cache.
@@ -185,13 +185,13 @@ impl Differentiator {
 
     /// Adds the parts up, in order.
     fn sum(&self, n_parts: usize, n: usize, objective: &Objective, gradient: &mut [f32]) -> Losses {
-        gradient.fill(0.0);
         let mut losses = Losses::default();
-        for part in &self.parts[..n_parts] {
-            let mut rest = &mut gradient[..];
-            part.by_policy.add_to(&mut rest);
-            part.by_value.add_to(&mut rest);
-            rest.iter_mut().zip(&part.by_log_std).for_each(|(sum, x)| *sum += x);
+        for (i, part) in self.parts[..n_parts].iter().enumerate() {
+            let (mut rest, add) = (&mut gradient[..], i > 0);
+            for derivatives in [&part.by_policy, &part.by_value] {
+                run(Give { derivatives, gradient: &mut rest, add });
+            }
+            rest.iter_mut().zip(&part.by_log_std).for_each(|(sum, x)| *sum = if add { *sum + x } else { *x });
             losses += part.losses;
         }
         losses.means(n, objective)

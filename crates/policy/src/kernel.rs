@@ -158,12 +158,16 @@ impl Matrix {
                 product::<S, 8>(simd, from, row, weights, start, to, column);
                 row += 8;
             }
-            while row + 4 <= n {
-                product::<S, 4>(simd, from, row, weights, start, to, column);
-                row += 4;
+            match n - row {
+                4 => product::<S, 4>(simd, from, row, weights, start, to, column),
+                5 => product::<S, 5>(simd, from, row, weights, start, to, column),
+                6 => product::<S, 6>(simd, from, row, weights, start, to, column),
+                7 => product::<S, 7>(simd, from, row, weights, start, to, column),
+                _ => {}
             }
         }
-        for row in n / 4 * 4..n {
+        let few = if n % 8 < 4 { n % 8 } else { 0 };
+        for row in n - few..n {
             let columns = self.data.len() / self.inputs;
             let mut column = 0;
             while column + 4 <= columns {
@@ -189,23 +193,24 @@ impl Matrix {
         column: usize,
     ) {
         let inputs = &from.row(row)[..self.inputs];
-        let weights: [&[S::f32s]; C] = std::array::from_fn(|c| {
-            let lanes = &self.data[(column + c) * self.inputs..][..self.inputs];
-            S::as_simd_f32s(lanes.as_flattened()).0
-        });
-        let start: [&[S::f32s]; C] =
-            std::array::from_fn(|c| S::as_simd_f32s(start.map_or(&ZERO, |start| &start[column + c])).0);
-        let vectors = start[0].len();
+        let (weights, _) = S::as_simd_f32s(self.data[column * self.inputs..][..C * self.inputs].as_flattened());
+        let vectors = LANES / S::F32_LANES;
         for vector in 0..vectors {
-            let mut sums: [S::f32s; C] = std::array::from_fn(|c| start[c][vector]);
+            let mut sums = [simd.splat_f32s(0.0); C];
+            if let Some(start) = start {
+                for c in 0..C {
+                    sums[c] = S::as_simd_f32s(&start[column + c]).0[vector];
+                }
+            }
             for (i, input) in inputs.iter().enumerate() {
                 let input = simd.splat_f32s(*input);
                 for c in 0..C {
-                    sums[c] = simd.add_f32s(sums[c], simd.mul_f32s(input, weights[c][i * vectors + vector]));
+                    let weights = weights[(c * inputs.len() + i) * vectors + vector];
+                    sums[c] = simd.add_f32s(sums[c], simd.mul_f32s(input, weights));
                 }
             }
-            for (c, sum) in sums.into_iter().enumerate() {
-                S::as_mut_simd_f32s(&mut to.data[row * to.width + column + c]).0[vector] = sum;
+            for c in 0..C {
+                S::as_mut_simd_f32s(&mut to.data[row * to.width + column + c]).0[vector] = sums[c];
             }
         }
     }
@@ -236,7 +241,8 @@ fn product<S: Simd, const R: usize>(
     to: &mut Rows,
     column: usize,
 ) {
-    let inputs: [&[f32]; R] = std::array::from_fn(|r| &from.row(row + r)[..weights.len()]);
+    let width = from.width * LANES;
+    let inputs = &from.data.as_flattened()[row * width..][..R * width];
     let (weights, _) = S::as_simd_f32s(weights.as_flattened());
     let (start, _) = S::as_simd_f32s(start);
     for vector in 0..start.len() {
@@ -244,11 +250,11 @@ fn product<S: Simd, const R: usize>(
         for (i, weights) in weights.chunks_exact(start.len()).enumerate() {
             let weights = weights[vector];
             for r in 0..R {
-                sums[r] = simd.add_f32s(sums[r], simd.mul_f32s(simd.splat_f32s(inputs[r][i]), weights));
+                sums[r] = simd.add_f32s(sums[r], simd.mul_f32s(simd.splat_f32s(inputs[r * width + i]), weights));
             }
         }
-        for (r, sum) in sums.into_iter().enumerate() {
-            S::as_mut_simd_f32s(&mut to.data[(row + r) * to.width + column]).0[vector] = sum;
+        for r in 0..R {
+            S::as_mut_simd_f32s(&mut to.data[(row + r) * to.width + column]).0[vector] = sums[r];
         }
     }
 }
@@ -279,19 +285,22 @@ fn outer<S: Simd, const R: usize>(
     column: usize,
     n: usize,
 ) {
+    let (inputs, width, stride) = (inputs.lanes(n), inputs.width, deltas.width * LANES);
+    let deltas = deltas.lanes(n).as_flattened();
     for vector in 0..LANES / S::F32_LANES {
-        let mut local: [S::f32s; R] = std::array::from_fn(|r| S::as_simd_f32s(&sums[r]).0[vector]);
-        let inputs = inputs.lanes(n).chunks_exact(inputs.width);
-        let deltas = deltas.lanes(n).chunks_exact(deltas.width);
-        for (inputs, deltas) in inputs.zip(deltas) {
-            let inputs = S::as_simd_f32s(&inputs[column]).0[vector];
-            let deltas = &deltas.as_flattened()[first..][..R];
+        let mut local = [simd.splat_f32s(0.0); R];
+        for r in 0..R {
+            local[r] = S::as_simd_f32s(&sums[r]).0[vector];
+        }
+        for b in 0..n {
+            let inputs = S::as_simd_f32s(&inputs[b * width + column]).0[vector];
+            let deltas = &deltas[b * stride + first..][..R];
             for r in 0..R {
                 local[r] = simd.add_f32s(local[r], simd.mul_f32s(simd.splat_f32s(deltas[r]), inputs));
             }
         }
-        for (sum, local) in sums.iter_mut().zip(local) {
-            S::as_mut_simd_f32s(sum).0[vector] = local;
+        for r in 0..R {
+            S::as_mut_simd_f32s(&mut sums[r]).0[vector] = local[r];
         }
     }
 }

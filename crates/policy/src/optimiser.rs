@@ -64,11 +64,11 @@ impl Optimiser {
         Optimiser::Adam(Adam { epsilon: epsilon as f32, mean, mean_square })
     }
 
-    /// One step on `weights` `[P]` against `gradient` `[P]`; `update` counts the steps before this one.
-    fn step(&mut self, update: u64, learning_rate: f64, weights: &mut [f32], gradient: &[f32]) {
+    /// One step on `weights` `[P]` against `scale` times `gradient` `[P]`; `update` counts the steps before this one.
+    fn step(&mut self, update: u64, learning_rate: f64, weights: &mut [f32], gradient: &[f32], scale: f32) {
         match self {
-            Optimiser::RmsProp(state) => run(RmsPropStep { state, learning_rate, weights, gradient }),
-            Optimiser::Adam(state) => run(AdamStep { state, update, learning_rate, weights, gradient }),
+            Optimiser::RmsProp(state) => run(RmsPropStep { state, learning_rate, weights, gradient, scale }),
+            Optimiser::Adam(state) => run(AdamStep { state, update, learning_rate, weights, gradient, scale }),
         }
     }
 
@@ -94,6 +94,7 @@ struct RmsPropStep<'a> {
     learning_rate: f64,
     weights: &'a mut [f32],
     gradient: &'a [f32],
+    scale: f32,
 }
 
 impl Kernel for RmsPropStep<'_> {
@@ -102,6 +103,7 @@ impl Kernel for RmsPropStep<'_> {
         let RmsProp { alpha, epsilon, mean_square } = self.state;
         let (alpha, epsilon, learning_rate) = (*alpha, *epsilon, self.learning_rate as f32);
         for ((w, s), g) in self.weights.iter_mut().zip(mean_square).zip(self.gradient) {
+            let g = self.scale * g;
             *s = alpha * *s + (1.0 - alpha) * g * g;
             *w -= learning_rate * g / (*s + epsilon).sqrt();
         }
@@ -114,6 +116,7 @@ struct AdamStep<'a> {
     learning_rate: f64,
     weights: &'a mut [f32],
     gradient: &'a [f32],
+    scale: f32,
 }
 
 impl Kernel for AdamStep<'_> {
@@ -127,6 +130,7 @@ impl Kernel for AdamStep<'_> {
         let Adam { epsilon, mean, mean_square } = self.state;
         let epsilon = *epsilon;
         for ((w, (m, v)), g) in self.weights.iter_mut().zip(mean.iter_mut().zip(mean_square)).zip(self.gradient) {
+            let g = self.scale * g;
             *m = beta_1 * *m + rest_1 * g;
             *v = beta_2 * *v + rest_2 * g * g;
             *w -= step_size * *m / (v.sqrt() * root_correction + epsilon);
@@ -173,11 +177,8 @@ impl Descent {
         let mut norm = 0.0;
         run(Norm { gradient: &self.gradient, norm: &mut norm });
         self.check_finite("the norm of the gradient", norm)?;
-        if norm > self.max_grad_norm {
-            let scale = (self.max_grad_norm / norm) as f32;
-            self.gradient.iter_mut().for_each(|g| *g *= scale);
-        }
-        self.optimiser.step(self.n_updates, learning_rate, weights, &self.gradient);
+        let scale = if norm > self.max_grad_norm { (self.max_grad_norm / norm) as f32 } else { 1.0 };
+        self.optimiser.step(self.n_updates, learning_rate, weights, &self.gradient, scale);
         self.n_updates += 1;
         Ok(norm)
     }

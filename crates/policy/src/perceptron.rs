@@ -165,19 +165,46 @@ impl Derivatives {
         }
     }
 
-    /// Adds them to the front of `gradient`, in the order of the weights; it moves on.
-    pub(crate) fn add_to(&self, gradient: &mut &mut [f32]) {
+    /// Puts them, or adds them, to the front of `gradient`, in the order of the weights; it moves on.
+    #[inline(always)]
+    fn give<const ADD: bool>(&self, gradient: &mut &mut [f32]) {
         for layer in &self.layers {
             let (weights, rest) = std::mem::take(gradient).split_at_mut(layer.outputs * layer.inputs);
             let (biases, rest) = rest.split_at_mut(layer.outputs);
             *gradient = rest;
-            for (o, row) in weights.chunks_exact_mut(layer.inputs).enumerate() {
-                for (numbers, lanes) in row.chunks_mut(LANES).zip(layer.weights.chunks_exact(layer.outputs)) {
-                    numbers.iter_mut().zip(&lanes[o]).for_each(|(sum, x)| *sum += x);
+            for (column, block) in layer.weights.chunks_exact(layer.outputs).enumerate() {
+                for (row, lane) in weights.chunks_exact_mut(layer.inputs).zip(block) {
+                    match row[column * LANES..].first_chunk_mut::<LANES>() {
+                        Some(whole) => give::<ADD>(whole, lane),
+                        None => give::<ADD>(&mut row[column * LANES..], lane),
+                    }
                 }
             }
-            biases.iter_mut().zip(layer.biases.as_flattened()).for_each(|(sum, x)| *sum += x);
+            give::<ADD>(biases, layer.biases.as_flattened());
         }
+    }
+}
+
+/// Replaces `to` by the first numbers of `from`, or adds those.
+#[inline(always)]
+fn give<const ADD: bool>(to: &mut [f32], from: &[f32]) {
+    for (to, from) in to.iter_mut().zip(from) {
+        *to = if ADD { *to + from } else { *from };
+    }
+}
+
+/// Adds derivatives to a gradient, or begins it with them.
+pub(crate) struct Give<'a, 'b> {
+    pub(crate) derivatives: &'a Derivatives,
+    pub(crate) gradient: &'a mut &'b mut [f32],
+    pub(crate) add: bool,
+}
+
+impl Kernel for Give<'_, '_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let Give { derivatives, gradient, add } = self;
+        if add { derivatives.give::<true>(gradient) } else { derivatives.give::<false>(gradient) }
     }
 }
 
