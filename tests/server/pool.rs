@@ -413,11 +413,11 @@ async fn wait_until(condition: impl Fn() -> bool) {
 
 #[tokio::test]
 async fn a_step_that_is_soon_done_waits_for_no_worker() {
-    let pool = Pool::new(1, 41_000).unwrap();
-    let open = |name, size| {
-        Batch::open(&pool, batch_settings(tasks::catalogue().find(name).unwrap(), size, Autoreset::SameStep))
-    };
     for (name, size, is_tiny) in [("CartPole", 1, true), ("CartPole", 150, true), ("CartPole", 600, false)] {
+        let pool = Pool::new(1, 41_000).unwrap();
+        let open = |name, size| {
+            Batch::open(&pool, batch_settings(tasks::catalogue().find(name).unwrap(), size, Autoreset::SameStep))
+        };
         let (mut busy, ..) = open("Acrobot", 40_000).await.unwrap();
         let (mut batch, ..) = open(name, size).await.unwrap();
         let (long, actions) = (vec![0; 4 * 40_000], vec![0; 4 * size]);
