@@ -35,8 +35,10 @@ pub struct EnvironmentSpec {
     pub control_timestep: f64,
     /// What a step costs on one core, in µs, roughly: the pool cuts batches by it. Results never depend on it.
     pub step_cost: f64,
-    /// When an episode is a success.
+    /// When an episode is a success: as the paper says it.
     pub success: Success,
+    /// When it is one in the paper's published code; `None` if that is the same.
+    pub code_success: Option<Success>,
     /// The two parameters, along x and along y, that show best where a policy works.
     pub heatmap_axes: Option<[&'static str; 2]>,
 }

@@ -60,7 +60,9 @@ pub struct EpisodeEnd {
     pub length: u32,
     /// What the spec's success rule compares, if there is any.
     pub achieved: Option<f64>,
-    /// Whether the rule holds.
+    /// What the rule of the paper's published code compares, if there is any.
+    pub code_achieved: Option<f64>,
+    /// Whether the spec's rule holds.
     pub success: bool,
     /// Whether the physics diverged.
     pub diverged: bool,
@@ -91,6 +93,9 @@ pub(super) struct Progress {
     pub(super) reached_at: u32,
     /// The number of last steps after all of which the goal held.
     pub(super) held_for: u32,
+    /// The most successive steps after all of which the goal held. Saved apart, as the youngest of all.
+    #[serde(skip)]
+    pub(super) held_longest: u32,
     pub(super) ended: bool,
     pub(super) diverged: bool,
 }
@@ -182,6 +187,7 @@ impl Episodes {
         progress.total_reward += reward;
         if transition.goal {
             progress.held_for += 1;
+            progress.held_longest = progress.held_longest.max(progress.held_for);
             if progress.reached_at == 0 {
                 progress.reached_at = progress.length;
             }
@@ -233,22 +239,28 @@ impl Episodes {
 
     /// The current episode as one that ended.
     pub fn finished(&self, receipt: bool) -> EpisodeEnd {
-        let Progress { reached_at, held_for, .. } = self.progress;
-        let (progress, success) = (&self.progress, &self.spec().success);
-        let achieved = match success.achievement {
-            Achievement::Length => Some(progress.length.into()),
-            Achievement::FirstGoal => (reached_at > 0).then_some(reached_at.into()),
-            Achievement::LastGoals => Some(held_for.into()),
-            Achievement::Own(_) => self.environment.achieved(),
-        };
+        let (progress, spec) = (&self.progress, self.spec());
+        let achieved = self.achieved(spec.success.achievement);
         EpisodeEnd {
             id: self.id(),
             total_reward: progress.total_reward,
             length: progress.length,
-            success: success.holds(achieved),
+            success: spec.success.holds(achieved),
             achieved,
+            code_achieved: spec.code_success.map_or(achieved, |code| self.achieved(code.achievement)),
             diverged: progress.diverged,
             receipt: receipt.then(|| self.receipt()),
+        }
+    }
+
+    fn achieved(&self, achievement: Achievement) -> Option<f64> {
+        let Progress { length, reached_at, held_for, held_longest, .. } = self.progress;
+        match achievement {
+            Achievement::Length => Some(length.into()),
+            Achievement::FirstGoal => (reached_at > 0).then_some(reached_at.into()),
+            Achievement::LastGoals => Some(held_for.into()),
+            Achievement::LongestGoals => Some(held_longest.into()),
+            Achievement::Own(_) => self.environment.achieved(),
         }
     }
 }

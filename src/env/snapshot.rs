@@ -4,7 +4,9 @@ use super::{Distribution, EnvironmentSpec, Episodes, Error, Interval, Settings, 
 use serde::{Deserialize, Serialize};
 
 /// Raised by every change of the layout below.
-const FORMAT: u32 = 1;
+const FORMAT: u32 = 2;
+/// The layout without [`Progress::held_longest`], which follows [`Saved`] since.
+const FORMAT_BEFORE: u32 = 1;
 
 /// More episodes than any environment runs: a snapshot that claims more would let the counts overflow.
 const MAX_EPISODE: u64 = 1 << 63;
@@ -47,7 +49,8 @@ impl Episodes {
             progress: self.progress,
             state,
         };
-        postcard::to_stdvec(&saved).expect("plain numbers and strings always encode into a growing buffer")
+        postcard::to_stdvec(&(saved, self.progress.held_longest))
+            .expect("plain numbers and strings always encode into a growing buffer")
     }
 
     /// Brings a saved environment back: what follows is what followed the snapshot, byte for byte.
@@ -83,13 +86,19 @@ impl Episodes {
     /// Decodes a snapshot and checks all that can be wrong with it, short of the physics' own state.
     fn check(&self, snapshot: &[u8]) -> Result<(Saved, Vec<Distribution>), Error> {
         let refuse = |reason: String| Err(Error::Snapshot { reason });
-        let Ok((saved, [])) = postcard::take_from_bytes::<Saved>(snapshot) else {
-            return refuse(format!("its {} bytes are not a snapshot", snapshot.len()));
+        let unreadable = || refuse(format!("its {} bytes are not a snapshot", snapshot.len()));
+        let Ok((mut saved, rest)) = postcard::take_from_bytes::<Saved>(snapshot) else { return unreadable() };
+        saved.progress.held_longest = match (saved.format, rest) {
+            // That run is the longest that it knows of; a longer one before it is lost.
+            (FORMAT_BEFORE, []) => saved.progress.held_for,
+            (FORMAT, rest) => match postcard::take_from_bytes(rest) {
+                Ok((held_longest, [])) => held_longest,
+                _ => return unreadable(),
+            },
+            (FORMAT_BEFORE, _) => return unreadable(),
+            (format, _) => return refuse(format!("its format is {format}, this server reads 1 to {FORMAT}")),
         };
         let spec = self.spec();
-        if saved.format != FORMAT {
-            return refuse(format!("its format is {}, this server reads {FORMAT}", saved.format));
-        }
         if (saved.environment.as_str(), saved.revision) != (spec.name, spec.revision) {
             let Saved { environment, revision, .. } = saved;
             return refuse(format!("it is of {environment}-v{revision}, this is {}-v{}", spec.name, spec.revision));
@@ -101,12 +110,13 @@ impl Episodes {
             return refuse(format!("it does not have the {} parameters of {}", spec.parameters.len(), spec.name));
         }
         let distributions = Self::distributions(spec, &saved)?;
-        let Progress { trial, episode, episode_in_trial, length, total_reward, reached_at, held_for, ended, .. } =
-            saved.progress;
+        let Progress { trial, episode, episode_in_trial, length, total_reward, ended, .. } = saved.progress;
+        let Progress { reached_at, held_for, held_longest, .. } = saved.progress;
         if episode_in_trial >= saved.episodes_per_trial
             || trial > episode
             || episode > MAX_EPISODE
-            || reached_at.max(held_for) > length
+            || reached_at.max(held_longest) > length
+            || held_for > held_longest
             || !total_reward.is_finite()
         {
             return refuse("its counters contradict each other".into());

@@ -25,6 +25,8 @@ pub enum Achievement {
     FirstGoal,
     /// The number of last steps after all of which the goal held.
     LastGoals,
+    /// The most successive steps after all of which the goal held.
+    LongestGoals,
     /// What the environment says: [`Environment::achieved`](super::Environment::achieved).
     Own(Quantity),
 }
@@ -43,6 +45,7 @@ impl Success {
     pub const fn quantity(&self) -> Quantity {
         match self.achievement {
             Achievement::Own(quantity) => quantity,
+            Achievement::LongestGoals => Quantity { name: "steps_in_a_row", unit: "1" },
             _ => Quantity { name: "steps", unit: "1" },
         }
     }

@@ -180,7 +180,7 @@ fn reward_normaliser(rewards: &proto::RewardMoments) -> Result<RewardNormaliser,
     const FIELD: &str = "act.policy.rewards.moments";
     let Some(given) = &rewards.moments else { return Err(Refusal::value(FIELD, "missing", "their statistics")) };
     let returns = doubles("act.policy.rewards.returns", &rewards.returns)?;
-    Ok(RewardNormaliser::from_parts(rewards.gamma, returns, moments(FIELD, given)?))
+    Ok(RewardNormaliser::from_parts(rewards.gamma, returns, moments(FIELD, given)?).running_on(rewards.runs_on))
 }
 
 fn random_stream(stream: &proto::RandomStream) -> Result<ChaCha8Rng, Refusal> {
@@ -292,6 +292,7 @@ pub fn saved(batch: &Batch) -> Result<proto::PlayerSaved, Refusal> {
             gamma: it.gamma(),
             returns: bytes64(it.returns()),
             moments: Some(save(it.moments())),
+            runs_on: it.runs_on(),
         }),
         actions: Some(proto::RandomStream {
             key: state.actions.get_seed().to_vec().into(),

@@ -265,22 +265,23 @@ pub fn environment(spec: &EnvironmentSpec, model_hash: &str) -> proto::Environme
         applied: spec.applied.iter().map(quantity).collect(),
         step_limit: spec.step_limit,
         control_timestep: spec.control_timestep,
-        success: Some(success(spec)),
+        success: Some(success(&spec.success, spec.step_limit)),
+        code_success: Some(success(spec.code_success.as_ref().unwrap_or(&spec.success), spec.step_limit)),
         model_hash: model_hash.into(),
         heatmap_axes: spec.heatmap_axes.iter().flatten().map(|name| (*name).into()).collect(),
     }
 }
 
-fn success(spec: &EnvironmentSpec) -> proto::Success {
-    let Success { description, achievement, comparison, threshold } = spec.success;
-    let env::Quantity { name, unit } = spec.success.quantity();
+fn success(rule: &Success, step_limit: u32) -> proto::Success {
+    let Success { description, achievement, comparison, threshold } = *rule;
+    let env::Quantity { name, unit } = rule.quantity();
     let comparison = match comparison {
         Comparison::AtLeast => proto::Comparison::AtLeast,
         Comparison::AtMost => proto::Comparison::AtMost,
     };
     proto::Success {
         description: description.into(),
-        steps: if let Achievement::Own(_) = achievement { spec.step_limit } else { threshold as u32 },
+        steps: if let Achievement::Own(_) = achievement { step_limit } else { threshold as u32 },
         quantity: name.into(),
         unit: unit.into(),
         comparison: comparison.into(),
@@ -352,6 +353,7 @@ pub(super) fn ended((slot, end): (u32, EpisodeEnd)) -> proto::EpisodeEnd {
         diverged: end.diverged,
         receipt: end.receipt.map(receipt),
         achieved: end.achieved,
+        code_achieved: end.code_achieved,
     }
 }
 

@@ -336,6 +336,7 @@ pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::settings::Preset;
 
     fn result() -> CellResult {
         let test = TestResult {
@@ -354,7 +355,12 @@ mod tests {
                 model_hash: String::new(),
                 version: Version::R,
                 set: None,
-                method: Method { algorithm: "ppo".into(), architecture: "ff".into(), episodes_per_trial: None },
+                method: Method {
+                    algorithm: "ppo".into(),
+                    architecture: "ff".into(),
+                    episodes_per_trial: None,
+                    preset: Preset::Perturb,
+                },
                 configuration: "00000000".into(),
                 run: 2,
                 seed: 8,

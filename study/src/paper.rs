@@ -5,6 +5,7 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::scenarios::Metric;
+use super::settings::Preset;
 use super::statistics::Summary;
 
 /// Every number of its tables.
@@ -22,12 +23,16 @@ pub struct Method {
     pub architecture: String,
     /// `None` of algorithms without trials.
     pub episodes_per_trial: Option<u32>,
+    /// Whose defaults the settings have.
+    #[serde(default, skip_serializing_if = "Preset::is_default")]
+    pub preset: Preset,
 }
 
 impl fmt::Display for Method {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} {}", self.algorithm, self.architecture)?;
-        self.episodes_per_trial.map_or(Ok(()), |episodes| write!(f, " N={episodes}"))
+        self.episodes_per_trial.map_or(Ok(()), |episodes| write!(f, " N={episodes}"))?;
+        if self.preset.is_default() { Ok(()) } else { write!(f, " ({})", self.preset) }
     }
 }
 
@@ -78,7 +83,12 @@ mod tests {
     const ALL: [&str; ENVIRONMENTS] = ["Acrobot", "CartPole", "MountainCar", "Pendulum", "HalfCheetah", "Hopper"];
 
     fn method(algorithm: &str, architecture: &str, episodes_per_trial: Option<u32>) -> Method {
-        Method { algorithm: algorithm.into(), architecture: architecture.into(), episodes_per_trial }
+        Method {
+            algorithm: algorithm.into(),
+            architecture: architecture.into(),
+            episodes_per_trial,
+            preset: Preset::Perturb,
+        }
     }
 
     #[test]
@@ -113,7 +123,7 @@ mod tests {
         let averages: Vec<Record> = records().filter(|record| record.environment == "Average").collect();
         assert_eq!(averages.len(), 42);
         for Record { algorithm, architecture, episodes_per_trial, metric, mean_percent, .. } in averages {
-            let method = Method { algorithm, architecture, episodes_per_trial };
+            let method = Method { algorithm, architecture, episodes_per_trial, preset: Preset::Paper };
             let means = ALL.map(|environment| number(environment, &method, metric).unwrap().mean);
             let mean = means.iter().sum::<f64>() / means.len() as f64;
             // Either is rounded to 0.01: half of that each, and some for the binary fractions.

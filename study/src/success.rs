@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::value_error::{ValueError, require};
 
 /// What is counted, not measured.
-const STEPS: &str = "steps";
+const STEPS: [&str; 2] = ["steps", "steps_in_a_row"];
 
 /// A success achieved the threshold, or was better than it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -40,8 +40,7 @@ pub enum Side {
 }
 
 /// A threshold of one's own, written `steps=90`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Threshold {
     /// What is compared with it.
     pub quantity: String,
@@ -49,20 +48,40 @@ pub struct Threshold {
     pub value: f64,
 }
 
+/// What decides about success in a test, written `text`, `code` or `steps=90`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum Rule {
+    /// The environment's own, which is that of the paper's text.
+    Text,
+    /// That of the paper's published code.
+    Code,
+    /// Either of them with another threshold, whichever compares that quantity.
+    At(Threshold),
+}
+
 /// What a refusal calls a threshold.
 const THRESHOLD: &str = "the success threshold";
 
 impl Criterion {
-    /// That of `environment`; `None` if its server does not say.
+    /// That of `environment`, after the paper's text; `None` if its server does not say.
     pub fn of(environment: &proto::Environment) -> Option<Self> {
-        let success = environment.success.as_ref()?;
+        Self::read(environment.success.as_ref()?, environment.step_limit)
+    }
+
+    /// That of the paper's published code; `None` if the server does not say.
+    pub fn of_code(environment: &proto::Environment) -> Option<Self> {
+        Self::read(environment.code_success.as_ref()?, environment.step_limit)
+    }
+
+    fn read(success: &proto::Success, step_limit: u32) -> Option<Self> {
         let side = match success.comparison() {
             proto::Comparison::Unspecified => return None,
             proto::Comparison::AtLeast => Side::AtLeast,
             proto::Comparison::AtMost => Side::AtMost,
         };
         let (quantity, unit) = (success.quantity.clone(), success.unit.clone());
-        let most = (quantity == STEPS).then(|| f64::from(environment.step_limit));
+        let most = STEPS.contains(&quantity.as_str()).then(|| f64::from(step_limit));
         Some(Self { quantity, unit, side, threshold: success.threshold, most })
     }
 
@@ -87,14 +106,25 @@ impl Criterion {
     }
 }
 
-impl Threshold {
-    /// The criterion with this threshold; `own` is the environment's.
+impl Rule {
+    /// The criterion by this rule; `text` and `code` are the environment's.
     ///
     /// # Errors
     /// [`ValueError`] if it is one of another quantity, or if the server does not say what is compared.
-    pub fn of(&self, own: Option<&Criterion>) -> Result<Criterion, ValueError> {
-        let expected = "left out: the server does not say what its success rule compares";
-        own.ok_or_else(|| ValueError::new(THRESHOLD, self, expected))?.with(self)
+    pub fn of(&self, text: Option<&Criterion>, code: Option<&Criterion>) -> Result<Criterion, ValueError> {
+        let unknown = |expected| move || ValueError::new("the rule of success", self, expected);
+        match self {
+            Self::Code => {
+                code.cloned().ok_or_else(unknown("left out: the server does not say what the paper's code asks"))
+            }
+            Self::Text | Self::At(_) => {
+                let text =
+                    text.ok_or_else(unknown("left out: the server does not say what its success rule compares"))?;
+                let Self::At(threshold) = self else { return Ok(text.clone()) };
+                let other = code.filter(|code| code.quantity == threshold.quantity && text.quantity != code.quantity);
+                other.unwrap_or(text).with(threshold)
+            }
+        }
     }
 }
 
@@ -115,18 +145,29 @@ impl fmt::Display for Threshold {
     }
 }
 
-impl FromStr for Threshold {
-    type Err = ValueError;
-
-    fn from_str(text: &str) -> Result<Self, ValueError> {
-        let wrong = || ValueError::new(THRESHOLD, format!("`{text}`"), "QUANTITY=NUMBER, e.g. steps=90");
-        let (quantity, value) = text.split_once('=').ok_or_else(wrong)?;
-        let value = value.trim().parse::<f64>().ok().filter(|value| value.is_finite()).ok_or_else(wrong)?;
-        Ok(Self { quantity: quantity.trim().to_owned(), value })
+impl fmt::Display for Rule {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Text => f.write_str("text"),
+            Self::Code => f.write_str("code"),
+            Self::At(threshold) => threshold.fmt(f),
+        }
     }
 }
 
-impl TryFrom<String> for Threshold {
+impl FromStr for Rule {
+    type Err = ValueError;
+
+    fn from_str(text: &str) -> Result<Self, ValueError> {
+        match text.trim() {
+            "text" => Ok(Self::Text),
+            "code" => Ok(Self::Code),
+            text => text.parse().map(Self::At),
+        }
+    }
+}
+
+impl TryFrom<String> for Rule {
     type Error = ValueError;
 
     fn try_from(text: String) -> Result<Self, ValueError> {
@@ -134,9 +175,20 @@ impl TryFrom<String> for Threshold {
     }
 }
 
-impl From<Threshold> for String {
-    fn from(threshold: Threshold) -> Self {
-        threshold.to_string()
+impl From<Rule> for String {
+    fn from(rule: Rule) -> Self {
+        rule.to_string()
+    }
+}
+
+impl FromStr for Threshold {
+    type Err = ValueError;
+
+    fn from_str(text: &str) -> Result<Self, ValueError> {
+        let wrong = || ValueError::new(THRESHOLD, format!("`{text}`"), "text, code, or QUANTITY=NUMBER, e.g. steps=90");
+        let (quantity, value) = text.split_once('=').ok_or_else(wrong)?;
+        let value = value.trim().parse::<f64>().ok().filter(|value| value.is_finite()).ok_or_else(wrong)?;
+        Ok(Self { quantity: quantity.trim().to_owned(), value })
     }
 }
 
@@ -157,6 +209,25 @@ mod tests {
             assert_eq!((most.holds(achieved), least.holds(achieved)), (at_most, at_least), "{achieved:?}");
         }
         assert_eq!(most.to_string(), "steps at most 80");
+    }
+
+    #[test]
+    fn a_rule_is_the_texts_the_codes_or_one_of_them_with_another_threshold() {
+        let text = steps(Side::AtLeast, 100.0);
+        let code = Criterion { quantity: "steps_in_a_row".into(), threshold: 90.0, ..text.clone() };
+        let of = |rule: &str| rule.parse::<Rule>().unwrap().of(Some(&text), Some(&code)).unwrap();
+        assert_eq!((of("text"), of("code")), (text.clone(), code.clone()));
+        assert_eq!(of("steps=80"), Criterion { threshold: 80.0, ..text.clone() });
+        assert_eq!(of("steps_in_a_row=70"), Criterion { threshold: 70.0, ..code.clone() });
+        let refused = |rule: &str| rule.parse::<Rule>().unwrap().of(Some(&text), None).unwrap_err().to_string();
+        assert_eq!(
+            refused("code"),
+            "the rule of success is code, but must be left out: the server does not say what the paper's code asks"
+        );
+        assert!(refused("steps_in_a_row=70").contains("must be one of steps"), "nobody counts them");
+        for rule in ["text", "code", "steps=90"] {
+            assert_eq!(rule.parse::<Rule>().unwrap().to_string(), rule);
+        }
     }
 
     #[test]

@@ -88,6 +88,7 @@ mod tests {
             success: environment_index == 0,
             ending: Ending::Terminated,
             achieved: None,
+            also_achieved: None,
         };
         let about = About {
             environment: "CartPole".into(),
@@ -97,6 +98,9 @@ mod tests {
             policy: String::new(),
             episodes_per_trial: 1,
             success: None,
+            text_success: None,
+            code_success: None,
+            also: None,
             tests: Vec::new(),
         };
         let mut records = Records::new(about);

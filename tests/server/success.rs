@@ -30,6 +30,7 @@ const fn scripted_spec(achievement: Achievement, comparison: Comparison, thresho
         control_timestep: 1.0,
         step_cost: 0.1,
         success: Success { description: "", achievement, comparison, threshold },
+        code_success: None,
         heatmap_axes: None,
     }
 }
@@ -37,6 +38,7 @@ const fn scripted_spec(achievement: Achievement, comparison: Comparison, thresho
 static LASTED_5: EnvironmentSpec = scripted_spec(Achievement::Length, Comparison::AtLeast, 5.0);
 static REACHED_WITHIN_5: EnvironmentSpec = scripted_spec(Achievement::FirstGoal, Comparison::AtMost, 5.0);
 static HELD_FOR_LAST_3: EnvironmentSpec = scripted_spec(Achievement::LastGoals, Comparison::AtLeast, 3.0);
+static HELD_FOR_ANY_3: EnvironmentSpec = scripted_spec(Achievement::LongestGoals, Comparison::AtLeast, 3.0);
 
 /// One character a step: `.` nothing, `g` the goal holds, `T` terminated, `G` both, `D` diverged.
 struct Scripted {
@@ -131,6 +133,30 @@ fn holding_counts_the_last_steps_without_a_gap(#[case] script: &'static str, #[c
 }
 
 #[rstest]
+#[case::the_last_three(".....ggg", 3.0)]
+#[case::the_first_three("ggg.....", 3.0)]
+#[case::the_longest_counts("gggg.ggg", 4.0)]
+#[case::a_step_too_few("gg.gg.gg", 2.0)]
+#[case::never("........", 0.0)]
+fn holding_anywhere_counts_the_longest_time_without_a_gap(#[case] script: &'static str, #[case] achieved: f64) {
+    let (_, end) = run(&HELD_FOR_ANY_3, script);
+    assert_eq!((end.achieved, end.success), (Some(achieved), achieved >= 3.0));
+}
+
+#[test]
+fn a_snapshot_keeps_the_longest_time() {
+    let scripted = || Scripted { spec: &HELD_FOR_ANY_3, script: b"ggg.g...", time: 0 };
+    let settings = settings(&HELD_FOR_ANY_3, Version::D, 0, 0, 1);
+    let mut e = Episodes::new(Box::new(scripted()), settings.clone());
+    (0..5).for_each(|_| drop(step(&mut e, &[0; 4])));
+    let mut restored = Episodes::new(Box::new(Scripted { time: 5, ..scripted() }), settings);
+    restored.restore(&e.snapshot()).unwrap();
+    assert_eq!(restored.snapshot(), e.snapshot());
+    (0..3).for_each(|_| drop(step(&mut restored, &[0; 4])));
+    assert_eq!(restored.finished(false).achieved, Some(3.0));
+}
+
+#[rstest]
 #[case::terminated("......T", (true, false, LIMIT - 1))]
 #[case::truncated("........", (false, true, LIMIT))]
 #[case::both(".......T", (true, true, LIMIT))]
@@ -190,6 +216,17 @@ fn drive(name: &str, state: &[f64], policy: impl Fn(u32, &[f32]) -> i32) -> (Out
         }
     }
     unreachable!("every episode has a step limit")
+}
+
+#[rstest]
+#[case("CartPole", "the episode lasted at least 196 steps", 196.0)]
+#[case("MountainCar", "the goal was reached within 110 steps", 110.0)]
+#[case("Acrobot", "the height was reached within 90 steps", 90.0)]
+fn the_papers_code_has_thresholds_of_its_own(#[case] name: &str, #[case] description: &str, #[case] threshold: f64) {
+    let spec = tasks::catalogue().find(name).unwrap();
+    let code = spec.code_success.unwrap_or(spec.success);
+    assert_eq!((code.description, code.threshold), (description, threshold));
+    assert_eq!((code.achievement, code.comparison), (spec.success.achievement, spec.success.comparison));
 }
 
 #[test]

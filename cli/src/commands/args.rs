@@ -10,8 +10,8 @@ use clap::{Args, Parser, Subcommand};
 use perturb_learner::client::Address;
 use perturb_study::scheduler::slurm::TimeLimit;
 use perturb_study::sets::Assignment;
-use perturb_study::settings::{Architecture, Settings};
-use perturb_study::success::Threshold;
+use perturb_study::settings::{Architecture, Preset, Settings};
+use perturb_study::success::Rule;
 use perturb_study::{Grouping, MOST_POINTS, Version};
 
 use crate::video::PIXELS;
@@ -96,6 +96,9 @@ pub(super) struct TrainArgs {
     /// Parameters in place of the version's: a value, or intervals to draw from, e.g. length=0.3..0.4,0.8..0.9 mass=0.1.
     #[arg(long, value_name = "PARAMETER=VALUES", num_args = 1..)]
     pub(super) parameters: Vec<Assignment>,
+    /// Whose defaults settings have: those that we recommend, or those of the paper's authors [default: perturb].
+    #[arg(long, value_parser = Preset::NAMES)]
+    pub(super) preset: Option<String>,
     /// What learns [default: ppo].
     #[arg(long, value_parser = Settings::names())]
     pub(super) algorithm: Option<String>,
@@ -132,7 +135,7 @@ pub(super) struct TrainArgs {
         long,
         value_name = "DIR",
         conflicts_with_all = [
-            "env", "version", "parameters", "algorithm", "architecture", "episodes_per_trial", "episodes", "seed", "out",
+            "env", "version", "parameters", "preset", "algorithm", "architecture", "episodes_per_trial", "episodes", "seed", "out",
             "overwrite", "config", "set"
         ]
     )]
@@ -151,9 +154,10 @@ pub(super) struct EvaluateArgs {
     pub(super) versions: Vec<Version>,
     #[command(flatten)]
     pub(super) set: SetArgs,
-    /// The threshold of success in place of the environment's own, e.g. steps=90; `perturb envs` tells what is compared.
-    #[arg(long, value_name = "QUANTITY=NUMBER")]
-    pub(super) success: Option<Threshold>,
+    /// What decides about success: the rule of the paper's text, that of its published code, or a threshold of one's own for
+    /// what either compares, e.g. steps=90; `perturb envs` tells them [default: text].
+    #[arg(long, value_name = "text|code|QUANTITY=NUMBER")]
+    pub(super) success: Option<Rule>,
     /// Keep every test episode in this file, as Parquet: `perturb audit` plays them again, `perturb rates` judges them by
     /// other thresholds, pandas and polars read it.
     #[arg(long, value_name = "FILE")]
@@ -209,10 +213,10 @@ pub(super) struct AuditArgs {
 pub(super) struct RatesArgs {
     /// The folder of a cell of `perturb run`, or the --records of `perturb evaluate`.
     pub(super) file: PathBuf,
-    /// Thresholds of success to judge the recorded episodes by, e.g. --success steps=80 steps=90 [default: the one that
-    /// they were tested with].
-    #[arg(long, value_name = "QUANTITY=NUMBER", num_args = 1..)]
-    pub(super) success: Vec<Threshold>,
+    /// Rules of success to judge the recorded episodes by, e.g. --success text code steps=85 [default: the one that they were
+    /// tested with].
+    #[arg(long, value_name = "text|code|QUANTITY=NUMBER", num_args = 1..)]
+    pub(super) success: Vec<Rule>,
 }
 
 #[derive(Args, Debug)]

@@ -16,7 +16,7 @@ use perturb_learner::client::Servers;
 use perturb_learner::evaluation::test;
 use perturb_learner::training::{Outcome, RunDirectory, train};
 use perturb_study::interrupt::StopFlag;
-use perturb_study::settings::TrainConfig;
+use perturb_study::settings::{Preset, TrainConfig};
 use perturb_study::table::Table;
 use perturb_study::{Method, Metric, Scenario, Version, paper};
 
@@ -117,7 +117,12 @@ fn rates_table(rates: &BTreeMap<Scenario, f64>) -> Table {
 }
 
 fn metrics_table(rates: &BTreeMap<Scenario, f64>) -> Table {
-    let method = Method { algorithm: "ppo".into(), architecture: "ff".into(), episodes_per_trial: None };
+    let method = Method {
+        algorithm: "ppo".into(),
+        architecture: "ff".into(),
+        episodes_per_trial: None,
+        preset: Preset::Perturb,
+    };
     let here = |metric: Metric| metric.of(|scenario| rates.get(&scenario).copied());
     let paper = |metric| paper::number(ENVIRONMENT, &method, metric);
     Table::of("", &Metric::ALL)

@@ -37,6 +37,9 @@ fn print(out: &mut impl Write, environment: &Environment) -> std::io::Result<()>
     writeln!(out, "  action       {action}")?;
     if let Some(success) = &environment.success {
         writeln!(out, "  success      {}", success.description)?;
+        if let Some(code) = environment.code_success.as_ref().filter(|code| *code != success) {
+            writeln!(out, "   (code)      {}", code.description)?;
+        }
     }
     let parameters = Table::of("", &environment.parameters)
         .text("parameter", |parameter| &parameter.name)

@@ -83,6 +83,7 @@ fn document(state: &State, evaluation_seed: u64, results: &[(String, TestResult)
         "episodes_per_trial": settings.episodes_per_trial(),
         "seed": common.seed,
         "evaluation_seed": evaluation_seed,
+        "preset": common.preset,
         "training_episodes": state.counters.episodes,
         "results": results,
     })

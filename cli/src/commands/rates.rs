@@ -20,7 +20,7 @@ pub(super) fn run(args: &RatesArgs) -> Result<()> {
     };
     let criteria: Vec<Criterion> = match &args.success[..] {
         [] => vec![own.clone()],
-        thresholds => thresholds.iter().map(|threshold| own.with(threshold)).collect::<Result<_, _>>()?,
+        rules => rules.iter().map(|rule| about.criterion(rule)).collect::<Result<_, _>>()?,
     };
     let mut rows: Vec<(&str, &Criterion, TestResult)> = Vec::new();
     for test in &about.tests {

@@ -88,7 +88,8 @@ fn print_policy(directory: &RunDirectory) -> std::io::Result<()> {
 /// What is trained, in a few words.
 pub(super) fn describe(config: &TrainConfig) -> String {
     let common = &config.common;
-    format!("{} {} {} {}", common.environment, common.version, config.settings.name(), common.architecture)
+    let preset = if common.preset.is_default() { String::new() } else { format!(" ({})", common.preset) };
+    format!("{} {} {} {}{preset}", common.environment, common.version, config.settings.name(), common.architecture)
 }
 
 /// A line of figures, with the shares of the time.
@@ -120,6 +121,7 @@ fn flags(args: &TrainArgs) -> Result<Table> {
         ("environment", text(&args.env)),
         ("version", text(&args.version.map(|version| version.to_string()))),
         ("parameters", (!own.is_empty()).then_some(Value::Table(own))),
+        ("preset", text(&args.preset)),
         ("algorithm", text(&args.algorithm)),
         ("architecture", text(&args.architecture)),
         ("episodes", number("episodes", args.episodes)?),

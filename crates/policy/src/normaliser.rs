@@ -182,7 +182,7 @@ impl ObservationNormaliser {
 /// Normalises rewards: divides them by the standard deviation of the discounted returns R_t = γ R_{t-1} + r_t that every
 /// environment has had so far (Engstrom et al., 2020, arXiv:2005.12729), and clips to ±10. Their mean is kept.
 ///
-/// R starts at 0 in every episode, or trial, as in stable-baselines3; the reference lets it run on.
+/// R starts at 0 in every episode, or trial, as in stable-baselines3, or runs on over their ends, as in the reference.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RewardNormaliser {
@@ -190,12 +190,15 @@ pub struct RewardNormaliser {
     /// `[N]` R of the running episodes.
     returns: Vec<f64>,
     moments: RunningMoments,
+    /// Whether R runs on.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    runs_on: bool,
 }
 
 impl RewardNormaliser {
     /// Nothing seen yet of N = `n_envs` environments; `gamma` is the discount factor per step.
     pub fn new(n_envs: usize, gamma: f64) -> Self {
-        RewardNormaliser { gamma, returns: vec![0.0; n_envs], moments: RunningMoments::new(1) }
+        Self::from_parts(gamma, vec![0.0; n_envs], RunningMoments::new(1))
     }
 
     /// The statistics of the discounted returns.
@@ -205,7 +208,17 @@ impl RewardNormaliser {
 
     /// One that goes on from saved numbers: `gamma`, R `[N]` and the statistics.
     pub fn from_parts(gamma: f64, returns: Vec<f64>, moments: RunningMoments) -> Self {
-        RewardNormaliser { gamma, returns, moments }
+        RewardNormaliser { gamma, returns, moments, runs_on: false }
+    }
+
+    /// The same, but for whether R runs on over the ends of episodes and trials.
+    pub fn running_on(self, runs_on: bool) -> Self {
+        RewardNormaliser { runs_on, ..self }
+    }
+
+    /// Whether R runs on over the ends of episodes and trials.
+    pub fn runs_on(&self) -> bool {
+        self.runs_on
     }
 
     /// The discount factor per step.
@@ -218,13 +231,20 @@ impl RewardNormaliser {
         &self.returns
     }
 
-    /// Whether this is that of a training of `n_envs` environments with `gamma`; says what is wrong if it is not.
-    pub fn fits(&self, n_envs: usize, gamma: f64) -> std::result::Result<(), String> {
+    /// Whether this is that of a training of `n_envs` environments with `gamma`, whose R runs on or not; says what is wrong if
+    /// it is not.
+    pub fn fits(&self, n_envs: usize, gamma: f64, runs_on: bool) -> std::result::Result<(), String> {
         if self.returns.len() != n_envs {
             return Err(format!("returns has {} numbers, expected {n_envs}", self.returns.len()));
         }
         if self.gamma.to_bits() != gamma.to_bits() {
             return Err(format!("gamma is {}, but {gamma} in the configuration", self.gamma));
+        }
+        if self.runs_on != runs_on {
+            return Err(format!(
+                "runs_on is {}, but reward_return_runs_on {runs_on} in the configuration",
+                self.runs_on
+            ));
         }
         Ok(())
     }
@@ -241,7 +261,7 @@ impl RewardNormaliser {
     }
 
     /// Adds a step's `rewards` `[N]` to the statistics. Where `done` `[N]`, at the end of an episode or, with trials, of a
-    /// trial, the discounted return starts again from 0 in the next step. Infinite numbers and NaN are refused and change nothing.
+    /// trial, the discounted return starts again from 0 in the next step, unless it runs on. Infinite numbers and NaN are refused and change nothing.
     pub fn update(&mut self, rewards: &[f32], done: &[bool]) -> Result<()> {
         self.update_active(rewards, done, None)
     }
@@ -263,16 +283,18 @@ impl RewardNormaliser {
         let count = counted.clone().count();
         self.moments.take_column(0, count, counted.map(|i| self.returns[i]));
         self.moments.count += count as u64;
-        for (sum, _) in self.returns.iter_mut().zip(done).filter(|(_, done)| **done) {
-            *sum = 0.0;
+        if !self.runs_on {
+            self.returns.iter_mut().zip(done).filter(|(_, done)| **done).for_each(|(sum, _)| *sum = 0.0);
         }
         Ok(())
     }
 
     /// Starts the discounted returns of all environments again from 0, as after a reset of the environments from
-    /// outside. The statistics stay.
+    /// outside, unless they run on. The statistics stay.
     pub fn reset_returns(&mut self) {
-        self.returns.fill(0.0);
+        if !self.runs_on {
+            self.returns.fill(0.0);
+        }
     }
 
     /// Normalises `rewards` in place. The statistics stay.

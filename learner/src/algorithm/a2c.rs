@@ -1,12 +1,12 @@
 //! Advantage actor-critic.
 
-use perturb_policy::{Descent, Objective, Optimiser, Surrogate};
+use perturb_policy::{Descent, Losses, Objective, Optimiser, Surrogate};
 use perturb_study::settings::A2cConfig;
 
-use super::{Algorithm, AlgorithmState, Experience, UpdateStats, check_rollout, explained_variance};
+use super::{Algorithm, AlgorithmState, Experience, InTurn, UpdateStats, check_rollout, explained_variance};
 use crate::error::Result;
 use crate::policy::Policy;
-use crate::rollout::{Rollout, n_step_returns};
+use crate::rollout::{Estimates, Rollout, n_step_returns};
 
 /// Synchronous advantage actor-critic, Mnih et al. (2016), arXiv:1602.01783, without asynchrony: one gradient step a
 /// rollout on all its T·N samples,
@@ -37,37 +37,7 @@ impl Algorithm for A2c {
     }
 
     fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats> {
-        let A2cConfig { gamma, ent_coef, vf_coef, bootstrap_truncation, .. } = self.config;
-        check_rollout(rollout, policy, self.config.n_steps)?;
-        let learning_rate = self.config.learning_rate_schedule.at(self.config.learning_rate, progress_remaining)?;
-        let estimates = n_step_returns(&rollout.trajectories()?, gamma, bootstrap_truncation);
-        let objective = Objective {
-            surrogate: Surrogate::PolicyGradient,
-            normalize_advantages: false,
-            ent_coef,
-            vf_coef,
-            value_clip_range: None,
-            kl_coef: 0.0,
-        };
-        let batch = policy.batch(rollout, &estimates)?;
-        let (losses, grad_norm) =
-            policy.descend(&batch, &batch.sequences(), &objective, &mut self.descent, learning_rate)?;
-        Ok(UpdateStats {
-            learning_rate,
-            policy_gradient_loss: losses.policy,
-            value_loss: losses.value,
-            entropy_loss: -losses.entropy,
-            loss: losses.total,
-            approx_kl: None,
-            kl_divergence: None,
-            clip_fraction: None,
-            clip_range: None,
-            explained_variance: explained_variance(rollout, &estimates),
-            grad_norm,
-            n_updates: self.descent.n_updates(),
-            std: policy.mean_std(),
-            selection: None,
-        })
+        self.update_in_turn(policy, &[rollout], progress_remaining)
     }
 
     fn state(&self) -> AlgorithmState {
@@ -77,5 +47,54 @@ impl Algorithm for A2c {
 
     fn load_state(&mut self, state: &AlgorithmState) -> Result<()> {
         Ok(self.descent.load_state(state.n_updates, &state.optimiser)?)
+    }
+}
+
+impl InTurn for A2c {
+    fn update_in_turn(
+        &mut self,
+        policy: &mut Policy,
+        rollouts: &[&Rollout],
+        progress_remaining: f64,
+    ) -> Result<UpdateStats> {
+        let A2cConfig { gamma, ent_coef, vf_coef, bootstrap_truncation, .. } = self.config;
+        let learning_rate = self.config.learning_rate_schedule.at(self.config.learning_rate, progress_remaining)?;
+        let objective = Objective {
+            surrogate: Surrogate::PolicyGradient,
+            normalize_advantages: false,
+            ent_coef,
+            vf_coef,
+            value_clip_range: None,
+            kl_coef: 0.0,
+        };
+        let mut estimates: Vec<Estimates> = Vec::with_capacity(rollouts.len());
+        let (mut losses, mut norms) = (Losses::default(), 0.0);
+        for rollout in rollouts {
+            check_rollout(rollout, policy, self.config.n_steps)?;
+            let estimated = n_step_returns(&rollout.trajectories()?, gamma, bootstrap_truncation);
+            let batch = policy.batch(rollout, &estimated)?;
+            let step = policy.descend(&batch, &batch.sequences(), &objective, &mut self.descent, learning_rate)?;
+            losses += step.0;
+            norms += step.1;
+            drop(batch);
+            estimates.push(estimated);
+        }
+        let mean = |sum: f64| sum / rollouts.len() as f64;
+        Ok(UpdateStats {
+            learning_rate,
+            policy_gradient_loss: mean(losses.policy),
+            value_loss: mean(losses.value),
+            entropy_loss: -mean(losses.entropy),
+            loss: mean(losses.total),
+            approx_kl: None,
+            kl_divergence: None,
+            clip_fraction: None,
+            clip_range: None,
+            explained_variance: explained_variance(rollouts, &estimates),
+            grad_norm: mean(norms),
+            n_updates: self.descent.n_updates(),
+            std: policy.mean_std(),
+            selection: None,
+        })
     }
 }

@@ -1,18 +1,19 @@
 //! EPOpt: learning from the worst episodes.
 
-use super::{Algorithm, AlgorithmState, Experience, UpdateStats};
+use super::{Algorithm, AlgorithmState, Experience, InTurn, UpdateStats};
 use crate::error::Result;
 use crate::policy::Policy;
 use crate::rollout::{Rollout, Span};
-use perturb_study::settings::EpoptConfig;
+use perturb_study::settings::{EpoptConfig, Ranking};
 
 /// EPOpt-ε, Rajeswaran et al. (2017), arXiv:1610.01283, around another algorithm: an iteration generates L complete
 /// episodes, each in a freshly drawn environment, and the other algorithm learns from those whose undiscounted return is
 /// at most the ε-percentile of all L. That percentile interpolates linearly between order statistics, as numpy's; where
-/// returns are equal to it more than the share ε is kept. After Packer et al. (2018), ε is 1 at first.
+/// returns are equal to it more than the share ε is kept. After Packer et al. (2018), ε is 1 at first. Episodes may also be
+/// ranked by the sums of their normalised rewards.
 pub struct Epopt {
     config: EpoptConfig,
-    base: Box<dyn Algorithm>,
+    base: Box<dyn InTurn>,
     iterations: u64,
 }
 
@@ -34,7 +35,7 @@ pub struct Selection {
 
 impl Epopt {
     /// Checks the settings; `base` is fresh.
-    pub fn new(config: EpoptConfig, base: Box<dyn Algorithm>) -> Result<Self> {
+    pub fn new(config: EpoptConfig, base: Box<dyn InTurn>) -> Result<Self> {
         config.validate()?;
         Ok(Epopt { config, base, iterations: 0 })
     }
@@ -50,7 +51,10 @@ impl Algorithm for Epopt {
         let full = self.iterations < self.config.full_iterations;
         let epsilon = if full { 1.0 } else { self.config.epsilon };
         let episodes = rollout.episodes();
-        let kept = worst(episodes, epsilon);
+        let kept = match self.config.rank_by {
+            Ranking::Raw => worst(episodes, &returns(episodes), epsilon),
+            Ranking::Normalized => worst(episodes, &rollout.learned_returns(), epsilon),
+        };
         let selection = Selection {
             epsilon,
             kept: kept.len() as u64,
@@ -58,7 +62,9 @@ impl Algorithm for Epopt {
             mean_return: mean_return(episodes),
             cvar: conditional_value_at_risk(episodes, self.config.epsilon),
         };
-        let mut stats = self.base.update(policy, &rollout.select(&kept)?, progress_remaining)?;
+        let parts: Vec<&[Span]> = if self.config.update_per_episode { kept.chunks(1).collect() } else { vec![&kept] };
+        let parts = parts.into_iter().map(|episodes| rollout.select(episodes)).collect::<Result<Vec<Rollout>>>()?;
+        let mut stats = self.base.update_in_turn(policy, &parts.iter().collect::<Vec<_>>(), progress_remaining)?;
         stats.selection = Some(selection);
         self.iterations += 1;
         Ok(stats)
@@ -75,12 +81,16 @@ impl Algorithm for Epopt {
     }
 }
 
-/// The episodes whose return is at most the `epsilon`-percentile, in their order.
-fn worst(episodes: &[Span], epsilon: f64) -> Vec<Span> {
-    let mut returns: Vec<f64> = episodes.iter().map(|episode| episode.episode_return).collect();
-    returns.sort_by(f64::total_cmp);
-    let threshold = percentile(&returns, epsilon);
-    episodes.iter().filter(|episode| episode.episode_return <= threshold).copied().collect()
+/// The episodes whose rank is at most the `epsilon`-percentile of `ranks`, in their order.
+fn worst(episodes: &[Span], ranks: &[f64], epsilon: f64) -> Vec<Span> {
+    let mut sorted = ranks.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let threshold = percentile(&sorted, epsilon);
+    episodes.iter().zip(ranks).filter(|(_, rank)| **rank <= threshold).map(|(episode, _)| *episode).collect()
+}
+
+fn returns(episodes: &[Span]) -> Vec<f64> {
+    episodes.iter().map(|episode| episode.episode_return).collect()
 }
 
 /// The `share`-percentile of `sorted`, linear between order statistics; never below the least.
@@ -93,7 +103,7 @@ fn percentile(sorted: &[f64], share: f64) -> f64 {
 
 /// The mean return of the ⌈share · L⌉ worst of L episodes; of equally bad ones no more than that.
 fn conditional_value_at_risk(episodes: &[Span], share: f64) -> f64 {
-    let mut returns: Vec<f64> = episodes.iter().map(|episode| episode.episode_return).collect();
+    let mut returns = returns(episodes);
     returns.sort_by(f64::total_cmp);
     returns.truncate((share * returns.len() as f64).ceil() as usize);
     returns.iter().sum::<f64>() / returns.len() as f64
@@ -113,7 +123,7 @@ mod tests {
     }
 
     fn kept(returns: &[f64], epsilon: f64) -> Vec<usize> {
-        worst(&episodes(returns), epsilon).iter().map(|episode| episode.environment).collect()
+        worst(&episodes(returns), returns, epsilon).iter().map(|episode| episode.environment).collect()
     }
 
     #[test]
@@ -127,7 +137,8 @@ mod tests {
     #[test]
     fn the_worst_share_is_kept_in_order_and_equal_returns_all() {
         let returns: Vec<f64> = (0..100).map(|i| f64::from((i * 37) % 100)).collect();
-        let kept_returns: Vec<f64> = worst(&episodes(&returns), 0.1).iter().map(|e| e.episode_return).collect();
+        let kept_returns: Vec<f64> =
+            worst(&episodes(&returns), &returns, 0.1).iter().map(|e| e.episode_return).collect();
         assert_eq!(kept_returns.len(), 10);
         assert!(kept_returns.iter().all(|&r| r < 10.0));
         assert_eq!(kept(&[5.0, 1.0, 7.0, 0.0], 0.5), [1, 3]);

@@ -54,6 +54,21 @@ pub trait Algorithm: Send {
     fn load_state(&mut self, state: &AlgorithmState) -> Result<()>;
 }
 
+/// What can learn from several rollouts in turn; EPOpt is wrapped around it.
+pub trait InTurn: Algorithm {
+    /// Improves `policy` by each of `rollouts`, at least one, as often as by one alone: A2C by a step on each, PPO by
+    /// `n_epochs` rounds of them. All advantages are those of before the first step. Figures are means over all steps.
+    ///
+    /// # Errors
+    /// Those of [`Algorithm::update`].
+    fn update_in_turn(
+        &mut self,
+        policy: &mut Policy,
+        rollouts: &[&Rollout],
+        progress_remaining: f64,
+    ) -> Result<UpdateStats>;
+}
+
 /// The state of an algorithm, for exact resumption.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct AlgorithmState {
@@ -117,7 +132,7 @@ fn check_rollout(rollout: &Rollout, policy: &Policy, n_steps: usize) -> Result<(
 /// # Errors
 /// A setting out of its range.
 pub fn build(settings: &Settings, policy: &Policy, seed: u64) -> Result<Box<dyn Algorithm>> {
-    let base: Box<dyn Algorithm> = match &settings.base {
+    let base: Box<dyn InTurn> = match &settings.base {
         Base::A2c(settings) => Box::new(A2c::new(settings.clone(), policy)?),
         Base::Ppo(settings) => Box::new(Ppo::new(settings.clone(), policy, seed)?),
     };
@@ -127,13 +142,20 @@ pub fn build(settings: &Settings, policy: &Policy, seed: u64) -> Result<Box<dyn 
     })
 }
 
-/// The share of the variance of the returns that the rollout's values explain.
-fn explained_variance(rollout: &Rollout, estimates: &Estimates) -> Option<f64> {
-    match rollout.samples() {
-        None => rollout::explained_variance(rollout.values(), &estimates.returns),
-        Some(samples) => {
-            let pick = |data: &[f32]| samples.iter().map(|&i| data[i as usize]).collect::<Vec<f32>>();
-            rollout::explained_variance(&pick(rollout.values()), &pick(&estimates.returns))
+/// The share of the variance of the returns that the rollouts' values explain.
+fn explained_variance(rollouts: &[&Rollout], estimates: &[Estimates]) -> Option<f64> {
+    let (mut values, mut returns) = (Vec::new(), Vec::new());
+    for (rollout, estimates) in rollouts.iter().zip(estimates) {
+        match rollout.samples() {
+            None => {
+                values.extend_from_slice(rollout.values());
+                returns.extend_from_slice(&estimates.returns);
+            }
+            Some(samples) => {
+                values.extend(samples.iter().map(|&i| rollout.values()[i as usize]));
+                returns.extend(samples.iter().map(|&i| estimates.returns[i as usize]));
+            }
         }
     }
+    rollout::explained_variance(&values, &returns)
 }

@@ -5,10 +5,10 @@ use perturb_policy::{Descent, Losses, Objective, Optimiser, Surrogate};
 use perturb_study::settings::{PpoConfig, SettingError};
 use rand_chacha::ChaCha8Rng;
 
-use super::{Algorithm, AlgorithmState, Experience, UpdateStats, check_rollout, explained_variance};
+use super::{Algorithm, AlgorithmState, Experience, InTurn, UpdateStats, check_rollout, explained_variance};
 use crate::error::Result;
 use crate::policy::Policy;
-use crate::rollout::{Rollout, gae};
+use crate::rollout::{Estimates, Rollout, gae};
 
 /// Proximal policy optimisation with a clipped ratio, Schulman et al. (2017), arXiv:1707.06347: `n_epochs` passes over a
 /// rollout's T·N samples, each in `n_minibatches` random parts with one gradient step (of samples or, for a recurrent
@@ -51,52 +51,7 @@ impl Algorithm for Ppo {
     }
 
     fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats> {
-        let PpoConfig { n_epochs, n_minibatches, .. } = self.config;
-        check_rollout(rollout, policy, self.config.n_steps)?;
-        let PpoConfig { gamma, gae_lambda, kl_coef, bootstrap_truncation, .. } = self.config;
-        let estimates = gae(&rollout.trajectories()?, gamma, gae_lambda, bootstrap_truncation);
-        let mut batch = policy.batch(rollout, &estimates)?;
-        if kl_coef > 0.0 {
-            policy.remember_acting(&mut batch)?;
-        }
-        let mut sequences = batch.sequences();
-        let count = sequences.len();
-        if !count.is_multiple_of(n_minibatches) {
-            let got = format!("{n_minibatches}, to part {count}");
-            let expected = "a divisor of n_steps times num_envs, or of num_envs if the policy is recurrent";
-            return Err(SettingError { name: "n_minibatches", got, expected }.into());
-        }
-        let learning_rate = self.config.learning_rate_schedule.at(self.config.learning_rate, progress_remaining)?;
-
-        let objective = self.objective();
-        let (mut losses, mut norms) = (Losses::default(), 0.0);
-        for _ in 0..n_epochs {
-            if n_minibatches > 1 {
-                shuffle(&mut sequences, &mut self.rng); // the order of one mean's samples does not matter
-            }
-            for part in sequences.chunks_exact(count / n_minibatches) {
-                let step = policy.descend(&batch, part, &objective, &mut self.descent, learning_rate)?;
-                losses += step.0;
-                norms += step.1;
-            }
-        }
-        let mean = |sum: f64| sum / (n_epochs * n_minibatches) as f64;
-        Ok(UpdateStats {
-            learning_rate,
-            policy_gradient_loss: mean(losses.policy),
-            value_loss: mean(losses.value),
-            entropy_loss: -mean(losses.entropy),
-            loss: mean(losses.total),
-            approx_kl: Some(mean(losses.approx_kl)),
-            kl_divergence: (kl_coef > 0.0).then(|| mean(losses.kl_divergence)),
-            clip_fraction: Some(mean(losses.clip_fraction)),
-            clip_range: Some(self.config.clip_range),
-            explained_variance: explained_variance(rollout, &estimates),
-            grad_norm: mean(norms),
-            n_updates: self.descent.n_updates(),
-            std: policy.mean_std(),
-            selection: None,
-        })
+        self.update_in_turn(policy, &[rollout], progress_remaining)
     }
 
     fn state(&self) -> AlgorithmState {
@@ -110,6 +65,71 @@ impl Algorithm for Ppo {
         self.descent.load_state(state.n_updates, &state.optimiser)?;
         self.rng = rng;
         Ok(())
+    }
+}
+
+impl InTurn for Ppo {
+    fn update_in_turn(
+        &mut self,
+        policy: &mut Policy,
+        rollouts: &[&Rollout],
+        progress_remaining: f64,
+    ) -> Result<UpdateStats> {
+        let PpoConfig { n_epochs, n_minibatches, .. } = self.config;
+        let PpoConfig { gamma, gae_lambda, kl_coef, bootstrap_truncation, .. } = self.config;
+        let mut estimates: Vec<Estimates> = Vec::with_capacity(rollouts.len());
+        for rollout in rollouts {
+            check_rollout(rollout, policy, self.config.n_steps)?;
+            estimates.push(gae(&rollout.trajectories()?, gamma, gae_lambda, bootstrap_truncation));
+        }
+        let mut batches = Vec::with_capacity(rollouts.len());
+        for (rollout, estimates) in rollouts.iter().zip(&estimates) {
+            let mut batch = policy.batch(rollout, estimates)?;
+            if kl_coef > 0.0 {
+                policy.remember_acting(&mut batch)?;
+            }
+            let sequences = batch.sequences();
+            let count = sequences.len();
+            if !count.is_multiple_of(n_minibatches) {
+                let got = format!("{n_minibatches}, to part {count}");
+                let expected = "a divisor of n_steps times num_envs, or of num_envs if the policy is recurrent";
+                return Err(SettingError { name: "n_minibatches", got, expected }.into());
+            }
+            batches.push((batch, sequences));
+        }
+        let learning_rate = self.config.learning_rate_schedule.at(self.config.learning_rate, progress_remaining)?;
+
+        let objective = self.objective();
+        let (mut losses, mut norms) = (Losses::default(), 0.0);
+        for _ in 0..n_epochs {
+            for (batch, sequences) in &mut batches {
+                if n_minibatches > 1 {
+                    shuffle(sequences, &mut self.rng); // the order of one mean's samples does not matter
+                }
+                for part in sequences.chunks_exact(sequences.len() / n_minibatches) {
+                    let step = policy.descend(batch, part, &objective, &mut self.descent, learning_rate)?;
+                    losses += step.0;
+                    norms += step.1;
+                }
+            }
+        }
+        let mean = |sum: f64| sum / (n_epochs * batches.len() * n_minibatches) as f64;
+        Ok(UpdateStats {
+            learning_rate,
+            policy_gradient_loss: mean(losses.policy),
+            value_loss: mean(losses.value),
+            entropy_loss: -mean(losses.entropy),
+            loss: mean(losses.total),
+            approx_kl: Some(mean(losses.approx_kl)),
+            kl_divergence: (kl_coef > 0.0).then(|| mean(losses.kl_divergence)),
+            clip_fraction: Some(mean(losses.clip_fraction)),
+            clip_range: Some(self.config.clip_range),
+            explained_variance: explained_variance(rollouts, &estimates),
+            grad_norm: mean(norms),
+            n_updates: self.descent.n_updates(),
+            std: policy.mean_std(),
+            selection: None,
+        })
     }
 }
 

@@ -213,7 +213,9 @@ impl State {
         };
         observations.map_err(|reason| format!("observation_normaliser: {reason}"))?;
         let rewards = match &self.reward_normaliser {
-            Some(normaliser) => normaliser.check().and_then(|()| normaliser.fits(common.num_envs, gamma)),
+            Some(normaliser) => {
+                normaliser.check().and_then(|()| normaliser.fits(common.num_envs, gamma, common.reward_return_runs_on))
+            }
             None if common.normalize_rewards => Err("there is none".into()),
             None => Ok(()),
         };

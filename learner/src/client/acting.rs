@@ -109,6 +109,7 @@ pub fn policy(spec: &PolicySpec, player: &Player) -> proto::Policy {
             gamma: it.gamma(),
             returns: doubles(it.returns()),
             moments: Some(moments(it.moments())),
+            runs_on: it.runs_on(),
         }),
         role: Some(match player.role() {
             Role::Training(stream) => proto::policy::Role::Training(proto::RandomStream {
@@ -156,7 +157,7 @@ fn saved_player(saved: &proto::PlayerSaved) -> Option<(PlayerState, Normalisers)
     let rewards = match &saved.rewards {
         Some(it) => {
             let statistics = moments(it.moments.as_ref()?)?;
-            Some(RewardNormaliser::from_parts(it.gamma, read_doubles(&it.returns)?, statistics))
+            Some(RewardNormaliser::from_parts(it.gamma, read_doubles(&it.returns)?, statistics).running_on(it.runs_on))
         }
         None => None,
     };

@@ -32,6 +32,8 @@ pub struct EndedEpisode {
     pub diverged: bool,
     /// What it achieved of what the environment's success rule compares; `None` if nothing.
     pub achieved: Option<f64>,
+    /// The same of the rule of the paper's published code.
+    pub code_achieved: Option<f64>,
     /// The parameters that were drawn or given and what the physics had, in the catalogue's order.
     pub receipt: proto::Receipt,
 }
@@ -140,6 +142,7 @@ impl EndedEpisode {
             terminated,
             diverged: end.diverged,
             achieved: end.achieved,
+            code_achieved: end.code_achieved,
             receipt,
         })
     }

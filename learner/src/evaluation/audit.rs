@@ -4,10 +4,10 @@ use std::collections::{BTreeMap, VecDeque};
 
 use perturb_protocol::Version;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::records::{EpisodeRecord, Records};
+use perturb_study::records::{About, EpisodeRecord, Records};
 
 use super::player;
-use super::test::{TestError, check_unchanged, ending};
+use super::test::{TestError, achieved, check_unchanged, ending};
 use super::trials::Trials;
 use crate::checkpoint::{Checkpoint, EnvironmentSummary};
 use crate::client::{EndedEpisode, OpenOptions, Servers, Session};
@@ -83,7 +83,7 @@ pub fn audit(
         for end in replay.trials.step()? {
             let Some(recorded) = running.remove(&end.slot) else { continue };
             audit.episodes += 1;
-            audit.different.extend(difference(recorded, &end));
+            audit.different.extend(difference(&records.about, recorded, &end));
         }
         report(audit.episodes);
     }
@@ -149,7 +149,8 @@ impl<'a> Replay<'a> {
 }
 
 /// In what an episode differs from its record; `None` if in nothing.
-fn difference(recorded: &EpisodeRecord, end: &EndedEpisode) -> Option<String> {
+fn difference(about: &About, recorded: &EpisodeRecord, end: &EndedEpisode) -> Option<String> {
+    let (achieved, also) = achieved(about, end);
     let place =
         format!("{}, environment {}, episode {}", recorded.set, recorded.environment_index, recorded.episode_index);
     let parts = [
@@ -160,7 +161,8 @@ fn difference(recorded: &EpisodeRecord, end: &EndedEpisode) -> Option<String> {
         ("length", recorded.length.to_string(), end.length.to_string()),
         ("return", format!("{:?}", recorded.episode_return), format!("{:?}", end.episode_return)),
         ("ending", format!("{:?}", recorded.ending), format!("{:?}", ending(end))),
-        ("achieved", format!("{:?}", recorded.achieved), format!("{:?}", end.achieved)),
+        ("achieved", format!("{:?}", recorded.achieved), format!("{achieved:?}")),
+        ("the other it achieved", format!("{:?}", recorded.also_achieved), format!("{also:?}")),
     ];
     let (what, recorded, got) = parts.into_iter().find(|(_, recorded, got)| recorded != got)?;
     Some(format!("{place}: {what} was {recorded}, is {got}"))

@@ -5,7 +5,7 @@ use perturb_protocol::{Distribution, Version, proto};
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::{About, Difference, Ending, EpisodeRecord, RecordedTest, Records};
 use perturb_study::sets::{self, Context, TestSet};
-use perturb_study::success::Threshold;
+use perturb_study::success::Rule;
 use perturb_study::{TestResult, ValueError};
 use rand::Rng;
 
@@ -97,8 +97,8 @@ pub struct TestOptions {
     pub episodes: u64,
     /// Fixes all randomness.
     pub seed: u64,
-    /// The threshold of success; `None` for the environment's own.
-    pub success: Option<Threshold>,
+    /// What decides about success; `None` for the environment's own rule.
+    pub success: Option<Rule>,
 }
 
 /// Tests a checkpoint.
@@ -132,8 +132,8 @@ impl<'a> Tester<'a> {
         check_unchanged(checkpoint, EnvironmentSummary::of(&environment))?;
         let id = checkpoint.id().map_err(TestError::Unnamed)?;
         let mut about = About::new(&environment, id, state.config.settings.episodes_per_trial());
-        if let Some(threshold) = &options.success {
-            about.success = Some(threshold.of(about.success.as_ref())?);
+        if let Some(rule) = &options.success {
+            about.judge_by(rule)?;
         }
         Ok(Self { servers, checkpoint, options, about, environment })
     }
@@ -260,7 +260,8 @@ impl<'a> Tester<'a> {
     }
 
     fn record(&self, test: &RecordedTest, end: EndedEpisode) -> EpisodeRecord {
-        let success = self.about.success.as_ref().map_or(end.success, |criterion| criterion.holds(end.achieved));
+        let (achieved, also_achieved) = achieved(&self.about, &end);
+        let success = self.about.success.as_ref().map_or(end.success, |criterion| criterion.holds(achieved));
         EpisodeRecord {
             set: test.set.name.clone(),
             seed: test.seed,
@@ -273,7 +274,8 @@ impl<'a> Tester<'a> {
             episode_return: end.episode_return,
             length: end.length,
             success,
-            achieved: end.achieved,
+            achieved,
+            also_achieved,
         }
     }
 }
@@ -294,6 +296,12 @@ pub fn test(
     let tester = Tester::new(servers, checkpoint, TestOptions { episodes, seed, success: None })?;
     let records = tester.test(&[version.into()], stop, &mut |_, done| report(done))?;
     Ok(records.result(&version.to_string(), None))
+}
+
+/// What an episode achieved of what decides about success, and of the environment's other quantity if it has two.
+pub(super) fn achieved(about: &About, end: &EndedEpisode) -> (Option<f64>, Option<f64>) {
+    let text = (end.achieved, about.also.is_some().then_some(end.code_achieved).flatten());
+    if about.is_judged_by_code() { (text.1, text.0) } else { text }
 }
 
 /// How an episode ended.

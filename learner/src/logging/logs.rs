@@ -168,6 +168,7 @@ mod tests {
             terminated: true,
             diverged: false,
             achieved: None,
+            code_achieved: None,
             receipt: Default::default(),
         }
     }

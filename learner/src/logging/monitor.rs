@@ -125,6 +125,7 @@ mod tests {
             terminated: true,
             diverged: false,
             achieved: None,
+            code_achieved: None,
             receipt: Receipt { requested: vec![0.1, 0.25], applied: vec![0.25], model_hash: String::new() },
         };
         monitor.write(&episode).unwrap();

@@ -217,6 +217,14 @@ impl Rollout {
         &self.episodes
     }
 
+    /// The sums of the complete episodes' rewards as they are learned from, normalised or not, in the order of
+    /// [`Rollout::episodes`].
+    pub fn learned_returns(&self) -> Vec<f64> {
+        let reward = |step: usize, environment: usize| f64::from(self.rewards[step * self.n_envs + environment]);
+        let sum = |span: &Span| (span.start..span.start + span.length).map(|step| reward(step, span.environment)).sum();
+        self.episodes.iter().map(sum).collect()
+    }
+
     /// A rollout of the given episodes of this one alone. T is the longest one's length; shorter ones stand one after the
     /// other in the same column where they fit, and what fills a column up is no sample. Every episode begins without
     /// memories.

@@ -16,7 +16,7 @@ use perturb_study::Counters;
 use perturb_study::files::write_atomically;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::Comparison;
-use perturb_study::settings::{Common, TrainConfig};
+use perturb_study::settings::{Common, EpoptConfig, TrainConfig, Wrapper};
 
 /// Means are over so many episodes, as in stable-baselines3.
 const RECENT: usize = 100;
@@ -100,7 +100,10 @@ impl<'a> Learning<'a> {
         let policy = Policy::new(spec.clone(), common.seed)?.with_threads(threads)?;
         let normalisers = Normalisers {
             observations: common.normalize_observations.then(|| ObservationNormaliser::new(observation_size)),
-            rewards: common.normalize_rewards.then(|| RewardNormaliser::new(common.num_envs, config.settings.gamma())),
+            rewards: common.normalize_rewards.then(|| {
+                let normaliser = RewardNormaliser::new(common.num_envs, config.settings.gamma());
+                normaliser.running_on(common.reward_return_runs_on)
+            }),
         };
         let mut player = player(&state, normalisers);
         player.begin(observations, None).map_err(crate::error::Error::from)?;
@@ -267,9 +270,13 @@ impl<'a> Learning<'a> {
         Ok((count, steps))
     }
 
-    /// 1 at the start, 0 when as many steps were learned from as the budget's episodes can have at most.
+    /// 1 at the start, 0 when as many steps were learned from as the budget's episodes can have at most. With an update for
+    /// each episode all count as long as that, as in the reference, which fills them up.
     fn progress_remaining(&self) -> f64 {
         let State { config, environment_spec, counters, .. } = &self.checkpoint.state;
+        if let Wrapper::Epopt(EpoptConfig { update_per_episode: true, .. }) = config.settings.wrapper {
+            return (1.0 - counters.episodes as f64 / config.common.episodes as f64).max(0.0);
+        }
         let most = config.common.episodes as f64 * f64::from(environment_spec.step_limit);
         (1.0 - counters.learned_timesteps as f64 / most).max(0.0)
     }

@@ -3,7 +3,9 @@
 use std::collections::{BTreeMap, HashSet};
 
 use crate::common::{bases, connect, contents, moved, options, server};
-use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Epopt, Experience, Ppo, Selection, UpdateStats};
+use perturb_learner::algorithm::{
+    A2c, Algorithm, AlgorithmState, Epopt, Experience, InTurn, Ppo, Selection, UpdateStats,
+};
 use perturb_learner::client::{EndedEpisode, PrivateServer, Session};
 use perturb_learner::error::Error;
 use perturb_learner::policy::Policy;
@@ -15,7 +17,7 @@ use perturb_policy::random::{Purpose, normal, stream, uniform};
 use perturb_policy::{
     ActionKind, Actor, Acts, Inputs, ObservationNormaliser, Player, PolicySpec, RewardNormaliser, Role,
 };
-use perturb_study::settings::{A2cConfig, EpoptConfig, PpoConfig};
+use perturb_study::settings::{A2cConfig, EpoptConfig, PpoConfig, Ranking};
 use proptest::prelude::*;
 use rand_chacha::ChaCha8Rng;
 use rstest::rstest;
@@ -87,8 +89,8 @@ fn of_episodes(spec: &PolicySpec, n_envs: usize) -> Rollout {
     Rollout::of_episodes(n_envs, O, spec.action.width())
 }
 
-fn epopt(base: Box<dyn Algorithm>, epsilon: f64, full_iterations: u64) -> Epopt {
-    let config = EpoptConfig { episodes_per_iteration: 8, epsilon, full_iterations };
+fn epopt(base: Box<dyn InTurn>, epsilon: f64, full_iterations: u64) -> Epopt {
+    let config = EpoptConfig { episodes_per_iteration: 8, epsilon, full_iterations, ..EpoptConfig::default() };
     Epopt::new(config, base).expect("valid settings")
 }
 
@@ -153,6 +155,67 @@ fn it_learns_from_the_worst_episodes_alone() {
             assert_ne!(policy.weights(), weights_of_all, "the better half would matter");
             let expected = Selection { epsilon: 0.5, kept: 4, kept_steps: 21, mean_return: 25.0 / 8.0, cvar: 0.5 };
             assert_eq!(stats.selection, Some(expected));
+        }
+    }
+}
+
+#[test]
+fn it_can_rank_by_what_is_learned_from() {
+    let (lengths, returns) = eight();
+    let spec = spec(DISCRETE, None);
+    let mut policy = moved(&spec);
+    let rollout = play(&policy, &lengths, &returns, of_episodes(&spec, 4));
+    let learned = rollout.learned_returns();
+    let rewards = rollout.trajectories().expect("a finished rollout").rewards;
+    let last = rollout.episodes()[7]; // of environment 1, its second
+    let sum: f64 = (9..11).map(|t| f64::from(rewards[4 * t + 1])).sum();
+    assert_eq!((last.environment, last.length, learned[7]), (1, 2, sum));
+    let mut ranked: Vec<usize> = (0..8).collect();
+    ranked.sort_by(|&a, &b| learned[a].total_cmp(&learned[b]));
+    let worst: u64 = ranked[..4].iter().map(|&i| rollout.episodes()[i].length as u64).sum();
+    assert_ne!(worst, 21, "those of the worst returns");
+    let config = EpoptConfig { epsilon: 0.5, full_iterations: 0, rank_by: Ranking::Normalized, ..Default::default() };
+    let [a2c, _] = bases(1, 1, &policy);
+    let stats = Epopt::new(config, a2c).expect("settings").update(&mut policy, &rollout, 1.0).expect("an update");
+    assert_eq!(stats.selection.map(|selection| (selection.kept, selection.kept_steps)), Some((4, worst)));
+}
+
+#[test]
+fn each_kept_episode_can_have_an_update_of_its_own() {
+    let (lengths, returns) = eight();
+    for lstm in [None, Some(8)] {
+        let spec = spec(DISCRETE, lstm);
+        for which in 0..2 {
+            let base = |policy: &Policy| {
+                let [a2c, ppo] = bases(1, 1, policy);
+                if which == 0 { a2c } else { ppo }
+            };
+            let mut policy = moved(&spec);
+            let rollout = play(&policy, &lengths, &returns, of_episodes(&spec, 4));
+            let mut worst: Vec<Span> = rollout.episodes().to_vec();
+            worst.retain(|span| span.episode_return < 3.0);
+            let alone: Vec<Rollout> = worst.iter().map(|span| rollout.select(&[*span]).expect("an episode")).collect();
+
+            let config =
+                EpoptConfig { epsilon: 0.5, full_iterations: 0, update_per_episode: true, ..Default::default() };
+            let mut epopt = Epopt::new(config, base(&policy)).expect("valid settings");
+            let stats = epopt.update(&mut policy, &rollout, 1.0).expect("an update");
+            let epochs = [1, 3][which];
+            assert_eq!(stats.n_updates, 4 * epochs, "a step for each episode and epoch");
+
+            let mut other = moved(&spec);
+            let mut each = base(&other);
+            let parts: Vec<&Rollout> = alone.iter().collect();
+            let expected = each.update_in_turn(&mut other, &parts, 1.0).expect("an update");
+            assert_eq!(policy.weights(), other.weights(), "{lstm:?}");
+            assert_eq!(UpdateStats { selection: None, ..stats }, expected, "{lstm:?}");
+            let mut other = moved(&spec);
+            let mut each = base(&other);
+            for part in &alone {
+                each.update(&mut other, part, 1.0).expect("an update");
+            }
+            let one_after_the_other = policy.weights() == other.weights();
+            assert_eq!(one_after_the_other, which == 0, "PPO takes an epoch on all before the next");
         }
     }
 }
@@ -436,7 +499,7 @@ fn padding_is_no_sample_of_an_update() {
         for action in [DISCRETE, CONTINUOUS] {
             let spec = spec(action, lstm);
             let rollout = play(&moved(&spec), &unequal(), &zeros(&unequal()), of_episodes(&spec, 4));
-            let update = |mut algorithm: Box<dyn Algorithm>, episodes: &[Span]| {
+            let update = |mut algorithm: Box<dyn InTurn>, episodes: &[Span]| {
                 let packed = rollout.select(episodes).expect("its own episodes");
                 algorithm.update(&mut moved(&spec), &packed, 1.0).expect("an update")
             };
@@ -635,12 +698,12 @@ fn pull(policy: &Policy, rng: &mut ChaCha8Rng, episodes: usize) -> Rollout {
     rollout
 }
 
-fn a2c(policy: &Policy) -> Box<dyn Algorithm> {
+fn a2c(policy: &Policy) -> Box<dyn InTurn> {
     let config = A2cConfig { learning_rate: 7e-3, ..A2cConfig::default() };
     Box::new(A2c::new(config, policy).expect("valid settings"))
 }
 
-fn ppo(policy: &Policy) -> Box<dyn Algorithm> {
+fn ppo(policy: &Policy) -> Box<dyn InTurn> {
     let config = PpoConfig { learning_rate: 3e-3, ..PpoConfig::default() };
     Box::new(Ppo::new(config, policy, 5).expect("valid settings"))
 }
@@ -650,7 +713,7 @@ fn ppo(policy: &Policy) -> Box<dyn Algorithm> {
 #[case::a2c(a2c, 1500)]
 #[case::ppo(ppo, 100)]
 fn it_avoids_what_is_catastrophic_in_some_environments_and_its_base_does_not(
-    #[case] base: fn(&Policy) -> Box<dyn Algorithm>,
+    #[case] base: fn(&Policy) -> Box<dyn InTurn>,
     #[case] updates: usize,
     #[values(0.2, 1.0)] epsilon: f64,
 ) {

@@ -14,13 +14,18 @@ use rstest::rstest;
 use crate::common::{connect, server};
 
 /// Algorithms of all kinds, with batches of different sizes, versions and parameters.
-const TRAININGS: [&str; 5] = [
+const TRAININGS: [&str; 8] = [
     "algorithm = 'a2c'\nnum_envs = 1\nn_steps = 5\nseed = 3",
     "algorithm = 'ppo'\nversion = 'R'\nnum_envs = 3\nn_steps = 16\nn_minibatches = 2\nn_epochs = 2\nseed = 3",
     "algorithm = 'epopt-ppo'\nversion = 'E'\nnum_envs = 2\nepisodes_per_iteration = 3\nepsilon = 0.5\nfull_iterations = 1
      n_epochs = 2\nseed = 4",
     "algorithm = 'ppo'\narchitecture = 'rc'\nnum_envs = 2\nn_steps = 24\nn_minibatches = 2\nn_epochs = 1\nseed = 5",
     "algorithm = 'rl2-a2c'\narchitecture = 'rc'\nversion = 'R'\nnum_envs = 2\nn_steps = 20\nseed = 6",
+    "preset = 'paper'\nalgorithm = 'ppo'\nversion = 'R'\nn_steps = 16\nn_epochs = 2\nseed = 3",
+    "preset = 'paper'\nalgorithm = 'epopt-a2c'\nversion = 'E'\nepisodes_per_iteration = 3\nepsilon = 0.5
+     full_iterations = 1\nseed = 4",
+    "preset = 'paper'\nalgorithm = 'epopt-ppo'\narchitecture = 'rc'\nepisodes_per_iteration = 3\nepsilon = 0.5
+     full_iterations = 1\nn_epochs = 2\nseed = 4",
 ];
 
 fn config(environment: &str, training: &str) -> TrainConfig {
@@ -103,17 +108,17 @@ fn the_bytes_of_a_training_are_its_own(#[values("CartPole", "Pendulum")] environ
     assert!(alone(&connect(&private), environment) == expected, "on two servers");
 
     let base = tempfile::tempdir().expect("a directory");
-    let all = |base: &Path| (0..5).map(|number| kept(&base.join(number.to_string()))).collect::<Vec<_>>();
-    together(&one, base.path(), environment, &[0, 1, 2, 3, 4], u64::MAX);
+    let all = |base: &Path| (0..TRAININGS.len()).map(|number| kept(&base.join(number.to_string()))).collect::<Vec<_>>();
+    together(&one, base.path(), environment, &[0, 1, 2, 3, 4, 5, 6, 7], u64::MAX);
     assert!(all(base.path()) == expected, "together");
 
     let base = tempfile::tempdir().expect("a directory");
-    together(&one, base.path(), environment, &[3, 1, 0], 1);
-    together(&connect(&private), base.path(), environment, &[2, 4], 1);
+    together(&one, base.path(), environment, &[3, 1, 7, 0], 1);
+    together(&connect(&private), base.path(), environment, &[2, 6, 4, 5], 1);
     assert!(all(base.path()) != expected, "all are stopped before their ends");
-    together(&connect(&private), base.path(), environment, &[0, 4, 3], u64::MAX);
-    together(&one, base.path(), environment, &[1], u64::MAX);
-    together(&one, base.path(), environment, &[2], u64::MAX);
+    together(&connect(&private), base.path(), environment, &[0, 4, 3, 6], u64::MAX);
+    together(&one, base.path(), environment, &[1, 5], u64::MAX);
+    together(&one, base.path(), environment, &[2, 7], u64::MAX);
     assert!(all(base.path()) == expected, "resumed in other groups");
 }
 

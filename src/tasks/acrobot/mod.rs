@@ -60,6 +60,12 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
         comparison: Comparison::AtMost,
         threshold: 80.0,
     },
+    code_success: Some(Success {
+        description: "the height was reached within 90 steps",
+        achievement: Achievement::FirstGoal,
+        comparison: Comparison::AtMost,
+        threshold: 90.0,
+    }),
     heatmap_axes: Some(["length", "mass"]),
 };
 

@@ -59,6 +59,13 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
         comparison: Comparison::AtLeast,
         threshold: 195.0,
     },
+    // It asks after each step for 195 of them, but an environment whose episode has ended is reset before it asks.
+    code_success: Some(Success {
+        description: "the episode lasted at least 196 steps",
+        achievement: Achievement::Length,
+        comparison: Comparison::AtLeast,
+        threshold: 196.0,
+    }),
     heatmap_axes: Some(["length", "mass"]),
 };
 

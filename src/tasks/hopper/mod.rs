@@ -42,6 +42,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     control_timestep: CONTROL_TIMESTEP,
     step_cost: 20.0,
     success: SUCCESS,
+    code_success: None,
     heatmap_axes: Some(["density", "friction"]),
 };
 

@@ -50,6 +50,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
         comparison: Comparison::AtMost,
         threshold: 110.0,
     },
+    code_success: None,
     heatmap_axes: Some(["force", "mass"]),
 };
 

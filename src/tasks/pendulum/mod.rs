@@ -50,6 +50,12 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
         comparison: Comparison::AtLeast,
         threshold: 100.0,
     },
+    code_success: Some(Success {
+        description: "the angle was within π/3 of vertical after each of 100 successive steps, wherever in the episode",
+        achievement: Achievement::LongestGoals,
+        comparison: Comparison::AtLeast,
+        threshold: 100.0,
+    }),
     heatmap_axes: Some(["mass", "length"]),
 };
 

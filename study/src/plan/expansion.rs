@@ -76,6 +76,7 @@ impl Expansion<'_> {
         table.extend(block.settings.clone());
         table.extend(point.clone());
         for (key, value) in [
+            ("preset", self.file.preset_of(block).to_string().as_str()),
             ("environment", environment),
             ("version", &set.version.to_string()),
             ("algorithm", &block.name),
@@ -97,7 +98,7 @@ impl Expansion<'_> {
         let sets = file.test_versions.iter().map(|name| self.set(name).cloned());
         let mut sets = sets.collect::<Result<Vec<_>, _>>()?;
         sets.sort_by_key(|set| set.plain().map_or(Version::ALL.len(), |version| version as usize));
-        let success = file.success.get(&config.common.environment).cloned();
+        let success = file.success_in(&config.common.environment, config.common.preset);
         let tests = Tests { episodes: file.test_episodes, sets, success };
         let configuration = fingerprint(&config, &tests);
         let set = self.set(trained_on)?.plain().is_none().then(|| trained_on.to_owned());
@@ -170,7 +171,7 @@ fn fingerprint(config: &TrainConfig, tests: &Tests) -> String {
         None => serde_json::to_string(set).unwrap_or_default(),
     };
     let sets: Vec<String> = tests.sets.iter().map(shown).collect();
-    let success = tests.success.as_ref().map(|threshold| format!(" {threshold}")).unwrap_or_default();
+    let success = tests.success.as_ref().map(|rule| format!(" {rule}")).unwrap_or_default();
     let text = format!("{table}\n{} [{}]{success}", tests.episodes, sets.join(", "));
     format!("{:08x}", crc32c::crc32c(text.as_bytes()))
 }

@@ -7,17 +7,19 @@ use toml::Table;
 
 use super::distinct;
 use crate::Version;
-use crate::success::Threshold;
+use crate::settings::Preset;
+use crate::success::Rule;
 use crate::value_error::{ValueError, require};
 
 /// Settings that the plan itself decides for each cell.
-const OWN_KEYS: [&str; 6] = ["environment", "version", "parameters", "algorithm", "architecture", "seed"];
+const OWN_KEYS: [&str; 7] = ["preset", "environment", "version", "parameters", "algorithm", "architecture", "seed"];
 /// The most cells of a plan.
 const MOST_CELLS: usize = 1_000_000;
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct File {
+    preset: Option<Preset>,
     pub(super) environments: Vec<String>,
     #[serde(default = "all_versions")]
     pub(super) versions: Vec<String>,
@@ -32,16 +34,33 @@ pub(super) struct File {
     #[serde(default)]
     pub(super) sets: BTreeMap<String, Table>,
     #[serde(default)]
-    pub(super) success: BTreeMap<String, Threshold>,
+    success: Success,
     #[serde(default)]
     pub(super) settings: Table,
     pub(super) algorithm: Vec<Block>,
+}
+
+/// What decides about success.
+#[derive(Deserialize)]
+#[serde(untagged, expecting = "\"text\", \"code\", or a table of environments with \"text\", \"code\" or thresholds")]
+enum Success {
+    /// In every environment.
+    All(Rule),
+    /// In these, and as ever in the others.
+    Some(BTreeMap<String, Rule>),
+}
+
+impl Default for Success {
+    fn default() -> Self {
+        Self::Some(BTreeMap::new())
+    }
 }
 
 /// A table `[[algorithm]]`.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Block {
+    preset: Option<Preset>,
     pub(super) name: String,
     pub(super) architectures: Vec<String>,
     environments: Option<Vec<String>>,
@@ -79,6 +98,21 @@ impl File {
         block.versions.as_ref().unwrap_or(&self.versions)
     }
 
+    /// Whose defaults the settings of `block` have.
+    pub(super) fn preset_of(&self, block: &Block) -> Preset {
+        block.preset.or(self.preset).unwrap_or_default()
+    }
+
+    /// What decides about success in tests of `environment` with a preset; `None` for the environment's own rule.
+    pub(super) fn success_in(&self, environment: &str, preset: Preset) -> Option<Rule> {
+        let given = match &self.success {
+            Success::All(rule) => Some(rule),
+            Success::Some(rules) => rules.get(environment),
+        };
+        let usual = if preset == Preset::Paper { Rule::Code } else { Rule::Text };
+        Some(given.cloned().unwrap_or(usual)).filter(|rule| *rule != Rule::Text)
+    }
+
     /// Refuses what does not depend on a table `[[algorithm]]`.
     pub(super) fn check(&self) -> Result<(), ValueError> {
         let most = i64::MAX as u64 - u64::from(u32::MAX);
@@ -90,10 +124,17 @@ impl File {
         check_list("versions", &self.versions)?;
         check_list("test_versions", &self.test_versions)?;
         let environments = self.all_environments();
-        self.success.keys().try_for_each(|name| {
-            let known = environments.contains(&name.as_str());
-            require(known, "[success]", format!("`{name}`"), format!("one of {}", environments.join(", ")))
-        })
+        match &self.success {
+            Success::All(Rule::At(threshold)) => {
+                let expected = "\"text\" or \"code\"; a threshold belongs to an environment: [success] NAME = …";
+                Err(ValueError::new("success", threshold, expected))
+            }
+            Success::All(_) => Ok(()),
+            Success::Some(rules) => rules.keys().try_for_each(|name| {
+                let known = environments.contains(&name.as_str());
+                require(known, "[success]", format!("`{name}`"), format!("one of {}", environments.join(", ")))
+            }),
+        }
     }
 
     /// Refuses what `block`, which is called `name` in refusals, has beside its grid; `before` cells stand before its own.
@@ -113,7 +154,7 @@ impl File {
     /// Settings belong to trainings, not to the plan, and stand in one place.
     fn check_keys(&self, name: &str, block: &Block) -> Result<(), ValueError> {
         let expected =
-            "left out: the plan's own keys decide it (environments, versions, sets, name, architectures, seed)";
+            "left out: the plan's own keys decide it (preset, environments, versions, sets, name, architectures, seed)";
         for (table, settings) in [
             ("[settings]".to_owned(), &self.settings),
             (format!("{name}: [algorithm.settings]"), &block.settings),

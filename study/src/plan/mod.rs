@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 use crate::files::{self, FileError};
 use crate::sets::{TestSet, check as check_parameters};
 use crate::settings::TrainConfig;
-use crate::success::{Criterion, Threshold};
+use crate::success::{Criterion, Rule};
 use crate::value_error::ValueError;
 use crate::{AnyError, Method, Version};
 use file::File;
@@ -64,9 +64,9 @@ pub struct Tests {
     pub episodes: u64,
     /// On what: versions in the order D, R, E, then the plan's own sets in theirs.
     pub sets: Vec<TestSet>,
-    /// The threshold of success; `None` for the environment's own.
+    /// What decides about success; `None` for the environment's own rule.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub success: Option<Threshold>,
+    pub success: Option<Rule>,
 }
 
 /// How much a plan asks for.
@@ -137,13 +137,13 @@ impl Plan {
     /// # Errors
     /// [`ValueError`] for one that it does not take.
     pub fn check(&self, environment: &proto::Environment) -> Result<(), ValueError> {
-        let criterion = Criterion::of(environment);
+        let (text, code) = (Criterion::of(environment), Criterion::of_code(environment));
         for cell in self.cells.iter().filter(|cell| cell.config.common.environment == environment.name) {
             let trained = cell.set.as_deref().unwrap_or_default();
             check_parameters(trained, &cell.config.common.parameters, environment)?;
             cell.tests.sets.iter().try_for_each(|set| set.check(environment))?;
-            if let Some(threshold) = &cell.tests.success {
-                threshold.of(criterion.as_ref())?;
+            if let Some(rule) = &cell.tests.success {
+                rule.of(text.as_ref(), code.as_ref())?;
             }
         }
         Ok(())

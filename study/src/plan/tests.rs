@@ -1,4 +1,5 @@
 use super::*;
+use crate::settings::Preset;
 
 const SMALL: &str = "
 environments = ['CartPole', 'Pendulum']
@@ -179,6 +180,49 @@ fn trials_of_different_lengths_are_different_methods() {
         [[algorithm]]\nname = 'epopt-a2c'\narchitectures = ['rc']";
     let methods: Vec<String> = parse(text).unwrap().methods().iter().map(ToString::to_string).collect();
     assert_eq!(methods, ["rl2-a2c rc N=1", "rl2-a2c rc N=2", "epopt-a2c rc"]);
+}
+
+#[test]
+fn a_plan_and_each_of_its_tables_may_name_a_preset_which_decides_about_success_too() {
+    let text = "environments = ['Pendulum', 'Acrobot']\npreset = 'paper'
+        [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']
+        [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\npreset = 'perturb'";
+    let plan = parse(text).unwrap();
+    let methods: Vec<String> = plan.methods().iter().map(ToString::to_string).collect();
+    assert_eq!(methods, ["ppo ff (paper)", "ppo ff"]);
+    let rule = |plan: &Plan, environment: &str, preset| {
+        let has = |cell: &&Cell| cell.config.common.environment == environment && cell.config.common.preset == preset;
+        plan.cells.iter().find(has).unwrap().tests.success.clone().map(|rule| rule.to_string())
+    };
+    let code = Some("code".to_owned());
+    assert_eq!([Preset::Paper, Preset::Perturb].map(|preset| rule(&plan, "Acrobot", preset)), [code.clone(), None]);
+    let plan = parse(&format!("success = 'text'\n{text}")).unwrap();
+    assert_eq!(rule(&plan, "Acrobot", Preset::Paper), None);
+    let plan = parse(&format!("{text}\n[success]\nAcrobot = 'steps=85'\nPendulum = 'text'")).unwrap();
+    let rules = ["Acrobot", "Pendulum"].map(|environment| rule(&plan, environment, Preset::Paper));
+    assert_eq!(rules, [Some("steps=85".into()), None]);
+    for (from, to, part) in [
+        ("preset = 'paper'", "success = 'steps=85'", "success is steps=85, but must be \"text\" or \"code\""),
+        ("preset = 'paper'", "success = 'mine'", "\"text\", \"code\", or a table of environments"),
+        ("preset = 'paper'", "preset = 'mine'", "unknown variant `mine`"),
+        ("preset = 'paper'", "settings = { preset = 'paper' }", "[settings] preset is \"paper\", but must be left out"),
+    ] {
+        let message = parse(&text.replacen(from, to, 1)).unwrap_err().to_string();
+        assert!(message.contains(part), "{to}: {message}");
+    }
+}
+
+/// As the program before presets named them.
+#[test]
+fn cells_of_the_usual_preset_keep_their_names() {
+    let names = |text: &str| -> Vec<String> { parse(text).unwrap().cells.into_iter().map(|cell| cell.id).collect() };
+    let text = "environments = ['Acrobot']\nversions = ['R']
+        [success]\nAcrobot = 'steps=90'
+        [[algorithm]]\nname = 'epopt-a2c'\narchitectures = ['rc']
+        [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+    let expected = ["Acrobot-epopt-a2c-rc-R-3b03e8da-s1", "Acrobot-ppo-ff-R-88e4a644-s1"];
+    assert_eq!(names(text), expected);
+    assert_eq!(names(&format!("preset = 'perturb'\n{text}")), expected);
 }
 
 #[test]

@@ -13,7 +13,8 @@ use serde::{Deserialize, Serialize};
 use crate::means::{mean, wilson};
 use crate::results::TestResult;
 use crate::sets::TestSet;
-use crate::success::Criterion;
+use crate::success::{Criterion, Rule};
+use crate::value_error::ValueError;
 
 /// Requested and applied values may differ by this share of the requested one: physics rounds what it derives.
 pub const ROUNDING: f64 = 1e-9;
@@ -44,6 +45,15 @@ pub struct About {
     pub episodes_per_trial: u32,
     /// What counted as a success; `None` if the server's word was taken, which did not say what it compares.
     pub success: Option<Criterion>,
+    /// The rule of the paper's text; `None` in records of programs that knew no other.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub text_success: Option<Criterion>,
+    /// That of the paper's published code; `None` likewise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub code_success: Option<Criterion>,
+    /// The quantity of [`EpisodeRecord::also_achieved`], where the two rules compare different ones.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub also: Option<String>,
     /// The tests, in order.
     pub tests: Vec<RecordedTest>,
 }
@@ -106,6 +116,8 @@ pub struct EpisodeRecord {
     pub ending: Ending,
     /// What it achieved of what the criterion compares; `None` if nothing.
     pub achieved: Option<f64>,
+    /// What it achieved of [`About::also`]; `None` if nothing, or if there is no such quantity.
+    pub also_achieved: Option<f64>,
 }
 
 /// How far requested and applied parameters agree.
@@ -138,6 +150,9 @@ impl About {
             unit: parameter.unit.clone(),
             applied: parameter.applied.clone(),
         };
+        let (text, code) = (Criterion::of(environment), Criterion::of_code(environment));
+        let quantities = text.as_ref().zip(code.as_ref()).map(|(text, code)| (&text.quantity, &code.quantity));
+        let also = quantities.filter(|(text, code)| text != code).map(|(_, code)| code.clone());
         Self {
             environment: environment.name.clone(),
             revision: environment.revision,
@@ -145,9 +160,39 @@ impl About {
             applied: environment.applied.iter().map(|quantity| quantity.name.clone()).collect(),
             policy,
             episodes_per_trial,
-            success: Criterion::of(environment),
+            success: text.clone(),
+            text_success: code.as_ref().and(text),
+            code_success: code,
+            also,
             tests: Vec::new(),
         }
+    }
+
+    /// The criterion by `rule`.
+    ///
+    /// # Errors
+    /// [`ValueError`] for one that these episodes cannot be judged by.
+    pub fn criterion(&self, rule: &Rule) -> Result<Criterion, ValueError> {
+        rule.of(self.text_success.as_ref().or(self.success.as_ref()), self.code_success.as_ref())
+    }
+
+    /// Has `rule` decide about success in what is to be recorded.
+    ///
+    /// # Errors
+    /// Those of [`About::criterion`].
+    pub fn judge_by(&mut self, rule: &Rule) -> Result<(), ValueError> {
+        let criterion = self.criterion(rule)?;
+        if self.also.as_ref() == Some(&criterion.quantity) {
+            self.also = self.success.take().map(|before| before.quantity);
+        }
+        self.success = Some(criterion);
+        Ok(())
+    }
+
+    /// Whether [`EpisodeRecord::achieved`] is what the code's rule compares, and another one than the text's does.
+    pub fn is_judged_by_code(&self) -> bool {
+        let quantity = |criterion: &Option<Criterion>| criterion.as_ref().map(|it| it.quantity.clone());
+        self.also.is_some() && quantity(&self.success) == quantity(&self.code_success)
     }
 }
 
@@ -168,10 +213,11 @@ impl Records {
         self.episodes.iter().filter(move |episode| episode.set == name)
     }
 
-    /// The figures of the test on the set called `name`; with `criterion`, which must be of the recorded quantity,
-    /// successes are judged anew.
+    /// The figures of the test on the set called `name`; with `criterion`, which must be of a recorded quantity, successes are
+    /// judged anew.
     pub fn result(&self, name: &str, criterion: Option<&Criterion>) -> TestResult {
-        let success = |episode: &EpisodeRecord| criterion.map_or(episode.success, |c| c.holds(episode.achieved));
+        let success =
+            |episode: &EpisodeRecord| criterion.map_or(episode.success, |c| c.holds(self.achieved(episode, c)));
         let episodes: Vec<&EpisodeRecord> = self.of(name).collect();
         let n = episodes.len() as u64;
         let successes = episodes.iter().filter(|episode| success(episode)).count() as u64;
@@ -183,6 +229,11 @@ impl Records {
             mean_return: mean(episodes.iter().map(|episode| episode.episode_return)),
             mean_length: mean(episodes.iter().map(|episode| f64::from(episode.length))),
         }
+    }
+
+    /// What an episode achieved of what `criterion` compares.
+    pub fn achieved(&self, episode: &EpisodeRecord, criterion: &Criterion) -> Option<f64> {
+        if self.about.also.as_ref() == Some(&criterion.quantity) { episode.also_achieved } else { episode.achieved }
     }
 
     /// Compares what every episode was asked to run with and what it ran with.

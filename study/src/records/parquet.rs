@@ -106,7 +106,9 @@ fn columns(Records { about, episodes }: &Records) -> Vec<(String, ColumnValues)>
         .map(|(index, parameter)| (format!("requested_{}", parameter.name), nth(index, |row| &row.requested)));
     let quantities = about.applied.iter().enumerate();
     let applied = quantities.map(|(index, name)| (format!("applied_{name}"), nth(index, |row| &row.applied)));
-    let there = rows().map(|row| row.achieved.is_some().into()).collect();
+    let optional = |of: fn(&EpisodeRecord) -> Option<f64>| {
+        ColumnValues::Optional(rows().filter_map(of).collect(), rows().map(|row| of(row).is_some().into()).collect())
+    };
     let first = [
         ("set", texts(|row| &row.set)),
         ("seed", longs(|row| row.seed)),
@@ -119,10 +121,11 @@ fn columns(Records { about, episodes }: &Records) -> Vec<(String, ColumnValues)>
         ("length", ints(|row| row.length)),
         ("success", ColumnValues::Flag(rows().map(|row| row.success).collect())),
         ("ending", texts(|row| Ending::NAMED[row.ending as usize].0)),
-        ("achieved", ColumnValues::Optional(rows().filter_map(|row| row.achieved).collect(), there)),
+        ("achieved", optional(|row| row.achieved)),
     ];
+    let also = about.also.iter().map(|_| ("also_achieved".to_owned(), optional(|row| row.also_achieved)));
     let named = |(name, values): (&str, ColumnValues)| (name.to_owned(), values);
-    first.map(named).into_iter().chain(requested).chain(applied).chain(last.map(named)).collect()
+    first.map(named).into_iter().chain(requested).chain(applied).chain(last.map(named)).chain(also).collect()
 }
 
 fn schema(columns: &[(String, ColumnValues)]) -> Result<Type, ParquetError> {
@@ -220,5 +223,6 @@ fn episode(about: &About, row: &Row) -> Result<EpisodeRecord, AnyError> {
             named.ok_or_else(|| format!("an ending is `{text}`"))?.1
         },
         achieved: row.get_double(next()).ok(), // its type is right, so that it is there or null
+        also_achieved: about.also.as_ref().and_then(|_| row.get_double(next()).ok()),
     })
 }

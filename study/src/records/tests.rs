@@ -16,6 +16,9 @@ fn records() -> Records {
         policy: "00000001-0a".into(),
         episodes_per_trial: 1,
         success: Some(success),
+        text_success: None,
+        code_success: None,
+        also: None,
         tests: Vec::new(),
     };
     let mut records = Records::new(about);
@@ -41,6 +44,7 @@ fn episode(version: Version, index: u64) -> EpisodeRecord {
         success: steps <= 80,
         ending: [Ending::Terminated, Ending::Truncated, Ending::Diverged][index as usize % 3],
         achieved: (index < 4).then_some(f64::from(steps)),
+        also_achieved: None,
     }
 }
 
@@ -52,6 +56,60 @@ fn records_read_back_bit_for_bit_and_always_have_the_same_bytes() {
     records().write(&other).unwrap();
     assert_eq!(std::fs::read(&one).unwrap(), std::fs::read(&other).unwrap());
     assert_eq!(Records::read(&one).unwrap(), records());
+}
+
+/// Records of an environment whose two rules compare different quantities: steps at the end, and in a row anywhere.
+fn of_two_rules() -> Records {
+    let rule = |quantity: &str| proto::Success {
+        quantity: quantity.into(),
+        unit: "1".into(),
+        comparison: proto::Comparison::AtLeast.into(),
+        threshold: 100.0,
+        ..Default::default()
+    };
+    let environment = proto::Environment {
+        step_limit: 200,
+        success: Some(rule("steps")),
+        code_success: Some(rule("steps_in_a_row")),
+        ..Default::default()
+    };
+    Records::new(About::new(&environment, String::new(), 1))
+}
+
+#[test]
+fn episodes_can_be_judged_by_the_texts_rule_and_by_the_codes_whichever_they_were_recorded_with() {
+    for by_code in [false, true] {
+        let mut records = of_two_rules();
+        if by_code {
+            records.about.judge_by(&Rule::Code).unwrap();
+        }
+        assert_eq!(records.about.is_judged_by_code(), by_code);
+        let at = |index: u64, at_the_end: f64, in_a_row: f64| {
+            let (achieved, also) = if by_code { (in_a_row, at_the_end) } else { (at_the_end, in_a_row) };
+            let (requested, applied) = (Vec::new(), Vec::new());
+            let (achieved, also_achieved) = (Some(achieved), Some(also));
+            EpisodeRecord { requested, applied, achieved, also_achieved, ..episode(Version::D, index) }
+        };
+        let episodes = vec![at(0, 150.0, 150.0), at(1, 20.0, 120.0), at(2, 0.0, 110.0), at(3, 0.0, 99.0)];
+        records.add(RecordedTest { set: Version::D.into(), seed: 1 }, episodes);
+
+        let directory = tempfile::tempdir().unwrap();
+        records.write(&directory.path().join(FILE)).unwrap();
+        let records = Records::read(&directory.path().join(FILE)).unwrap();
+        let percent = |rule: &str| {
+            let criterion = records.about.criterion(&rule.parse().unwrap()).unwrap();
+            records.result("D", Some(&criterion)).success_percent
+        };
+        for (rule, expected) in [
+            ("text", 25.0),
+            ("code", 75.0),
+            ("steps=20", 50.0),
+            ("steps_in_a_row=99", 100.0),
+            ("steps_in_a_row=121", 25.0),
+        ] {
+            assert_eq!(percent(rule), expected, "{rule}");
+        }
+    }
 }
 
 #[test]

@@ -45,7 +45,8 @@ pub struct A2cConfig {
     pub gamma: f64,
     /// Weight of the entropy in nats, not negative (default: `0.01`). Larger keeps actions random for longer.
     pub ent_coef: f64,
-    /// Weight of the value loss, not negative (default: `0.5`). Feed-forward policy and value networks share no weights, so
+    /// Weight of the value loss, the mean squared error, not negative (default: `0.5`; paper: `0.25`, where it is
+    /// half of the squared error that has the weight 0.5). Feed-forward policy and value networks share no weights, so
     /// it acts through the clipping of the common gradient only; recurrent ones share all but their heads.
     pub vf_coef: f64,
     /// Global norm that longer gradients are scaled down to, above 0 (default: `0.5`).
@@ -55,8 +56,8 @@ pub struct A2cConfig {
     /// RMSProp's ε, added to that average inside the root, above 0 (default: `1e-5`). Limits the step of weights with
     /// small gradients.
     pub rms_eps: f64,
-    /// Whether V(final observation) follows the last reward of a truncated episode (default: `true`). `false` treats a
-    /// time limit as the task's end, as the reference does.
+    /// Whether V(final observation) follows the last reward of a truncated episode (default: `true`; paper: `false`).
+    /// `false` treats a time limit as the task's end, as the reference does.
     pub bootstrap_truncation: bool,
 }
 
@@ -125,15 +126,16 @@ pub struct PpoConfig {
     /// Weight of the KL divergence of the new from the acting policy, in nats, not negative (default: `0`). Larger holds
     /// the policy back where clipping does not. Packer et al. (2018) search it for RL².
     pub kl_coef: f64,
-    /// Weight of the value loss, not negative (default: `0.5`). Feed-forward policy and value networks share no weights, so
+    /// Weight of the value loss, the mean squared error, not negative (default: `0.5`; paper: `0.25`, where it is
+    /// half of the squared error that has the weight 0.5). Feed-forward policy and value networks share no weights, so
     /// it acts through the clipping of the common gradient only; recurrent ones share all but their heads.
     pub vf_coef: f64,
     /// Global norm that longer gradients are scaled down to, above 0 (default: `0.5`).
     pub max_grad_norm: f64,
     /// Adam's ε, above 0 (default: `1e-5`). Limits the step of weights with small gradients.
     pub adam_eps: f64,
-    /// Whether V(final observation) follows the last reward of a truncated episode (default: `true`). `false` treats a
-    /// time limit as the task's end, as the reference does.
+    /// Whether V(final observation) follows the last reward of a truncated episode (default: `true`; paper: `false`).
+    /// `false` treats a time limit as the task's end, as the reference does.
     pub bootstrap_truncation: bool,
 }
 
@@ -192,11 +194,35 @@ pub struct EpoptConfig {
     pub epsilon: f64,
     /// Iterations at the start that learn from all episodes, ε = 1 (default: `100`).
     pub full_iterations: u64,
+    /// What the worst episodes are the worst by: "raw", the undiscounted return, or "normalized", the sum of the rewards as
+    /// the policy learns from them (default: `"raw"`; paper: `"normalized"`). What divides them changes while an iteration
+    /// is collected, so that of equal episodes normalised ones rank by when they were.
+    pub rank_by: Ranking,
+    /// Whether each kept episode has an update of its own, one after the other, in place of one update on all (default:
+    /// `false`; paper: `true` with RC). PPO takes all its epochs over the row of episodes.
+    pub update_per_episode: bool,
+}
+
+/// What EPOpt ranks episodes by.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Ranking {
+    /// The undiscounted return.
+    #[default]
+    Raw,
+    /// The undiscounted sum of normalised rewards.
+    Normalized,
 }
 
 impl Default for EpoptConfig {
     fn default() -> Self {
-        EpoptConfig { episodes_per_iteration: 100, epsilon: 0.1, full_iterations: 100 }
+        EpoptConfig {
+            episodes_per_iteration: 100,
+            epsilon: 0.1,
+            full_iterations: 100,
+            rank_by: Ranking::Raw,
+            update_per_episode: false,
+        }
     }
 }
 

@@ -1,11 +1,12 @@
-//! The defaults of every pair of algorithm and architecture. Why they are what they are, with numbers:
+//! The defaults of every pair of algorithm and architecture in each preset. Why they are what they are, with numbers:
 //! docs/algorithms.md.
 
+use super::preset::{self, Preset};
 use super::{Architecture, Base, Common, Settings, TrainConfig, Wrapper};
 use perturb_protocol::Version;
 
 /// The defaults of the algorithm that `settings` are of, whose parts have their own, without an environment.
-pub(super) fn of(mut settings: Settings, architecture: Architecture) -> TrainConfig {
+pub(super) fn of(mut settings: Settings, architecture: Architecture, preset: Preset) -> TrainConfig {
     tune(&mut settings, architecture);
     let num_envs = match (&settings.wrapper, &settings.base, architecture) {
         (Wrapper::Epopt(_), _, _) => 25,
@@ -17,6 +18,7 @@ pub(super) fn of(mut settings: Settings, architecture: Architecture) -> TrainCon
         _ => 1,
     };
     let common = Common {
+        preset: Preset::Perturb,
         environment: String::new(),
         version: Version::D,
         parameters: Default::default(),
@@ -26,10 +28,15 @@ pub(super) fn of(mut settings: Settings, architecture: Architecture) -> TrainCon
         num_envs,
         normalize_observations: true,
         normalize_rewards: true,
+        reward_return_runs_on: false,
         log_interval,
         checkpoint_interval: 500,
     };
-    TrainConfig { common, settings }
+    let mut config = TrainConfig { common, settings };
+    if preset == Preset::Paper {
+        preset::apply_paper(&mut config);
+    }
+    config
 }
 
 fn tune(settings: &mut Settings, architecture: Architecture) {

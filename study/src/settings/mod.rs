@@ -1,19 +1,21 @@
 //! The configuration of a training: flat, by the field's names.
 //!
-//! Layers, each over the one before: the algorithm's defaults, `--config FILE.toml`, `--set key=value`, flags. The
+//! Layers, each over the one before: the algorithm's defaults in the preset, `--config FILE.toml`, `--set key=value`, flags. The
 //! result is written to `config.toml` of the run; given back with `--config` it repeats the run.
 
 mod algorithms;
 mod architecture;
 mod defaults;
 mod error;
+mod preset;
 
 mod base_and_wrapper;
 
-pub use algorithms::{A2cConfig, EpoptConfig, PpoConfig, Rl2Config, Schedule};
+pub use algorithms::{A2cConfig, EpoptConfig, PpoConfig, Ranking, Rl2Config, Schedule};
 pub use architecture::Architecture;
 pub use base_and_wrapper::{Base, Settings, Wrapper};
 pub use error::{ConfigError, SettingError};
+pub use preset::Preset;
 
 use std::path::Path;
 
@@ -34,6 +36,8 @@ const MOST_ENVS: usize = 65_536;
 const PARAMETERS: &str = "parameters";
 /// The key of [`Settings::name`].
 const ALGORITHM: &str = "algorithm";
+/// The key of [`Common::preset`].
+const PRESET: &str = "preset";
 /// The key of [`Common::architecture`].
 const ARCHITECTURE: &str = "architecture";
 
@@ -61,6 +65,8 @@ pub struct TrainConfig {
 /// Settings that every training has.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Common {
+    /// Which defaults the other settings have: "perturb" or "paper" (default: `"perturb"`).
+    pub preset: Preset,
     /// The environment's name in the catalogue. Has no default.
     pub environment: String,
     /// Where its parameters come from while training.
@@ -76,13 +82,17 @@ pub struct Common {
     pub episodes: u64,
     /// Fixes all randomness, 0 … 2⁶³-1 (default: `1`).
     pub seed: u64,
-    /// N: environments that are stepped together, 1 … 65536 (default: `16`, `8` with PPO FF, `25` with EPOpt).
+    /// N: environments that are stepped together, 1 … 65536 (default: `16`, `8` with PPO FF, `25` with EPOpt; paper:
+    /// `1`).
     /// More makes a step cheaper and updates rarer.
     pub num_envs: usize,
     /// Whether observations are normalised by their running mean and variance (default: `true`).
     pub normalize_observations: bool,
     /// Whether rewards are divided by the running deviation of the discounted return (default: `true`).
     pub normalize_rewards: bool,
+    /// Whether that discounted return runs on over the ends of episodes, as in the reference, instead of starting again from 0
+    /// (default: `false`; paper: `true`).
+    pub reward_return_runs_on: bool,
     /// Iterations between two lines of progress.csv, at least 1 (default: `100` with A2C and RL²-A2C, else `1`). A line has the
     /// figures of the last update, and means over the last 100 ended episodes.
     pub log_interval: u64,
@@ -112,14 +122,23 @@ impl TrainConfig {
         resolve(&layers)
     }
 
-    /// The configuration as TOML.
+    /// The configuration as TOML, every setting of it.
     pub fn to_toml(&self) -> String {
         // Serialisation of plain numbers, booleans and names cannot fail.
-        toml::to_string(&self.table()).unwrap_or_default()
+        toml::to_string(&self.full_table()).unwrap_or_default()
     }
 
-    /// The configuration as a flat table, which [`TrainConfig::from_table`] reads back.
+    /// The configuration as a flat table, which [`TrainConfig::from_table`] reads back. Of the preset that stands if none is
+    /// named it lacks settings that are younger than some results and as they were before.
     pub fn table(&self) -> Table {
+        let mut table = self.full_table();
+        if self.common.preset.is_default() {
+            preset::leave_out_younger(&mut table);
+        }
+        table
+    }
+
+    fn full_table(&self) -> Table {
         let mut table = Table::try_from(&self.common).unwrap_or_default();
         table.insert(ALGORITHM.into(), self.settings.name().into());
         table.extend(self.settings.table());
@@ -141,6 +160,7 @@ impl TrainConfig {
             algorithm: settings.name().to_owned(),
             architecture: common.architecture.to_string(),
             episodes_per_trial: settings.has_trials().then(|| settings.episodes_per_trial()),
+            preset: common.preset,
         }
     }
 
@@ -190,8 +210,12 @@ fn resolve(layers: &[(String, Table)]) -> Result<TrainConfig, ConfigError> {
         None => algorithm.default_architecture(),
         Some(value) => Architecture::ALL[choice(ARCHITECTURE, value, &Architecture::NAMES)?],
     };
-    let config = defaults::of(algorithm, architecture);
-    let mut defaults = config.table();
+    let preset = match named(PRESET) {
+        None => Preset::default(),
+        Some(value) => Preset::ALL[choice(PRESET, value, &Preset::NAMES)?],
+    };
+    let config = defaults::of(algorithm, architecture, preset);
+    let mut defaults = config.full_table();
     defaults.insert(PARAMETERS.into(), Value::Table(Table::new())); // empty, it is not written
     for (origin, table) in layers {
         for (key, value) in table {
@@ -242,6 +266,8 @@ fn check(origin: &str, key: &str, value: &Value, defaults: &Table, algorithm: &'
         "version" => Some(&["D", "R", "E"]),
         ARCHITECTURE => Some(&Architecture::NAMES),
         "learning_rate_schedule" => Some(&["constant", "linear"]),
+        PRESET => Some(&Preset::NAMES),
+        "rank_by" => Some(&["raw", "normalized"]),
         _ => None,
     };
     let expected = match (default, value) {

@@ -53,6 +53,67 @@ fn the_written_configuration_gives_the_same_again() {
     }
 }
 
+fn of(preset: &str, algorithm: &str, architecture: Architecture, sets: &[&str]) -> TrainConfig {
+    let flags = format!(
+        "environment = 'Hopper'\nalgorithm = '{algorithm}'\narchitecture = '{architecture}'\npreset = '{preset}'"
+    );
+    load(None, sets, &flags).unwrap()
+}
+
+/// docs/algorithms.md has these in a table.
+#[test]
+fn the_presets_differ_in_named_settings_and_in_nothing_else() {
+    for (algorithm, architecture) in pairs() {
+        let [ours, papers] = ["perturb", "paper"].map(|preset| of(preset, algorithm, architecture, &[]).full_table());
+        assert!(ours.keys().eq(papers.keys()), "the same keys");
+        let different = ours.iter().filter(|(key, value)| papers[*key] != **value);
+        let different: Table = different.map(|(key, _)| (key.clone(), papers[key].clone())).collect();
+        let (is_rc, is_epopt) = (architecture == Architecture::Rc, algorithm.starts_with("epopt"));
+        let mut expected: Table = "preset = 'paper'\nnum_envs = 1\nreward_return_runs_on = true\nvf_coef = 0.25\n\
+                                   bootstrap_truncation = false"
+            .parse()
+            .unwrap();
+        if algorithm.ends_with("ppo") {
+            expected.extend((!is_epopt).then(|| ("log_interval".into(), 10.into())));
+            expected.extend(is_rc.then(|| ("n_epochs".into(), 10.into())));
+        }
+        if is_epopt {
+            expected.insert("rank_by".into(), "normalized".into());
+            expected.extend(is_rc.then(|| ("update_per_episode".into(), true.into())));
+        }
+        assert_eq!(different, expected, "{algorithm} {architecture}");
+    }
+}
+
+#[test]
+fn a_preset_gives_defaults_that_every_layer_beats() {
+    let config = of("paper", "epopt-ppo", Architecture::Rc, &["num_envs=7", "update_per_episode=false", "rank_by=raw"]);
+    assert_eq!((config.common.num_envs, ppo(&config).n_epochs), (7, 10));
+    let expected = EpoptConfig::default();
+    assert_eq!(config.settings.wrapper, Wrapper::Epopt(expected), "none of the paper's is left");
+    for text in [config.to_toml(), toml::to_string(&config.table()).unwrap()] {
+        assert_eq!(load(Some(&text), &[], "").unwrap(), config, "and none comes back");
+    }
+    let file = "preset = 'paper'\nn_epochs = 3";
+    let config = load(Some(file), &["architecture=rc"], "environment = 'CartPole'").unwrap();
+    assert_eq!((config.common.num_envs, ppo(&config).n_epochs), (1, 3));
+    assert!(refusal(None, &["preset=ours"]).contains("preset is \"ours\", but must be one of \"perturb\", \"paper\""));
+}
+
+/// Results of earlier programs are found by what cells are named by.
+#[test]
+fn a_table_without_the_papers_preset_has_no_younger_settings_that_are_as_before() {
+    for (algorithm, architecture) in pairs() {
+        let younger = ["preset", "reward_return_runs_on", "rank_by", "update_per_episode"];
+        let table = of("perturb", algorithm, architecture, &[]).table();
+        assert!(younger.iter().all(|key| !table.contains_key(*key)), "{table}");
+        let table = of("perturb", algorithm, architecture, &["reward_return_runs_on=true"]).table();
+        assert_eq!(table.get("reward_return_runs_on"), Some(&true.into()));
+        let config = of("perturb", algorithm, architecture, &[]);
+        assert!(config.to_toml().contains("preset = \"perturb\""), "config.toml has every setting");
+    }
+}
+
 /// The paper's ten pairs.
 fn pairs() -> impl Iterator<Item = (&'static str, Architecture)> {
     let all = Settings::names().into_iter().flat_map(|name| Architecture::ALL.map(|architecture| (name, architecture)));

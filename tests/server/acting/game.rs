@@ -76,6 +76,11 @@ impl Game {
         (0..self.spec(environment).n_weights() as u64).map(weight).collect()
     }
 
+    /// In half of the games.
+    fn return_runs_on(self) -> bool {
+        self.lstm == 0
+    }
+
     fn normalisers(self, environment: &Environment) -> Normalisers {
         if !self.normalised {
             return Normalisers::default();
@@ -84,7 +89,9 @@ impl Game {
         let moments = |size| RunningMoments::from_parts(SEEN, vec![0.05; size], vec![80.0; size]);
         Normalisers {
             observations: Some(ObservationNormaliser::from_moments(moments(size))),
-            rewards: Some(RewardNormaliser::from_parts(GAMMA, vec![0.0; self.n], moments(1))),
+            rewards: Some(
+                RewardNormaliser::from_parts(GAMMA, vec![0.0; self.n], moments(1)).running_on(self.return_runs_on()),
+            ),
         }
     }
 
@@ -95,7 +102,12 @@ impl Game {
             mean: doubles(&vec![0.05; size]),
             squares: doubles(&vec![80.0; size]),
         };
-        let rewards = || RewardMoments { gamma: GAMMA, returns: doubles(&vec![0.0; self.n]), moments: Some(of(1)) };
+        let rewards = || RewardMoments {
+            gamma: GAMMA,
+            returns: doubles(&vec![0.0; self.n]),
+            moments: Some(of(1)),
+            runs_on: self.return_runs_on(),
+        };
         let role = if self.testing {
             Role::Testing(TestStreams { seed: SEED })
         } else {

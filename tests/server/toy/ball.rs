@@ -31,6 +31,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
         comparison: Comparison::AtLeast,
         threshold: 0.3,
     },
+    code_success: None,
     heatmap_axes: Some(["mass", "drag"]),
 };
 

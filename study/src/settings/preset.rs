@@ -1,0 +1,73 @@
+//! What settings are if nobody says otherwise: as we recommend, or as the paper's authors published them.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+use toml::Table;
+
+use super::{Architecture, Base, Ranking, TrainConfig, Wrapper};
+
+/// Which defaults settings have. Every setting that they differ in can also be given by itself; docs/algorithms.md has them
+/// in a table, with their places in the authors' code.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Preset {
+    /// Those that we recommend.
+    #[default]
+    Perturb,
+    /// Those of Packer et al. (2018), as far as they can be had: sunblaze-ucb/rl-generalization at 5e05aa1 with
+    /// openai/baselines at 2b0283b.
+    Paper,
+}
+
+impl Preset {
+    /// Both.
+    pub const ALL: [Self; 2] = [Self::Perturb, Self::Paper];
+    /// Their names, as they are typed.
+    pub const NAMES: [&'static str; 2] = ["perturb", "paper"];
+
+    /// Whether it is what stands if none is named.
+    pub fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+}
+
+impl fmt::Display for Preset {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(Self::NAMES[*self as usize])
+    }
+}
+
+/// Puts the authors' values into the defaults of an algorithm.
+pub(super) fn apply_paper(TrainConfig { common, settings }: &mut TrainConfig) {
+    common.preset = Preset::Paper;
+    common.num_envs = 1;
+    common.reward_return_runs_on = true;
+    match &mut settings.base {
+        Base::A2c(a2c) => (a2c.bootstrap_truncation, a2c.vf_coef) = (false, HALF * a2c.vf_coef),
+        Base::Ppo(ppo) => {
+            (ppo.bootstrap_truncation, ppo.vf_coef, ppo.n_epochs) = (false, HALF * ppo.vf_coef, 10);
+            // Rollouts are an eighth as long. Nothing but the log depends on it.
+            common.log_interval = if let Wrapper::Epopt(_) = settings.wrapper { 1 } else { 10 };
+        }
+    }
+    if let Wrapper::Epopt(epopt) = &mut settings.wrapper {
+        epopt.rank_by = Ranking::Normalized;
+        epopt.update_per_episode = common.architecture == Architecture::Rc;
+    }
+}
+
+/// The authors' value loss is half of the squared error.
+const HALF: f64 = 0.5;
+
+/// Settings that are younger than some results, with the values that these have. Where they have them, they are left out of
+/// what cells are named by, so that the names of older cells stay.
+pub(super) fn leave_out_younger(table: &mut Table) {
+    let is_older = |key: &str, value: &toml::Value| match key {
+        "preset" => value.as_str() == Some("perturb"),
+        "reward_return_runs_on" | "update_per_episode" => value.as_bool() == Some(false),
+        "rank_by" => value.as_str() == Some("raw"),
+        _ => false,
+    };
+    table.retain(|key, value| !is_older(key, value));
+}
