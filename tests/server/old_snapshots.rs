@@ -18,7 +18,10 @@ fn forget(mut responses: Vec<SessionResponse>) -> Vec<SessionResponse> {
         Some(Response::Stepped(stepped)) => Some(stepped),
         _ => None,
     });
-    steps.flat_map(|stepped| &mut stepped.ended).take(1).for_each(|end| end.achieved = None);
+    steps
+        .flat_map(|stepped| &mut stepped.ended)
+        .take(1)
+        .for_each(|end| (end.achieved, end.code_achieved) = (None, None));
     responses
 }
 

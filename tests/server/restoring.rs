@@ -25,6 +25,7 @@ struct Saved {
     values: Vec<f64>,
     progress: Progress,
     state: Vec<f64>,
+    held_longest: u32,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -260,6 +261,8 @@ fn snapshots_that_contradict_themselves_are_refused_and_change_nothing() {
         ("an episode beyond the limit", |s, spec| s.progress.length = spec.step_limit + 1),
         ("an episode at the limit that goes on", |s, spec| s.progress.length = spec.step_limit),
         ("a goal held for longer than the episode", |s, _| s.progress.held_for = s.progress.length + 1),
+        ("a goal held for longer than the longest time", |s, _| (s.progress.held_for, s.held_longest) = (1, 0)),
+        ("a longest time longer than the episode", |s, _| s.held_longest = s.progress.length + 1),
         ("a goal held for ever", |s, _| s.progress.held_for = u32::MAX),
         ("a goal reached in the future", |s, _| s.progress.reached_at = s.progress.length + 1),
         ("more trials than episodes", |s, _| s.progress.trial = s.progress.episode + 1),

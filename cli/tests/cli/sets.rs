@@ -160,11 +160,15 @@ fn sets_are_typed_judged_by_other_thresholds_and_played_again() {
     let parameters = ["--parameters", "length=0.75..1.25,1.5", "mass=1"];
     let refused = perturb(&["train", "--env", "Acrobot", "--out", &training]).args(parameters).output().unwrap();
     assert_eq!(refused.status.code(), Some(2), "a fixed value stands alone: {}", stderr(&refused));
-    let train = ["train", "--env", "Acrobot", "--episodes", "12", "--set", "num_envs=4", "--out", &training];
+    let train = ["train", "--env", "Acrobot", "--preset", "paper", "--episodes", "4", "--out", &training];
     stdout(&perturb(&train).args(["--parameters", "length=0.75..1.25", "mass=1"]).output().unwrap());
-    let evaluate = ["evaluate", "--checkpoint", &training, "--episodes", "12", "--records", &records];
-    stdout(&perturb(&evaluate).args(["--parameters", "length=0.75..1.25"]).output().unwrap());
-    let rates = perturb(&["rates", &records, "--success", "steps=80", "steps=90", "steps=500"]).output().unwrap();
+    let evaluate =
+        ["evaluate", "--checkpoint", &training, "--episodes", "12", "--records", &records, "--success", "code"];
+    let config = std::fs::read_to_string(directory.path().join("training/config.toml")).expect("written");
+    assert!(config.contains("preset = \"paper\"\n") && config.contains("num_envs = 1\n"), "{config}");
+    let tested = stdout(&perturb(&evaluate).args(["--parameters", "length=0.75..1.25"]).output().unwrap());
+    assert!(tested.contains("Acrobot ppo ff (paper)") && tested.contains("success: steps at most 90"), "{tested}");
+    let rates = perturb(&["rates", &records, "--success", "text", "code", "steps=500"]).output().unwrap();
     let text = stdout(&rates);
     for line in ["steps at most 80", "steps at most 90", "steps at most 500"] {
         assert!(text.contains(line), "{text}");
