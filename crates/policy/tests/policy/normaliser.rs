@@ -96,6 +96,23 @@ fn rewards_are_divided_by_the_deviation_of_the_discounted_return_which_starts_ag
 }
 
 #[test]
+fn a_discounted_return_can_run_on_over_the_ends_of_episodes() {
+    let mut normaliser = RewardNormaliser::new(2, 0.5).running_on(true);
+    normaliser.update(&[1.0, -2.0], &[false, true]).expect("two rewards"); // returns 1, -2
+    normaliser.reset_returns();
+    normaliser.update(&[3.0, 4.0], &[true, false]).expect("two rewards"); // returns 3.5, 3
+    assert_eq!(normaliser.returns(), [3.5, 3.0]);
+    let (_, variance) = moments(&[1.0, -2.0, 3.5, 3.0]);
+    assert!((normaliser.moments().variance(0) - variance).abs() < 1e-12, "f64 rounding");
+    let stored: RewardNormaliser =
+        serde_json::from_str(&serde_json::to_string(&normaliser).expect("JSON")).expect("a normaliser");
+    assert_eq!(stored, normaliser);
+    assert!(stored.fits(2, 0.5, true).is_ok() && stored.fits(2, 0.5, false).is_err());
+    let before = serde_json::to_string(&RewardNormaliser::new(2, 0.5)).expect("JSON");
+    assert!(!before.contains("runs_on"), "as earlier programs kept it: {before}");
+}
+
+#[test]
 fn numbers_that_are_not_finite_are_refused_and_change_nothing() {
     let (mut observations, mut rewards) = (ObservationNormaliser::new(1), RewardNormaliser::new(1, 0.9));
     let before = (observations.clone(), rewards.clone());
