@@ -5,6 +5,7 @@ use std::path::Path;
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{ActAt, PrivateServer, Servers};
 use perturb_learner::evaluation::{TestOptions, Tester};
+use perturb_learner::logging::Progress;
 use perturb_learner::training::{Entry, RunDirectory, Start, train, train_together};
 use perturb_study::Version;
 use perturb_study::interrupt::StopFlag;
@@ -120,6 +121,29 @@ fn the_bytes_of_a_training_are_its_own(#[values("CartPole", "Pendulum")] environ
     together(&one, base.path(), environment, &[1, 5], u64::MAX);
     together(&one, base.path(), environment, &[2, 7], u64::MAX);
     assert!(all(base.path()) == expected, "resumed in other groups");
+}
+
+/// The reference fills each kept episode up to the step limit, and counts all steps.
+#[rstest]
+fn with_an_update_for_each_episode_the_learning_rate_falls_by_episodes(
+    #[values(true, false)] update_per_episode: bool,
+) {
+    let private = [server()];
+    let text = format!(
+        "preset = 'paper'\nenvironment = 'CartPole'\nalgorithm = 'epopt-a2c'\nepisodes = 6\n\
+         episodes_per_iteration = 3\nlearning_rate = 1.0e-3\nupdate_per_episode = {update_per_episode}"
+    );
+    let config = TrainConfig::from_table("the test", text.parse().expect("TOML")).expect("a configuration");
+    let base = tempfile::tempdir().expect("a directory");
+    let directory = RunDirectory::choose(&base.path().join("run"), false).expect("a directory");
+    let mut progress = Vec::new();
+    let report = |it: &Progress| progress.push((it.update.learning_rate, it.timesteps, it.update.n_updates));
+    train(&connect(&private), &config, &directory, 1, &StopFlag::default(), report).expect("a training");
+    let steps = progress[0].1 as f64 / (6.0 * 200.0);
+    let (left, updates) = if update_per_episode { (0.5, [3, 6]) } else { (1.0 - steps, [1, 2]) };
+    assert_eq!(progress.iter().map(|it| it.2).collect::<Vec<_>>(), updates);
+    assert_eq!(progress[0].0, 1e-3);
+    assert!((progress[1].0 - 1e-3 * left).abs() < 1e-15, "f64 rounding: {progress:?}");
 }
 
 #[rstest]
