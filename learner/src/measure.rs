@@ -165,7 +165,8 @@ impl Meter {
 /// The seconds of a step in tests: they go on in all environments until the last has had its episode.
 fn measure_test(servers: &Servers, cell: &Cell, checkpoint: &Checkpoint) -> Result<f64, MeasureError> {
     let episodes = cell.tests.episodes.min(TEST_EPISODES);
-    let options = TestOptions { episodes, seed: cell.config.common.seed, success: cell.tests.success.clone() };
+    let (seed, success) = (cell.config.common.seed, cell.tests.success.clone());
+    let options = TestOptions { episodes, seed, selects: false, success };
     let sets = &cell.tests.sets[..1.min(cell.tests.sets.len())];
     let start = Instant::now();
     let records = Tester::new(servers, checkpoint, options)?.test(sets, &StopFlag::default(), &mut |_, _| {})?;

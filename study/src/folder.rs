@@ -14,7 +14,7 @@
 //!
 //! Every file appears complete.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
@@ -203,6 +203,19 @@ impl Folder {
             }
         }
         Ok(earlier.is_some() && !same)
+    }
+
+    /// Which records of failures there are, by the cells' ids, whatever plan has them.
+    ///
+    /// # Errors
+    /// [`FileError`].
+    pub fn failures(&self) -> files::Result<HashMap<String, FailureMark>> {
+        let places = files::list(&self.path.join("cells"))?.into_iter().map(|path| CellFolder { path });
+        let marked = |place: CellFolder| {
+            let id = place.path.file_name()?.to_str()?.to_owned();
+            Some((id, place.failure_mark()?))
+        };
+        Ok(places.filter_map(marked).collect())
     }
 
     /// How far `cell` is.

@@ -31,6 +31,7 @@ pub mod settings;
 mod statistics;
 pub mod success;
 pub mod table;
+mod tuning;
 mod value_error;
 mod verify;
 
@@ -43,11 +44,12 @@ pub use heatmaps::{
 };
 pub use means::{geometric_mean, mean, wilson};
 pub use paper::Method;
-pub use plan::{Cell, Counts, Grouping, Plan, PlanError, Tests, TrainedOn};
+pub use plan::{Cell, Counts, Grouping, Plan, PlanError, SELECTION_TEST, Selection, Tests, TrainedOn};
 pub use results::{Counters, TestResult};
 pub use scenarios::{Metric, Scenario, Version};
 pub use selection::{MethodResults, Results, Selected, SelectedRun, average, interquartile};
 pub use statistics::{Iqm, Summary, interquartile_mean};
+pub use tuning::{Chosen, Tuned, tuned};
 pub use value_error::ValueError;
 pub use verify::{VerifyError, verify};
 

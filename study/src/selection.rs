@@ -1,6 +1,7 @@
 //! From the results of cells to the paper's numbers.
 //!
-//! Per environment, method, training version and run, one configuration is selected: the one with the highest success
+//! By the clean rule, what is reported are the cells that were trained anew ([`tuned`](super::tuned) says how they are
+//! selected). By the paper's rule every cell may be: per environment, method, training version and run, one configuration is selected: the one with the highest success
 //! rate when tested on the version that it was trained on. Of equal ones the one with the higher mean return in the same
 //! test is taken, of still equal ones the one that the plan lists first; so is it where that version was not tested. Like
 //! in the paper, the test that selects is the test that is reported; with a large grid that makes Default and
@@ -9,8 +10,9 @@
 use std::collections::BTreeMap;
 
 use super::folder::{CellResult, CellState, Failure, Folder, FolderError};
-use super::plan::{Cell, Plan, TrainedOn};
+use super::plan::{Cell, Plan, Selection, TrainedOn};
 use super::statistics::{Iqm, Summary};
+use super::tuning::{Tuned, tuned};
 use crate::{Method, Metric, Scenario, TestResult, Version, mean};
 
 /// What is known of a plan's cells.
@@ -29,7 +31,7 @@ pub struct MethodResults<'a> {
     pub environment: &'a str,
     /// What was trained.
     pub method: Method,
-    /// Cells that the plan has for it, without those that are trained on its own sets.
+    /// Cells that the plan has for it, also those that it will have, without those that are trained on its own sets.
     pub cells: usize,
     /// Of these, cells with a result. If some are missing, selection was among fewer than the plan asks for.
     pub done: usize,
@@ -51,7 +53,7 @@ pub struct Selected<'a> {
 }
 
 impl<'a> Results<'a> {
-    /// Reads all cells of `plan` in `folder`.
+    /// Reads all cells of `plan`, see [`Plan::in_folder`], in `folder`.
     ///
     /// # Errors
     /// [`FolderError`] if a file is there that cannot be read.
@@ -76,6 +78,11 @@ impl<'a> Results<'a> {
         })
     }
 
+    /// What tuning cells select.
+    pub fn tuned(&self) -> Vec<Tuned<'_>> {
+        tuned(self.plan, &self.states)
+    }
+
     /// Selects for each environment and method of the plan, in its order.
     pub fn select(&self) -> Vec<MethodResults<'_>> {
         let mut selections: Vec<MethodResults<'_>> = Vec::new();
@@ -86,17 +93,36 @@ impl<'a> Results<'a> {
                 selections.push(MethodResults { environment, method, cells: 0, done: 0, runs: BTreeMap::new() });
                 selections.len() - 1
             });
-            selections[place].consider(cell, state);
+            match self.plan.selection {
+                Selection::Clean if cell.tuned_as.is_none() => selections[place].tune(cell, state, self.plan.runs),
+                Selection::Clean => selections[place].consider(cell, state),
+                Selection::Paper => {
+                    selections[place].cells += usize::from(cell.set.is_none());
+                    selections[place].consider(cell, state);
+                }
+            }
         }
         selections
     }
 }
 
 impl<'a> MethodResults<'a> {
+    /// Counts a tuning cell; the first one that is trained on something, also those that are trained on it anew.
+    fn tune(&mut self, cell: &'a Cell, state: &'a CellState, runs: u32) {
+        let is_papers = usize::from(cell.set.is_none());
+        self.cells += is_papers;
+        self.done += is_papers * usize::from(matches!(state, CellState::Done(_)));
+        for run in 1..=runs {
+            self.runs.entry(run).or_default().0.entry(cell.trained_on()).or_insert_with(|| {
+                self.cells += is_papers;
+                None
+            });
+        }
+    }
+
     /// Takes `cell` into account, which comes after all cells that the plan lists before it.
     fn consider(&mut self, cell: &'a Cell, state: &'a CellState) {
         let is_papers = usize::from(cell.set.is_none());
-        self.cells += is_papers;
         let best = self.runs.entry(cell.run).or_default().0.entry(cell.trained_on()).or_default();
         let CellState::Done(result) = state else { return };
         self.done += is_papers;

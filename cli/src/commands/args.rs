@@ -12,7 +12,7 @@ use perturb_study::scheduler::slurm::TimeLimit;
 use perturb_study::sets::Assignment;
 use perturb_study::settings::{Architecture, Preset, Settings};
 use perturb_study::success::Rule;
-use perturb_study::{Grouping, MOST_POINTS, Version};
+use perturb_study::{Grouping, MOST_POINTS, Selection, Version};
 
 use crate::video::PIXELS;
 
@@ -170,6 +170,10 @@ pub(super) struct EvaluateArgs {
     /// [default: the training's seed].
     #[arg(long, value_name = "N")]
     pub(super) seed: Option<u64>,
+    /// Test with the episodes that select a configuration where an experiment file has selection = "clean"; no other test
+    /// has them.
+    #[arg(long)]
+    pub(super) selection: bool,
     /// Also write the result to a file, as JSON.
     #[arg(long, value_name = "FILE")]
     pub(super) json: Option<PathBuf>,
@@ -336,6 +340,10 @@ pub(super) enum Engine {
 pub(super) struct ReportArgs {
     /// The --out of `perturb run`; tables go to its folder report/.
     pub(super) dir: PathBuf,
+    /// The rule by which configurations are selected [default: the plan's]. Of a plan with selection = "clean", `paper`
+    /// reports its tuning cells as the paper would; tables go to report/paper/.
+    #[arg(long, value_name = "RULE")]
+    pub(super) selection: Option<Selection>,
     /// Also write everything, with training curves and the heatmaps of `perturb heatmap`, as one HTML page that needs
     /// nothing else.
     #[arg(long, value_name = "FILE")]

@@ -15,7 +15,7 @@ use super::args::AuditArgs;
 use super::display::Display;
 use super::error::{CommandError, Result, system};
 use super::rates::file_in;
-use super::servers;
+use super::{plan_in, servers};
 
 /// So many differences are told of each policy.
 const SHOWN: usize = 3;
@@ -89,7 +89,7 @@ fn tested(args: &AuditArgs) -> Result<Vec<Tested>> {
         return Err(CommandError::Usage(message));
     }
     let folder = Folder::new(path);
-    let plan = perturb_study::Plan::load(&folder.require_plan()?)?;
+    let plan = plan_in(&folder)?;
     let done = plan.cells.iter().map(|found| folder.cell(&found.id)).filter(|place| place.is_settled(false));
     let paths = done.map(|place| place.path().to_owned()).filter(|path| path.join(FILE).is_file());
     let tested: Vec<Tested> = paths.map(|path| cell(&path)).collect();

@@ -1,58 +1,99 @@
 //! Doing a plan's cells, whatever does them.
 
+use std::collections::HashMap;
+use std::process::ExitCode;
+
 use super::args::RunArgs;
 use super::display::Display;
 use super::error::{CommandError, Result};
 use super::report;
 use super::signal_code;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::scheduler::{Announcement, Backend, RunEnd, run as run_plan, write_line};
-use perturb_study::{Folder, Plan};
-use std::process::ExitCode;
+use perturb_study::scheduler::{Announcement, Backend, RunEnd, count, run as run_plan, write_line};
+use perturb_study::{FailureMark, Folder, Plan};
 
-/// Has `backend` do all cells, shows how far that is, and says how it ended.
-pub(super) fn do_cells(
-    args: &RunArgs,
-    plan: &Plan,
-    folder: &Folder,
-    backend: &mut dyn Backend,
-    stop: &StopFlag,
-) -> Result<ExitCode> {
-    keep_plan(args, plan, folder)?;
-    let mut display = Display::of_cells(plan.cells.len());
-    let mut report = |report: Announcement<'_>| match report {
-        Announcement::Status(status) => display.cells(status),
-        Announcement::Note(sentence) => display.say(sentence),
-        Announcement::Line(line) if args.json => write_line(&mut std::io::stdout(), line),
-        Announcement::Line(_) => {}
-    };
-    let end = run_plan(plan, folder, backend, args.retry_failed, stop, &mut report);
-    drop(display);
-    let failed = match end? {
-        RunEnd::Finished { failed } => failed,
-        RunEnd::Stopped { signal, left } => {
-            let jobs = left.join(" ");
-            eprintln!("stopped by signal {signal}; the same command goes on");
-            if !left.is_empty() {
-                eprintln!("Slurm job {jobs} runs meanwhile, and is watched again then; to end it: scancel {jobs}");
-            }
-            return Ok(signal_code(signal));
-        }
-    };
-    if let Some(page) = &args.html {
-        report::write(folder, Some(page))?;
-        eprintln!("the report is in {} and {}", page.display(), folder.path().join("report").display());
+/// A run, which does a plan's cells and, when these select others, those too.
+pub(super) struct Doing<'a> {
+    args: &'a RunArgs,
+    folder: &'a Folder,
+    stop: &'a StopFlag,
+    /// What is done, or is to be done next.
+    plan: Plan,
+    /// Failures that were there when the run began.
+    forgiven: HashMap<String, FailureMark>,
+    /// `None` before anything is done.
+    end: Option<RunEnd>,
+}
+
+impl<'a> Doing<'a> {
+    /// Keeps the plan in its folder.
+    pub(super) fn begin(args: &'a RunArgs, plan: Plan, folder: &'a Folder, stop: &'a StopFlag) -> Result<Self> {
+        keep_plan(args, &plan, folder)?;
+        let forgiven = if args.retry_failed { folder.failures()? } else { HashMap::new() };
+        Ok(Self { args, folder, stop, plan, forgiven, end: None })
     }
-    let Some(first) = failed.first() else {
-        eprintln!("all {} cells are done; perturb report {}", plan.cells.len(), folder.path().display());
-        return Ok(ExitCode::SUCCESS);
-    };
-    Err(CommandError::Failed(format!(
-        "{} of {} cells failed, the first is {first}: see {} for the reason, and use --retry-failed to try again",
-        failed.len(),
-        plan.cells.len(),
-        folder.path().join("cells").join(first).join("failure.json").display()
-    )))
+
+    /// The cells to do next: the plan's, then those that it has beside them when these are done; `None` at the end.
+    pub(super) fn next(&mut self) -> Result<Option<Plan>> {
+        match self.end {
+            None => {}
+            Some(RunEnd::Stopped { .. }) => return Ok(None),
+            Some(RunEnd::Finished { .. }) => {
+                let plan = self.plan.in_folder(self.folder)?;
+                let new = plan.cells.len() - self.plan.cells.len();
+                if new == 0 {
+                    return Ok(None);
+                }
+                eprintln!("tuning is done; {} with what is selected", count(new, "cell"));
+                self.plan = Plan { candidates: Vec::new(), ..plan };
+            }
+        }
+        Ok(Some(self.plan.clone()))
+    }
+
+    /// Has `backend` do all cells of `plan`, and shows how far that is.
+    pub(super) fn run(&mut self, plan: &Plan, backend: &mut dyn Backend) -> Result<()> {
+        let mut display = Display::of_cells(plan.cells.len());
+        let mut report = |report: Announcement<'_>| match report {
+            Announcement::Status(status) => display.cells(status),
+            Announcement::Note(sentence) => display.say(sentence),
+            Announcement::Line(line) if self.args.json => write_line(&mut std::io::stdout(), line),
+            Announcement::Line(_) => {}
+        };
+        self.end = Some(run_plan(plan, self.folder, backend, &self.forgiven, self.stop, &mut report)?);
+        Ok(())
+    }
+
+    /// Says how everything ended.
+    pub(super) fn end(self) -> Result<ExitCode> {
+        let Self { args, folder, plan, end, .. } = self;
+        let failed = match end {
+            Some(RunEnd::Stopped { signal, left }) => {
+                let jobs = left.join(" ");
+                eprintln!("stopped by signal {signal}; the same command goes on");
+                if !left.is_empty() {
+                    eprintln!("Slurm job {jobs} runs meanwhile, and is watched again then; to end it: scancel {jobs}");
+                }
+                return Ok(signal_code(signal));
+            }
+            Some(RunEnd::Finished { failed }) => failed,
+            None => Vec::new(),
+        };
+        if let Some(page) = &args.html {
+            report::write(folder, None, Some(page))?;
+            eprintln!("the report is in {} and {}", page.display(), folder.path().join("report").display());
+        }
+        let Some(first) = failed.first() else {
+            eprintln!("all {} cells are done; perturb report {}", plan.cells.len(), folder.path().display());
+            return Ok(ExitCode::SUCCESS);
+        };
+        Err(CommandError::Failed(format!(
+            "{} of {} cells failed, the first is {first}: see {} for the reason, and use --retry-failed to try again",
+            failed.len(),
+            plan.cells.len(),
+            folder.path().join("cells").join(first).join("failure.json").display()
+        )))
+    }
 }
 
 /// Copies the plan into its folder, and says so if another one was there. Single cells leave that one: their plan may be

@@ -25,7 +25,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
     let servers = playing_servers(&args.play)?;
     let (state, config) = (&checkpoint.state, &checkpoint.state.config);
     let common = &config.common;
-    let options = TestOptions { episodes: args.episodes, seed, success: args.success.clone() };
+    let options = TestOptions { episodes: args.episodes, seed, selects: args.selection, success: args.success.clone() };
     let tester = Tester::new(&servers, &checkpoint, options)?;
     let mut display: Option<(String, Display)> = None;
     let mut report = |set: &TestSet, episodes| {

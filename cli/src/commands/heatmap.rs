@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use super::args::HeatmapArgs;
 use super::display::Display;
 use super::error::{CommandError, Result, system};
-use super::{playing_servers, sets};
+use super::{plan_in, playing_servers, sets};
 use perturb_learner::checkpoint::{Checkpoint, State};
 use perturb_learner::client::Servers;
 use perturb_learner::evaluation::{heatmap, heatmap_again};
@@ -18,7 +18,7 @@ use perturb_study::records::Records;
 use perturb_study::sets::Context;
 use perturb_study::settings::{Common, TrainConfig};
 use perturb_study::{
-    Folder, Heatmap, HeatmapOptions, NoHeatmap, Plan, Results, Selected, heatmap_files, heatmap_places, store_heatmap,
+    Folder, Heatmap, HeatmapOptions, NoHeatmap, Results, Selected, heatmap_files, heatmap_places, store_heatmap,
 };
 
 pub(super) fn run(args: &HeatmapArgs) -> Result<()> {
@@ -93,7 +93,7 @@ fn default_path(state: &State, [x, y]: &[String; 2]) -> PathBuf {
 /// Of everything that was selected in the first run of an experiment, unless it is there already.
 fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<()> {
     let folder = Folder::new(directory);
-    let plan = Plan::load(&folder.require_plan()?)?;
+    let plan = plan_in(&folder)?;
     let results = Results::read(&plan, &folder)?;
     let selections = results.select();
     let places = heatmap_places(&selections);

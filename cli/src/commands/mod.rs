@@ -31,6 +31,7 @@ use clap::Parser;
 use args::{Cli, Command, PlayArgs, ServerArgs};
 use error::{CommandError, Result};
 use perturb_learner::client::{ActAt, Servers};
+use perturb_study::{Folder, Plan};
 
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
@@ -87,6 +88,11 @@ fn servers(args: &ServerArgs) -> Result<Servers> {
 fn playing_servers(args: &PlayArgs) -> Result<Servers> {
     let act = if args.act == "client" { ActAt::Client } else { ActAt::Server };
     Ok(servers(&args.server)?.with_act(act))
+}
+
+/// The plan of an experiment, with all cells that are known.
+fn plan_in(folder: &Folder) -> Result<Plan> {
+    Ok(Plan::load(&folder.require_plan()?)?.in_folder(folder)?)
 }
 
 /// One a core, if nothing is asked for.

@@ -13,7 +13,9 @@ use perturb_learner::client::Servers;
 use perturb_learner::measure::measure;
 use perturb_study::scheduler::count;
 use perturb_study::table::Table;
-use perturb_study::{Cell, Estimate, Folder, Grouping, Measurement, Plan, Taken, estimates, representatives};
+use perturb_study::{
+    Cell, Estimate, Folder, Grouping, Measurement, Plan, Selection, Taken, estimates, representatives,
+};
 
 pub(super) fn run(args: &PlanArgs) -> Result<()> {
     let plan = Plan::load(&args.file)?;
@@ -22,9 +24,10 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
         return Err(CommandError::Usage("--json lists cells: give --cells or --missing DIR with it".into()));
     }
     let folder = args.missing.as_deref().map(Folder::new);
+    let known = folder.as_ref().map_or_else(|| Ok(plan.clone()), |folder| plan.in_folder(folder))?;
     let listed: Vec<&Cell> = match &folder {
-        Some(folder) => plan.cells.iter().filter(|cell| !folder.cell(&cell.id).is_settled(true)).collect(),
-        None if args.cells => plan.cells.iter().collect(),
+        Some(folder) => known.cells.iter().filter(|cell| !folder.cell(&cell.id).is_settled(true)).collect(),
+        None if args.cells => known.cells.iter().collect(),
         None => Vec::new(),
     };
     if args.json {
@@ -41,19 +44,29 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     let counts = plan.counts();
     writeln!(
         out,
-        "{} configurations, {} trainings, {} train/test pairs, {} with {}",
+        "{} configurations, {} trainings, {} train/test pairs, {} with {}{}",
         grouped(counts.configurations),
         grouped(counts.trainings),
         grouped(counts.pairs),
         grouped(counts.all_pairs),
-        count(counts.runs as usize, "run")
+        count(counts.runs as usize, "run"),
+        if plan.selection == Selection::Clean { " to select from" } else { "" }
     )?;
+    let from = args.from.as_deref().map(Folder::new);
+    let known = plan.in_full(from.as_ref())?;
+    let anew = &known.cells[plan.cells.len()..];
+    if let Some(pairs) = anew.first().map(|cell| cell.tests.sets.len()) {
+        let (cells, runs) = (anew.len(), plan.runs as usize);
+        let trained = format!("{} are selected and trained anew", grouped(cells / runs));
+        writeln!(out, "{trained}, {} train/test pairs with {}", grouped(cells * pairs), count(runs, "run"))?;
+    }
+    let plan = known;
     let grouping = Grouping { most: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
     let all: Vec<usize> = (0..plan.cells.len()).collect();
     let groups = plan.groups(&all, grouping);
     writeln!(out, "{}", groups_line(&groups, grouping))?;
     let grouping = Grouping { at_a_time: grouping.at_a_time.min(groups.len()), ..grouping };
-    let taken = args.from.as_deref().map(|path| (Folder::new(path), Taken::read(&plan, &Folder::new(path))));
+    let taken = from.map(|folder| (folder.clone(), Taken::read(&plan, &folder)));
     estimate(args, &plan, grouping, taken.as_ref(), &mut out)
 }
 

@@ -1,32 +1,38 @@
 //! `perturb report` and `perturb curves`.
 
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::args::{CurvesArgs, ReportArgs};
 use super::error::Result;
+use super::plan_in;
 use perturb_study::files::write_atomically;
 use perturb_study::plot::{Quantity, draw_curves, save};
 use perturb_study::report::{Figures, Report, html};
-use perturb_study::{Folder, Plan, Results, curves_table, read_curves, verify};
+use perturb_study::{Folder, Plan, Results, Selection, curves_table, read_curves, verify};
 
 pub(super) fn run(args: &ReportArgs) -> Result<()> {
     let folder = Folder::new(&args.dir);
-    let text = write(&folder, args.html.as_deref())?;
+    let (text, out) = write(&folder, args.selection, args.html.as_deref())?;
     write!(std::io::stdout(), "{text}")?;
-    eprintln!("\nthe tables are also in {}", args.dir.join("report").display());
+    eprintln!("\nthe tables are also in {}", out.display());
     Ok(())
 }
 
-/// Writes the tables of an experiment and, with `page`, everything as HTML; returns the tables as text.
-pub(super) fn write(folder: &Folder, page: Option<&Path>) -> Result<String> {
+/// Writes the tables of an experiment and, with `page`, everything as HTML; returns the tables as text, and where they are.
+pub(super) fn write(folder: &Folder, rule: Option<Selection>, page: Option<&Path>) -> Result<(String, PathBuf)> {
     let plan = Plan::load(&folder.require_plan()?)?;
+    let mut out = folder.path().join("report");
+    if let Some(rule) = rule.filter(|rule| *rule != plan.selection) {
+        out = out.join(rule.to_string()); // beside what the plan asks for
+    }
+    let rule = rule.unwrap_or(plan.selection);
+    let plan = plan.by(rule)?.in_folder(folder)?;
     let results = Results::read(&plan, folder)?;
     verify(&results, folder)?;
     let selections = results.select();
     let report = Report::new(&results, &selections);
 
-    let out = folder.path().join("report");
     write_atomically(&out.join("report.md"), report.markdown().as_bytes())?;
     for table in report.files() {
         write_atomically(&out.join(&table.title), &table.to_csv())?;
@@ -35,12 +41,12 @@ pub(super) fn write(folder: &Folder, page: Option<&Path>) -> Result<String> {
         let figures = Figures::read(&selections, folder)?;
         write_atomically(path, html(&report, &figures).as_bytes())?;
     }
-    Ok(report.text())
+    Ok((report.text(), out))
 }
 
 pub(super) fn curves(args: &CurvesArgs) -> Result<()> {
     let folder = Folder::new(&args.dir);
-    let plan = Plan::load(&folder.require_plan()?)?;
+    let plan = plan_in(&folder)?;
     let results = Results::read(&plan, &folder)?;
     let all = read_curves(&results.select(), &folder)?;
     let out = args.out.clone().unwrap_or_else(|| args.dir.join("report"));

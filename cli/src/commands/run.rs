@@ -6,7 +6,7 @@ use std::process::{Command, ExitCode};
 use std::sync::Mutex;
 
 use super::args::{Engine, RunArgs};
-use super::cells::do_cells;
+use super::cells::Doing;
 use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
 use super::{cores, refuse_workers, single_thread, slurm};
@@ -24,15 +24,15 @@ pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
     }
     let plan = Plan::load(&args.plan)?;
     if args.engine.engine == Some(Engine::Slurm) {
-        return slurm::run(args, &plan, &stop);
+        return slurm::run(args, plan, &stop);
     }
     if args.cell.is_empty() {
-        return all_cells(args, &plan, &folder, &stop);
+        return all_cells(args, plan, &folder, &stop);
     }
     let mut cells = args.cell.iter().map(|name| find(args, &plan, name).cloned()).collect::<Result<Vec<Cell>>>()?;
     cells.sort_by_key(|cell| cell.index);
     cells.dedup_by_key(|cell| cell.index); // named by index and by id
-    all_cells(args, &Plan { cells, ..plan }, &folder, &stop)
+    all_cells(args, Plan { cells, candidates: Vec::new(), ..plan }, &folder, &stop)
 }
 
 /// The cell with this index or id.
@@ -41,7 +41,7 @@ fn find<'a>(args: &RunArgs, plan: &'a Plan, name: &str) -> Result<&'a Cell> {
         CommandError::Usage(format!(
             "{} has no cell `{name}`: give an index from 0 to {}, or an id that `perturb plan --cells` prints",
             args.plan.display(),
-            plan.cells.len() - 1
+            plan.cells.len() + plan.candidates.len() - 1
         ))
     })
 }
@@ -99,13 +99,13 @@ fn stop_with_input(stop: &StopFlag) -> Result<()> {
 }
 
 /// Does all cells in worker processes.
-fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> Result<ExitCode> {
+fn all_cells(args: &RunArgs, plan: Plan, folder: &Folder, stop: &StopFlag) -> Result<ExitCode> {
     let grouping = Grouping { most: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
     let (local, addresses) = shared_servers(args)?;
     let local = local.map(Mutex::new);
     let (servers, troubles) = Servers::connect_to_some(&addresses)?;
     troubles.iter().for_each(|trouble| eprintln!("perturb: {trouble}; going on with the other servers"));
-    step_limits(&servers, plan)?; // refuses environments that there are not
+    step_limits(&servers, &plan)?; // refuses environments that there are not
     drop(servers);
     let addresses: Vec<String> = addresses.iter().map(Address::to_string).collect();
     let command = || worker(args, folder, &addresses);
@@ -113,7 +113,11 @@ fn all_cells(args: &RunArgs, plan: &Plan, folder: &Folder, stop: &StopFlag) -> R
         let status = local.as_ref()?.lock().ok()?.exit_status()?;
         Some(format!("the private server ended with {status}"))
     };
-    do_cells(args, plan, folder, &mut Local::new(plan, folder, grouping, &command, &server_ended), stop)
+    let mut doing = Doing::begin(args, plan, folder, stop)?;
+    while let Some(plan) = doing.next()? {
+        doing.run(&plan, &mut Local::new(&plan, folder, grouping, &command, &server_ended))?;
+    }
+    doing.end()
 }
 
 /// The servers that all workers share.

@@ -4,7 +4,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use super::args::RunArgs;
-use super::cells::do_cells;
+use super::cells::Doing;
 use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
 use super::refuse_workers;
@@ -20,7 +20,7 @@ const MEASURE: Duration = Duration::from_secs(2);
 /// How often Slurm is asked: its controller has others to answer too.
 const QUEUE_INTERVAL: Duration = Duration::from_secs(15);
 
-pub(super) fn run(args: &RunArgs, plan: &Plan, stop: &StopFlag) -> Result<ExitCode> {
+pub(super) fn run(args: &RunArgs, plan: Plan, stop: &StopFlag) -> Result<ExitCode> {
     let path = std::path::absolute(&args.out).map_err(system("find out where --out is"))?;
     let folder = Folder::new(&path);
     let options = options(args)?;
@@ -29,10 +29,14 @@ pub(super) fn run(args: &RunArgs, plan: &Plan, stop: &StopFlag) -> Result<ExitCo
     slurm.check(stop)?;
     // Which environments there are, and what they cost, is found out here: servers that jobs share may be out of reach.
     let servers = || Servers::local(args.server.workers);
-    step_limits(&servers()?, plan)?;
+    step_limits(&servers()?, &plan)?;
     let grouping = Grouping { most: args.group, at_a_time: options.task.jobs };
-    let costs = || Ok(costs(&servers()?, plan, grouping, stop)?);
-    do_cells(args, plan, &folder, &mut Jobs::new(plan, &folder, &slurm, &options, &costs, stop), stop)
+    let mut doing = Doing::begin(args, plan, &folder, stop)?;
+    while let Some(plan) = doing.next()? {
+        let costs = || Ok(costs(&servers()?, &plan, grouping, stop)?);
+        doing.run(&plan, &mut Jobs::new(&plan, &folder, &slurm, &options, &costs, stop))?;
+    }
+    doing.end()
 }
 
 fn options(args: &RunArgs) -> Result<SlurmOptions> {

@@ -258,7 +258,7 @@ fn a_checkpoint_of_format_1_is_understood_and_one_of_another_revision_refused() 
     assert_eq!((state.history.recent.len(), state.collector.snapshots.len()), (21, 2));
     assert_eq!((last.episode_return, last.length, last.success), (21.0, 21.0, 0.0));
 
-    let options = TestOptions { episodes: 3, seed: 1, success: None };
+    let options = TestOptions { episodes: 3, seed: 1, selects: false, success: None };
     let error = Tester::new(&servers, &checkpoint, options.clone()).err().expect("another revision").to_string();
     let revisions = "trained in CartPole with revision 0, the server's has 1";
     let advice = "test with the version of perturb that trained it, or train again";

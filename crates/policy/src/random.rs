@@ -20,6 +20,8 @@ pub enum Purpose {
     TestActions = 4,
     /// Seeds of test environments.
     TestEnvironments = 5,
+    /// Seeds of the environments of tests that select a configuration.
+    SelectionEnvironments = 6,
     /// Resamples of a bootstrap.
     Bootstrap = 16,
 }

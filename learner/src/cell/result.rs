@@ -8,7 +8,7 @@ use crate::client::Servers;
 use crate::evaluation::{TestError, TestOptions, Tester};
 use perturb_protocol::Distribution;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::records;
+use perturb_study::records::{self, RecordedTest};
 use perturb_study::scheduler::CellEvent;
 use perturb_study::sets::{Parameters, TestSet};
 use perturb_study::{Cell, CellFolder, CellResult, Tests, Training};
@@ -25,16 +25,25 @@ pub(super) fn tested(
     stop: &StopFlag,
     tell: &mut dyn FnMut(CellEvent),
 ) -> Result<Option<CellResult>, CellError> {
-    let Tests { episodes, ref sets, ref success } = cell.tests;
-    let options = TestOptions { episodes, seed: cell.config.common.seed, success: success.clone() };
-    let tester = Tester::new(servers, &checkpoint, options)?;
+    let Tests { episodes, ref sets, ref success, .. } = cell.tests;
     let mut testing = |set: &TestSet, episodes| tell(CellEvent::Testing { set: set.name.clone(), episodes });
-    let records = match tester.test(sets, stop, &mut testing) {
+    let mut test = |sets: &[TestSet], episodes, selects| {
+        let options = TestOptions { episodes, seed: cell.config.common.seed, selects, success: success.clone() };
+        Tester::new(servers, &checkpoint, options)?.test(sets, stop, &mut testing)
+    };
+    let tested = test(sets, episodes, false).and_then(|mut records| {
+        if let Some((set, episodes)) = cell.selection_test() {
+            records.append(test(&[set], episodes, true)?);
+        }
+        Ok(records)
+    });
+    let records = match tested {
         Err(TestError::Stopped { .. }) => return Ok(None),
         records => records?,
     };
     records.write(&folder.path().join(records::FILE))?;
-    let results = sets.iter().map(|set| (set.name.clone(), records.result(&set.name, None))).collect();
+    let result = |test: &RecordedTest| (test.set.name.clone(), records.result(&test.set.name, None));
+    let results = records.about.tests.iter().map(result).collect();
     let state = checkpoint.state;
     let common = &state.config.common;
     Ok(Some(CellResult {
@@ -100,18 +109,23 @@ fn command(cell: &Cell) -> String {
         let value = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
         let _ = write!(text, " --set {key}={value}"); // writing to a String cannot fail
     }
-    let Tests { episodes, sets, success } = &cell.tests;
+    let Tests { episodes, sets, success, .. } = &cell.tests;
     let success = success.as_ref().map(|threshold| format!(" --success {threshold}")).unwrap_or_default();
-    let mut evaluate = |how: String| {
+    let mut evaluate = |how: String, episodes: u64| {
         let _ = write!(text, " && perturb evaluate --checkpoint RUN {how} --episodes {episodes}{success}");
     };
     let versions: Vec<String> = sets.iter().filter_map(TestSet::plain).map(|version| version.to_string()).collect();
     if !versions.is_empty() {
-        evaluate(format!("--versions {}", versions.join(",")));
+        evaluate(format!("--versions {}", versions.join(",")), *episodes);
     }
     // What a set of contexts is stands in the recorded episodes alone.
+    let own = |set: &TestSet| format!("--parameters {} --base {}", parameters(&set.drawn()), set.version);
     for set in sets.iter().filter(|set| set.plain().is_none() && !set.drawn().is_empty()) {
-        evaluate(format!("--parameters {} --base {}", parameters(&set.drawn()), set.version));
+        evaluate(own(set), *episodes);
+    }
+    if let Some((set, episodes)) = cell.selection_test() {
+        let how = set.plain().map_or_else(|| own(&set), |version| format!("--versions {version}"));
+        evaluate(format!("{how} --selection"), episodes);
     }
     text
 }

@@ -64,7 +64,8 @@ pub fn heatmap(
     let state = &checkpoint.state;
     let grid = options.grid.clamp(1, MOST_POINTS);
     let points = (grid * grid) as u64;
-    let test = TestOptions { episodes: options.episodes.saturating_mul(points), seed: options.seed, success: None };
+    let episodes = options.episodes.saturating_mul(points);
+    let test = TestOptions { episodes, seed: options.seed, selects: false, success: None };
     let tester = Tester::new(servers, checkpoint, test)?;
     let axes = axes(tester.environment(), &options.parameters)?;
     if let Some(axis) = axes.iter().find(|axis| options.fixed.contains_key(&axis.name)) {

@@ -9,7 +9,7 @@ use crate::checkpoint::Checkpoint;
 pub use audit::{Audit, AuditError, audit};
 pub use heatmap::{HeatmapError, heatmap, heatmap_again};
 use perturb_policy::{Normalisers, Player, Result, Role};
-pub use test::{TestError, TestOptions, Tester, check_unchanged, environment_seed, open_options, test};
+pub use test::{TestError, TestOptions, Tester, check_unchanged, open_options, test};
 
 /// The policy of a checkpoint as it plays in tests, with sampled actions and frozen statistics, in N = `n_envs` environments
 /// whose indices are 0 … N-1. `seed` fixes the actions.

@@ -97,8 +97,16 @@ pub struct TestOptions {
     pub episodes: u64,
     /// Fixes all randomness.
     pub seed: u64,
+    /// With selection episodes, which no other test has.
+    pub selects: bool,
     /// What decides about success; `None` for the environment's own rule.
     pub success: Option<Rule>,
+}
+
+impl TestOptions {
+    fn purpose(&self) -> Purpose {
+        if self.selects { Purpose::SelectionEnvironments } else { Purpose::TestEnvironments }
+    }
 }
 
 /// Tests a checkpoint.
@@ -112,11 +120,12 @@ pub struct Tester<'a> {
 
 /// The seed of the test environments on `version`.
 ///
-/// It is the first, second or third number (D, R, E) of the stream of `seed` for [`Purpose::TestEnvironments`], so that
-/// a policy never meets its training episodes again, whatever seeds are used, and the versions are independent. Sets have
-/// the seed of their base version: what differs between two of them is parameters, not initial states.
-pub fn environment_seed(seed: u64, version: Version) -> u64 {
-    let mut rng = stream(seed, Purpose::TestEnvironments);
+/// It is the first, second or third number (D, R, E) of the stream of `seed` for `purpose`, which is
+/// [`Purpose::TestEnvironments`] or [`Purpose::SelectionEnvironments`], so that a policy never meets its training episodes
+/// again, whatever seeds are used, nor those that selected it, and the versions are independent. Sets have the seed of
+/// their base version: what differs between two of them is parameters, not initial states.
+fn environment_seed(purpose: Purpose, seed: u64, version: Version) -> u64 {
+    let mut rng = stream(seed, purpose);
     let drawn: [u64; 3] = std::array::from_fn(|_| rng.next_u64());
     drawn[version as usize]
 }
@@ -158,7 +167,8 @@ impl<'a> Tester<'a> {
         sets.iter().try_for_each(|set| set.check(&self.environment))?;
         let mut records = Records::new(self.about.clone());
         for set in sets {
-            let test = RecordedTest { set: set.clone(), seed: environment_seed(self.options.seed, set.version) };
+            let seed = environment_seed(self.options.purpose(), self.options.seed, set.version);
+            let test = RecordedTest { set: set.clone(), seed };
             let episodes = self.play(&test, stop, &mut |done| report(set, done))?;
             records.add(test, episodes);
             let largest = records.agreement().largest;
@@ -293,7 +303,8 @@ pub fn test(
     stop: &StopFlag,
     mut report: impl FnMut(u64),
 ) -> Result<TestResult, TestError> {
-    let tester = Tester::new(servers, checkpoint, TestOptions { episodes, seed, success: None })?;
+    let options = TestOptions { episodes, seed, selects: false, success: None };
+    let tester = Tester::new(servers, checkpoint, options)?;
     let records = tester.test(&[version.into()], stop, &mut |_, done| report(done))?;
     Ok(records.result(&version.to_string(), None))
 }
@@ -320,7 +331,7 @@ pub fn open_options(environment: &str, set: &TestSet, seed: u64) -> OpenOptions 
         version: set.version,
         parameters: set.drawn(),
         num_envs: 1,
-        seed: environment_seed(seed, set.version),
+        seed: environment_seed(Purpose::TestEnvironments, seed, set.version),
         episodes_per_trial: 1,
     }
 }
@@ -381,14 +392,19 @@ mod tests {
 
     #[test]
     fn test_environments_have_seeds_of_their_own() {
-        let seeds: Vec<u64> =
-            (0..100).flat_map(|seed| Version::ALL.map(|version| environment_seed(seed, version))).collect();
+        let of = |purpose| {
+            (0..100).flat_map(move |seed| Version::ALL.map(|version| environment_seed(purpose, seed, version)))
+        };
+        let seeds: Vec<u64> = of(Purpose::TestEnvironments).chain(of(Purpose::SelectionEnvironments)).collect();
         let distinct: std::collections::HashSet<u64> = seeds.iter().copied().collect();
-        assert_eq!(distinct.len(), 300);
+        assert_eq!(distinct.len(), 600, "those of a test never select");
         assert!(seeds.iter().all(|&seed| seed > 1000), "none is a seed that people train with");
         for version in Version::ALL {
             let options = open_options("CartPole", &version.into(), 5);
-            assert_eq!((options.seed, options.version), (environment_seed(5, version), version));
+            assert_eq!(
+                (options.seed, options.version),
+                (environment_seed(Purpose::TestEnvironments, 5, version), version)
+            );
         }
     }
 }

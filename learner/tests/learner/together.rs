@@ -177,7 +177,7 @@ fn tests_have_the_same_episodes_wherever_actions_are_chosen(#[values(0, 3, 4)] n
     together(&one, base.path(), "CartPole", &[number], u64::MAX);
     let checkpoint = Checkpoint::load(&base.path().join(number.to_string())).expect("a checkpoint");
     let episodes = |servers: &Servers| {
-        let options = TestOptions { episodes: 130, seed: 8, success: None };
+        let options = TestOptions { episodes: 130, seed: 8, selects: false, success: None };
         let tester = Tester::new(servers, &checkpoint, options).expect("a tester");
         let sets = [Version::D.into(), Version::E.into()];
         tester.test(&sets, &StopFlag::default(), &mut |_, _| {}).expect("records").episodes

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, HashMap};
 use toml::{Table, Value};
 
 use super::file::{Block, File};
-use super::{AnyError, Cell, Tests};
+use super::{AnyError, Cell, SELECTION_TEST, Tests};
 use crate::Version;
 use crate::sets::{Contexts, TestSet};
 use crate::settings::{ConfigError, SettingError, TrainConfig};
@@ -13,18 +13,20 @@ use crate::value_error::{ValueError, require};
 
 type Result<T, E = AnyError> = std::result::Result<T, E>;
 
-/// The cells of `file`, whose versions and sets are `sets`: in the order of the environments, otherwise as the tables give
-/// them.
-pub(super) fn expand(file: &File, sets: &BTreeMap<String, TestSet>) -> Result<Vec<Cell>> {
+/// The cells of `file`, whose versions and sets are `sets`, and what may become one when it is selected: in the order of the
+/// environments, otherwise as the tables give them.
+pub(super) fn expand(file: &File, sets: &BTreeMap<String, TestSet>) -> Result<(Vec<Cell>, Vec<Cell>)> {
     let mut expansion = Expansion { file, sets, cells: Vec::new(), tables: HashMap::new() };
     for (index, block) in file.algorithm.iter().enumerate() {
         expansion.add_block(&format!("[[algorithm]] {} ({})", index + 1, block.name), block)?;
     }
     let mut cells = expansion.cells;
     let environments = file.all_environments();
-    cells.sort_by_cached_key(|cell| environments.iter().position(|name| *name == cell.config.common.environment));
+    let place = |cell: &Cell| environments.iter().position(|name| *name == cell.config.common.environment);
+    cells.sort_by_cached_key(|cell| (cell.tuned_as.is_some(), place(cell)));
     cells.iter_mut().enumerate().for_each(|(index, cell)| cell.index = index);
-    Ok(cells)
+    let candidates = cells.split_off(cells.partition_point(|cell| cell.tuned_as.is_none()));
+    Ok((cells, candidates))
 }
 
 struct Expansion<'a> {
@@ -93,18 +95,38 @@ impl Expansion<'_> {
         })
     }
 
+    /// Every run of a configuration; if the reported tests do not select, its tuning runs first.
     fn add_runs(&mut self, name: &str, config: TrainConfig, trained_on: &str) -> Result<()> {
         let file = self.file;
         let sets = file.test_versions.iter().map(|name| self.set(name).cloned());
         let mut sets = sets.collect::<Result<Vec<_>, _>>()?;
         sets.sort_by_key(|set| set.plain().map_or(Version::ALL.len(), |version| version as usize));
         let success = file.success_in(&config.common.environment, config.common.preset);
-        let tests = Tests { episodes: file.test_episodes, sets, success };
-        let configuration = fingerprint(&config, &tests);
+        let tests = Tests { episodes: file.test_episodes, sets, selection: None, success };
+        let mut tuned_as = None;
+        if let Some(episodes) = file.selection_episodes() {
+            let tests = Tests { selection: Some(episodes), ..tests.clone() };
+            tuned_as = Some(fingerprint(&config, &tests));
+            self.add_cells(name, &config, trained_on, &tests, (file.seed, file.tuning_runs()), None)?;
+        }
+        let seed = file.seed + u64::from(file.tuning_runs());
+        self.add_cells(name, &config, trained_on, &tests, (seed, file.runs), tuned_as)
+    }
+
+    fn add_cells(
+        &mut self,
+        name: &str,
+        config: &TrainConfig,
+        trained_on: &str,
+        tests: &Tests,
+        (seed, runs): (u64, u32),
+        tuned_as: Option<String>,
+    ) -> Result<()> {
+        let configuration = fingerprint(config, tests);
         let set = self.set(trained_on)?.plain().is_none().then(|| trained_on.to_owned());
-        for run in 1..=file.runs {
+        for run in 1..=runs {
             let mut config = config.clone();
-            config.common.seed = file.seed + u64::from(run - 1);
+            config.common.seed = seed + u64::from(run - 1);
             let (common, algorithm) = (&config.common, config.settings.name());
             let id = format!(
                 "{}-{algorithm}-{}-{trained_on}-{configuration}-s{}",
@@ -114,7 +136,8 @@ impl Expansion<'_> {
                 return Err(format!("{first} and {name} both ask for {id}: take it out of one of them").into());
             }
             let (configuration, set, tests) = (configuration.clone(), set.clone(), tests.clone());
-            self.cells.push(Cell { index: 0, id, configuration, run, set, config, tests });
+            let tuned_as = tuned_as.clone();
+            self.cells.push(Cell { index: 0, id, configuration, run, tuned_as, set, config, tests });
         }
         Ok(())
     }
@@ -172,6 +195,7 @@ fn fingerprint(config: &TrainConfig, tests: &Tests) -> String {
     };
     let sets: Vec<String> = tests.sets.iter().map(shown).collect();
     let success = tests.success.as_ref().map(|rule| format!(" {rule}")).unwrap_or_default();
-    let text = format!("{table}\n{} [{}]{success}", tests.episodes, sets.join(", "));
+    let selection = tests.selection.map(|episodes| format!(" {SELECTION_TEST} {episodes}")).unwrap_or_default();
+    let text = format!("{table}\n{} [{}]{success}{selection}", tests.episodes, sets.join(", "));
     format!("{:08x}", crc32c::crc32c(text.as_bytes()))
 }

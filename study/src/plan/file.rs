@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use serde::Deserialize;
 use toml::Table;
 
-use super::distinct;
+use super::SELECTION_TEST;
+use super::{Selection, distinct};
 use crate::Version;
 use crate::settings::Preset;
 use crate::success::Rule;
@@ -23,6 +24,10 @@ pub(super) struct File {
     pub(super) environments: Vec<String>,
     #[serde(default = "all_versions")]
     pub(super) versions: Vec<String>,
+    #[serde(default)]
+    pub(super) selection: Selection,
+    tuning_runs: Option<u32>,
+    selection_episodes: Option<u64>,
     #[serde(default = "one")]
     pub(super) runs: u32,
     #[serde(default = "one")]
@@ -113,10 +118,21 @@ impl File {
         Some(given.cloned().unwrap_or(usual)).filter(|rule| *rule != Rule::Text)
     }
 
+    /// Runs whose tests select and are not reported.
+    pub(super) fn tuning_runs(&self) -> u32 {
+        if self.selection == Selection::Clean { self.tuning_runs.unwrap_or(1) } else { 0 }
+    }
+
+    /// Episodes of the test that selects and nothing else; `None` if there is none.
+    pub(super) fn selection_episodes(&self) -> Option<u64> {
+        (self.selection == Selection::Clean).then(|| self.selection_episodes.unwrap_or(self.test_episodes))
+    }
+
     /// Refuses what does not depend on a table `[[algorithm]]`.
     pub(super) fn check(&self) -> Result<(), ValueError> {
-        let most = i64::MAX as u64 - u64::from(u32::MAX);
+        let most = i64::MAX as u64 - 2 * u64::from(u32::MAX);
         require(self.runs > 0, "runs", self.runs, "at least 1")?;
+        self.check_selection()?;
         require(self.seed <= most, "seed", self.seed, format!("at most {most}"))?;
         require(self.test_episodes > 0, "test_episodes", self.test_episodes, "at least 1")?;
         require(!self.algorithm.is_empty(), "algorithm", "empty", "one or more tables [[algorithm]]")?;
@@ -135,6 +151,20 @@ impl File {
                 require(known, "[success]", format!("`{name}`"), format!("one of {}", environments.join(", ")))
             }),
         }
+    }
+
+    fn check_selection(&self) -> Result<(), ValueError> {
+        for (key, given) in
+            [("tuning_runs", self.tuning_runs.map(u64::from)), ("selection_episodes", self.selection_episodes)]
+        {
+            let Some(given) = given else { continue };
+            let expected = "left out, or beside selection = \"clean\"";
+            require(self.selection == Selection::Clean, key, given, expected)?;
+            require(given > 0, key, given, "at least 1")?;
+        }
+        let key = format!("[sets.{SELECTION_TEST}]");
+        let is_free = self.selection == Selection::Paper || !self.sets.contains_key(SELECTION_TEST);
+        require(is_free, key, format!("`{SELECTION_TEST}`"), "another name: the test that selects has this one")
     }
 
     /// Refuses what `block`, which is called `name` in refusals, has beside its grid; `before` cells stand before its own.
@@ -173,8 +203,9 @@ impl File {
     /// Refuses more cells than anybody can do, before they fill the memory.
     fn check_size(&self, name: &str, block: &Block, before: usize) -> Result<(), ValueError> {
         let lists = [self.environments_of(block), self.versions_of(block), &block.architectures].map(<[_]>::len);
+        let runs = self.runs as usize + self.tuning_runs() as usize;
         let values = block.grid.values().map(|values| values.as_array().map_or(1, Vec::len));
-        let cells = lists.into_iter().chain([self.runs as usize]).chain(values).fold(1, usize::saturating_mul);
+        let cells = lists.into_iter().chain([runs]).chain(values).fold(1, usize::saturating_mul);
         let cells = cells.saturating_add(before);
         let what =
             format!("{name}: the number of cells up to here, every combination of [algorithm.grid] in each run,");

@@ -2,7 +2,8 @@
 //!
 //! A cell is one training and its tests. Cells are the product of environments, algorithms, architectures, grid,
 //! training versions and runs, in this order, the last one varying fastest. All cells of a run have the same seed, so
-//! that two of them differ in nothing but what the file says.
+//! that two of them differ in nothing but what the file says. With `selection = "clean"` these are tuning cells, which
+//! select what is trained anew.
 
 mod expansion;
 mod file;
@@ -16,10 +17,10 @@ use perturb_protocol::proto;
 use serde::{Deserialize, Serialize};
 
 use crate::files::{self, FileError};
-use crate::sets::{TestSet, check as check_parameters};
+use crate::sets::{Contexts, TestSet, check as check_parameters};
 use crate::settings::TrainConfig;
 use crate::success::{Criterion, Rule};
-use crate::value_error::ValueError;
+use crate::value_error::{ValueError, require};
 use crate::{AnyError, Method, Version};
 use file::File;
 pub use groups::Grouping;
@@ -31,11 +32,51 @@ pub struct Plan {
     pub text: String,
     /// The files beside it that its sets name, with their content.
     pub beside: BTreeMap<String, Vec<u8>>,
-    /// How often the whole is repeated, each time with another seed.
+    /// By which rule configurations are selected.
+    pub selection: Selection,
+    /// How often what is reported is repeated, each time with another seed.
     pub runs: u32,
-    /// All cells; a cell's index is its place here.
+    /// How often everything is done before that, with seeds of its own, so that configurations can be selected; 0 if the
+    /// reported tests select.
+    pub tuning_runs: u32,
+    /// All cells that are known before anything is done, tuning cells if there are any. A cell's index is its place here.
     pub cells: Vec<Cell>,
+    /// What may become a cell when its configuration is selected; indices go on. [`Plan::in_folder`] has those that do.
+    pub candidates: Vec<Cell>,
 }
+
+/// How one configuration of many is selected for a report.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Selection {
+    /// As published: by the tests that are reported.
+    #[default]
+    Paper,
+    /// By selection episodes of trainings on tuning seeds. What is selected is trained anew on other seeds, and tested on
+    /// other episodes.
+    Clean,
+}
+
+impl std::fmt::Display for Selection {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.pad(match self {
+            Selection::Paper => "paper",
+            Selection::Clean => "clean",
+        })
+    }
+}
+
+impl std::str::FromStr for Selection {
+    type Err = ValueError;
+
+    fn from_str(text: &str) -> Result<Self, ValueError> {
+        let known = [Selection::Paper, Selection::Clean].into_iter().find(|rule| rule.to_string() == text);
+        known.ok_or_else(|| ValueError::new("selection", format!("`{text}`"), "\"paper\" or \"clean\""))
+    }
+}
+
+/// What results and recorded episodes call the test that selects, and does nothing else.
+pub const SELECTION_TEST: &str = "selection";
 
 /// One training and its tests.
 #[derive(Clone, Debug, PartialEq)]
@@ -47,8 +88,10 @@ pub struct Cell {
     pub id: String,
     /// Names the settings, without environment, version and seed, in eight hexadecimal digits.
     pub configuration: String,
-    /// Which run it belongs to, from 1.
+    /// Which run it belongs to, from 1; tuning cells have runs of their own.
     pub run: u32,
+    /// The configuration of the tuning cells that select this one, if it is trained anew; `None` of a cell of the grid.
+    pub tuned_as: Option<String>,
     /// The name of the plan's own set of parameters, if it is trained on one.
     pub set: Option<String>,
     /// What is trained.
@@ -64,6 +107,9 @@ pub struct Tests {
     pub episodes: u64,
     /// On what: versions in the order D, R, E, then the plan's own sets in theirs.
     pub sets: Vec<TestSet>,
+    /// Episodes of the test that selects and nothing else, on what was trained on; `None` if there is none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub selection: Option<u64>,
     /// What decides about success; `None` for the environment's own rule.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub success: Option<Rule>,
@@ -129,7 +175,9 @@ impl Plan {
         file.check()?;
         let mut beside = BTreeMap::new();
         let sets = sets::read(&file.sets, Path::new(path).parent().unwrap_or(Path::new("")), &mut beside)?;
-        Ok(Self { runs: file.runs, cells: expansion::expand(&file, &sets)?, beside, text })
+        let (cells, candidates) = expansion::expand(&file, &sets)?;
+        let (selection, runs, tuning_runs) = (file.selection, file.runs, file.tuning_runs());
+        Ok(Self { selection, runs, tuning_runs, cells, candidates, beside, text })
     }
 
     /// Whether `environment` has the parameters and thresholds that the plan's cells name for it.
@@ -149,23 +197,42 @@ impl Plan {
         Ok(())
     }
 
-    /// How much it asks for.
+    /// How much it asks for, but for what is trained anew.
     pub fn counts(&self) -> Counts {
-        let first = self.cells.iter().filter(|cell| cell.run == 1);
+        let of_grid = || self.cells.iter().filter(|cell| cell.tuned_as.is_none());
+        let first = of_grid().filter(|cell| cell.run == 1);
         let configurations: BTreeSet<_> = first.clone().map(|cell| (cell.method(), &cell.configuration)).collect();
         Counts {
             configurations: configurations.len(),
             trainings: first.clone().count(),
             pairs: first.map(|cell| cell.tests.sets.len()).sum(),
-            all_pairs: self.cells.iter().map(|cell| cell.tests.sets.len()).sum(),
-            runs: self.runs,
+            all_pairs: of_grid().map(|cell| cell.tests.sets.len()).sum(),
+            runs: if self.selection == Selection::Clean { self.tuning_runs } else { self.runs },
         }
     }
 
-    /// The cell with this id, or with this index.
+    /// The same results by another rule: as published, a plan's tuning cells are what is reported.
+    ///
+    /// # Errors
+    /// [`ValueError`] for `clean` of a plan that was not made for it.
+    pub fn by(self, rule: Selection) -> Result<Self, ValueError> {
+        match (self.selection, rule) {
+            (Selection::Clean, Selection::Paper) => {
+                let runs = self.tuning_runs;
+                Ok(Self { selection: rule, runs, tuning_runs: 0, candidates: Vec::new(), ..self })
+            }
+            (known, rule) => {
+                let expected = "\"paper\": the plan has no tuning cells; write selection = \"clean\" in its file";
+                require(known == rule, "selection", rule, expected).map(|()| self)
+            }
+        }
+    }
+
+    /// The cell or candidate with this id, or with this index.
     pub fn find(&self, name: &str) -> Option<&Cell> {
-        let by_index = || name.parse().ok().and_then(|index: usize| self.cells.get(index));
-        self.cells.iter().find(|cell| cell.id == name).or_else(by_index)
+        let all = || self.cells.iter().chain(&self.candidates);
+        let by_index = |index: usize| all().find(|cell| cell.index == index);
+        all().find(|cell| cell.id == name).or_else(|| name.parse().ok().and_then(by_index))
     }
 
     /// The environments, in the plan's order.
@@ -180,7 +247,7 @@ impl Plan {
 }
 
 /// What a policy is trained on.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum TrainedOn<'a> {
     /// D, R or E.
     Version(Version),
@@ -201,6 +268,13 @@ impl Cell {
     /// Its set or version.
     pub fn trained_on(&self) -> TrainedOn<'_> {
         self.set.as_deref().map_or(TrainedOn::Version(self.config.common.version), TrainedOn::Set)
+    }
+
+    /// The test that selects and nothing else, if it has one.
+    pub fn selection_test(&self) -> Option<(TestSet, u64)> {
+        let parameters = Contexts::Drawn(self.config.common.parameters.clone());
+        let set = TestSet { name: SELECTION_TEST.into(), version: self.config.common.version, contexts: parameters };
+        self.tests.selection.map(|episodes| (set, episodes))
     }
 
     /// What trains.

@@ -55,7 +55,10 @@ fn a_cell_has_all_settings_and_the_seed_of_its_run() {
     for (index, run, version) in [(0, 1, "D"), (1, 2, "D"), (2, 1, "E"), (3, 2, "E")] {
         let cell = &plan.cells[index];
         assert_eq!((&cell.config, cell.run), (&expected(run, version), run));
-        assert_eq!(cell.tests, Tests { episodes: 30, sets: Version::ALL.map(TestSet::from).to_vec(), success: None });
+        assert_eq!(
+            cell.tests,
+            Tests { episodes: 30, sets: Version::ALL.map(TestSet::from).to_vec(), selection: None, success: None }
+        );
     }
     assert_eq!(plan.cells[0].configuration, plan.cells[3].configuration);
     assert_ne!(plan.cells[0].configuration, plan.cells[4].configuration, "the next point of the grid");

@@ -208,6 +208,12 @@ impl Records {
         self.episodes.extend(episodes);
     }
 
+    /// Adds other tests of the same policy.
+    pub fn append(&mut self, other: Self) {
+        self.about.tests.extend(other.about.tests);
+        self.episodes.extend(other.episodes);
+    }
+
     /// The episodes of the test on the set called `name`.
     pub fn of<'a>(&'a self, name: &'a str) -> impl Iterator<Item = &'a EpisodeRecord> + Clone {
         self.episodes.iter().filter(move |episode| episode.set == name)

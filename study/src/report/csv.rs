@@ -1,6 +1,6 @@
 //! The numbers of a report as lines of files; an empty field is a number that there is not.
 
-use super::Report;
+use super::{Cell, Report};
 use crate::statistics::Summary;
 use crate::table::{Table, TableBuilder};
 use crate::{Method, Metric, Scenario, Version};
@@ -9,8 +9,9 @@ impl Report<'_> {
     /// The files that a report has beside its documents, by their titles.
     pub fn files(&self) -> Vec<Table> {
         let sets = (!self.set_tests.is_empty()).then(|| self.sets_file());
+        let tuned = (!self.tuned.is_empty()).then(|| self.tuned_file());
         let files = [self.metrics_file(), self.iqm_file(), self.scenarios_file(), self.selected_file()];
-        files.into_iter().chain(sets).collect()
+        files.into_iter().chain(sets).chain(tuned).collect()
     }
 
     fn metrics_file(&self) -> Table {
@@ -61,6 +62,28 @@ impl Report<'_> {
             .text("test", |test| test.tested_on)
             .summary(|test| test.success)
             .number("mean_return", |test| or_empty(test.mean_return.map(|summary| summary.mean)))
+            .build()
+    }
+
+    fn tuned_file(&self) -> Table {
+        Table::of("tuning.csv", &self.tuned)
+            .text("environment", |tuned| tuned.environment)
+            .method(|tuned| &tuned.method)
+            .text("train", |tuned| tuned.trained_on)
+            .number("cells", |tuned| tuned.cells)
+            .number("done", |tuned| tuned.done)
+            .number("failed", |tuned| tuned.failed)
+            .text("cell", |tuned| or_empty(tuned.chosen.map(|chosen| &chosen.cell.id)))
+            .number("seeds", |tuned| tuned.chosen.map_or(0, |chosen| chosen.seeds))
+            .number("success_mean", |tuned| or_empty(tuned.chosen.map(|chosen| chosen.success_percent)))
+            .number("return_mean", |tuned| or_empty(tuned.chosen.map(|chosen| chosen.mean_return)))
+            .text("settings", |tuned| {
+                let settings = |cell: &Cell| {
+                    let written = cell.config.table().into_iter().filter(|(key, _)| key != "seed");
+                    written.map(|(key, value)| format!("{key}={value}")).collect::<Vec<_>>().join(" ")
+                };
+                or_empty(tuned.chosen.map(|chosen| settings(chosen.cell)))
+            })
             .build()
     }
 

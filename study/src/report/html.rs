@@ -38,7 +38,13 @@ pub fn html(report: &Report<'_>, figures: &Figures) -> String {
     let metrics = report.metrics_tables().into_iter().map(plain).collect();
     let scenarios = report.scenario_tables().iter().map(|table| table_subsection(table, true)).collect();
     let sets: Vec<Subsection> = report.set_table().into_iter().map(plain).collect();
-    let cells = [report.selected_table()].into_iter().chain(report.failure_table()).map(plain).collect();
+    let cells = report
+        .tuned_table()
+        .into_iter()
+        .chain([report.selected_table()])
+        .chain(report.failure_table())
+        .map(plain)
+        .collect();
     let sections = [
         section("metrics", "Default, Interpolation, Extrapolation", html! { p { (METRICS) } }, metrics),
         section("iqm", "Interquartile means", html! {}, vec![plain(report.iqm_table())]),

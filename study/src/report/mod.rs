@@ -12,9 +12,10 @@ mod tables;
 use std::collections::BTreeSet;
 
 use super::folder::Failure;
-use super::plan::{Cell, Plan};
+use super::plan::{Cell, Plan, Selection};
 use super::selection::{MethodResults, Results, Selected};
 use super::table::Table;
+use super::tuning::Tuned;
 use numbers::{MethodMetrics, SetTest};
 
 pub use figures::{Figure, FigureData, Figures};
@@ -35,19 +36,23 @@ pub struct Report<'a> {
     metrics: Vec<MethodMetrics<'a>>,
     averages: Vec<MethodMetrics<'a>>,
     set_tests: Vec<SetTest<'a>>,
+    /// By the clean rule, what was selected; otherwise nothing.
+    tuned: Vec<Tuned<'a>>,
     failures: Vec<&'a Failure>,
 }
 
 impl<'a> Report<'a> {
     /// Of `results`, from which `selections` were made.
     pub fn new(results: &'a Results<'a>, selections: &'a [MethodResults<'a>]) -> Self {
+        let tuned = if results.plan.selection == Selection::Clean { results.tuned() } else { Vec::new() };
         Self {
             plan: results.plan,
             selections,
-            overview: overview(results, selections),
+            overview: overview(results, selections, &tuned),
             metrics: numbers::metrics(selections),
             averages: numbers::averages(results.plan, selections),
             set_tests: numbers::set_tests(results.plan, selections),
+            tuned,
             failures: results.failures().collect(),
         }
     }
@@ -61,7 +66,8 @@ impl<'a> Report<'a> {
 
     /// For GitHub and the like.
     pub fn markdown(&self) -> String {
-        let tables = self.number_tables().chain([self.selected_table()]).chain(self.failure_table());
+        let cells = self.tuned_table().into_iter().chain([self.selected_table()]);
+        let tables = self.number_tables().chain(cells).chain(self.failure_table());
         let shown = tables.map(|table| format!("\n## {}\n\n{}\n", table.title, table.to_markdown()));
         format!("# Results\n\n{}\n{}", self.overview.join("\n\n"), shown.collect::<String>())
     }
@@ -78,17 +84,22 @@ impl<'a> Report<'a> {
     }
 }
 
-fn overview(results: &Results<'_>, selections: &[MethodResults<'_>]) -> Vec<String> {
+fn overview(results: &Results<'_>, selections: &[MethodResults<'_>], tuned: &[Tuned<'_>]) -> Vec<String> {
     let (cells, done, failed) = (results.plan.cells.len(), results.done().count(), results.failures().count());
     let mut lines =
         vec![format!("{done} of {cells} cells are done, {failed} failed, {} are missing.", cells - done - failed)];
+    lines.push(rule(results.plan));
+    lines.extend(selected(tuned));
     lines.extend(budgets(results.plan));
     let incomplete = selections.iter().filter(|selection| selection.done < selection.cells).count();
     if incomplete > 0 {
         lines.push(format!(
-            "{incomplete} of {} rows lack cells, so that their configurations were selected among fewer than the plan \
-             has; the column `cells` says which.",
-            selections.len()
+            "{incomplete} of {} rows lack cells{}; the column `cells` says which.",
+            selections.len(),
+            match results.plan.selection {
+                Selection::Paper => ", so that their configurations were selected among fewer than the plan has",
+                Selection::Clean => "",
+            }
         ));
     }
     let commits: BTreeSet<&str> = results.done().flat_map(|result| result.commits()).collect();
@@ -103,6 +114,51 @@ fn overview(results: &Results<'_>, selections: &[MethodResults<'_>]) -> Vec<Stri
             .into(),
     );
     lines
+}
+
+/// By which rule configurations are selected, and on which seeds.
+fn rule(plan: &Plan) -> String {
+    let seeds = |cells: &mut dyn Iterator<Item = &Cell>| {
+        let seeds: BTreeSet<u64> = cells.map(|cell| cell.config.common.seed).collect();
+        match (seeds.first(), seeds.last()) {
+            (Some(first), Some(last)) if first < last => format!("seeds {first} to {last}"),
+            (first, _) => format!("seed {}", first.copied().unwrap_or_default()),
+        }
+    };
+    let tuning = seeds(&mut plan.cells.iter().filter(|cell| cell.tuned_as.is_none()));
+    match plan.selection {
+        Selection::Paper => format!(
+            "Selection: `paper`, as published. In each run, the test that selects a configuration is the test that is \
+             reported; {tuning}."
+        ),
+        Selection::Clean => format!(
+            "Selection: `clean`. Configurations were selected by {} selection episodes of every training on {tuning}; \
+             those that are reported were trained anew on {}, and tested on other episodes.",
+            plan.cells.iter().find_map(|cell| cell.tests.selection).unwrap_or_default(),
+            seeds(&mut plan.candidates.iter())
+        ),
+    }
+}
+
+/// What is to be known of the selected configurations beside their numbers.
+fn selected(tuned: &[Tuned<'_>]) -> Vec<String> {
+    let all = tuned.len();
+    let name = |tuned: &Tuned<'_>| format!("{} {} on {}", tuned.environment, tuned.method, tuned.trained_on);
+    let names = |of: &dyn Fn(&&Tuned<'_>) -> bool| tuned.iter().filter(of).map(name).collect::<Vec<_>>();
+    let waiting = names(&|tuned| !tuned.is_complete());
+    let none = names(&|tuned| tuned.is_complete() && tuned.chosen.is_none());
+    let partly = tuned.iter().filter_map(|tuned| {
+        let chosen = tuned.chosen.filter(|chosen| chosen.seeds < tuned.seeds)?;
+        Some(format!("{} ({} of {} tuning seeds)", name(tuned), chosen.seeds, tuned.seeds))
+    });
+    let partly: Vec<String> = partly.collect();
+    let told = [
+        ("wait for tuning cells", waiting),
+        ("have nothing to select, since all their tuning cells failed", none),
+        ("are of configurations some of whose tuning cells failed", partly),
+    ];
+    let told = told.into_iter().filter(|(_, names)| !names.is_empty());
+    told.map(|(what, names)| format!("{} of {all} selections {what}: {}.", names.len(), names.join(", "))).collect()
 }
 
 /// How far requested and applied parameters agreed in all tests.

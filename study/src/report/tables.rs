@@ -81,6 +81,25 @@ impl Report<'_> {
         (!table.rows.is_empty()).then_some(table)
     }
 
+    /// `None` if nothing was tuned.
+    pub(super) fn tuned_table(&self) -> Option<Table> {
+        let title = "What was selected, by selection episodes on tuning seeds (tuning.csv has the configurations)";
+        let table = Table::of(title, &self.tuned)
+            .text("environment", |tuned| tuned.environment)
+            .text("method", |tuned| &tuned.method)
+            .text("trained on", |tuned| tuned.trained_on)
+            .text("first tuning cell", |tuned| or(MISSING, tuned.chosen.map(|chosen| &chosen.cell.id)))
+            .number("success, %", |tuned| {
+                or(MISSING, tuned.chosen.map(|chosen| format!("{:.1}", chosen.success_percent)))
+            })
+            .number("mean return", |tuned| or(MISSING, tuned.chosen.map(|chosen| format!("{:.1}", chosen.mean_return))))
+            .number("seeds", |tuned| tuned.chosen.map_or(0, |chosen| chosen.seeds))
+            .number("cells", |tuned| format!("{}/{}", tuned.done, tuned.cells))
+            .number("failed", |tuned| tuned.failed)
+            .build();
+        (!table.rows.is_empty()).then_some(table)
+    }
+
     pub(super) fn selected_table(&self) -> Table {
         let title =
             "Where the numbers come from: the selected cell of each run (selected.csv has its settings and command)";

@@ -2,7 +2,8 @@ use rstest::rstest;
 
 use super::*;
 use crate::fixture;
-use crate::folder::{CellState, Failure};
+use crate::folder::{CellState, Failure, Folder};
+use crate::plan::SELECTION_TEST;
 use crate::records::{Agreement, Difference};
 use crate::{TestResult, Version};
 
@@ -115,6 +116,64 @@ fn tests_on_own_sets_have_a_table_and_leave_the_papers_numbers_alone() {
     assert_eq!(report.files()[4].title, "sets.csv");
     let told = "compared in 8000 of 10000 test episodes; the largest relative difference is 2.0e-16, of length.";
     assert!(report.overview.iter().any(|line| line.contains(told)), "{:?}", report.overview);
+}
+
+/// Two configurations and two tuning seeds. One cell of what is selected failed; what is trained on E waits, and on R nothing
+/// can be selected.
+#[test]
+fn a_clean_report_names_its_rule_its_seeds_and_what_was_selected() {
+    let text = "environments = ['CartPole']\nselection = 'clean'\ntuning_runs = 2\nruns = 2\nselection_episodes = 70
+        [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\ngrid = { n_steps = [64, 128] }";
+    let plan = Plan::parse("test", text.into()).unwrap();
+    let directory = tempfile::tempdir().unwrap();
+    let folder = Folder::new(directory.path());
+    let n_steps = |cell: &Cell| cell.config.table()["n_steps"].as_integer();
+    for cell in plan.cells.iter().chain(&plan.candidates) {
+        let (version, seed) = (cell.config.common.version, cell.config.common.seed);
+        let place = folder.cell(&cell.id);
+        let selected = n_steps(cell) == Some(128);
+        if version == Version::R || (version, selected, seed) == (Version::D, true, 2) {
+            place.write_failure(&Failure { id: cell.id.clone(), reason: "NaN".into(), commit: "x".into() }).unwrap();
+        } else if (version, selected, seed) != (Version::E, true, 2) {
+            let mut result = fixture::result(cell, [if selected { 10.0 } else { 90.0 } + seed as f64, 5.0, 0.0], 1.0);
+            let test =
+                TestResult { success_percent: if selected { 75.0 } else { 25.0 }, ..result.results["D"].clone() };
+            result.results.insert(SELECTION_TEST.into(), test);
+            place.write_result(&result).unwrap();
+        }
+    }
+    let plan = plan.in_folder(&folder).unwrap();
+    let results = Results::read(&plan, &folder).unwrap();
+    let selections = results.select();
+    let report = Report::new(&results, &selections);
+    let told = report.overview.join("\n");
+    for part in [
+        "Selection: `clean`. Configurations were selected by 70 selection episodes of every training on seeds 1 to 2; \
+         those that are reported were trained anew on seeds 3 to 4, and tested on other episodes.",
+        "1 of 3 selections wait for tuning cells: CartPole ppo ff on E.",
+        "1 of 3 selections have nothing to select, since all their tuning cells failed: CartPole ppo ff on R.",
+        "1 of 3 selections are of configurations some of whose tuning cells failed: CartPole ppo ff on D (1 of 2 tuning \
+         seeds).",
+    ] {
+        assert!(told.contains(part), "{told}");
+    }
+    let table = |title: &str| report.files().into_iter().find(|table| table.title == title).unwrap();
+    let rows: Vec<String> =
+        String::from_utf8(table("tuning.csv").to_csv()).unwrap().lines().map(str::to_owned).collect();
+    assert!(
+        rows[1].starts_with("CartPole,ppo,ff,,D,4,3,1,CartPole-ppo-ff-D-") && rows[1].contains("-s1,1,75,1,"),
+        "{rows:?}"
+    );
+    assert!(rows[1].contains("n_steps=128") && !rows[1].contains("seed"), "{rows:?}");
+    assert_eq!(rows[2..], ["CartPole,ppo,ff,,R,4,0,4,,0,,,", "CartPole,ppo,ff,,E,4,3,0,,0,,,"]);
+    let metrics = String::from_utf8(table("metrics.csv").to_csv()).unwrap();
+    // 13 and 14 of what was trained anew, not the 90s that were not selected.
+    assert!(metrics.contains("CartPole,ppo,ff,,Default,2,13.5,0.5"), "{metrics}");
+    assert!(
+        report.markdown().contains("| CartPole    | ppo ff | D          | CartPole-ppo-ff-D-"),
+        "{}",
+        report.markdown()
+    );
 }
 
 #[rstest]

@@ -186,6 +186,7 @@ impl Backend for Local<'_> {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::HashMap;
     use std::time::Duration;
 
     use super::super::{Announcement, Line, RunEnd, run};
@@ -229,7 +230,7 @@ mod tests {
                 lines.push(line.clone());
             }
         };
-        let end = run(&plan, folder, &mut local, false, stop, &mut report);
+        let end = run(&plan, folder, &mut local, &HashMap::new(), stop, &mut report);
         Ran { end, lines }
     }
 

@@ -170,7 +170,7 @@ pub enum RunError {
 
 type Result<T, E = RunError> = std::result::Result<T, E>;
 
-/// Does every cell of `plan` that has no result in `folder`; with `retry_failed`, also those that had failed before.
+/// Does every cell of `plan` that has no result in `folder`, also those that had failed as is `forgiven` them, by their ids.
 /// Returns when no cell is left, also none that another run works on.
 ///
 /// # Errors
@@ -179,11 +179,11 @@ pub fn run(
     plan: &Plan,
     folder: &Folder,
     backend: &mut dyn Backend,
-    retry_failed: bool,
+    forgiven: &HashMap<String, FailureMark>,
     stop: &StopFlag,
     report: &mut dyn FnMut(Announcement<'_>),
 ) -> Result<RunEnd> {
-    let mut scheduler = Scheduler::new(plan, folder, backend, retry_failed, report);
+    let mut scheduler = Scheduler::new(plan, folder, backend, forgiven, report);
     let end = loop {
         match (scheduler.step(Instant::now()), stop.signal()) {
             (Ok(None), None) => std::thread::sleep(TICK),
@@ -254,10 +254,10 @@ impl<'a> Scheduler<'a> {
         plan: &'a Plan,
         folder: &'a Folder,
         backend: &'a mut dyn Backend,
-        retry_failed: bool,
+        forgiven: &HashMap<String, FailureMark>,
         report: &'a mut dyn FnMut(Announcement<'_>),
     ) -> Self {
-        let forgiven = |id: &str| folder.cell(id).failure_mark().filter(|_| retry_failed);
+        let forgiven = |id| forgiven.get(id).copied();
         let cells = plan.cells.iter().map(|cell| Tracked { forgiven: forgiven(&cell.id), ..Tracked::default() });
         let mut scheduler = Self {
             plan,

@@ -222,7 +222,8 @@ impl Place {
             Announcement::Note(note) => notes.push(note.to_owned()),
             Announcement::Line(_) => {}
         };
-        let mut scheduler = Scheduler::new(&self.plan, &self.folder, &mut fake, retry_failed, &mut report);
+        let forgiven = if retry_failed { self.folder.failures().unwrap() } else { HashMap::new() };
+        let mut scheduler = Scheduler::new(&self.plan, &self.folder, &mut fake, &forgiven, &mut report);
         let end = (0..10_000).find_map(|second| scheduler.step(start + Duration::from_secs(second)).transpose());
         let end = end.expect("it ends").map_err(|error| error.to_string());
         let Fake { begun, groups, most_at_a_time, .. } = fake;

@@ -1,5 +1,5 @@
 //! The defaults of every pair of algorithm and architecture in each preset. Why they are what they are, with numbers:
-//! docs/algorithms.md.
+//! docs/algorithms.md. They were chosen on seed 1.
 
 use super::preset::{self, Preset};
 use super::{Architecture, Base, Common, Settings, TrainConfig, Wrapper};

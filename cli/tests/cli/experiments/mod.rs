@@ -3,6 +3,7 @@
 mod groups;
 mod reports;
 mod running;
+mod selection;
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;

@@ -2,6 +2,7 @@
 //! `cli/tests/cli/slurm`.
 
 use std::cell::Cell;
+use std::collections::HashMap;
 use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -123,7 +124,8 @@ impl Fake {
         };
         let slurm = self.slurm();
         let mut jobs = Jobs::new(&self.plan, &self.folder, &slurm, &self.options, &costs, stop);
-        let mut scheduler = Scheduler::new(&self.plan, &self.folder, &mut jobs, self.retry_failed, watch);
+        let forgiven = if self.retry_failed { self.folder.failures().unwrap() } else { HashMap::new() };
+        let mut scheduler = Scheduler::new(&self.plan, &self.folder, &mut jobs, &forgiven, watch);
         let start = Instant::now();
         for second in 0..1000 {
             let stepped = scheduler.step(start + Duration::from_secs(second))?;
