@@ -134,7 +134,8 @@ pub fn estimates(plan: &Plan, measurements: &[Measurement], step_limits: &HashMa
         let speed = *speeds.entry(pair.clone()).or_insert_with(|| speed_of(&pair, measurements));
         let limit = f64::from(step_limits.get(pair.0).copied().unwrap_or_default());
         let training_steps = generated_episodes(&cell.config) * limit;
-        let trials = cell.tests.episodes * cell.tests.sets.len() as u64 + cell.tests.selection.unwrap_or_default();
+        let times = cell.tests.sets.len() as u64 * (1 + cell.tests.marks.len() as u64);
+        let trials = cell.tests.episodes * times + cell.tests.selection.unwrap_or_default();
         let testing_steps = (trials * u64::from(cell.config.settings.episodes_per_trial())) as f64 * limit;
         Estimate {
             training_steps,

@@ -33,6 +33,7 @@ pub fn result(cell: &Cell, [d, r, e]: [f64; 3], mean_return: f64) -> CellResult 
             settings: cell.config.table(),
         },
         results: [("D".into(), test(d)), ("R".into(), test(r)), ("E".into(), test(e))].into(),
+        marks: Default::default(),
         agreement: None,
         commit: "0.1.0 (0123456789ab)".into(),
         earlier_commits: Vec::new(),

@@ -5,7 +5,8 @@
 //! DIR/cells/ID/result.json   appears complete, when all is done
 //! DIR/cells/ID/failure.json  why it failed
 //! DIR/cells/ID/timing.json   how long it took; everything that differs from run to run
-//! DIR/cells/ID/training/     what `perturb train --out` writes
+//! DIR/cells/ID/training/     what `perturb train --out` writes; marks/ in it, the policies of earlier moments
+//! DIR/cells/ID/marks/        their recorded episodes
 //! DIR/cells/ID/log.txt       warnings of worker processes
 //! DIR/cells/ID/lock          locked while someone works on the cell
 //! DIR/heatmaps/              what `perturb heatmap DIR` writes
@@ -75,6 +76,9 @@ pub struct CellResult {
     pub training: Training,
     /// Success, return and length, by the name of the set that was tested: "D", "R", "E" or one of the plan's own.
     pub results: BTreeMap<String, TestResult>,
+    /// The same of the policies of earlier moments, by the episodes of the budget that mark these.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub marks: BTreeMap<u64, MarkResult>,
     /// How far requested and applied parameters agreed in the tests; `None` in results of earlier programs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub agreement: Option<Agreement>,
@@ -85,6 +89,18 @@ pub struct CellResult {
     pub earlier_commits: Vec<String>,
     /// What gives the same numbers again without the plan.
     pub command: String,
+}
+
+/// Tests of the policy of an earlier moment.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MarkResult {
+    /// How long the training had become: to the end of the iteration in which the mark was passed.
+    pub counters: Counters,
+    /// As those of the cell.
+    pub results: BTreeMap<String, TestResult>,
+    /// How far requested and applied parameters agreed.
+    pub agreement: Agreement,
 }
 
 /// What was trained.
@@ -238,6 +254,11 @@ impl CellFolder {
         self.path.join("training")
     }
 
+    /// Where the recorded episodes of the policy of an earlier moment are.
+    pub fn mark(&self, mark: u64) -> PathBuf {
+        self.path.join("marks").join(mark.to_string())
+    }
+
     /// What a worker process said.
     pub fn log(&self) -> PathBuf {
         self.path.join("log.txt")
@@ -381,6 +402,7 @@ mod tests {
                 settings: "learning_rate = 3e-4".parse().unwrap(),
             },
             results: BTreeMap::from([("D".to_owned(), test)]),
+            marks: BTreeMap::new(),
             agreement: None,
             commit: "x".into(),
             earlier_commits: Vec::new(),

@@ -7,6 +7,7 @@
 //! - [`report`] compares them, in [`table::Table`]s and on a page; [`plot`] draws.
 #![forbid(unsafe_code)]
 
+mod against_training;
 mod cost;
 mod curves;
 pub mod files;
@@ -37,7 +38,9 @@ mod verify;
 
 pub use cost::{Estimate, Measurement, Speed, Taken, estimates, representatives};
 pub use curves::{Curve, EnvironmentCurves, Point, curves_table, read_curves};
-pub use folder::{CellFolder, CellResult, CellState, Failure, FailureMark, Folder, FolderError, Timing, Training};
+pub use folder::{
+    CellFolder, CellResult, CellState, Failure, FailureMark, Folder, FolderError, MarkResult, Timing, Training,
+};
 pub use heatmap::{Axis, Heatmap, HeatmapOptions, HeatmapPoint, MOST_POINTS, heatmap_table};
 pub use heatmaps::{
     HeatmapPlace, HeatmapRecord, NoHeatmap, StoredHeatmap, heatmap_files, heatmap_places, store_heatmap,

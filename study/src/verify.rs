@@ -1,8 +1,11 @@
 //! Whether results follow from the episodes that were recorded with them.
 
+use std::collections::BTreeMap;
+use std::path::Path;
+
 use crate::TestResult;
-use crate::folder::Folder;
-use crate::records::{self, Records, RecordsError};
+use crate::folder::{CellResult, Folder};
+use crate::records::{self, Agreement, Records, RecordsError};
 use crate::selection::Results;
 
 /// Why results are not trusted.
@@ -42,23 +45,38 @@ pub enum VerifyError {
 pub fn verify(results: &Results<'_>, folder: &Folder) -> Result<usize, VerifyError> {
     let mut verified = 0;
     for result in results.done() {
-        let records = match Records::read(&folder.cell(&result.id).path().join(records::FILE)) {
-            Err(RecordsError::Missing { .. }) => continue,
-            records => records?,
-        };
-        for (test, kept) in &result.results {
-            let recorded = records.result(test, None);
-            if recorded != *kept {
-                let (kept, recorded) = (Box::new(kept.clone()), Box::new(recorded));
-                return Err(VerifyError::Test { cell: result.id.clone(), test: test.clone(), kept, recorded });
-            }
-        }
-        if result.agreement.as_ref().is_some_and(|agreement| *agreement != records.agreement()) {
-            return Err(VerifyError::Agreement { cell: result.id.clone() });
-        }
-        verified += 1;
+        let place = folder.cell(&result.id);
+        let of_marks = result.marks.iter().map(|(&mark, of)| (place.mark(mark), &of.results, Some(&of.agreement)));
+        verified += usize::from(follows(result, place.path(), &result.results, result.agreement.as_ref())?);
+        of_marks
+            .map(|(path, results, agreement)| follows(result, &path, results, agreement))
+            .collect::<Result<Vec<_>, _>>()?;
     }
     Ok(verified)
+}
+
+/// Whether there are episodes in `path`, from which these figures of a result then follow.
+fn follows(
+    result: &CellResult,
+    path: &Path,
+    results: &BTreeMap<String, TestResult>,
+    agreement: Option<&Agreement>,
+) -> Result<bool, VerifyError> {
+    let records = match Records::read(&path.join(records::FILE)) {
+        Err(RecordsError::Missing { .. }) => return Ok(false),
+        records => records?,
+    };
+    for (test, kept) in results {
+        let recorded = records.result(test, None);
+        if recorded != *kept {
+            let (kept, recorded) = (Box::new(kept.clone()), Box::new(recorded));
+            return Err(VerifyError::Test { cell: result.id.clone(), test: test.clone(), kept, recorded });
+        }
+    }
+    if agreement.is_some_and(|agreement| *agreement != records.agreement()) {
+        return Err(VerifyError::Agreement { cell: result.id.clone() });
+    }
+    Ok(true)
 }
 
 #[cfg(test)]
@@ -66,7 +84,7 @@ mod tests {
     use rstest::rstest;
 
     use super::*;
-    use crate::folder::{CellResult, CellState};
+    use crate::folder::{CellState, MarkResult};
     use crate::plan::Plan;
     use crate::records::{About, Ending, EpisodeRecord, RecordedTest};
     use crate::{Version, fixture};
@@ -130,6 +148,25 @@ mod tests {
                 assert!(message.contains(expected) && message.contains(&plan.cells[0].id), "{message}");
             }
             (outcome, _) => panic!("{outcome:?}"),
+        }
+    }
+
+    #[test]
+    fn so_is_that_of_an_earlier_moment() {
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(directory.path());
+        let records = records();
+        records.write(&folder.cell(&plan.cells[0].id).mark(5).join(records::FILE)).unwrap();
+        for (wrong, refused) in [(0.0, false), (1.0, true)] {
+            let mut results = fixture::results(&plan, |_| Some(([0.0; 3], 0.0)));
+            let CellState::Done(result) = &mut results.states[0] else { unreachable!("it is done") };
+            let mut test = records.result("D", None);
+            test.mean_length += wrong;
+            let of_mark = [("D".to_owned(), test)].into();
+            let of_mark = MarkResult { counters: Default::default(), results: of_mark, agreement: records.agreement() };
+            result.marks.insert(5, of_mark);
+            assert_eq!(verify(&results, &folder).is_err(), refused);
         }
     }
 

@@ -7,9 +7,9 @@ use std::process::ExitCode;
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::Servers;
 use perturb_learner::evaluation::{Audit, audit};
-use perturb_study::Folder;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::{FILE, Records};
+use perturb_study::{Folder, files};
 
 use super::args::AuditArgs;
 use super::display::Display;
@@ -21,6 +21,7 @@ use super::{plan_in, servers};
 const SHOWN: usize = 3;
 
 /// Recorded episodes and the policy that they are of.
+#[derive(Clone)]
 struct Tested {
     name: String,
     records: PathBuf,
@@ -78,8 +79,18 @@ fn tested(args: &AuditArgs) -> Result<Vec<Tested>> {
         let name = path.display().to_string();
         return Ok(vec![Tested { name, records: file_in(path), checkpoint: checkpoint.clone() }]);
     }
+    // Of the cell in `path`: its policy, and those of earlier moments.
+    let cells = |path: &Path| -> Result<Vec<Tested>> {
+        let of_mark = |records: PathBuf| {
+            let mark = records.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            let name = format!("{} after {mark} episodes", cell(path).name);
+            Tested { name, records: records.join(FILE), checkpoint: path.join("training/marks").join(mark) }
+        };
+        let marks = files::list(&path.join("marks"))?.into_iter().map(of_mark);
+        Ok(marks.chain([cell(path)]).collect())
+    };
     if path.join(FILE).is_file() {
-        return Ok(vec![cell(path)]);
+        return cells(path);
     }
     if !path.exists() {
         return Err(CommandError::Usage(format!("there is no {}", path.display())));
@@ -92,7 +103,7 @@ fn tested(args: &AuditArgs) -> Result<Vec<Tested>> {
     let plan = plan_in(&folder)?;
     let done = plan.cells.iter().map(|found| folder.cell(&found.id)).filter(|place| place.is_settled(false));
     let paths = done.map(|place| place.path().to_owned()).filter(|path| path.join(FILE).is_file());
-    let tested: Vec<Tested> = paths.map(|path| cell(&path)).collect();
+    let tested = paths.map(|path| cells(&path)).collect::<Result<Vec<_>>>()?.concat();
     if tested.is_empty() {
         return Err(CommandError::Failed(format!("no cell of {} has recorded episodes", path.display())));
     }

@@ -115,7 +115,8 @@ fn group_of(
         .clone()
         .map(|seed| RunDirectory::choose(&out.path().join(seed.to_string()), false))
         .collect::<std::result::Result<_, _>>()?;
-    let entry = |(directory, seed)| Ok(Entry { directory, start: Start::Fresh(Box::new(config(settings, seed)?)) });
+    let entry =
+        |(directory, seed)| Ok(Entry { directory, start: Start::Fresh(Box::new(config(settings, seed)?)), marks: &[] });
     let entries: Vec<Entry<'_>> = directories.iter().zip(seeds.clone()).map(entry).collect::<Result<_>>()?;
     let mut steps = vec![0; seeds.len()];
     let (mut before, mut after) = (None, None);

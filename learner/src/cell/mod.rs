@@ -139,8 +139,12 @@ fn train(
     if places.is_empty() {
         return Ok(());
     }
-    let trainings = places.iter().filter_map(|&place| all[place].training.as_ref());
-    let entries = trainings.map(|(directory, start)| Entry { directory, start: start.clone() }).collect();
+    let entry = |&place: &usize| {
+        let Work { order, training, .. } = &all[place];
+        let (directory, start) = training.as_ref()?;
+        Some(Entry { directory, start: start.clone(), marks: &order.cell.tests.marks })
+    };
+    let entries = places.iter().filter_map(entry).collect();
     let cells: Vec<&Cell> = places.iter().map(|&place| all[place].order.cell).collect();
     let mut outcomes: Vec<(usize, Result<Outcome, TrainError>)> = Vec::new();
     let mut report = |index: usize, &Progress { episodes, timesteps, saved_timesteps: saved, .. }: &Progress| {
@@ -186,8 +190,12 @@ impl<'a> Work<'a> {
     /// Decides what becomes of a training that was broken off: one that had finished is taken as it is, another goes on
     /// from its last checkpoint, to the same bytes as without the break, and one without a usable checkpoint begins again.
     fn look_back(&mut self, tell: &mut dyn FnMut(&Cell, CellEvent)) -> Result<(), RunDirectoryError> {
-        let (config, path) = (&self.order.cell.config, self.order.folder.training());
-        let earlier = earlier(&path)?.filter(|(_, checkpoint, _)| checkpoint.state.config == *config);
+        let Cell { config, tests, .. } = self.order.cell;
+        let path = self.order.folder.training();
+        let earlier = earlier(&path)?.filter(|(directory, checkpoint, _)| {
+            let past = tests.marks.iter().copied().filter(|mark| *mark <= checkpoint.state.counters.episodes);
+            checkpoint.state.config == *config && directory.has_kept(past)
+        });
         let Counters { episodes, timesteps, .. } =
             earlier.as_ref().map_or_else(Counters::default, |(_, checkpoint, _)| checkpoint.state.counters);
         tell(self.order.cell, CellEvent::Training { episodes, timesteps, saved: timesteps });

@@ -1,17 +1,19 @@
 //! The result of a cell: tests of its policy, and all that says what they are of.
 
+use std::collections::BTreeMap;
 use std::fmt::Write;
 
 use super::CellError;
 use crate::checkpoint::Checkpoint;
 use crate::client::Servers;
 use crate::evaluation::{TestError, TestOptions, Tester};
+use crate::training::{TrainError, mark_in};
 use perturb_protocol::Distribution;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::records::{self, RecordedTest};
+use perturb_study::records::{self, RecordedTest, Records};
 use perturb_study::scheduler::CellEvent;
 use perturb_study::sets::{Parameters, TestSet};
-use perturb_study::{Cell, CellFolder, CellResult, Tests, Training};
+use perturb_study::{Cell, CellFolder, CellResult, MarkResult, TestResult, Tests, Training};
 
 /// Stands for the program that began a training whose checkpoint does not say.
 const UNKNOWN: &str = "unknown";
@@ -25,25 +27,34 @@ pub(super) fn tested(
     stop: &StopFlag,
     tell: &mut dyn FnMut(CellEvent),
 ) -> Result<Option<CellResult>, CellError> {
-    let Tests { episodes, ref sets, ref success, .. } = cell.tests;
-    let mut testing = |set: &TestSet, episodes| tell(CellEvent::Testing { set: set.name.clone(), episodes });
-    let mut test = |sets: &[TestSet], episodes, selects| {
+    let Tests { episodes, ref sets, ref success, ref marks, .. } = cell.tests;
+    let mut test = |checkpoint: &Checkpoint, sets: &[TestSet], episodes, selects, when: &str| {
         let options = TestOptions { episodes, seed: cell.config.common.seed, selects, success: success.clone() };
-        Tester::new(servers, &checkpoint, options)?.test(sets, stop, &mut testing)
-    };
-    let tested = test(sets, episodes, false).and_then(|mut records| {
-        if let Some((set, episodes)) = cell.selection_test() {
-            records.append(test(&[set], episodes, true)?);
+        let mut testing = |set: &TestSet, episodes| {
+            let set = format!("{}{when}", set.name);
+            tell(CellEvent::Testing { set, episodes });
+        };
+        match Tester::new(servers, checkpoint, options)?.test(sets, stop, &mut testing) {
+            Err(TestError::Stopped { .. }) => Ok(None),
+            records => records.map(Some),
         }
-        Ok(records)
-    });
-    let records = match tested {
-        Err(TestError::Stopped { .. }) => return Ok(None),
-        records => records?,
     };
+    let mut of_marks = BTreeMap::new();
+    for &mark in marks {
+        let kept = Checkpoint::load(&mark_in(&folder.training(), mark)).map_err(TrainError::from)?;
+        let when = format!(" after {mark} episodes");
+        let Some(records) = test(&kept, sets, episodes, false, &when)? else { return Ok(None) };
+        records.write(&folder.mark(mark).join(records::FILE))?;
+        let (results, agreement) = (results(&records), records.agreement());
+        of_marks.insert(mark, MarkResult { counters: kept.state.counters, results, agreement });
+    }
+    let Some(mut records) = test(&checkpoint, sets, episodes, false, "")? else { return Ok(None) };
+    if let Some((set, episodes)) = cell.selection_test() {
+        let Some(selecting) = test(&checkpoint, &[set], episodes, true, "")? else { return Ok(None) };
+        records.append(selecting);
+    }
     records.write(&folder.path().join(records::FILE))?;
-    let result = |test: &RecordedTest| (test.set.name.clone(), records.result(&test.set.name, None));
-    let results = records.about.tests.iter().map(result).collect();
+    let results = results(&records);
     let state = checkpoint.state;
     let common = &state.config.common;
     Ok(Some(CellResult {
@@ -63,11 +74,18 @@ pub(super) fn tested(
             settings: state.config.table(),
         },
         results,
+        marks: of_marks,
         agreement: Some(records.agreement()),
         commit: perturb_study::VERSION.into(),
         earlier_commits: earlier_commits(state.commits),
         command: command(cell),
     }))
+}
+
+/// The figures of each test.
+fn results(records: &Records) -> BTreeMap<String, TestResult> {
+    let result = |test: &RecordedTest| (test.set.name.clone(), records.result(&test.set.name, None));
+    records.about.tests.iter().map(result).collect()
 }
 
 /// Of the programs that trained, those that are not this one.

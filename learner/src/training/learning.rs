@@ -40,6 +40,8 @@ pub(super) struct Learning<'a> {
     last_update: Option<Duration>,
     /// What the last checkpoint on disk counts.
     saved: Option<Counters>,
+    /// Episodes after which the policy of the moment is kept, without those that are past.
+    marks: VecDeque<u64>,
 }
 
 /// What is noted of the episodes of a rollout.
@@ -56,6 +58,8 @@ pub(super) struct Turn {
     pub(super) progress: Progress,
     /// A checkpoint is due.
     pub(super) save: bool,
+    /// The marks that were passed.
+    pub(super) marks: Vec<u64>,
     /// The budget is used up, or a signal came.
     pub(super) ends: bool,
     signal: Option<i32>,
@@ -191,7 +195,14 @@ impl<'a> Learning<'a> {
             shares: TimeShares::default(),
             last_update: None,
             saved: None,
+            marks: VecDeque::new(),
         })
+    }
+
+    /// Keeps the policies of those of `marks` that are to come; the others were kept when they came.
+    pub(super) fn keep_at(&mut self, marks: &[u64]) {
+        let episodes = self.checkpoint.state.counters.episodes;
+        self.marks = marks.iter().copied().filter(|mark| *mark > episodes).collect();
     }
 
     pub(super) fn spec(&self) -> &PolicySpec {
@@ -292,7 +303,26 @@ impl<'a> Learning<'a> {
         }
         let due = |saved: Counters| progress.episodes / checkpoint_interval > saved.episodes / checkpoint_interval;
         let save = finished || self.saved.is_none_or(due) || signal.is_some();
-        Ok(Turn { progress, save, ends: finished || signal.is_some(), signal, logged })
+        let passed = self.marks.partition_point(|mark| *mark <= progress.episodes);
+        let marks = self.marks.drain(..passed).collect();
+        Ok(Turn { progress, save, marks, ends: finished || signal.is_some(), signal, logged })
+    }
+
+    /// Puts the policy of the moment into the checkpoint.
+    fn take_policy(&mut self, normalisers: Normalisers) {
+        let Self { policy, checkpoint, .. } = self;
+        policy.copy_weights(&mut checkpoint.weights);
+        checkpoint.state.observation_normaliser = normalisers.observations;
+        checkpoint.state.reward_normaliser = normalisers.rewards;
+    }
+
+    /// Keeps the policy of the moment for the marks that were passed. To be called before the next checkpoint is saved:
+    /// what goes on from that does not come by these marks again.
+    pub(super) fn keep(&mut self, turn: &Turn, normalisers: &Normalisers) -> Result<()> {
+        if !turn.marks.is_empty() {
+            self.take_policy(normalisers.clone());
+        }
+        turn.marks.iter().try_for_each(|&mark| Ok(self.checkpoint.save(&self.directory.mark(mark), None)?))
     }
 
     /// Replaces the checkpoint on disk; environments and player are those after the last iteration.
@@ -302,10 +332,7 @@ impl<'a> Learning<'a> {
         player: PlayerState,
         normalisers: Normalisers,
     ) -> Result<()> {
-        let Self { policy, checkpoint, .. } = self;
-        policy.copy_weights(&mut checkpoint.weights);
-        checkpoint.state.observation_normaliser = normalisers.observations;
-        checkpoint.state.reward_normaliser = normalisers.rewards;
+        self.take_policy(normalisers);
         // What the checkpoint counts on is on the disk before it.
         let history = History {
             logs: self.logs.sync()?,

@@ -197,6 +197,7 @@ impl<'a> Seat<'a> {
         let Self { learning, collector, slots, .. } = self;
         let turn = learning.turn(progress, stop)?;
         let player = collector.player();
+        learning.keep(&turn, player.normalisers())?;
         if let (true, Some(state)) = (turn.save, player.state()) {
             learning.save(session.snapshot(slots.clone())?, state, player.normalisers().clone())?;
         }

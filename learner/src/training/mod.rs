@@ -24,7 +24,7 @@ use perturb_policy::Player;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::settings::TrainConfig;
 use remote::Remote;
-pub use run_directory::{RunDirectory, RunDirectoryError};
+pub use run_directory::{RunDirectory, RunDirectoryError, mark_in};
 
 type Result<T> = std::result::Result<T, TrainError>;
 
@@ -46,6 +46,8 @@ pub struct Entry<'a> {
     pub directory: &'a RunDirectory,
     /// From where on.
     pub start: Start,
+    /// Episodes of the budget, ascending, after which the policy of the moment is kept as well: [`RunDirectory::mark`].
+    pub marks: &'a [u64],
 }
 
 /// Where a training begins.
@@ -80,7 +82,13 @@ pub fn train(
     stop: &StopFlag,
     report: impl FnMut(&Progress),
 ) -> Result<Outcome> {
-    alone(servers, Entry { directory, start: Start::Fresh(Box::new(config.clone())) }, threads, stop, report)
+    alone(
+        servers,
+        Entry { directory, start: Start::Fresh(Box::new(config.clone())), marks: &[] },
+        threads,
+        stop,
+        report,
+    )
 }
 
 /// Goes on with the run in `directory` from its last `checkpoint` to the same bytes as without the break, times aside;
@@ -97,7 +105,7 @@ pub fn resume(
     report: impl FnMut(&Progress),
 ) -> Result<Outcome> {
     let start = Start::Checkpoint(Box::new(checkpoint));
-    alone(servers, Entry { directory, start }, threads, stop, report)
+    alone(servers, Entry { directory, start, marks: &[] }, threads, stop, report)
 }
 
 fn alone(
@@ -165,15 +173,18 @@ fn sit_down<'a>(
     threads: usize,
 ) -> Result<(Learning<'a>, Player)> {
     let environment = session.environment().clone();
-    match entry.start {
-        Start::Fresh(config) => Learning::begin(&config, entry.directory, &environment, observations, threads),
+    let Entry { directory, start, marks } = entry;
+    let (mut learning, player) = match start {
+        Start::Fresh(config) => Learning::begin(&config, directory, &environment, observations, threads)?,
         Start::Checkpoint(saved) => {
             let (checkpoint, state) = *saved;
             let restore = || {
                 let restored = session.restore(slots, &state.collector.snapshots);
                 restored.map(drop).map_err(|error| learning::not_restored("environments", error.into()))
             };
-            Learning::resume((checkpoint, &state), entry.directory, &environment, threads, restore)
+            Learning::resume((checkpoint, &state), directory, &environment, threads, restore)?
         }
-    }
+    };
+    learning.keep_at(marks);
+    Ok((learning, player))
 }

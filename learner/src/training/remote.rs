@@ -56,10 +56,13 @@ impl<'a> Remote<'a> {
         let progress = keep_alive(servers, learning.last_update(), || learning.learn(Duration::ZERO, waited))?;
         report(&progress);
         let turn = learning.turn(progress, stop)?;
-        if turn.save
+        if (turn.save || !turn.marks.is_empty())
             && let Some((player, normalisers)) = collector.state(session)?
         {
-            learning.save(session.snapshot(0..session.num_envs())?, player, normalisers)?;
+            learning.keep(&turn, &normalisers)?;
+            if turn.save {
+                learning.save(session.snapshot(0..session.num_envs())?, player, normalisers)?;
+            }
         }
         if turn.ends { learning.end(&turn).map(Some) } else { Ok(None) }
     }

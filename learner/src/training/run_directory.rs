@@ -187,12 +187,29 @@ impl RunDirectory {
     }
 }
 
+impl RunDirectory {
+    /// Where the policy is that a run kept when its budget had passed so many episodes: a checkpoint to test.
+    pub fn mark(&self, mark: u64) -> PathBuf {
+        mark_in(&self.path, mark)
+    }
+
+    /// Whether the policies of all `marks` are there.
+    pub fn has_kept(&self, mut marks: impl Iterator<Item = u64>) -> bool {
+        marks.all(|mark| self.mark(mark).join("checkpoint.json").is_file())
+    }
+}
+
+/// [`RunDirectory::mark`] of the run in `path`.
+pub fn mark_in(path: &Path, mark: u64) -> PathBuf {
+    path.join("marks").join(mark.to_string())
+}
+
 /// What a run has written in `path`; other files are left alone.
 fn files_of_a_run(path: &Path) -> files::Result<Vec<PathBuf>> {
     let mut paths = files::list(path)?;
     paths.retain(|path| {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
-        let known = ["config.toml", "progress.csv", "monitor.csv", "checkpoint"].contains(&name.as_ref());
+        let known = ["config.toml", "progress.csv", "monitor.csv", "checkpoint", "marks"].contains(&name.as_ref());
         known || name.starts_with("events.out.tfevents.")
     });
     Ok(paths)

@@ -67,7 +67,8 @@ fn together(servers: &Servers, base: &Path, environment: &str, numbers: &[usize]
             }
         })
         .collect();
-    let entries = directories.iter().map(|(directory, start)| Entry { directory, start: start.clone() }).collect();
+    let entries =
+        directories.iter().map(|(directory, start)| Entry { directory, start: start.clone(), marks: &[] }).collect();
     let (stop, mut ended) = (StopFlag::default(), vec![false; numbers.len()]);
     train_together(
         servers,
@@ -156,7 +157,8 @@ fn one_that_fails_does_not_stop_the_others(#[values("CartPole", "Pendulum")] env
     let directories: Vec<RunDirectory> =
         ["bad", "good"].map(|name| RunDirectory::choose(&base.path().join(name), false).expect("a directory")).into();
     let starts = [config(environment, bad), good].map(|config| Start::Fresh(Box::new(config)));
-    let entries = directories.iter().zip(starts).map(|(directory, start)| Entry { directory, start }).collect();
+    let entries =
+        directories.iter().zip(starts).map(|(directory, start)| Entry { directory, start, marks: &[] }).collect();
     let mut ends = vec![String::new(); 2];
     let mut ended = |index: usize, outcome: Result<_, _>| {
         ends[index] =

@@ -102,10 +102,15 @@ impl Expansion<'_> {
         let mut sets = sets.collect::<Result<Vec<_>, _>>()?;
         sets.sort_by_key(|set| set.plain().map_or(Version::ALL.len(), |version| version as usize));
         let success = file.success_in(&config.common.environment, config.common.preset);
-        let tests = Tests { episodes: file.test_episodes, sets, selection: None, success };
+        let budget = config.common.episodes;
+        let last = file.evaluate_at.last().copied().unwrap_or_default();
+        let expected = format!("at most the {budget} episodes of a training");
+        require(last <= budget, format!("{name}: evaluate_at"), last, expected)?;
+        let marks = file.evaluate_at.iter().copied().filter(|mark| *mark < budget).collect();
+        let tests = Tests { episodes: file.test_episodes, sets, selection: None, marks, success };
         let mut tuned_as = None;
         if let Some(episodes) = file.selection_episodes() {
-            let tests = Tests { selection: Some(episodes), ..tests.clone() };
+            let tests = Tests { selection: Some(episodes), marks: Vec::new(), ..tests.clone() };
             tuned_as = Some(fingerprint(&config, &tests));
             self.add_cells(name, &config, trained_on, &tests, (file.seed, file.tuning_runs()), None)?;
         }
@@ -196,6 +201,7 @@ fn fingerprint(config: &TrainConfig, tests: &Tests) -> String {
     let sets: Vec<String> = tests.sets.iter().map(shown).collect();
     let success = tests.success.as_ref().map(|rule| format!(" {rule}")).unwrap_or_default();
     let selection = tests.selection.map(|episodes| format!(" {SELECTION_TEST} {episodes}")).unwrap_or_default();
-    let text = format!("{table}\n{} [{}]{success}{selection}", tests.episodes, sets.join(", "));
+    let marks = if tests.marks.is_empty() { String::new() } else { format!(" at {:?}", tests.marks) };
+    let text = format!("{table}\n{} [{}]{success}{selection}{marks}", tests.episodes, sets.join(", "));
     format!("{:08x}", crc32c::crc32c(text.as_bytes()))
 }

@@ -37,6 +37,8 @@ pub(super) struct File {
     #[serde(default = "all_versions")]
     pub(super) test_versions: Vec<String>,
     #[serde(default)]
+    pub(super) evaluate_at: Vec<u64>,
+    #[serde(default)]
     pub(super) sets: BTreeMap<String, Table>,
     #[serde(default)]
     success: Success,
@@ -133,6 +135,9 @@ impl File {
         let most = i64::MAX as u64 - 2 * u64::from(u32::MAX);
         require(self.runs > 0, "runs", self.runs, "at least 1")?;
         self.check_selection()?;
+        let ascending = self.evaluate_at.first() != Some(&0) && self.evaluate_at.is_sorted_by(|a, b| a < b);
+        let expected = "numbers of episodes, at least 1, in ascending order";
+        require(ascending, "evaluate_at", format!("{:?}", self.evaluate_at), expected)?;
         require(self.seed <= most, "seed", self.seed, format!("at most {most}"))?;
         require(self.test_episodes > 0, "test_episodes", self.test_episodes, "at least 1")?;
         require(!self.algorithm.is_empty(), "algorithm", "empty", "one or more tables [[algorithm]]")?;

@@ -110,6 +110,9 @@ pub struct Tests {
     /// Episodes of the test that selects and nothing else, on what was trained on; `None` if there is none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub selection: Option<u64>,
+    /// Episodes of the training's budget, ascending and fewer than it has: the policies of these moments are tested, too.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub marks: Vec<u64>,
     /// What decides about success; `None` for the environment's own rule.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub success: Option<Rule>,

@@ -57,7 +57,13 @@ fn a_cell_has_all_settings_and_the_seed_of_its_run() {
         assert_eq!((&cell.config, cell.run), (&expected(run, version), run));
         assert_eq!(
             cell.tests,
-            Tests { episodes: 30, sets: Version::ALL.map(TestSet::from).to_vec(), selection: None, success: None }
+            Tests {
+                episodes: 30,
+                sets: Version::ALL.map(TestSet::from).to_vec(),
+                selection: None,
+                marks: Vec::new(),
+                success: None
+            }
         );
     }
     assert_eq!(plan.cells[0].configuration, plan.cells[3].configuration);
@@ -136,6 +142,13 @@ fn an_invalid_plan_is_refused_with_its_key() {
         ("seed = 7", "seed = -7", "seed"),
         ("seed = 7", "seed = 9223372036854775807", "seed is 9223372036854775807, but must be at most"),
         ("test_episodes = 30", "test_episodes = 0", "test_episodes is 0"),
+        ("runs = 2", "runs = 2\nevaluate_at = [9, 5]", "evaluate_at is [9, 5], but must be numbers of episodes"),
+        ("runs = 2", "runs = 2\nevaluate_at = [0]", "evaluate_at is [0], but must be"),
+        (
+            "runs = 2",
+            "runs = 2\nevaluate_at = [9, 51]",
+            "(a2c): evaluate_at is 51, but must be at most the 50 episodes",
+        ),
         ("['CartPole', 'Pendulum']", "[]", "environments is empty"),
         ("['CartPole', 'Pendulum']", "['CartPole', 'CartPole']", "a list without repetitions"),
         ("['CartPole', 'Pendulum']", "['../CartPole']", "environments is `../CartPole`, but must be names of letters"),
@@ -153,6 +166,22 @@ fn an_invalid_plan_is_refused_with_its_key() {
         let message = refusal(from, to);
         assert!(message.contains("small.toml") && message.contains(part), "{to}: {message}");
     }
+}
+
+#[test]
+fn marks_are_those_before_the_end_and_name_another_cell() {
+    let with =
+        |marks: &str| parse(&SMALL.replacen("runs = 2", &format!("runs = 2\nevaluate_at = {marks}"), 1)).unwrap();
+    let plan = with("[5, 20, 50]");
+    assert!(plan.cells.iter().all(|cell| cell.tests.marks == [5, 20]), "the last is the test at the end");
+    assert_eq!(with("[50]").cells, parse(SMALL).unwrap().cells);
+    assert!(
+        plan.cells.iter().all(|cell| with("[5]").find(&cell.id).is_none() && with("[50]").find(&cell.id).is_none())
+    );
+    let clean = SMALL.replacen("runs = 2", "runs = 2\nselection = 'clean'\nevaluate_at = [5]", 1);
+    let clean = parse(&clean).unwrap();
+    assert!(clean.cells.iter().all(|cell| cell.tests.marks.is_empty()));
+    assert!(clean.candidates.iter().all(|cell| cell.tests.marks == [5]));
 }
 
 #[test]

@@ -44,14 +44,20 @@ impl std::fmt::Display for Quantity {
     }
 }
 
-/// The picture of `curves`.
+/// The picture of training curves, a panel for each version that is trained on.
 pub fn draw_curves(curves: &EnvironmentCurves, quantity: Quantity) -> impl Plot + '_ {
-    let methods = distinct(curves.curves.iter().map(|curve| curve.method.clone()));
-    CurvesPlot { curves, quantity, methods }
+    CurvesPlot::new(curves, None, quantity)
+}
+
+/// The picture of tests of what was trained on a version, a panel for each version that is tested on.
+pub(crate) fn draw_tests(curves: &EnvironmentCurves, trained_on: Version, quantity: Quantity) -> impl Plot + '_ {
+    CurvesPlot::new(curves, Some(trained_on), quantity)
 }
 
 struct CurvesPlot<'a> {
     curves: &'a EnvironmentCurves,
+    /// Of tests, what was trained on; `None` of training curves.
+    trained_on: Option<Version>,
     quantity: Quantity,
     methods: Vec<Method>,
 }
@@ -70,12 +76,24 @@ impl Plot for CurvesPlot<'_> {
             Quantity::Return => "mean return",
             Quantity::Success => "success rate, %",
         };
-        let text = format!("{}: {what} while training, mean and deviation over runs", self.curves.environment);
+        let environment = &self.curves.environment;
+        let of = match self.trained_on {
+            None => format!("{environment}: {what} while training"),
+            Some(version) => format!("{environment}, trained on {version}: {what} in tests"),
+        };
+        let text = format!("{of}, mean and deviation over runs");
         title.draw_text(&text, &font(15, scale), (12 * scale as i32, 10 * scale as i32)).map_err(drawing)?;
         for (version, panel) in Version::ALL.into_iter().zip(panels.split_evenly((1, 3))) {
             self.panel(&panel, version, scale)?;
         }
         self.legend(&legend, scale)
+    }
+}
+
+impl<'a> CurvesPlot<'a> {
+    fn new(curves: &'a EnvironmentCurves, trained_on: Option<Version>, quantity: Quantity) -> Self {
+        let methods = distinct(curves.curves.iter().map(|curve| curve.method.clone()));
+        Self { curves, trained_on, quantity, methods }
     }
 }
 
@@ -89,7 +107,8 @@ impl CurvesPlot<'_> {
         let (episodes, range) = self.ranges();
         let x = AxisLook { name: "episodes".into(), range: 0.0..episodes, ticks: 4 };
         let y = AxisLook { name: String::new(), range, ticks: 6 };
-        let mut chart = chart(area, &format!("trained on {version}"), x, y, scale)?;
+        let panel = if self.trained_on.is_some() { "tested on" } else { "trained on" };
+        let mut chart = chart(area, &format!("{panel} {version}"), x, y, scale)?;
         for Curve { method, points, .. } in self.curves.curves.iter().filter(|curve| curve.version == version) {
             let index = self.methods.iter().position(|known| known == method).unwrap_or_default();
             let style = LineStyle::nth(index);

@@ -18,6 +18,7 @@ use plotters::style::{FontStyle, register_font};
 
 use crate::files::{self, FileError, io, write_atomically};
 use crate::folder::FolderError;
+pub(crate) use curves::draw_tests;
 pub use curves::{Quantity, draw_curves};
 
 /// DejaVu Sans, cut down to the letters that pictures have; its licence is beside it.

@@ -11,7 +11,8 @@ impl Report<'_> {
         let sets = (!self.set_tests.is_empty()).then(|| self.sets_file());
         let tuned = (!self.tuned.is_empty()).then(|| self.tuned_file());
         let files = [self.metrics_file(), self.iqm_file(), self.scenarios_file(), self.selected_file()];
-        files.into_iter().chain(sets).chain(tuned).collect()
+        let marks = (!self.marks.is_empty()).then(|| self.marks_file());
+        files.into_iter().chain(sets).chain(tuned).chain(marks).collect()
     }
 
     fn metrics_file(&self) -> Table {
@@ -59,6 +60,18 @@ impl Report<'_> {
             .text("environment", |test| test.environment)
             .method(|test| test.method)
             .text("train", |test| test.trained_on)
+            .text("test", |test| test.tested_on)
+            .summary(|test| test.success)
+            .number("mean_return", |test| or_empty(test.mean_return.map(|summary| summary.mean)))
+            .build()
+    }
+
+    fn marks_file(&self) -> Table {
+        Table::of("marks.csv", &self.marks)
+            .text("environment", |test| test.environment)
+            .method(|test| test.method)
+            .text("train", |test| test.trained_on)
+            .number("episodes", |test| test.episodes)
             .text("test", |test| test.tested_on)
             .summary(|test| test.success)
             .number("mean_return", |test| or_empty(test.mean_return.map(|summary| summary.mean)))

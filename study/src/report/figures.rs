@@ -1,10 +1,11 @@
 //! The pictures of a report, and what is said of those that are missing.
 
+use crate::against_training::{against_training, test_curves};
 use crate::curves::read_curves;
 use crate::folder::Folder;
 use crate::heatmap::HeatmapOptions;
 use crate::heatmaps::{HeatmapRecord, NoHeatmap, heatmap_places};
-use crate::plot::{PlotError, Quantity, draw_curves, svg};
+use crate::plot::{PlotError, Quantity, draw_curves, draw_tests, svg};
 use crate::scheduler::count;
 use crate::selection::MethodResults;
 
@@ -13,6 +14,8 @@ use crate::selection::MethodResults;
 pub struct Figures {
     /// One for each environment and quantity.
     pub curves: Vec<Figure>,
+    /// Of tests of the policies of earlier moments: one for each environment, version that was trained on, and quantity.
+    pub marks: Vec<Figure>,
     /// What is said of curves that are missing.
     pub no_curves: Vec<String>,
     /// Heatmaps in rows, one of a method's trainings.
@@ -52,9 +55,27 @@ impl Figures {
     /// [`PlotError`].
     pub fn read(selections: &[MethodResults<'_>], folder: &Folder) -> Result<Self, PlotError> {
         let mut figures = Self::default();
+        figures.add_marks(selections)?;
         figures.add_curves(selections, folder)?;
         figures.add_heatmaps(selections, folder)?;
         Ok(figures)
+    }
+
+    fn add_marks(&mut self, selections: &[MethodResults<'_>]) -> Result<(), PlotError> {
+        for (trained_on, curves) in test_curves(&against_training(selections)) {
+            let environment = &curves.environment;
+            for quantity in Quantity::ALL {
+                let name =
+                    format!("{environment}, trained on {trained_on}: {quantity} in tests after so many episodes");
+                self.marks.push(Figure {
+                    environment: environment.clone(),
+                    caption: format!("{name}. Lines are means over runs, bands their standard deviation."),
+                    name,
+                    picture: FigureData::Svg(svg(&draw_tests(&curves, trained_on, quantity))?),
+                });
+            }
+        }
+        Ok(())
     }
 
     fn add_curves(&mut self, selections: &[MethodResults<'_>], folder: &Folder) -> Result<(), PlotError> {

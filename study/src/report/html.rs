@@ -38,6 +38,8 @@ pub fn html(report: &Report<'_>, figures: &Figures) -> String {
     let metrics = report.metrics_tables().into_iter().map(plain).collect();
     let scenarios = report.scenario_tables().iter().map(|table| table_subsection(table, true)).collect();
     let sets: Vec<Subsection> = report.set_table().into_iter().map(plain).collect();
+    let marks: Vec<Subsection> =
+        report.marks_table().into_iter().map(plain).chain(by_environment(&figures.marks)).collect();
     let cells = report
         .tuned_table()
         .into_iter()
@@ -50,12 +52,15 @@ pub fn html(report: &Report<'_>, figures: &Figures) -> String {
         section("iqm", "Interquartile means", html! {}, vec![plain(report.iqm_table())]),
         section("scenarios", "The nine scenarios", html! { p { (SCENARIOS) } }, scenarios),
         section("sets", "Own sets of parameters", html! {}, sets),
-        section("curves", "Training curves", list(&figures.no_curves), curves(figures)),
+        section("marks", "Generalisation against training", html! {}, marks),
+        section("curves", "Training curves", list(&figures.no_curves), by_environment(&figures.curves)),
         section("heatmaps", "Heatmaps", html! { p { (HEATMAPS) } (list(&figures.no_heatmaps)) }, heatmaps(figures)),
         section("cells", "Cells", html! {}, cells),
     ];
-    let shown: Vec<&Section> =
-        sections.iter().filter(|section| section.id != "sets" || !section.subsections.is_empty()).collect();
+    let shown: Vec<&Section> = sections
+        .iter()
+        .filter(|section| !["sets", "marks"].contains(&section.id) || !section.subsections.is_empty())
+        .collect();
     page(report, &shown).into_string()
 }
 
@@ -189,13 +194,10 @@ fn classes(names: &[(&str, bool)]) -> Option<String> {
     (!applying.is_empty()).then(|| applying.join(" "))
 }
 
-fn curves(figures: &Figures) -> Vec<Subsection> {
-    let of_environments = figures.curves.chunk_by(|a, b| a.environment == b.environment);
+fn by_environment(figures: &[Figure]) -> Vec<Subsection> {
+    let of_environments = figures.chunk_by(|a, b| a.environment == b.environment);
     of_environments
-        .map(|of| Subsection {
-            title: of[0].environment.clone(),
-            content: html! { @for curve in of { (figure(curve)) } },
-        })
+        .map(|of| Subsection { title: of[0].environment.clone(), content: html! { @for one in of { (figure(one)) } } })
         .collect()
 }
 

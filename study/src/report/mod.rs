@@ -11,6 +11,7 @@ mod tables;
 
 use std::collections::BTreeSet;
 
+use super::against_training::{MarkTest, against_training};
 use super::folder::Failure;
 use super::plan::{Cell, Plan, Selection};
 use super::selection::{MethodResults, Results, Selected};
@@ -36,6 +37,8 @@ pub struct Report<'a> {
     metrics: Vec<MethodMetrics<'a>>,
     averages: Vec<MethodMetrics<'a>>,
     set_tests: Vec<SetTest<'a>>,
+    /// Of policies of earlier moments, and at the end; nothing without `evaluate_at`.
+    marks: Vec<MarkTest<'a>>,
     /// By the clean rule, what was selected; otherwise nothing.
     tuned: Vec<Tuned<'a>>,
     failures: Vec<&'a Failure>,
@@ -52,6 +55,7 @@ impl<'a> Report<'a> {
             metrics: numbers::metrics(selections),
             averages: numbers::averages(results.plan, selections),
             set_tests: numbers::set_tests(results.plan, selections),
+            marks: against_training(selections),
             tuned,
             failures: results.failures().collect(),
         }
@@ -74,7 +78,7 @@ impl<'a> Report<'a> {
 
     fn number_tables(&self) -> impl Iterator<Item = Table> {
         let papers = self.metrics_tables().into_iter().chain([self.iqm_table()]).chain(self.scenario_tables());
-        papers.chain(self.set_table())
+        papers.chain(self.set_table()).chain(self.marks_table())
     }
 
     /// All cells that numbers come from.

@@ -1,7 +1,8 @@
 //! The numbers of a report as tables for reading.
 
 use super::numbers::MethodMetrics;
-use super::{MISSING, Report};
+use super::{MISSING, MarkTest, Report};
+use crate::plan::distinct;
 use crate::statistics::Summary;
 use crate::table::{Column, Entry, Table};
 use crate::{Metric, Scenario, Version};
@@ -78,6 +79,27 @@ impl Report<'_> {
             .number("mean return", |test| or(MISSING, test.mean_return))
             .number("runs", |test| self.runs(test.success.map_or(0, |summary| summary.runs)))
             .build();
+        (!table.rows.is_empty()).then_some(table)
+    }
+
+    /// `None` if only the last policies were tested.
+    pub(super) fn marks_table(&self) -> Option<Table> {
+        let title = "Generalisation against training: success after so many episodes (marks.csv has the returns)";
+        let of_moment = |a: &MarkTest<'_>, b: &MarkTest<'_>| {
+            (a.environment, a.method, a.trained_on, a.episodes) == (b.environment, b.method, b.trained_on, b.episodes)
+        };
+        let moments: Vec<&[MarkTest<'_>]> = self.marks.chunk_by(of_moment).collect();
+        let mut table = Table::of(title, &moments)
+            .text("environment", |tests| tests[0].environment)
+            .text("method", |tests| tests[0].method)
+            .text("trained on", |tests| tests[0].trained_on)
+            .number("episodes", |tests| tests[0].episodes);
+        for name in distinct(self.marks.iter().map(|test| test.tested_on)) {
+            table = table.number(format!("on {name}"), |tests| {
+                rate(tests.iter().find(|test| test.tested_on == name).and_then(|test| test.success))
+            });
+        }
+        let table = table.build();
         (!table.rows.is_empty()).then_some(table)
     }
 

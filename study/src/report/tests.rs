@@ -2,7 +2,7 @@ use rstest::rstest;
 
 use super::*;
 use crate::fixture;
-use crate::folder::{CellState, Failure, Folder};
+use crate::folder::{CellState, Failure, Folder, MarkResult};
 use crate::plan::SELECTION_TEST;
 use crate::records::{Agreement, Difference};
 use crate::{TestResult, Version};
@@ -62,6 +62,7 @@ fn figures() -> Figures {
     let png = [&[0; 16][..], &800_u32.to_be_bytes(), &600_u32.to_be_bytes()].concat();
     Figures {
         curves: vec![figure("CartPole", FigureData::Svg("<svg></svg>".into()))],
+        marks: Vec::new(),
         no_curves: vec!["Pendulum: no training with a result has its monitor.csv.".into()],
         heatmaps: vec![vec![figure("CartPole", FigureData::Png(png)), figure("CartPole", FigureData::Missing)]],
         no_heatmaps: vec!["1 of 2. `perturb heatmap DIR` makes them.".into()],
@@ -116,6 +117,48 @@ fn tests_on_own_sets_have_a_table_and_leave_the_papers_numbers_alone() {
     assert_eq!(report.files()[4].title, "sets.csv");
     let told = "compared in 8000 of 10000 test episodes; the largest relative difference is 2.0e-16, of length.";
     assert!(report.overview.iter().any(|line| line.contains(told)), "{:?}", report.overview);
+}
+
+#[test]
+fn tests_at_marks_have_a_table_with_the_end_as_its_last_line() {
+    let text =
+        "environments = ['CartPole']\nversions = ['R']\nruns = 2\nevaluate_at = [5, 20]\nsettings = { episodes = 50 }
+        [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+    let plan = Plan::parse("test", text.into()).unwrap();
+    let mut results = fixture::results(&plan, |cell| Some(([90.0, 40.0, 20.0 + f64::from(cell.run)], 1.0)));
+    let CellState::Done(result) = &mut results.states[0] else { unreachable!("it is done") };
+    for mark in [5, 20] {
+        let success_percent = mark as f64;
+        let test = TestResult { success_percent, mean_return: -success_percent, ..result.results["D"].clone() };
+        let agreement = Agreement { episodes: 1, largest: None };
+        let of_mark = MarkResult { counters: Default::default(), results: [("E".to_owned(), test)].into(), agreement };
+        result.marks.insert(mark, of_mark);
+    }
+    let selections = results.select();
+    let report = Report::new(&results, &selections);
+    insta::assert_snapshot!(report.marks_table().unwrap().to_text(), @r"
+     environment  method  trained on  episodes        on D        on R        on E
+     CartPole     ppo ff  R                  5     missing     missing         5.0
+     CartPole     ppo ff  R                 20     missing     missing        20.0
+     CartPole     ppo ff  R                 50  90.0 ± 0.0  40.0 ± 0.0  21.5 ± 0.5
+    ");
+    let marks = report.files().into_iter().find(|table| table.title == "marks.csv").unwrap();
+    let marks = String::from_utf8(marks.to_csv()).unwrap();
+    assert!(
+        marks.contains("CartPole,ppo,ff,,R,20,E,1,20,,-20\n") && marks.contains("R,50,E,2,21.5,0.5,1\n"),
+        "{marks}"
+    );
+    let figures = Figures::read(&selections, &Folder::new(std::path::Path::new("/nowhere"))).unwrap();
+    let names: Vec<&str> = figures.marks.iter().map(|figure| figure.name.as_str()).collect();
+    assert_eq!(names.len(), 2, "return and success");
+    assert_eq!(names[1], "CartPole, trained on R: success in tests after so many episodes");
+    let FigureData::Svg(svg) = &figures.marks[1].picture else { unreachable!("it is drawn") };
+    assert!(svg.contains("tested on E") && svg.contains("trained on R: success rate, % in tests"), "{svg}");
+    let page = html(&report, &figures);
+    assert!(page.contains("id=\"marks\"") && page.contains(names[0]));
+    let without = fixture::results(&plan, |_| Some(([90.0, 40.0, 20.0], 1.0)));
+    let selections = without.select();
+    assert!(Report::new(&without, &selections).marks_table().is_none());
 }
 
 /// Two configurations and two tuning seeds. One cell of what is selected failed; what is trained on E waits, and on R nothing

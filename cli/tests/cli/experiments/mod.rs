@@ -1,6 +1,7 @@
 //! Experiments with real worker processes and servers.
 
 mod groups;
+mod marks;
 mod reports;
 mod running;
 mod selection;

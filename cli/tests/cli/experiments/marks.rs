@@ -1,0 +1,118 @@
+//! Tests of the policies of earlier moments.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use super::{Experiment, kill_all, succeeded};
+use crate::common::{perturb, stderr, wait_for};
+use perturb_learner::checkpoint::Checkpoint;
+use perturb_study::Folder;
+
+/// Three cells of one kind, the last one of EPOpt, which learns from fewer episodes than it generates.
+const PLAN: &str = "
+environments = ['CartPole']
+versions = ['D']
+test_versions = ['D', 'E']
+test_episodes = 6
+evaluate_at = [10, 30, 60]
+settings = { episodes = 60, num_envs = 4, checkpoint_interval = 15 }
+
+[[algorithm]]
+name = 'a2c'
+architectures = ['ff']
+grid = { learning_rate = [7e-3, 7e-4] }
+
+[[algorithm]]
+name = 'epopt-ppo'
+architectures = ['ff']
+settings = { episodes_per_iteration = 20 }
+";
+
+impl Experiment {
+    /// The bytes of all results, records and kept policies.
+    fn kept(&self, name: &str) -> BTreeMap<PathBuf, Vec<u8>> {
+        let folder = Folder::new(&self.out(name));
+        let mut files = BTreeMap::new();
+        for cell in &self.plan.cells {
+            let place = folder.cell(&cell.id).path().to_owned();
+            add(&place, "result.json", &mut files);
+            for mark in ["10", "30"] {
+                add(&place, &format!("marks/{mark}/episodes.parquet"), &mut files);
+                add(&place, &format!("training/marks/{mark}/checkpoint.json"), &mut files);
+            }
+        }
+        files
+            .into_iter()
+            .map(|(path, bytes)| (path.strip_prefix(self.out(name)).expect("inside").into(), bytes))
+            .collect()
+    }
+}
+
+fn add(place: &Path, name: &str, files: &mut BTreeMap<PathBuf, Vec<u8>>) {
+    if let Ok(bytes) = std::fs::read(place.join(name)) {
+        files.insert(place.join(name), bytes);
+    }
+}
+
+#[test]
+fn policies_on_the_way_are_tested_and_change_nothing_however_often_a_run_is_killed() {
+    let experiment = Experiment::new(PLAN);
+    succeeded(&experiment.run("whole", &["--jobs", "1"]));
+    let whole = experiment.kept("whole");
+    assert_eq!(whole.len(), 3 * 5, "{:?}", whole.keys());
+    let without = Experiment::new(&PLAN.replace("evaluate_at = [10, 30, 60]\n", ""));
+    succeeded(&without.run("out", &[]));
+    for index in 0..3 {
+        let (marked, plain) = (experiment.cell_result("whole", index), without.cell_result("out", index));
+        assert_eq!((&marked.training.counters, &marked.results), (&plain.training.counters, &plain.results));
+        let training = |experiment: &Experiment, name: &str| {
+            let folder = Folder::new(&experiment.out(name));
+            let path = folder.cell(&experiment.plan.cells[index].id).training();
+            (std::fs::read(path.join("monitor.csv")).is_ok(), Checkpoint::load(&path).expect("a checkpoint"))
+        };
+        assert!(training(&experiment, "whole") == training(&without, "out"), "the same policy and statistics");
+        assert_eq!(marked.marks.keys().copied().collect::<Vec<_>>(), [10, 30], "the end is tested anyway");
+        for (mark, test) in &marked.marks {
+            assert!((*mark..60).contains(&test.counters.episodes), "{:?}", test.counters);
+            assert_eq!(test.results.values().map(|test| test.episodes).collect::<Vec<_>>(), [6, 6]);
+        }
+        let policies: Vec<String> = [10, 30]
+            .iter()
+            .map(|mark| {
+                let place =
+                    Folder::new(&experiment.out("whole")).cell(&marked.id).training().join(format!("marks/{mark}"));
+                Checkpoint::load(&place).expect("a policy").id().expect("a name")
+            })
+            .collect();
+        assert_ne!(policies[0], policies[1]);
+    }
+
+    let marks = || experiment.kept("killed").len();
+    for least in [1, 4, 6] {
+        let child = experiment.command("killed", &["--jobs", "1", "--group", "1"]).spawn().expect("started");
+        wait_for("a policy on the way", || marks() >= least);
+        kill_all(child);
+    }
+    assert!(marks() < 15, "killed before the end");
+    succeeded(&experiment.run("killed", &["--jobs", "1", "--group", "1"]));
+    assert!(experiment.kept("killed") == whole, "the same bytes, alone and together");
+
+    let output = perturb(&["audit", "--all"]).arg(experiment.out("killed")).output().expect("ended");
+    assert!(output.stdout.starts_with(b"108 of 108 episodes of 9 policies"), "{output:?}");
+    let output = perturb(&["report"]).arg(experiment.out("killed")).output().expect("ended");
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(text.contains("Generalisation against training"), "{text}{}", stderr(&output));
+}
+
+/// One that was deleted is made again.
+#[test]
+fn a_training_whose_kept_policies_are_gone_begins_again() {
+    let experiment = Experiment::new(PLAN);
+    succeeded(&experiment.run("out", &["--cell", "0"]));
+    let whole = experiment.kept("out");
+    let place = Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[0].id);
+    std::fs::remove_dir_all(place.training().join("marks/10")).expect("deleted");
+    std::fs::remove_file(place.path().join("result.json")).expect("deleted");
+    succeeded(&experiment.run("out", &["--cell", "0"]));
+    assert!(experiment.kept("out") == whole);
+}
