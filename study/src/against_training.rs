@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use crate::plan::{TrainedOn, distinct};
 use crate::selection::{MethodResults, Selected};
 use crate::statistics::Summary;
-use crate::{Curve, EnvironmentCurves, Method, Point, TestResult, Version};
+use crate::{Curve, EnvironmentCurves, Footing, Method, Point, TestResult, Version};
 
 /// A policy's test at one moment of its training.
 #[derive(Clone, Debug, PartialEq)]
@@ -75,11 +75,15 @@ pub(crate) fn test_curves(tests: &[MarkTest<'_>]) -> Vec<(Version, EnvironmentCu
                 else {
                     continue;
                 };
-                let point = Point { episodes: test.episodes as f64, episode_return, success };
+                let point = Point { progress: test.episodes as f64, episode_return, success };
                 let same = |curve: &&mut Curve| curve.method == *test.method && curve.version == version;
                 match curves.iter_mut().find(same) {
-                    Some(curve) => curve.points.push(point),
-                    None => curves.push(Curve { method: test.method.clone(), version, points: vec![point] }),
+                    Some(curve) => curve.add(Footing::Episodes, point),
+                    None => {
+                        let mut curve = Curve::new(test.method, version);
+                        curve.add(Footing::Episodes, point);
+                        curves.push(curve);
+                    }
                 }
             }
             if !curves.is_empty() {

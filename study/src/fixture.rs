@@ -1,9 +1,10 @@
-//! Results for tests, as if cells had been done.
+//! Results and records for tests, as if cells had been done.
 
 use super::folder::{CellResult, CellState, Training};
 use super::plan::{Cell, Plan};
 use super::selection::Results;
 use crate::TestResult;
+use crate::records::{Ending, EpisodeRecord};
 use crate::results::Counters;
 
 /// A result with success rates, %, on D, R and E, and the same mean return on all.
@@ -48,4 +49,23 @@ pub fn results(plan: &Plan, known: impl Fn(&Cell) -> Option<([f64; 3], f64)>) ->
         None => CellState::Missing,
     };
     Results { plan, states: plan.cells.iter().map(state).collect() }
+}
+
+/// The `index`th episode of a test on `set`, which had one requested parameter, and achieved so many steps.
+pub fn episode(set: &str, index: u32, requested: f64, steps: u32, success: bool) -> EpisodeRecord {
+    EpisodeRecord {
+        set: set.into(),
+        seed: 7,
+        environment_index: index,
+        episode_index: 0,
+        requested: vec![requested],
+        applied: vec![requested],
+        model_hash: String::new(),
+        episode_return: f64::from(steps),
+        length: steps,
+        success,
+        ending: Ending::Terminated,
+        achieved: Some(f64::from(steps)),
+        also_achieved: None,
+    }
 }

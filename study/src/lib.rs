@@ -18,6 +18,7 @@ mod heatmap;
 mod heatmaps;
 pub mod interrupt;
 mod means;
+pub mod outcomes;
 pub mod paper;
 mod plan;
 pub mod plot;
@@ -29,7 +30,7 @@ pub mod scheduler;
 mod selection;
 pub mod sets;
 pub mod settings;
-mod statistics;
+pub mod statistics;
 pub mod success;
 pub mod table;
 mod tuning;
@@ -37,7 +38,7 @@ mod value_error;
 mod verify;
 
 pub use cost::{Estimate, Measurement, Speed, Taken, estimates, representatives};
-pub use curves::{Curve, EnvironmentCurves, Point, curves_table, read_curves};
+pub use curves::{Curve, EnvironmentCurves, Footing, Point, curves_table, read_curves};
 pub use folder::{
     CellFolder, CellResult, CellState, Failure, FailureMark, Folder, FolderError, MarkResult, Timing, Training,
 };
@@ -51,7 +52,7 @@ pub use plan::{Cell, Counts, Grouping, Plan, PlanError, SELECTION_TEST, Selectio
 pub use results::{Counters, TestResult};
 pub use scenarios::{Metric, Scenario, Version};
 pub use selection::{MethodResults, Results, Selected, SelectedRun, average, interquartile};
-pub use statistics::{Iqm, Summary, interquartile_mean};
+pub use statistics::{Bootstrapped, Summary};
 pub use tuning::{Chosen, Tuned, tuned};
 pub use value_error::ValueError;
 pub use verify::{VerifyError, verify};

@@ -46,14 +46,24 @@ impl Metric {
     /// All, in the paper's order.
     pub const ALL: [Metric; 3] = [Metric::Default, Metric::Interpolation, Metric::Extrapolation];
 
+    /// What Extrapolation is the geometric mean of.
+    pub const EXTRAPOLATION: [Scenario; 3] = [
+        Scenario { train: Version::D, test: Version::R },
+        Scenario { train: Version::D, test: Version::E },
+        Scenario { train: Version::R, test: Version::E },
+    ];
+
     /// The metric from the success rates of scenarios; `None` if one that it needs has none.
-    pub fn of(self, rate: impl Fn(Scenario) -> Option<f64>) -> Option<f64> {
-        use Version::{D, E, R};
-        let rate = |train, test| rate(Scenario { train, test });
+    pub fn of(self, rate_of: impl Fn(Scenario) -> Option<f64>) -> Option<f64> {
+        use Version::{D, R};
+        let rate = |train, test| rate_of(Scenario { train, test });
         match self {
             Metric::Default => rate(D, D),
             Metric::Interpolation => rate(R, R),
-            Metric::Extrapolation => Some(geometric_mean(&[rate(D, R)?, rate(D, E)?, rate(R, E)?])),
+            Metric::Extrapolation => {
+                let rates: Option<Vec<f64>> = Self::EXTRAPOLATION.into_iter().map(&rate_of).collect();
+                Some(geometric_mean(&rates?))
+            }
         }
     }
 }

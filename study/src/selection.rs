@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 
 use super::folder::{CellResult, CellState, Failure, Folder, FolderError};
 use super::plan::{Cell, Plan, Selection, TrainedOn};
-use super::statistics::{Iqm, Summary};
+use super::statistics::{Bootstrapped, Summary, interquartile_mean};
 use super::tuning::{Tuned, tuned};
 use crate::{Method, Metric, Scenario, TestResult, Version, mean};
 
@@ -199,11 +199,14 @@ pub fn average(selections: &[&MethodResults<'_>], metric: Metric) -> Option<Summ
 
 /// The interquartile mean of a metric over the environments of `selections` and the runs that all of them have, with
 /// its bootstrap interval.
-pub fn interquartile(selections: &[&MethodResults<'_>], metric: Metric, resamples: usize) -> Option<Iqm> {
+pub fn interquartile(selections: &[&MethodResults<'_>], metric: Metric, resamples: usize) -> Option<Bootstrapped> {
+    Bootstrapped::of(&scores(selections, metric), resamples, 1, interquartile_mean)
+}
+
+/// A metric by `selections`, then by the runs that all of them have.
+pub(crate) fn scores(selections: &[&MethodResults<'_>], metric: Metric) -> Vec<Vec<f64>> {
     let runs = common_runs(selections, metric);
-    let strata: Vec<Vec<f64>> =
-        (0..selections.len()).map(|i| runs.iter().map(|numbers| numbers[i]).collect()).collect();
-    Iqm::of(&strata, resamples, 1)
+    (0..selections.len()).map(|i| runs.iter().map(|numbers| numbers[i]).collect()).collect()
 }
 
 /// For each run that all `selections` have, the metric in each of them.

@@ -112,7 +112,7 @@ fn metrics_are_those_computed_by_hand() {
     assert_summary(average(&both, Metric::Extrapolation), (first + second) / 2.0, (second - first) / 2.0, 2);
     // Of 90, 80, 50, 60 the lowest and the highest go.
     let iqm = interquartile(&both, Metric::Default, 100).unwrap();
-    close(iqm.iqm, 70.0);
+    close(iqm.point, 70.0);
     assert_eq!(iqm.runs, 2);
 }
 

@@ -38,16 +38,24 @@ pub enum VerifyError {
     Agreement { cell: String },
 }
 
-/// Computes every result again from its recorded episodes, where they are there; gives how many results have them.
+/// Computes every result again from its recorded episodes, where they are there, and hands them to `each`; gives how many
+/// results have them.
 ///
 /// # Errors
 /// [`VerifyError`] for the first result that is another one.
-pub fn verify(results: &Results<'_>, folder: &Folder) -> Result<usize, VerifyError> {
+pub fn verify(
+    results: &Results<'_>,
+    folder: &Folder,
+    mut each: impl FnMut(&CellResult, &Records),
+) -> Result<usize, VerifyError> {
     let mut verified = 0;
     for result in results.done() {
         let place = folder.cell(&result.id);
         let of_marks = result.marks.iter().map(|(&mark, of)| (place.mark(mark), &of.results, Some(&of.agreement)));
-        verified += usize::from(follows(result, place.path(), &result.results, result.agreement.as_ref())?);
+        if let Some(records) = follows(result, place.path(), &result.results, result.agreement.as_ref())? {
+            each(result, &records);
+            verified += 1;
+        }
         of_marks
             .map(|(path, results, agreement)| follows(result, &path, results, agreement))
             .collect::<Result<Vec<_>, _>>()?;
@@ -55,15 +63,15 @@ pub fn verify(results: &Results<'_>, folder: &Folder) -> Result<usize, VerifyErr
     Ok(verified)
 }
 
-/// Whether there are episodes in `path`, from which these figures of a result then follow.
+/// The episodes in `path`, from which these figures of a result then follow; `None` if there are none.
 fn follows(
     result: &CellResult,
     path: &Path,
     results: &BTreeMap<String, TestResult>,
     agreement: Option<&Agreement>,
-) -> Result<bool, VerifyError> {
+) -> Result<Option<Records>, VerifyError> {
     let records = match Records::read(&path.join(records::FILE)) {
-        Err(RecordsError::Missing { .. }) => return Ok(false),
+        Err(RecordsError::Missing { .. }) => return Ok(None),
         records => records?,
     };
     for (test, kept) in results {
@@ -76,7 +84,7 @@ fn follows(
     if agreement.is_some_and(|agreement| *agreement != records.agreement()) {
         return Err(VerifyError::Agreement { cell: result.id.clone() });
     }
-    Ok(true)
+    Ok(Some(records))
 }
 
 #[cfg(test)]
@@ -141,8 +149,9 @@ mod tests {
         result.results = [("D".to_owned(), records.result("D", None))].into();
         result.agreement = Some(records.agreement());
         change(result);
-        match (verify(&results, &folder), refused) {
-            (Ok(verified), None) => assert_eq!(verified, 1),
+        let mut handed = 0;
+        match (verify(&results, &folder, |_, records| handed += records.episodes.len()), refused) {
+            (Ok(verified), None) => assert_eq!((verified, handed), (1, 3)),
             (Err(error), Some(expected)) => {
                 let message = error.to_string();
                 assert!(message.contains(expected) && message.contains(&plan.cells[0].id), "{message}");
@@ -166,7 +175,7 @@ mod tests {
             let of_mark = [("D".to_owned(), test)].into();
             let of_mark = MarkResult { counters: Default::default(), results: of_mark, agreement: records.agreement() };
             result.marks.insert(5, of_mark);
-            assert_eq!(verify(&results, &folder).is_err(), refused);
+            assert_eq!(verify(&results, &folder, |_, _| ()).is_err(), refused);
         }
     }
 
@@ -175,6 +184,6 @@ mod tests {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let directory = tempfile::tempdir().unwrap();
         let results = fixture::results(&plan, |_| Some(([0.0; 3], 0.0)));
-        assert_eq!(verify(&results, &Folder::new(directory.path())).unwrap(), 0);
+        assert_eq!(verify(&results, &Folder::new(directory.path()), |_, _| panic!("none")).unwrap(), 0);
     }
 }

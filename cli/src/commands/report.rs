@@ -7,9 +7,10 @@ use super::args::{CurvesArgs, ReportArgs};
 use super::error::Result;
 use super::plan_in;
 use perturb_study::files::write_atomically;
+use perturb_study::outcomes::Recorded;
 use perturb_study::plot::{Quantity, draw_curves, save};
-use perturb_study::report::{Figures, Report, html};
-use perturb_study::{Folder, Plan, Results, Selection, curves_table, read_curves, verify};
+use perturb_study::report::{Figures, Picture, Report, html};
+use perturb_study::{Folder, Footing, Plan, Results, Selection, curves_table, read_curves, verify};
 
 pub(super) fn run(args: &ReportArgs) -> Result<()> {
     let folder = Folder::new(&args.dir);
@@ -29,16 +30,21 @@ pub(super) fn write(folder: &Folder, rule: Option<Selection>, page: Option<&Path
     let rule = rule.unwrap_or(plan.selection);
     let plan = plan.by(rule)?.in_folder(folder)?;
     let results = Results::read(&plan, folder)?;
-    verify(&results, folder)?;
     let selections = results.select();
-    let report = Report::new(&results, &selections);
+    let mut recorded = Recorded::of(&selections);
+    verify(&results, folder, |result, records| recorded.add(result, records))?;
+    let curves = read_curves(&selections, folder)?;
+    let report = Report::new(&results, &selections, &recorded, &curves);
 
     write_atomically(&out.join("report.md"), report.markdown().as_bytes())?;
     for table in report.files() {
         write_atomically(&out.join(&table.title), &table.to_csv())?;
     }
+    for Picture { file, panels, .. } in report.pictures() {
+        save(&panels, &out.join(file))?;
+    }
     if let Some(path) = page {
-        let figures = Figures::read(&selections, folder)?;
+        let figures = Figures::read(&report, &curves, folder)?;
         write_atomically(path, html(&report, &figures).as_bytes())?;
     }
     Ok((report.text(), out))
@@ -57,10 +63,12 @@ pub(super) fn curves(args: &CurvesArgs) -> Result<()> {
             eprintln!("{}: no finished training with a monitor.csv", curves.environment);
             continue;
         }
-        for quantity in Quantity::ALL {
-            let path = out.join(format!("{}-{quantity}.svg", curves.environment));
-            save(&draw_curves(curves, quantity), &path)?;
-            writeln!(stdout, "{} and .png", path.display())?;
+        for (by, ending) in [(Footing::Episodes, ""), (Footing::Steps, "-steps")] {
+            for quantity in Quantity::ALL {
+                let path = out.join(format!("{}-{quantity}{ending}.svg", curves.environment));
+                save(&draw_curves(curves, quantity, by), &path)?;
+                writeln!(stdout, "{} and .png", path.display())?;
+            }
         }
     }
     Ok(writeln!(stdout, "{}", out.join("curves.csv").display())?)

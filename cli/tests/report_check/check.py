@@ -33,6 +33,7 @@ LOOK = """
     }).length,
     tables: [...document.querySelectorAll('table')].filter(seen).length,
     curves: [...document.querySelectorAll('#curves svg')].filter(seen).length,
+    pictures: [...document.querySelectorAll('#profiles svg, #parameters svg, #thresholds svg')].filter(seen).length,
     heatmaps: [...document.querySelectorAll('#heatmaps img')]
       .filter(image => seen(image) && image.complete && image.naturalWidth > 0).length,
     without_heatmap: [...document.querySelectorAll('#heatmaps figure.missing')].filter(seen).length,
@@ -141,6 +142,9 @@ def expectations(directory):
     places = [line for line in selected if line["run"] == first]
     pictures = [line for line in places if (directory / "heatmaps" / f"{line['cell']}.png").exists()]
     environments = len({line["environment"] for line in scenarios})
+    compared = (report / "comparisons.csv").exists()
+    files = [path for path in (report / "worst.csv", report / "footing.csv") if path.exists()]
+    detailed = sum(len({line["environment"] for line in lines(path)}) for path in files)
     return {
         "rows": {
             "metrics": len(shown) // 3,  # three metrics in a row
@@ -148,8 +152,10 @@ def expectations(directory):
             "scenarios": len(scenarios) // 3,  # three tests in a row
             "cells": len(selected) + len(failures),
         },
-        "tables": environments + several + 1 + environments + 1 + bool(failures),
-        "curves": 2 * len(with_curves),
+        # Metrics, two over all environments, comparisons, Extrapolation and scenarios, worst and footing, cells.
+        "tables": environments + several + 2 + compared + 2 * environments + detailed + 1 + bool(failures),
+        "curves": 4 * len(with_curves),
+        "pictures": sum(len(list(report.glob(f"*{name}.svg"))) for name in ("profiles", "-parameters", "-thresholds")),
         "without_curves": environments - len(with_curves),
         "heatmaps": len(pictures),
         "without_heatmap": len(scenarios) // 3 - len(pictures),  # of a plan that trains on D, R and E
@@ -206,8 +212,8 @@ def main():
         sys.exit("\n".join([f"{page} is not as it should be:", *wrong]))
     figures = ", ".join(f"{number} {name}" for name, number in expected["rows"].items())
     print(
-        f"{page}: rows of {figures}; {expected['tables']} tables, {expected['curves']} curves and"
-        f" {expected['heatmaps']} heatmaps; pictures of it in {screenshots}"
+        f"{page}: rows of {figures}; {expected['tables']} tables, {expected['curves']} curves,"
+        f" {expected['pictures']} other pictures and {expected['heatmaps']} heatmaps; pictures of it in {screenshots}"
     )
 
 

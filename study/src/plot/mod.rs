@@ -5,6 +5,7 @@
 
 mod curves;
 mod heatmap;
+pub(crate) mod panels;
 
 use std::ops::Range;
 use std::path::Path;
@@ -20,6 +21,7 @@ use crate::files::{self, FileError, io, write_atomically};
 use crate::folder::FolderError;
 pub(crate) use curves::draw_tests;
 pub use curves::{Quantity, draw_curves};
+pub use panels::Panels;
 
 /// DejaVu Sans, cut down to the letters that pictures have; its licence is beside it.
 const FONT: &[u8] = include_bytes!("../../data/fonts/DejaVuSans-subset.ttf");
@@ -203,6 +205,7 @@ fn chart<'a, DB: DrawingBackend>(
 /// A number at an axis: short, and without the noise of binary fractions.
 fn tick(number: f64) -> String {
     let digits = match number.abs() {
+        1e6.. => return format!("{}M", (number / 1e5).round() / 10.0),
         10_000.0.. => return format!("{}k", (number / 100.0).round() / 10.0),
         100.0.. => 0,
         10.0.. => 1,
@@ -279,6 +282,7 @@ mod tests {
     #[case(9999.6, "10000")]
     #[case(15_000.0, "15k")]
     #[case(-12_345.0, "-12.3k")]
+    #[case(2_520_000.0, "2.5M")]
     fn numbers_at_an_axis_are_short(#[case] number: f64, #[case] shown: &str) {
         assert_eq!(tick(number), shown);
     }

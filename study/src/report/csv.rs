@@ -1,7 +1,8 @@
 //! The numbers of a report as lines of files; an empty field is a number that there is not.
 
+use super::numbers::{counted, or_empty};
 use super::{Cell, Report};
-use crate::statistics::Summary;
+use crate::statistics::{Bootstrapped, Summary};
 use crate::table::{Table, TableBuilder};
 use crate::{Method, Metric, Scenario, Version};
 
@@ -12,7 +13,16 @@ impl Report<'_> {
         let tuned = (!self.tuned.is_empty()).then(|| self.tuned_file());
         let files = [self.metrics_file(), self.iqm_file(), self.scenarios_file(), self.selected_file()];
         let marks = (!self.marks.is_empty()).then(|| self.marks_file());
-        files.into_iter().chain(sets).chain(tuned).chain(marks).collect()
+        let more = [
+            self.comparisons_file(),
+            self.profiles_file(),
+            self.footing_file(),
+            self.worst_file(),
+            self.parameters_file(),
+            self.thresholds_file(),
+        ];
+        let more = more.into_iter().filter(|table| !table.rows.is_empty());
+        files.into_iter().chain(sets).chain(tuned).chain(marks).chain(more).collect()
     }
 
     fn metrics_file(&self) -> Table {
@@ -30,16 +40,23 @@ impl Report<'_> {
     }
 
     fn iqm_file(&self) -> Table {
-        let of_method =
-            self.averages.iter().flat_map(|row| Metric::ALL.map(|metric| (row, metric, row.iqms.get(&metric))));
+        let of_method = self
+            .averages
+            .iter()
+            .flat_map(|row| Metric::ALL.map(|metric| (row, metric, row.iqms.get(&metric), row.gaps.get(&metric))));
+        let low = |number: Option<&Bootstrapped>| or_empty(number.and_then(|number| Some(number.interval_95?[0])));
+        let high = |number: Option<&Bootstrapped>| or_empty(number.and_then(|number| Some(number.interval_95?[1])));
         let lines: Vec<_> = of_method.collect();
         Table::of("iqm.csv", &lines)
             .method(|(row, ..)| &row.method)
-            .text("metric", |(_, metric, _)| metric)
-            .number("runs", |(.., iqm)| iqm.map_or(0, |iqm| iqm.runs))
-            .number("iqm", |(.., iqm)| or_empty(iqm.map(|iqm| iqm.iqm)))
-            .number("low_95", |(.., iqm)| or_empty(iqm.and_then(|iqm| Some(iqm.interval_95?[0]))))
-            .number("high_95", |(.., iqm)| or_empty(iqm.and_then(|iqm| Some(iqm.interval_95?[1]))))
+            .text("metric", |(_, metric, ..)| metric)
+            .number("runs", |(.., iqm, _)| iqm.map_or(0, |iqm| iqm.runs))
+            .number("iqm", |(.., iqm, _)| or_empty(iqm.map(|iqm| iqm.point)))
+            .number("low_95", move |(.., iqm, _)| low(*iqm))
+            .number("high_95", move |(.., iqm, _)| high(*iqm))
+            .number("optimality_gap", |(.., gap)| or_empty(gap.map(|gap| gap.point)))
+            .number("gap_low_95", move |(.., gap)| low(*gap))
+            .number("gap_high_95", move |(.., gap)| high(*gap))
             .build()
     }
 
@@ -52,6 +69,9 @@ impl Report<'_> {
             .text("train", |(_, scenario)| scenario.train)
             .text("test", |(_, scenario)| scenario.test)
             .summary(|(selection, scenario)| selection.scenario(*scenario))
+            .number("episodes", |(selection, scenario)| counted(selection, *scenario).episodes)
+            .number("low_95", |(selection, scenario)| or_empty(counted(selection, *scenario).known().map(|it| it[0])))
+            .number("high_95", |(selection, scenario)| or_empty(counted(selection, *scenario).known().map(|it| it[1])))
             .build()
     }
 
@@ -130,8 +150,4 @@ impl<'r, R> TableBuilder<'r, R> {
             .number("mean", |row| or_empty(summary(row).map(|summary| summary.mean)))
             .number("std", |row| or_empty(summary(row).and_then(|summary| summary.std)))
     }
-}
-
-fn or_empty(number: Option<impl ToString>) -> String {
-    number.map(|number| number.to_string()).unwrap_or_default()
 }

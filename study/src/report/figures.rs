@@ -1,7 +1,7 @@
 //! The pictures of a report, and what is said of those that are missing.
 
 use crate::against_training::{against_training, test_curves};
-use crate::curves::read_curves;
+use crate::curves::{EnvironmentCurves, Footing};
 use crate::folder::Folder;
 use crate::heatmap::HeatmapOptions;
 use crate::heatmaps::{HeatmapRecord, NoHeatmap, heatmap_places};
@@ -9,10 +9,18 @@ use crate::plot::{PlotError, Quantity, draw_curves, draw_tests, svg};
 use crate::scheduler::count;
 use crate::selection::MethodResults;
 
+use super::{Picture, Report};
+
 /// All pictures of a report.
 #[derive(Clone, Debug, Default)]
 pub struct Figures {
-    /// One for each environment and quantity.
+    /// Of all environments together.
+    pub profiles: Vec<Figure>,
+    /// One for each environment and version that was trained on.
+    pub parameters: Vec<Figure>,
+    /// One for each environment.
+    pub thresholds: Vec<Figure>,
+    /// One for each environment, quantity and footing.
     pub curves: Vec<Figure>,
     /// Of tests of the policies of earlier moments: one for each environment, version that was trained on, and quantity.
     pub marks: Vec<Figure>,
@@ -24,7 +32,7 @@ pub struct Figures {
     pub no_heatmaps: Vec<String>,
 }
 
-/// A picture, or the place of one that is missing.
+/// A picture as it is shown, or the place of one that is missing.
 #[derive(Clone, Debug)]
 pub struct Figure {
     /// Figures of one environment stand together.
@@ -49,15 +57,21 @@ pub enum FigureData {
 }
 
 impl Figures {
-    /// Draws the training curves of `selections` and reads their heatmaps, both from `folder`.
+    /// Draws the pictures of `report` and its training `curves`, and reads the heatmaps of its selections from `folder`.
     ///
     /// # Errors
     /// [`PlotError`].
-    pub fn read(selections: &[MethodResults<'_>], folder: &Folder) -> Result<Self, PlotError> {
-        let mut figures = Self::default();
-        figures.add_marks(selections)?;
-        figures.add_curves(selections, folder)?;
-        figures.add_heatmaps(selections, folder)?;
+    pub fn read(report: &Report<'_>, curves: &[EnvironmentCurves], folder: &Folder) -> Result<Self, PlotError> {
+        let drawn = |pictures: Vec<Picture>| pictures.iter().map(Picture::figure).collect::<Result<_, _>>();
+        let mut figures = Self {
+            profiles: drawn(report.profiles_picture().into_iter().collect())?,
+            parameters: drawn(report.parameter_pictures())?,
+            thresholds: drawn(report.threshold_pictures())?,
+            ..Self::default()
+        };
+        figures.add_marks(report.selections)?;
+        figures.add_curves(curves)?;
+        figures.add_heatmaps(report.selections, folder)?;
         Ok(figures)
     }
 
@@ -78,22 +92,22 @@ impl Figures {
         Ok(())
     }
 
-    fn add_curves(&mut self, selections: &[MethodResults<'_>], folder: &Folder) -> Result<(), PlotError> {
-        for curves in read_curves(selections, folder)? {
+    fn add_curves(&mut self, curves: &[EnvironmentCurves]) -> Result<(), PlotError> {
+        for curves in curves {
             let environment = &curves.environment;
             if curves.curves.is_empty() {
                 self.no_curves.push(format!("{environment}: no training with a result has its monitor.csv."));
                 continue;
             }
-            for quantity in Quantity::ALL {
+            for (by, quantity) in Footing::ALL.into_iter().flat_map(|by| Quantity::ALL.map(|quantity| (by, quantity))) {
                 self.curves.push(Figure {
                     environment: environment.clone(),
-                    name: format!("{environment}: {quantity} while training"),
+                    name: format!("{environment}: {quantity} while training, over {by}"),
                     caption: format!(
-                        "{environment}: {quantity} while training, of the selected configurations. Lines are means over \
-                         runs, bands their standard deviation."
+                        "{environment}: {quantity} while training, over {by}, of the selected configurations. Lines are means \
+                         over runs, bands their standard deviation."
                     ),
-                    picture: FigureData::Svg(svg(&draw_curves(&curves, quantity))?),
+                    picture: FigureData::Svg(svg(&draw_curves(curves, quantity, by))?),
                 });
             }
         }

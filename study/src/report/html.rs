@@ -14,6 +14,14 @@ const METRICS: &str = "Default is the success rate of policies that were trained
                        tested on R, trained on D and tested on E, trained on R and tested on E.";
 const HEATMAPS: &str = "How the policies that were selected in the first run do over two parameters. Colours are mean \
                         return and success rate; the whole line is R's box, dashed lines are E's.";
+const COMPARISONS: &str = "Runs of two methods with the same seed, in each of the environments. P(X > Y) is the probability that \
+                           a run of X is better than one of Y, where equal ones count half. Corrected p-values up to 0.05 \
+                           are, all together, wrong with a probability of 5 % at most.";
+const WORST: &str = "Mean return of the worst tenth of a test's episodes, and success in those parts of the parameter space that \
+                     hold the worst tenth of contexts: half of the episodes say which these are, the other half their \
+                     success. From recorded episodes; mean and deviation over runs.";
+const FOOTING: &str = "How long the selected trainings were, of all environments together, and the success rate in training \
+                       after as many steps, and as many episodes, as the trainings of all methods have.";
 const SCENARIOS: &str = "The darker, the higher the success rate.";
 /// A text of so many bytes is broken into lines.
 const LONG: usize = 60;
@@ -34,33 +42,38 @@ struct Subsection {
 /// The page.
 pub fn html(report: &Report<'_>, figures: &Figures) -> String {
     let plain = |table: Table| table_subsection(&table, false);
+    let shaded = |table: Table| table_subsection(&table, true);
     let section = |id, title, notes, subsections| Section { id, title, notes, subsections };
-    let metrics = report.metrics_tables().into_iter().map(plain).collect();
-    let scenarios = report.scenario_tables().iter().map(|table| table_subsection(table, true)).collect();
-    let sets: Vec<Subsection> = report.set_table().into_iter().map(plain).collect();
-    let marks: Vec<Subsection> =
-        report.marks_table().into_iter().map(plain).chain(by_environment(&figures.marks)).collect();
-    let cells = report
-        .tuned_table()
-        .into_iter()
-        .chain([report.selected_table()])
-        .chain(report.failure_table())
-        .map(plain)
-        .collect();
+    let tables = |tables: Vec<Table>| tables.into_iter().map(plain).collect();
+    let said = |text: &str| html! { p { (text) } };
+    let gap_and_profiles = [plain(report.gap_table())].into_iter().chain(by_environment(&figures.profiles)).collect();
+    let cells = report.tuned_table().into_iter().chain([report.selected_table()]).chain(report.failure_table());
+    let cells = cells.map(plain).collect();
+    let marks = report.marks_table().into_iter().map(plain).chain(by_environment(&figures.marks)).collect();
+    let scenarios = report.scenario_tables().into_iter().map(shaded).collect();
+    let worst = report.worst_tables().into_iter().map(shaded).collect();
+    let comparisons = report.comparisons_table().into_iter().collect();
+    let sets = report.set_table().into_iter().collect();
     let sections = [
-        section("metrics", "Default, Interpolation, Extrapolation", html! { p { (METRICS) } }, metrics),
+        section("metrics", "Default, Interpolation, Extrapolation", said(METRICS), tables(report.metrics_tables())),
         section("iqm", "Interquartile means", html! {}, vec![plain(report.iqm_table())]),
-        section("scenarios", "The nine scenarios", html! { p { (SCENARIOS) } }, scenarios),
-        section("sets", "Own sets of parameters", html! {}, sets),
+        section("profiles", "Optimality gap and performance profiles", html! {}, gap_and_profiles),
+        section("comparisons", "Methods in pairs", said(COMPARISONS), tables(comparisons)),
+        section("extrapolation", "What Extrapolation is made of", html! {}, tables(report.extrapolation_tables())),
+        section("scenarios", "The nine scenarios", said(SCENARIOS), scenarios),
+        section("worst", "The worst tenth", said(WORST), worst),
+        section("parameters", "Success over parameters", html! {}, by_environment(&figures.parameters)),
+        section("thresholds", "Success over the threshold", html! {}, by_environment(&figures.thresholds)),
+        section("sets", "Own sets of parameters", html! {}, tables(sets)),
         section("marks", "Generalisation against training", html! {}, marks),
+        section("footing", "Trainings on an equal footing", said(FOOTING), tables(report.footing_tables())),
         section("curves", "Training curves", list(&figures.no_curves), by_environment(&figures.curves)),
         section("heatmaps", "Heatmaps", html! { p { (HEATMAPS) } (list(&figures.no_heatmaps)) }, heatmaps(figures)),
         section("cells", "Cells", html! {}, cells),
     ];
-    let shown: Vec<&Section> = sections
-        .iter()
-        .filter(|section| !["sets", "marks"].contains(&section.id) || !section.subsections.is_empty())
-        .collect();
+    // Curves and heatmaps say what is missing.
+    let always = |section: &&Section| ["curves", "heatmaps"].contains(&section.id) || !section.subsections.is_empty();
+    let shown: Vec<&Section> = sections.iter().filter(always).collect();
     page(report, &shown).into_string()
 }
 

@@ -3,11 +3,19 @@
 //! [`Report::new`] has the numbers; [`Report::text`], [`Report::markdown`] and [`html`] make documents of them,
 //! [`Report::files`] CSV. Nothing in them depends on when, where or in how many attempts the cells were done.
 
+mod comparisons;
 mod csv;
 mod figures;
+mod footing;
 mod html;
 mod numbers;
+mod pictures;
+mod profiles;
+mod sweep_pictures;
+mod sweeps;
 mod tables;
+mod tested;
+mod worst;
 
 use std::collections::BTreeSet;
 
@@ -17,10 +25,18 @@ use super::plan::{Cell, Plan, Selection};
 use super::selection::{MethodResults, Results, Selected};
 use super::table::Table;
 use super::tuning::Tuned;
+use crate::curves::EnvironmentCurves;
+use crate::outcomes::Recorded;
+use comparisons::Comparison;
+use footing::Trainings;
 use numbers::{MethodMetrics, SetTest};
+use profiles::Profile;
+use sweeps::{AtParameter, AtThreshold, Swept};
+use worst::Worst;
 
 pub use figures::{Figure, FigureData, Figures};
 pub use html::html;
+pub use pictures::Picture;
 
 /// The paper's budgets.
 const PAPER_EPISODES: u64 = 15_000;
@@ -36,7 +52,13 @@ pub struct Report<'a> {
     overview: Vec<String>,
     metrics: Vec<MethodMetrics<'a>>,
     averages: Vec<MethodMetrics<'a>>,
+    comparisons: Vec<Comparison>,
+    profiles: Vec<Profile>,
+    worst: Vec<Worst<'a>>,
+    over_parameters: Vec<Swept<'a, AtParameter<'a>>>,
+    over_thresholds: Vec<Swept<'a, AtThreshold<'a>>>,
     set_tests: Vec<SetTest<'a>>,
+    trainings: Vec<Trainings<'a>>,
     /// Of policies of earlier moments, and at the end; nothing without `evaluate_at`.
     marks: Vec<MarkTest<'a>>,
     /// By the clean rule, what was selected; otherwise nothing.
@@ -45,23 +67,37 @@ pub struct Report<'a> {
 }
 
 impl<'a> Report<'a> {
-    /// Of `results`, from which `selections` were made.
-    pub fn new(results: &'a Results<'a>, selections: &'a [MethodResults<'a>]) -> Self {
-        let tuned = if results.plan.selection == Selection::Clean { results.tuned() } else { Vec::new() };
+    /// Of `results`, from which `selections` were made, and of what is there of these: recorded episodes and training
+    /// `curves`.
+    pub fn new(
+        results: &'a Results<'a>,
+        selections: &'a [MethodResults<'a>],
+        recorded: &'a Recorded,
+        curves: &[EnvironmentCurves],
+    ) -> Self {
+        let plan = results.plan;
+        let tuned = if plan.selection == Selection::Clean { results.tuned() } else { Vec::new() };
+        let averages = numbers::averages(plan, selections);
         Self {
-            plan: results.plan,
+            plan,
             selections,
-            overview: overview(results, selections, &tuned),
+            overview: overview(results, selections, recorded, &tuned),
             metrics: numbers::metrics(selections),
-            averages: numbers::averages(results.plan, selections),
-            set_tests: numbers::set_tests(results.plan, selections),
+            comparisons: comparisons::comparisons(plan, selections),
+            profiles: profiles::profiles(selections, &averages),
+            averages,
+            worst: worst::worst(plan, selections, recorded),
+            over_parameters: sweeps::over_parameters(plan, selections, recorded),
+            over_thresholds: sweeps::over_thresholds(plan, selections, recorded),
+            trainings: footing::trainings(selections, curves),
+            set_tests: numbers::set_tests(plan, selections),
             marks: against_training(selections),
             tuned,
             failures: results.failures().collect(),
         }
     }
 
-    /// For a terminal. The selected cells are left out; `selected.csv` has them.
+    /// For a terminal, without what goes into details; `report.md` has them.
     pub fn text(&self) -> String {
         let tables = self.number_tables().chain(self.failure_table());
         let shown = tables.map(|table| format!("\n{}\n{}\n", table.title, table.to_text()));
@@ -70,15 +106,17 @@ impl<'a> Report<'a> {
 
     /// For GitHub and the like.
     pub fn markdown(&self) -> String {
+        let details = self.comparisons_table().into_iter().chain(self.worst_tables()).chain(self.footing_tables());
         let cells = self.tuned_table().into_iter().chain([self.selected_table()]);
-        let tables = self.number_tables().chain(cells).chain(self.failure_table());
+        let tables = self.number_tables().chain(details).chain(cells).chain(self.failure_table());
         let shown = tables.map(|table| format!("\n## {}\n\n{}\n", table.title, table.to_markdown()));
         format!("# Results\n\n{}\n{}", self.overview.join("\n\n"), shown.collect::<String>())
     }
 
     fn number_tables(&self) -> impl Iterator<Item = Table> {
-        let papers = self.metrics_tables().into_iter().chain([self.iqm_table()]).chain(self.scenario_tables());
-        papers.chain(self.set_table()).chain(self.marks_table())
+        let papers = self.metrics_tables().into_iter().chain([self.iqm_table(), self.gap_table()]);
+        let scenarios = self.extrapolation_tables().into_iter().chain(self.scenario_tables());
+        papers.chain(scenarios).chain(self.set_table()).chain(self.marks_table())
     }
 
     /// All cells that numbers come from.
@@ -88,7 +126,12 @@ impl<'a> Report<'a> {
     }
 }
 
-fn overview(results: &Results<'_>, selections: &[MethodResults<'_>], tuned: &[Tuned<'_>]) -> Vec<String> {
+fn overview(
+    results: &Results<'_>,
+    selections: &[MethodResults<'_>],
+    recorded: &Recorded,
+    tuned: &[Tuned<'_>],
+) -> Vec<String> {
     let (cells, done, failed) = (results.plan.cells.len(), results.done().count(), results.failures().count());
     let mut lines =
         vec![format!("{done} of {cells} cells are done, {failed} failed, {} are missing.", cells - done - failed)];
@@ -111,6 +154,13 @@ fn overview(results: &Results<'_>, selections: &[MethodResults<'_>], tuned: &[Tu
         lines.push(format!("Done by perturb {}.", commits.into_iter().collect::<Vec<_>>().join(", ")));
     }
     lines.extend(agreement(results));
+    let (known, selected) = recorded.count();
+    if known < selected {
+        lines.push(format!(
+            "{known} of {selected} selected cells have recorded episodes, from which the worst tenth, and success over \
+             parameters and over the threshold, follow."
+        ));
+    }
     lines.push(
         "Numbers are success rates in percent: mean ± standard deviation over runs; one run has none. The paper's are \
          those of its five runs; a difference is ours less the paper's. Hopper and HalfCheetah run on another physics \
@@ -201,5 +251,7 @@ fn budgets(plan: &Plan) -> Option<String> {
     ))
 }
 
+#[cfg(test)]
+mod recorded_tests;
 #[cfg(test)]
 mod tests;

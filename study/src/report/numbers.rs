@@ -2,14 +2,17 @@
 
 use std::collections::BTreeMap;
 
+use crate::outcomes::Counted;
 use crate::paper;
 use crate::plan::{Plan, TrainedOn};
-use crate::selection::{MethodResults, average, interquartile};
-use crate::statistics::{Iqm, Summary};
-use crate::{Method, Metric, Version};
+use crate::selection::{MethodResults, average, interquartile, scores};
+use crate::statistics::{Bootstrapped, Summary, optimality_gap};
+use crate::{Method, Metric, Scenario, TestResult, Version};
 
-/// Resamples of each bootstrap, as many as rliable takes.
+/// Resamples of a bootstrap, as many as rliable takes.
 const RESAMPLES: usize = 50_000;
+/// The best success rate, %, from which the optimality gap is.
+const BEST: f64 = 100.0;
 /// What stands for all environments together, here and in the paper.
 const AVERAGE: &str = "Average";
 
@@ -20,7 +23,9 @@ pub(super) struct MethodMetrics<'a> {
     pub(super) ours: BTreeMap<Metric, Summary>,
     pub(super) papers: BTreeMap<Metric, Summary>,
     /// Of all environments only.
-    pub(super) iqms: BTreeMap<Metric, Iqm>,
+    pub(super) iqms: BTreeMap<Metric, Bootstrapped>,
+    /// Likewise.
+    pub(super) gaps: BTreeMap<Metric, Bootstrapped>,
     pub(super) done: usize,
     pub(super) cells: usize,
 }
@@ -60,6 +65,7 @@ pub(super) fn metrics<'a>(selections: &[MethodResults<'a>]) -> Vec<MethodMetrics
         ours: known(|metric| selection.summary(metric)),
         papers: known(|metric| paper::number(selection.environment, &selection.method, metric)),
         iqms: BTreeMap::new(),
+        gaps: BTreeMap::new(),
         done: selection.done,
         cells: selection.cells,
     };
@@ -72,11 +78,14 @@ pub(super) fn averages(plan: &Plan, selections: &[MethodResults<'_>]) -> Vec<Met
     let of_method = |method: Method| {
         let found: Vec<_> = selections.iter().filter(|selection| selection.method == method).collect();
         let everywhere = found.len() == environments.len();
+        let gap = |strata: &[Vec<f64>]| optimality_gap(strata, BEST);
+        let gap = |metric| Bootstrapped::of(&scores(&found, metric), RESAMPLES, 1, gap);
         MethodMetrics {
             environment: AVERAGE,
             ours: known(|metric| average(&found, metric).filter(|_| everywhere)),
             papers: known(|metric| paper::average(&environments, &method, metric)),
             iqms: known(|metric| interquartile(&found, metric, RESAMPLES).filter(|_| everywhere)),
+            gaps: known(|metric| gap(metric).filter(|_| everywhere)),
             done: found.iter().map(|selection| selection.done).sum(),
             cells: found.iter().map(|selection| selection.cells).sum(),
             method,
@@ -91,9 +100,8 @@ pub(super) fn set_tests<'a>(plan: &'a Plan, selections: &'a [MethodResults<'a>])
     let mut tests = Vec::new();
     for selection in selections {
         for &trained_on in selection.runs.values().next().into_iter().flat_map(|run| run.0.keys()) {
-            let names = plan.cells.iter().take(1).flat_map(|cell| &cell.tests.sets).map(|set| set.name.as_str());
             let is_of_set = matches!(trained_on, TrainedOn::Set(_));
-            tests.extend(names.filter(|name| is_of_set || !is_version(name)).map(|tested_on| SetTest {
+            tests.extend(tested_on(plan).filter(|name| is_of_set || !is_version(name)).map(|tested_on| SetTest {
                 environment: selection.environment,
                 method: &selection.method,
                 trained_on,
@@ -104,6 +112,27 @@ pub(super) fn set_tests<'a>(plan: &'a Plan, selections: &'a [MethodResults<'a>])
         }
     }
     tests
+}
+
+/// The test episodes of a scenario, of all runs together.
+pub(super) fn counted(selection: &MethodResults<'_>, Scenario { train, test }: Scenario) -> Counted {
+    let trained = selection.runs.values().filter_map(|run| run.trained_on(TrainedOn::Version(train)));
+    let tests = trained.filter_map(|selected| selected.test(&test.to_string()));
+    let of = |test: &TestResult| Counted {
+        successes: (test.success_percent * test.episodes as f64 / 100.0).round() as u64,
+        episodes: test.episodes,
+    };
+    tests.map(of).sum()
+}
+
+/// A field of a file.
+pub(super) fn or_empty(number: Option<impl ToString>) -> String {
+    number.map(|number| number.to_string()).unwrap_or_default()
+}
+
+/// The names of what the plan tests on.
+pub(super) fn tested_on(plan: &Plan) -> impl Iterator<Item = &str> {
+    plan.cells.iter().take(1).flat_map(|cell| &cell.tests.sets).map(|set| set.name.as_str())
 }
 
 fn known<T>(of: impl Fn(Metric) -> Option<T>) -> BTreeMap<Metric, T> {

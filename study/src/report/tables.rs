@@ -1,9 +1,10 @@
 //! The numbers of a report as tables for reading.
 
-use super::numbers::MethodMetrics;
+use super::numbers::{MethodMetrics, counted};
 use super::{MISSING, MarkTest, Report};
 use crate::plan::distinct;
-use crate::statistics::Summary;
+use crate::selection::MethodResults;
+use crate::statistics::{Bootstrapped, Summary};
 use crate::table::{Column, Entry, Table};
 use crate::{Metric, Scenario, Version};
 
@@ -43,11 +44,46 @@ impl Report<'_> {
     pub(super) fn iqm_table(&self) -> Table {
         let title = "Interquartile mean over all environments and the runs that all of them have, with its 95 % stratified \
                      bootstrap interval";
+        self.aggregate_table(title, |row, metric| row.iqms.get(&metric).copied())
+    }
+
+    pub(super) fn gap_table(&self) -> Table {
+        let title = "Optimality gap: how far success rates stay below 100 % on average, over the same runs and with the same \
+                     interval; lower is better";
+        self.aggregate_table(title, |row, metric| row.gaps.get(&metric).copied())
+    }
+
+    fn aggregate_table(&self, title: &str, number: fn(&MethodMetrics<'_>, Metric) -> Option<Bootstrapped>) -> Table {
         let mut table = Table::of(title, &self.averages).text("method", |row| &row.method);
         for metric in Metric::ALL {
-            table = table.number(metric.to_string(), |row| or(MISSING, row.iqms.get(&metric)));
+            table = table.number(metric.to_string(), move |row| or(MISSING, number(row, metric)));
         }
         table.number("runs", |row| self.runs(row.iqm_runs())).build()
+    }
+
+    /// Extrapolation of each environment, and what it is the geometric mean of.
+    pub(super) fn extrapolation_tables(&self) -> Vec<Table> {
+        let of_environments = self.selections.chunk_by(|a, b| a.environment == b.environment);
+        let table = |selections: &[MethodResults<'_>]| {
+            let title = format!(
+                "{}: Extrapolation and the three that it is the geometric mean of, with 95 % Wilson intervals",
+                selections[0].environment
+            );
+            let mut table = Table::of(title, selections).text("method", |selection| &selection.method);
+            for scenario in Metric::EXTRAPOLATION {
+                table = table.number(scenario.to_string(), move |selection| {
+                    let counted = counted(selection, scenario);
+                    let shown = |[low, high]: [f64; 2]| format!("{:.1} [{low:.1}, {high:.1}]", counted.rate());
+                    or(MISSING, counted.known().map(shown))
+                });
+            }
+            let metric = Metric::Extrapolation;
+            table
+                .number(metric.to_string(), move |selection| or(MISSING, selection.summary(metric)))
+                .number("runs", move |selection| self.runs(selection.metric(metric).len()))
+                .build()
+        };
+        of_environments.map(table).collect()
     }
 
     /// The nine scenarios of each environment.
@@ -55,7 +91,7 @@ impl Report<'_> {
         let of_environments = self.selections.chunk_by(|a, b| a.environment == b.environment);
         let table = |selections: &[_]| {
             let trained = |selection| Version::ALL.map(|train| (selection, train));
-            let rows: Vec<(&super::MethodResults<'_>, Version)> = selections.iter().flat_map(trained).collect();
+            let rows: Vec<(&MethodResults<'_>, Version)> = selections.iter().flat_map(trained).collect();
             let mut table = Table::of(format!("{}: the nine scenarios", rows[0].0.environment), &rows)
                 .text("method", |(selection, _)| &selection.method)
                 .text("trained on", |(_, train)| train);

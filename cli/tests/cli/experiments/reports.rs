@@ -40,7 +40,9 @@ fn a_report_is_the_same_however_often_the_run_was_broken_off() {
     }
 
     let page = String::from_utf8_lossy(&whole["page"]).into_owned();
-    assert!(page.matches("<svg").count() == 4 && page.matches("<table").count() == 7, "every picture and table");
+    assert!(page.matches("<svg").count() == 15 && page.matches("<table").count() == 14, "every picture and table");
+    let pictures = ["profiles.png", "Pendulum-E-parameters.svg", "CartPole-thresholds.svg"];
+    assert!(pictures.iter().all(|name| whole.contains_key(*name)), "{:?}", whole.keys());
     assert!(!page.contains("<script") && !page.contains("src=") && !page.contains("@import"), "it needs nothing else");
     let links: Vec<&str> = page.split("href=\"").skip(1).filter_map(|rest| rest.split('"').next()).collect();
     let inside = |link: &&str| link.strip_prefix('#').is_some_and(|id| page.contains(&format!(" id=\"{id}\"")));
@@ -211,9 +213,9 @@ fn curves_of_two_learners_are_drawn_and_written() {
     let output = command.arg(experiment.out("out")).output().expect("ended");
     succeeded(&output);
     let report = experiment.out("out").join("report");
-    for quantity in ["return", "success"] {
+    for picture in ["return", "success", "return-steps", "success-steps"] {
         let read = |ending: &str| {
-            let name = format!("CartPole-{quantity}.{ending}");
+            let name = format!("CartPole-{picture}.{ending}");
             std::fs::read(report.join(&name)).unwrap_or_else(|error| panic!("{name}: {error}"))
         };
         let picture = String::from_utf8(read("svg")).expect("text");

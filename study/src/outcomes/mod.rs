@@ -1,0 +1,105 @@
+//! What the recorded episodes of selected policies say: of the worst of them, of success over a parameter, and over the
+//! threshold of success.
+
+mod partition;
+mod sweeps;
+mod worst;
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use crate::folder::CellResult;
+use crate::records::{RecordedParameter, RecordedTest, Records};
+use crate::selection::{MethodResults, Selected};
+use crate::sets::Contexts;
+use crate::success::Criterion;
+
+pub(crate) use sweeps::{Bin, Counted, bins, success_at, success_within, thresholds};
+pub use worst::{SHARE, conditional_value_at_risk, worst_contexts};
+
+/// The recorded episodes of selected policies, by their cells' ids. Filled while the records are read for
+/// [`verify`](crate::verify), so that no file is read twice.
+#[derive(Clone, Debug, Default)]
+pub struct Recorded {
+    wanted: BTreeSet<String>,
+    policies: BTreeMap<String, PolicyOutcomes>,
+}
+
+/// The tests of a policy.
+#[derive(Clone, Debug)]
+pub struct PolicyOutcomes {
+    /// In the order of [`Outcomes::parameters`].
+    pub parameters: Vec<RecordedParameter>,
+    /// What counted as a success; `None` if the server did not say.
+    pub success: Option<Criterion>,
+    tests: BTreeMap<String, Outcomes>,
+}
+
+/// The n episodes of a test, in their order.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Outcomes {
+    /// `[P, n]`: requested values of each parameter.
+    pub parameters: Vec<Vec<f64>>,
+    /// Which of the set's contexts each episode had, where the set lists them.
+    pub contexts: Option<Vec<usize>>,
+    /// Undiscounted.
+    pub returns: Vec<f64>,
+    /// Whether each was a success.
+    pub successes: Vec<bool>,
+    /// What each achieved of what the criterion compares; `None` if nothing.
+    pub achieved: Vec<Option<f64>>,
+}
+
+impl Recorded {
+    /// Of the cells that `selections` are of; nothing so far.
+    pub fn of(selections: &[MethodResults<'_>]) -> Self {
+        let runs = selections.iter().flat_map(|selection| selection.runs.values());
+        let selected = runs.flat_map(|run| run.0.values().flatten());
+        Self { wanted: selected.map(|selected| selected.cell.id.clone()).collect(), policies: BTreeMap::new() }
+    }
+
+    /// Keeps what is needed of a cell's `records`, if it is one of those that were selected.
+    pub fn add(&mut self, result: &CellResult, records: &Records) {
+        if self.wanted.contains(&result.id) {
+            let tests = result.results.keys().map(|name| (name.clone(), Outcomes::of(records, name))).collect();
+            let (parameters, success) = (records.about.parameters.clone(), records.about.success.clone());
+            self.policies.insert(result.id.clone(), PolicyOutcomes { parameters, success, tests });
+        }
+    }
+
+    /// Of the cells that are wanted: how many have recorded episodes, and how many there are.
+    pub fn count(&self) -> (usize, usize) {
+        (self.policies.len(), self.wanted.len())
+    }
+
+    /// The policy that was selected; `None` without recorded episodes.
+    pub fn policy(&self, selected: &Selected<'_>) -> Option<&PolicyOutcomes> {
+        self.policies.get(&selected.cell.id)
+    }
+}
+
+impl PolicyOutcomes {
+    /// Its test on a set; `None` if there was none.
+    pub fn test(&self, tested_on: &str) -> Option<&Outcomes> {
+        self.tests.get(tested_on).filter(|outcomes| !outcomes.returns.is_empty())
+    }
+}
+
+impl Outcomes {
+    fn of(records: &Records, name: &str) -> Self {
+        let rows = || records.of(name);
+        let parameter =
+            |place: usize| rows().map(|row| row.requested.get(place).copied().unwrap_or(f64::NAN)).collect();
+        let listed = |test: &RecordedTest| match &test.set.contexts {
+            Contexts::Listed(contexts) if test.set.name == name => Some(contexts.len()),
+            _ => None,
+        };
+        let contexts = records.about.tests.iter().find_map(listed);
+        Self {
+            parameters: (0..records.about.parameters.len()).map(parameter).collect(),
+            contexts: contexts.map(|n| rows().map(|row| row.environment_index as usize % n).collect()),
+            returns: rows().map(|row| row.episode_return).collect(),
+            successes: rows().map(|row| row.success).collect(),
+            achieved: rows().map(|row| row.achieved).collect(),
+        }
+    }
+}

@@ -1,0 +1,62 @@
+//! What Agarwal et al. (2021, arXiv:2108.13264) say of all environments together. Scores are by environment, then run; all
+//! count alike unless said otherwise.
+
+/// The mean of what is left when the ⌊n/4⌋ lowest and the ⌊n/4⌋ highest of n scores are taken away; NaN if there are none.
+pub fn interquartile_mean(strata: &[Vec<f64>]) -> f64 {
+    let mut scores = strata.concat();
+    scores.sort_unstable_by(f64::total_cmp);
+    let cut = scores.len() / 4;
+    let middle = &scores[cut..scores.len() - cut];
+    middle.iter().sum::<f64>() / middle.len() as f64
+}
+
+/// How far scores stay below `target` on average; one beyond it counts as the target. NaN if there are none.
+pub fn optimality_gap(strata: &[Vec<f64>], target: f64) -> f64 {
+    let count = strata.iter().map(Vec::len).sum::<usize>() as f64;
+    target - strata.iter().flatten().map(|score| score.min(target)).sum::<f64>() / count
+}
+
+/// The performance profile, a score distribution: for each of `thresholds` the share of scores, 0 … 1, above it.
+pub fn profile(strata: &[Vec<f64>], thresholds: &[f64]) -> Vec<f64> {
+    let mut scores = strata.concat();
+    scores.sort_unstable_by(f64::total_cmp);
+    let above = |&threshold: &f64| scores.len() - scores.partition_point(|score| *score <= threshold);
+    thresholds.iter().map(|threshold| above(threshold) as f64 / scores.len() as f64).collect()
+}
+
+/// The probability, 0 … 1, that a run of X has a higher score than one of Y in the same environment, where equal scores
+/// count as one half (Mann and Whitney, 1947), averaged over environments. Both have the same environments.
+pub fn probability_of_improvement(x: &[Vec<f64>], y: &[Vec<f64>]) -> f64 {
+    let of_environment = |(x, y): (&Vec<f64>, &Vec<f64>)| {
+        let wins =
+            x.iter().flat_map(|x| y.iter().map(move |y| f64::from(u8::from(x > y)) + f64::from(u8::from(x >= y))));
+        wins.sum::<f64>() / (2 * x.len() * y.len()) as f64
+    };
+    x.iter().zip(y).map(of_environment).sum::<f64>() / x.len() as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_quarter_of_the_scores_counts_at_neither_end() {
+        let iqm = |scores: &[f64]| interquartile_mean(&[scores.to_vec()]);
+        assert_eq!(iqm(&[100.0, 1.0, 3.0, -50.0]), 2.0);
+        assert_eq!(iqm(&[9.0, 0.0, 0.0]), 3.0, "of three none is taken away");
+        assert_eq!(iqm(&[0.0, 10.0, 20.0, 30.0, 90.0]), 20.0);
+        assert!(iqm(&[]).is_nan());
+    }
+
+    #[test]
+    fn a_score_at_a_threshold_is_not_above_it_and_beyond_the_target_is_no_credit() {
+        assert_eq!(profile(&[vec![0.0, 50.0], vec![100.0, 50.0]], &[-1.0, 0.0, 50.0, 100.0]), [1.0, 0.75, 0.25, 0.0]);
+        assert_eq!(optimality_gap(&[vec![120.0, 40.0]], 100.0), 30.0);
+    }
+
+    #[test]
+    fn equal_scores_are_half_an_improvement() {
+        assert_eq!(probability_of_improvement(&[vec![1.0, 2.0]], &[vec![2.0]]), 0.25);
+        assert_eq!(probability_of_improvement(&[vec![1.0], vec![5.0]], &[vec![1.0], vec![0.0, 9.0]]), 0.5);
+    }
+}
