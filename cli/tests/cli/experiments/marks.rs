@@ -104,6 +104,26 @@ fn policies_on_the_way_are_tested_and_change_nothing_however_often_a_run_is_kill
     assert!(text.contains("Generalisation against training"), "{text}{}", stderr(&output));
 }
 
+/// With a constant learning rate a training is the beginning of one with a larger budget.
+#[test]
+fn the_policy_of_a_mark_is_that_of_a_training_that_ends_there() {
+    let shorter = PLAN.replace("30, 60]", "30]").replace("= 60", "= 30");
+    let [long, short] = [PLAN, &shorter].map(|plan| {
+        let experiment = Experiment::new(plan);
+        succeeded(&experiment.run("out", &["--cell", "2"]));
+        experiment
+    });
+    let policy = |experiment: &Experiment, place: &str| {
+        let cell = Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[2].id);
+        let Checkpoint { state, weights, .. } = Checkpoint::load(&cell.training().join(place)).expect("a policy");
+        (state.counters, state.observation_normaliser, state.reward_normaliser, weights)
+    };
+    assert!(policy(&long, "marks/30") == policy(&short, "checkpoint"));
+    let (marked, ended) = (long.cell_result("out", 2), short.cell_result("out", 2));
+    assert_eq!((&marked.marks[&30].results, marked.marks.len()), (&ended.results, 2));
+    assert_eq!(marked.marks[&10], ended.marks[&10]);
+}
+
 /// One that was deleted is made again.
 #[test]
 fn a_training_whose_kept_policies_are_gone_begins_again() {
