@@ -177,6 +177,31 @@ fn sets_are_typed_judged_by_other_thresholds_and_played_again() {
     assert_eq!(same, "12 of 12 episodes of 1 policy have the same bytes\n");
 }
 
+/// The text's rule counts Pendulum's last steps near upright, the code's the longest time.
+#[test]
+fn two_rules_that_count_different_steps_see_the_same_episodes() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let [training, text, code] =
+        ["training", "text", "code"].map(|name| directory.path().join(name).display().to_string());
+    stdout(&perturb(&["train", "--env", "Pendulum", "--episodes", "4", "--out", &training]).output().unwrap());
+    let evaluate = ["evaluate", "--checkpoint", &training, "--versions", "D", "--episodes", "12"];
+    let [by_text, by_code] = [("text", &text), ("code", &code)].map(|(rule, records)| {
+        stdout(&perturb(&evaluate).args(["--records", records, "--success", rule]).output().unwrap());
+        let same = stdout(&audit(records.as_ref(), &["--all", "--checkpoint", &training]));
+        assert_eq!(same, "12 of 12 episodes of 1 policy have the same bytes\n");
+        Records::read(records.as_ref()).expect("recorded").episodes
+    });
+    let of_text: Vec<_> = by_text.iter().map(|episode| (episode.achieved, episode.also_achieved)).collect();
+    let of_code: Vec<_> = by_code.iter().map(|episode| (episode.also_achieved, episode.achieved)).collect();
+    assert_eq!(of_text, of_code);
+    assert!(of_text.iter().any(|(last, longest)| last < longest), "some fell from near upright: {of_text:?}");
+    let rates = |records: &String| {
+        let rules = ["--success", "text", "code", "steps=1", "steps_in_a_row=5"];
+        stdout(&perturb(&["rates", records]).args(rules).output().unwrap())
+    };
+    assert_eq!(rates(&text), rates(&code));
+}
+
 #[test]
 fn what_no_environment_has_is_refused_before_anything_begins() {
     let directory = experiment();
