@@ -236,6 +236,12 @@ fn statistics_that_cannot_be_are_refused() {
         let message = refusal(&pointer, value);
         assert!(message.contains(part), "{pointer}: {message}");
     }
+    let directory = tempfile::tempdir().unwrap();
+    let mut other = checkpoint(1, 1);
+    other.state.reward_normaliser = other.state.reward_normaliser.map(|normaliser| normaliser.running_on(true));
+    other.save(directory.path(), None).unwrap();
+    let message = Checkpoint::load(directory.path()).unwrap_err().to_string();
+    assert!(message.contains("runs_on is true, but reward_return_runs_on false in the configuration"), "{message}");
 }
 
 #[test]
