@@ -261,7 +261,8 @@ impl RewardNormaliser {
     }
 
     /// Adds a step's `rewards` `[N]` to the statistics. Where `done` `[N]`, at the end of an episode or, with trials, of a
-    /// trial, the discounted return starts again from 0 in the next step, unless it runs on. Infinite numbers and NaN are refused and change nothing.
+    /// trial, the discounted return starts again from 0 in the next step, unless it runs on. Infinite numbers and NaN are
+    /// refused and change nothing.
     pub fn update(&mut self, rewards: &[f32], done: &[bool]) -> Result<()> {
         self.update_active(rewards, done, None)
     }

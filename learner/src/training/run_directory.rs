@@ -185,9 +185,7 @@ impl RunDirectory {
     pub fn checkpoint(&self) -> PathBuf {
         self.path.join("checkpoint")
     }
-}
 
-impl RunDirectory {
     /// Where the policy is that a run kept when its budget had passed so many episodes: a checkpoint to test.
     pub fn mark(&self, mark: u64) -> PathBuf {
         mark_in(&self.path, mark)
