@@ -296,29 +296,48 @@ fn acrobot_succeeds_up_to_80_steps() {
     assert!(lengths.contains(&80) && lengths.contains(&81), "both sides were seen: {lengths:?}");
 }
 
-#[test]
-fn pendulum_succeeds_if_the_last_100_steps_were_near_upright() {
+/// An episode of a pendulum that is led to an angle in each step, with whether it was near upright after each.
+fn pendulum(angle: impl Fn(u32) -> f32) -> (Vec<bool>, EpisodeEnd) {
     let spec = tasks::catalogue().find("Pendulum").unwrap();
     // A rod so light that the torque can hold it anywhere.
     let light = [("length", 1.0), ("mass", 0.1)].map(|(name, value)| (name, perturb::env::Distribution::fixed(value)));
     let mut settings = settings(spec, Version::D, 0, 0, 1);
     perturb::env::resolve(spec, &mut settings.distributions, light).unwrap();
+    let mut e = Episodes::new((spec.make)().unwrap(), settings);
+    e.begin(Some(&[f64::from(angle(0)), 0.0]));
+    let mut near = Vec::new();
+    for t in 0..spec.step_limit {
+        let [cos, sin, velocity] = observe(&e)[..] else { panic!("three numbers") };
+        // Gravity's acceleration is 15 sin θ, the torque's 30 u.
+        let torque = -0.5 * sin + 2.0 * (angle(t) - sin.atan2(cos)) - 0.4 * velocity;
+        step(&mut e, &torque.to_le_bytes());
+        near.push(observe(&e)[0] > 0.5); // within π/3
+    }
+    assert!(e.ended());
+    (near, e.finished(false))
+}
+
+#[test]
+fn pendulum_succeeds_if_the_last_100_steps_were_near_upright() {
     let mut entries = Vec::new();
     for release in 80..110 {
-        let mut e = Episodes::new((spec.make)().unwrap(), settings.clone());
-        e.begin(Some(&[1.3, 0.0]));
-        let mut near = Vec::new();
-        for t in 0..spec.step_limit {
-            let [cos, sin, velocity] = observe(&e)[..] else { panic!("three numbers") };
-            let target = if t < release { 1.3 } else { 0.0 };
-            // Gravity's acceleration is 15 sin θ, the torque's 30 u.
-            let torque = -0.5 * sin + 2.0 * (target - sin.atan2(cos)) - 0.4 * velocity;
-            step(&mut e, &torque.to_le_bytes());
-            near.push(observe(&e)[0] > 0.5); // within π/3
-        }
-        assert!(e.ended());
+        let (near, end) = pendulum(|t| if t < release { 1.3 } else { 0.0 });
         let held = near.iter().rev().take_while(|near| **near).count();
-        assert_eq!(e.finished(false).success, held >= 100, "held for {held} steps");
+        assert_eq!(end.success, held >= 100, "held for {held} steps");
+        entries.push(held);
+    }
+    assert!(entries.contains(&99) && entries.contains(&100), "both sides were seen: {entries:?}");
+}
+
+#[test]
+fn by_the_papers_code_pendulum_succeeds_after_any_100_steps_near_upright() {
+    let code = tasks::catalogue().find("Pendulum").unwrap().code_success.unwrap();
+    let mut entries = Vec::new();
+    for left in 80..110 {
+        let (near, end) = pendulum(|t| if (20..20 + left).contains(&t) { 0.0 } else { 1.3 });
+        let held = near.iter().filter(|near| **near).count(); // once
+        assert_eq!((end.achieved, end.code_achieved), (Some(0.0), Some(held as f64)));
+        assert_eq!((end.success, code.holds(end.code_achieved)), (false, held >= 100), "held for {held} steps");
         entries.push(held);
     }
     assert!(entries.contains(&99) && entries.contains(&100), "both sides were seen: {entries:?}");
