@@ -79,6 +79,19 @@ fn tuning_and_reporting_share_neither_seeds_nor_cells() {
     assert_eq!(plan.counts().all_pairs, 16 * 3, "of what is known beforehand");
 }
 
+#[test]
+fn selection_episodes_have_the_parameters_that_were_trained_on() {
+    let own = PLAN.replace("versions = ['D', 'E']", "versions = ['R', 'long']").replace("'CartPole', ", "")
+        + "[sets.long]\nversion = 'E'\nlength = '1.2..1.4'";
+    let plan = Plan::parse("test", own).unwrap();
+    for (cell, (version, own)) in plan.cells.iter().step_by(2).zip([(Version::R, 0), (Version::E, 1)]) {
+        let (set, episodes) = cell.selection_test().unwrap();
+        assert_eq!((set.name.as_str(), set.version, episodes), (SELECTION_TEST, version, 70));
+        assert_eq!((set.drawn(), set.drawn().len()), (cell.config.common.parameters.clone(), own));
+    }
+    assert!(plan.candidates.iter().all(|cell| cell.selection_test().is_none()));
+}
+
 /// Results of a plan without selection episodes are those of what is trained anew, and of no tuning cell.
 #[test]
 fn a_cell_without_selection_episodes_has_the_id_that_it_has_by_the_papers_rule() {

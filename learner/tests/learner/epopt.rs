@@ -211,12 +211,47 @@ fn each_kept_episode_can_have_an_update_of_its_own() {
             assert_eq!(UpdateStats { selection: None, ..stats }, expected, "{lstm:?}");
             let mut other = moved(&spec);
             let mut each = base(&other);
-            for part in &alone {
-                each.update(&mut other, part, 1.0).expect("an update");
-            }
+            let mut update = |part| each.update(&mut other, part, 1.0).expect("an update");
+            let steps: Vec<UpdateStats> = alone.iter().map(&mut update).collect();
             let one_after_the_other = policy.weights() == other.weights();
             assert_eq!(one_after_the_other, which == 0, "PPO takes an epoch on all before the next");
+
+            let figures: [fn(&UpdateStats) -> f64; 4] =
+                [|it| it.entropy_loss, |it| it.value_loss, |it| it.loss, |it| it.grad_norm];
+            // PPO's are of other weights in the other order; the entropy hardly is.
+            let (count, share) = [(4, 1e-9), (1, 0.1)][which];
+            for figure in &figures[..count] {
+                let mean = steps.iter().map(figure).sum::<f64>() / 4.0;
+                assert!((figure(&stats) - mean).abs() < share * mean.abs(), "a mean over all steps: {stats:?} {mean}");
+            }
+            let together = rollout.select(&worst).expect("its own episodes");
+            let mut other = moved(&spec);
+            let whole = base(&other).update(&mut other, &together, 1.0).expect("an update");
+            let explained = [stats, whole].map(|it| it.explained_variance.expect("returns that vary"));
+            assert!((explained[0] - explained[1]).abs() < 1e-5, "of all episodes, up to rounding: {explained:?}");
         }
+    }
+}
+
+#[test]
+fn an_epoch_of_ppo_is_a_round_of_all_kept_episodes() {
+    let (lengths, returns) = eight();
+    for lstm in [None, Some(8)] {
+        let spec = spec(DISCRETE, lstm);
+        let rollout = play(&moved(&spec), &lengths, &returns, of_episodes(&spec, 4));
+        let select = |span: &Span| rollout.select(&[*span]).expect("an episode");
+        let alone: Vec<Rollout> = rollout.episodes().iter().map(select).collect();
+        let parts: Vec<&Rollout> = alone.iter().collect();
+        let after = |updates: usize, n_epochs: usize| {
+            let mut policy = moved(&spec);
+            let config = PpoConfig { n_epochs, learning_rate: 3e-3, ..PpoConfig::default() };
+            let mut ppo = Ppo::new(config, &policy, 1).expect("valid settings");
+            for _ in 0..updates {
+                ppo.update_in_turn(&mut policy, &parts, 1.0).expect("an update");
+            }
+            policy.weights()
+        };
+        assert_eq!(after(1, 3), after(3, 1), "{lstm:?}");
     }
 }
 

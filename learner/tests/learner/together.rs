@@ -147,6 +147,21 @@ fn with_an_update_for_each_episode_the_learning_rate_falls_by_episodes(
     assert!((progress[1].0 - 1e-3 * left).abs() < 1e-15, "f64 rounding: {progress:?}");
 }
 
+#[test]
+fn a_run_that_begins_again_has_no_policies_of_the_one_before() {
+    let base = tempfile::tempdir().expect("a directory");
+    let kept = base.path().join("marks/10");
+    std::fs::create_dir_all(&kept).expect("a folder");
+    std::fs::write(kept.join("checkpoint.json"), "{}").expect("a file");
+    let error = RunDirectory::choose(base.path(), false).expect_err("it holds a run").to_string();
+    assert!(error.contains("already holds a run (marks)"), "{error}");
+    let directory = RunDirectory::choose(base.path(), true).expect("a directory");
+    assert!(directory.has_kept([10].into_iter()) && !directory.has_kept([10, 20].into_iter()));
+    let stop = StopFlag::default();
+    train(&connect(&[server()]), &config("CartPole", TRAININGS[0]), &directory, 1, &stop, |_| {}).expect("a training");
+    assert!(!directory.has_kept([10].into_iter()));
+}
+
 #[rstest]
 fn one_that_fails_does_not_stop_the_others(#[values("CartPole", "Pendulum")] environment: &str) {
     let private: [PrivateServer; 1] = [server()];
