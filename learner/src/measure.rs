@@ -13,6 +13,7 @@ use crate::cell::{CellOrder, run_cells};
 use crate::checkpoint::{Checkpoint, CheckpointError};
 use crate::client::{Address, ClientError, Servers};
 use crate::evaluation::{TestError, TestOptions, Tester};
+use crate::training::{RunDirectory, RunDirectoryError, TrainError, train};
 
 /// A budget that no measurement uses up.
 const ENDLESS: u64 = 1 << 40;
@@ -39,6 +40,12 @@ pub enum MeasureError {
         /// How.
         reason: String,
     },
+    /// A policy cannot be made.
+    #[error(transparent)]
+    Train(#[from] TrainError),
+    /// There is no place for it.
+    #[error(transparent)]
+    Directory(#[from] RunDirectoryError),
     /// What was learned cannot be read.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
@@ -75,6 +82,11 @@ pub fn measure(servers: &Servers, group: &[&Cell], jobs: usize, limit: Duration)
 }
 
 fn measure_one(servers: &Servers, group: &[&Cell], scratch: &Path, limit: Duration) -> Result<Speed, MeasureError> {
+    if group[0].config.settings.is_random() {
+        let directory = RunDirectory::choose(scratch, true)?;
+        let made = train(servers, &group[0].config, &directory, 1, &StopFlag::default(), |_| {})?;
+        return Ok(Speed { training: 0.0, testing: measure_test(servers, group[0], &made.checkpoint)? });
+    }
     let endless = |cell: &&Cell| {
         let mut cell = Cell::clone(cell);
         cell.config.common.episodes = ENDLESS;

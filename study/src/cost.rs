@@ -147,8 +147,11 @@ pub fn estimates(plan: &Plan, measurements: &[Measurement], step_limits: &HashMa
     plan.cells.iter().map(estimate).collect()
 }
 
-/// How many episodes a training has: more than its budget if it learns from the worst of them only.
+/// How many episodes a training has: more than its budget if it learns from the worst of them only, none if nothing learns.
 fn generated_episodes(config: &TrainConfig) -> f64 {
+    if config.settings.is_random() {
+        return 0.0;
+    }
     let budget = config.common.episodes as f64;
     let Wrapper::Epopt(epopt) = &config.settings.wrapper else { return budget };
     let full = (epopt.full_iterations as f64 * epopt.episodes_per_iteration as f64).min(budget);

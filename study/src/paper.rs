@@ -28,9 +28,20 @@ pub struct Method {
     pub preset: Preset,
 }
 
+impl Method {
+    /// Whether it is a line to compare with, which learns nothing.
+    pub fn is_reference(&self) -> bool {
+        self.algorithm == "random"
+    }
+}
+
 impl fmt::Display for Method {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} {}", self.algorithm, self.architecture)?;
+        if self.is_reference() {
+            f.write_str("random policy (reference)")?;
+        } else {
+            write!(f, "{} {}", self.algorithm, self.architecture)?;
+        }
         self.episodes_per_trial.map_or(Ok(()), |episodes| write!(f, " N={episodes}"))?;
         if self.preset.is_default() { Ok(()) } else { write!(f, " ({})", self.preset) }
     }

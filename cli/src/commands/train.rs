@@ -61,7 +61,9 @@ fn go_on(args: &TrainArgs, path: &Path) -> Result<ExitCode> {
 
 /// Says what a training came to.
 fn end(config: &TrainConfig, directory: &RunDirectory, outcome: &Outcome) -> Result<ExitCode> {
-    summarise(&outcome.progress);
+    if !config.settings.is_random() {
+        summarise(&outcome.progress);
+    }
     match outcome.signal {
         Some(number) => {
             eprintln!(

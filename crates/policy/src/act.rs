@@ -9,7 +9,7 @@ use crate::act_ff::FeedForward;
 use crate::act_rc::Recurrent;
 use crate::error::{Error, Result, check_length};
 use crate::kernel::Rows;
-use crate::sample::{sample_categorical, sample_gaussian};
+use crate::sample::{sample_categorical, sample_gaussian, sample_uniform};
 use crate::spec::{ActionKind, PolicySpec};
 use crate::weights::Weights;
 
@@ -24,6 +24,8 @@ pub struct Actor {
     max_batch: usize,
     network: Network,
     log_std: Vec<f32>,
+    /// Continuous actions are uniform in a box, not Gaussian.
+    uniform: bool,
 }
 
 /// What an architecture computes with.
@@ -77,7 +79,13 @@ impl Actor {
             Some(width) => Network::Recurrent(Box::new(Recurrent::new(spec, width, max_batch))),
             None => Network::FeedForward(FeedForward::new(spec, max_batch)),
         };
-        Actor { spec: spec.clone(), max_batch, network, log_std }
+        Actor { spec: spec.clone(), max_batch, network, log_std, uniform: false }
+    }
+
+    /// From now on a continuous action is uniform in the box whose middle is the policy's mean and half of whose width is its
+    /// deviation. Discrete ones stay as they are: equal logits make them uniform.
+    pub fn act_uniformly(&mut self) {
+        self.uniform = true;
     }
 
     /// Takes over weights, whose names and shapes must be those of [`PolicySpec::layout`]. Memories stay.
@@ -128,6 +136,7 @@ impl Actor {
                     action[0] = choice as f32;
                     log_prob
                 }
+                ActionKind::Continuous { .. } if self.uniform => sample_uniform(head, &self.log_std, rng, action),
                 ActionKind::Continuous { .. } => sample_gaussian(head, &self.log_std, rng, action),
             };
             let finite = action.iter().all(|x| x.is_finite()) && log_prob.is_finite() && out.values[n].is_finite();

@@ -209,6 +209,13 @@ impl Player {
         }
     }
 
+    /// The same, see [`Actor::act_uniformly`].
+    #[must_use]
+    pub fn uniformly(mut self) -> Self {
+        self.actor.act_uniformly();
+        self
+    }
+
     /// N.
     pub fn n_envs(&self) -> usize {
         self.starts.len()

@@ -3,6 +3,7 @@
 //! Categorical over logits l_j, j = 0 … n-1: log π(a) = l_a - log Σ_j exp l_j.
 //! Diagonal Gaussian with means μ_i and log standard deviations log σ_i, i = 0 … A-1:
 //! log π(a) = -½ Σ_i ((a_i - μ_i)/σ_i)² - Σ_i log σ_i - ½ A log 2π.
+//! Uniform in the box with middles μ_i and half widths σ_i: log π(a) = -Σ_i log 2σ_i.
 
 use rand_chacha::ChaCha8Rng;
 
@@ -48,11 +49,43 @@ pub(crate) fn sample_gaussian(means: &[f32], log_std: &[f32], rng: &mut ChaCha8R
     log_prob
 }
 
+/// Draws an action `[A]` uniformly from the box with `middles` `[A]` and the logarithms of half its widths, `log_half` `[A]`,
+/// into `action`; one uniform number an element. Gives the log-density.
+pub(crate) fn sample_uniform(middles: &[f32], log_half: &[f32], rng: &mut ChaCha8Rng, action: &mut [f32]) -> f32 {
+    let mut log_prob = 0.0;
+    for ((action, middle), log_half) in action.iter_mut().zip(middles).zip(log_half) {
+        *action = middle + exp(*log_half) * (2.0 * uniform(rng) - 1.0) as f32;
+        log_prob -= log_half + std::f32::consts::LN_2;
+    }
+    log_prob
+}
+
 #[cfg(test)]
 #[allow(clippy::disallowed_methods)] // what it is compared with
 mod tests {
     use super::*;
     use crate::random::{Purpose, stream};
+
+    #[test]
+    fn uniform_actions_fill_the_box_evenly() {
+        let (middles, half, draws) = ([0.0f32, 3.0], [2.0f32, 0.5], 100_000);
+        let mut rng = stream(1, Purpose::Actions);
+        let mut counts = [[0u32; 10]; 2];
+        for _ in 0..draws {
+            let mut action = [0.0; 2];
+            let log_prob = sample_uniform(&middles, &half.map(ln), &mut rng, &mut action);
+            assert!((log_prob + 4.0f32.ln()).abs() < 1e-6, "the area is 4 · 1");
+            for i in 0..2 {
+                let place = (action[i] - middles[i]) / half[i];
+                assert!(place.abs() < 1.000_001, "{action:?}");
+                counts[i][((5.0 * (place + 1.0)) as usize).min(9)] += 1;
+            }
+        }
+        // Four standard deviations of a tenth of the draws: √(draws · 0.1 · 0.9).
+        for count in counts.into_iter().flatten() {
+            assert!((f64::from(count) - 10_000.0).abs() < 380.0, "{counts:?}");
+        }
+    }
 
     #[test]
     fn choices_are_as_frequent_as_their_probabilities() {

@@ -135,6 +135,7 @@ pub fn build(settings: &Settings, policy: &Policy, seed: u64) -> Result<Box<dyn 
     let base: Box<dyn InTurn> = match &settings.base {
         Base::A2c(settings) => Box::new(A2c::new(settings.clone(), policy)?),
         Base::Ppo(settings) => Box::new(Ppo::new(settings.clone(), policy, seed)?),
+        Base::Random => unreachable!("a random policy is made, not trained"),
     };
     Ok(match &settings.wrapper {
         Wrapper::Plain | Wrapper::Rl2(_) => base,

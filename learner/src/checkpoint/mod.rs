@@ -224,6 +224,15 @@ impl State {
 
     /// The shape of a policy that this was trained with.
     pub fn policy(&self) -> PolicySpec {
+        if self.config.settings.is_random() {
+            let observation_size = self.inputs(1).size();
+            return PolicySpec {
+                observation_size,
+                action: self.environment_spec.action,
+                hidden: Vec::new(),
+                lstm: None,
+            };
+        }
         let shape = match self.config.common.architecture {
             Architecture::Ff => PolicySpec::feed_forward,
             Architecture::Rc => PolicySpec::recurrent,

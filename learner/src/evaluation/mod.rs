@@ -23,6 +23,9 @@ pub fn player(checkpoint: &Checkpoint, n_envs: usize, seed: u64) -> Result<Playe
     let episodes_per_trial = state.config.settings.episodes_per_trial();
     let role = Role::testing(seed, 0, n_envs);
     let mut player = Player::new(policy, state.inputs(n_envs), n_envs, episodes_per_trial, normalisers, role);
+    if state.config.settings.is_random() {
+        player = player.uniformly();
+    }
     policy.check(weights)?;
     player.load(&weights.iter().flat_map(|array| array.data.iter().copied()).collect::<Vec<f32>>())?;
     Ok(player)

@@ -214,13 +214,15 @@ impl<'a> Tester<'a> {
         }
         let player = player(self.checkpoint, quotas.len(), test.seed)?;
         let episodes: u64 = quotas.iter().sum();
-        let mut trials: Box<dyn FnMut() -> Result<Vec<EndedEpisode>, TestError>> = if session.acts() {
-            let mut remote = RemoteTrials::new(session, &player, self.checkpoint);
-            Box::new(move || remote.play())
-        } else {
-            let mut trials = Trials::begin(session, player, &observations)?;
-            Box::new(move || trials.step())
-        };
+        // Servers do not know the random policy's distribution of continuous actions.
+        let mut trials: Box<dyn FnMut() -> Result<Vec<EndedEpisode>, TestError>> =
+            if session.acts() && !self.checkpoint.state.config.settings.is_random() {
+                let mut remote = RemoteTrials::new(session, &player, self.checkpoint);
+                Box::new(move || remote.play())
+            } else {
+                let mut trials = Trials::begin(session, player, &observations)?;
+                Box::new(move || trials.step())
+            };
         let mut counted: Vec<EndedEpisode> = Vec::new();
         while (counted.len() as u64) < episodes {
             if let Some(signal) = stop.signal() {

@@ -28,6 +28,16 @@ pub enum TrainError {
     /// The checkpoint cannot be written.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
+    /// The box of the action space has no volume, or an infinite one.
+    #[error("a random policy draws actions from their bounds, but `{name}` is in [{low}, {high}]: train another")]
+    Unbounded {
+        /// The action's entry.
+        name: String,
+        /// Its lower bound.
+        low: f64,
+        /// Its upper bound.
+        high: f64,
+    },
     /// A log cannot be gone on with.
     #[error(transparent)]
     Log(#[from] LogError),

@@ -8,6 +8,7 @@
 mod error;
 mod learning;
 mod lockstep;
+mod random;
 mod remote;
 mod run_directory;
 
@@ -134,14 +135,22 @@ pub fn train_together(
     report: &mut dyn FnMut(usize, &Progress),
     ended: &mut dyn FnMut(usize, Result<Outcome>),
 ) -> Result<()> {
-    let options: Vec<OpenOptions> = entries.iter().map(|entry| learning::options(entry.start.config())).collect();
+    let of_random = |(_, entry): &(usize, Entry<'_>)| entry.start.config().settings.is_random();
+    let (random, entries): (Vec<_>, Vec<_>) = entries.into_iter().enumerate().partition(of_random);
+    for (index, entry) in random {
+        ended(index, random::make(servers, &entry));
+    }
+    if entries.is_empty() {
+        return Ok(());
+    }
+    let options: Vec<OpenOptions> = entries.iter().map(|(_, entry)| learning::options(entry.start.config())).collect();
     let mut observations = Vec::new();
     let mut session = Session::open_together(servers, &options, &mut observations)?;
     let size = session.observation_size();
     let at_server = options.len() == 1 && session.plays_together();
     let (mut seats, mut free) = (Vec::new(), Vec::new());
     let mut first = 0;
-    for (index, (entry, options)) in entries.into_iter().zip(&options).enumerate() {
+    for ((index, entry), options) in entries.into_iter().zip(&options) {
         let slots = first..first + options.num_envs;
         first = slots.end;
         let observations = &observations[slots.start * size..slots.end * size];

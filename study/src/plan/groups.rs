@@ -1,12 +1,13 @@
 //! Which cells one process does together.
 //!
-//! A group's cells have the same environment and architecture, so that their steps can be one batch. What a cell comes
+//! A group's cells have the same environment and architecture, so that their steps can be one batch; a random policy, which
+//! takes none, is no cell to measure others by. What a cell comes
 //! to does not depend on its group.
 
 use std::ops::Range;
 
 use super::{Cell, Plan, distinct};
-use crate::settings::Architecture;
+use crate::settings::{Architecture, TrainConfig};
 
 /// How large groups are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -32,9 +33,10 @@ impl Grouping {
 }
 
 impl Cell {
-    /// Environment and architecture: cells that have both in common may be in one group.
-    pub fn kind(&self) -> (&str, Architecture) {
-        (&self.config.common.environment, self.config.common.architecture)
+    /// Environment, architecture, and whether anything learns: cells that have all in common may be in one group.
+    pub fn kind(&self) -> (&str, Architecture, bool) {
+        let TrainConfig { common, settings } = &self.config;
+        (&common.environment, common.architecture, !settings.is_random())
     }
 }
 
@@ -86,7 +88,7 @@ mod tests {
         // Of each environment two cells of A2C with FF, two with RC, and two of PPO with FF.
         let groups = plan.groups(&all, Grouping { most: 3, at_a_time: 1 });
         assert_eq!(groups, [vec![0, 1], vec![4, 5], vec![2, 3], vec![6, 7], vec![10, 11], vec![8, 9]]);
-        assert_eq!(plan.cells[groups[1][0]].kind(), ("CartPole", Architecture::Ff));
+        assert_eq!(plan.cells[groups[1][0]].kind(), ("CartPole", Architecture::Ff, true));
         let left = plan.groups(&[1, 5, 8, 11], Grouping { most: 36, at_a_time: 1 });
         assert_eq!(left, [vec![1, 5], vec![8], vec![11]]);
     }

@@ -42,9 +42,10 @@ pub(super) fn comparisons(plan: &Plan, selections: &[MethodResults<'_>]) -> Vec<
     of(plan, selections, ALL, &environments).into_iter().chain(each).collect()
 }
 
-/// The family of comparisons over some environments.
+/// The family of comparisons over some environments. Reference lines are not in it: each would cost the others' p-values.
 fn of(plan: &Plan, selections: &[MethodResults<'_>], name: &str, environments: &[&str]) -> Vec<Comparison> {
-    let methods = plan.methods();
+    let mut methods = plan.methods();
+    methods.retain(|method| !method.is_reference());
     let found = |method: &Method| -> Option<Vec<&MethodResults<'_>>> {
         let of = |environment| selections.iter().find(|of| of.environment == environment && of.method == *method);
         environments.iter().map(|environment| of(*environment)).collect()
@@ -170,5 +171,20 @@ mod tests {
         // Unpaired, a run is better than its own and those below it: 3 + 2 + 1 of 9.
         assert!((comparison.improvement.point - 6.0 / 9.0).abs() < 1e-12);
         assert_eq!(compared(&[vec![1.0], vec![2.0]]), None, "one run says nothing of others");
+    }
+
+    #[test]
+    fn a_reference_line_changes_no_comparison() {
+        let learners =
+            "environments = ['CartPole']\nruns = 3\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff', 'rc']";
+        let of = |text: String| {
+            let plan = Plan::parse("test", text).unwrap();
+            let rate = |cell: &crate::Cell| 10.0 * f64::from(cell.run) + cell.method().to_string().len() as f64;
+            let results = crate::fixture::results(&plan, |cell| Some(([rate(cell); 3], 1.0)));
+            comparisons(&plan, &results.select())
+        };
+        let without = of(learners.into());
+        assert_eq!(without.len(), Metric::ALL.len());
+        assert_eq!(of(format!("{learners}\n[[algorithm]]\nname = 'random'\narchitectures = ['ff']")), without);
     }
 }

@@ -59,7 +59,7 @@ impl Running {
         if let Some(number) = group {
             self.places.insert(number, self.groups.len());
         }
-        let (environment, architecture) = cell.kind();
+        let (environment, architecture, ..) = cell.kind();
         self.groups.push(RunningGroup { kind: format!("{environment} {architecture}"), cells: vec![entry] });
     }
 

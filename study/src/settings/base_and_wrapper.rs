@@ -29,6 +29,8 @@ pub enum Base {
     A2c(A2cConfig),
     /// Proximal policy optimisation.
     Ppo(PpoConfig),
+    /// Nothing: every action is as likely as any other. A line to compare with.
+    Random,
 }
 
 /// What is wrapped around it.
@@ -45,7 +47,7 @@ pub enum Wrapper {
 
 impl Settings {
     /// All algorithms, each part with its own defaults, in the order in which they are listed.
-    pub fn all() -> [Self; 6] {
+    pub fn all() -> [Self; 7] {
         let (a2c, ppo) = (|| Base::A2c(A2cConfig::default()), || Base::Ppo(PpoConfig::default()));
         let epopt = || Wrapper::Epopt(EpoptConfig::default());
         let rl2 = || Wrapper::Rl2(Rl2Config::default());
@@ -56,18 +58,20 @@ impl Settings {
             (epopt(), ppo()),
             (rl2(), a2c()),
             (rl2(), ppo()),
+            (Wrapper::Plain, Base::Random),
         ]
         .map(|(wrapper, base)| Self { base, wrapper })
     }
 
     /// The names of all algorithms.
-    pub fn names() -> [&'static str; 6] {
+    pub fn names() -> [&'static str; 7] {
         Self::all().map(|settings| settings.name())
     }
 
     /// The algorithm's name, as it is typed.
     pub fn name(&self) -> &'static str {
         match (&self.wrapper, &self.base) {
+            (_, Base::Random) => "random",
             (Wrapper::Plain, Base::A2c(_)) => "a2c",
             (Wrapper::Plain, Base::Ppo(_)) => "ppo",
             (Wrapper::Epopt(_), Base::A2c(_)) => "epopt-a2c",
@@ -75,6 +79,11 @@ impl Settings {
             (Wrapper::Rl2(_), Base::A2c(_)) => "rl2-a2c",
             (Wrapper::Rl2(_), Base::Ppo(_)) => "rl2-ppo",
         }
+    }
+
+    /// Whether there is nothing to be learned.
+    pub fn is_random(&self) -> bool {
+        matches!(self.base, Base::Random)
     }
 
     /// Whether the policy learns over trials.
@@ -105,6 +114,7 @@ impl Settings {
             base: match self.base {
                 Base::A2c(_) => Base::A2c(table().try_into()?),
                 Base::Ppo(_) => Base::Ppo(table().try_into()?),
+                Base::Random => Base::Random,
             },
             wrapper: match self.wrapper {
                 Wrapper::Plain => Wrapper::Plain,
@@ -114,11 +124,12 @@ impl Settings {
         })
     }
 
-    /// γ, per step.
+    /// γ, per step; 1 where nothing learns.
     pub fn gamma(&self) -> f64 {
         match &self.base {
             Base::A2c(settings) => settings.gamma,
             Base::Ppo(settings) => settings.gamma,
+            Base::Random => 1.0,
         }
     }
 
@@ -141,6 +152,10 @@ impl Settings {
                 settings.validate()?;
                 check_size(settings.n_steps, num_envs)?;
                 check_minibatches(settings, architecture, num_envs)?;
+            }
+            Base::Random => {
+                let expected = "\"ff\": a random policy has nothing to remember";
+                require(architecture == Architecture::Ff, "architecture", architecture, expected)?;
             }
         }
         match &self.wrapper {

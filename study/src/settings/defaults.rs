@@ -10,6 +10,7 @@ pub(super) fn of(mut settings: Settings, architecture: Architecture, preset: Pre
     tune(&mut settings, architecture);
     let num_envs = match (&settings.wrapper, &settings.base, architecture) {
         (Wrapper::Epopt(_), _, _) => 25,
+        (_, Base::Random, _) => 1,
         (_, Base::Ppo(_), Architecture::Ff) => 8,
         _ => 16,
     };
@@ -17,6 +18,7 @@ pub(super) fn of(mut settings: Settings, architecture: Architecture, preset: Pre
         (Wrapper::Plain | Wrapper::Rl2(_), Base::A2c(_)) => 100,
         _ => 1,
     };
+    let learns = !settings.is_random();
     let common = Common {
         preset: Preset::Perturb,
         environment: String::new(),
@@ -26,8 +28,8 @@ pub(super) fn of(mut settings: Settings, architecture: Architecture, preset: Pre
         episodes: 15_000,
         seed: 1,
         num_envs,
-        normalize_observations: true,
-        normalize_rewards: true,
+        normalize_observations: learns,
+        normalize_rewards: learns,
         reward_return_runs_on: false,
         log_interval,
         checkpoint_interval: 500,
@@ -59,5 +61,6 @@ fn tune(settings: &mut Settings, architecture: Architecture) {
                 ppo.n_epochs = 4; // an epoch costs five times as much as that of a feed-forward policy
             }
         }
+        Base::Random => {}
     }
 }

@@ -50,6 +50,7 @@ pub(super) fn apply_paper(TrainConfig { common, settings }: &mut TrainConfig) {
             // Rollouts are an eighth as long. Nothing but the log depends on it.
             common.log_interval = if let Wrapper::Epopt(_) = settings.wrapper { 1 } else { 10 };
         }
+        Base::Random => {}
     }
     if let Wrapper::Epopt(epopt) = &mut settings.wrapper {
         epopt.rank_by = Ranking::Normalized;

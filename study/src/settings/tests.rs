@@ -16,7 +16,7 @@ fn refusal(file: Option<&str>, sets: &[&str]) -> String {
 fn ppo(config: &TrainConfig) -> &PpoConfig {
     match &config.settings.base {
         Base::Ppo(settings) => settings,
-        Base::A2c(_) => panic!("not PPO"),
+        Base::A2c(_) | Base::Random => panic!("not PPO"),
     }
 }
 
@@ -117,7 +117,9 @@ fn a_table_without_the_papers_preset_has_no_younger_settings_that_are_as_before(
 /// The paper's ten pairs.
 fn pairs() -> impl Iterator<Item = (&'static str, Architecture)> {
     let all = Settings::names().into_iter().flat_map(|name| Architecture::ALL.map(|architecture| (name, architecture)));
-    all.filter(|(name, architecture)| !name.starts_with("rl2") || *architecture == Architecture::Rc)
+    all.filter(|(name, architecture)| {
+        *name != "random" && (!name.starts_with("rl2") || *architecture == Architecture::Rc)
+    })
 }
 
 #[test]
@@ -132,8 +134,22 @@ fn there_are_ten_pairs_of_algorithm_and_architecture_and_no_others() {
 }
 
 #[test]
+fn a_random_policy_has_no_settings_of_a_learner_and_no_memory() {
+    for preset in Preset::ALL {
+        let config = of(&preset.to_string(), "random", Architecture::Ff, &["episodes=7"]);
+        assert!(
+            config.settings.is_random() && !config.common.normalize_observations && !config.common.normalize_rewards
+        );
+        assert_eq!(load(Some(&config.to_toml()), &[], "").unwrap(), config);
+    }
+    assert!(refusal(None, &["algorithm=random", "learning_rate=1"]).contains("unknown key `learning_rate`"));
+    let message = refusal(None, &["algorithm=random", "architecture=rc"]);
+    assert!(message.contains("a random policy has nothing to remember"), "{message}");
+}
+
+#[test]
 fn names_are_typed_as_they_are_written() {
-    assert_eq!(Settings::names(), ["a2c", "ppo", "epopt-a2c", "epopt-ppo", "rl2-a2c", "rl2-ppo"]);
+    assert_eq!(Settings::names(), ["a2c", "ppo", "epopt-a2c", "epopt-ppo", "rl2-a2c", "rl2-ppo", "random"]);
     assert_eq!(serde_json::to_value(Architecture::ALL).unwrap(), serde_json::json!(Architecture::NAMES));
 }
 

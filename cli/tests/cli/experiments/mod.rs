@@ -2,6 +2,7 @@
 
 mod groups;
 mod marks;
+mod reference;
 mod reports;
 mod running;
 mod selection;

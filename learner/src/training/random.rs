@@ -1,0 +1,133 @@
+//! The random policy: a checkpoint to test like any other, which no training leads to.
+//!
+//! As Gymnasium's `action_space.sample()`: choices are equally likely, and continuous actions uniform in the box of the
+//! action space, each entry by itself, whatever is observed. The weights say so: none of an observation, the middles of the
+//! box as biases, and the logarithms of half its widths where log standard deviations stand.
+
+use super::{Entry, Outcome, Result, TrainError};
+use crate::checkpoint::{Checkpoint, EnvironmentSummary, State};
+use crate::client::Servers;
+use crate::logging::Progress;
+use crate::proto::{Channel, Environment, action_space::Kind};
+use perturb_policy::math::ln;
+use perturb_policy::{NamedArray, ObservationNormaliser, PolicySpec, RewardNormaliser, Weights};
+use perturb_study::Counters;
+use perturb_study::files::write_atomically;
+use perturb_study::settings::{Common, TrainConfig};
+
+/// Writes the random policy to the directory of `entry`, as the last checkpoint and as that of all its marks.
+///
+/// # Errors
+/// A server that does not know the environment, actions without bounds, a full disk.
+pub(super) fn make(servers: &Servers, entry: &Entry<'_>) -> Result<Outcome> {
+    let Entry { directory, ref start, marks } = *entry;
+    let config = start.config();
+    let environment = servers.environment(&config.common.environment)?;
+    let checkpoint = checkpoint(config, &environment)?;
+    directory.prepare()?; // from here on an earlier run is gone
+    write_atomically(&directory.path().join("config.toml"), config.to_toml().as_bytes())?;
+    marks.iter().try_for_each(|&mark| checkpoint.save(&directory.mark(mark), None))?;
+    checkpoint.save(&directory.checkpoint(), None)?;
+    Ok(Outcome { checkpoint, progress: Progress::default(), signal: None })
+}
+
+fn checkpoint(config: &TrainConfig, environment: &Environment) -> Result<Checkpoint> {
+    let Common { normalize_observations, normalize_rewards, num_envs, reward_return_runs_on, .. } = config.common;
+    let summary = EnvironmentSummary::of(environment).ok_or(TrainError::NoActions)?;
+    let observations = normalize_observations.then(|| ObservationNormaliser::new(summary.observation.len()));
+    let rewards = normalize_rewards
+        .then(|| RewardNormaliser::new(num_envs, config.settings.gamma()).running_on(reward_return_runs_on));
+    let state = State {
+        environment_spec: summary,
+        observation_normaliser: observations,
+        reward_normaliser: rewards,
+        counters: Counters::default(),
+        config: config.clone(),
+        commits: vec![perturb_study::VERSION.into()],
+    };
+    let policy = state.policy();
+    let weights = weights(&policy, environment)?;
+    Ok(Checkpoint { state, policy, weights })
+}
+
+fn weights(policy: &PolicySpec, environment: &Environment) -> Result<Weights> {
+    let channels: &[Channel] = match environment.action.as_ref().and_then(|action| action.kind.as_ref()) {
+        Some(Kind::Continuous(continuous)) => &continuous.channels,
+        _ => &[],
+    };
+    let bounded = |channel: &Channel| channel.low.is_finite() && channel.high.is_finite() && channel.low < channel.high;
+    if let Some(Channel { name, low, high, .. }) = channels.iter().find(|channel| !bounded(channel)) {
+        return Err(TrainError::Unbounded { name: name.clone(), low: *low, high: *high });
+    }
+    let of = |number: fn(&Channel) -> f64| channels.iter().map(|channel| number(channel) as f32).collect();
+    let array = |(name, shape): (String, Vec<usize>)| {
+        let data = match name.as_str() {
+            "policy.0.bias" if !channels.is_empty() => of(|channel| (channel.low + channel.high) / 2.0),
+            "log_std" => of(|channel| f64::from(ln(((channel.high - channel.low) / 2.0) as f32))),
+            _ => vec![0.0; shape.iter().product()],
+        };
+        NamedArray { name, shape, data }
+    };
+    Ok(policy.layout().into_iter().map(array).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::evaluation::player;
+    use crate::proto::{ActionSpace, Continuous, Discrete};
+
+    fn checkpoint_for(kind: Kind) -> Result<Checkpoint> {
+        let table = "environment = 'Test'\nalgorithm = 'random'".parse().unwrap();
+        let observation = vec![Channel::default(); 3];
+        let action = Some(ActionSpace { kind: Some(kind) });
+        let environment = Environment { observation, action, ..Environment::default() };
+        checkpoint(&TrainConfig::from_table("", table).unwrap(), &environment)
+    }
+
+    fn continuous(bounds: &[(f64, f64)]) -> Kind {
+        let channel = |&(low, high): &(f64, f64)| Channel { low, high, ..Channel::default() };
+        Kind::Continuous(Continuous { channels: bounds.iter().map(channel).collect() })
+    }
+
+    /// The actions of the first step in so many environments, which all see something else.
+    fn actions(checkpoint: &Checkpoint, n: usize) -> Vec<[u8; 4]> {
+        let mut player = player(checkpoint, n, 7).unwrap();
+        let observations: Vec<f32> = (0..3 * n).map(|i| i as f32 - 100.0).collect();
+        player.begin(&observations, None).unwrap();
+        player.act().unwrap().as_chunks::<4>().0.to_vec()
+    }
+
+    #[test]
+    fn every_choice_is_as_frequent() {
+        let names = vec![String::new(); 3];
+        let checkpoint = checkpoint_for(Kind::Discrete(Discrete { names })).unwrap();
+        let mut counts = [0u32; 3];
+        actions(&checkpoint, 9000).iter().for_each(|action| counts[i32::from_le_bytes(*action) as usize] += 1);
+        // Four standard deviations: √(9000 · ⅓ · ⅔).
+        assert!(counts.iter().all(|count| (f64::from(*count) - 3000.0).abs() < 179.0), "{counts:?}");
+    }
+
+    #[test]
+    fn continuous_actions_are_uniform_in_their_bounds() {
+        let checkpoint = checkpoint_for(continuous(&[(-2.0, 2.0), (1.0, 2.0)])).unwrap();
+        let actions: Vec<f32> = actions(&checkpoint, 9000).into_iter().map(f32::from_le_bytes).collect();
+        for (entry, low, high) in [(0, -2.0f32, 2.0f32), (1, 1.0, 2.0)] {
+            let mut quarters = [0u32; 4];
+            for action in actions.iter().skip(entry).step_by(2) {
+                assert!((low - 1e-6..=high + 1e-6).contains(action), "{action}");
+                quarters[((4.0 * (action - low) / (high - low)) as usize).min(3)] += 1;
+            }
+            // Four standard deviations: √(9000 · ¼ · ¾).
+            assert!(quarters.iter().all(|count| (f64::from(*count) - 2250.0).abs() < 165.0), "{quarters:?}");
+        }
+    }
+
+    #[test]
+    fn actions_without_a_box_are_refused() {
+        for bounds in [(f64::NEG_INFINITY, 1.0), (0.0, f64::INFINITY), (1.0, 1.0)] {
+            let error = checkpoint_for(continuous(&[bounds])).unwrap_err().to_string();
+            assert!(error.contains("draws actions from their bounds"), "{error}");
+        }
+    }
+}
