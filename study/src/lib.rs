@@ -24,6 +24,7 @@ mod plan;
 pub mod plot;
 pub mod records;
 pub mod report;
+mod reselection;
 mod results;
 mod scenarios;
 pub mod scheduler;

@@ -194,7 +194,7 @@ impl<'a> Selected<'a> {
 /// these runs.
 pub fn average(selections: &[&MethodResults<'_>], metric: Metric) -> Option<Summary> {
     let runs = common_runs(selections, metric);
-    Summary::of(&runs.into_iter().map(|numbers| mean(numbers.into_iter())).collect::<Vec<_>>())
+    Summary::of(&runs.into_iter().map(|(_, numbers)| mean(numbers.into_iter())).collect::<Vec<_>>())
 }
 
 /// The interquartile mean of a metric over the environments of `selections` and the runs that all of them have, with
@@ -206,13 +206,16 @@ pub fn interquartile(selections: &[&MethodResults<'_>], metric: Metric, resample
 /// A metric by `selections`, then by the runs that all of them have.
 pub(crate) fn scores(selections: &[&MethodResults<'_>], metric: Metric) -> Vec<Vec<f64>> {
     let runs = common_runs(selections, metric);
-    (0..selections.len()).map(|i| runs.iter().map(|numbers| numbers[i]).collect()).collect()
+    (0..selections.len()).map(|i| runs.iter().map(|(_, numbers)| numbers[i]).collect()).collect()
 }
 
-/// For each run that all `selections` have, the metric in each of them.
-fn common_runs(selections: &[&MethodResults<'_>], metric: Metric) -> Vec<Vec<f64>> {
+/// Each run that all `selections` have, with the metric in each of them.
+pub(crate) fn common_runs(selections: &[&MethodResults<'_>], metric: Metric) -> Vec<(u32, Vec<f64>)> {
     let by_environment: Vec<BTreeMap<u32, f64>> = selections.iter().map(|selection| selection.metric(metric)).collect();
-    let of_run = |run: &u32| by_environment.iter().map(|runs| runs.get(run).copied()).collect();
+    let of_run = |run: &u32| {
+        let numbers: Option<_> = by_environment.iter().map(|runs| runs.get(run).copied()).collect();
+        Some((*run, numbers?))
+    };
     by_environment.first().map_or_else(Vec::new, |first| first.keys().filter_map(of_run).collect())
 }
 

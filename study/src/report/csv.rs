@@ -1,6 +1,6 @@
 //! The numbers of a report as lines of files; an empty field is a number that there is not.
 
-use super::numbers::{counted, or_empty};
+use super::numbers::{MethodMetrics, counted, or_empty};
 use super::{Cell, Report};
 use crate::statistics::{Bootstrapped, Summary};
 use crate::table::{Table, TableBuilder};
@@ -47,6 +47,9 @@ impl Report<'_> {
         let low = |number: Option<&Bootstrapped>| or_empty(number.and_then(|number| Some(number.interval_95?[0])));
         let high = |number: Option<&Bootstrapped>| or_empty(number.and_then(|number| Some(number.interval_95?[1])));
         let lines: Vec<_> = of_method.collect();
+        let reselected = |line: &(&MethodMetrics<'_>, Metric, _, _), which: usize| {
+            line.0.reselected.get(&line.1).map(|both| both[which])
+        };
         Table::of("iqm.csv", &lines)
             .method(|(row, ..)| &row.method)
             .text("metric", |(_, metric, ..)| metric)
@@ -57,6 +60,10 @@ impl Report<'_> {
             .number("optimality_gap", |(.., gap)| or_empty(gap.map(|gap| gap.point)))
             .number("gap_low_95", move |(.., gap)| low(*gap))
             .number("gap_high_95", move |(.., gap)| high(*gap))
+            .number("selection_low_95", move |line| low(reselected(line, 0).as_ref()))
+            .number("selection_high_95", move |line| high(reselected(line, 0).as_ref()))
+            .number("gap_selection_low_95", move |line| low(reselected(line, 1).as_ref()))
+            .number("gap_selection_high_95", move |line| high(reselected(line, 1).as_ref()))
             .build()
     }
 

@@ -22,6 +22,7 @@ use std::collections::BTreeSet;
 use super::against_training::{MarkTest, against_training};
 use super::folder::Failure;
 use super::plan::{Cell, Plan, Selection};
+use super::reselection::Reselection;
 use super::selection::{MethodResults, Results, Selected};
 use super::table::Table;
 use super::tuning::Tuned;
@@ -77,7 +78,7 @@ impl<'a> Report<'a> {
     ) -> Self {
         let plan = results.plan;
         let tuned = if plan.selection == Selection::Clean { results.tuned() } else { Vec::new() };
-        let averages = numbers::averages(plan, selections);
+        let averages = numbers::averages(plan, selections, &Reselection::of(results));
         Self {
             plan,
             selections,

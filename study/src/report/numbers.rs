@@ -5,8 +5,9 @@ use std::collections::BTreeMap;
 use crate::outcomes::Counted;
 use crate::paper;
 use crate::plan::{Plan, TrainedOn};
+use crate::reselection::Reselection;
 use crate::selection::{MethodResults, average, interquartile, scores};
-use crate::statistics::{Bootstrapped, Summary, optimality_gap};
+use crate::statistics::{Bootstrapped, Summary, interquartile_mean, optimality_gap};
 use crate::{Method, Metric, Scenario, TestResult, Version};
 
 /// Resamples of a bootstrap, as many as rliable takes.
@@ -26,6 +27,8 @@ pub(super) struct MethodMetrics<'a> {
     pub(super) iqms: BTreeMap<Metric, Bootstrapped>,
     /// Likewise.
     pub(super) gaps: BTreeMap<Metric, Bootstrapped>,
+    /// Both once more, with every selection made anew in each resample.
+    pub(super) reselected: BTreeMap<Metric, [Bootstrapped; 2]>,
     pub(super) done: usize,
     pub(super) cells: usize,
 }
@@ -66,6 +69,7 @@ pub(super) fn metrics<'a>(selections: &[MethodResults<'a>]) -> Vec<MethodMetrics
         papers: known(|metric| paper::number(selection.environment, &selection.method, metric)),
         iqms: BTreeMap::new(),
         gaps: BTreeMap::new(),
+        reselected: BTreeMap::new(),
         done: selection.done,
         cells: selection.cells,
     };
@@ -73,12 +77,18 @@ pub(super) fn metrics<'a>(selections: &[MethodResults<'a>]) -> Vec<MethodMetrics
 }
 
 /// Averaged over the plan's environments.
-pub(super) fn averages(plan: &Plan, selections: &[MethodResults<'_>]) -> Vec<MethodMetrics<'static>> {
+pub(super) fn averages<'a>(
+    plan: &Plan,
+    selections: &[MethodResults<'a>],
+    reselection: &Reselection<'a>,
+) -> Vec<MethodMetrics<'static>> {
     let environments = plan.environments();
     let of_method = |method: Method| {
         let found: Vec<_> = selections.iter().filter(|selection| selection.method == method).collect();
         let everywhere = found.len() == environments.len();
         let gap = |strata: &[Vec<f64>]| optimality_gap(strata, BEST);
+        let both = |strata: &[Vec<f64>]| vec![interquartile_mean(strata), gap(strata)];
+        let reselected = |metric| reselection.bootstrap(&found, metric, RESAMPLES, both)?.try_into().ok();
         let gap = |metric| Bootstrapped::of(&scores(&found, metric), RESAMPLES, 1, gap);
         MethodMetrics {
             environment: AVERAGE,
@@ -86,6 +96,7 @@ pub(super) fn averages(plan: &Plan, selections: &[MethodResults<'_>]) -> Vec<Met
             papers: known(|metric| paper::average(&environments, &method, metric)),
             iqms: known(|metric| interquartile(&found, metric, RESAMPLES).filter(|_| everywhere)),
             gaps: known(|metric| gap(metric).filter(|_| everywhere)),
+            reselected: known(|metric| reselected(metric).filter(|_| everywhere)),
             done: found.iter().map(|selection| selection.done).sum(),
             cells: found.iter().map(|selection| selection.cells).sum(),
             method,

@@ -1,5 +1,7 @@
 //! The numbers of a report as tables for reading.
 
+use std::collections::BTreeMap;
+
 use super::numbers::{MethodMetrics, counted};
 use super::{MISSING, MarkTest, Report};
 use crate::plan::distinct;
@@ -43,20 +45,32 @@ impl Report<'_> {
 
     pub(super) fn iqm_table(&self) -> Table {
         let title = "Interquartile mean over all environments and the runs that all of them have, with its 95 % stratified \
-                     bootstrap interval";
-        self.aggregate_table(title, |row, metric| row.iqms.get(&metric).copied())
+                     bootstrap interval, and the interval with every selection made anew in each resample";
+        self.aggregate_table(title, |row| &row.iqms, 0)
     }
 
     pub(super) fn gap_table(&self) -> Table {
         let title = "Optimality gap: how far success rates stay below 100 % on average, over the same runs and with the same \
-                     interval; lower is better";
-        self.aggregate_table(title, |row, metric| row.gaps.get(&metric).copied())
+                     intervals; lower is better";
+        self.aggregate_table(title, |row| &row.gaps, 1)
     }
 
-    fn aggregate_table(&self, title: &str, number: fn(&MethodMetrics<'_>, Metric) -> Option<Bootstrapped>) -> Table {
+    /// `reselected` is the place of the number among those with selections made anew.
+    fn aggregate_table(
+        &self,
+        title: &str,
+        numbers: for<'m> fn(&'m MethodMetrics<'_>) -> &'m BTreeMap<Metric, Bootstrapped>,
+        reselected: usize,
+    ) -> Table {
         let mut table = Table::of(title, &self.averages).text("method", |row| &row.method);
         for metric in Metric::ALL {
-            table = table.number(metric.to_string(), move |row| or(MISSING, number(row, metric)));
+            let interval = move |row: &MethodMetrics<'_>| {
+                let [low, high] = row.reselected.get(&metric)?[reselected].interval_95?;
+                Some(format!("[{:.1}, {:.1}]", low + 0.0, high + 0.0)) // no negative zero
+            };
+            table = table
+                .number(metric.to_string(), move |row| or(MISSING, numbers(row).get(&metric)))
+                .number("selection anew", move |row| or(NOT_GIVEN, interval(row)));
         }
         table.number("runs", |row| self.runs(row.iqm_runs())).build()
     }
