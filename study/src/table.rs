@@ -85,6 +85,11 @@ impl Table {
 }
 
 impl<'r, R> TableBuilder<'r, R> {
+    /// What the rows are of.
+    pub(crate) fn sources(&self) -> &'r [R] {
+        self.sources
+    }
+
     /// A column of texts.
     pub fn text<E: Into<Entry>>(self, name: impl Into<String>, entry: impl Fn(&'r R) -> E) -> Self {
         self.column(Column { name: name.into(), group: None, is_number: false }, entry)

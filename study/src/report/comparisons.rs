@@ -119,16 +119,10 @@ impl Report<'_> {
         let end = |number: &Bootstrapped, end: usize| {
             number.interval_95.map(|interval| interval[end].to_string()).unwrap_or_default()
         };
-        let mut table = Table::of("comparisons.csv", &self.comparisons).text("environment", |row| &row.environment);
-        for (side, method) in [("x", (|row| &row.x) as fn(&Comparison) -> &Method), ("y", |row| &row.y)] {
-            table = table
-                .text(format!("{side}_algorithm"), move |row| &method(row).algorithm)
-                .text(format!("{side}_architecture"), move |row| &method(row).architecture)
-                .text(format!("{side}_episodes_per_trial"), move |row| {
-                    method(row).episodes_per_trial.map(|n| n.to_string()).unwrap_or_default()
-                });
-        }
-        table
+        Table::of("comparisons.csv", &self.comparisons)
+            .text("environment", |row| &row.environment)
+            .method_as("x_", |row| &row.x)
+            .method_as("y_", |row| &row.y)
             .text("metric", |row| row.metric)
             .number("pairs", |row| row.pairs)
             .number("difference", |row| row.difference.point)

@@ -147,9 +147,18 @@ impl Report<'_> {
 impl<'r, R> TableBuilder<'r, R> {
     /// What identifies a method.
     pub(crate) fn method(self, method: impl Fn(&'r R) -> &'r Method) -> Self {
-        self.text("algorithm", |row| &method(row).algorithm)
-            .text("architecture", |row| &method(row).architecture)
-            .text("episodes_per_trial", |row| or_empty(method(row).episodes_per_trial))
+        self.method_as("", method)
+    }
+
+    /// The same with names that begin with `prefix`. Presets have a column only where one is not the default, so that other
+    /// files stay as they were.
+    pub(crate) fn method_as(self, prefix: &str, method: impl Fn(&'r R) -> &'r Method) -> Self {
+        let presets = self.sources().iter().any(|row| !method(row).preset.is_default());
+        let table = self
+            .text(format!("{prefix}algorithm"), |row| &method(row).algorithm)
+            .text(format!("{prefix}architecture"), |row| &method(row).architecture)
+            .text(format!("{prefix}episodes_per_trial"), |row| or_empty(method(row).episodes_per_trial));
+        if presets { table.text(format!("{prefix}preset"), |row| method(row).preset) } else { table }
     }
 
     fn summary(self, summary: impl Fn(&'r R) -> Option<Summary>) -> Self {

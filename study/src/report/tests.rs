@@ -252,3 +252,25 @@ fn what_is_not_done_is_missing_and_has_no_colour() {
     assert!(entries.iter().all(|entry| entry.heat.is_none()));
     assert_eq!(entries.iter().filter(|entry| entry.text == MISSING).count(), 3 * (4 + 2 + 2 + 2) + 4 * 4 + 9 * 4);
 }
+
+#[test]
+fn files_tell_two_presets_of_a_method_apart() {
+    let plan = |preset: &str| {
+        let text = format!(
+            "environments = ['CartPole']\nversions = ['D']\nruns = 2\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\n\
+             [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\n{preset}"
+        );
+        Plan::parse("test", text).unwrap()
+    };
+    let (both, one) = (plan("preset = 'paper'"), plan("settings = { learning_rate = 1e-3 }"));
+    for (plan, expected) in [(&both, true), (&one, false)] {
+        let results = fixture::results(plan, |cell| Some(([90.0, 40.0, f64::from(cell.run)], 1.0)));
+        let selections = results.select();
+        let recorded = Recorded::default();
+        for file in Report::new(&results, &selections, &recorded, &[]).files() {
+            // Of a pair, one side alone is of another preset.
+            let columns = file.columns.iter().filter(|column| column.name.ends_with("preset")).count();
+            assert_eq!(columns, usize::from(expected), "{}", file.title);
+        }
+    }
+}
