@@ -38,10 +38,13 @@ impl Plot for Heatmap {
         let returns = range(self.points.iter().map(|point| point.mean_return));
         self.panel(&panels[0], "mean return", |point| point.mean_return, returns, scale)?;
         self.panel(&panels[1], "success rate, %", |point| point.success_percent, 0.0..100.0, scale)?;
-        for (i, (name, line)) in [("R", RANDOM), ("E", EXTREME)].into_iter().enumerate() {
-            let (x, y) = ((60 + 60 * i as i32) * unit, 8 * unit);
-            outline(&key, [(x, y), (x + 22 * unit, y + 14 * unit)], line, scale)?;
-            key.draw_text(name, &font(13, scale), (x + 28 * unit, y)).map_err(drawing)?;
+        for (i, (name, line)) in [("R, random", RANDOM), ("E, extreme", EXTREME)].into_iter().enumerate() {
+            let (x, y) = ((60 + 130 * i as i32) * unit, 6 * unit);
+            let sample = [(x, y), (x + 40 * unit, y + 18 * unit)];
+            // On a colour of the surface, since white lines are not seen on white.
+            key.draw(&Rectangle::new(sample, viridis(0.4).filled())).map_err(drawing)?;
+            outline(&key, sample, line, scale)?;
+            key.draw_text(name, &font(13, scale), (x + 48 * unit, y + 2 * unit)).map_err(drawing)?;
         }
         Ok(())
     }
