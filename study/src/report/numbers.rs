@@ -12,6 +12,8 @@ use crate::{Method, Metric, Scenario, TestResult, Version};
 
 /// Resamples of a bootstrap, as many as rliable takes.
 const RESAMPLES: usize = 50_000;
+/// Of one that selects anew, hundreds of times in each of them.
+const RESELECTIONS: usize = 10_000;
 /// The best success rate, %, from which the optimality gap is.
 const BEST: f64 = 100.0;
 /// What stands for all environments together, here and in the paper.
@@ -88,7 +90,7 @@ pub(super) fn averages<'a>(
         let everywhere = found.len() == environments.len();
         let gap = |strata: &[Vec<f64>]| optimality_gap(strata, BEST);
         let both = |strata: &[Vec<f64>]| vec![interquartile_mean(strata), gap(strata)];
-        let reselected = |metric| reselection.bootstrap(&found, metric, RESAMPLES, both)?.try_into().ok();
+        let reselected = |metric| reselection.bootstrap(&found, metric, RESELECTIONS, both)?.try_into().ok();
         let gap = |metric| Bootstrapped::of(&scores(&found, metric), RESAMPLES, 1, gap);
         MethodMetrics {
             environment: AVERAGE,
