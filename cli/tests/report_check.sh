@@ -33,6 +33,6 @@ check "$out/whole"
 
 cp -a "$out/whole" "$out/gaps"
 rm "$out"/gaps/cells/Pendulum-ppo-ff-R-*/result.json
-rm "$out"/gaps/heatmaps/MountainCar-ppo-ff-E-*.png
+rm "$out"/gaps/heatmaps/MountainCar-ppo-ff-E-*.csv "$out"/gaps/heatmaps/Pendulum-a2c-*.csv "$out"/gaps/report/*-heatmap-*
 rm "$out"/gaps/cells/MountainCar-*/training/monitor.csv
 check "$out/gaps"

@@ -74,6 +74,8 @@ def test_wrong_actions_of_a_batch_move_nothing(actions: Any, says: str, server: 
     [
         ({"environment": "Cartpole"}, perturb.InvalidArgumentError, "CartPole"),
         ({"version": "X"}, perturb.InvalidArgumentError, "'D'"),
+        ({"observe": "everything"}, perturb.InvalidArgumentError, "observe='everything' is none of 'state'"),
+        ({"observe": True}, perturb.InvalidArgumentError, "observe=True"),
         ({"server": "nowhere"}, perturb.InvalidArgumentError, "port is missing"),
         ({"server": 7}, perturb.InvalidArgumentError, "no text"),
         ({"parameters": ["force"]}, perturb.InvalidArgumentError, "expected a dict"),

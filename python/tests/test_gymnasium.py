@@ -24,7 +24,7 @@ def equal(a: object, b: object) -> bool:
 
 
 @pytest.mark.filterwarnings("ignore")  # CartPole's unbounded observations, Pendulum's torque of ±2
-@pytest.mark.parametrize("version", ["D", "R", "E"])
+@pytest.mark.parametrize("version", ["D", "R", "E", "R+E"])
 @pytest.mark.parametrize("name", NAMES)
 def test_gymnasiums_checker_accepts_every_environment_and_version(name: str, version: str, server: str) -> None:
     env = gymnasium.make(identifier(name), version=version, server=server)

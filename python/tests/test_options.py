@@ -130,6 +130,17 @@ def test_parameters_of_a_reset_stay(server: str) -> None:
     assert first["parameters"]["force"] != second["parameters"]["force"]
 
 
+def test_a_trial_of_r_and_e_is_all_of_one_of_them(server: str) -> None:
+    envs = make_vec(num_envs=60, version="R+E", server=server)
+    parameters = envs.reset(seed=4)[1]["parameters"]
+    of_r = [
+        (low <= parameters[name]) & (parameters[name] < high)
+        for name, low, high in [("force", 5, 15), ("mass", 0.05, 0.5)]
+    ]
+    assert (of_r[0] == of_r[1]).all()
+    assert 15 <= of_r[0].sum() <= 45
+
+
 def test_trials_keep_parameters(server: str) -> None:
     env = make(version="R", episodes_per_trial=2, server=server)
     infos = [env.reset(seed=4)[1], env.reset()[1], env.reset()[1]]

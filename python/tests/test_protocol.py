@@ -103,6 +103,12 @@ def test_what_an_episode_achieved_is_told_where_there_is_anything(
     assert ("achieved" in envs.step([0])[-1]) == bool(told)
 
 
+def test_a_server_that_does_not_know_parameters_as_observations_is_refused(fake: FakeServer) -> None:
+    fake.answers = [Answer(opened=opened())]
+    with pytest.raises(perturb.ProtocolError, match="does not know observe='parameters': it is older"):
+        perturb.PerturbEnv("CartPole", server=fake.address, observe="parameters").reset()
+
+
 def test_another_revision_is_refused(fake: FakeServer) -> None:
     other = opened()
     other.environment.revision = 3

@@ -44,9 +44,11 @@ pub struct EnvironmentSpec {
 }
 
 impl EnvironmentSpec {
-    /// The distributions of a version, one for each parameter.
+    /// The distributions of a version, one for each parameter; of R+E those of R, then those of E:
+    /// [`Settings::distributions`](super::Settings::distributions).
     pub fn distributions(&self, version: Version) -> Vec<Distribution> {
-        self.parameters.iter().map(|parameter| parameter.distribution(version)).collect()
+        let of = |&part: &Version| self.parameters.iter().map(move |parameter| parameter.distribution(part));
+        version.parts().iter().flat_map(of).collect()
     }
 }
 
@@ -69,7 +71,8 @@ pub fn check_bounds(spec: &EnvironmentSpec, parameter: &Parameter, (low, high): 
     })
 }
 
-/// Replaces in `base` (one distribution a parameter, in the spec's order) those that `overrides` names.
+/// Replaces in `base` (one distribution a parameter, in the spec's order, of one box or of several) those that
+/// `overrides` names, in every box.
 ///
 /// # Errors
 /// [`Error::UnknownParameter`] and [`Error::OutOfRange`]; `base` is unchanged then.
@@ -90,7 +93,7 @@ pub fn resolve<'a>(
         replaced.push((position, distribution));
     }
     for (position, distribution) in replaced {
-        base[position] = distribution;
+        base.chunks_exact_mut(spec.parameters.len()).for_each(|of_box| of_box[position] = distribution.clone());
     }
     Ok(())
 }

@@ -1,6 +1,6 @@
 //! One environment and its episodes: trials, step limit, success, receipts, snapshots.
 
-use super::{Achievement, Action, Distribution, Environment, EnvironmentSpec, Purpose, Stream};
+use super::{Achievement, Action, Distribution, Environment, EnvironmentSpec, Purpose, Stream, seen::SeenParameters};
 use crate::scene::Scene;
 
 /// What fixes an environment's episodes.
@@ -10,11 +10,15 @@ pub struct Settings {
     pub seed: u64,
     /// The environment's index: with the seed and an episode's number it fixes all randomness.
     pub environment_index: u32,
-    /// One for each parameter, in the spec's order, within the parameters' bounds.
+    /// One for each parameter, in the spec's order, within the parameters' bounds: a box. Or two boxes, one after the
+    /// other: a trial is of one of them, each as likely.
     pub distributions: Vec<Distribution>,
     /// Episodes in a trial, at least 1. Parameters are drawn when a trial begins.
     pub episodes_per_trial: u32,
 }
+
+/// As many as R+E has.
+pub(super) const MOST_BOXES: usize = 2;
 
 /// Names an episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -107,16 +111,31 @@ pub struct Episodes {
     /// The parameters in force.
     pub(super) values: Vec<f64>,
     pub(super) progress: Progress,
+    /// What observations have at their end, if they do.
+    pub(super) seen: Option<Box<SeenParameters>>,
+}
+
+/// How many boxes so many distributions are of, for `n` parameters; `None` if they cannot be. Without parameters one.
+pub(super) fn boxes(distributions: usize, n: usize) -> Option<usize> {
+    (1..=MOST_BOXES).find(|boxes| boxes * n == distributions)
 }
 
 impl Episodes {
     /// Takes an environment and begins its first episode.
     pub fn new(environment: Box<dyn Environment>, settings: Settings) -> Self {
-        assert_eq!(settings.distributions.len(), environment.spec().parameters.len(), "one for each parameter");
-        let values = vec![0.0; settings.distributions.len()];
-        let mut episodes = Self { environment, settings, values, progress: Progress::default() };
+        let n = environment.spec().parameters.len();
+        assert!(boxes(settings.distributions.len(), n).is_some(), "one for each parameter in each box");
+        let values = vec![0.0; n];
+        let mut episodes = Self { environment, settings, values, progress: Progress::default(), seen: None };
         episodes.start(None);
         episodes
+    }
+
+    /// The same with the parameters at the end of observations, as
+    /// [`Parameter::observed`](super::Parameter::observed) says.
+    pub fn observing_parameters(mut self) -> Self {
+        self.seen = Some(Box::new(SeenParameters::of(self.environment.as_ref())));
+        self
     }
 
     /// What is fixed about the environment.
@@ -163,10 +182,15 @@ impl Episodes {
         let Settings { seed, environment_index, ref distributions, .. } = self.settings;
         if self.progress.episode_in_trial == 0 {
             let mut stream = Stream::new(seed, environment_index.into(), Purpose::Parameters, self.progress.trial);
-            for (value, distribution) in self.values.iter_mut().zip(distributions) {
+            let n = self.values.len();
+            let boxes = boxes(distributions.len(), n).unwrap_or(1);
+            // Of a single box nothing is drawn: the numbers of its trials are those of the parameters alone.
+            let chosen = if boxes > 1 { (stream.unit() * boxes as f64) as usize } else { 0 };
+            for (value, distribution) in self.values.iter_mut().zip(&distributions[chosen * n..]) {
                 *value = distribution.at(stream.unit());
             }
             self.environment.set_parameters(&self.values);
+            self.see_parameters();
         }
         match state {
             Some(state) => self.environment.reset_to(state),
@@ -200,9 +224,19 @@ impl Episodes {
         Outcome { reward, terminated: transition.terminated, truncated }
     }
 
+    /// After parameters were set.
+    pub(super) fn see_parameters(&mut self) {
+        if let Some(seen) = &mut self.seen {
+            seen.read(self.environment.as_ref());
+        }
+    }
+
     /// Writes the current observation, `[O]`.
     pub fn observe(&self, out: &mut [f32]) {
-        self.environment.observe(out);
+        let entries = self.seen.as_ref().map_or(&[][..], |seen| seen.entries());
+        let (state, parameters) = out.split_at_mut(out.len() - entries.len());
+        self.environment.observe(state);
+        parameters.copy_from_slice(entries);
     }
 
     /// What a picture of the current state shows; none where the physics diverged.

@@ -6,6 +6,7 @@ mod episode;
 mod error;
 mod parameter;
 mod seeding;
+mod seen;
 mod snapshot;
 mod spaces;
 mod success;

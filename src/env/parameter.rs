@@ -46,13 +46,46 @@ impl Parameter {
         self
     }
 
-    /// The distribution of a version.
+    /// The distribution of a version; of R+E, whose trials are of one of both for all parameters, the values that it
+    /// may have.
     pub fn distribution(&self, version: Version) -> Distribution {
+        let [below, above] = self.extreme;
         let intervals: &[Interval] = match version {
             Version::D => return Distribution::fixed(self.default),
             Version::R => &[self.random],
             Version::E => &self.extreme,
+            Version::RE => &[below, self.random, above],
         };
         Distribution::union(intervals).expect("the table holds valid sets; a test checks each")
+    }
+
+    /// From the least to the greatest value that R and E have.
+    pub fn whole(&self) -> Interval {
+        let [below, above] = self.extreme;
+        Interval::new(self.random.low.min(below.low), self.random.high.max(above.high))
+    }
+
+    /// A value as it is observed: -1 … 1 within [`Parameter::whole`], and linearly beyond it. Where that is a single
+    /// value, the distance from it.
+    pub fn observed(&self, value: f64) -> f32 {
+        let Interval { low, high } = self.whole();
+        let distance = value - low;
+        (if high > low { 2.0 * distance / (high - low) - 1.0 } else { distance }) as f32
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_parameter_is_observed_on_the_whole_range_of_the_versions_and_beyond_it() {
+        let wider_e = Parameter::new("x", "1", "", (0.0, 100.0)).versions(2.0, (1.0, 3.0), (0.5, 4.5));
+        let seen = |p: &Parameter, values: &[f64]| values.iter().map(|&value| p.observed(value)).collect::<Vec<_>>();
+        assert_eq!(seen(&wider_e, &[0.5, 2.5, 4.5, 0.0, 8.5]), [-1.0, 0.0, 1.0, -1.25, 3.0]);
+        let wider_r = Parameter { random: Interval::new(0.0, 8.0), ..wider_e };
+        assert_eq!(seen(&wider_r, &[0.0, 4.0, 8.0]), [-1.0, 0.0, 1.0], "R reaches further than E");
+        let single = Parameter::new("x", "1", "", (0.0, 100.0)).versions(2.0, (2.0, 2.0), (2.0, 2.0));
+        assert_eq!(seen(&single, &[2.0, 0.5, 3.0]), [0.0, -1.5, 1.0], "nothing is divided by 0");
     }
 }

@@ -14,7 +14,7 @@
 //!
 //! | purpose | index | draws, in order |
 //! |---|---|---|
-//! | 0 | trial | one number u in [0, 1) for each parameter, in the catalogue's order |
+//! | 0 | trial | of R+E one below ½ for R; one number u in [0, 1) for each parameter, in the catalogue's order |
 //! | 1 | episode | the initial state's numbers, in the order of the environment's document |
 
 /// What a stream is for: the third word of the counter.

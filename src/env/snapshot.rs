@@ -1,6 +1,9 @@
 //! Saving an environment whole, and bringing it back in another session, process or server.
 
-use super::{Distribution, EnvironmentSpec, Episodes, Error, Interval, Settings, check_bounds, episode::Progress};
+use super::{
+    Distribution, EnvironmentSpec, Episodes, Error, Interval, Settings, check_bounds,
+    episode::{Progress, boxes},
+};
 use serde::{Deserialize, Serialize};
 
 /// Raised by every change of the layout below.
@@ -22,7 +25,7 @@ struct Saved {
     seed: u64,
     environment_index: u32,
     episodes_per_trial: u32,
-    /// (low, high) of every interval of every parameter's distribution.
+    /// (low, high) of every interval of every parameter's distribution, box after box.
     distributions: Vec<Vec<(f64, f64)>>,
     values: Vec<f64>,
     progress: Progress,
@@ -67,6 +70,7 @@ impl Episodes {
             return Err(error);
         }
         self.values = saved.values;
+        self.see_parameters();
         self.progress = saved.progress;
         self.settings = Settings {
             seed: saved.seed,
@@ -106,8 +110,9 @@ impl Episodes {
         if saved.model_hash != self.environment.model_hash() {
             return refuse("it was taken with another model".into());
         }
-        if saved.distributions.len() != spec.parameters.len() || saved.values.len() != spec.parameters.len() {
-            return refuse(format!("it does not have the {} parameters of {}", spec.parameters.len(), spec.name));
+        let n = spec.parameters.len();
+        if boxes(saved.distributions.len(), n).is_none() || saved.values.len() != n {
+            return refuse(format!("it does not have the {n} parameters of {}", spec.name));
         }
         let distributions = Self::distributions(spec, &saved)?;
         let Progress { trial, episode, episode_in_trial, length, total_reward, ended, .. } = saved.progress;
@@ -129,8 +134,9 @@ impl Episodes {
 
     fn distributions(spec: &'static EnvironmentSpec, saved: &Saved) -> Result<Vec<Distribution>, Error> {
         let bad = |error: Error| Error::Snapshot { reason: error.to_string() };
-        let each = spec.parameters.iter().zip(&saved.distributions).zip(&saved.values);
-        each.map(|((parameter, pairs), &value)| {
+        let parameters = spec.parameters.iter().zip(&saved.values).cycle();
+        let each = parameters.zip(&saved.distributions);
+        each.map(|((parameter, &value), pairs)| {
             let intervals: Vec<Interval> = pairs.iter().map(|&(low, high)| Interval { low, high }).collect();
             let distribution = Distribution::union(&intervals).map_err(Error::of(parameter.name)).map_err(bad)?;
             check_bounds(spec, parameter, distribution.range()).map_err(bad)?;

@@ -37,6 +37,8 @@ pub struct BatchSettings {
     pub receipts: bool,
     /// Whether steps report the reward's terms.
     pub reward_terms: bool,
+    /// Whether observations have the parameters at their end.
+    pub observe_parameters: bool,
 }
 
 /// Successive slots with settings of their own.
@@ -52,6 +54,12 @@ impl BatchSettings {
     /// N, when the batch is opened.
     pub fn size(&self) -> usize {
         self.groups.iter().map(|group| group.size).sum()
+    }
+
+    /// O: the length of an observation.
+    pub fn observation_size(&self) -> usize {
+        let parameters = if self.observe_parameters { self.spec.parameters.len() } else { 0 };
+        self.spec.observation.len() + parameters
     }
 
     /// Episodes in a trial, if all groups have as many.
@@ -122,9 +130,9 @@ impl Batch {
         let (workers, size) = (pool.queue(), settings.size());
         let permit = Arc::new(workers.reserve(size)?);
         let shard_size = shard_size(settings.spec, size, pool.workers());
-        let BatchSettings { spec, ref groups, autoreset, receipts, .. } = settings;
-        let parts = cut(groups, shard_size).into_iter().enumerate();
-        let shard = |(i, part)| Mutex::new(Shard::new(spec, part, i * shard_size, autoreset, receipts));
+        let spec = settings.spec;
+        let parts = cut(&settings.groups, shard_size).into_iter().enumerate();
+        let shard = |(i, part)| Mutex::new(Shard::new(&settings, part, i * shard_size));
         let job = job(spec, parts.map(shard).collect(), pool.workers(), permit, size);
         let mut batch = Self {
             settings,
@@ -209,12 +217,12 @@ impl Batch {
         all.retain(|_| slot.next().is_some_and(|slot: usize| !leaves[slot]));
         self.size = all.len();
         self.shard_size = shard_size(self.settings.spec, self.size, self.n_workers);
-        let BatchSettings { spec, autoreset, receipts, .. } = self.settings;
+        let spec = self.settings.spec;
         let mut shards = Vec::new();
         for first in (0..self.size).step_by(self.shard_size) {
             let part: Vec<Episodes> = all.drain(..self.shard_size.min(all.len())).collect();
             let size = part.len();
-            shards.push(Mutex::new(Shard::of(spec, part, (first, size), autoreset, receipts)));
+            shards.push(Mutex::new(Shard::of(&self.settings, part, (first, size))));
         }
         let permit = Arc::clone(&self.job.permit);
         permit.give_back(slots.len());
@@ -277,7 +285,7 @@ impl Batch {
         Ok(self.observations(&slots))
     }
 
-    /// The distributions in force in a slot, one for each parameter.
+    /// The distributions in force in a slot: [`Settings::distributions`].
     pub fn distributions(&self, slot: usize) -> Vec<Distribution> {
         lock(&self.job.shards[slot / self.shard_size]).distributions(slot).to_vec()
     }
@@ -364,7 +372,7 @@ impl Batch {
     }
 
     fn observations(&mut self, slots: &[usize]) -> Bytes {
-        let n = self.settings.spec.observation.len();
+        let n = self.settings.observation_size();
         for &slot in slots {
             let shard = lock(&self.job.shards[slot / self.shard_size]);
             put(&mut self.buffer, &shard.observations[(slot - shard.first_slot) * n..][..n]);

@@ -1,6 +1,6 @@
 //! A part of a batch: what one worker runs at a time.
 
-use super::batch::SlotGroup;
+use super::batch::{BatchSettings, SlotGroup};
 use crate::{
     env::{self, Action, ActionSpace, Distribution, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings},
     scene::Scene,
@@ -57,6 +57,9 @@ pub(super) struct Shard {
     groups: Vec<SlotGroup>,
     autoreset: Autoreset,
     receipts: bool,
+    observe_parameters: bool,
+    /// O.
+    observation_size: usize,
     pub(super) command: Command,
     slots: Vec<Episodes>,
     backups: Vec<(usize, Vec<u8>)>,
@@ -87,26 +90,16 @@ pub(super) struct Shard {
 
 impl Shard {
     /// A shard of slots from `first_slot` on, whose environments are yet to be made by [`Command::Open`].
-    pub(super) fn new(
-        spec: &'static EnvironmentSpec,
-        groups: Vec<SlotGroup>,
-        first_slot: usize,
-        autoreset: Autoreset,
-        receipts: bool,
-    ) -> Self {
+    pub(super) fn new(settings: &BatchSettings, groups: Vec<SlotGroup>, first_slot: usize) -> Self {
         let size = groups.iter().map(|group| group.size).sum();
-        Self { groups, command: Command::Open, ..Self::of(spec, Vec::new(), (first_slot, size), autoreset, receipts) }
+        Self { groups, command: Command::Open, ..Self::of(settings, Vec::new(), (first_slot, size)) }
     }
 
     /// A shard of `size` slots from `first_slot` on with these environments; its outputs are unknown yet but for the
     /// observations.
-    pub(super) fn of(
-        spec: &'static EnvironmentSpec,
-        slots: Vec<Episodes>,
-        (first_slot, size): (usize, usize),
-        autoreset: Autoreset,
-        receipts: bool,
-    ) -> Self {
+    pub(super) fn of(settings: &BatchSettings, slots: Vec<Episodes>, (first_slot, size): (usize, usize)) -> Self {
+        let BatchSettings { spec, autoreset, receipts, observe_parameters, .. } = *settings;
+        let observation_size = settings.observation_size();
         let (choices, vectors) = match spec.action {
             ActionSpace::Discrete(_) => (size, 0),
             ActionSpace::Continuous(channels) => (0, size * channels.len()),
@@ -118,12 +111,14 @@ impl Shard {
             groups: Vec::new(),
             autoreset,
             receipts,
+            observe_parameters,
+            observation_size,
             command: Command::Step,
             slots,
             backups: Vec::new(),
             choices: vec![0; choices],
             vectors: vec![0.0; vectors],
-            observations: vec![0.0; size * spec.observation.len()],
+            observations: vec![0.0; size * observation_size],
             rewards: vec![0.0; size],
             terminated: vec![0; size],
             truncated: vec![0; size],
@@ -191,7 +186,9 @@ impl Shard {
                         // Whoever opened has checked that the last index fits.
                         let environment_index = group.episodes.environment_index + i as u32;
                         let settings = Settings { environment_index, ..group.episodes.clone() };
-                        self.slots.push(Episodes::new(environment, settings));
+                        let episodes = Episodes::new(environment, settings);
+                        let seen = self.observe_parameters;
+                        self.slots.push(if seen { episodes.observing_parameters() } else { episodes });
                     }
                     Err(error) => {
                         self.failure = Some(error);
@@ -239,7 +236,7 @@ impl Shard {
     }
 
     fn finish(&mut self, slot: usize) {
-        let n = self.spec.observation.len();
+        let n = self.observation_size;
         self.final_observations.extend_from_slice(&self.observations[slot * n..][..n]);
         self.ended.push(((self.first_slot + slot) as u32, self.slots[slot].finished(self.receipts)));
         if self.autoreset == Autoreset::SameStep {
@@ -291,7 +288,7 @@ impl Shard {
     }
 
     fn observe(&mut self, slot: usize) {
-        let n = self.spec.observation.len();
+        let n = self.observation_size;
         self.slots[slot].observe(&mut self.observations[slot * n..][..n]);
     }
 }

@@ -33,6 +33,8 @@ struct Sizes {
     envs: usize,
     /// O.
     observation: usize,
+    /// How many of these are parameters.
+    parameters: usize,
     action: ActionKind,
 }
 
@@ -52,7 +54,9 @@ pub fn turn(batch: &Batch, request: proto::Act) -> Result<Turn, Refusal> {
         ActionSpace::Discrete(names) => ActionKind::Discrete { n: names.len() },
         ActionSpace::Continuous(channels) => ActionKind::Continuous { size: channels.len() },
     };
-    let sizes = Sizes { envs: n_envs, observation: settings.spec.observation.len(), action };
+    let observation = settings.observation_size();
+    let parameters = observation - settings.spec.observation.len();
+    let sizes = Sizes { envs: n_envs, observation, parameters, action };
     let proto::Act { policy: given, weights: given_weights, task: given_task, most_steps, only_ended } = request;
     let task = task(given_task, n_envs)?;
     let (policy, given_weights) = match (given, batch.play()) {
@@ -112,10 +116,11 @@ fn policy(policy: proto::Policy, given: &Bytes, sizes: Sizes, episodes_per_trial
         observations: policy
             .observations
             .map(|it| moments("act.policy.observations", &it).map(ObservationNormaliser::from_moments))
-            .transpose()?,
+            .transpose()?
+            .map(|it| it.leaving_alone(sizes.parameters)),
         rewards: policy.rewards.map(|it| reward_normaliser(&it)).transpose()?,
     };
-    normalisers.check(sizes.envs, sizes.observation).map_err(|error| {
+    normalisers.check(sizes.envs, sizes.observation, sizes.parameters).map_err(|error| {
         Refusal::value("act.policy", format!("with statistics that do not fit: {error}"), "those of this session")
     })?;
     let role = match policy.role {

@@ -26,7 +26,7 @@ pub fn open(catalogue: &Catalogue, most: usize, request: proto::Open) -> Result<
             return Err(Refusal::value("open.autoreset_mode", request.autoreset_mode, expected));
         }
     };
-    let (receipts, reward_terms) = (request.receipts, request.reward_terms);
+    let proto::Open { receipts, reward_terms, observe_parameters, .. } = request;
     let groups = if request.groups.is_empty() {
         vec![group(spec, "open", "open.batch_size", single(request))?]
     } else {
@@ -40,7 +40,7 @@ pub fn open(catalogue: &Catalogue, most: usize, request: proto::Open) -> Result<
         let named = |i, slots| group(spec, &format!("open.groups[{i}]"), &format!("open.groups[{i}].size"), slots);
         numbered.map(|(i, slots)| named(i, slots)).collect::<Result<_, _>>()?
     };
-    Ok(BatchSettings { spec, groups, autoreset, receipts, reward_terms })
+    Ok(BatchSettings { spec, groups, autoreset, receipts, reward_terms, observe_parameters })
 }
 
 /// An `open` without groups as one group.
@@ -74,7 +74,7 @@ fn group(
     group: proto::SlotGroup,
 ) -> Result<SlotGroup, Refusal> {
     let version = Version::from_proto(group.version()).ok_or_else(|| {
-        let expected = "VERSION_DEFAULT (1), VERSION_RANDOM (2) or VERSION_EXTREME (3)";
+        let expected = "VERSION_DEFAULT (1), VERSION_RANDOM (2), VERSION_EXTREME (3) or VERSION_RANDOM_OR_EXTREME (4)";
         Refusal::value(format!("{path}.version"), group.version, expected)
     })?;
     if group.size == 0 {
@@ -269,6 +269,7 @@ pub fn environment(spec: &EnvironmentSpec, model_hash: &str) -> proto::Environme
         code_success: Some(success(spec.code_success.as_ref().unwrap_or(&spec.success), spec.step_limit)),
         model_hash: model_hash.into(),
         heatmap_axes: spec.heatmap_axes.iter().flatten().map(|name| (*name).into()).collect(),
+        parameter_observations: spec.parameters.iter().map(parameter_observation).collect(),
     }
 }
 
@@ -305,6 +306,21 @@ fn parameter(p: &Parameter) -> proto::Parameter {
         random: Some((&p.distribution(Version::R)).into()),
         extreme: Some((&p.distribution(Version::E)).into()),
         applied: p.applied.into(),
+    }
+}
+
+fn parameter_observation(p: &Parameter) -> proto::ParameterObservation {
+    let whole = p.whole();
+    let bound = |value| f64::from(p.observed(value));
+    proto::ParameterObservation {
+        entry: Some(proto::Channel {
+            name: format!("parameter_{}", p.name),
+            unit: "1".into(),
+            low: bound(p.bounds.low),
+            high: bound(p.bounds.high),
+        }),
+        at_minus_one: whole.low,
+        at_plus_one: whole.high,
     }
 }
 

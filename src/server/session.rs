@@ -40,12 +40,13 @@ impl Session {
         let autoreset_mode = request.autoreset_mode;
         let most = self.shared.listing.max_batch_size as usize;
         let settings = convert::open(&self.shared.catalogue, most, request)?;
-        let environment =
-            self.shared.listing.environments.iter().find(|entry| entry.name == settings.spec.name).cloned();
+        let observes_parameters = settings.observe_parameters;
+        let environment = self.shared.listing.environments.iter().find(|entry| entry.name == settings.spec.name);
+        let environment = environment.map(|entry| entry.observed(observes_parameters));
         let (batch, observations, started) = Batch::open(&self.shared.pool, settings).await?;
         self.batch = Some(batch);
         let started = convert::started(started);
-        Ok(proto::Opened { environment, observations, started, autoreset_mode, acts: true })
+        Ok(proto::Opened { environment, observations, started, autoreset_mode, acts: true, observes_parameters })
     }
 
     async fn step(&mut self, request: proto::Step) -> Result<proto::Stepped, Refusal> {

@@ -61,10 +61,10 @@ pub(crate) fn against_training<'a>(selections: &'a [MethodResults<'a>]) -> Vec<M
 /// Curves of `tests` over the training's budget, for each environment and version that was trained on; a curve's version
 /// is the one that was tested on.
 pub(crate) fn test_curves(tests: &[MarkTest<'_>]) -> Vec<(Version, EnvironmentCurves)> {
-    let known = |name: &str| Version::ALL.into_iter().find(|version| version.to_string() == name);
+    let known = |name: &str| Version::KNOWN.into_iter().find(|version| version.to_string() == name);
     let mut all = Vec::new();
     for environment in distinct(tests.iter().map(|test| test.environment)) {
-        for trained_on in Version::ALL {
+        for trained_on in Version::KNOWN {
             let of = |test: &&MarkTest<'_>| {
                 test.environment == environment && test.trained_on == TrainedOn::Version(trained_on)
             };

@@ -138,7 +138,7 @@ pub fn read_curves(selections: &[MethodResults<'_>], folder: &Folder) -> Result<
     for of_environment in selections.chunk_by(|a, b| a.environment == b.environment) {
         let mut curves = Vec::new();
         for selection in of_environment {
-            for version in Version::ALL {
+            for version in Version::KNOWN {
                 let runs = read_runs(selection, version, folder)?;
                 if !runs.is_empty() {
                     curves.push(Curve::of(&selection.method, version, &runs));

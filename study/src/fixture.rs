@@ -3,9 +3,9 @@
 use super::folder::{CellResult, CellState, Training};
 use super::plan::{Cell, Plan};
 use super::selection::Results;
-use crate::TestResult;
 use crate::records::{Ending, EpisodeRecord};
 use crate::results::Counters;
+use crate::{Axis, Heatmap, HeatmapPoint, TestResult, Version};
 
 /// A result with success rates, %, on D, R and E, and the same mean return on all.
 pub fn result(cell: &Cell, [d, r, e]: [f64; 3], mean_return: f64) -> CellResult {
@@ -68,4 +68,26 @@ pub fn episode(set: &str, index: u32, requested: f64, steps: u32, success: bool)
         achieved: Some(f64::from(steps)),
         also_achieved: None,
     }
+}
+
+/// A policy of Pendulum's mean return and success rate, %, by mass and length.
+pub fn heatmap(grid: usize, figures: impl Fn(f64, f64) -> (f64, f64)) -> Heatmap {
+    let axis = |name: &str, unit: &str| Axis {
+        name: name.into(),
+        unit: unit.into(),
+        default: 1.0,
+        low: 0.5,
+        high: 1.5,
+        random: vec![(0.75, 1.25)],
+        extreme: vec![(0.5, 0.75), (1.25, 1.5)],
+    };
+    let axes = [axis("mass", "kg"), axis("length", "m")];
+    let point = |index: usize| {
+        let (x, y) = (axes[0].value(index % grid, grid), axes[1].value(index / grid, grid));
+        let (mean_return, success_percent) = figures(x, y);
+        HeatmapPoint { x, y, mean_return, success_percent }
+    };
+    let points = (0..grid * grid).map(point).collect();
+    let environment = "Pendulum".into();
+    Heatmap { environment, base: Version::D, fixed: Default::default(), grid, episodes: 20, points, axes }
 }

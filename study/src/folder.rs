@@ -74,7 +74,8 @@ pub struct CellResult {
     pub id: String,
     /// What was trained.
     pub training: Training,
-    /// Success, return and length, by the name of the set that was tested: "D", "R", "E" or one of the plan's own.
+    /// Success, return and length, by the name of the set that was tested: "D", "R", "E", "R+E" or one of the plan's
+    /// own.
     pub results: BTreeMap<String, TestResult>,
     /// The same of the policies of earlier moments, by the episodes of the budget that mark these.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
@@ -394,6 +395,7 @@ mod tests {
                     architecture: "ff".into(),
                     episodes_per_trial: None,
                     preset: Preset::Perturb,
+                    observe: Default::default(),
                 },
                 configuration: "00000000".into(),
                 run: 2,

@@ -1,9 +1,10 @@
-//! How a policy does over two parameters.
+//! How policies do over two parameters.
 
 use serde::{Deserialize, Serialize};
 
 use perturb_protocol::proto::{self, Interval};
 
+use crate::Version;
 use crate::means::mean;
 use crate::records::{EpisodeRecord, Records};
 use crate::sets::Context;
@@ -17,24 +18,29 @@ pub const MOST_POINTS: usize = 100;
 pub struct HeatmapOptions {
     /// Names of the two parameters, along x and along y.
     pub parameters: [String; 2],
+    /// Where all other parameters come from: of D each has its default, of R and E they are drawn for each episode (RL²: each
+    /// trial).
+    pub base: Version,
     /// Points along each axis, 1 … 100.
     pub grid: usize,
     /// Episodes at each point, at least 1.
     pub episodes: u64,
     /// Fixes all randomness.
     pub seed: u64,
-    /// Values of other parameters; the rest have those of version D.
+    /// Values of other parameters, in place of the base's.
     #[serde(default, skip_serializing_if = "Context::is_empty")]
     pub fixed: Context,
 }
 
 /// A parameter as an axis.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Axis {
     /// The parameter.
     pub name: String,
     /// Its unit; "1" if dimensionless.
     pub unit: String,
+    /// Its value in D.
+    pub default: f64,
     /// The lowest value of R and E.
     pub low: f64,
     /// The highest value of R and E.
@@ -45,18 +51,20 @@ pub struct Axis {
     pub extreme: Vec<(f64, f64)>,
 }
 
-/// A policy's figures over two parameters.
+/// A policy's figures over two parameters, or the means of several policies'.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Heatmap {
     /// By its name in the catalogue.
     pub environment: String,
-    /// What was tested, e.g. "a2c ff, trained on D with seed 1".
-    pub policy: String,
     /// x and y.
     pub axes: [Axis; 2],
+    /// Where the other parameters come from, see [`HeatmapOptions::base`].
+    pub base: Version,
+    /// Those that have a value of their own.
+    pub fixed: Context,
     /// G, points along each axis.
     pub grid: usize,
-    /// Episodes at each point.
+    /// Episodes of each policy at each point.
     pub episodes: u64,
     /// `[G, G]`, by y, then x, in ascending order.
     pub points: Vec<HeatmapPoint>,
@@ -92,6 +100,7 @@ impl Axis {
         Self {
             name: parameter.name.clone(),
             unit: parameter.unit.clone(),
+            default: parameter.default_value,
             low: all().map(|pair| pair.0).fold(f64::INFINITY, f64::min),
             high: all().map(|pair| pair.1).fold(f64::NEG_INFINITY, f64::max),
             random,
@@ -104,36 +113,91 @@ impl Heatmap {
     /// What the set of a heatmap's recorded test is called.
     pub const SET: &str = "heatmap";
 
+    /// Where other parameters came from in a recorded test; `None` if it is not that of a heatmap.
+    pub fn base_of(records: &Records) -> Option<Version> {
+        records.about.tests.iter().find(|test| test.set.name == Self::SET).map(|test| test.set.version)
+    }
+
     /// From the recorded episodes of a test over `axes`, whose contexts are the points, by y, then x; `None` if they are
     /// those of something else.
-    pub fn of(records: &Records, policy: String, axes: [Axis; 2]) -> Option<Self> {
+    pub fn of(records: &Records, axes: [Axis; 2]) -> Option<Self> {
         let test = records.about.tests.iter().find(|test| test.set.name == Self::SET)?;
         let contexts = test.set.listed();
-        let (points, grid) = (contexts.len(), contexts.len().isqrt());
-        let [x, y] = &axes;
-        let place = |point: usize| (x.value(point % grid, grid), y.value(point / grid, grid));
-        let fits = |(point, context): (usize, &Context)| {
-            (context.get(&x.name), context.get(&y.name)) == (Some(&place(point).0), Some(&place(point).1))
+        let fixed_of = |context: &Context| -> Context {
+            let is_axis = |name: &String| axes.iter().any(|axis| axis.name == *name);
+            context.iter().filter(|(name, _)| !is_axis(name)).map(|(name, value)| (name.clone(), *value)).collect()
         };
-        if grid * grid != points || !contexts.iter().enumerate().all(fits) {
+        let fixed = fixed_of(contexts.first()?);
+        if contexts.iter().any(|context| fixed_of(context) != fixed) {
             return None;
         }
-        let mut by_point: Vec<Vec<&EpisodeRecord>> = vec![Vec::new(); points];
-        records.of(Self::SET).for_each(|episode| by_point[episode.environment_index as usize % points].push(episode));
-        let figures = |(point, episodes): (usize, &Vec<&EpisodeRecord>)| HeatmapPoint {
-            x: place(point).0,
-            y: place(point).1,
+        let grid = contexts.len().isqrt();
+        let [x, y] = &axes;
+        let value = |context: &Context, axis: &Axis| context.get(&axis.name).copied().unwrap_or(f64::NAN);
+        let mut by_point: Vec<Vec<&EpisodeRecord>> = vec![Vec::new(); contexts.len()];
+        let place = |episode: &EpisodeRecord| episode.environment_index as usize % contexts.len();
+        records.of(Self::SET).for_each(|episode| by_point[place(episode)].push(episode));
+        let figures = |(context, episodes): (&Context, &Vec<&EpisodeRecord>)| HeatmapPoint {
+            x: value(context, x),
+            y: value(context, y),
             mean_return: mean(episodes.iter().map(|episode| episode.episode_return)),
             success_percent: mean(episodes.iter().map(|episode| if episode.success { 100.0 } else { 0.0 })),
         };
-        Some(Self {
+        let heatmap = Self {
             environment: records.about.environment.clone(),
-            policy,
+            base: test.set.version,
+            fixed,
             grid,
             episodes: by_point.first()?.len() as u64,
-            points: by_point.iter().enumerate().map(figures).collect(),
+            points: contexts.iter().zip(&by_point).map(figures).collect(),
             axes,
-        })
+        };
+        heatmap.is_whole().then_some(heatmap)
+    }
+
+    /// The means of several policies' figures at each point; `None` of nothing, or of figures over other points.
+    pub fn mean(heatmaps: &[Self]) -> Option<Self> {
+        let first = heatmaps.first()?;
+        let about = |of: &Self| Self { points: Vec::new(), ..of.clone() };
+        if heatmaps.iter().any(|other| about(other) != about(first)) {
+            return None;
+        }
+        let over =
+            |point: usize, figure: fn(&HeatmapPoint) -> f64| mean(heatmaps.iter().map(|of| figure(&of.points[point])));
+        let point = |(index, point): (usize, &HeatmapPoint)| HeatmapPoint {
+            mean_return: over(index, |point| point.mean_return),
+            success_percent: over(index, |point| point.success_percent),
+            ..*point
+        };
+        Some(Self { points: first.points.iter().enumerate().map(point).collect(), ..about(first) })
+    }
+
+    /// With the points of [`heatmap_table`] as CSV; `None` if they are others than its axes and grid have.
+    pub(crate) fn with_points(self, csv: &[u8]) -> Option<Self> {
+        let mut reader = csv::Reader::from_reader(csv);
+        let rows: Result<Vec<[f64; 4]>, _> = reader.deserialize().collect();
+        let point =
+            |[x, y, mean_return, success_percent]: [f64; 4]| HeatmapPoint { x, y, mean_return, success_percent };
+        let read = Self { points: rows.ok()?.into_iter().map(point).collect(), ..self };
+        read.is_whole().then_some(read)
+    }
+
+    /// Whether each point is where it belongs.
+    fn is_whole(&self) -> bool {
+        let ([x, y], grid) = (&self.axes, self.grid);
+        let fits = |(index, point): (usize, &HeatmapPoint)| {
+            (point.x, point.y) == (x.value(index % grid, grid), y.value(index / grid, grid))
+        };
+        self.points.len() == grid * grid && self.points.iter().enumerate().all(fits)
+    }
+
+    /// What is said of the parameters that are no axes.
+    pub fn others(&self) -> String {
+        let fixed: String = self.fixed.iter().map(|(name, value)| format!("{name} = {value}, ")).collect();
+        match self.base {
+            Version::D => format!("{fixed}other parameters at their defaults"),
+            base => format!("{fixed}other parameters drawn from {base}"),
+        }
     }
 }
 
@@ -146,4 +210,53 @@ pub fn heatmap_table(heatmap: &Heatmap) -> Table {
         .number("mean_return", |point| point.mean_return)
         .number("success_percent", |point| point.success_percent)
         .build()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fixture;
+
+    #[test]
+    fn a_mean_is_over_policies_at_each_point_and_over_like_points_alone() {
+        let [a, b] = [0.0, 100.0].map(|success| fixture::heatmap(2, |x, y| (10.0 * x + y + success, success)));
+        let both = Heatmap::mean(&[a.clone(), b.clone()]).unwrap();
+        for (index, point) in both.points.iter().enumerate() {
+            assert_eq!((point.x, point.y), (a.points[index].x, a.points[index].y));
+            assert_eq!(point.mean_return, a.points[index].mean_return + 50.0);
+            assert_eq!(point.success_percent, 50.0);
+        }
+        assert_eq!(Heatmap::mean(&[]), None);
+        let others: [fn(Heatmap) -> Heatmap; 4] = [
+            |it| Heatmap { base: Version::R, ..it },
+            |it| Heatmap { episodes: 7, ..it },
+            |it| Heatmap { fixed: [("gravity".to_owned(), 9.81)].into(), ..it },
+            |it| Heatmap { environment: "Elsewhere".into(), ..it },
+        ];
+        assert!(others.iter().all(|other| Heatmap::mean(&[a.clone(), other(b.clone())]).is_none()));
+        assert_eq!(Heatmap::mean(&[a, fixture::heatmap(3, |_, _| (0.0, 0.0))]), None, "of other grids");
+    }
+
+    #[test]
+    fn figures_are_read_back_to_the_last_digit_or_not_at_all() {
+        let heatmap = fixture::heatmap(3, |x, y| (x / 3.0 - y, 100.0 / 3.0 * y));
+        let csv = heatmap_table(&heatmap).to_csv();
+        let empty = || Heatmap { points: Vec::new(), ..heatmap.clone() };
+        assert_eq!(empty().with_points(&csv), Some(heatmap.clone()));
+        let text = String::from_utf8(csv.clone()).unwrap();
+        let line = text.lines().nth(4).unwrap();
+        for other in
+            [text.replace(line, ""), text.replace(line, "1,2,3,4"), text.replace(line, "1,2,3,many"), String::new()]
+        {
+            assert_eq!(empty().with_points(other.as_bytes()), None, "{other}");
+        }
+    }
+
+    #[test]
+    fn it_is_said_where_other_parameters_come_from() {
+        let heatmap = fixture::heatmap(1, |_, _| (0.0, 0.0));
+        assert_eq!(heatmap.others(), "other parameters at their defaults");
+        let drawn = Heatmap { base: Version::R, fixed: [("force".to_owned(), 7.5)].into(), ..heatmap };
+        assert_eq!(drawn.others(), "force = 7.5, other parameters drawn from R");
+    }
 }

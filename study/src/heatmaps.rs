@@ -1,30 +1,39 @@
-//! The heatmaps of an experiment: one for each training that was selected in the first run.
+//! The heatmaps of an experiment: of each policy that was selected in a run, over any two parameters.
 //!
 //! ```text
-//! DIR/heatmaps/ID.csv .svg .png .parquet  of the cell ID
-//! DIR/heatmaps/ID.json           what they show; written last
+//! DIR/heatmaps/ID-X-Y.csv .parquet  of the cell ID, over the parameters X and Y: figures and episodes
+//! DIR/heatmaps/ID-X-Y.json          how they were made; written last
+//! DIR/heatmaps/ID-X-Y-R.…           the same with the other parameters drawn from R
 //! ```
 //!
-//! The record holds checksums of the pictures and of the cell's result. Pictures of two records, or of a result that
-//! has been replaced since, are therefore never taken for current ones.
+//! The record holds checksums of the figures and of the cell's result. Figures of two records, or of a result that has
+//! been replaced since, are therefore never taken for current ones. Pictures are drawn from figures when they are wanted.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
 use super::folder::{Folder, FolderError};
-use super::heatmap::{Heatmap, HeatmapOptions, heatmap_table};
+use super::heatmap::{Axis, Heatmap, HeatmapOptions, heatmap_table};
 use super::plan::{Cell, TrainedOn};
-use super::plot::{self, PlotError};
 use super::selection::{MethodResults, Selected};
-use crate::Method;
 use crate::files::{self, delete, read_if_there, write_atomically, write_json};
+use crate::{Method, Version};
 
 /// Of the records; raised when older programs could misread them.
-const FORMAT_VERSION: u32 = 1;
+const FORMAT_VERSION: u32 = 2;
 
-/// A heatmap that an experiment has room for.
+/// What heatmaps have in common that stand beside each other.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct HeatmapKind {
+    /// Along x and along y.
+    pub parameters: [String; 2],
+    /// Where the other parameters come from.
+    pub base: Version,
+}
+
+/// A policy that an experiment has heatmaps of, or could have.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeatmapPlace<'a> {
     /// The environment's name.
@@ -33,13 +42,14 @@ pub struct HeatmapPlace<'a> {
     pub method: &'a Method,
     /// Where it was trained.
     pub trained_on: TrainedOn<'a>,
-    /// What was selected in the first run; `None` if nothing has a result.
+    /// Counted from 1.
+    pub run: u32,
+    /// What was selected; `None` if nothing has a result.
     pub selected: Option<Selected<'a>>,
 }
 
-/// `ID.json`: what a heatmap shows. It depends on nothing but the results, the program and the settings.
+/// `ID-X-Y.json`: what a heatmap shows. It depends on nothing but the results, the program and the settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct HeatmapRecord {
     /// Of this layout.
     format_version: u32,
@@ -54,23 +64,25 @@ pub struct HeatmapRecord {
     /// How it was tested.
     #[serde(flatten)]
     pub options: HeatmapOptions,
+    /// x and y.
+    pub axes: [Axis; 2],
     /// The program's version and the commit that it was built from.
     pub commit: String,
-    /// CRC-32C of the files, by their endings.
-    files: BTreeMap<String, String>,
+    /// CRC-32C of `ID-X-Y.csv`.
+    figures: String,
 }
 
 /// A heatmap that belongs to the current results.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StoredHeatmap {
-    /// What it shows.
+    /// How it was made.
     pub record: HeatmapRecord,
-    /// As it is in the file.
-    pub png: Vec<u8>,
+    /// What it shows.
+    pub heatmap: Heatmap,
 }
 
 /// Why there is no heatmap at a place.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
 pub enum NoHeatmap {
     /// The training was not done yet.
     #[error("no heatmap, since this training has no result yet")]
@@ -81,74 +93,131 @@ pub enum NoHeatmap {
     /// The result has been replaced.
     #[error("the heatmap is of an earlier result")]
     Outdated,
+    /// Means are over the same points and as many episodes.
+    #[error("the heatmap has another grid or other episodes than that of an earlier run")]
+    NotAlike,
 }
 
-/// All heatmaps that a plan has room for, in the order of `selections` and of what it trains on.
+/// The policies that a plan has heatmaps of, in the order of `selections`, of what it trains on and of runs.
 pub fn heatmap_places<'a>(selections: &'a [MethodResults<'a>]) -> Vec<HeatmapPlace<'a>> {
-    let of_selection = |selection: &'a MethodResults<'a>| {
-        let MethodResults { environment, method, runs, .. } = selection;
-        let first = runs.values().next().into_iter().flat_map(|run| &run.0);
-        first.map(move |(&trained_on, &selected)| HeatmapPlace { environment, method, trained_on, selected })
-    };
-    selections.iter().flat_map(of_selection).collect()
+    let mut places = Vec::new();
+    for MethodResults { environment, method, runs, .. } in selections {
+        let trained_on: BTreeSet<TrainedOn<'a>> = runs.values().flat_map(|run| run.0.keys().copied()).collect();
+        for trained_on in trained_on {
+            places.extend(runs.iter().map(|(&run, of_run)| {
+                let selected = of_run.trained_on(trained_on);
+                HeatmapPlace { environment, method, trained_on, run, selected }
+            }));
+        }
+    }
+    places
+}
+
+/// What there are heatmaps over in `folder`, by environment; of results that have been replaced, too.
+///
+/// # Errors
+/// The operating system's.
+pub(crate) fn heatmap_kinds<'a>(
+    folder: &Folder,
+    places: &[HeatmapPlace<'a>],
+) -> files::Result<BTreeMap<&'a str, BTreeSet<HeatmapKind>>> {
+    let ids = places.iter().filter_map(|place| Some((place.selected?.cell.id.as_str(), place.environment)));
+    let environments: BTreeMap<&str, &'a str> = ids.collect();
+    let mut kinds: BTreeMap<&str, BTreeSet<HeatmapKind>> = BTreeMap::new();
+    for path in files::list(&folder.path().join("heatmaps"))? {
+        if path.extension().is_none_or(|ending| ending != "json") {
+            continue;
+        }
+        let Some(record) = read_if_there(&path)?.and_then(|text| HeatmapRecord::of(&text)) else { continue };
+        if let Some(environment) = environments.get(record.cell.as_str()) {
+            kinds.entry(environment).or_default().insert(record.options.kind());
+        }
+    }
+    Ok(kinds)
+}
+
+impl HeatmapOptions {
+    /// What it is over.
+    pub fn kind(&self) -> HeatmapKind {
+        HeatmapKind { parameters: self.parameters.clone(), base: self.base }
+    }
+}
+
+impl std::fmt::Display for HeatmapKind {
+    /// As in the names of files.
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { parameters: [x, y], base } = self;
+        write!(f, "{x}-{y}")?;
+        if *base == Version::D { Ok(()) } else { write!(f, "-{}", base.file_name()) }
+    }
+}
+
+impl HeatmapRecord {
+    /// One that is not understood is made again like one that is not there.
+    fn of(text: &[u8]) -> Option<Self> {
+        serde_json::from_slice(text).ok().filter(|record: &Self| record.format_version == FORMAT_VERSION)
+    }
 }
 
 impl HeatmapPlace<'_> {
-    /// The heatmap that is there, or why there is none.
+    /// The heatmap of `kind` that is there, or why there is none.
     ///
     /// # Errors
     /// [`FolderError`] if a file is there that cannot be read.
-    pub fn read(&self, folder: &Folder) -> Result<Result<StoredHeatmap, NoHeatmap>, FolderError> {
+    pub fn read(&self, folder: &Folder, kind: &HeatmapKind) -> Result<Result<StoredHeatmap, NoHeatmap>, FolderError> {
         let Some(Selected { cell, .. }) = self.selected else { return Ok(Err(NoHeatmap::NoResult)) };
-        let Some(text) = read_if_there(&file(folder, &cell.id, "json"))? else { return Ok(Err(NoHeatmap::NotMade)) };
-        // One that is not understood is made again like one that is not there.
-        let Ok(record) = serde_json::from_slice::<HeatmapRecord>(&text) else { return Ok(Err(NoHeatmap::NotMade)) };
-        if record.format_version != FORMAT_VERSION || record.cell != cell.id {
+        let path = heatmap_path(folder, cell, kind);
+        let record = read_if_there(&path.with_added_extension("json"))?.and_then(|text| HeatmapRecord::of(&text));
+        let Some(record) = record.filter(|record| record.cell == cell.id && record.options.kind() == *kind) else {
             return Ok(Err(NoHeatmap::NotMade));
-        }
+        };
         if Some(&record.result) != result_checksum(folder, cell)?.as_ref() {
             return Ok(Err(NoHeatmap::Outdated));
         }
-        let mut png = Vec::new();
-        for (ending, expected) in &record.files {
-            match read_if_there(&file(folder, &cell.id, ending))? {
-                Some(content) if checksum(&content) == *expected => {
-                    if ending == "png" {
-                        png = content;
-                    }
-                }
-                _ => return Ok(Err(NoHeatmap::NotMade)),
-            }
-        }
-        Ok(if png.is_empty() { Err(NoHeatmap::NotMade) } else { Ok(StoredHeatmap { record, png }) })
+        let figures = read_if_there(&path.with_added_extension("csv"))?;
+        let figures = figures.filter(|figures| checksum(figures) == record.figures);
+        let heatmap = figures.and_then(|figures| record.blank(self.environment).with_points(&figures));
+        Ok(heatmap.map_or(Err(NoHeatmap::NotMade), |heatmap| Ok(StoredHeatmap { record, heatmap })))
+    }
+}
+
+impl HeatmapRecord {
+    /// Without points.
+    fn blank(&self, environment: &str) -> Heatmap {
+        let HeatmapOptions { base, grid, episodes, fixed, .. } = self.options.clone();
+        let (environment, axes) = (environment.to_owned(), self.axes.clone());
+        Heatmap { environment, axes, base, fixed, grid, episodes, points: Vec::new() }
     }
 }
 
 impl std::fmt::Display for HeatmapPlace<'_> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{}, {} trained on {}", self.environment, self.method, self.trained_on)
+        write!(f, "{}, {} trained on {}, run {}", self.environment, self.method, self.trained_on, self.run)
     }
 }
 
-/// Keeps `heatmap` of the policy called `checkpoint` as that of `cell`; gives the path without endings.
+/// Where a heatmap of `cell` is, without the ending.
+pub fn heatmap_path(folder: &Folder, cell: &Cell, kind: &HeatmapKind) -> PathBuf {
+    folder.path().join("heatmaps").join(format!("{}-{kind}", cell.id))
+}
+
+/// Keeps `heatmap` of the policy called `checkpoint` as that of `cell`.
 ///
 /// # Errors
-/// [`PlotError`]; then there is none.
+/// The operating system's; then there is none.
 pub fn store_heatmap(
     folder: &Folder,
     cell: &Cell,
     checkpoint: String,
     options: HeatmapOptions,
     heatmap: &Heatmap,
-) -> Result<PathBuf, PlotError> {
-    let record_path = file(folder, &cell.id, "json");
+) -> files::Result<()> {
+    let path = heatmap_path(folder, cell, &options.kind());
+    let record_path = path.with_added_extension("json");
     let result = result_checksum(folder, cell)?;
     delete(&record_path)?;
-    let mut files = BTreeMap::new();
-    for (ending, content) in heatmap_files(heatmap)? {
-        write_atomically(&file(folder, &cell.id, ending), &content)?;
-        files.insert(ending.to_owned(), checksum(&content));
-    }
+    let figures = heatmap_table(heatmap).to_csv();
+    write_atomically(&path.with_added_extension("csv"), &figures)?;
     let record = HeatmapRecord {
         format_version: FORMAT_VERSION,
         cell: cell.id.clone(),
@@ -156,27 +225,11 @@ pub fn store_heatmap(
         checkpoint,
         train_seed: cell.config.common.seed,
         options,
+        axes: heatmap.axes.clone(),
         commit: crate::VERSION.into(),
-        files,
+        figures: checksum(&figures),
     };
-    write_json(&record_path, &record)?;
-    Ok(record_path.with_extension(""))
-}
-
-/// The files of a heatmap with their endings: csv, svg and png.
-///
-/// # Errors
-/// [`PlotError`].
-pub fn heatmap_files(heatmap: &Heatmap) -> Result<[(&'static str, Vec<u8>); 3], PlotError> {
-    Ok([
-        ("csv", heatmap_table(heatmap).to_csv()),
-        ("svg", plot::svg(heatmap)?.into_bytes()),
-        ("png", plot::png(heatmap)?),
-    ])
-}
-
-fn file(folder: &Folder, id: &str, ending: &str) -> PathBuf {
-    folder.path().join("heatmaps").join(format!("{id}.{ending}"))
+    write_json(&record_path, &record)
 }
 
 /// Of a cell's result as it is on the disk.
@@ -191,40 +244,18 @@ fn checksum(content: &[u8]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Axis, HeatmapPoint, Plan, Version, fixture};
+    use crate::{Plan, fixture};
 
     const PLAN: &str = "environments = ['Pendulum', 'Elsewhere']\nversions = ['D', 'E']\nruns = 2
         [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
 
     fn heatmap() -> Heatmap {
-        let axis = |name: &str| Axis {
-            name: name.into(),
-            unit: "1".into(),
-            low: 0.0,
-            high: 1.0,
-            random: vec![(0.4, 0.6)],
-            extreme: vec![(0.0, 0.4), (0.6, 1.0)],
-        };
-        Heatmap {
-            environment: "Pendulum".into(),
-            policy: "a2c ff".into(),
-            axes: ["mass", "length"].map(axis),
-            grid: 2,
-            episodes: 1,
-            points: [(1.0, 0.0), (2.0, 0.0), (3.0, 50.0), (4.0, 100.0)]
-                .map(|(mean_return, success_percent)| HeatmapPoint { x: 0.0, y: 0.0, mean_return, success_percent })
-                .into(),
-        }
+        fixture::heatmap(2, |x, y| (x / 3.0, 100.0 * y / 1.5))
     }
 
-    fn options() -> HeatmapOptions {
-        HeatmapOptions {
-            parameters: ["mass", "length"].map(str::to_owned),
-            grid: 2,
-            episodes: 1,
-            seed: 1,
-            fixed: Default::default(),
-        }
+    fn options(base: Version) -> HeatmapOptions {
+        let Heatmap { axes, grid, episodes, fixed, .. } = heatmap();
+        HeatmapOptions { parameters: axes.map(|axis| axis.name), base, grid, episodes, seed: 1, fixed }
     }
 
     #[test]
@@ -236,53 +267,114 @@ mod tests {
         let result = folder.cell(&cell.id).path().join("result.json");
         write_atomically(&result, b"{}").unwrap();
         let (method, done) = (cell.method(), fixture::result(cell, [0.0; 3], 0.0));
-        let selected = Some(Selected { cell, result: &done });
         let place = HeatmapPlace {
             environment: "Pendulum",
             method: &method,
             trained_on: TrainedOn::Version(Version::D),
-            selected,
+            run: 1,
+            selected: Some(Selected { cell, result: &done }),
         };
-        assert_eq!(place.read(&folder).unwrap(), Err(NoHeatmap::NotMade));
+        let kind = options(Version::D).kind();
+        assert_eq!(place.read(&folder, &kind).unwrap(), Err(NoHeatmap::NotMade));
         let nobody = HeatmapPlace { selected: None, ..place.clone() };
-        assert_eq!(nobody.read(&folder).unwrap(), Err(NoHeatmap::NoResult));
+        assert_eq!(nobody.read(&folder, &kind).unwrap(), Err(NoHeatmap::NoResult));
 
-        let store = || store_heatmap(&folder, cell, "00000001-0a".into(), options(), &heatmap()).unwrap();
-        let path = store();
-        assert_eq!(path, directory.path().join("heatmaps").join(&cell.id));
-        let stored = place.read(&folder).unwrap().unwrap();
-        assert!(stored.png.starts_with(b"\x89PNG"));
-        assert_eq!((&stored.record.cell, &stored.record.options), (&cell.id, &options()));
+        let store = || store_heatmap(&folder, cell, "00000001-0a".into(), options(Version::D), &heatmap()).unwrap();
+        store();
+        let path = heatmap_path(&folder, cell, &kind);
+        assert_eq!(path, directory.path().join("heatmaps").join(format!("{}-mass-length", cell.id)));
+        let stored = place.read(&folder, &kind).unwrap().unwrap();
+        assert_eq!((stored.record.cell, stored.record.options), (cell.id.clone(), options(Version::D)));
+        assert_eq!(stored.heatmap, heatmap(), "to the last digit");
 
-        for ending in ["png", "svg", "csv", "json"] {
-            let damaged = path.with_extension(ending);
+        for ending in ["csv", "json"] {
+            let damaged = path.with_added_extension(ending);
             let content = std::fs::read(&damaged).unwrap();
-            std::fs::write(&damaged, &content[..content.len() / 2]).unwrap();
-            assert_eq!(place.read(&folder).unwrap(), Err(NoHeatmap::NotMade), "half a {ending}");
+            for write in [&content[..content.len() / 2], b""] {
+                std::fs::write(&damaged, write).unwrap();
+                assert_eq!(place.read(&folder, &kind).unwrap(), Err(NoHeatmap::NotMade), "half a {ending}");
+            }
+            std::fs::remove_file(&damaged).unwrap();
+            assert_eq!(place.read(&folder, &kind).unwrap(), Err(NoHeatmap::NotMade), "no {ending}");
             store();
             assert_eq!(std::fs::read(&damaged).unwrap(), content, "the same bytes again");
         }
-        write_atomically(&result, b"{ }").unwrap();
-        assert_eq!(place.read(&folder).unwrap(), Err(NoHeatmap::Outdated));
+        let figures = path.with_added_extension("csv");
+        let text = std::fs::read_to_string(&figures).unwrap();
+        std::fs::write(&figures, text.replace(",50\n", ",51\n")).unwrap();
+        assert_eq!(place.read(&folder, &kind).unwrap(), Err(NoHeatmap::NotMade), "other figures");
         store();
-        assert!(place.read(&folder).unwrap().is_ok());
-        std::fs::remove_file(path.with_extension("svg")).unwrap();
-        assert_eq!(place.read(&folder).unwrap(), Err(NoHeatmap::NotMade));
+        let record = path.with_added_extension("json");
+        let text = std::fs::read_to_string(&record).unwrap();
+        std::fs::write(&record, text.replace("\"format_version\": 2", "\"format_version\": 1")).unwrap();
+        assert_eq!(place.read(&folder, &kind).unwrap(), Err(NoHeatmap::NotMade), "of an older program");
+        store();
+        write_atomically(&result, b"{ }").unwrap();
+        assert_eq!(place.read(&folder, &kind).unwrap(), Err(NoHeatmap::Outdated));
+        store();
+        assert!(place.read(&folder, &kind).unwrap().is_ok());
         let left: Vec<_> = std::fs::read_dir(directory.path().join("heatmaps")).unwrap().collect();
-        assert_eq!(left.len(), 3, "nothing temporary");
+        assert_eq!(left.len(), 2, "nothing temporary");
     }
 
     #[test]
-    fn there_is_room_for_what_the_plan_trains_and_the_first_run_selects() {
+    fn heatmaps_of_several_kinds_stand_beside_each_other() {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
-        let done = |cell: &Cell| cell.id.starts_with("Pendulum-a2c-ff-D").then_some(([0.0; 3], 0.0));
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(directory.path());
+        let results = fixture::results(&plan, |_| Some(([0.0; 3], 0.0)));
+        let selections = results.select();
+        let places = heatmap_places(&selections);
+        let cell = places[0].selected.unwrap().cell;
+        write_atomically(&folder.cell(&cell.id).path().join("result.json"), b"{}").unwrap();
+        let length_first = |base| {
+            let Heatmap { axes: [x, y], .. } = heatmap();
+            let parameters = [y.name.clone(), x.name.clone()];
+            let axes = [y, x];
+            (HeatmapOptions { parameters, ..options(base) }, Heatmap { axes, base, ..heatmap() })
+        };
+        let drawn = (options(Version::R), Heatmap { base: Version::R, ..heatmap() });
+        let all = [(options(Version::D), heatmap()), drawn, length_first(Version::D)];
+        for (options, heatmap) in &all {
+            store_heatmap(&folder, cell, "1".into(), options.clone(), heatmap).unwrap();
+        }
+        for (options, heatmap) in all {
+            let stored = places[0].read(&folder, &options.kind()).unwrap().unwrap();
+            assert_eq!((stored.record.options, stored.heatmap), (options, heatmap));
+        }
+        // Of another kind than its name says.
+        let of = |base| heatmap_path(&folder, cell, &options(base).kind());
+        for ending in ["csv", "json"] {
+            let [from, to] = [Version::R, Version::E].map(|base| of(base).with_added_extension(ending));
+            std::fs::copy(from, to).unwrap();
+        }
+        assert_eq!(places[0].read(&folder, &options(Version::E).kind()).unwrap(), Err(NoHeatmap::NotMade));
+        // Of a cell that was not selected.
+        let mut elsewhere = plan.cells[1].clone();
+        elsewhere.id = "elsewhere".into();
+        store_heatmap(&folder, &elsewhere, "1".into(), length_first(Version::E).0, &heatmap()).unwrap();
+        std::fs::write(directory.path().join("heatmaps/damaged.json"), "{").unwrap();
+        let kinds = heatmap_kinds(&folder, &places).unwrap();
+        let shown: Vec<String> = kinds["Pendulum"].iter().map(ToString::to_string).collect();
+        assert_eq!(
+            (kinds.len(), shown),
+            (1, ["length-mass", "mass-length", "mass-length-R"].map(str::to_owned).into())
+        );
+    }
+
+    #[test]
+    fn there_is_room_for_what_the_plan_trains_in_all_runs() {
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        let done = |cell: &Cell| (cell.id.starts_with("Pendulum-a2c-ff-D") && cell.run == 1).then_some(([0.0; 3], 0.0));
         let results = fixture::results(&plan, done);
         let selections = results.select();
         let places = heatmap_places(&selections);
         let shown: Vec<String> = places.iter().map(ToString::to_string).collect();
-        let expected = ["Pendulum, a2c ff trained on D", "Pendulum, a2c ff trained on E"];
-        assert_eq!((shown[..2] == expected, shown.len()), (true, 4), "none on R");
+        let expected =
+            ["D, run 1", "D, run 2", "E, run 1", "E, run 2"].map(|it| format!("Pendulum, a2c ff trained on {it}"));
+        assert_eq!((&shown[..4], shown.len()), (&expected[..], 8), "none on R");
         let runs: Vec<_> = places.iter().map(|place| place.selected.map(|selected| selected.cell.run)).collect();
-        assert_eq!(runs, [Some(1), None, None, None]);
+        assert_eq!(runs[..2], [Some(1), None]);
+        assert!(runs[2..].iter().all(Option::is_none));
     }
 }

@@ -15,6 +15,7 @@ pub mod files;
 mod fixture;
 mod folder;
 mod heatmap;
+mod heatmap_policies;
 mod heatmaps;
 pub mod interrupt;
 mod means;
@@ -44,8 +45,9 @@ pub use folder::{
     CellFolder, CellResult, CellState, Failure, FailureMark, Folder, FolderError, MarkResult, Timing, Training,
 };
 pub use heatmap::{Axis, Heatmap, HeatmapOptions, HeatmapPoint, MOST_POINTS, heatmap_table};
+pub use heatmap_policies::{PolicyHeatmap, policies_side_by_side};
 pub use heatmaps::{
-    HeatmapPlace, HeatmapRecord, NoHeatmap, StoredHeatmap, heatmap_files, heatmap_places, store_heatmap,
+    HeatmapKind, HeatmapPlace, HeatmapRecord, NoHeatmap, StoredHeatmap, heatmap_path, heatmap_places, store_heatmap,
 };
 pub use means::{geometric_mean, mean, wilson};
 pub use paper::Method;

@@ -5,7 +5,7 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::scenarios::Metric;
-use super::settings::Preset;
+use super::settings::{Observe, Preset};
 use super::statistics::Summary;
 
 /// Every number of its tables.
@@ -26,24 +26,35 @@ pub struct Method {
     /// Whose defaults the settings have.
     #[serde(default, skip_serializing_if = "Preset::is_default")]
     pub preset: Preset,
+    /// What its policies see.
+    #[serde(default, skip_serializing_if = "Observe::is_default")]
+    pub observe: Observe,
 }
 
 impl Method {
-    /// Whether it is a line to compare with, which learns nothing.
-    pub fn is_reference(&self) -> bool {
+    /// Whether it learns nothing.
+    fn is_random(&self) -> bool {
         self.algorithm == "random"
+    }
+
+    /// Whether it is a line to compare with: it learns nothing, or sees what others have to find out.
+    pub fn is_reference(&self) -> bool {
+        self.is_random() || self.observe.sees_parameters()
     }
 }
 
 impl fmt::Display for Method {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        if self.is_reference() {
+        if self.is_random() {
             f.write_str("random policy (reference)")?;
         } else {
             write!(f, "{} {}", self.algorithm, self.architecture)?;
         }
         self.episodes_per_trial.map_or(Ok(()), |episodes| write!(f, " N={episodes}"))?;
-        if self.preset.is_default() { Ok(()) } else { write!(f, " ({})", self.preset) }
+        let preset = (!self.preset.is_default()).then(|| self.preset.to_string());
+        let sees = self.observe.note().map(str::to_owned);
+        let notes = preset.into_iter().chain(sees).collect::<Vec<_>>().join(", ");
+        if notes.is_empty() { Ok(()) } else { write!(f, " ({notes})") }
     }
 }
 
@@ -64,6 +75,7 @@ impl Record {
             && self.algorithm.eq_ignore_ascii_case(&method.algorithm)
             && self.architecture.eq_ignore_ascii_case(&method.architecture)
             && self.episodes_per_trial == method.episodes_per_trial
+            && !method.observe.sees_parameters()
     }
 }
 
@@ -99,6 +111,7 @@ mod tests {
             architecture: architecture.into(),
             episodes_per_trial,
             preset: Preset::Perturb,
+            observe: Observe::State,
         }
     }
 
@@ -114,6 +127,11 @@ mod tests {
         let shown = |metric| number("CartPole", &ppo, metric).unwrap().to_string();
         assert_eq!(Metric::ALL.map(shown), ["100.0 ± 0.0", "100.0 ± 0.0", "86.2 ± 12.6"]);
         assert_eq!(number("CartPole", &method("ppo", "transformer", None), Metric::Default), None);
+        assert_eq!(
+            number("CartPole", &Method { observe: Observe::Parameters, ..ppo }, Metric::Default),
+            None,
+            "it saw less"
+        );
         assert_eq!(number("Pendulum", &method("rl2-a2c", "rc", None), Metric::Default), None, "it has trials");
         let with = |trials| number("Average", &method("rl2-a2c", "rc", Some(trials)), Metric::Default).unwrap().mean;
         assert_eq!([1, 2, 5].map(with), [66.83, 45.79, 41.08]);
@@ -128,13 +146,24 @@ mod tests {
         assert_eq!(average(&["CartPole", "Ant"], &a2c, Metric::Default), None);
     }
 
+    #[test]
+    fn a_name_says_in_what_a_method_differs_from_others() {
+        let rl2 = method("rl2-ppo", "rc", Some(2));
+        assert_eq!(rl2.to_string(), "rl2-ppo rc N=2");
+        let seeing = |preset| Method { preset, observe: Observe::Parameters, ..rl2.clone() }.to_string();
+        assert_eq!(seeing(Preset::Perturb), "rl2-ppo rc N=2 (sees parameters)");
+        assert_eq!(seeing(Preset::Paper), "rl2-ppo rc N=2 (paper, sees parameters)");
+        assert_eq!(Method { preset: Preset::Paper, ..rl2 }.to_string(), "rl2-ppo rc N=2 (paper)");
+    }
+
     /// The paper's averages follow from its tables of the environments, to the two digits that they are rounded to.
     #[test]
     fn the_published_averages_are_those_of_the_environments() {
         let averages: Vec<Record> = records().filter(|record| record.environment == "Average").collect();
         assert_eq!(averages.len(), 42);
         for Record { algorithm, architecture, episodes_per_trial, metric, mean_percent, .. } in averages {
-            let method = Method { algorithm, architecture, episodes_per_trial, preset: Preset::Paper };
+            let (preset, observe) = (Preset::Paper, Observe::State);
+            let method = Method { algorithm, architecture, episodes_per_trial, preset, observe };
             let means = ALL.map(|environment| number(environment, &method, metric).unwrap().mean);
             let mean = means.iter().sum::<f64>() / means.len() as f64;
             // Either is rounded to 0.01: half of that each, and some for the binary fractions.

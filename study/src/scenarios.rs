@@ -8,6 +8,11 @@ use super::means::geometric_mean;
 
 pub use perturb_protocol::Version;
 
+/// The paper's versions, and those others that there is something of: lines to compare with.
+pub(crate) fn versions(is_there: impl Fn(Version) -> bool) -> Vec<Version> {
+    Version::KNOWN.into_iter().filter(|version| Version::ALL.contains(version) || is_there(*version)).collect()
+}
+
 /// Training on one version and testing on another, e.g. "DR".
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Scenario {
@@ -20,7 +25,12 @@ pub struct Scenario {
 impl Scenario {
     /// The nine pairs: DD, DR, DE, RD, … EE.
     pub fn all() -> impl Iterator<Item = Scenario> {
-        Version::ALL.into_iter().flat_map(|train| Version::ALL.map(|test| Scenario { train, test }))
+        Self::of(&Version::ALL, &Version::ALL)
+    }
+
+    /// All pairs of what was trained on and tested on.
+    pub fn of(trained: &[Version], tested: &[Version]) -> impl Iterator<Item = Scenario> {
+        trained.iter().flat_map(|&train| tested.iter().map(move |&test| Scenario { train, test }))
     }
 }
 

@@ -84,6 +84,12 @@ async fn the_catalogue_is_complete_and_consistent() {
         assert!(!success.description.is_empty() && (1..=e.step_limit).contains(&success.steps), "{e:?}");
         assert!(!success.quantity.is_empty() && !success.unit.is_empty() && success.threshold.is_finite(), "{e:?}");
         assert_ne!(success.comparison(), Comparison::Unspecified, "{e:?}");
+        let code = e.code_success.as_ref().unwrap();
+        let other = [("CartPole", 196.0), ("Acrobot", 90.0), ("Pendulum", 100.0)];
+        match other.iter().find(|(name, _)| *name == e.name) {
+            Some((_, threshold)) => assert!(code.threshold == *threshold && code != success, "{e:?}"),
+            None => assert_eq!(code, success, "{}: the text's rule", e.name),
+        }
         let is_parameter = |name: &String| e.parameters.iter().any(|p| p.name == *name);
         assert!(matches!(e.heatmap_axes.len(), 0 | 2) && e.heatmap_axes.iter().all(is_parameter), "{e:?}");
         assert!(!e.observation.is_empty() && !e.state.is_empty() && !e.reward_terms.is_empty(), "{e:?}");

@@ -214,6 +214,34 @@ fn an_override_does_not_move_the_other_parameters_draws() {
     assert_eq!(receipt(base)[1..], receipt(changed)[1..]);
 }
 
+#[test]
+fn a_trial_of_r_and_e_is_all_of_one_of_them_as_the_document_says() {
+    for spec in tasks::catalogue().specs() {
+        let mut of_r = 0;
+        for (trial, got) in (1..).zip(drawn(spec, Version::RE)) {
+            let mut stream = Stream::new(2026, 3, Purpose::Parameters, trial);
+            let part = if stream.unit() < 0.5 { Version::R } else { Version::E };
+            let expected: Vec<f64> = spec.parameters.iter().map(|p| p.distribution(part).at(stream.unit())).collect();
+            assert_eq!(got, expected, "{} trial {trial}, {part}", spec.name);
+            of_r += u32::from(part == Version::R);
+        }
+        let sigmas = (f64::from(of_r) - f64::from(DRAWS) / 2.0) / (f64::from(DRAWS) / 4.0).sqrt();
+        assert!(sigmas.abs() < SIGMAS, "{}: {of_r} trials of R: {sigmas} σ", spec.name);
+    }
+}
+
+#[test]
+fn overrides_replace_the_sets_of_r_and_of_e() {
+    let spec = tasks::catalogue().find("CartPole").unwrap();
+    let mut distributions = spec.distributions(Version::RE);
+    resolve(spec, &mut distributions, [("length", Distribution::fixed(0.7))]).unwrap();
+    let expected = [Version::R, Version::E].map(|part| {
+        let [force, _, mass] = [0, 1, 2].map(|place: usize| spec.parameters[place].distribution(part));
+        [force, Distribution::fixed(0.7), mass]
+    });
+    assert_eq!(distributions, expected.concat());
+}
+
 #[rstest]
 #[case::empty(&[], "1 to 64 intervals")]
 #[case::nan_low(&[(f64::NAN, 1.0)], "finite ends")]

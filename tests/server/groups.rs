@@ -21,7 +21,7 @@ fn groups() -> Vec<SlotGroup> {
         group(3, Version::Random, 5, 100, 2),
         SlotGroup { parameters: parameters(&[("length", &[(0.4, 0.5)])]), ..group(150, Version::Default, 5, 0, 0) },
         group(1, Version::Extreme, 6, u32::MAX, 1),
-        group(1, Version::Default, u64::MAX, 0, 3),
+        group(1, Version::RandomOrExtreme, u64::MAX, 0, 3),
     ]
 }
 
@@ -92,6 +92,25 @@ async fn environments_of_a_group_give_the_bytes_of_a_session_of_their_own() {
         }
     }
     assert!(ended > 1000, "{ended} episodes ended");
+}
+
+#[tokio::test]
+async fn parameters_of_a_session_of_r_and_e_replace_those_of_both_also_at_a_reset() {
+    let server = Server::start(&[]);
+    let given = || parameters(&[("length", &[(0.3, 0.3)])]);
+    let of = |parameters| Open { version: Version::RandomOrExtreme.into(), parameters, ..open("CartPole", 60, 4) };
+    let (_, at_open) = Session::open(server.unix(), of(given())).await;
+    let (mut session, _) = Session::open(server.unix(), of(Default::default())).await;
+    let at_reset = session.ask(Reset { parameters: given(), ..Reset::default() }).await;
+    for started in [at_open.started, at_reset.started] {
+        let requested: Vec<Vec<f64>> = started.into_iter().map(|start| start.receipt.unwrap().requested).collect();
+        assert!(requested.iter().all(|values| values[1] == 0.3));
+        // R's force is within 5 … 15, E's is not.
+        let of_r = requested.iter().filter(|values| (5.0..15.0).contains(&values[0])).count();
+        assert!((15..45).contains(&of_r), "{of_r} of 60");
+        let mass_of_r = |values: &&Vec<f64>| (0.05..0.5).contains(&values[2]) == (5.0..15.0).contains(&values[0]);
+        assert_eq!(requested.iter().filter(mass_of_r).count(), 60, "all parameters are of one version");
+    }
 }
 
 fn spoiled(spoil: impl FnOnce(&mut Vec<SlotGroup>)) -> Open {

@@ -15,6 +15,7 @@ mod groups;
 mod lifecycle;
 #[cfg(feature = "mujoco")]
 mod locomotion;
+mod observing;
 mod old_snapshots;
 mod pool;
 mod reference;

@@ -21,7 +21,7 @@ const MODES: [Autoreset; 3] = [Autoreset::NextStep, Autoreset::SameStep, Autores
 fn batch_settings(spec: &'static EnvironmentSpec, size: usize, autoreset: Autoreset) -> BatchSettings {
     let episodes = common::settings(spec, Version::R, 17, 100, 2);
     let groups = vec![SlotGroup { size, episodes }];
-    BatchSettings { spec, groups, autoreset, receipts: true, reward_terms: true }
+    BatchSettings { spec, groups, autoreset, receipts: true, reward_terms: true, observe_parameters: false }
 }
 
 /// Random actions for slots whose environments have the indices from `first` on.

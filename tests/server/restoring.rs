@@ -80,6 +80,26 @@ fn refused(result: Result<(), Error>) -> String {
 }
 
 #[test]
+fn an_environment_of_r_and_e_goes_on_with_both_and_more_sets_are_refused() {
+    for spec in tasks::catalogue().specs() {
+        let mut e = episodes(spec, Version::RE, 31, 5, 1);
+        let saved = e.snapshot();
+        let mut other = episodes(spec, Version::D, 1, 1, 1);
+        other.restore(&saved).unwrap();
+        assert_eq!(other.settings(), e.settings());
+        for _ in 0..20 {
+            e.begin(None);
+            other.begin(None);
+            assert_eq!(start_line(&other), start_line(&e));
+        }
+        let mut saved = decode(&saved);
+        saved.distributions.extend(saved.distributions.clone());
+        let refused = other.restore(&encode(&saved)).unwrap_err().to_string();
+        assert!(refused.contains("it does not have the"), "{refused}");
+    }
+}
+
+#[test]
 fn a_snapshot_in_mid_episode_continues_with_the_same_bytes() {
     for spec in tasks::catalogue().specs() {
         let mut e = used(spec);
@@ -361,7 +381,7 @@ proptest! {
 fn batch_settings(spec: &'static EnvironmentSpec, seed: u64, size: usize, autoreset: Autoreset) -> BatchSettings {
     let episodes = common::settings(spec, Version::R, seed, 0, 2);
     let groups = vec![SlotGroup { size, episodes }];
-    BatchSettings { spec, groups, autoreset, receipts: true, reward_terms: true }
+    BatchSettings { spec, groups, autoreset, receipts: true, reward_terms: true, observe_parameters: false }
 }
 
 fn actions(spec: &EnvironmentSpec, size: usize, t: u64) -> Vec<u8> {

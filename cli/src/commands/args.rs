@@ -10,7 +10,7 @@ use clap::{Args, Parser, Subcommand};
 use perturb_learner::client::Address;
 use perturb_study::scheduler::slurm::TimeLimit;
 use perturb_study::sets::Assignment;
-use perturb_study::settings::{Architecture, Preset, Settings};
+use perturb_study::settings::{Architecture, Observe, Preset, Settings};
 use perturb_study::success::Rule;
 use perturb_study::{Grouping, MOST_POINTS, Selection, Version};
 
@@ -105,6 +105,10 @@ pub(super) struct TrainArgs {
     /// What acts [default: ff; with RL², which has no other, rc].
     #[arg(long, value_parser = Architecture::NAMES)]
     pub(super) architecture: Option<String>,
+    /// What the policy sees: the environment's observation, or the parameters that the episode runs with, too [default:
+    /// state].
+    #[arg(long, value_parser = Observe::NAMES)]
+    pub(super) observe: Option<String>,
     /// RL² only: episodes in a trial [default: 2].
     #[arg(long, value_name = "N")]
     pub(super) episodes_per_trial: Option<u64>,
@@ -135,8 +139,8 @@ pub(super) struct TrainArgs {
         long,
         value_name = "DIR",
         conflicts_with_all = [
-            "env", "version", "parameters", "preset", "algorithm", "architecture", "episodes_per_trial", "episodes", "seed", "out",
-            "overwrite", "config", "set"
+            "env", "version", "parameters", "preset", "algorithm", "architecture", "observe", "episodes_per_trial",
+            "episodes", "seed", "out", "overwrite", "config", "set"
         ]
     )]
     pub(super) resume: Option<PathBuf>,
@@ -361,45 +365,55 @@ pub(super) struct CurvesArgs {
 
 #[derive(Args, Debug)]
 pub(super) struct HeatmapArgs {
-    /// The --out of `perturb run`: every training that was selected in its first run, over the environment's usual two
-    /// parameters. Heatmaps go to its folder heatmaps/; those that are there are kept.
+    /// The --out of `perturb run`: every policy that was selected in one of its runs. What they do goes to its folder
+    /// heatmaps/, where what is there is kept; pictures of the means over runs go to report/.
     #[arg(
         value_name = "DIR",
         required_unless_present = "checkpoint",
-        conflicts_with_all = ["checkpoint", "x", "y", "out"]
+        conflicts_with_all = ["checkpoint", "parameters", "records", "out"]
     )]
     pub(super) dir: Option<PathBuf>,
-    /// One policy instead: the --out of a training, or the checkpoint folder in it.
-    #[arg(long, value_name = "DIR")]
-    pub(super) checkpoint: Option<PathBuf>,
-    /// The parameter along x, e.g. force; `perturb envs` lists them [default: the environment's usual two].
+    /// Policies instead, of one environment: the --out of each training, or the checkpoint folder in it. The picture shows
+    /// the mean over those of a method that were trained on the same, side by side with others.
+    #[arg(long, value_name = "DIR", num_args = 1..)]
+    pub(super) checkpoint: Vec<PathBuf>,
+    /// Test the policies of the first N runs only, and draw what is there of the others [default: of all runs].
+    #[arg(long, value_name = "N", conflicts_with = "checkpoint", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(super) runs: Option<u32>,
+    /// The parameter along x, e.g. force; `perturb envs` lists them. Environments of DIR that lack one are left out
+    /// [default: the environment's usual two].
     #[arg(long, value_name = "PARAMETER", requires = "y")]
     pub(super) x: Option<String>,
     /// The parameter along y, e.g. mass.
     #[arg(long, value_name = "PARAMETER", requires = "x")]
     pub(super) y: Option<String>,
-    /// Values of other parameters, e.g. force=7 [default: those of version D].
+    /// The version that other parameters come from: D, where each has its default, or R or E, of which they are drawn for
+    /// each episode.
+    #[arg(long, value_name = "VERSION", default_value = "D")]
+    pub(super) base: Version,
+    /// Values of other parameters, e.g. force=7 [default: those of --base].
     #[arg(long, value_name = "PARAMETER=VALUE", num_args = 1.., requires = "checkpoint")]
     pub(super) parameters: Vec<Assignment>,
-    /// Make the heatmap again from the file .parquet that an earlier one left, without playing.
+    /// Make the heatmap again from the files .parquet that an earlier one left, one for each --checkpoint, without playing.
     #[arg(
         long,
         value_name = "FILE",
+        num_args = 1..,
         requires = "checkpoint",
-        conflicts_with_all = ["grid", "episodes", "seed", "parameters"]
+        conflicts_with_all = ["grid", "episodes", "seed", "parameters", "base"]
     )]
-    pub(super) records: Option<PathBuf>,
+    pub(super) records: Vec<PathBuf>,
     /// Points along each axis, at most 100.
     #[arg(long, value_name = "N", default_value_t = 40, value_parser = |text: &str| within(text, 1..=MOST_POINTS))]
     pub(super) grid: usize,
-    /// Episodes at each point.
+    /// Episodes of each policy at each point.
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..))]
     pub(super) episodes: u64,
-    /// Fixes the tests' randomness [default: the training's seed].
+    /// Fixes the tests' randomness [default: each training's seed].
     #[arg(long, value_name = "N")]
     pub(super) seed: Option<u64>,
-    /// The files without their endings .csv, .svg, .png [default: in the working directory, named after environment,
-    /// algorithm, architecture, version, seed and parameters].
+    /// The files without their endings .csv, .svg, .png, .parquet [default: in the working directory, named after
+    /// environment, algorithm, architecture, version, seed and parameters].
     #[arg(long, value_name = "PATH")]
     pub(super) out: Option<PathBuf>,
     #[command(flatten)]

@@ -122,6 +122,7 @@ fn metrics_table(rates: &BTreeMap<Scenario, f64>) -> Table {
         architecture: "ff".into(),
         episodes_per_trial: None,
         preset: Preset::Perturb,
+        observe: Default::default(),
     };
     let here = |metric: Metric| metric.of(|scenario| rates.get(&scenario).copied());
     let paper = |metric| paper::number(ENVIRONMENT, &method, metric);

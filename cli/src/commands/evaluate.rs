@@ -84,6 +84,7 @@ fn document(state: &State, evaluation_seed: u64, results: &[(String, TestResult)
         "seed": common.seed,
         "evaluation_seed": evaluation_seed,
         "preset": common.preset,
+        "observe": common.observe,
         "training_episodes": state.counters.episodes,
         "results": results,
     })

@@ -1,64 +1,83 @@
 //! `perturb heatmap`.
 
+mod experiment;
+
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use super::args::HeatmapArgs;
 use super::display::Display;
 use super::error::{CommandError, Result, system};
-use super::{plan_in, playing_servers, sets};
-use perturb_learner::checkpoint::{Checkpoint, State};
+use super::{playing_servers, sets};
+use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::Servers;
 use perturb_learner::evaluation::{heatmap, heatmap_again};
 use perturb_learner::proto;
 use perturb_protocol::{Distribution, Version};
 use perturb_study::files::write_atomically;
 use perturb_study::interrupt::StopFlag;
+use perturb_study::plot;
 use perturb_study::records::Records;
 use perturb_study::sets::Context;
 use perturb_study::settings::{Common, TrainConfig};
-use perturb_study::{
-    Folder, Heatmap, HeatmapOptions, NoHeatmap, Results, Selected, heatmap_files, heatmap_places, store_heatmap,
-};
+use perturb_study::{Heatmap, HeatmapKind, HeatmapOptions, PolicyHeatmap, policies_side_by_side};
 
 pub(super) fn run(args: &HeatmapArgs) -> Result<()> {
-    match (&args.dir, &args.checkpoint) {
-        (Some(directory), _) => of_experiment(args, directory),
-        (None, Some(checkpoint)) => of_checkpoint(args, checkpoint),
-        (None, None) => Err(CommandError::Usage("give the directory of an experiment, or --checkpoint".into())),
+    match &args.dir {
+        Some(directory) => experiment::run(args, directory),
+        None => of_checkpoints(args),
     }
 }
 
-/// Of one policy.
-fn of_checkpoint(args: &HeatmapArgs, path: &Path) -> Result<()> {
-    let checkpoint = Checkpoint::load(path)?;
-    let state = &checkpoint.state;
+/// Of some policies.
+fn of_checkpoints(args: &HeatmapArgs) -> Result<()> {
+    let checkpoints = args.checkpoint.iter().map(|path| Checkpoint::load(path)).collect::<Result<Vec<_>, _>>()?;
+    let name = one_environment(&args.checkpoint, &checkpoints)?;
+    if let Some(twice) = (1..args.checkpoint.len()).find(|&i| args.checkpoint[..i].contains(&args.checkpoint[i])) {
+        let path = args.checkpoint[twice].display();
+        return Err(CommandError::Usage(format!("--checkpoint names {path} twice: a mean is over different policies")));
+    }
+    if !args.records.is_empty() && args.records.len() != checkpoints.len() {
+        let (files, policies) = (args.records.len(), checkpoints.len());
+        let message =
+            format!("--records has {files} files for {policies} policies; give one for each --checkpoint, in order");
+        return Err(CommandError::Usage(message));
+    }
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = playing_servers(&args.play)?;
-    let environment = servers.environment(&state.config.common.environment)?;
-    let parameters = match (&args.x, &args.y) {
-        (Some(x), Some(y)) => [x.clone(), y.clone()],
-        _ => usual_axes(&environment).ok_or_else(|| {
-            let message = format!("give --x and --y: it is not known which of {}'s to show", environment.name);
-            CommandError::Usage(message)
-        })?,
-    };
-    let options = HeatmapOptions { fixed: fixed(args)?, ..options(args, parameters, state) };
-    let (heatmap, records) = match &args.records {
-        None => {
-            let (heatmap, records) = test(&servers, &checkpoint, &options, &stop)?;
-            (heatmap, Some(records))
-        }
-        Some(path) => (heatmap_again(&environment, &checkpoint, &Records::read(path)?, &options.parameters)?, None),
-    };
-    let path = args.out.clone().unwrap_or_else(|| default_path(state, &options.parameters));
-    let mut out = std::io::stdout();
-    if let Some(records) = records {
-        let path = path.with_added_extension("parquet");
-        records.write(&path)?;
-        writeln!(out, "{}", path.display())?;
+    let environment = servers.environment(&name)?;
+    let mut kind = HeatmapKind { parameters: wanted_axes(args, &environment)?, base: args.base };
+    let recorded = args.records.iter().map(|path| Records::read(path)).collect::<Result<Vec<_>, _>>()?;
+    if let Some(base) = recorded.first().and_then(Heatmap::base_of) {
+        kind.base = base;
     }
-    for (ending, content) in heatmap_files(&heatmap)? {
+    let fixed = fixed(args)?;
+    let path = args.out.clone().unwrap_or_else(|| default_path(&checkpoints, &kind));
+    let mut out = std::io::stdout();
+    let mut policies = Vec::new();
+    for (index, checkpoint) in checkpoints.iter().enumerate() {
+        let heatmap = if let Some(records) = recorded.get(index) {
+            heatmap_again(&environment, checkpoint, records, &kind.parameters)?
+        } else {
+            let options = HeatmapOptions { fixed: fixed.clone(), ..options(args, &kind, &checkpoint.state.config) };
+            let (heatmap, records) = test(&servers, checkpoint, &options, &stop)?;
+            let ending = if checkpoints.len() > 1 { format!("{}.parquet", index + 1) } else { "parquet".into() };
+            let path = path.with_added_extension(ending);
+            records.write(&path)?;
+            writeln!(out, "{}", path.display())?;
+            heatmap
+        };
+        let config = &checkpoint.state.config;
+        let (method, trained_on) = (config.method().to_string(), config.common.trained_on());
+        policies.push(PolicyHeatmap { method, trained_on, seed: config.common.seed, heatmap });
+    }
+    let (panels, figures) = policies_side_by_side(&policies).ok_or_else(|| {
+        let message = "the recorded episodes are over other points, or more of them, in one file than in another: give \
+                       those of one call";
+        CommandError::Failed(message.into())
+    })?;
+    let svg = plot::svg(&panels)?.into_bytes();
+    for (ending, content) in [("csv", figures.to_csv()), ("svg", svg), ("png", plot::png(&panels)?)] {
         let path = path.with_added_extension(ending);
         write_atomically(&path, &content)?;
         writeln!(out, "{}", path.display())?;
@@ -66,9 +85,32 @@ fn of_checkpoint(args: &HeatmapArgs, path: &Path) -> Result<()> {
     Ok(())
 }
 
-/// The two parameters over which an environment's heatmaps are unless others are asked for.
-fn usual_axes(environment: &proto::Environment) -> Option<[String; 2]> {
-    environment.heatmap_axes.clone().try_into().ok()
+/// The environment that all policies are of.
+fn one_environment(paths: &[PathBuf], checkpoints: &[Checkpoint]) -> Result<String> {
+    let of = |checkpoint: &Checkpoint| checkpoint.state.config.common.environment.clone();
+    let named: Vec<(&Path, String)> = paths.iter().map(PathBuf::as_path).zip(checkpoints.iter().map(of)).collect();
+    let Some((first, name)) = named.first() else {
+        return Err(CommandError::Usage("give the directory of an experiment, or --checkpoint".into()));
+    };
+    match named.iter().find(|(_, other)| other != name) {
+        None => Ok(name.clone()),
+        Some((path, other)) => Err(CommandError::Usage(format!(
+            "{} was trained in {name}, {} in {other}: a picture is of one environment, give its policies alone",
+            first.display(),
+            path.display()
+        ))),
+    }
+}
+
+/// The two parameters that are asked for, or those over which an environment's heatmaps usually are.
+fn wanted_axes(args: &HeatmapArgs, environment: &proto::Environment) -> Result<[String; 2]> {
+    if let (Some(x), Some(y)) = (&args.x, &args.y) {
+        return Ok([x.clone(), y.clone()]);
+    }
+    environment.heatmap_axes.clone().try_into().map_err(|_| {
+        let message = format!("give --x and --y: it is not known which of {}'s to show", environment.name);
+        CommandError::Usage(message)
+    })
 }
 
 /// The values of other parameters.
@@ -83,81 +125,25 @@ fn fixed(args: &HeatmapArgs) -> Result<Context> {
 }
 
 /// In the working directory: a training's folder has nothing in it that its training did not write.
-fn default_path(state: &State, [x, y]: &[String; 2]) -> PathBuf {
-    let TrainConfig { common: Common { environment, architecture, version, parameters, seed, .. }, settings } =
-        &state.config;
+fn default_path(checkpoints: &[Checkpoint], kind: &HeatmapKind) -> PathBuf {
+    let TrainConfig { common, settings } = &checkpoints[0].state.config;
+    let Common { environment, architecture, version, parameters, seed, .. } = common;
+    if checkpoints.len() > 1 {
+        return format!("{environment}-{}-policies-{kind}", checkpoints.len()).into();
+    }
     let own = if parameters.is_empty() { "" } else { "-own" };
-    format!("{environment}-{}-{architecture}-{version}{own}-s{seed}-{x}-{y}", settings.name()).into()
+    let version = version.file_name();
+    format!("{environment}-{}-{architecture}-{version}{own}-s{seed}-{kind}", settings.name()).into()
 }
 
-/// Of everything that was selected in the first run of an experiment, unless it is there already.
-fn of_experiment(args: &HeatmapArgs, directory: &Path) -> Result<()> {
-    let folder = Folder::new(directory);
-    let plan = plan_in(&folder)?;
-    let results = Results::read(&plan, &folder)?;
-    let selections = results.select();
-    let places = heatmap_places(&selections);
-    let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let mut servers_of_all = None;
-    let mut out = std::io::stdout();
-    let mut failed = 0;
-    for place in &places {
-        let Some(selected) = place.selected else {
-            eprintln!("{place}: {}", NoHeatmap::NoResult);
-            continue;
-        };
-        let servers = match &mut servers_of_all {
-            Some(servers) => servers,
-            none => none.insert(playing_servers(&args.play)?),
-        };
-        let Some(parameters) = usual_axes(&servers.environment(place.environment)?) else {
-            eprintln!("{place}: it is not known which parameters to show");
-            continue;
-        };
-        let checkpoint = match checkpoint_of(&folder, selected) {
-            Ok(checkpoint) => checkpoint,
-            Err(error) => {
-                eprintln!("{place}: {error}");
-                failed += 1;
-                continue;
-            }
-        };
-        let options = options(args, parameters, &checkpoint.state);
-        if place.read(&folder)?.is_ok_and(|heatmap| heatmap.record.options == options) {
-            eprintln!("{place}: is there already");
-            continue;
-        }
-        let (heatmap, records) = test(servers, &checkpoint, &options, &stop)
-            .map_err(|error| CommandError::Place { place: place.to_string(), source: Box::new(error) })?;
-        let id = checkpoint.id().map_err(|reason| CommandError::Failed(format!("{place}: {reason}")))?;
-        // Before the heatmap, whose record is what tells that it is complete.
-        records.write(&folder.path().join("heatmaps").join(format!("{}.parquet", selected.cell.id)))?;
-        let path = store_heatmap(&folder, selected.cell, id, options, &heatmap)?;
-        writeln!(out, "{}.png, .svg and .csv", path.display())?;
-    }
-    if failed > 0 {
-        return Err(CommandError::Failed(format!("{failed} of {} heatmaps could not be made", places.len())));
-    }
-    Ok(())
-}
-
-/// The checkpoint that a result comes from.
-fn checkpoint_of(folder: &Folder, Selected { cell, result }: Selected<'_>) -> Result<Checkpoint> {
-    let checkpoint = Checkpoint::load(&folder.cell(&cell.id).training())?;
-    let (state, training) = (&checkpoint.state, &result.training);
-    if training.settings != state.config.table() || training.counters != state.counters {
-        let message = format!("the checkpoint of {} is not the one that its result.json came from", cell.id);
-        return Err(CommandError::Failed(message));
-    }
-    Ok(checkpoint)
-}
-
-fn options(args: &HeatmapArgs, parameters: [String; 2], state: &State) -> HeatmapOptions {
+/// How to test what was trained with these settings.
+fn options(args: &HeatmapArgs, kind: &HeatmapKind, trained: &TrainConfig) -> HeatmapOptions {
     HeatmapOptions {
-        parameters,
+        parameters: kind.parameters.clone(),
+        base: kind.base,
         grid: args.grid,
         episodes: args.episodes,
-        seed: args.seed.unwrap_or(state.config.common.seed),
+        seed: args.seed.unwrap_or(trained.common.seed),
         fixed: Context::new(),
     }
 }

@@ -9,7 +9,7 @@ use super::plan_in;
 use perturb_study::files::write_atomically;
 use perturb_study::outcomes::Recorded;
 use perturb_study::plot::{Quantity, draw_curves, save};
-use perturb_study::report::{Figures, Picture, Report, html};
+use perturb_study::report::{Figures, Picture, Report, heatmap_pictures, html, save_heatmaps};
 use perturb_study::{Folder, Footing, Plan, Results, Selection, curves_table, read_curves, verify};
 
 pub(super) fn run(args: &ReportArgs) -> Result<()> {
@@ -43,8 +43,10 @@ pub(super) fn write(folder: &Folder, rule: Option<Selection>, page: Option<&Path
     for Picture { file, panels, .. } in report.pictures() {
         save(&panels, &out.join(file))?;
     }
+    let heatmaps = heatmap_pictures(&selections, folder)?;
+    save_heatmaps(&heatmaps, &out)?;
     if let Some(path) = page {
-        let figures = Figures::read(&report, &curves, folder)?;
+        let figures = Figures::draw(&report, &curves, &heatmaps)?;
         write_atomically(path, html(&report, &figures).as_bytes())?;
     }
     Ok((report.text(), out))

@@ -11,10 +11,10 @@ use super::display::Display;
 use super::error::{CommandError, Result, system};
 use super::{playing_servers, sets, signal_code, threads};
 use perturb_learner::logging::{EpisodeFigures, Progress, TimeShares};
-use perturb_learner::training::{Outcome, RunDirectory, resume, train};
+use perturb_learner::training::{Outcome, RunDirectory, is_over, resume, train};
 use perturb_study::Version;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::settings::TrainConfig;
+use perturb_study::settings::{Common, TrainConfig};
 
 pub(super) fn run(args: &TrainArgs) -> Result<ExitCode> {
     match (&args.resume, &args.out) {
@@ -30,7 +30,7 @@ fn begin(args: &TrainArgs, out: &Path) -> Result<ExitCode> {
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let directory = RunDirectory::choose(out, args.overwrite)?;
     let servers = playing_servers(&args.play)?;
-    let environment = servers.environment(&config.common.environment)?; // its refusal lists the names
+    let environment = servers.environment_seen(&config.common)?; // its refusal lists the names
     perturb_study::sets::check("--parameters", &config.common.parameters, &environment)?;
     let mut display = Display::of_episodes(describe(&config), config.common.episodes);
     let outcome =
@@ -45,8 +45,9 @@ fn go_on(args: &TrainArgs, path: &Path) -> Result<ExitCode> {
     let (directory, checkpoint, state) = RunDirectory::resume(path)?;
     let config = checkpoint.state.config.clone();
     let (done, budget) = (checkpoint.state.counters.episodes, config.common.episodes);
-    if done >= budget {
-        eprintln!("the training in {} is finished: it has {done} of {budget} episodes", path.display());
+    if is_over(&config.common, &checkpoint.state.counters, state.history.recent.iter()) {
+        let enough = if done < budget { ", and stopped at its success rate" } else { "" };
+        eprintln!("the training in {} is finished: it has {done} of {budget} episodes{enough}", path.display());
         print_policy(&directory)?;
         return Ok(ExitCode::SUCCESS);
     }
@@ -89,9 +90,8 @@ fn print_policy(directory: &RunDirectory) -> std::io::Result<()> {
 
 /// What is trained, in a few words.
 pub(super) fn describe(config: &TrainConfig) -> String {
-    let common = &config.common;
-    let preset = if common.preset.is_default() { String::new() } else { format!(" ({})", common.preset) };
-    format!("{} {} {} {}{preset}", common.environment, common.version, config.settings.name(), common.architecture)
+    let Common { environment, version, .. } = &config.common;
+    format!("{environment} {version} {}", config.method())
 }
 
 /// A line of figures, with the shares of the time.
@@ -126,6 +126,7 @@ fn flags(args: &TrainArgs) -> Result<Table> {
         ("preset", text(&args.preset)),
         ("algorithm", text(&args.algorithm)),
         ("architecture", text(&args.architecture)),
+        ("observe", text(&args.observe)),
         ("episodes", number("episodes", args.episodes)?),
         ("seed", number("seed", args.seed)?),
         ("episodes_per_trial", number("episodes-per-trial", args.episodes_per_trial)?),

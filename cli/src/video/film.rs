@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use super::panel::{Panel, Shown, ShownEnding, parameter};
 use super::{VideoError, VideoFile, VideoWriter};
 use perturb_learner::checkpoint::{Checkpoint, EnvironmentSummary, State};
-use perturb_learner::client::{BegunEpisode, ClientError, OpenOptions, Picture, Servers, Single, StepReply};
+use perturb_learner::client::{BegunEpisode, ClientError, Picture, Servers, Single, StepReply};
 use perturb_learner::evaluation::{TestError, check_unchanged, open_options, player};
 use perturb_learner::proto;
 use perturb_policy::{Ended, Player};
@@ -134,10 +134,7 @@ impl<'a> Film<'a> {
     /// At the start of the first episode, whose picture has been asked for.
     fn open(servers: &'a Servers, checkpoint: &'a Checkpoint, options: &'a VideoOptions) -> Result<Self, VideoError> {
         let state = &checkpoint.state;
-        let open = OpenOptions {
-            episodes_per_trial: state.config.settings.episodes_per_trial(),
-            ..open_options(&state.config.common.environment, &options.set, options.seed)
-        };
+        let open = open_options(&state.config, &options.set, options.seed);
         let mut reply = StepReply::default();
         let (single, begun) = Single::open(servers, &open, &mut reply.observations)?;
         check_unchanged(checkpoint, EnvironmentSummary::of(single.environment()))?;

@@ -125,6 +125,7 @@ fn pendulums() -> OpenOptions {
         num_envs: N_ENVS,
         seed: 3,
         episodes_per_trial: 1,
+        observe: Default::default(),
     }
 }
 
@@ -252,6 +253,7 @@ fn a_refused_request_is_told_in_the_servers_words_and_the_session_lives_on() {
         num_envs: 2,
         seed: 1,
         episodes_per_trial: 1,
+        observe: Default::default(),
     };
     let mut observations = Vec::new();
     let mut session = Session::open(&servers, &options, &mut observations).expect("a session");
@@ -452,6 +454,7 @@ fn a_server_keeps_a_learner_that_computes_for_long() {
         num_envs: 1,
         seed: 1,
         episodes_per_trial: 1,
+        observe: Default::default(),
     };
     let mut session = Session::open(&servers, &options, &mut Vec::new()).expect("a session");
     let compute = || std::thread::sleep(Duration::from_secs(4));

@@ -151,6 +151,7 @@ fn snapshots_bring_a_batch_back_on_any_number_of_servers() {
             num_envs: n,
             seed: 3,
             episodes_per_trial: 1,
+            observe: Default::default(),
         };
         let open = |servers| {
             let mut observations = Vec::new();

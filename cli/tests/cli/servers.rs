@@ -69,6 +69,7 @@ fn options() -> OpenOptions {
         num_envs: 2,
         seed: 1,
         episodes_per_trial: 1,
+        observe: Default::default(),
     }
 }
 

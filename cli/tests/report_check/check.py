@@ -34,12 +34,10 @@ LOOK = """
     tables: [...document.querySelectorAll('table')].filter(seen).length,
     curves: [...document.querySelectorAll('#curves svg')].filter(seen).length,
     pictures: [...document.querySelectorAll('#profiles svg, #parameters svg, #thresholds svg')].filter(seen).length,
-    heatmaps: [...document.querySelectorAll('#heatmaps img')]
-      .filter(image => seen(image) && image.complete && image.naturalWidth > 0).length,
+    heatmaps: [...document.querySelectorAll('#heatmaps svg')].filter(seen).length,
     without_heatmap: [...document.querySelectorAll('#heatmaps figure.missing')].filter(seen).length,
     without_curves: document.querySelectorAll('#curves li').length,
-    unnamed: [...document.querySelectorAll('svg, img')]
-      .filter(picture => !(picture.alt || picture.closest('[aria-label]'))).length,
+    unnamed: [...document.querySelectorAll('svg')].filter(picture => !picture.closest('[aria-label]')).length,
     dangling: [...document.querySelectorAll('nav a')].map(link => link.getAttribute('href'))
       .filter(link => !document.querySelector(link)),
     links: document.querySelectorAll('nav a').length,
@@ -138,11 +136,14 @@ def expectations(directory):
         for line in selected
         if (directory / "cells" / line["cell"] / "training" / "monitor.csv").exists()
     }
-    first = min((line["run"] for line in selected), default=None, key=int)
-    places = [line for line in selected if line["run"] == first]
-    pictures = [line for line in places if (directory / "heatmaps" / f"{line['cell']}.png").exists()]
+    tested = {
+        (line["environment"], line["algorithm"], line["architecture"])
+        for line in selected
+        if any((directory / "heatmaps").glob(f"{line['cell']}-*.csv"))
+    }
     environments = len({line["environment"] for line in scenarios})
     compared = (report / "comparisons.csv").exists()
+    settings = (report / "settings.csv").exists()
     files = [path for path in (report / "worst.csv", report / "footing.csv") if path.exists()]
     detailed = sum(len({line["environment"] for line in lines(path)}) for path in files)
     return {
@@ -152,13 +153,13 @@ def expectations(directory):
             "scenarios": len(scenarios) // 3,  # three tests in a row
             "cells": len(selected) + len(failures),
         },
-        # Metrics, two over all environments, comparisons, Extrapolation and scenarios, worst and footing, cells.
-        "tables": environments + several + 2 + compared + 2 * environments + detailed + 1 + bool(failures),
+        # Metrics, two over all environments, comparisons, Extrapolation and scenarios, worst and footing, settings, cells.
+        "tables": environments + several + 2 + compared + 2 * environments + detailed + settings + 1 + bool(failures),
         "curves": 4 * len(with_curves),
         "pictures": sum(len(list(report.glob(f"*{name}.svg"))) for name in ("profiles", "-parameters", "-thresholds")),
         "without_curves": environments - len(with_curves),
-        "heatmaps": len(pictures),
-        "without_heatmap": len(scenarios) // 3 - len(pictures),  # of a plan that trains on D, R and E
+        "heatmaps": len(tested),
+        "without_heatmap": len(scenarios) // 9 - len(tested),
     }
 
 

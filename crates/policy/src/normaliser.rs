@@ -116,22 +116,42 @@ impl RunningMoments {
     }
 }
 
-/// Normalises observations: (x - mean)/√(variance + 10⁻⁸) of every element, clipped to ±10.
+/// Normalises observations: (x - mean)/√(variance + 10⁻⁸) of every element, clipped to ±10, but for those at their end
+/// that are left alone.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ObservationNormaliser {
     moments: RunningMoments,
+    /// How many elements at the end are neither normalised nor taken in.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    left_alone: usize,
+}
+
+fn is_zero(number: &usize) -> bool {
+    *number == 0
 }
 
 impl ObservationNormaliser {
     /// Nothing seen yet of observations of O = `observation_size` numbers.
     pub fn new(observation_size: usize) -> Self {
-        ObservationNormaliser { moments: RunningMoments::new(observation_size) }
+        Self::from_moments(RunningMoments::new(observation_size))
     }
 
     /// One with these statistics.
     pub fn from_moments(moments: RunningMoments) -> Self {
-        ObservationNormaliser { moments }
+        ObservationNormaliser { moments, left_alone: 0 }
+    }
+
+    /// The same for observations with so many elements more, which are scaled already: parameters that are observed may
+    /// be the same in all of a training, and stretched without bound by statistics of it.
+    #[must_use]
+    pub fn leaving_alone(self, left_alone: usize) -> Self {
+        ObservationNormaliser { left_alone, ..self }
+    }
+
+    /// O.
+    fn observation_size(&self) -> usize {
+        self.moments.mean.len() + self.left_alone
     }
 
     /// The statistics.
@@ -139,9 +159,13 @@ impl ObservationNormaliser {
         &self.moments
     }
 
-    /// Whether this can normalise observations of `observation_size` numbers; says what is wrong if it cannot.
-    pub fn check(&self, observation_size: usize) -> std::result::Result<(), String> {
-        self.moments.check(observation_size)
+    /// Whether this can normalise observations of `observation_size` numbers, of which it leaves so many alone; says
+    /// what is wrong if it cannot.
+    pub fn check(&self, observation_size: usize, left_alone: usize) -> std::result::Result<(), String> {
+        if self.left_alone != left_alone {
+            return Err(format!("left_alone is {}, expected {left_alone}", self.left_alone));
+        }
+        self.moments.check(observation_size.saturating_sub(left_alone))
     }
 
     /// Adds `observations` `[N, O]` to the statistics. Infinite numbers and NaN are refused and change nothing.
@@ -151,7 +175,7 @@ impl ObservationNormaliser {
 
     /// The same with the `active` `[N]` environments alone; what the others bring is passed over.
     pub fn update_active(&mut self, observations: &[f32], active: Option<&[bool]>) -> Result<()> {
-        let size = self.moments.mean.len();
+        let size = self.observation_size();
         check_length("observations [N, O]", observations.len(), observations.len() / size * size)?;
         check_finite("observations [N, O]", observations)?;
         let rows = observations.chunks_exact(size);
@@ -167,9 +191,9 @@ impl ObservationNormaliser {
 
     /// Normalises `observations` `[N, O]` in place. The statistics stay.
     pub fn normalise(&self, observations: &mut [f32]) -> Result<()> {
-        let size = self.moments.mean.len();
+        let size = self.observation_size();
         check_length("observations [N, O]", observations.len(), observations.len() / size * size)?;
-        for i in 0..size {
+        for i in 0..self.moments.mean.len() {
             let (mean, scale) = (self.moments.mean[i], scale(self.moments.variance(i)));
             for x in observations.iter_mut().skip(i).step_by(size) {
                 *x = ((f64::from(*x) - mean) * scale).clamp(-CLIP, CLIP) as f32;

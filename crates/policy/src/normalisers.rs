@@ -59,14 +59,15 @@ impl Normalisers {
         self.observations.as_ref().map_or(Ok(()), |normaliser| normaliser.normalise(observations))
     }
 
-    /// Whether these can normalise what N environments with observations of O numbers give.
+    /// Whether these can normalise what N environments with observations of O numbers give, the last `left_alone` of
+    /// which are not normalised.
     ///
     /// # Errors
     /// [`Error::Statistics`](crate::Error::Statistics) with what is wrong; [`Error::Length`](crate::Error::Length).
-    pub fn check(&self, n_envs: usize, observation_size: usize) -> Result<()> {
+    pub fn check(&self, n_envs: usize, observation_size: usize, left_alone: usize) -> Result<()> {
         let named = |name| move |reason| crate::error::Error::Statistics { name, reason };
         if let Some(normaliser) = &self.observations {
-            normaliser.check(observation_size).map_err(named("observations"))?;
+            normaliser.check(observation_size, left_alone).map_err(named("observations"))?;
         }
         if let Some(normaliser) = &self.rewards {
             normaliser.check().map_err(named("rewards"))?;

@@ -1,10 +1,12 @@
-//! The catalogue as JSON, for those who do not speak the protocol.
+//! The catalogue: what a session observes of an environment, and all of it as JSON, for those who do not speak the
+//! protocol.
 
 use serde_json::{Value, json};
 
 use crate::limits;
 use crate::proto::{
-    Comparison, Distribution, Environment, ListEnvironmentsResponse, Parameter, Success, action_space::Kind,
+    Comparison, Distribution, Environment, ListEnvironmentsResponse, Parameter, ParameterObservation, Success,
+    action_space::Kind,
 };
 
 /// Everything that a server tells of its environments, and the [`limits`] that hold for clients too. Names are those of
@@ -26,6 +28,18 @@ pub fn to_json(catalogue: &ListEnvironmentsResponse) -> Value {
     })
 }
 
+impl Environment {
+    /// As a session has it, whose observations have the parameters at their end or not.
+    #[must_use]
+    pub fn observed(&self, parameters: bool) -> Self {
+        let mut session = self.clone();
+        if parameters {
+            session.observation.extend(self.parameter_observations.iter().filter_map(|seen| seen.entry.clone()));
+        }
+        session
+    }
+}
+
 fn environment(environment: &Environment) -> Value {
     let action = match environment.action.as_ref().and_then(|action| action.kind.as_ref()) {
         Some(Kind::Discrete(discrete)) => json!({ "discrete": discrete.names }),
@@ -39,6 +53,7 @@ fn environment(environment: &Environment) -> Value {
         "step_limit": environment.step_limit,
         "control_timestep": environment.control_timestep,
         "observation": environment.observation,
+        "parameter_observations": environment.parameter_observations.iter().map(seen).collect::<Vec<_>>(),
         "action": action,
         "state": environment.state,
         "reward_terms": environment.reward_terms,
@@ -48,6 +63,10 @@ fn environment(environment: &Environment) -> Value {
         "heatmap_axes": environment.heatmap_axes,
         "model_hash": environment.model_hash,
     })
+}
+
+fn seen(seen: &ParameterObservation) -> Value {
+    json!({ "entry": seen.entry, "at_minus_one": seen.at_minus_one, "at_plus_one": seen.at_plus_one })
 }
 
 fn parameter(parameter: &Parameter) -> Value {

@@ -45,6 +45,12 @@ pub enum ClientError {
     /// Servers of one run must serve the same environment.
     #[error("the servers at {first} and {other} describe {environment} differently: run one version of perturb-server")]
     Disagreement { first: Address, other: Address, environment: String },
+    /// The server does not know [`Open::observe_parameters`](crate::proto::Open::observe_parameters).
+    #[error(
+        "the server at {address} cannot let a policy observe parameters: it is older than this program; run a \
+         perturb-server of this version, or leave out `observe = \"parameters\"`"
+    )]
+    NoParameters { address: Address },
     /// There is not one snapshot for each environment.
     #[error("there are {got} snapshots to restore, expected {expected}: one for each environment")]
     Snapshots { got: usize, expected: usize },
@@ -93,6 +99,7 @@ impl ClientError {
             | Self::TimedOut { .. }
             | Self::Protocol { .. } // a server of another version
             | Self::Disagreement { .. }
+            | Self::NoParameters { .. } // likewise
             | Self::NoServerProgram { .. }
             | Self::Start { .. }
             | Self::System { .. } => true,

@@ -1,4 +1,4 @@
-//! The three versions of every environment.
+//! The versions of every environment: the paper's three, and two of them together.
 
 use std::fmt;
 use std::str::FromStr;
@@ -16,16 +16,39 @@ pub enum Version {
     R,
     /// Extreme: drawn from sets outside those intervals.
     E,
+    /// R or E, each in half of the trials.
+    #[serde(rename = "R+E")]
+    RE,
 }
 
 /// A text that names no version.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("there is no version `{0}`; expected D, R or E")]
+#[error("there is no version `{0}`; expected D, R, E or R+E")]
 pub struct UnknownVersion(String);
 
 impl Version {
-    /// All, in the paper's order.
+    /// The paper's, in its order.
     pub const ALL: [Version; 3] = [Version::D, Version::R, Version::E];
+    /// These and what is made of them.
+    pub const KNOWN: [Version; 4] = [Version::D, Version::R, Version::E, Version::RE];
+    /// The names of [`Version::KNOWN`].
+    pub const NAMES: [&str; 4] = ["D", "R", "E", "R+E"];
+
+    /// Those of which a trial is of one, each as likely: itself, but of R+E both.
+    pub fn parts(self) -> &'static [Version] {
+        match self {
+            Version::D => &[Version::D],
+            Version::R => &[Version::R],
+            Version::E => &[Version::E],
+            Version::RE => &[Version::R, Version::E],
+        }
+    }
+
+    /// Its name where only letters, digits, `.`, `-` and `_` may stand: in ids and names of files. No own set has that
+    /// of R+E.
+    pub fn file_name(self) -> &'static str {
+        if self == Version::RE { "R-or-E" } else { Self::NAMES[self as usize] }
+    }
 
     /// The protocol's name for it.
     pub fn to_proto(self) -> proto::Version {
@@ -33,31 +56,47 @@ impl Version {
             Version::D => proto::Version::Default,
             Version::R => proto::Version::Random,
             Version::E => proto::Version::Extreme,
+            Version::RE => proto::Version::RandomOrExtreme,
         }
     }
 
     /// What the protocol's name stands for; `None` if none was given.
     pub fn from_proto(version: proto::Version) -> Option<Self> {
-        Version::ALL.into_iter().find(|known| known.to_proto() == version)
+        Version::KNOWN.into_iter().find(|known| known.to_proto() == version)
     }
 }
 
 impl fmt::Display for Version {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            Version::D => "D",
-            Version::R => "R",
-            Version::E => "E",
-        })
+        f.pad(Self::NAMES[*self as usize])
     }
 }
 
 impl FromStr for Version {
     type Err = UnknownVersion;
 
-    /// The letter, large or small.
+    /// The name, in large or small letters.
     fn from_str(text: &str) -> Result<Self, UnknownVersion> {
         let named = |version: &Version| version.to_string().eq_ignore_ascii_case(text);
-        Version::ALL.into_iter().find(named).ok_or_else(|| UnknownVersion(text.into()))
+        Version::KNOWN.into_iter().find(named).ok_or_else(|| UnknownVersion(text.into()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_version_is_read_from_what_it_is_called_everywhere() {
+        for version in Version::KNOWN {
+            assert_eq!(version.to_string().parse(), Ok(version));
+            assert_eq!(version.to_string().to_lowercase().parse(), Ok(version));
+            assert_eq!(serde_json::to_value(version).unwrap(), version.to_string());
+            assert_eq!(Version::from_proto(version.to_proto()), Some(version));
+            let plain = |c: char| c.is_ascii_alphanumeric() || c == '-';
+            assert!(version.file_name().chars().all(plain), "{}", version.file_name());
+        }
+        assert_eq!("RE".parse::<Version>(), Err(UnknownVersion("RE".into())));
+        assert_eq!(Version::from_proto(proto::Version::Unspecified), None);
     }
 }

@@ -10,7 +10,7 @@ use crate::checkpoint::{Checkpoint, ResumeState};
 use crate::client::Servers;
 use crate::evaluation::TestError;
 use crate::logging::Progress;
-use crate::training::{Entry, Outcome, RunDirectory, RunDirectoryError, Start, TrainError, train_together};
+use crate::training::{Entry, Outcome, RunDirectory, RunDirectoryError, Start, TrainError, is_over, train_together};
 use perturb_study::files::Lock;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::RecordsError;
@@ -192,15 +192,18 @@ impl<'a> Work<'a> {
     fn look_back(&mut self, tell: &mut dyn FnMut(&Cell, CellEvent)) -> Result<(), RunDirectoryError> {
         let Cell { config, tests, .. } = self.order.cell;
         let path = self.order.folder.training();
-        let earlier = earlier(&path)?.filter(|(directory, checkpoint, _)| {
-            let past = tests.marks.iter().copied().filter(|mark| *mark <= checkpoint.state.counters.episodes);
-            checkpoint.state.config == *config && directory.has_kept(past)
+        let over = |(_, checkpoint, state): &(RunDirectory, Checkpoint, ResumeState)| {
+            is_over(&config.common, &checkpoint.state.counters, state.history.recent.iter())
+        };
+        let earlier = earlier(&path)?.filter(|earlier @ (directory, checkpoint, _)| {
+            let past = |mark: &u64| over(earlier) || *mark <= checkpoint.state.counters.episodes;
+            checkpoint.state.config == *config && directory.has_kept(tests.marks.iter().copied().filter(past))
         });
         let Counters { episodes, timesteps, .. } =
             earlier.as_ref().map_or_else(Counters::default, |(_, checkpoint, _)| checkpoint.state.counters);
         tell(self.order.cell, CellEvent::Training { episodes, timesteps, saved: timesteps });
         match earlier {
-            Some((_, checkpoint, _)) if episodes >= config.common.episodes => self.trained = Some(Ok(checkpoint)),
+            Some(earlier) if over(&earlier) => self.trained = Some(Ok(earlier.1)),
             Some((directory, checkpoint, state)) => {
                 self.training = Some((directory, Start::Checkpoint(Box::new((checkpoint, state)))));
             }

@@ -207,7 +207,7 @@ impl State {
     fn check(&self) -> std::result::Result<(), String> {
         let (common, gamma) = (&self.config.common, self.config.settings.gamma());
         let observations = match &self.observation_normaliser {
-            Some(normaliser) => normaliser.check(self.environment_spec.observation.len()),
+            Some(normaliser) => normaliser.check(self.environment_spec.observation.len(), self.parameters_seen()),
             None if common.normalize_observations => Err("there is none".into()),
             None => Ok(()),
         };
@@ -220,6 +220,19 @@ impl State {
             None => Ok(()),
         };
         rewards.map_err(|reason| format!("reward_normaliser: {reason}"))
+    }
+
+    /// How many entries at the end of an observation are parameters.
+    fn parameters_seen(&self) -> usize {
+        if self.config.common.observe.sees_parameters() { self.environment_spec.parameters.len() } else { 0 }
+    }
+
+    /// What normalises observations in training from its beginning, if they are normalised. Parameters that are seen
+    /// are scaled already.
+    pub(crate) fn fresh_normaliser(&self) -> Option<ObservationNormaliser> {
+        let (size, parameters) = (self.environment_spec.observation.len(), self.parameters_seen());
+        let fresh = || ObservationNormaliser::new(size.saturating_sub(parameters)).leaving_alone(parameters);
+        self.config.common.normalize_observations.then(fresh)
     }
 
     /// The shape of a policy that this was trained with.

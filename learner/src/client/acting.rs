@@ -62,6 +62,7 @@ impl Session<'_> {
     /// # Errors
     /// Those of [`Session::play`].
     pub fn save_player(&mut self) -> Result<Option<(PlayerState, Normalisers)>, ClientError> {
+        let size = self.observation_size();
         let mut states = Vec::new();
         self.exchange(
             |_| Some(proto::SavePlayer {}),
@@ -70,7 +71,7 @@ impl Session<'_> {
                     let expected = "what a later policy goes on from";
                     part.stream.mismatch::<proto::SavePlayer>("an incomplete player".into(), expected.into())
                 };
-                states.push(saved_player(&saved).ok_or_else(mismatch)?);
+                states.push(saved_player(&saved, size).ok_or_else(mismatch)?);
                 Ok(())
             },
         )?;
@@ -141,8 +142,9 @@ fn moments(moments: &RunningMoments) -> proto::Moments {
     proto::Moments { count: moments.count(), mean: doubles(moments.mean()), squares: doubles(moments.squares()) }
 }
 
-/// `None` if something is missing.
-fn saved_player(saved: &proto::PlayerSaved) -> Option<(PlayerState, Normalisers)> {
+/// `None` if something is missing. `observation_size` is that of the session, O, of which statistics may leave the end
+/// alone.
+fn saved_player(saved: &proto::PlayerSaved, observation_size: usize) -> Option<(PlayerState, Normalisers)> {
     let (stream, state) = (saved.actions.as_ref()?, saved.state.as_ref()?);
     let mut actions = ChaCha8Rng::from_seed(stream.key[..].try_into().ok()?);
     actions.set_stream(stream.stream);
@@ -151,7 +153,11 @@ fn saved_player(saved: &proto::PlayerSaved) -> Option<(PlayerState, Normalisers)
         Some(RunningMoments::from_parts(it.count, read_doubles(&it.mean)?, read_doubles(&it.squares)?))
     };
     let observations = match &saved.observations {
-        Some(it) => Some(ObservationNormaliser::from_moments(moments(it)?)),
+        Some(it) => {
+            let moments = moments(it)?;
+            let left_alone = observation_size.checked_sub(moments.mean().len())?;
+            Some(ObservationNormaliser::from_moments(moments).leaving_alone(left_alone))
+        }
         None => None,
     };
     let rewards = match &saved.rewards {

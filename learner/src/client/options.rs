@@ -4,6 +4,7 @@ use std::ops::Range;
 
 use perturb_protocol::{Version, proto};
 use perturb_study::sets::Parameters;
+use perturb_study::settings::Observe;
 
 use crate::proto::AutoresetMode;
 
@@ -22,6 +23,8 @@ pub struct OpenOptions {
     pub seed: u64,
     /// Episodes in a trial.
     pub episodes_per_trial: u32,
+    /// What observations have; the same in all options of a session.
+    pub observe: Observe,
 }
 
 /// The request for the slots of `range`, counted over all `options`; `None` if an index is beyond what the protocol can
@@ -40,10 +43,12 @@ pub(super) fn open_request(
         }
         first += option.num_envs;
     }
+    let OpenOptions { environment, observe, .. } = options.first()?;
     let open = proto::Open {
-        environment: options.first()?.environment.clone(),
+        environment: environment.clone(),
         autoreset_mode: autoreset_mode.into(),
         receipts: true,
+        observe_parameters: observe.sees_parameters(),
         ..proto::Open::default()
     };
     Some(match <[proto::SlotGroup; 1]>::try_from(groups) {
@@ -82,6 +87,7 @@ mod tests {
             num_envs,
             seed,
             episodes_per_trial: 1,
+            observe: Observe::State,
         }
     }
 

@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use bytes::{Bytes, BytesMut};
-use perturb_protocol::{Ask, ClientError, Connection, Stream};
+use perturb_protocol::{Address, Ask, ClientError, Connection, Stream};
 
 use super::options::{OpenOptions, open_request};
 use super::reply::{EndedEpisode, StepReply};
@@ -35,7 +35,9 @@ impl Part {
             code: tonic::Code::InvalidArgument,
             message: format!("environments {range:?} are more than the protocol can number (2^32 - 1)"),
         })?;
+        let asked = open.observe_parameters;
         let (stream, opened) = Stream::open(connection, open).await?;
+        check_observed(connection.address(), asked, &opened)?;
         Ok((Self { stream, range, actions: BytesMut::new(), asked: false }, opened))
     }
 
@@ -88,5 +90,31 @@ impl Part {
 
     fn mismatch(&self, got: String, expected: String) -> ClientError {
         self.stream.mismatch::<proto::Step>(got, expected)
+    }
+}
+
+/// A server that does not know what was asked for leaves it out without a word.
+fn check_observed(address: &Address, asked: bool, opened: &proto::Opened) -> Result<(), ClientError> {
+    if opened.observes_parameters == asked {
+        Ok(())
+    } else {
+        Err(ClientError::NoParameters { address: address.clone() })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_server_that_does_not_know_parameters_as_observations_is_named() {
+        let address = "127.0.0.1:7447".parse().unwrap();
+        let of = |asked, observes_parameters| {
+            check_observed(&address, asked, &proto::Opened { observes_parameters, ..proto::Opened::default() })
+        };
+        assert!(of(true, true).is_ok() && of(false, false).is_ok());
+        let error = of(true, false).unwrap_err();
+        assert!(error.to_string().contains("127.0.0.1:7447") && error.to_string().contains("older than this program"));
+        assert!(error.can_be_retried(), "with another server");
     }
 }

@@ -12,6 +12,7 @@ use perturb_protocol::{Address, ClientError, Connection, Machines, PrivateServer
 
 use super::acting::ActAt;
 use crate::proto;
+use perturb_study::settings::Common;
 
 /// Connections to servers, all of which serve the same environments.
 #[derive(Debug)]
@@ -172,6 +173,22 @@ impl Servers {
             }
         }
         Ok(environment)
+    }
+
+    /// The same as a training's policy sees it.
+    ///
+    /// # Errors
+    /// Those of [`Servers::environment`]; [`ClientError::NoParameters`] if it sees parameters and the servers cannot
+    /// tell them.
+    pub fn environment_seen(&self, common: &Common) -> Result<proto::Environment, ClientError> {
+        let environment = self.environment(&common.environment)?;
+        let sees = common.observe.sees_parameters();
+        match self.connections.first() {
+            Some(first) if sees && environment.parameter_observations.is_empty() => {
+                Err(ClientError::NoParameters { address: first.address().clone() })
+            }
+            _ => Ok(environment.observed(sees)),
+        }
     }
 
     fn environment_of(&self, connection: &Connection, name: &str) -> Result<proto::Environment, ClientError> {

@@ -38,7 +38,8 @@ impl<'a> Session<'a> {
         Self::open_together(servers, std::slice::from_ref(options), observations)
     }
 
-    /// The same with the slots of several `options`, one after the other, which must name the same environment.
+    /// The same with the slots of several `options`, one after the other, which must name the same environment
+    /// and observe the same.
     ///
     /// # Errors
     /// Those of [`Session::open`].

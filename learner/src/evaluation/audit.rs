@@ -121,6 +121,7 @@ impl<'a> Replay<'a> {
             num_envs,
             seed: 0,
             episodes_per_trial: about.episodes_per_trial,
+            observe: checkpoint.state.config.common.observe,
         };
         let mut observations = Vec::new();
         let session = Session::open(servers, &options, &mut observations)?;

@@ -1,13 +1,13 @@
 //! Testing a policy over two parameters.
 
-use perturb_protocol::{Version, proto};
+use perturb_protocol::proto;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::Records;
 use perturb_study::sets::{Context, Contexts, TestSet};
 use perturb_study::{Axis, Heatmap, HeatmapOptions, MOST_POINTS};
 
 use super::test::{TestError, TestOptions, Tester};
-use crate::checkpoint::{Checkpoint, State};
+use crate::checkpoint::Checkpoint;
 use crate::client::Servers;
 
 /// Why there is no heatmap.
@@ -48,9 +48,9 @@ pub enum HeatmapError {
     Test(#[from] TestError),
 }
 
-/// Tests `checkpoint` at every point of a grid over two parameters, whose range is that of R and E together. Each
-/// point is an environment with random numbers of its own, so that points differ by their parameters and by chance.
-/// Calls `report` with the number of episodes; gives the recorded episodes, too.
+/// Tests `checkpoint` at every point of a grid over two parameters, whose range is that of R and E together; the others come
+/// from the options' base. Each point is an environment with random numbers of its own, so that points differ by their
+/// parameters and by chance. Calls `report` with the number of episodes; gives the recorded episodes, too.
 ///
 /// # Errors
 /// [`HeatmapError`].
@@ -61,7 +61,6 @@ pub fn heatmap(
     stop: &StopFlag,
     report: &mut dyn FnMut(u64),
 ) -> Result<(Heatmap, Records), HeatmapError> {
-    let state = &checkpoint.state;
     let grid = options.grid.clamp(1, MOST_POINTS);
     let points = (grid * grid) as u64;
     let episodes = options.episodes.saturating_mul(points);
@@ -77,9 +76,9 @@ pub fn heatmap(
         options.fixed.clone().into_iter().chain([value(0), value(1)]).collect::<Context>()
     };
     let contexts = Contexts::Listed((0..grid * grid).map(context).collect());
-    let set = TestSet { name: Heatmap::SET.into(), version: Version::D, contexts };
+    let set = TestSet { name: Heatmap::SET.into(), version: options.base, contexts };
     let records = tester.test(&[set], stop, &mut |_, done| report(done))?;
-    let heatmap = Heatmap::of(&records, policy(state), axes).ok_or(HeatmapError::NotOfAxes)?;
+    let heatmap = Heatmap::of(&records, axes).ok_or(HeatmapError::NotOfAxes)?;
     Ok((heatmap, records))
 }
 
@@ -98,13 +97,7 @@ pub fn heatmap_again(
         return Err(HeatmapError::Policy { recorded: records.about.policy.clone(), got });
     }
     let axes = axes(environment, parameters)?;
-    Heatmap::of(records, policy(&checkpoint.state), axes).ok_or(HeatmapError::NotOfAxes)
-}
-
-/// Who is tested.
-fn policy(state: &State) -> String {
-    let config = &state.config;
-    format!("{}, trained on {} with seed {}", config.method(), config.common.trained_on(), config.common.seed)
+    Heatmap::of(records, axes).ok_or(HeatmapError::NotOfAxes)
 }
 
 fn axes(environment: &proto::Environment, names: &[String; 2]) -> Result<[Axis; 2], HeatmapError> {

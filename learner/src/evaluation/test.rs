@@ -5,6 +5,7 @@ use perturb_protocol::{Distribution, Version, proto};
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::{About, Difference, Ending, EpisodeRecord, RecordedTest, Records};
 use perturb_study::sets::{self, Context, TestSet};
+use perturb_study::settings::TrainConfig;
 use perturb_study::success::Rule;
 use perturb_study::{TestResult, ValueError};
 use rand::Rng;
@@ -120,13 +121,13 @@ pub struct Tester<'a> {
 
 /// The seed of the test environments on `version`.
 ///
-/// It is the first, second or third number (D, R, E) of the stream of `seed` for `purpose`, which is
+/// It is the first, second, third or fourth number (D, R, E, R+E) of the stream of `seed` for `purpose`, which is
 /// [`Purpose::TestEnvironments`] or [`Purpose::SelectionEnvironments`], so that a policy never meets its training episodes
 /// again, whatever seeds are used, nor those that selected it, and the versions are independent. Sets have the seed of
 /// their base version: what differs between two of them is parameters, not initial states.
 fn environment_seed(purpose: Purpose, seed: u64, version: Version) -> u64 {
     let mut rng = stream(seed, purpose);
-    let drawn: [u64; 3] = std::array::from_fn(|_| rng.next_u64());
+    let drawn: [u64; Version::KNOWN.len()] = std::array::from_fn(|_| rng.next_u64());
     drawn[version as usize]
 }
 
@@ -137,7 +138,7 @@ impl<'a> Tester<'a> {
     /// [`TestError`].
     pub fn new(servers: &'a Servers, checkpoint: &'a Checkpoint, options: TestOptions) -> Result<Self, TestError> {
         let state = &checkpoint.state;
-        let environment = servers.environment(&state.config.common.environment)?;
+        let environment = servers.environment_seen(&state.config.common)?;
         check_unchanged(checkpoint, EnvironmentSummary::of(&environment))?;
         let id = checkpoint.id().map_err(TestError::Unnamed)?;
         let mut about = About::new(&environment, id, state.config.settings.episodes_per_trial());
@@ -200,6 +201,7 @@ impl<'a> Tester<'a> {
             num_envs: quotas.len(),
             seed: test.seed,
             episodes_per_trial: self.about.episodes_per_trial,
+            observe: self.checkpoint.state.config.common.observe,
         };
         let mut observations = Vec::new();
         let mut session = Session::open(self.servers, &options, &mut observations)?;
@@ -235,21 +237,23 @@ impl<'a> Tester<'a> {
         }
         drop(trials);
         counted.sort_by_key(|end| (end.environment_index, end.episode_index));
-        let asked: Vec<Vec<Distribution>> = contexts.iter().map(|context| self.asked(&test.set, context)).collect();
+        let parts = test.set.version.parts();
+        let asked_in = |context| parts.iter().map(|&part| self.asked(&test.set, part, context)).collect();
+        let asked: Vec<Vec<Vec<Distribution>>> = contexts.iter().map(asked_in).collect();
         for end in &counted {
             self.check_requested(&test.set, &asked[end.slot % contexts.len()], end)?;
         }
         Ok(counted.into_iter().map(|end| self.record(test, end)).collect())
     }
 
-    /// What each parameter may be in a context of a set.
-    fn asked(&self, set: &TestSet, context: &Context) -> Vec<Distribution> {
+    /// What each parameter may be in a context of a set, in a trial of `version`.
+    fn asked(&self, set: &TestSet, version: Version, context: &Context) -> Vec<Distribution> {
         let drawn = set.drawn();
         let of = |parameter: &proto::Parameter| {
             let own = context.get(&parameter.name).map(|value| Distribution::fixed(*value));
             let own = own.or_else(|| drawn.get(&parameter.name).cloned());
-            let of_version = match set.version {
-                Version::D => None,
+            let of_version = match version {
+                Version::D | Version::RE => None, // a trial of R+E is one of R or of E
                 Version::R => parameter.random.as_ref(),
                 Version::E => parameter.extreme.as_ref(),
             };
@@ -259,16 +263,16 @@ impl<'a> Tester<'a> {
         self.environment.parameters.iter().map(of).collect()
     }
 
-    /// Whether the server requested of its physics what it was asked for.
-    fn check_requested(&self, set: &TestSet, asked: &[Distribution], end: &EndedEpisode) -> Result<(), TestError> {
-        for (index, (parameter, asked)) in self.environment.parameters.iter().zip(asked).enumerate() {
-            let got = end.receipt.requested.get(index).copied().unwrap_or(f64::NAN);
-            if !asked.contains(got) {
-                let (set, parameter) = (set.name.clone(), parameter.name.clone());
-                return Err(TestError::NotRequested { set, parameter, asked: asked.to_string(), got });
-            }
-        }
-        Ok(())
+    /// Whether the server requested of its physics what it was asked for: all parameters of one part of the version.
+    fn check_requested(&self, set: &TestSet, asked: &[Vec<Distribution>], end: &EndedEpisode) -> Result<(), TestError> {
+        let Some(index) = wrong(asked, &end.receipt.requested) else { return Ok(()) };
+        let sets: Vec<String> = asked.iter().map(|asked| asked[index].to_string()).collect();
+        Err(TestError::NotRequested {
+            set: set.name.clone(),
+            parameter: self.environment.parameters[index].name.clone(),
+            asked: sets.join(", like all others, or in "),
+            got: end.receipt.requested.get(index).copied().unwrap_or(f64::NAN),
+        })
     }
 
     fn record(&self, test: &RecordedTest, end: EndedEpisode) -> EpisodeRecord {
@@ -326,15 +330,26 @@ pub(super) fn ending(end: &EndedEpisode) -> Ending {
     }
 }
 
-/// What a test of one environment opens of a policy without trials.
-pub fn open_options(environment: &str, set: &TestSet, seed: u64) -> OpenOptions {
+/// The first parameter that is not what it may be in any of the parts, all of whose parameters belong together.
+fn wrong(asked: &[Vec<Distribution>], requested: &[f64]) -> Option<usize> {
+    let in_part = |asked: &Vec<Distribution>| {
+        let requested = requested.iter().copied().chain(std::iter::repeat(f64::NAN));
+        asked.iter().zip(requested).position(|(asked, got)| !asked.contains(got))
+    };
+    let wrongs: Option<Vec<usize>> = asked.iter().map(in_part).collect();
+    wrongs?.into_iter().max()
+}
+
+/// What a test of one environment opens of a policy that was trained so.
+pub fn open_options(TrainConfig { common, settings }: &TrainConfig, set: &TestSet, seed: u64) -> OpenOptions {
     OpenOptions {
-        environment: environment.to_owned(),
+        environment: common.environment.clone(),
         version: set.version,
         parameters: set.drawn(),
         num_envs: 1,
         seed: environment_seed(Purpose::TestEnvironments, seed, set.version),
-        episodes_per_trial: 1,
+        episodes_per_trial: settings.episodes_per_trial(),
+        observe: common.observe,
     }
 }
 
@@ -370,6 +385,21 @@ mod tests {
     use super::*;
 
     #[test]
+    fn all_parameters_of_an_episode_are_of_one_part_of_its_version() {
+        let part = |low, high| vec!["low..high".replace("low", low).replace("high", high).parse().unwrap(); 2];
+        let (r, e) = (part("1", "2"), part("2", "3"));
+        let both = [r, e];
+        assert_eq!([wrong(&both, &[1.5, 1.0]), wrong(&both, &[2.5, 3.0])], [None, None]);
+        assert_eq!(wrong(&both, &[1.5, 2.5]), Some(1), "the second is not of R, the first not of E");
+        assert_eq!(wrong(&both, &[4.0, 1.5]), Some(0));
+        assert_eq!(
+            (wrong(&both[..1], &[1.5, 2.5]), wrong(&both[..1], &[1.5])),
+            (Some(1), Some(1)),
+            "nor is what is missing"
+        );
+    }
+
+    #[test]
     fn every_environment_gets_its_share_beforehand() {
         assert_eq!(quotas(3, 1), [1, 1, 1]);
         assert_eq!(quotas(1000, 1), vec![10; 100]);
@@ -395,14 +425,15 @@ mod tests {
     #[test]
     fn test_environments_have_seeds_of_their_own() {
         let of = |purpose| {
-            (0..100).flat_map(move |seed| Version::ALL.map(|version| environment_seed(purpose, seed, version)))
+            (0..100).flat_map(move |seed| Version::KNOWN.map(|version| environment_seed(purpose, seed, version)))
         };
         let seeds: Vec<u64> = of(Purpose::TestEnvironments).chain(of(Purpose::SelectionEnvironments)).collect();
         let distinct: std::collections::HashSet<u64> = seeds.iter().copied().collect();
-        assert_eq!(distinct.len(), 600, "those of a test never select");
+        assert_eq!(distinct.len(), 800, "those of a test never select");
         assert!(seeds.iter().all(|&seed| seed > 1000), "none is a seed that people train with");
-        for version in Version::ALL {
-            let options = open_options("CartPole", &version.into(), 5);
+        let config = TrainConfig::from_table("", "environment = 'CartPole'".parse().unwrap()).unwrap();
+        for version in Version::KNOWN {
+            let options = open_options(&config, &version.into(), 5);
             assert_eq!(
                 (options.seed, options.version),
                 (environment_seed(Purpose::TestEnvironments, 5, version), version)

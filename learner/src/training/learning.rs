@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
+use super::ending::{RECENT, is_over};
 use super::{LastCheckpoint, Outcome, Result, RunDirectory, TrainError};
 use crate::algorithm::{self, Algorithm, Experience, UpdateStats};
 use crate::checkpoint::{Checkpoint, EnvironmentSummary, History, ResumeState, State};
@@ -11,15 +12,13 @@ use crate::logging::{Clock, EpisodeFigures, Logs, Progress, TimeShares};
 use crate::policy::{Policy, Room};
 use crate::proto;
 use crate::rollout::{CollectorState, Rollout};
-use perturb_policy::{Normalisers, ObservationNormaliser, Player, PlayerState, PolicySpec, RewardNormaliser, Role};
+use perturb_policy::{Normalisers, Player, PlayerState, PolicySpec, RewardNormaliser, Role};
 use perturb_study::Counters;
 use perturb_study::files::write_atomically;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::Comparison;
 use perturb_study::settings::{Common, EpoptConfig, TrainConfig, Wrapper};
 
-/// Means are over so many episodes, as in stable-baselines3.
-const RECENT: usize = 100;
 /// During longer updates the connections are kept alive; servers wait for seconds at least.
 const LONG_UPDATE: Duration = Duration::from_millis(100);
 
@@ -76,6 +75,7 @@ pub(super) fn options(config: &TrainConfig) -> OpenOptions {
         num_envs: common.num_envs,
         seed: common.seed,
         episodes_per_trial: config.settings.episodes_per_trial(),
+        observe: common.observe,
     }
 }
 
@@ -91,7 +91,6 @@ impl<'a> Learning<'a> {
     ) -> Result<(Self, Player)> {
         let common = &config.common;
         let summary = EnvironmentSummary::of(environment).ok_or(TrainError::NoActions)?;
-        let observation_size = summary.observation.len();
         let state = State {
             environment_spec: summary,
             observation_normaliser: None,
@@ -103,7 +102,7 @@ impl<'a> Learning<'a> {
         let spec = state.policy();
         let policy = Policy::new(spec.clone(), common.seed)?.with_threads(threads)?;
         let normalisers = Normalisers {
-            observations: common.normalize_observations.then(|| ObservationNormaliser::new(observation_size)),
+            observations: state.fresh_normaliser(),
             rewards: common.normalize_rewards.then(|| {
                 let normaliser = RewardNormaliser::new(common.num_envs, config.settings.gamma());
                 normaliser.running_on(common.reward_return_runs_on)
@@ -294,8 +293,9 @@ impl<'a> Learning<'a> {
 
     /// Logs the iteration, if its turn has come, and says how it goes on.
     pub(super) fn turn(&mut self, progress: Progress, stop: &StopFlag) -> Result<Turn> {
-        let Common { episodes, log_interval, checkpoint_interval, .. } = self.checkpoint.state.config.common;
-        let finished = progress.episodes >= episodes;
+        let State { config: TrainConfig { common, .. }, counters, .. } = &self.checkpoint.state;
+        let Common { log_interval, checkpoint_interval, .. } = *common;
+        let finished = is_over(common, counters, self.tally.recent.iter());
         let signal = stop.signal().filter(|_| !finished);
         let logged = finished || progress.iterations.is_multiple_of(log_interval);
         if logged {
@@ -303,7 +303,8 @@ impl<'a> Learning<'a> {
         }
         let due = |saved: Counters| progress.episodes / checkpoint_interval > saved.episodes / checkpoint_interval;
         let save = finished || self.saved.is_none_or(due) || signal.is_some();
-        let passed = self.marks.partition_point(|mark| *mark <= progress.episodes);
+        let passed = |mark: &u64| finished || *mark <= progress.episodes; // one that stops early stays as it is
+        let passed = self.marks.partition_point(passed);
         let marks = self.marks.drain(..passed).collect();
         Ok(Turn { progress, save, marks, ends: finished || signal.is_some(), signal, logged })
     }

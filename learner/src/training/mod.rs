@@ -5,6 +5,7 @@
 //! weights, byte for byte, whatever the number of servers, of their workers and of threads, wherever actions are chosen,
 //! and whichever trainings run together.
 
+mod ending;
 mod error;
 mod learning;
 mod lockstep;
@@ -18,6 +19,7 @@ use crate::checkpoint::{Checkpoint, ResumeState};
 use crate::client::{OpenOptions, Servers, Session};
 use crate::logging::Progress;
 use crate::rollout::{Collector, RemoteCollector};
+pub use ending::is_over;
 pub use error::{LastCheckpoint, TrainError};
 use learning::Learning;
 use lockstep::{Lockstep, Seat};

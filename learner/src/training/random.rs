@@ -10,7 +10,7 @@ use crate::client::Servers;
 use crate::logging::Progress;
 use crate::proto::{Channel, Environment, action_space::Kind};
 use perturb_policy::math::ln;
-use perturb_policy::{NamedArray, ObservationNormaliser, PolicySpec, RewardNormaliser, Weights};
+use perturb_policy::{NamedArray, PolicySpec, RewardNormaliser, Weights};
 use perturb_study::Counters;
 use perturb_study::files::write_atomically;
 use perturb_study::settings::{Common, TrainConfig};
@@ -22,7 +22,7 @@ use perturb_study::settings::{Common, TrainConfig};
 pub(super) fn make(servers: &Servers, entry: &Entry<'_>) -> Result<Outcome> {
     let Entry { directory, ref start, marks } = *entry;
     let config = start.config();
-    let environment = servers.environment(&config.common.environment)?;
+    let environment = servers.environment_seen(&config.common)?;
     let checkpoint = checkpoint(config, &environment)?;
     directory.prepare()?; // from here on an earlier run is gone
     write_atomically(&directory.path().join("config.toml"), config.to_toml().as_bytes())?;
@@ -32,19 +32,19 @@ pub(super) fn make(servers: &Servers, entry: &Entry<'_>) -> Result<Outcome> {
 }
 
 fn checkpoint(config: &TrainConfig, environment: &Environment) -> Result<Checkpoint> {
-    let Common { normalize_observations, normalize_rewards, num_envs, reward_return_runs_on, .. } = config.common;
+    let Common { normalize_rewards, num_envs, reward_return_runs_on, .. } = config.common;
     let summary = EnvironmentSummary::of(environment).ok_or(TrainError::NoActions)?;
-    let observations = normalize_observations.then(|| ObservationNormaliser::new(summary.observation.len()));
     let rewards = normalize_rewards
         .then(|| RewardNormaliser::new(num_envs, config.settings.gamma()).running_on(reward_return_runs_on));
-    let state = State {
+    let mut state = State {
         environment_spec: summary,
-        observation_normaliser: observations,
+        observation_normaliser: None,
         reward_normaliser: rewards,
         counters: Counters::default(),
         config: config.clone(),
         commits: vec![perturb_study::VERSION.into()],
     };
+    state.observation_normaliser = state.fresh_normaliser();
     let policy = state.policy();
     let weights = weights(&policy, environment)?;
     Ok(Checkpoint { state, policy, weights })

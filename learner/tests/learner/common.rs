@@ -29,6 +29,7 @@ pub fn options(environment: &str, num_envs: usize, episodes_per_trial: u32) -> O
         num_envs,
         seed: 3,
         episodes_per_trial,
+        observe: Default::default(),
     }
 }
 

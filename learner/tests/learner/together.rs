@@ -21,7 +21,7 @@ const TRAININGS: [&str; 8] = [
     "algorithm = 'epopt-ppo'\nversion = 'E'\nnum_envs = 2\nepisodes_per_iteration = 3\nepsilon = 0.5\nfull_iterations = 1
      n_epochs = 2\nseed = 4",
     "algorithm = 'ppo'\narchitecture = 'rc'\nnum_envs = 2\nn_steps = 24\nn_minibatches = 2\nn_epochs = 1\nseed = 5",
-    "algorithm = 'rl2-a2c'\narchitecture = 'rc'\nversion = 'R'\nnum_envs = 2\nn_steps = 20\nseed = 6",
+    "algorithm = 'rl2-a2c'\narchitecture = 'rc'\nversion = 'R+E'\nnum_envs = 2\nn_steps = 20\nseed = 6",
     "preset = 'paper'\nalgorithm = 'ppo'\nversion = 'R'\nn_steps = 16\nn_epochs = 2\nseed = 3",
     "preset = 'paper'\nalgorithm = 'epopt-a2c'\nversion = 'E'\nepisodes_per_iteration = 3\nepsilon = 0.5
      full_iterations = 1\nseed = 4",
@@ -29,9 +29,13 @@ const TRAININGS: [&str; 8] = [
      full_iterations = 1\nn_epochs = 2\nseed = 4",
 ];
 
-fn config(environment: &str, training: &str) -> TrainConfig {
-    let episodes = if environment == "CartPole" { 12 } else { 5 };
-    let text = format!("environment = '{environment}'\nepisodes = {episodes}\n{training}");
+/// Tasks, with what their policies see.
+const CART_POLE: &str = "environment = 'CartPole'\nepisodes = 12";
+const PENDULUM: &str = "environment = 'Pendulum'\nepisodes = 5";
+const SEEN_PENDULUM: &str = "environment = 'Pendulum'\nepisodes = 5\nobserve = 'parameters'";
+
+fn config(task: &str, training: &str) -> TrainConfig {
+    let text = format!("{task}\n{training}");
     TrainConfig::from_table("the test", text.parse().expect("TOML")).expect("a configuration")
 }
 
@@ -53,7 +57,7 @@ fn kept(directory: &Path) -> String {
 }
 
 /// Trains in folders of these numbers, from where these are, until all end or one has had so many iterations.
-fn together(servers: &Servers, base: &Path, environment: &str, numbers: &[usize], most_iterations: u64) {
+fn together(servers: &Servers, base: &Path, task: &str, numbers: &[usize], most_iterations: u64) {
     let directories: Vec<(RunDirectory, Start)> = numbers
         .iter()
         .map(|number| {
@@ -62,7 +66,7 @@ fn together(servers: &Servers, base: &Path, environment: &str, numbers: &[usize]
                 let (directory, checkpoint, state) = RunDirectory::resume(&path).expect("a run");
                 (directory, Start::Checkpoint(Box::new((checkpoint, state))))
             } else {
-                let start = Start::Fresh(Box::new(config(environment, TRAININGS[*number])));
+                let start = Start::Fresh(Box::new(config(task, TRAININGS[*number])));
                 (RunDirectory::choose(&path, false).expect("a directory"), start)
             }
         })
@@ -89,38 +93,37 @@ fn together(servers: &Servers, base: &Path, environment: &str, numbers: &[usize]
     assert!(ended.iter().all(|&ended| ended));
 }
 
-fn alone(servers: &Servers, environment: &str) -> Vec<String> {
+fn alone(servers: &Servers, task: &str) -> Vec<String> {
     let base = tempfile::tempdir().expect("a directory");
     let one = |training: &&str| {
         let path = base.path().join("run");
         let directory = RunDirectory::choose(&path, true).expect("a directory");
-        train(servers, &config(environment, training), &directory, 1, &StopFlag::default(), |_| {})
-            .expect("a training");
+        train(servers, &config(task, training), &directory, 1, &StopFlag::default(), |_| {}).expect("a training");
         kept(&path)
     };
     TRAININGS.iter().map(one).collect()
 }
 
 #[rstest]
-fn the_bytes_of_a_training_are_its_own(#[values("CartPole", "Pendulum")] environment: &str) {
+fn the_bytes_of_a_training_are_its_own(#[values(CART_POLE, PENDULUM, SEEN_PENDULUM)] task: &str) {
     let private = [server(), server()];
     let one = connect(&private[..1]);
-    let expected = alone(&connect(&private[..1]).with_act(ActAt::Client), environment);
-    assert!(alone(&one, environment) == expected, "acting at the server");
-    assert!(alone(&connect(&private), environment) == expected, "on two servers");
+    let expected = alone(&connect(&private[..1]).with_act(ActAt::Client), task);
+    assert!(alone(&one, task) == expected, "acting at the server");
+    assert!(alone(&connect(&private), task) == expected, "on two servers");
 
     let base = tempfile::tempdir().expect("a directory");
     let all = |base: &Path| (0..TRAININGS.len()).map(|number| kept(&base.join(number.to_string()))).collect::<Vec<_>>();
-    together(&one, base.path(), environment, &[0, 1, 2, 3, 4, 5, 6, 7], u64::MAX);
+    together(&one, base.path(), task, &[0, 1, 2, 3, 4, 5, 6, 7], u64::MAX);
     assert!(all(base.path()) == expected, "together");
 
     let base = tempfile::tempdir().expect("a directory");
-    together(&one, base.path(), environment, &[3, 1, 7, 0], 1);
-    together(&connect(&private), base.path(), environment, &[2, 6, 4, 5], 1);
+    together(&one, base.path(), task, &[3, 1, 7, 0], 1);
+    together(&connect(&private), base.path(), task, &[2, 6, 4, 5], 1);
     assert!(all(base.path()) != expected, "all are stopped before their ends");
-    together(&connect(&private), base.path(), environment, &[0, 4, 3, 6], u64::MAX);
-    together(&one, base.path(), environment, &[1, 5], u64::MAX);
-    together(&one, base.path(), environment, &[2, 7], u64::MAX);
+    together(&connect(&private), base.path(), task, &[0, 4, 3, 6], u64::MAX);
+    together(&one, base.path(), task, &[1, 5], u64::MAX);
+    together(&one, base.path(), task, &[2, 7], u64::MAX);
     assert!(all(base.path()) == expected, "resumed in other groups");
 }
 
@@ -158,20 +161,20 @@ fn a_run_that_begins_again_has_no_policies_of_the_one_before() {
     let directory = RunDirectory::choose(base.path(), true).expect("a directory");
     assert!(directory.has_kept([10].into_iter()) && !directory.has_kept([10, 20].into_iter()));
     let stop = StopFlag::default();
-    train(&connect(&[server()]), &config("CartPole", TRAININGS[0]), &directory, 1, &stop, |_| {}).expect("a training");
+    train(&connect(&[server()]), &config(CART_POLE, TRAININGS[0]), &directory, 1, &stop, |_| {}).expect("a training");
     assert!(!directory.has_kept([10].into_iter()));
 }
 
 #[rstest]
-fn one_that_fails_does_not_stop_the_others(#[values("CartPole", "Pendulum")] environment: &str) {
+fn one_that_fails_does_not_stop_the_others(#[values(CART_POLE, PENDULUM)] task: &str) {
     let private: [PrivateServer; 1] = [server()];
     let servers = connect(&private);
     let base = tempfile::tempdir().expect("a directory");
     let bad = "algorithm = 'a2c'\nnum_envs = 2\nn_steps = 5\nlearning_rate = 1e30\nmax_grad_norm = 1e30\nseed = 1";
-    let good = config(environment, TRAININGS[0]);
+    let good = config(task, TRAININGS[0]);
     let directories: Vec<RunDirectory> =
         ["bad", "good"].map(|name| RunDirectory::choose(&base.path().join(name), false).expect("a directory")).into();
-    let starts = [config(environment, bad), good].map(|config| Start::Fresh(Box::new(config)));
+    let starts = [config(task, bad), good].map(|config| Start::Fresh(Box::new(config)));
     let entries =
         directories.iter().zip(starts).map(|(directory, start)| Entry { directory, start, marks: &[] }).collect();
     let mut ends = vec![String::new(); 2];
@@ -182,16 +185,19 @@ fn one_that_fails_does_not_stop_the_others(#[values("CartPole", "Pendulum")] env
     train_together(&servers, entries, 1, &StopFlag::default(), &mut |_, _| {}, &mut ended).expect("a session");
     assert!(ends[0].contains("not finite") || ends[0].contains("became"), "{}", ends[0]);
     assert_eq!(ends[1], "ok");
-    let expected = alone(&servers, environment).remove(0);
+    let expected = alone(&servers, task).remove(0);
     assert!(kept(&base.path().join("good")) == expected, "as if it had been alone");
 }
 
 #[rstest]
-fn tests_have_the_same_episodes_wherever_actions_are_chosen(#[values(0, 3, 4)] number: usize) {
+fn tests_have_the_same_episodes_wherever_actions_are_chosen(
+    #[values(0, 3, 4)] number: usize,
+    #[values("", "\nobserve = 'parameters'")] observe: &str,
+) {
     let private = [server(), server()];
     let one = connect(&private[..1]);
     let base = tempfile::tempdir().expect("a directory");
-    together(&one, base.path(), "CartPole", &[number], u64::MAX);
+    together(&one, base.path(), &format!("{CART_POLE}{observe}"), &[number], u64::MAX);
     let checkpoint = Checkpoint::load(&base.path().join(number.to_string())).expect("a checkpoint");
     let episodes = |servers: &Servers| {
         let options = TestOptions { episodes: 130, seed: 8, selects: false, success: None };

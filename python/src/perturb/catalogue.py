@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
@@ -50,6 +50,8 @@ class Description:
     observation: tuple[Range, ...]
     actions: int | tuple[Range, ...]
     control_timestep: float
+    # What follows the observation where parameters are observed.
+    parameter_observations: tuple[Range, ...] = field(default=(), compare=False)
     # The rule of this package's version; the server's, whose word is `is_success`, may be another.
     success: Success | None = field(default=None, compare=False)
 
@@ -68,8 +70,13 @@ class Description:
             observation=ranges(entry["observation"]),
             actions=len(action["discrete"]) if "discrete" in action else ranges(action["continuous"]),
             control_timestep=entry["control_timestep"],
+            parameter_observations=ranges(seen["entry"] for seen in entry.get("parameter_observations", [])),
             success=Success(**entry["success"]),
         )
+
+    def observing_parameters(self) -> Description:
+        """The environment of a session whose observations have the parameters at their end."""
+        return replace(self, observation=self.observation + self.parameter_observations)
 
     @property
     def discrete(self) -> bool:

@@ -37,6 +37,7 @@ class Client:
         first_environment_index: int,
         episodes_per_trial: int,
         autoreset_mode: AutoresetMode,
+        observe: str,
         receipts: bool,
         reward_terms: bool,
         timeout: float,
@@ -48,6 +49,9 @@ class Client:
         self._drawn = render_mode is not None
         self._width, self._height = requests.pixels(width, "width"), requests.pixels(height, "height")
         self.description = catalogue.find(environment)
+        observe_parameters = requests.observes_parameters(observe)
+        if observe_parameters:
+            self.description = self.description.observing_parameters()
         self.num_envs = requests.count(num_envs, "num_envs", 1)
         self._server = None if server is None else parse_address(server)
         if server is None:
@@ -63,6 +67,7 @@ class Client:
             autoreset_mode=requests.autoreset(autoreset_mode),
             receipts=receipts,
             reward_terms=reward_terms,
+            observe_parameters=observe_parameters,
         )
         self._partly_changed = False
         self._session: Session | None = None
@@ -109,6 +114,11 @@ class Client:
         try:
             self._request.seed = seeds[0] if seeds else int(generator.integers(2**63))
             opened = session.open(self._request)
+            if opened.observes_parameters != self._request.observe_parameters:
+                raise ProtocolError(
+                    "the server does not know observe='parameters': it is older than this package; "
+                    "run the perturb-server of the package's version, or leave it out"
+                )
             self.description.require_equal(opened.environment)
         except BaseException:
             session.close()

@@ -26,13 +26,16 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
 
     Args:
         environment: a name of docs/environments.md, such as `CartPole`.
-        version: where parameters come from: `D` their defaults, `R` random, `E` extreme.
+        version: where parameters come from: `D` their defaults, `R` random, `E` extreme, `R+E` one of
+            both, each in half of the trials.
         server: `unix:/path` or `host:port`; None starts a server of this process's own.
         parameters: replaces the version's set of the named parameters: a value, an interval `(low, high)`, or several
             `[(low, high), …]`.
         environment_index: fixes all randomness, together with the seed. Environment i of a vector with the same
             first index and seed gives the same bytes as this one with the index and the seed i higher.
         episodes_per_trial: parameters are drawn anew after so many episodes.
+        observe: `state`, or `parameters` for observations that have the episode's parameters at their end, scaled to
+            -1 … 1 over the range of R and E.
         receipts: whether infos have parameters and receipt.
         reward_terms: whether every step's info has the terms of the reward.
         timeout: how long a reply may take, s.
@@ -56,6 +59,7 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
         parameters: requests.Parameters | None = None,
         environment_index: int = 0,
         episodes_per_trial: int = 1,
+        observe: str = "state",
         receipts: bool = True,
         reward_terms: bool = False,
         timeout: float = TIMEOUT,
@@ -72,6 +76,7 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
             first_environment_index=environment_index,
             episodes_per_trial=episodes_per_trial,
             autoreset_mode=AutoresetMode.DISABLED,
+            observe=observe,
             receipts=receipts,
             reward_terms=reward_terms,
             timeout=timeout,

@@ -27,7 +27,12 @@ if TYPE_CHECKING:
 ParameterSet: TypeAlias = float | tuple[float, float] | Sequence[tuple[float, float]]
 Parameters: TypeAlias = Mapping[str, ParameterSet]
 
-_VERSIONS = {"D": pb.VERSION_DEFAULT, "R": pb.VERSION_RANDOM, "E": pb.VERSION_EXTREME}
+_VERSIONS = {
+    "D": pb.VERSION_DEFAULT,
+    "R": pb.VERSION_RANDOM,
+    "E": pb.VERSION_EXTREME,
+    "R+E": pb.VERSION_RANDOM_OR_EXTREME,
+}
 _AUTORESET = {
     AutoresetMode.NEXT_STEP: pb.AUTORESET_MODE_NEXT_STEP,
     AutoresetMode.SAME_STEP: pb.AUTORESET_MODE_SAME_STEP,
@@ -37,10 +42,20 @@ _INT32 = np.iinfo(np.int32)
 
 
 def version(name: str) -> pb.Version:
-    """D, R or E."""
+    """D, R, E or R+E."""
     if name not in _VERSIONS:
-        raise InvalidArgumentError(f"version={name!r} is none of 'D' (default physics), 'R' (random) and 'E' (extreme)")
+        raise InvalidArgumentError(
+            f"version={name!r} is none of 'D' (default physics), 'R' (random), 'E' (extreme) and 'R+E' (each in half "
+            "of the trials)"
+        )
     return _VERSIONS[name]
+
+
+def observes_parameters(observe: Any) -> bool:
+    """Whether observations have the parameters at their end."""
+    if observe not in ("state", "parameters"):
+        raise InvalidArgumentError(f"observe={observe!r} is none of 'state' and 'parameters' (both, state first)")
+    return bool(observe == "parameters")
 
 
 def autoreset(mode: AutoresetMode) -> pb.AutoresetMode:

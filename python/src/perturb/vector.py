@@ -28,7 +28,8 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
     Args:
         environment: a name of docs/environments.md, such as `CartPole`.
         num_envs: N.
-        version: where parameters come from: `D` their defaults, `R` random, `E` extreme.
+        version: where parameters come from: `D` their defaults, `R` random, `E` extreme, `R+E` one of
+            both, each in half of the trials.
         server: `unix:/path` or `host:port`; None starts a server of this process's own.
         parameters: replaces the version's set of the named parameters: a value, an interval `(low, high)`, or several
             `[(low, high), …]`.
@@ -36,6 +37,8 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         first_environment_index: the index of the first environment. A batch that is split gives the same bytes as a
             whole one if each part has its place here, and seeds to match.
         episodes_per_trial: parameters are drawn anew after so many episodes.
+        observe: `state`, or `parameters` for observations that have the episode's parameters at their end, scaled to
+            -1 … 1 over the range of R and E.
         receipts: whether infos have parameters and receipt.
         reward_terms: whether every step's infos have the terms of the reward.
         copy: False returns observations and pictures as they came, read-only arrays without a copy; True returns
@@ -60,6 +63,7 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         first_environment_index: int = 0,
         episodes_per_trial: int = 1,
+        observe: str = "state",
         receipts: bool = True,
         reward_terms: bool = False,
         copy: bool = False,
@@ -78,6 +82,7 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
             first_environment_index=first_environment_index,
             episodes_per_trial=episodes_per_trial,
             autoreset_mode=self._mode,
+            observe=observe,
             receipts=receipts,
             reward_terms=reward_terms,
             timeout=timeout,

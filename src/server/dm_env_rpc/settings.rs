@@ -63,6 +63,7 @@ pub(super) fn create(catalogue: &Catalogue, settings: &Settings) -> Result<(Batc
         autoreset,
         receipts: true,
         reward_terms: false,
+        observe_parameters: false,
     };
     Ok((batch, version))
 }

@@ -100,7 +100,7 @@ impl Expansion<'_> {
         let file = self.file;
         let sets = file.test_versions.iter().map(|name| self.set(name).cloned());
         let mut sets = sets.collect::<Result<Vec<_>, _>>()?;
-        sets.sort_by_key(|set| set.plain().map_or(Version::ALL.len(), |version| version as usize));
+        sets.sort_by_key(|set| set.plain().map_or(Version::KNOWN.len(), |version| version as usize));
         let success = file.success_in(&config.common.environment, config.common.preset);
         let budget = config.common.episodes;
         let last = file.evaluate_at.last().copied().unwrap_or_default();
@@ -128,7 +128,9 @@ impl Expansion<'_> {
         tuned_as: Option<String>,
     ) -> Result<()> {
         let configuration = fingerprint(config, tests);
-        let set = self.set(trained_on)?.plain().is_none().then(|| trained_on.to_owned());
+        let plain = self.set(trained_on)?.plain();
+        let set = plain.is_none().then(|| trained_on.to_owned());
+        let trained_on = plain.map_or(trained_on, |version| version.file_name());
         for run in 1..=runs {
             let mut config = config.clone();
             config.common.seed = seed + u64::from(run - 1);

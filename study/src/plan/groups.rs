@@ -1,13 +1,12 @@
 //! Which cells one process does together.
 //!
-//! A group's cells have the same environment and architecture, so that their steps can be one batch; a random policy, which
-//! takes none, is no cell to measure others by. What a cell comes
-//! to does not depend on its group.
+//! A group's cells have the same environment and architecture and see the same, so that their steps can be one batch; a
+//! random policy, which takes none, is no cell to measure others by. What a cell comes to does not depend on its group.
 
 use std::ops::Range;
 
 use super::{Cell, Plan, distinct};
-use crate::settings::{Architecture, TrainConfig};
+use crate::settings::{Architecture, Observe, TrainConfig};
 
 /// How large groups are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -33,10 +32,11 @@ impl Grouping {
 }
 
 impl Cell {
-    /// Environment, architecture, and whether anything learns: cells that have all in common may be in one group.
-    pub fn kind(&self) -> (&str, Architecture, bool) {
+    /// Environment, architecture, what is observed, and whether anything learns: cells that have all in common may be
+    /// in one group.
+    pub fn kind(&self) -> (&str, Architecture, Observe, bool) {
         let TrainConfig { common, settings } = &self.config;
-        (&common.environment, common.architecture, !settings.is_random())
+        (&common.environment, common.architecture, common.observe, !settings.is_random())
     }
 }
 
@@ -88,8 +88,19 @@ mod tests {
         // Of each environment two cells of A2C with FF, two with RC, and two of PPO with FF.
         let groups = plan.groups(&all, Grouping { most: 3, at_a_time: 1 });
         assert_eq!(groups, [vec![0, 1], vec![4, 5], vec![2, 3], vec![6, 7], vec![10, 11], vec![8, 9]]);
-        assert_eq!(plan.cells[groups[1][0]].kind(), ("CartPole", Architecture::Ff, true));
+        assert_eq!(plan.cells[groups[1][0]].kind(), ("CartPole", Architecture::Ff, Observe::State, true));
         let left = plan.groups(&[1, 5, 8, 11], Grouping { most: 36, at_a_time: 1 });
         assert_eq!(left, [vec![1, 5], vec![8], vec![11]]);
+    }
+
+    #[test]
+    fn cells_of_a_group_see_the_same() {
+        let text = "environments = ['CartPole']\nversions = ['D']\nruns = 2
+            [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\ngrid = { observe = ['state', 'parameters'] }";
+        let plan = Plan::parse("test", text.into()).unwrap();
+        let groups = plan.groups(&[0, 1, 2, 3], Grouping::BY_KIND);
+        assert_eq!(groups, [vec![0, 1], vec![2, 3]], "a session's observations have one length");
+        let methods: Vec<String> = plan.methods().iter().map(ToString::to_string).collect();
+        assert_eq!(methods, ["ppo ff", "ppo ff (sees parameters)"], "each is a row of its own, and selected by itself");
     }
 }

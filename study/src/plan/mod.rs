@@ -105,7 +105,7 @@ pub struct Cell {
 pub struct Tests {
     /// Episodes of each test.
     pub episodes: u64,
-    /// On what: versions in the order D, R, E, then the plan's own sets in theirs.
+    /// On what: versions in the order D, R, E, R+E, then the plan's own sets in theirs.
     pub sets: Vec<TestSet>,
     /// Episodes of the test that selects and nothing else, on what was trained on; `None` if there is none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -252,10 +252,20 @@ impl Plan {
 /// What a policy is trained on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum TrainedOn<'a> {
-    /// D, R or E.
+    /// D, R, E or R+E.
     Version(Version),
     /// The plan's own set of that name.
     Set(&'a str),
+}
+
+impl TrainedOn<'_> {
+    /// Its name where a file has it.
+    pub fn file_name(&self) -> &str {
+        match self {
+            TrainedOn::Version(version) => version.file_name(),
+            TrainedOn::Set(name) => name,
+        }
+    }
 }
 
 impl std::fmt::Display for TrainedOn<'_> {

@@ -20,12 +20,12 @@ pub(super) fn read(
     folder: &Path,
     beside: &mut BTreeMap<String, Vec<u8>>,
 ) -> Result<BTreeMap<String, TestSet>, ValueError> {
-    let mut sets = BTreeMap::from(Version::ALL.map(|version| (version.to_string(), version.into())));
+    let mut sets = BTreeMap::from(Version::KNOWN.map(|version| (version.to_string(), version.into())));
     for (name, table) in tables {
         let key = format!("[sets.{name}]");
         let named = !name.is_empty() && is_plain(name);
         require(named, &key, format!("`{name}`"), "a name of letters, digits and _")?;
-        require(!sets.contains_key(name), &key, "there already", "another name than D, R and E")?;
+        require(!sets.contains_key(name), &key, "there already", "another name than D, R, E and R+E")?;
         let expected = "values of some parameters, or left out: it is a version";
         require(table.keys().any(|key| key != VERSION), &key, "without parameters", expected)?;
         let set = read_set(name, table, folder, beside)
@@ -47,7 +47,7 @@ fn read_set(
     for (key, value) in table {
         match (key.as_str(), value) {
             (VERSION, Value::String(text)) => {
-                version = text.parse().map_err(|_| ValueError::new(key, value, "\"D\", \"R\" or \"E\""))?;
+                version = text.parse().map_err(|_| ValueError::new(key, value, "\"D\", \"R\", \"E\" or \"R+E\""))?;
             }
             (FILE, Value::String(name)) => file = Some(name),
             (VERSION | FILE, _) => return Err(ValueError::new(key, value, "a text")),

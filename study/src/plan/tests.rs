@@ -118,6 +118,26 @@ fn the_order_of_a_list_without_order_changes_no_id() {
 }
 
 #[test]
+fn r_and_e_together_are_a_version_like_the_others_and_change_no_id_of_theirs() {
+    let plan = |versions: &str| parse(&SMALL.replacen("versions = ['D', 'E']", versions, 1)).unwrap();
+    let tests = "test_versions = ['D', 'R', 'E']";
+    let with = plan(&format!("versions = ['D', 'E', 'R+E']\n{tests}"));
+    let without: BTreeSet<String> =
+        plan(&format!("versions = ['D', 'E']\n{tests}")).cells.into_iter().map(|it| it.id).collect();
+    let (both, others): (Vec<_>, Vec<_>) =
+        with.cells.into_iter().partition(|cell| cell.trained_on() == TrainedOn::Version(Version::RE));
+    assert_eq!(others.into_iter().map(|cell| cell.id).collect::<BTreeSet<_>>(), without);
+    assert!(!both.is_empty());
+    for cell in both {
+        assert!(cell.id.contains("-R-or-E-") && cell.set.is_none(), "{}", cell.id);
+        assert!(cell.id.chars().all(|c| c.is_ascii_alphanumeric() || "-_".contains(c)), "{}", cell.id);
+        assert_eq!(cell.config.common.trained_on(), "R+E");
+    }
+    let tested = plan("versions = ['D']\ntest_versions = ['R+E', 'E', 'D']").cells.remove(0).tests.sets;
+    assert_eq!(tested.iter().map(|set| set.name.as_str()).collect::<Vec<_>>(), ["D", "E", "R+E"]);
+}
+
+#[test]
 fn an_invalid_cell_is_refused_with_its_table_and_key() {
     for (from, to, parts) in [
         ("7e-3,", "-1,", &["small.toml: [[algorithm]] 1 (a2c): [algorithm.grid]: learning_rate is -1"][..]),
@@ -155,7 +175,7 @@ fn an_invalid_plan_is_refused_with_its_key() {
         (
             "versions = ['D', 'E']",
             "versions = ['X']",
-            "a version is `X`, but must be one of D, E, R, or a set [sets.X]",
+            "a version is `X`, but must be one of D, E, R, R+E, or a set [sets.X]",
         ),
         ("n_steps = [5, 10]", "n_steps = 5", "[algorithm.grid] n_steps is 5, but must be a list"),
         ("n_steps = [5, 10]", "n_steps = []", "[algorithm.grid] n_steps is empty"),

@@ -1,4 +1,4 @@
-//! Training curves: three panels, D, R and E, side by side.
+//! Training curves: three panels, D, R and E, side by side; and R+E, if anything is trained on it.
 
 use std::ops::Range;
 
@@ -6,6 +6,7 @@ use super::super::plan::distinct;
 use super::super::statistics::Summary;
 use super::panels::{Panel, PanelLine, PanelPoint, Panels, RATES, index_of};
 use crate::curves::{Curve, EnvironmentCurves, Footing, Point};
+use crate::scenarios::versions;
 use crate::{Method, Version};
 
 /// What a picture shows over episodes or steps.
@@ -61,6 +62,7 @@ fn draw(curves: &EnvironmentCurves, trained_on: Option<Version>, quantity: Quant
         Some(version) => format!("{environment}, trained on {version}: {what} in tests"),
     };
     let (x, y) = ranges(&curves.curves, quantity, by);
+    let versions = versions(|version| curves.curves.iter().any(|curve| curve.version == version));
     let panel = |version: Version| Panel {
         caption: format!("{} {version}", if trained_on.is_some() { "tested on" } else { "trained on" }),
         x_name: by.to_string(),
@@ -76,8 +78,8 @@ fn draw(curves: &EnvironmentCurves, trained_on: Option<Version>, quantity: Quant
     };
     Panels {
         title: format!("{of}, mean and deviation over runs"),
-        columns: Version::ALL.len(),
-        panels: Version::ALL.map(panel).into(),
+        columns: versions.len(),
+        panels: versions.into_iter().map(panel).collect(),
         legend: methods.iter().map(ToString::to_string).collect(),
     }
 }

@@ -6,6 +6,7 @@
 mod curves;
 mod heatmap;
 pub(crate) mod panels;
+mod ticks;
 
 use std::ops::Range;
 use std::path::Path;
@@ -21,6 +22,7 @@ use crate::files::{self, FileError, io, write_atomically};
 use crate::folder::FolderError;
 pub(crate) use curves::draw_tests;
 pub use curves::{Quantity, draw_curves};
+pub use heatmap::{HeatmapColumn, HeatmapPanels, common_returns};
 pub use panels::Panels;
 
 /// DejaVu Sans, cut down to the letters that pictures have; its licence is beside it.
@@ -55,6 +57,11 @@ pub trait Plot {
     /// # Errors
     /// The backend's.
     fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError>;
+
+    /// What becomes of its SVG.
+    fn finish(&self, svg: String) -> String {
+        svg
+    }
 }
 
 /// A picture as SVG.
@@ -69,7 +76,7 @@ pub fn svg(plot: &impl Plot) -> Result<String, PlotError> {
         plot.draw(&area, 1)?;
         area.present().map_err(drawing)?;
     }
-    Ok(text)
+    Ok(plot.finish(text))
 }
 
 /// A picture as PNG, with [`PNG_SCALE`] pixels for each unit.

@@ -20,6 +20,8 @@ impl Report<'_> {
             self.worst_file(),
             self.parameters_file(),
             self.thresholds_file(),
+            self.settings_file(),
+            self.configurations_file(),
         ];
         let more = more.into_iter().filter(|table| !table.rows.is_empty());
         files.into_iter().chain(sets).chain(tuned).chain(marks).chain(more).collect()
@@ -68,7 +70,8 @@ impl Report<'_> {
     }
 
     fn scenarios_file(&self) -> Table {
-        let of_selection = |selection| Scenario::all().map(move |scenario| (selection, scenario));
+        let (trained, tested) = (self.trained_versions(), self.tested_versions());
+        let of_selection = |selection| Scenario::of(&trained, &tested).map(move |scenario| (selection, scenario));
         let lines: Vec<_> = self.selections.iter().flat_map(of_selection).collect();
         Table::of("scenarios.csv", &lines)
             .text("environment", |(selection, _)| selection.environment)
@@ -150,18 +153,20 @@ impl<'r, R> TableBuilder<'r, R> {
         self.method_as("", method)
     }
 
-    /// The same with names that begin with `prefix`. Presets have a column only where one is not the default, so that other
-    /// files stay as they were.
+    /// The same with names that begin with `prefix`. Presets and what is observed have a column only where one is not
+    /// the default, so that other files stay as they were.
     pub(crate) fn method_as(self, prefix: &str, method: impl Fn(&'r R) -> &'r Method) -> Self {
-        let presets = self.sources().iter().any(|row| !method(row).preset.is_default());
+        let any = |is: fn(&Method) -> bool| self.sources().iter().any(|row| is(method(row)));
+        let (presets, observes) = (any(|it| !it.preset.is_default()), any(|it| !it.observe.is_default()));
         let table = self
             .text(format!("{prefix}algorithm"), |row| &method(row).algorithm)
             .text(format!("{prefix}architecture"), |row| &method(row).architecture)
             .text(format!("{prefix}episodes_per_trial"), |row| or_empty(method(row).episodes_per_trial));
-        if presets { table.text(format!("{prefix}preset"), |row| method(row).preset) } else { table }
+        let table = if presets { table.text(format!("{prefix}preset"), |row| method(row).preset) } else { table };
+        if observes { table.text(format!("{prefix}observe"), |row| method(row).observe) } else { table }
     }
 
-    fn summary(self, summary: impl Fn(&'r R) -> Option<Summary>) -> Self {
+    pub(super) fn summary(self, summary: impl Fn(&'r R) -> Option<Summary>) -> Self {
         self.number("runs", |row| summary(row).map_or(0, |summary| summary.runs))
             .number("mean", |row| or_empty(summary(row).map(|summary| summary.mean)))
             .number("std", |row| or_empty(summary(row).and_then(|summary| summary.std)))

@@ -2,14 +2,11 @@
 
 use crate::against_training::{against_training, test_curves};
 use crate::curves::{EnvironmentCurves, Footing};
-use crate::folder::Folder;
-use crate::heatmap::HeatmapOptions;
-use crate::heatmaps::{HeatmapRecord, NoHeatmap, heatmap_places};
+use crate::heatmaps::NoHeatmap;
 use crate::plot::{PlotError, Quantity, draw_curves, draw_tests, svg};
-use crate::scheduler::count;
 use crate::selection::MethodResults;
 
-use super::{Picture, Report};
+use super::{HeatmapPicture, Picture, Report};
 
 /// All pictures of a report.
 #[derive(Clone, Debug, Default)]
@@ -20,14 +17,16 @@ pub struct Figures {
     pub parameters: Vec<Figure>,
     /// One for each environment.
     pub thresholds: Vec<Figure>,
+    /// One for each setting of a grid.
+    pub settings: Vec<Figure>,
     /// One for each environment, quantity and footing.
     pub curves: Vec<Figure>,
     /// Of tests of the policies of earlier moments: one for each environment, version that was trained on, and quantity.
     pub marks: Vec<Figure>,
     /// What is said of curves that are missing.
     pub no_curves: Vec<String>,
-    /// Heatmaps in rows, one of a method's trainings.
-    pub heatmaps: Vec<Vec<Figure>>,
+    /// One for each environment, pair of parameters, and method.
+    pub heatmaps: Vec<Figure>,
     /// What to do about heatmaps that are missing.
     pub no_heatmaps: Vec<String>,
 }
@@ -41,7 +40,7 @@ pub struct Figure {
     pub name: String,
     /// What the picture shows, or why it is missing.
     pub caption: String,
-    /// SVG and PNG are complete in themselves.
+    /// Complete in itself.
     pub picture: FigureData,
 }
 
@@ -50,28 +49,32 @@ pub struct Figure {
 pub enum FigureData {
     /// An SVG element.
     Svg(String),
-    /// A PNG file.
-    Png(Vec<u8>),
     /// There is none; the caption says why.
     Missing,
 }
 
 impl Figures {
-    /// Draws the pictures of `report` and its training `curves`, and reads the heatmaps of its selections from `folder`.
+    /// Draws the pictures of `report`, its training `curves` and the `heatmaps` of its selections.
     ///
     /// # Errors
     /// [`PlotError`].
-    pub fn read(report: &Report<'_>, curves: &[EnvironmentCurves], folder: &Folder) -> Result<Self, PlotError> {
+    pub fn draw(
+        report: &Report<'_>,
+        curves: &[EnvironmentCurves],
+        heatmaps: &[HeatmapPicture],
+    ) -> Result<Self, PlotError> {
         let drawn = |pictures: Vec<Picture>| pictures.iter().map(Picture::figure).collect::<Result<_, _>>();
         let mut figures = Self {
             profiles: drawn(report.profiles_picture().into_iter().collect())?,
             parameters: drawn(report.parameter_pictures())?,
             thresholds: drawn(report.threshold_pictures())?,
+            settings: drawn(report.settings_pictures())?,
             ..Self::default()
         };
         figures.add_marks(report.selections)?;
         figures.add_curves(curves)?;
-        figures.add_heatmaps(report.selections, folder)?;
+        figures.heatmaps = heatmaps.iter().map(HeatmapPicture::figure).collect::<Result<_, _>>()?;
+        figures.no_heatmaps = advice(heatmaps);
         Ok(figures)
     }
 
@@ -113,53 +116,18 @@ impl Figures {
         }
         Ok(())
     }
-
-    fn add_heatmaps(&mut self, selections: &[MethodResults<'_>], folder: &Folder) -> Result<(), PlotError> {
-        let places = heatmap_places(selections);
-        let mut missing = Vec::new();
-        for row in places.chunk_by(|a, b| (a.environment, a.method) == (b.environment, b.method)) {
-            let mut figures = Vec::new();
-            for place in row {
-                let (caption, picture) = match place.read(folder)? {
-                    Ok(heatmap) => (format!("{place}{}", details(&heatmap.record)), FigureData::Png(heatmap.png)),
-                    Err(why) => {
-                        missing.push(why);
-                        (format!("{place}: {why}."), FigureData::Missing)
-                    }
-                };
-                figures.push(Figure {
-                    environment: place.environment.to_owned(),
-                    name: format!("{place}: mean return and success over two parameters"),
-                    caption,
-                    picture,
-                });
-            }
-            self.heatmaps.push(figures);
-        }
-        self.no_heatmaps = advice(&missing, places.len());
-        Ok(())
-    }
 }
 
-/// What to do about the heatmaps that are missing, of so many.
-fn advice(missing: &[NoHeatmap], all: usize) -> Vec<String> {
+/// What to do about the heatmaps that are missing.
+fn advice(heatmaps: &[HeatmapPicture]) -> Vec<String> {
+    let all: usize = heatmaps.iter().map(|picture| picture.wanted).sum();
+    let missing: Vec<NoHeatmap> = heatmaps.iter().flat_map(|picture| picture.missing.iter().copied()).collect();
     let waiting = missing.iter().filter(|why| **why == NoHeatmap::NoResult).count();
     let makeable = missing.len() - waiting;
     let make = format!(
         "Heatmaps that are not there: {makeable} of {all}. `perturb heatmap DIR` makes them, where DIR is the folder of \
-         these results."
+         these results; `--x`, `--y` and `--base` say over what."
     );
     let wait = format!("Heatmaps that wait for the results of their trainings: {waiting} of {all}.");
     [(makeable, make), (waiting, wait)].into_iter().filter(|(count, _)| *count > 0).map(|(_, advice)| advice).collect()
-}
-
-/// What a heatmap's caption says after who was tested.
-fn details(record: &HeatmapRecord) -> String {
-    let HeatmapOptions { parameters: [x, y], grid, episodes, seed, .. } = &record.options;
-    let episodes = count(*episodes as usize, "episode");
-    format!(
-        " with seed {}: {x} and {y}, {grid} × {grid} points of {episodes}, test seed {seed}. Cell {}, checkpoint {}, \
-         perturb {}.",
-        record.train_seed, record.cell, record.checkpoint, record.commit
-    )
 }

@@ -38,7 +38,7 @@ pub(super) fn trainings<'a>(selections: &'a [MethodResults<'a>], curves: &[Envir
     };
     selections
         .iter()
-        .flat_map(|selection| Version::ALL.into_iter().filter_map(move |version| of(selection, version)))
+        .flat_map(|selection| Version::KNOWN.into_iter().filter_map(move |version| of(selection, version)))
         .collect()
 }
 

@@ -1,7 +1,5 @@
 //! A report as one HTML page, complete in itself: no network, no script, all pictures inside.
 
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 use super::{Figure, FigureData, Figures, MISSING, Report};
@@ -12,8 +10,9 @@ pub(super) const STYLE: &str = include_str!("style.css");
 const METRICS: &str = "Default is the success rate of policies that were trained and tested on D, Interpolation that of \
                        policies trained and tested on R. Extrapolation is the geometric mean of three: trained on D and \
                        tested on R, trained on D and tested on E, trained on R and tested on E.";
-const HEATMAPS: &str = "How the policies that were selected in the first run do over two parameters. Colours are mean \
-                        return and success rate; the whole line is R's box, dashed lines are E's.";
+const HEATMAPS: &str = "How the selected policies do over two parameters: means over runs. Colours are mean return and success \
+                        rate, the same in all pictures of an environment. The whole line is R's box, dashed lines are E's, \
+                        the ring is D.";
 const COMPARISONS: &str = "Runs of two methods with the same seed, in each of the environments. P(X > Y) is the probability that \
                            a run of X is better than one of Y, where equal ones count half. Corrected p-values up to 0.05 \
                            are, all together, wrong with a probability of 5 % at most.";
@@ -50,10 +49,12 @@ pub fn html(report: &Report<'_>, figures: &Figures) -> String {
     let cells = report.tuned_table().into_iter().chain([report.selected_table()]).chain(report.failure_table());
     let cells = cells.map(plain).collect();
     let marks = report.marks_table().into_iter().map(plain).chain(by_environment(&figures.marks)).collect();
+    let settings = report.settings_table().into_iter().map(plain).chain(by_environment(&figures.settings)).collect();
     let scenarios = report.scenario_tables().into_iter().map(shaded).collect();
     let worst = report.worst_tables().into_iter().map(shaded).collect();
     let comparisons = report.comparisons_table().into_iter().collect();
     let sets = report.set_table().into_iter().collect();
+    let heatmap_notes = html! { p { (HEATMAPS) } (list(&figures.no_heatmaps)) };
     let sections = [
         section("metrics", "Default, Interpolation, Extrapolation", said(METRICS), tables(report.metrics_tables())),
         section("iqm", "Interquartile means", html! {}, vec![plain(report.iqm_table())]),
@@ -66,9 +67,10 @@ pub fn html(report: &Report<'_>, figures: &Figures) -> String {
         section("thresholds", "Success over the threshold", html! {}, by_environment(&figures.thresholds)),
         section("sets", "Own sets of parameters", html! {}, tables(sets)),
         section("marks", "Generalisation against training", html! {}, marks),
+        section("settings", "What settings do", html! {}, settings),
         section("footing", "Trainings on an equal footing", said(FOOTING), tables(report.footing_tables())),
         section("curves", "Training curves", list(&figures.no_curves), by_environment(&figures.curves)),
-        section("heatmaps", "Heatmaps", html! { p { (HEATMAPS) } (list(&figures.no_heatmaps)) }, heatmaps(figures)),
+        section("heatmaps", "Heatmaps", heatmap_notes, by_environment(&figures.heatmaps)),
         section("cells", "Cells", html! {}, cells),
     ];
     // Curves and heatmaps say what is missing.
@@ -214,21 +216,6 @@ fn by_environment(figures: &[Figure]) -> Vec<Subsection> {
         .collect()
 }
 
-fn heatmaps(figures: &Figures) -> Vec<Subsection> {
-    let of_environments = figures.heatmaps.chunk_by(|a, b| a[0].environment == b[0].environment);
-    let subsection = |rows: &[Vec<Figure>]| {
-        let environment = rows[0][0].environment.clone();
-        let content = html! {
-            h3 { (environment) }
-            @for row in rows {
-                div.row style={ "--columns:" (row.len()) } { @for heatmap in row { (figure(heatmap)) } }
-            }
-        };
-        Subsection { title: environment, content }
-    };
-    of_environments.map(subsection).collect()
-}
-
 fn figure(Figure { name, caption, picture, .. }: &Figure) -> Markup {
     html! {
         figure class=[matches!(picture, FigureData::Missing).then_some("missing")] {
@@ -236,21 +223,10 @@ fn figure(Figure { name, caption, picture, .. }: &Figure) -> Markup {
                 FigureData::Missing => {}
                 // Named for those who do not see it.
                 FigureData::Svg(svg) => div role="img" aria-label=(name) { (PreEscaped(svg)) }
-                FigureData::Png(png) => {
-                    @let size = png_size(png);
-                    img alt=(name) width=[size.map(|size| size.0)] height=[size.map(|size| size.1)]
-                        src={ "data:image/png;base64," (STANDARD.encode(png)) };
-                }
             }
             figcaption { (caption) }
         }
     }
-}
-
-/// Width and height of a PNG file, as many units as the picture has: the first numbers of its first chunk.
-fn png_size(png: &[u8]) -> Option<(u32, u32)> {
-    let number = |from: usize| Some(u32::from_be_bytes(png.get(from..from + 4)?.try_into().ok()?) / plot::PNG_SCALE);
-    Some((number(16)?, number(20)?))
 }
 
 fn list(notes: &[String]) -> Markup {

@@ -7,10 +7,12 @@ mod comparisons;
 mod csv;
 mod figures;
 mod footing;
+mod heatmap_pictures;
 mod html;
 mod numbers;
 mod pictures;
 mod profiles;
+mod settings;
 mod sweep_pictures;
 mod sweeps;
 mod tables;
@@ -32,10 +34,12 @@ use comparisons::Comparison;
 use footing::Trainings;
 use numbers::{MethodMetrics, SetTest};
 use profiles::Profile;
+use settings::{GridTests, grid_tests};
 use sweeps::{AtParameter, AtThreshold, Swept};
 use worst::Worst;
 
 pub use figures::{Figure, FigureData, Figures};
+pub use heatmap_pictures::{HeatmapPicture, heatmap_pictures, save_heatmaps};
 pub use html::html;
 pub use pictures::Picture;
 
@@ -62,6 +66,8 @@ pub struct Report<'a> {
     trainings: Vec<Trainings<'a>>,
     /// Of policies of earlier moments, and at the end; nothing without `evaluate_at`.
     marks: Vec<MarkTest<'a>>,
+    /// Of every point of a grid.
+    grid_tests: GridTests<'a>,
     /// By the clean rule, what was selected; otherwise nothing.
     tuned: Vec<Tuned<'a>>,
     failures: Vec<&'a Failure>,
@@ -93,6 +99,7 @@ impl<'a> Report<'a> {
             trainings: footing::trainings(selections, curves),
             set_tests: numbers::set_tests(plan, selections),
             marks: against_training(selections),
+            grid_tests: grid_tests(results),
             tuned,
             failures: results.failures().collect(),
         }
@@ -108,7 +115,7 @@ impl<'a> Report<'a> {
     /// For GitHub and the like.
     pub fn markdown(&self) -> String {
         let details = self.comparisons_table().into_iter().chain(self.worst_tables()).chain(self.footing_tables());
-        let cells = self.tuned_table().into_iter().chain([self.selected_table()]);
+        let cells = self.settings_table().into_iter().chain(self.tuned_table()).chain([self.selected_table()]);
         let tables = self.number_tables().chain(details).chain(cells).chain(self.failure_table());
         let shown = tables.map(|table| format!("\n## {}\n\n{}\n", table.title, table.to_markdown()));
         format!("# Results\n\n{}\n{}", self.overview.join("\n\n"), shown.collect::<String>())

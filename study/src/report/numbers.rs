@@ -109,7 +109,7 @@ pub(super) fn averages<'a>(
 
 /// In the order of `selections`, of what they were trained on, and of the plan's tests.
 pub(super) fn set_tests<'a>(plan: &'a Plan, selections: &'a [MethodResults<'a>]) -> Vec<SetTest<'a>> {
-    let is_version = |name: &str| Version::ALL.iter().any(|version| version.to_string() == name);
+    let is_version = |name: &str| Version::KNOWN.iter().any(|version| version.to_string() == name);
     let mut tests = Vec::new();
     for selection in selections {
         for &trained_on in selection.runs.values().next().into_iter().flat_map(|run| run.0.keys()) {

@@ -1,6 +1,7 @@
 //! Pictures of a report's numbers, which are drawn for its page and as files of their own.
 
 use super::{Figure, FigureData, Report};
+use crate::Method;
 use crate::plot::{Panels, PlotError, svg};
 
 /// A picture.
@@ -27,9 +28,18 @@ impl Picture {
 }
 
 impl Report<'_> {
-    /// All of them: performance profiles, success over parameters and over the threshold, as far as there are numbers.
+    /// All of them: performance profiles, success over parameters and over the threshold, what settings do, as far as there
+    /// are numbers.
     pub fn pictures(&self) -> Vec<Picture> {
-        let profiles = self.profiles_picture();
-        profiles.into_iter().chain(self.parameter_pictures()).chain(self.threshold_pictures()).collect()
+        let profiles = self.profiles_picture().into_iter();
+        let swept = self.parameter_pictures().into_iter().chain(self.threshold_pictures());
+        profiles.chain(swept).chain(self.settings_pictures()).collect()
     }
+}
+
+/// The method's name in small letters, digits and hyphens.
+pub(super) fn file_name(method: &Method) -> String {
+    let name = method.to_string().to_lowercase();
+    let words = name.split(|letter: char| !letter.is_ascii_alphanumeric()).filter(|word| !word.is_empty());
+    words.collect::<Vec<_>>().join("-")
 }

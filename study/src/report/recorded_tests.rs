@@ -34,7 +34,7 @@ fn length(version: Version, index: u32) -> f64 {
         Version::D => 0.5,
         Version::R => 0.25 + 0.5 * place,
         Version::E if place < 0.5 => 0.05 + 0.4 * place,
-        Version::E => 0.75 + 0.5 * (place - 0.5),
+        Version::E | Version::RE => 0.75 + 0.5 * (place - 0.5),
     }
 }
 

@@ -15,7 +15,7 @@ impl Report<'_> {
         let all: Vec<_> = all.filter(|row| Version::ALL.iter().any(|it| it.to_string() == row.tested_on)).collect();
         let mut pictures = Vec::new();
         for environment in self.plan.environments() {
-            for version in Version::ALL {
+            for version in Version::KNOWN {
                 let is_of = |row: &&&Swept<'_, AtParameter<'_>>| {
                     row.environment == environment && row.trained_on == TrainedOn::Version(version)
                 };
@@ -55,7 +55,7 @@ impl Report<'_> {
         };
         Picture {
             environment: environment.into(),
-            file: format!("{environment}-{version}-parameters"),
+            file: format!("{environment}-{}-parameters", version.file_name()),
             name: format!("{environment}: success over each parameter, trained on {version}"),
             caption: format!(
                 "{environment}: success of policies trained on {version}, by the value that a parameter had in tests on R \

@@ -2,9 +2,10 @@
 
 use std::collections::BTreeMap;
 
-use super::numbers::{MethodMetrics, counted};
+use super::numbers::{MethodMetrics, counted, tested_on};
 use super::{MISSING, MarkTest, Report};
-use crate::plan::distinct;
+use crate::plan::{TrainedOn, distinct};
+use crate::scenarios::versions;
 use crate::selection::MethodResults;
 use crate::statistics::{Bootstrapped, Summary};
 use crate::table::{Column, Entry, Table};
@@ -100,22 +101,35 @@ impl Report<'_> {
         of_environments.map(table).collect()
     }
 
-    /// The nine scenarios of each environment.
+    /// The nine scenarios of each environment, and those of R+E.
     pub(super) fn scenario_tables(&self) -> Vec<Table> {
         let of_environments = self.selections.chunk_by(|a, b| a.environment == b.environment);
+        let (trained, tested) = (self.trained_versions(), self.tested_versions());
+        let more = if trained.len() + tested.len() > 2 * Version::ALL.len() { ", and R+E for reference" } else { "" };
         let table = |selections: &[_]| {
-            let trained = |selection| Version::ALL.map(|train| (selection, train));
+            let trained = |selection| trained.iter().map(move |&train| (selection, train));
             let rows: Vec<(&MethodResults<'_>, Version)> = selections.iter().flat_map(trained).collect();
-            let mut table = Table::of(format!("{}: the nine scenarios", rows[0].0.environment), &rows)
+            let mut table = Table::of(format!("{}: the nine scenarios{more}", rows[0].0.environment), &rows)
                 .text("method", |(selection, _)| &selection.method)
                 .text("trained on", |(_, train)| train);
-            for test in Version::ALL {
+            for &test in &tested {
                 let name = if test == Version::D { format!("tested on {test}") } else { format!("on {test}") };
                 table = table.number(name, |&(selection, train)| rate(selection.scenario(Scenario { train, test })));
             }
             table.build()
         };
         of_environments.map(table).collect()
+    }
+
+    /// The paper's, and R+E if the plan trains on it.
+    pub(super) fn trained_versions(&self) -> Vec<Version> {
+        let runs = || self.selections.iter().flat_map(|selection| selection.runs.values());
+        versions(|version| runs().any(|run| run.0.contains_key(&TrainedOn::Version(version))))
+    }
+
+    /// The paper's, and R+E if the plan tests on it.
+    pub(super) fn tested_versions(&self) -> Vec<Version> {
+        versions(|version| tested_on(self.plan).any(|name| name == version.to_string()))
     }
 
     /// `None` if the plan has no sets of its own.

@@ -43,7 +43,7 @@ fn results(plan: &Plan) -> Results<'_> {
         let easier = match common.version {
             Version::D => [90.0, 40.0, 20.0],
             Version::R => [80.0, 70.0, 30.0],
-            Version::E => [33.3, 50.0, 60.0],
+            Version::E | Version::RE => [33.3, 50.0, 60.0],
         };
         known.then(|| (easier.map(|rate| rate + f64::from(cell.run)), 1.0))
     });
@@ -59,13 +59,15 @@ fn figures() -> Figures {
         caption: "Mean & deviation".into(),
         picture,
     };
-    let png = [&[0; 16][..], &800_u32.to_be_bytes(), &600_u32.to_be_bytes()].concat();
     Figures {
         profiles: vec![figure("", FigureData::Svg("<svg></svg>".into()))],
         curves: vec![figure("CartPole", FigureData::Svg("<svg></svg>".into()))],
         marks: Vec::new(),
         no_curves: vec!["Pendulum: no training with a result has its monitor.csv.".into()],
-        heatmaps: vec![vec![figure("CartPole", FigureData::Png(png)), figure("CartPole", FigureData::Missing)]],
+        heatmaps: vec![
+            figure("CartPole", FigureData::Svg("<svg></svg>".into())),
+            figure("CartPole", FigureData::Missing),
+        ],
         no_heatmaps: vec!["1 of 2. `perturb heatmap DIR` makes them.".into()],
         ..Figures::default()
     }
@@ -154,7 +156,7 @@ fn tests_at_marks_have_a_table_with_the_end_as_its_last_line() {
         marks.contains("CartPole,ppo,ff,,R,20,E,1,20,,-20\n") && marks.contains("R,50,E,2,21.5,0.5,1\n"),
         "{marks}"
     );
-    let figures = Figures::read(&report, &[], &Folder::new(std::path::Path::new("/nowhere"))).unwrap();
+    let figures = Figures::draw(&report, &[], &[]).unwrap();
     let names: Vec<&str> = figures.marks.iter().map(|figure| figure.name.as_str()).collect();
     assert_eq!(names.len(), 2, "return and success");
     assert_eq!(names[1], "CartPole, trained on R: success in tests after so many episodes");
@@ -253,6 +255,39 @@ fn what_is_not_done_is_missing_and_has_no_colour() {
     assert_eq!(entries.iter().filter(|entry| entry.text == MISSING).count(), 3 * (4 + 2 + 2 + 2) + 4 * 4 + 9 * 4);
 }
 
+/// What is trained on both is a line to compare with.
+#[test]
+fn what_is_trained_on_r_and_e_is_a_row_of_scenarios_and_in_none_of_the_papers_numbers() {
+    let plan = |versions: &str| {
+        let text = format!(
+            "environments = ['CartPole']\nversions = ['D', 'R', 'E'{versions}]\ntest_versions = ['D', 'R', 'E']\n\
+             runs = 2\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']"
+        );
+        Plan::parse("test", text).unwrap()
+    };
+    let (with, without) = (plan(", 'R+E'"), plan(""));
+    let [with, without] = [&with, &without].map(|plan| {
+        let rates = |cell: &Cell| {
+            [90.0, 40.0, f64::from(cell.run)].map(|rate| rate / (1.0 + f64::from(cell.config.common.version as u8)))
+        };
+        let results = fixture::results(plan, |cell| Some((rates(cell), 1.0)));
+        let selections = results.select();
+        let recorded = Recorded::default();
+        let report = Report::new(&results, &selections, &recorded, &[]);
+        let lines = |table: &Table| table.to_markdown().lines().map(ToOwned::to_owned).collect::<Vec<String>>();
+        let scenarios = report.scenario_tables().iter().flat_map(&lines).collect::<Vec<_>>();
+        let file = report.files().into_iter().find(|file| file.title == "scenarios.csv").unwrap();
+        let metrics = report.metrics.iter().map(|row| format!("{:?} {:?} {:?}", row.ours, row.iqms, row.gaps));
+        (scenarios, lines(&file), metrics.collect::<Vec<_>>())
+    });
+    assert_eq!(with.2, without.2, "Default, Interpolation and Extrapolation come from D, R and E");
+    for (with, without, more) in [(with.0, without.0, 1), (with.1, without.1, 3)] {
+        let (of_both, others): (Vec<_>, Vec<_>) = with.into_iter().partition(|line| line.contains("R+E"));
+        assert_eq!((of_both.len(), others), (more, without));
+        assert!(of_both[0].contains("22.5"), "a quarter of 90: {}", of_both[0]);
+    }
+}
+
 #[test]
 fn files_tell_two_presets_of_a_method_apart() {
     let plan = |preset: &str| {
@@ -263,14 +298,33 @@ fn files_tell_two_presets_of_a_method_apart() {
         Plan::parse("test", text).unwrap()
     };
     let (both, one) = (plan("preset = 'paper'"), plan("settings = { learning_rate = 1e-3 }"));
-    for (plan, expected) in [(&both, true), (&one, false)] {
+    let seeing = plan("settings = { observe = 'parameters' }");
+    for (plan, name, expected) in
+        [(&both, "preset", true), (&one, "preset", false), (&seeing, "observe", true), (&both, "observe", false)]
+    {
         let results = fixture::results(plan, |cell| Some(([90.0, 40.0, f64::from(cell.run)], 1.0)));
         let selections = results.select();
         let recorded = Recorded::default();
         for file in Report::new(&results, &selections, &recorded, &[]).files() {
             // Of a pair, one side alone is of another preset.
-            let columns = file.columns.iter().filter(|column| column.name.ends_with("preset")).count();
-            assert_eq!(columns, usize::from(expected), "{}", file.title);
+            let columns = file.columns.iter().filter(|column| column.name.ends_with(name)).count();
+            // Reference lines are not compared in pairs.
+            let compared = file.columns.iter().any(|column| column.name.starts_with("x_"));
+            assert_eq!(columns, usize::from(expected && !(name == "observe" && compared)), "{}", file.title);
         }
     }
+}
+
+/// What follows a rule that is not closed is read as part of it, and no browser says so.
+#[test]
+fn every_rule_of_the_style_is_closed() {
+    let depths: Vec<i32> = super::html::STYLE
+        .chars()
+        .scan(0, |depth, char| {
+            *depth += i32::from(char == '{') - i32::from(char == '}');
+            Some(*depth)
+        })
+        .collect();
+    assert_eq!(depths.last(), Some(&0));
+    assert!(depths.iter().all(|depth| (0..=2).contains(depth)), "only a medium has rules inside");
 }

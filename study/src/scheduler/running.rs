@@ -59,8 +59,9 @@ impl Running {
         if let Some(number) = group {
             self.places.insert(number, self.groups.len());
         }
-        let (environment, architecture, ..) = cell.kind();
-        self.groups.push(RunningGroup { kind: format!("{environment} {architecture}"), cells: vec![entry] });
+        let (environment, architecture, observe, _) = cell.kind();
+        let sees = observe.note().map_or_else(String::new, |sees| format!(" ({sees})"));
+        self.groups.push(RunningGroup { kind: format!("{environment} {architecture}{sees}"), cells: vec![entry] });
     }
 
     /// How many cells there are.

@@ -25,6 +25,7 @@ pub(super) fn of(mut settings: Settings, architecture: Architecture, preset: Pre
         version: Version::D,
         parameters: Default::default(),
         architecture,
+        observe: Default::default(),
         episodes: 15_000,
         seed: 1,
         num_envs,
@@ -33,6 +34,7 @@ pub(super) fn of(mut settings: Settings, architecture: Architecture, preset: Pre
         reward_return_runs_on: false,
         log_interval,
         checkpoint_interval: 500,
+        stop_at_success: 0.0,
     };
     let mut config = TrainConfig { common, settings };
     if preset == Preset::Paper {

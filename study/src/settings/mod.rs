@@ -7,6 +7,7 @@ mod algorithms;
 mod architecture;
 mod defaults;
 mod error;
+mod observe;
 mod preset;
 
 mod base_and_wrapper;
@@ -15,6 +16,7 @@ pub use algorithms::{A2cConfig, EpoptConfig, PpoConfig, Ranking, Rl2Config, Sche
 pub use architecture::Architecture;
 pub use base_and_wrapper::{Base, Settings, Wrapper};
 pub use error::{ConfigError, SettingError};
+pub use observe::Observe;
 pub use preset::Preset;
 
 use std::path::Path;
@@ -38,6 +40,8 @@ const PARAMETERS: &str = "parameters";
 const ALGORITHM: &str = "algorithm";
 /// The key of [`Common::preset`].
 const PRESET: &str = "preset";
+/// The key of [`Common::observe`].
+const OBSERVE: &str = "observe";
 /// The key of [`Common::architecture`].
 const ARCHITECTURE: &str = "architecture";
 
@@ -77,6 +81,11 @@ pub struct Common {
     pub parameters: Parameters,
     /// What acts.
     pub architecture: Architecture,
+    /// What the policy sees: "state", or "parameters" for the environment's present parameters beside it, in training
+    /// and in tests (default: `"state"`). It is written only where it is not the default: settings from before it stay
+    /// what they were.
+    #[serde(default, skip_serializing_if = "Observe::is_default")]
+    pub observe: Observe,
     /// Training ends after the iteration in which this many episodes have ended, at least 1 (default: `15000`). EPOpt
     /// counts those that it learned from.
     pub episodes: u64,
@@ -99,6 +108,15 @@ pub struct Common {
     /// Ended episodes between two checkpoints, at least 1 (default: `500`). The first iteration and the last always
     /// write one.
     pub checkpoint_interval: u64,
+    /// Training ends, too, after the iteration in which the last 100 ended episodes have this success rate, 0 … 100 %
+    /// (default: `0`, which is never). Longer training can lose what generalises. It is written only where it is not the
+    /// default: settings from before it stay what they were.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub stop_at_success: f64,
+}
+
+fn is_zero(number: &f64) -> bool {
+    *number == 0.0
 }
 
 impl TrainConfig {
@@ -161,6 +179,7 @@ impl TrainConfig {
             architecture: common.architecture.to_string(),
             episodes_per_trial: settings.has_trials().then(|| settings.episodes_per_trial()),
             preset: common.preset,
+            observe: common.observe,
         }
     }
 
@@ -178,6 +197,8 @@ impl TrainConfig {
             let expected = if most == u64::MAX { "at least 1".to_owned() } else { format!("between 1 and {most}") };
             require((1..=most).contains(&value), key, value, expected)?;
         }
+        let rate = self.common.stop_at_success;
+        require((0.0..=100.0).contains(&rate), "stop_at_success", rate, "a success rate, 0 … 100 %")?;
         let architecture = self.common.architecture;
         if self.settings.has_trials() && architecture == Architecture::Ff {
             return Err(ConfigError::NeedsMemory { algorithm: self.settings.name() });
@@ -216,7 +237,10 @@ fn resolve(layers: &[(String, Table)]) -> Result<TrainConfig, ConfigError> {
     };
     let config = defaults::of(algorithm, architecture, preset);
     let mut defaults = config.full_table();
-    defaults.insert(PARAMETERS.into(), Value::Table(Table::new())); // empty, it is not written
+    // By default they are not written.
+    defaults.insert(PARAMETERS.into(), Value::Table(Table::new()));
+    defaults.insert("stop_at_success".into(), 0.0.into());
+    defaults.insert(OBSERVE.into(), Observe::default().to_string().into());
     for (origin, table) in layers {
         for (key, value) in table {
             check(origin, key, value, &defaults, name)?;
@@ -263,10 +287,11 @@ fn check(origin: &str, key: &str, value: &Value, defaults: &Table, algorithm: &'
     let algorithms = Settings::names();
     let choices: Option<&[&str]> = match key {
         ALGORITHM => Some(&algorithms),
-        "version" => Some(&["D", "R", "E"]),
+        "version" => Some(&Version::NAMES),
         ARCHITECTURE => Some(&Architecture::NAMES),
         "learning_rate_schedule" => Some(&["constant", "linear"]),
         PRESET => Some(&Preset::NAMES),
+        OBSERVE => Some(&Observe::NAMES),
         "rank_by" => Some(&["raw", "normalized"]),
         _ => None,
     };

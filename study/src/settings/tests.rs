@@ -114,6 +114,37 @@ fn a_table_without_the_papers_preset_has_no_younger_settings_that_are_as_before(
     }
 }
 
+#[test]
+fn a_success_rate_to_stop_at_is_written_only_where_there_is_one() {
+    for preset in ["perturb", "paper"] {
+        let config = |sets: &[&str]| of(preset, "ppo", Architecture::Ff, sets);
+        let (plain, named, stopping) = (config(&[]), config(&["stop_at_success=0"]), config(&["stop_at_success=99.5"]));
+        assert_eq!(plain, named);
+        assert!(!plain.full_table().contains_key("stop_at_success"), "what cells are named by stays");
+        assert_eq!(stopping.table().get("stop_at_success"), Some(&99.5.into()));
+        assert_eq!(load(Some(&stopping.to_toml()), &[], "").unwrap(), stopping);
+    }
+    for wrong in ["-1", "100.5", "nan"] {
+        let message = refusal(None, &[&format!("stop_at_success={wrong}")]);
+        assert!(message.contains("stop_at_success") && message.contains("a success rate, 0 … 100 %"), "{message}");
+    }
+}
+
+#[test]
+fn what_is_observed_is_written_only_where_it_is_not_the_default() {
+    for preset in ["perturb", "paper"] {
+        let config = |sets: &[&str]| of(preset, "ppo", Architecture::Ff, sets);
+        let (plain, named, seeing) = (config(&[]), config(&["observe=state"]), config(&["observe=parameters"]));
+        assert_eq!(plain, named);
+        assert!(!plain.full_table().contains_key("observe"), "what cells are named by stays, and so does config.toml");
+        assert_eq!(seeing.table().get("observe"), Some(&"parameters".into()));
+        assert_eq!(load(Some(&seeing.to_toml()), &[], "").unwrap(), seeing);
+        assert_eq!((plain.method().observe, seeing.method().observe), (Observe::State, Observe::Parameters));
+    }
+    let message = refusal(None, &["observe=everything"]);
+    assert!(message.contains("observe is \"everything\", but must be one of \"state\", \"parameters\""), "{message}");
+}
+
 /// The paper's ten pairs.
 fn pairs() -> impl Iterator<Item = (&'static str, Architecture)> {
     let all = Settings::names().into_iter().flat_map(|name| Architecture::ALL.map(|architecture| (name, architecture)));

@@ -1,6 +1,6 @@
 //! A policy in environments, played by the server and by a client that acts by itself.
 
-use crate::common::server::{Server, Session, doubles, environment, floats, mixed};
+use crate::common::server::{Server, Session, doubles, floats, mixed};
 use bytes::Bytes;
 use perturb::proto::{
     Act, Acted, AutoresetMode, EndedAt, Environment, Moments, Open, Policy, RandomStream, Reset, RewardMoments, Step,
@@ -29,11 +29,21 @@ pub struct Game {
     /// Whether observations and rewards are normalised.
     pub normalised: bool,
     pub testing: bool,
+    /// Whether parameters are observed.
+    pub sees: bool,
 }
 
 /// A training with everything on: CartPole, recurrent, RL².
-pub const FULL: Game =
-    Game { environment: "CartPole", n: 5, per_trial: 2, lstm: 6, outcomes: true, normalised: true, testing: false };
+pub const FULL: Game = Game {
+    environment: "CartPole",
+    n: 5,
+    per_trial: 2,
+    lstm: 6,
+    outcomes: true,
+    normalised: true,
+    testing: false,
+    sees: false,
+};
 
 /// A small feed-forward policy without normalisation in CartPole.
 pub const PLAIN: Game = Game { per_trial: 1, lstm: 0, outcomes: false, normalised: false, ..FULL };
@@ -53,6 +63,7 @@ impl Game {
             episodes_per_trial: self.per_trial,
             autoreset_mode: AutoresetMode::SameStep.into(),
             receipts: true,
+            observe_parameters: self.sees,
             ..Open::default()
         }
     }
@@ -85,10 +96,11 @@ impl Game {
         if !self.normalised {
             return Normalisers::default();
         }
-        let size = environment.observation.len();
+        let parameters = if self.sees { environment.parameters.len() } else { 0 };
+        let size = environment.observation.len() - parameters;
         let moments = |size| RunningMoments::from_parts(SEEN, vec![0.05; size], vec![80.0; size]);
         Normalisers {
-            observations: Some(ObservationNormaliser::from_moments(moments(size))),
+            observations: Some(ObservationNormaliser::from_moments(moments(size)).leaving_alone(parameters)),
             rewards: Some(
                 RewardNormaliser::from_parts(GAMMA, vec![0.0; self.n], moments(1)).running_on(self.return_runs_on()),
             ),
@@ -102,6 +114,7 @@ impl Game {
             mean: doubles(&vec![0.05; size]),
             squares: doubles(&vec![80.0; size]),
         };
+        let parameters = if self.sees { environment.parameters.len() } else { 0 };
         let rewards = || RewardMoments {
             gamma: GAMMA,
             returns: doubles(&vec![0.0; self.n]),
@@ -119,7 +132,7 @@ impl Game {
             hidden: vec![9, 7],
             lstm: self.lstm,
             outcomes: self.outcomes,
-            observations: self.normalised.then(|| of(environment.observation.len())),
+            observations: self.normalised.then(|| of(environment.observation.len() - parameters)),
             rewards: self.normalised.then(rewards),
             role: Some(role),
             state: None,
@@ -165,13 +178,13 @@ pub struct Client {
 
 impl Client {
     pub async fn begin(game: Game, server: &Server) -> Self {
-        let environment = environment(server.unix(), game.environment).await;
         let (session, opened) = Session::open(server.unix(), game.open()).await;
         let role = if game.testing {
             acting::Role::testing(SEED, game.open().first_environment_index, game.n)
         } else {
             acting::Role::training(SEED)
         };
+        let environment = opened.environment.unwrap();
         let (spec, inputs) = (game.spec(&environment), game.inputs(&environment));
         let normalisers = game.normalisers(&environment);
         let mut player = Player::new(&spec, inputs, game.n, game.per_trial, normalisers, role);

@@ -41,6 +41,9 @@ fn assert_same(got: &Acted, expected: &Acted) {
 #[case::feed_forward_trials("MountainCar", Game { lstm: 0, ..FULL })]
 #[case::test("CartPole", Game { testing: true, ..FULL })]
 #[case::continuous_test("Pendulum", Game { testing: true, ..PLAIN })]
+#[case::with_parameters("Pendulum", Game { sees: true, normalised: true, ..PLAIN })]
+#[case::trials_with_parameters("CartPole", Game { sees: true, ..FULL })]
+#[case::test_with_parameters("CartPole", Game { sees: true, testing: true, ..FULL })]
 #[tokio::test]
 async fn the_server_plays_the_bytes_of_a_client_that_acts_by_itself(
     #[case] environment: &'static str,

@@ -71,7 +71,7 @@ async fn wrong_requests_before_open_are_refused_and_open_still_works() {
         bad(|o| o.environment.clear()),
         bad(|o| o.environment = "x\0\n".into()),
         bad(|o| o.version = 0),
-        bad(|o| o.version = 4),
+        bad(|o| o.version = 5),
         bad(|o| o.version = -1),
         bad(|o| o.autoreset_mode = 0),
         bad(|o| o.autoreset_mode = 77),

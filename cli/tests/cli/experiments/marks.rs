@@ -8,7 +8,7 @@ use crate::common::{perturb, stderr, wait_for};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_study::Folder;
 
-/// Three cells of one kind, the last one of EPOpt, which learns from fewer episodes than it generates.
+/// Two cells that reach every number of episodes exactly, and one of EPOpt, which learns from fewer episodes than it generates.
 const PLAN: &str = "
 environments = ['CartPole']
 versions = ['D']
@@ -20,6 +20,7 @@ settings = { episodes = 60, num_envs = 4, checkpoint_interval = 15 }
 [[algorithm]]
 name = 'a2c'
 architectures = ['ff']
+settings = { num_envs = 1, learning_rate_schedule = 'constant' }
 grid = { learning_rate = [7e-3, 7e-4] }
 
 [[algorithm]]
@@ -110,18 +111,21 @@ fn the_policy_of_a_mark_is_that_of_a_training_that_ends_there() {
     let shorter = PLAN.replace("30, 60]", "30]").replace("= 60", "= 30");
     let [long, short] = [PLAN, &shorter].map(|plan| {
         let experiment = Experiment::new(plan);
-        succeeded(&experiment.run("out", &["--cell", "2"]));
+        succeeded(&experiment.run("out", &["--cell", "0,2"]));
         experiment
     });
-    let policy = |experiment: &Experiment, place: &str| {
-        let cell = Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[2].id);
-        let Checkpoint { state, weights, .. } = Checkpoint::load(&cell.training().join(place)).expect("a policy");
-        (state.counters, state.observation_normaliser, state.reward_normaliser, weights)
-    };
-    assert!(policy(&long, "marks/30") == policy(&short, "checkpoint"));
-    let (marked, ended) = (long.cell_result("out", 2), short.cell_result("out", 2));
-    assert_eq!((&marked.marks[&30].results, marked.marks.len()), (&ended.results, 2));
-    assert_eq!(marked.marks[&10], ended.marks[&10]);
+    for index in [0, 2] {
+        let policy = |experiment: &Experiment, place: &str| {
+            let cell = Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[index].id);
+            let Checkpoint { state, weights, .. } = Checkpoint::load(&cell.training().join(place)).expect("a policy");
+            (state.counters, state.observation_normaliser, state.reward_normaliser, weights)
+        };
+        assert!(policy(&long, "marks/30") == policy(&short, "checkpoint"), "cell {index}");
+        let (marked, ended) = (long.cell_result("out", index), short.cell_result("out", index));
+        assert_eq!((&marked.marks[&30].results, marked.marks.len()), (&ended.results, 2));
+        assert_eq!(marked.marks[&10], ended.marks[&10]);
+    }
+    assert_eq!(long.cell_result("out", 0).marks[&30].counters.episodes, 30, "reached exactly");
 }
 
 /// One that was deleted is made again.

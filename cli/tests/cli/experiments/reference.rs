@@ -2,6 +2,7 @@
 
 use super::{Experiment, succeeded};
 use crate::common::{perturb, stderr};
+use perturb_study::settings::Observe;
 
 /// Six cells of the random policy, two of a learner.
 const PLAN: &str = "
@@ -47,4 +48,131 @@ fn a_random_policy_is_tested_reported_and_played_again_like_any_other_but_not_tr
     assert!(text.contains("random policy (reference)"), "{text}{}", stderr(&output));
     let output = perturb(&["plan", "--measure", "1", "--jobs", "1"]).arg(experiment.out("file.toml")).output();
     succeeded(&output.expect("ended"));
+}
+
+/// Of two learners, whose policies see parameters or not, and of the random policy.
+const SEEING: &str = "
+environments = ['Pendulum']
+versions = ['R']
+test_versions = ['D', 'E']
+test_episodes = 12
+evaluate_at = [10]
+settings = { episodes = 20, num_envs = 4, observe = 'parameters' }
+
+[[algorithm]]
+name = 'ppo'
+architectures = ['ff']
+grid = { observe = ['state', 'parameters'] }
+settings = { n_steps = 64 }
+
+[[algorithm]]
+name = 'rl2-ppo'
+architectures = ['rc']
+settings = { n_steps = 32, n_epochs = 1 }
+
+[[algorithm]]
+name = 'random'
+architectures = ['ff']
+";
+
+#[test]
+fn policies_that_see_parameters_are_a_row_of_their_own_and_played_again_and_drawn_like_any_other() {
+    // The grid names what [settings] name, too: it stands above them.
+    let experiment = Experiment::new(SEEING);
+    succeeded(&experiment.run("out", &["--jobs", "1"]));
+    let results: Vec<_> = (0..4).map(|index| experiment.cell_result("out", index)).collect();
+    let seen = results.iter().map(|result| result.training.method.observe).collect::<Vec<_>>();
+    assert_eq!(seen, [Observe::State, Observe::Parameters, Observe::Parameters, Observe::Parameters]);
+    assert!(results[0].results != results[1].results);
+
+    succeeded(&experiment.run("alone", &["--jobs", "1", "--group", "1"]));
+    assert!(experiment.results("out") == experiment.results("alone"), "alone, acting at the server, and together");
+    let output = perturb(&["audit", "--all"]).arg(experiment.out("out")).output().expect("ended");
+    assert!(output.stdout.starts_with(b"192 of 192 episodes of 8 policies"), "{output:?}");
+    succeeded(&experiment.heatmap("out", &[]));
+    let output = perturb(&["report"]).arg(experiment.out("out")).output().expect("ended");
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    for row in ["ppo ff  ", "ppo ff (sees parameters)", "random policy (reference) (sees parameters)"] {
+        assert!(text.contains(row), "{row}: {text}{}", stderr(&output));
+    }
+    let output = perturb(&["plan", "--measure", "1", "--jobs", "1"]).arg(experiment.out("file.toml")).output();
+    succeeded(&output.expect("ended"));
+}
+
+#[test]
+fn a_checkpoint_knows_what_its_policy_sees() {
+    let out = tempfile::tempdir().expect("a directory");
+    let run = out.path().join("run");
+    let run = run.to_str().expect("a path");
+    let episodes = |more: &[&str]| {
+        let output = perturb(more).output().expect("ended");
+        succeeded(&output);
+        String::from_utf8_lossy(&output.stdout).into_owned()
+    };
+    let train = ["train", "--env", "CartPole", "--version", "R", "--episodes", "40", "--out", run];
+    episodes(&[&train[..], &["--observe", "parameters", "--set", "n_steps=32"]].concat());
+    let told = episodes(&["evaluate", "--checkpoint", run, "--episodes", "12"]);
+    assert!(told.contains("CartPole ppo ff (sees parameters), trained on R"), "{told}");
+    let json = out.path().join("evaluated.json");
+    episodes(&["evaluate", "--checkpoint", run, "--episodes", "12", "--json", json.to_str().expect("a path")]);
+    let told = std::fs::read_to_string(json).expect("a document");
+    assert!(told.contains("\"observe\": \"parameters\""), "{told}");
+    let video = out.path().join("video.gif");
+    episodes(&[
+        "video",
+        "--checkpoint",
+        run,
+        "--out",
+        video.to_str().expect("a path"),
+        "--width",
+        "240",
+        "--height",
+        "240",
+    ]);
+    let heatmap = out.path().join("heatmap");
+    let heatmap = heatmap.to_str().expect("a path");
+    episodes(&["heatmap", "--checkpoint", run, "--grid", "2", "--episodes", "1", "--out", heatmap]);
+    let output = perturb(&[&train[..7], &["--observe", "all", "--out", run]].concat()).output().expect("ended");
+    assert!(stderr(&output).contains("possible values: state, parameters"), "{}", stderr(&output));
+}
+
+/// What is trained on both R and E, beside D.
+const BOTH: &str = "
+environments = ['CartPole']
+versions = ['D', 'R+E']
+test_versions = ['D', 'R', 'E', 'R+E']
+test_episodes = 12
+evaluate_at = [10]
+settings = { episodes = 40 }
+
+[[algorithm]]
+name = 'a2c'
+architectures = ['ff']
+grid = { learning_rate = [7e-3, 7e-4] }
+";
+
+#[test]
+fn what_is_trained_on_r_and_e_stands_beside_the_scenarios() {
+    let experiment = Experiment::new(BOTH);
+    succeeded(&experiment.run("out", &["--jobs", "1"]));
+    let results: Vec<_> = (0..4).map(|index| experiment.cell_result("out", index)).collect();
+    let of_both = results.iter().filter(|result| result.id.starts_with("CartPole-a2c-ff-R-or-E-")).count();
+    assert_eq!(of_both, 2);
+    assert!(results.iter().all(|result| result.results.keys().eq(["D", "E", "R", "R+E"])));
+
+    let output = perturb(&["audit", "--all"]).arg(experiment.out("out")).output().expect("ended");
+    assert!(output.stdout.starts_with(b"384 of 384 episodes of 8 policies"), "{output:?}");
+    let output = perturb(&["report"]).arg(experiment.out("out")).output().expect("ended");
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(text.contains("the nine scenarios, and R+E for reference"), "{text}{}", stderr(&output));
+    let row = text.lines().find(|line| line.contains(" R+E ") && !line.contains("tested on")).expect("a row");
+    assert!(!row.contains("missing") && text.contains("on R+E"), "{text}");
+    let page = experiment.page("out");
+    assert!(page.contains("trained on R+E"), "curves and tests of earlier moments");
+    let files = std::fs::read_dir(experiment.out("out").join("report")).expect("a folder");
+    let names: Vec<String> = files.map(|file| file.expect("a file").file_name().into_string().expect("text")).collect();
+    assert!(
+        names.iter().any(|name| name.contains("R-or-E")) && names.iter().all(|name| !name.contains('+')),
+        "{names:?}"
+    );
 }

@@ -7,6 +7,7 @@ use std::process::Output;
 use super::{Experiment, PLAN, kill_all, succeeded};
 use crate::common::{perturb, stderr, wait_for};
 use perturb_study::Folder;
+use perturb_study::records::Records;
 
 #[test]
 fn a_report_is_the_same_however_often_the_run_was_broken_off() {
@@ -40,7 +41,7 @@ fn a_report_is_the_same_however_often_the_run_was_broken_off() {
     }
 
     let page = String::from_utf8_lossy(&whole["page"]).into_owned();
-    assert!(page.matches("<svg").count() == 15 && page.matches("<table").count() == 14, "every picture and table");
+    assert!(page.matches("<svg").count() == 15 && page.matches("<table").count() == 15, "every picture and table");
     let pictures = ["profiles.png", "Pendulum-E-parameters.svg", "CartPole-thresholds.svg"];
     assert!(pictures.iter().all(|name| whole.contains_key(*name)), "{:?}", whole.keys());
     assert!(!page.contains("<script") && !page.contains("src=") && !page.contains("@import"), "it needs nothing else");
@@ -132,6 +133,84 @@ fn a_heatmap_is_drawn_of_two_parameters_and_others_are_refused() {
     assert_eq!(draw(&["--x", "force"]).status.code(), Some(2), "one parameter is not enough");
 }
 
+/// A file's content as text.
+fn text(path: &Path) -> String {
+    std::fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}
+
+/// The figures of a heatmap's CSV, without its head.
+fn figures(path: &Path) -> Vec<Vec<f64>> {
+    let numbers = |line: &str| line.split(',').map(|field| field.parse().expect("a number")).collect();
+    text(path).lines().skip(1).map(numbers).collect()
+}
+
+#[test]
+fn a_heatmap_of_several_policies_is_their_mean_and_of_one_environment() {
+    let experiment = Experiment::new(
+        "environments = ['CartPole', 'Pendulum']\nversions = ['D']\nruns = 2
+        test_episodes = 4\nsettings = { episodes = 40, num_envs = 4 }
+        [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']",
+    );
+    succeeded(&experiment.run("out", &["--jobs", "2"]));
+    let folder = Folder::new(&experiment.out("out"));
+    let trainings: Vec<PathBuf> = experiment.plan.cells.iter().map(|cell| folder.cell(&cell.id).training()).collect();
+    let elsewhere = tempfile::tempdir().expect("a directory");
+    let draw = |trainings: &[&PathBuf], arguments: &[&str]| {
+        let mut command = perturb(&["heatmap"]);
+        command.args(arguments).arg("--checkpoint").args(trainings).current_dir(elsewhere.path());
+        command.output().expect("ended")
+    };
+    let small = |more: &[&'static str]| [&["--grid", "2", "--episodes", "2"], more].concat();
+    let [a, b, pendulum] = [&trainings[0], &trainings[1], &trainings[2]];
+    succeeded(&draw(&[a], &small(&["--out", "a"])));
+    succeeded(&draw(&[b], &small(&["--out", "b"])));
+    succeeded(&draw(&[a, b], &small(&[])));
+    let at = |name: &str| elsewhere.path().join(name);
+    let both = figures(&at("CartPole-2-policies-length-mass.csv"));
+    let alone = [figures(&at("a.csv")), figures(&at("b.csv"))];
+    let mean = |(a, b): (&Vec<f64>, &Vec<f64>)| a.iter().zip(b).map(|(a, b)| (a + b) / 2.0).collect::<Vec<f64>>();
+    assert_eq!(both, alone[0].iter().zip(&alone[1]).map(mean).collect::<Vec<_>>());
+    assert_ne!(alone[0], alone[1]);
+    assert!(text(&at("CartPole-2-policies-length-mass.svg")).contains("trained on D, 2 policies"));
+    let records = ["1", "2"].map(|number| format!("CartPole-2-policies-length-mass.{number}.parquet"));
+    succeeded(&draw(&[a, b], &["--out", "again", "--records", &records[0], &records[1]]));
+    assert_eq!(figures(&at("again.csv")), both, "without playing");
+
+    let output = draw(&[a, pendulum], &small(&[]));
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(2), "{said}");
+    assert!(
+        said.contains("was trained in CartPole") && said.contains("in Pendulum: a picture is of one environment"),
+        "{said}"
+    );
+    let output = draw(&[a, b, a], &small(&[]));
+    assert!(output.status.code() == Some(2) && stderr(&output).contains("twice: a mean is over different policies"));
+    let output = draw(&[a, b], &["--records", &records[0]]);
+    let said = stderr(&output);
+    assert!(output.status.code() == Some(2) && said.contains("1 files for 2 policies; give one for each"), "{said}");
+
+    // The third parameter, force: of D everywhere the default, of E drawn for each episode.
+    succeeded(&draw(&[a], &small(&["--base", "E"])));
+    let forces = |name: &str| -> Vec<f64> {
+        let records = Records::read(&at(name)).expect("records");
+        let place = records.about.parameters.iter().position(|parameter| parameter.name == "force").expect("there");
+        records.episodes.iter().map(|episode| episode.requested[place]).collect()
+    };
+    assert_eq!(forces("a.parquet"), [10.0; 8]);
+    let of_e = "CartPole-a2c-ff-D-s1-length-mass-E.parquet";
+    let drawn = forces(of_e);
+    assert!(drawn.iter().all(|force| (1.0..=5.0).contains(force) || (15.0..=20.0).contains(force)), "{drawn:?}");
+    let different: BTreeSet<u64> = drawn.iter().map(|force| force.to_bits()).collect();
+    assert_eq!(different.len(), 8);
+    let picture = text(&at("CartPole-a2c-ff-D-s1-length-mass-E.svg"));
+    assert!(picture.contains("other parameters drawn from E"));
+    succeeded(&draw(&[a], &["--out", "again-e", "--records", of_e]));
+    assert_eq!(text(&at("again-e.svg")), picture, "the file knows what was drawn");
+
+    succeeded(&draw(&[a], &small(&["--base", "R+E"])));
+    assert!(text(&at("CartPole-a2c-ff-D-s1-length-mass-R-or-E.svg")).contains("drawn from R+E"));
+}
+
 /// Every file of a run's heatmaps.
 fn heatmap_files(out: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let entries = std::fs::read_dir(out.join("heatmaps")).expect("a folder");
@@ -139,51 +218,66 @@ fn heatmap_files(out: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     paths.map(|path| (path.clone(), std::fs::read(path).expect("read"))).collect()
 }
 
-/// How many pictures are in a page.
-fn embedded(page: &str) -> usize {
-    page.matches("<img ").count()
+/// What the heatmaps that a page shows are of.
+fn embedded(page: &str) -> Vec<&str> {
+    let names = page.split("aria-label=\"").skip(1).filter_map(|rest| rest.split('"').next());
+    names.filter(|name| name.contains("mean return and success over ")).collect()
+}
+
+/// How many heatmaps are made, and how many were there already.
+fn made(experiment: &Experiment, arguments: &[&str]) -> (usize, usize) {
+    let output = experiment.heatmap("out", arguments);
+    succeeded(&output);
+    let made = String::from_utf8_lossy(&output.stdout).lines().filter(|line| line.ends_with(" and .parquet")).count();
+    (made, stderr(&output).matches("is there already").count())
 }
 
 #[test]
 fn heatmaps_of_an_experiment_are_made_once_and_are_in_its_report() {
-    let experiment = Experiment::new(&PLAN.replace("['D', 'R']", "['D', 'E']"));
+    let experiment = Experiment::new(&PLAN.replace("['D', 'R']", "['D', 'E']\nruns = 2"));
     succeeded(&experiment.run("out", &["--jobs", "2"]));
     let out = experiment.out("out");
-    // How many are made, and how many were there already.
-    let heatmaps = |arguments: &[&str]| {
-        let output = experiment.heatmap("out", arguments);
-        succeeded(&output);
-        (String::from_utf8_lossy(&output.stdout).lines().count(), stderr(&output).matches("is there already").count())
-    };
     let without = experiment.page("out");
-    assert_eq!(embedded(&without), 0);
-    assert!(without.contains("not there: 4 of 4. <code>perturb heatmap DIR</code> makes them"));
+    assert!(embedded(&without).is_empty());
+    assert!(without.contains("not there: 8 of 8. <code>perturb heatmap DIR</code> makes them"));
 
-    // Two environments, trained on D and on E; the better of two configurations.
-    assert_eq!(heatmaps(&[]), (4, 0));
-    assert_eq!(heatmaps(&[]), (0, 4), "made once");
+    // Two environments, trained on D and on E in two runs; the better of two configurations.
+    assert_eq!(made(&experiment, &["--runs", "1"]), (4, 0));
+    let partial = experiment.page("out");
+    assert_eq!(embedded(&partial).len(), 2, "one of each environment");
+    assert!(partial.contains("not there: 4 of 8.") && partial.contains("trained on E, 1 of 2 runs"));
+    assert_eq!(made(&experiment, &[]), (4, 4));
+    assert_eq!(made(&experiment, &[]), (0, 8), "made once");
     let with = experiment.page("out");
-    assert_eq!(embedded(&with), 4);
-    assert!(!with.contains("not there") && !with.contains("src=\"http") && !with.contains("<script"));
+    assert!(embedded(&with).len() == 2 && with.matches("trained on E, 2 runs").count() == 2);
+    assert!(!with.contains("not there") && !with.contains("src=") && !with.contains("<script"));
     assert_eq!(with, experiment.page("out"), "the same folder, the same bytes");
     let first = heatmap_files(&out);
-    assert_eq!(first.len(), 20, "four files and a record of each");
+    assert_eq!(first.len(), 24, "two files and a record of each");
+    let pictures = ["CartPole", "Pendulum"].map(|environment| {
+        let (x, y) = if environment == "CartPole" { ("length", "mass") } else { ("mass", "length") };
+        out.join(format!("report/{environment}-a2c-ff-heatmap-{x}-{y}"))
+    });
+    for picture in &pictures {
+        assert!(with.contains(&text(&picture.with_extension("svg"))), "the page has the same picture");
+        assert_eq!(text(&picture.with_extension("csv")).lines().count(), 9, "two columns of four points");
+    }
 
-    // Half a picture does not count, nor one of a result that has been replaced.
-    let is_picture = |path: &&PathBuf| path.extension().is_some_and(|ending| ending == "png");
-    let damaged = first.keys().find(is_picture).expect("one");
-    std::fs::write(damaged, b"\x89PNG").expect("written");
-    assert_eq!(embedded(&experiment.page("out")), 3);
-    assert_eq!(heatmaps(&[]), (1, 3));
+    // Half of the figures do not count, nor those of a result that has been replaced.
+    let damaged = first.keys().find(|path| path.extension().is_some_and(|ending| ending == "csv")).expect("one");
+    std::fs::write(damaged, b"mass,").expect("written");
+    assert!(experiment.page("out").contains("not there: 1 of 8."));
+    assert_eq!(made(&experiment, &[]), (1, 7));
     assert_eq!(heatmap_files(&out), first, "the same bytes again");
-    let id = damaged.file_stem().expect("a name").to_string_lossy().into_owned();
-    let result = Folder::new(&out).cell(&id).path().join("result.json");
-    let text = std::fs::read_to_string(&result).expect("a result");
-    std::fs::write(&result, text.replace("\"command\": \"perturb", "\"command\": \"/bin/perturb")).expect("written");
+    let name = damaged.file_stem().expect("a name").to_string_lossy().into_owned();
+    let id = experiment.plan.cells.iter().map(|cell| &cell.id).find(|id| name.starts_with(*id)).expect("a cell");
+    let result = Folder::new(&out).cell(id).path().join("result.json");
+    let written = text(&result).replace("\"command\": \"perturb", "\"command\": \"/bin/perturb");
+    std::fs::write(&result, written).expect("written");
     let outdated = experiment.page("out");
-    assert!(embedded(&outdated) == 3 && outdated.contains("the heatmap is of an earlier result"));
-    assert_eq!(heatmaps(&["--seed", "2"]), (4, 0), "other settings, other heatmaps");
-    without_its_checkpoint(&experiment, &id);
+    assert!(embedded(&outdated).len() == 2 && outdated.contains("1: the heatmap is of an earlier result"));
+    assert_eq!(made(&experiment, &["--seed", "3"]), (8, 0), "other settings, other heatmaps");
+    without_its_checkpoint(&experiment, id);
 }
 
 /// Without the checkpoint that a result came from there is no heatmap of it, and the others are made.
@@ -192,14 +286,49 @@ fn without_its_checkpoint(experiment: &Experiment, id: &str) {
     let output = experiment.heatmap("out", &[]);
     assert_eq!(output.status.code(), Some(1));
     let said = stderr(&output);
-    assert!(said.contains("holds no checkpoint") && said.contains("1 of 4 heatmaps"), "{said}");
-    assert_eq!(String::from_utf8_lossy(&output.stdout).lines().count(), 3);
+    assert!(said.contains("holds no checkpoint") && said.contains("1 of 8 heatmaps"), "{said}");
+    assert_eq!(String::from_utf8_lossy(&output.stdout).lines().count(), 7 + 2, "and two pictures");
 }
 
 #[test]
-fn an_experiment_has_its_environments_usual_parameters() {
-    let experiment = Experiment::new(PLAN);
-    assert_eq!(experiment.heatmap(".", &["--x", "force", "--y", "mass"]).status.code(), Some(2));
+fn heatmaps_of_an_experiment_are_over_any_parameters_that_its_environments_have() {
+    let plan = PLAN.replace("versions = ['D', 'E']", "versions = ['D']").replace("7e-3, 7e-4", "7e-4");
+    let experiment = Experiment::new(&plan);
+    succeeded(&experiment.run("out", &["--jobs", "2"]));
+    let output = experiment.heatmap("out", &["--x", "force", "--y", "mass"]);
+    succeeded(&output);
+    assert!(
+        stderr(&output).contains("Pendulum has no parameter `force`, only length, mass: left out"),
+        "{}",
+        stderr(&output)
+    );
+    assert_eq!(made(&experiment, &["--base", "R"]), (2, 0));
+    assert_eq!(made(&experiment, &[]), (2, 0));
+    let page = experiment.page("out");
+    let [cart_pole, pendulum] =
+        ["CartPole, a2c ff", "Pendulum, a2c ff"].map(|of| format!("{of}: mean return and success over"));
+    let expected = [
+        format!("{cart_pole} force and mass"),
+        format!("{cart_pole} length and mass"),
+        format!("{cart_pole} length and mass, the others drawn from R"),
+        format!("{pendulum} mass and length"),
+        format!("{pendulum} mass and length, the others drawn from R"),
+    ];
+    assert_eq!(embedded(&page), expected, "every pair that is there");
+    assert!(!page.contains("not there"));
+
+    let none = experiment.heatmap("out", &["--x", "force", "--y", "colour"]);
+    assert_eq!(none.status.code(), Some(1));
+    assert!(
+        stderr(&none).contains("no environment of this experiment has two parameters to show"),
+        "{}",
+        stderr(&none)
+    );
+    let same = experiment.heatmap("out", &["--x", "mass", "--y", "mass"]);
+    assert!(same.status.code() == Some(1) && stderr(&same).contains("`mass` cannot be an axis"), "{}", stderr(&same));
+    for wrong in [&["--x", "mass"][..], &["--parameters", "force=7"], &["--runs", "0"], &["--out", "x"]] {
+        assert_eq!(experiment.heatmap("out", wrong).status.code(), Some(2), "{wrong:?}");
+    }
 }
 
 #[test]

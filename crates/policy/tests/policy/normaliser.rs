@@ -138,3 +138,23 @@ fn a_stored_normaliser_goes_on_exactly() {
         assert_eq!(stored, (observations.clone(), rewards.clone()));
     }
 }
+
+#[test]
+fn what_is_left_alone_is_neither_taken_in_nor_changed() {
+    let rows = [[1.0f32, 5.0, -3.0], [3.0, 5.0, 70.0]].concat();
+    let mut normaliser = ObservationNormaliser::new(1).leaving_alone(2);
+    normaliser.update(&rows).expect("rows");
+    assert_eq!((normaliser.moments().count(), normaliser.moments().mean()), (2, &[2.0][..]));
+    let mut normalised = rows;
+    normaliser.normalise(&mut normalised).expect("rows");
+    let ends = [&normalised[1..3], &normalised[4..]].concat();
+    assert_eq!(ends, [5.0, -3.0, 5.0, 70.0], "not even a constant, nor beyond the clip");
+    // The square root of 1 + 10⁻⁸, in float32.
+    assert!((normalised[0] + 1.0).abs() < 1e-6 && (normalised[3] - 1.0).abs() < 1e-6, "{normalised:?}");
+    assert_eq!(normaliser.check(3, 2), Ok(()));
+    assert!(normaliser.check(3, 0).is_err() && normaliser.check(2, 2).is_err());
+    let json = serde_json::to_string(&normaliser).expect("JSON");
+    assert_eq!(serde_json::from_str::<ObservationNormaliser>(&json).expect("the same type"), normaliser);
+    let usual = serde_json::to_string(&ObservationNormaliser::new(1)).expect("JSON");
+    assert!(!usual.contains("left_alone"), "earlier checkpoints have no such field, and others none either: {usual}");
+}

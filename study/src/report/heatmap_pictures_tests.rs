@@ -1,0 +1,168 @@
+use super::*;
+use crate::fixture;
+use crate::heatmaps::store_heatmap;
+use crate::plan::{Cell, Plan};
+use crate::{HeatmapOptions, Version};
+
+const PLAN: &str = "environments = ['Pendulum', 'Elsewhere']\nruns = 2
+    [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+
+/// A folder in which everything has a result, whose heatmaps are those that `heatmap` makes of a cell.
+fn folder(plan: &Plan, heatmap: impl Fn(&Cell) -> Option<Heatmap>) -> tempfile::TempDir {
+    let directory = tempfile::tempdir().unwrap();
+    let folder = Folder::new(directory.path());
+    for cell in &plan.cells {
+        write_atomically(&folder.cell(&cell.id).path().join("result.json"), b"{}").unwrap();
+        if let Some(heatmap) = heatmap(cell) {
+            store(&folder, cell, &heatmap);
+        }
+    }
+    directory
+}
+
+fn store(folder: &Folder, cell: &Cell, heatmap: &Heatmap) {
+    let Heatmap { axes, base, grid, episodes, fixed, .. } = heatmap.clone();
+    let (parameters, seed) = (axes.map(|axis| axis.name), cell.config.common.seed);
+    let options = HeatmapOptions { parameters, base, grid, episodes, seed, fixed };
+    store_heatmap(folder, cell, "1".into(), options, heatmap).unwrap();
+}
+
+fn pictures(plan: &Plan, folder: &Folder) -> Vec<HeatmapPicture> {
+    let results = fixture::results(plan, |_| Some(([0.0; 3], 0.0)));
+    heatmap_pictures(&results.select(), folder).unwrap()
+}
+
+fn is_of(cell: &Cell, environment: &str, algorithm: &str) -> bool {
+    (cell.config.common.environment.as_str(), cell.method().algorithm.as_str()) == (environment, algorithm)
+}
+
+/// Better on the side of what it was trained on, the second run by 40 points.
+fn trained(cell: &Cell) -> Heatmap {
+    let of_run = 20.0 * f64::from(cell.run * 2 - 1);
+    let reach = [0.3, 0.5, 0.9][cell.config.common.version as usize];
+    fixture::heatmap(6, |mass, length| {
+        let far = (mass - 1.0).hypot(length - 1.0);
+        let success = (100.0 - (far - reach).max(0.0) * 200.0 - of_run).clamp(0.0, 100.0);
+        (-1600.0 + 14.0 * success - 90.0 * mass, success)
+    })
+}
+
+#[test]
+fn a_picture_is_of_the_mean_over_runs_and_says_how_many() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    // Of A2C both runs on D, the first on R, nothing on E.
+    let version = |cell: &Cell| cell.config.common.version;
+    let is_there = |cell: &Cell| version(cell) == Version::D || (version(cell) == Version::R && cell.run == 1);
+    let made = |cell: &Cell| (is_of(cell, "Pendulum", "a2c") && is_there(cell)).then(|| trained(cell));
+    let directory = folder(&plan, made);
+    let pictures = pictures(&plan, &Folder::new(directory.path()));
+    assert_eq!(pictures.len(), 4, "of two environments and methods");
+    let picture = &pictures[0];
+    let panels = picture.panels.as_ref().unwrap();
+    let captions: Vec<&str> = panels.columns.iter().map(|column| column.caption.as_str()).collect();
+    assert_eq!(captions, ["trained on D, 2 runs", "trained on R, 1 of 2 runs", "trained on E, 0 of 2 runs"]);
+    let runs: Vec<Heatmap> = plan.cells.iter().filter_map(made).collect();
+    assert_eq!(
+        panels.columns[0].content.as_ref().unwrap(),
+        &Heatmap::mean(&[runs[0].clone(), runs[1].clone()]).unwrap()
+    );
+    assert_eq!(panels.columns[1].content.as_ref().unwrap(), &runs[2]);
+    assert_eq!(panels.columns[2].content, Err("the heatmap has not been made".into()));
+    assert_eq!(
+        picture.caption.replace(crate::VERSION, "VERSION"),
+        "Pendulum, a2c ff: mean return and success over mass and length. Means over runs: 2 runs trained on D; 1 of 2 runs \
+         trained on R (run 2: the heatmap has not been made); 0 of 2 runs trained on E (run 1: the heatmap has not been \
+         made, run 2: the heatmap has not been made). 6 × 6 points of 20 episodes of each policy, test seeds 1, 2. perturb \
+         VERSION."
+    );
+    assert_eq!((picture.wanted, picture.missing.len()), (6, 3));
+    let csv = String::from_utf8(picture.figures.to_csv()).unwrap();
+    assert!(csv.starts_with("train,runs,mass,length,mean_return,success_percent\nD,2,0.5833333333333334,"), "{csv}");
+    assert_eq!((csv.lines().count(), csv.lines().filter(|line| line.starts_with("R,1,")).count()), (73, 36));
+
+    let nothing = &pictures[1];
+    assert_eq!((&nothing.panels, nothing.missing.len()), (&None, 6), "nothing of PPO");
+    assert_eq!(
+        nothing.caption,
+        "Pendulum, ppo ff: mean return and success over mass and length: the heatmap has not been made."
+    );
+    let out = tempfile::tempdir().unwrap();
+    let others = ["iqm.csv", "Pendulum-a2c-ff-heatmap-mass-length-R.svg"];
+    for name in others {
+        write_atomically(&out.path().join(name), b"").unwrap();
+    }
+    assert_eq!(save_heatmaps(&pictures, out.path()).unwrap(), ["Pendulum-a2c-ff-heatmap-mass-length"]);
+    let names = ["svg", "png", "csv"].map(|ending| format!("Pendulum-a2c-ff-heatmap-mass-length.{ending}"));
+    assert!(names.iter().all(|name| out.path().join(name).exists()));
+    assert!(out.path().join(others[0]).exists(), "not a heatmap's");
+    assert_eq!(std::fs::read_dir(out.path()).unwrap().count(), 4, "the picture of a heatmap that is gone is gone, too");
+    insta::with_settings!({ prepend_module_to_snapshot => false }, {
+        insta::assert_snapshot!("heatmap", svg(panels).unwrap());
+    });
+}
+
+#[test]
+fn returns_have_one_scale_in_an_environment_and_success_always_the_same() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let of = |cell: &Cell| match cell.config.common.environment.as_str() {
+        "Pendulum" if cell.method().algorithm == "a2c" => -1600.0,
+        "Pendulum" => -200.0,
+        _ => 5.0,
+    };
+    let directory = folder(&plan, |cell| Some(fixture::heatmap(2, |mass, _| (of(cell) + mass, 0.0))));
+    let folder = Folder::new(directory.path());
+    // Over other parameters, of one of them.
+    let cell = plan.cells.iter().find(|cell| is_of(cell, "Pendulum", "ppo")).unwrap();
+    store(&folder, cell, &Heatmap { base: Version::R, ..fixture::heatmap(3, |_, _| (-9000.0, 0.0)) });
+    let pictures = pictures(&plan, &folder);
+    let scales: Vec<_> = pictures
+        .iter()
+        .filter_map(|picture| Some((picture.file.as_str(), picture.panels.as_ref()?.returns.clone())))
+        .collect();
+    let (pendulum, elsewhere) = (-9000.0..-198.75, 5.75..6.25);
+    assert_eq!(
+        scales,
+        [
+            ("Pendulum-a2c-ff-heatmap-mass-length", pendulum.clone()),
+            ("Pendulum-ppo-ff-heatmap-mass-length", pendulum.clone()),
+            ("Pendulum-ppo-ff-heatmap-mass-length-R", pendulum),
+            ("Elsewhere-a2c-ff-heatmap-mass-length", elsewhere.clone()),
+            ("Elsewhere-ppo-ff-heatmap-mass-length", elsewhere),
+        ]
+    );
+    let drawn = pictures.iter().find(|picture| picture.file == "Pendulum-ppo-ff-heatmap-mass-length-R").unwrap();
+    assert!(drawn.caption.contains("over mass and length, the others drawn from R."), "{}", drawn.caption);
+    assert!(drawn.panels.as_ref().unwrap().title[1].ends_with("other parameters drawn from R"));
+}
+
+#[test]
+fn only_heatmaps_of_the_same_points_and_as_many_episodes_are_in_a_mean() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let first = fixture::heatmap(2, |_, _| (0.0, 0.0));
+    for other in [fixture::heatmap(3, |_, _| (9.0, 9.0)), Heatmap { episodes: 5, ..first.clone() }] {
+        let directory = folder(&plan, |cell| Some(if cell.run == 1 { first.clone() } else { other.clone() }));
+        let pictures = pictures(&plan, &Folder::new(directory.path()));
+        let panels = pictures[0].panels.as_ref().unwrap();
+        assert!(panels.columns.iter().all(|column| column.content.as_ref() == Ok(&first)));
+        assert_eq!(pictures[0].missing, [NoHeatmap::NotAlike; 3]);
+        assert!(pictures[0].caption.contains("1 of 2 runs trained on E (run 2: the heatmap has another grid"));
+    }
+}
+
+#[test]
+fn of_an_experiment_without_heatmaps_it_is_said_why() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let directory = tempfile::tempdir().unwrap();
+    let folder = Folder::new(directory.path());
+    let results = fixture::results(&plan, |cell| is_of(cell, "Pendulum", "a2c").then_some(([0.0; 3], 0.0)));
+    let pictures = heatmap_pictures(&results.select(), &folder).unwrap();
+    let captions: Vec<&str> = pictures.iter().map(|picture| picture.caption.as_str()).collect();
+    assert_eq!(captions.len(), 4);
+    assert_eq!(captions[0], "Pendulum, a2c ff: mean return and success: the heatmap has not been made.");
+    assert!(
+        captions[1..].iter().all(|caption| caption.ends_with("no heatmap, since this training has no result yet."))
+    );
+    assert!(
+        pictures.iter().all(|picture| picture.panels.is_none() && picture.wanted == 6 && picture.missing.len() == 6)
+    );
+}
