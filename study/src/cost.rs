@@ -187,7 +187,8 @@ mod tests {
     fn plan() -> Plan {
         let text = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 3\ntest_episodes = 10
             settings = { episodes = 100 }\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff', 'rc']
-            grid = { n_steps = [5, 10, 15] }\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+            grid = { n_steps = [5, 10, 15] }\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']
+            settings = { n_steps = 32 }";
         Plan::parse("test", text.into()).unwrap()
     }
 
@@ -212,7 +213,7 @@ mod tests {
         // Of CartPole with FF there are nine cells of A2C and three of PPO: groups of six.
         assert_eq!(chosen(&all, 6)[0].1, [10, 15, 15, 5, 5, 10], "all over the grid");
         assert_eq!(chosen(&all, 6)[2].1.len(), 3, "there are no more");
-        assert_eq!(chosen(&[18, 19], 36), [("CartPole ppo ff".to_owned(), vec![128, 128])], "those that are asked for");
+        assert_eq!(chosen(&[18, 19], 36), [("CartPole ppo ff".to_owned(), vec![32, 32])], "those that are asked for");
     }
 
     #[test]

@@ -123,7 +123,14 @@ pub fn sync_folder(path: &Path) -> Result<()> {
 
 /// An advisory lock: it ends with the process that holds it, however it ends.
 #[derive(Debug)]
-pub struct Lock(#[expect(dead_code, reason = "unlocked when it is closed")] File);
+pub struct Lock(File);
+
+impl Drop for Lock {
+    /// A process that is just being started has copies of all open files for a moment: closing this one does not unlock it.
+    fn drop(&mut self) {
+        let _ = self.0.unlock(); // a failure leaves it to the closing
+    }
+}
 
 impl Lock {
     /// Takes the lock of the folder at `path`, or of a file, which is created if it is not there; `None` while somebody
@@ -157,6 +164,17 @@ fn if_there<T>(result: std::io::Result<T>) -> std::io::Result<Option<T>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_lock_ends_with_its_value_although_a_started_process_has_the_open_file() {
+        let directory = tempfile::tempdir().unwrap();
+        let lock = Lock::try_take(directory.path()).unwrap().unwrap();
+        let copy = lock.0.try_clone().unwrap(); // as a process gets it
+        assert!(Lock::try_take(directory.path()).unwrap().is_none());
+        drop(lock);
+        assert!(Lock::try_take(directory.path()).unwrap().is_some());
+        drop(copy);
+    }
 
     #[test]
     fn a_file_that_is_written_whole_is_as_readable_as_others() {

@@ -1,5 +1,6 @@
 //! Players and what servers played, between the protocol and the domain.
 
+use std::io::ErrorKind;
 use std::ops::Range;
 
 use bytes::Bytes;
@@ -19,7 +20,8 @@ use crate::proto;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ActAt {
     /// At the server, if it can: a line's delay is then paid once a rollout, not at each step. Trainings over several
-    /// servers, and several trainings together, choose theirs at the client all the same.
+    /// servers, and several together whose rollouts are [short](perturb_study::settings::Rollouts),
+    /// choose theirs at the client all the same.
     #[default]
     Server,
     /// At the client.
@@ -51,10 +53,42 @@ impl Session<'_> {
             |part| request(part.range.clone()),
             |part, acted: proto::Acted| {
                 let played = part.played(acted)?;
-                let expected = "arrays as the protocol describes them";
-                take(part.range.clone(), played).map_err(|got| part.stream.mismatch::<proto::Act>(got, expected.into()))
+                take(part.range.clone(), played).map_err(|got| part.misplayed(got))
             },
         )
+    }
+
+    /// Asks the one server of a batch that is [played as a whole](Session::plays_together) to play, without waiting for its
+    /// reply, which [`Session::played`] takes.
+    ///
+    /// # Errors
+    /// The failures of a connection.
+    pub fn ask_to_play(&mut self, act: proto::Act) -> Result<(), ClientError> {
+        let Self { servers, parts, .. } = self;
+        let [part] = parts.as_mut_slice() else { return Err(not_played_together()) };
+        let sent = servers.block_on(async {
+            part.stream.send(act).await?;
+            // What drives the connection has its turn before the caller computes for long.
+            tokio::task::yield_now().await;
+            Ok(())
+        });
+        sent.map_err(|error| servers.explain(error))
+    }
+
+    /// The reply to [`Session::ask_to_play`], when it comes.
+    ///
+    /// # Errors
+    /// Those of [`Session::play`].
+    pub async fn played(&mut self) -> Result<Played, ClientError> {
+        let Self { servers, parts, .. } = self;
+        let [part] = parts.as_mut_slice() else { return Err(not_played_together()) };
+        let acted = part.stream.receive::<proto::Act>().await.map_err(|error| servers.explain(error))?;
+        part.played(acted)
+    }
+
+    /// The error for a reply to [`Session::played`] that does not fit.
+    pub fn misplayed(&self, got: String) -> ClientError {
+        self.parts.first().map_or_else(not_played_together, |part| part.misplayed(got))
     }
 
     /// What stands beside the weights of the policy that a server plays; `None` if the batch is not on one server.
@@ -79,7 +113,15 @@ impl Session<'_> {
     }
 }
 
+fn not_played_together() -> ClientError {
+    ClientError::System { action: "play a batch of several servers as a whole", source: ErrorKind::Unsupported.into() }
+}
+
 impl Part {
+    fn misplayed(&self, got: String) -> ClientError {
+        self.stream.mismatch::<proto::Act>(got, "arrays as the protocol describes them".into())
+    }
+
     /// Names the episodes that ended in a reply.
     fn played(&self, mut acted: proto::Acted) -> Result<Played, ClientError> {
         let mut ended = Vec::with_capacity(acted.ended.len());

@@ -119,6 +119,11 @@ impl Servers {
         &self.connections
     }
 
+    /// Waits for `future`, which may wait for servers.
+    pub(crate) fn block_on<T>(&self, future: impl Future<Output = T>) -> T {
+        self.runtime.block_on(future)
+    }
+
     /// What drives the connections.
     pub(super) fn runtime(&self) -> &Runtime {
         &self.runtime

@@ -20,8 +20,8 @@ const RESTORED_AT_ONCE: usize = 1024;
 /// range.
 #[derive(Debug)]
 pub struct Session<'a> {
-    servers: &'a Servers,
-    parts: Vec<Part>,
+    pub(super) servers: &'a Servers,
+    pub(super) parts: Vec<Part>,
     environment: proto::Environment,
     observation_size: usize,
     num_envs: usize,

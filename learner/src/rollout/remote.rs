@@ -8,11 +8,19 @@ use perturb_policy::{ActionKind, Normalisers, Player, PlayerState, PolicySpec, R
 
 /// Fills rollouts with what a player does that plays at the server, to the bytes of a
 /// [`Collector`](super::Collector).
+///
+/// [`RemoteCollector::begin`] says what to ask the server for, [`RemoteCollector::take`] takes the reply and says what to
+/// ask for next, until nothing is left.
 #[derive(Debug)]
 pub struct RemoteCollector {
     spec: PolicySpec,
     /// Until the server has it.
     player: Option<Player>,
+    experience: Experience,
+    /// Of a reply; 0 leaves it to the server.
+    most_steps: u32,
+    /// The next reply is the rollout's first.
+    begins: bool,
     arrays: Arrays,
 }
 
@@ -34,55 +42,64 @@ struct Arrays {
 impl RemoteCollector {
     /// Collects what `player` does from where it is, with a policy of `spec`.
     pub fn new(spec: PolicySpec, player: Player) -> Self {
-        Self { spec, player: Some(player), arrays: Arrays::default() }
+        let (experience, arrays) = (Experience::Steps(0), Arrays::default());
+        Self { spec, player: Some(player), experience, most_steps: 0, begins: true, arrays }
     }
 
-    /// A rollout under the policy of `weights`; gives every episode that ended, and was to be collected, to `on_episode`.
-    ///
-    /// # Errors
-    /// [`CollectError`]; what was collected of this rollout is lost.
-    pub fn collect(
-        &mut self,
-        session: &mut Session<'_>,
-        weights: &[f32],
-        experience: Experience,
-        rollout: &mut Rollout,
-        mut on_episode: impl FnMut(&EndedEpisode),
-    ) -> Result<(), CollectError> {
-        let mut next = proto::Act {
+    /// The same with replies of about so many environment steps at most, where others wait for the server too.
+    pub fn in_pieces(self, env_steps: usize) -> Self {
+        let n_envs = self.player.as_ref().map_or(1, Player::n_envs);
+        Self { most_steps: (env_steps / n_envs).max(1) as u32, ..self }
+    }
+
+    /// The request that begins a rollout under the policy of `weights`.
+    pub fn begin(&mut self, weights: &[f32], experience: Experience) -> proto::Act {
+        (self.experience, self.begins) = (experience, true);
+        proto::Act {
             policy: self.player.take().map(|player| acting::policy(&self.spec, &player)),
             weights: acting::floats(weights),
             task: Some(match experience {
                 Experience::Steps(count) => proto::act::Task::Steps(count as u32),
                 Experience::Episodes(count) => proto::act::Task::Episodes(count as u32),
             }),
+            most_steps: self.most_steps,
             ..proto::Act::default()
-        };
-        let (mut first, mut finished) = (true, false);
-        while !finished {
-            let mut reply = Played::default();
-            let request = |_| Some(std::mem::take(&mut next));
-            session.play(request, |_, played| {
-                let memory = first.then(|| acting::read_floats(&played.acted.memory).ok_or("odd bytes of memory"));
-                if let Some(memory) = memory.transpose()? {
-                    rollout.begin(&memory);
-                }
-                self.arrays.decode(&played.acted, &self.spec)?;
-                reply = played;
-                Ok(())
-            })?;
-            let before = rollout.len();
-            rollout.push(self.arrays.steps())?;
-            for (step, episode) in &reply.ended {
-                if let Experience::Episodes(_) = experience {
-                    let (end, length) = (before + step + 1, episode.length as usize);
-                    rollout.note_episode(episode.slot, end, length, episode.episode_return)?;
-                }
-                on_episode(episode);
-            }
-            (first, finished) = (false, reply.acted.finished);
         }
-        Ok(rollout.finish(&self.arrays.last)?)
+    }
+
+    /// Takes what `session` played; gives every episode that ended, and was to be collected, to `on_episode`. The request
+    /// for what is left of the rollout, `None` when it is finished.
+    ///
+    /// # Errors
+    /// [`CollectError`]; what was collected of this rollout is lost.
+    pub fn take(
+        &mut self,
+        session: &Session<'_>,
+        played: &Played,
+        rollout: &mut Rollout,
+        mut on_episode: impl FnMut(&EndedEpisode),
+    ) -> Result<Option<proto::Act>, CollectError> {
+        let Self { spec, experience, most_steps, begins, arrays, .. } = self;
+        let mismatch = |got| session.misplayed(got);
+        if std::mem::take(begins) {
+            let memory = acting::read_floats(&played.acted.memory);
+            rollout.begin(&memory.ok_or_else(|| mismatch("odd bytes of memory".into()))?);
+        }
+        arrays.decode(&played.acted, spec).map_err(mismatch)?;
+        let before = rollout.len();
+        rollout.push(arrays.steps())?;
+        for (step, episode) in &played.ended {
+            if let Experience::Episodes(_) = experience {
+                let (end, length) = (before + step + 1, episode.length as usize);
+                rollout.note_episode(episode.slot, end, length, episode.episode_return)?;
+            }
+            on_episode(episode);
+        }
+        if played.acted.finished {
+            rollout.finish(&arrays.last)?;
+            return Ok(None);
+        }
+        Ok(Some(proto::Act { most_steps: *most_steps, ..proto::Act::default() }))
     }
 
     /// What stands beside the weights after a rollout; `None` before the first.

@@ -25,11 +25,15 @@ use learning::Learning;
 use lockstep::{Lockstep, Seat};
 use perturb_policy::Player;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::settings::TrainConfig;
+use perturb_study::settings::{Rollouts, TrainConfig};
 use remote::Remote;
 pub use run_directory::{RunDirectory, RunDirectoryError, mark_in};
 
 type Result<T> = std::result::Result<T, TrainError>;
+
+/// Environment steps of a reply to one of several trainings: some milliseconds of a classic task, a tenth of a second of a
+/// robot. So none waits for long, however many there are.
+const PIECE: usize = 4096;
 
 /// What a training came to.
 #[derive(Debug)]
@@ -124,11 +128,13 @@ fn alone(
     outcome.unwrap_or_else(|| unreachable!("a training ends with an outcome or an error"))
 }
 
-/// Trains several policies in one environment in lockstep, over one session, as [`train`] and [`resume`] do each alone, to
-/// the same bytes. `report` and `ended` are told the place among `entries`. One that fails ends; the others go on.
+/// Trains several policies in one environment as [`train`] and [`resume`] do each alone, to the same bytes: in lockstep over
+/// one session, but for those with long rollouts where servers act, which have a session each. `report` and `ended` are
+/// told the place among `entries`. One that fails ends; the others go on.
 ///
 /// # Errors
-/// The session's, which ends all that have not ended yet; their last checkpoints stay as they are.
+/// Those of opening sessions, and the lockstep's, which ends all that have not ended yet; their last checkpoints stay as
+/// they are.
 pub fn train_together(
     servers: &Servers,
     entries: Vec<Entry<'_>>,
@@ -142,14 +148,46 @@ pub fn train_together(
     for (index, entry) in random {
         ended(index, random::make(servers, &entry));
     }
-    if entries.is_empty() {
-        return Ok(());
+    let is_one = entries.len() == 1;
+    let (mut remotes, mut in_lockstep) = (Vec::new(), Vec::new());
+    for (index, entry) in entries {
+        if !is_one && entry.start.config().settings.rollouts() != Rollouts::Long {
+            in_lockstep.push((index, entry));
+            continue;
+        }
+        let mut observations = Vec::new();
+        let mut session = Session::open(servers, &learning::options(entry.start.config()), &mut observations)?;
+        if !session.plays_together() {
+            in_lockstep.push((index, entry));
+            continue;
+        }
+        let slots = 0..session.num_envs();
+        match sit_down(entry, &mut session, slots, &observations, threads) {
+            Ok((learning, player)) => {
+                let collector = RemoteCollector::new(learning.spec().clone(), player);
+                let collector = if is_one { collector } else { collector.in_pieces(PIECE) };
+                remotes.push(Remote::new(index, session, collector, learning));
+            }
+            Err(error) => ended(index, Err(error)),
+        }
     }
+    remote::run(servers, remotes, stop, report, ended)?;
+    if in_lockstep.is_empty() { Ok(()) } else { lockstep(servers, in_lockstep, threads, stop, report, ended) }
+}
+
+/// Trains `entries`, at least one, each with its index, over one session.
+fn lockstep(
+    servers: &Servers,
+    entries: Vec<(usize, Entry<'_>)>,
+    threads: usize,
+    stop: &StopFlag,
+    report: &mut dyn FnMut(usize, &Progress),
+    ended: &mut dyn FnMut(usize, Result<Outcome>),
+) -> Result<()> {
     let options: Vec<OpenOptions> = entries.iter().map(|(_, entry)| learning::options(entry.start.config())).collect();
     let mut observations = Vec::new();
     let mut session = Session::open_together(servers, &options, &mut observations)?;
     let size = session.observation_size();
-    let at_server = options.len() == 1 && session.plays_together();
     let (mut seats, mut free) = (Vec::new(), Vec::new());
     let mut first = 0;
     for ((index, entry), options) in entries.into_iter().zip(&options) {
@@ -157,12 +195,6 @@ pub fn train_together(
         first = slots.end;
         let observations = &observations[slots.start * size..slots.end * size];
         match sit_down(entry, &mut session, slots.clone(), observations, threads) {
-            Ok((learning, player)) if at_server => {
-                let collector = RemoteCollector::new(learning.spec().clone(), player);
-                let outcome = Remote::new(session, collector, learning).run(servers, stop, &mut |it| report(index, it));
-                ended(index, outcome);
-                return Ok(());
-            }
             Ok((learning, player)) => seats.push(Seat::new(index, slots, Collector::new(player), learning)),
             Err(error) => {
                 free.push(slots);

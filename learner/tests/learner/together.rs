@@ -14,19 +14,21 @@ use rstest::rstest;
 
 use crate::common::{connect, server};
 
-/// Algorithms of all kinds, with batches of different sizes, versions and parameters.
-const TRAININGS: [&str; 8] = [
+/// Algorithms of all kinds, with batches of different sizes, versions and parameters, and long rollouts and short ones.
+const TRAININGS: [&str; 9] = [
     "algorithm = 'a2c'\nnum_envs = 1\nn_steps = 5\nseed = 3",
     "algorithm = 'ppo'\nversion = 'R'\nnum_envs = 3\nn_steps = 16\nn_minibatches = 2\nn_epochs = 2\nseed = 3",
     "algorithm = 'epopt-ppo'\nversion = 'E'\nnum_envs = 2\nepisodes_per_iteration = 3\nepsilon = 0.5\nfull_iterations = 1
      n_epochs = 2\nseed = 4",
-    "algorithm = 'ppo'\narchitecture = 'rc'\nnum_envs = 2\nn_steps = 24\nn_minibatches = 2\nn_epochs = 1\nseed = 5",
+    "algorithm = 'ppo'\narchitecture = 'rc'\nnum_envs = 2\nn_steps = 64\nn_minibatches = 2\nn_epochs = 1\nseed = 5",
     "algorithm = 'rl2-a2c'\narchitecture = 'rc'\nversion = 'R+E'\nnum_envs = 2\nn_steps = 20\nseed = 6",
-    "preset = 'paper'\nalgorithm = 'ppo'\nversion = 'R'\nn_steps = 16\nn_epochs = 2\nseed = 3",
+    "preset = 'paper'\nalgorithm = 'ppo'\nversion = 'R'\nn_steps = 64\nn_epochs = 2\nseed = 3",
     "preset = 'paper'\nalgorithm = 'epopt-a2c'\nversion = 'E'\nepisodes_per_iteration = 3\nepsilon = 0.5
      full_iterations = 1\nseed = 4",
     "preset = 'paper'\nalgorithm = 'epopt-ppo'\narchitecture = 'rc'\nepisodes_per_iteration = 3\nepsilon = 0.5
      full_iterations = 1\nn_epochs = 2\nseed = 4",
+    // A rollout that comes in pieces, if others wait for the server too.
+    "algorithm = 'ppo'\nversion = 'R'\nnum_envs = 65\nn_steps = 64\nn_minibatches = 2\nn_epochs = 1\nseed = 7",
 ];
 
 /// Tasks, with what their policies see.
@@ -113,18 +115,19 @@ fn the_bytes_of_a_training_are_its_own(#[values(CART_POLE, PENDULUM, SEEN_PENDUL
     assert!(alone(&connect(&private), task) == expected, "on two servers");
 
     let base = tempfile::tempdir().expect("a directory");
-    let all = |base: &Path| (0..TRAININGS.len()).map(|number| kept(&base.join(number.to_string()))).collect::<Vec<_>>();
-    together(&one, base.path(), task, &[0, 1, 2, 3, 4, 5, 6, 7], u64::MAX);
-    assert!(all(base.path()) == expected, "together");
+    let all = |base: &Path, count| (0..count).map(|number| kept(&base.join(number.to_string()))).collect::<Vec<_>>();
+    together(&one, base.path(), task, &[0, 1, 2, 3, 4, 5, 6, 7, 8], u64::MAX);
+    assert!(all(base.path(), TRAININGS.len()) == expected, "together");
 
     let base = tempfile::tempdir().expect("a directory");
     together(&one, base.path(), task, &[3, 1, 7, 0], 1);
     together(&connect(&private), base.path(), task, &[2, 6, 4, 5], 1);
-    assert!(all(base.path()) != expected, "all are stopped before their ends");
+    let expected = &expected[..8]; // the last one has ended after its first iteration
+    assert!(all(base.path(), 8) != expected, "all are stopped before their ends");
     together(&connect(&private), base.path(), task, &[0, 4, 3, 6], u64::MAX);
     together(&one, base.path(), task, &[1, 5], u64::MAX);
     together(&one, base.path(), task, &[2, 7], u64::MAX);
-    assert!(all(base.path()) == expected, "resumed in other groups");
+    assert!(all(base.path(), 8) == expected, "resumed in other groups");
 }
 
 /// The reference fills each kept episode up to the step limit, and counts all steps.
@@ -166,15 +169,19 @@ fn a_run_that_begins_again_has_no_policies_of_the_one_before() {
 }
 
 #[rstest]
-fn one_that_fails_does_not_stop_the_others(#[values(CART_POLE, PENDULUM)] task: &str) {
+fn one_that_fails_does_not_stop_the_others(
+    #[values(CART_POLE, PENDULUM)] task: &str,
+    #[values(("algorithm = 'a2c'\nn_steps = 5", 0), ("algorithm = 'ppo'\nn_steps = 64", 5))] kind: (&str, usize),
+) {
     let private: [PrivateServer; 1] = [server()];
     let servers = connect(&private);
     let base = tempfile::tempdir().expect("a directory");
-    let bad = "algorithm = 'a2c'\nnum_envs = 2\nn_steps = 5\nlearning_rate = 1e30\nmax_grad_norm = 1e30\nseed = 1";
-    let good = config(task, TRAININGS[0]);
+    let (base_settings, number) = kind;
+    let bad = format!("{base_settings}\nnum_envs = 2\nlearning_rate = 1e30\nmax_grad_norm = 1e30\nseed = 1");
+    let good = config(task, TRAININGS[number]);
     let directories: Vec<RunDirectory> =
         ["bad", "good"].map(|name| RunDirectory::choose(&base.path().join(name), false).expect("a directory")).into();
-    let starts = [config(task, bad), good].map(|config| Start::Fresh(Box::new(config)));
+    let starts = [config(task, &bad), good].map(|config| Start::Fresh(Box::new(config)));
     let entries =
         directories.iter().zip(starts).map(|(directory, start)| Entry { directory, start, marks: &[] }).collect();
     let mut ends = vec![String::new(); 2];
@@ -185,7 +192,7 @@ fn one_that_fails_does_not_stop_the_others(#[values(CART_POLE, PENDULUM)] task: 
     train_together(&servers, entries, 1, &StopFlag::default(), &mut |_, _| {}, &mut ended).expect("a session");
     assert!(ends[0].contains("not finite") || ends[0].contains("became"), "{}", ends[0]);
     assert_eq!(ends[1], "ok");
-    let expected = alone(&servers, task).remove(0);
+    let expected = alone(&servers, task).remove(number);
     assert!(kept(&base.path().join("good")) == expected, "as if it had been alone");
 }
 

@@ -1,12 +1,13 @@
 //! Which cells one process does together.
 //!
-//! A group's cells have the same environment and architecture and see the same, so that their steps can be one batch; a
-//! random policy, which takes none, is no cell to measure others by. What a cell comes to does not depend on its group.
+//! A group's cells have the same environment and architecture and see the same, so that their steps can be one batch,
+//! which only those with short rollouts make: all of a group wait for its slowest. A random policy, which takes none, is no
+//! cell to measure others by. What a cell comes to does not depend on its group.
 
 use std::ops::Range;
 
 use super::{Cell, Plan, distinct};
-use crate::settings::{Architecture, Observe, TrainConfig};
+use crate::settings::{Architecture, Observe, Rollouts, TrainConfig};
 
 /// How large groups are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -32,11 +33,11 @@ impl Grouping {
 }
 
 impl Cell {
-    /// Environment, architecture, what is observed, and whether anything learns: cells that have all in common may be
-    /// in one group.
-    pub fn kind(&self) -> (&str, Architecture, Observe, bool) {
+    /// Environment, architecture, what is observed, and how long rollouts are: cells that have all in common may be in
+    /// one group.
+    pub fn kind(&self) -> (&str, Architecture, Observe, Rollouts) {
         let TrainConfig { common, settings } = &self.config;
-        (&common.environment, common.architecture, common.observe, !settings.is_random())
+        (&common.environment, common.architecture, common.observe, settings.rollouts())
     }
 }
 
@@ -82,15 +83,27 @@ mod tests {
     #[test]
     fn a_group_has_one_environment_and_one_architecture_and_neighbours() {
         let text = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 2
-            [[algorithm]]\nname = 'a2c'\narchitectures = ['ff', 'rc']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+            [[algorithm]]\nname = 'a2c'\narchitectures = ['ff', 'rc']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']
+            settings = { n_steps = 63, n_minibatches = 1 }";
         let plan = Plan::parse("test", text.into()).unwrap();
         let all: Vec<usize> = (0..plan.cells.len()).collect();
         // Of each environment two cells of A2C with FF, two with RC, and two of PPO with FF.
         let groups = plan.groups(&all, Grouping { most: 3, at_a_time: 1 });
         assert_eq!(groups, [vec![0, 1], vec![4, 5], vec![2, 3], vec![6, 7], vec![10, 11], vec![8, 9]]);
-        assert_eq!(plan.cells[groups[1][0]].kind(), ("CartPole", Architecture::Ff, Observe::State, true));
+        assert_eq!(plan.cells[groups[1][0]].kind(), ("CartPole", Architecture::Ff, Observe::State, Rollouts::Short));
         let left = plan.groups(&[1, 5, 8, 11], Grouping { most: 36, at_a_time: 1 });
         assert_eq!(left, [vec![1, 5], vec![8], vec![11]]);
+    }
+
+    #[test]
+    fn cells_with_long_rollouts_are_groups_of_their_own() {
+        let text = "environments = ['CartPole']\nversions = ['D']\nruns = 1
+            [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\ngrid = { n_steps = [32, 64, 128] }
+            [[algorithm]]\nname = 'epopt-a2c'\narchitectures = ['ff']\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff']
+            [[algorithm]]\nname = 'random'\narchitectures = ['ff']";
+        let plan = Plan::parse("test", text.into()).unwrap();
+        let all: Vec<usize> = (0..plan.cells.len()).collect();
+        assert_eq!(plan.groups(&all, Grouping::BY_KIND), [vec![0, 4], vec![1, 2, 3], vec![5]]);
     }
 
     #[test]

@@ -396,7 +396,11 @@ impl<'a> Scheduler<'a> {
     fn look(&mut self, now: Instant) -> Result<()> {
         let begun = Instant::now();
         for cell in 0..self.cells.len() {
-            if !self.settled(cell)
+            let Tracked { phase, begun, .. } = self.cells[cell];
+            // Whoever does it for this run has yet to say so: a result is written before that.
+            let is_heard = phase == Phase::Running && begun.is_some();
+            if !is_heard
+                && !self.settled(cell)
                 && self.cells[cell].phase == Phase::Elsewhere
                 && self.folder.cell(self.id(cell)).try_lock()?.is_some()
             {

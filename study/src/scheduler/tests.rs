@@ -142,6 +142,8 @@ struct Ran {
     most_at_a_time: usize,
     notes: Vec<String>,
     statuses: Vec<Status>,
+    /// Cells that were told to be done.
+    told: Vec<String>,
 }
 
 impl Ran {
@@ -216,10 +218,11 @@ impl Place {
         let (now, most_at_a_time) = (start, 0);
         let mut fake =
             Fake::<CONVICTS> { place: self, script, grouping, start, now, running, begun, groups, most_at_a_time };
-        let (mut notes, mut statuses) = (Vec::new(), Vec::new());
+        let (mut notes, mut statuses, mut told) = (Vec::new(), Vec::new(), Vec::new());
         let mut report = |report: Announcement<'_>| match report {
             Announcement::Status(status) => statuses.push(status.clone()),
             Announcement::Note(note) => notes.push(note.to_owned()),
+            Announcement::Line(line) if line.event == CellEvent::Done => told.push(line.cell.clone()),
             Announcement::Line(_) => {}
         };
         let forgiven = if retry_failed { self.folder.failures().unwrap() } else { HashMap::new() };
@@ -227,7 +230,7 @@ impl Place {
         let end = (0..10_000).find_map(|second| scheduler.step(start + Duration::from_secs(second)).transpose());
         let end = end.expect("it ends").map_err(|error| error.to_string());
         let Fake { begun, groups, most_at_a_time, .. } = fake;
-        Ran { end, begun, groups, most_at_a_time, notes, statuses }
+        Ran { end, begun, groups, most_at_a_time, notes, statuses, told }
     }
 }
 
@@ -367,6 +370,14 @@ fn what_others_did_is_not_done_again_and_seen_at_once() {
     let ran = place.run(&script);
     assert_eq!(ran.end, place.finished(&[]));
     assert_eq!(ran.statuses[1].done, 3);
+}
+
+#[test]
+fn a_run_does_not_end_before_its_last_cell_is_told_to_be_done() {
+    let place = Place::new();
+    let ran = place.run(&|_, _| vec![server(), Succeeds, Wait(5), ends(CellEvent::Done)]);
+    assert_eq!(ran.end, place.finished(&[]));
+    assert_eq!(ran.told, [0, 1, 2, 3].map(|cell| place.id(cell)));
 }
 
 #[test]

@@ -12,6 +12,10 @@ const NOT_WITH_EPISODES: [&str; 2] = ["n_steps", "n_minibatches"];
 /// The most samples of a rollout: some gigabytes.
 const MOST_SAMPLES: u128 = 1 << 26;
 
+/// Steps of each environment in a long rollout: with fewer, a policy's weights take longer to send than the observations
+/// and actions that several trainings send together.
+const LONG_ROLLOUT: usize = 64;
+
 /// The settings of an algorithm, which say which one it is.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
@@ -45,6 +49,17 @@ pub enum Wrapper {
     Rl2(Rl2Config),
 }
 
+/// What a training learns from, as far as it matters to others that are trained with it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Rollouts {
+    /// Nothing: a random policy.
+    None,
+    /// Few steps, whose messages several trainings share.
+    Short,
+    /// Many steps, or complete episodes: a server can be sent the weights for each.
+    Long,
+}
+
 impl Settings {
     /// All algorithms, each part with its own defaults, in the order in which they are listed.
     pub fn all() -> [Self; 7] {
@@ -66,6 +81,17 @@ impl Settings {
     /// The names of all algorithms.
     pub fn names() -> [&'static str; 7] {
         Self::all().map(|settings| settings.name())
+    }
+
+    /// How long rollouts are.
+    pub fn rollouts(&self) -> Rollouts {
+        let n_steps = match (&self.wrapper, &self.base) {
+            (_, Base::Random) => return Rollouts::None,
+            (Wrapper::Epopt(_), _) => return Rollouts::Long,
+            (_, Base::A2c(a2c)) => a2c.n_steps,
+            (_, Base::Ppo(ppo)) => ppo.n_steps,
+        };
+        if n_steps < LONG_ROLLOUT { Rollouts::Short } else { Rollouts::Long }
     }
 
     /// The algorithm's name, as it is typed.

@@ -14,7 +14,7 @@ mod base_and_wrapper;
 
 pub use algorithms::{A2cConfig, EpoptConfig, PpoConfig, Ranking, Rl2Config, Schedule};
 pub use architecture::Architecture;
-pub use base_and_wrapper::{Base, Settings, Wrapper};
+pub use base_and_wrapper::{Base, Rollouts, Settings, Wrapper};
 pub use error::{ConfigError, SettingError};
 pub use observe::Observe;
 pub use preset::Preset;

@@ -335,7 +335,7 @@ fn plan_prints_the_papers_counts_and_an_estimate_from_measurements() {
     };
     let paper = shipped("paper.toml").display().to_string();
     let counts = "183 configurations, 3 294 trainings, 9 882 train/test pairs, 49 410 with 5 runs\n\
-                  16 470 cells in 468 groups of 34 to 36, 2 at a time\n";
+                  16 470 cells in 468 groups of 33 to 36, 2 at a time\n";
     assert_eq!(printed(&["plan", &paper, "--measure", "0", "--jobs", "2"]), counts);
 
     let experiment = Experiment::new(PLAN);
