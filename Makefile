@@ -142,7 +142,7 @@ python-test: $(VENV)/installed opengl ## lint, type-check and test the Python pa
 
 python-wheel: $(VENV)/installed ## build the Python package, install it in an empty environment, run its loop
 	rm -rf python/dist $(VENV)-empty
-	$(VENV)/bin/python -m build --outdir python/dist python
+	$(VENV)/bin/pip wheel -q --disable-pip-version-check --no-deps --wheel-dir python/dist ./python
 	python3 -m venv $(VENV)-empty
 	$(VENV)-empty/bin/pip install -q --disable-pip-version-check python/dist/*.whl
 	$(VENV)-empty/bin/python python/examples/ten_lines.py
@@ -155,8 +155,9 @@ python-acceptance: $(VENV)/installed ## train with stable-baselines3, measure be
 $(PROGRAMS)/perturb-server: deps
 	cargo build --package perturb --release --locked
 
-# The protocol's messages are generated when the package is installed, and the server is asked for its catalogue.
-$(VENV)/installed: python/requirements-dev.txt python/pyproject.toml python/hatch_build.py proto/perturb/v1/perturb.proto \
+# The native module is compiled when the package is installed, and the server is asked for its catalogue.
+$(VENV)/installed: python/requirements-dev.txt python/pyproject.toml python/build_backend.py proto/perturb/v1/perturb.proto \
+		$(wildcard python/native/Cargo.toml python/native/src/*.rs crates/protocol/src/*.rs) Cargo.lock \
 		$(PROGRAMS)/perturb-server | python-venv
 	python3 -m venv $(VENV)
 	$(VENV)/bin/pip install -q --disable-pip-version-check -r python/requirements-dev.txt
