@@ -157,6 +157,33 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         """
         return self._outcome(self._client.session.step(actions, self._encode))
 
+    def send(self, actions: Any) -> None:
+        """The first half of `step`: the server computes, and nobody waits for it.
+
+        So several batches, each with a session of its own, can be under way together. The same batch can have up to 64
+        steps under way, with actions that do not depend on what they lead to.
+
+        Raises:
+            InvalidArgumentError: for a wrong shape or kind of numbers; wrong values are told by `recv`.
+            OutOfOrderError: before the first reset, or if 64 steps are under way.
+            ServerConnectionError, ServerTimeoutError: and the environments are gone.
+        """
+        self._client.session.send(actions, self._encode)
+
+    def recv(
+        self,
+    ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """The second half: what `step` returns, of the oldest step that was sent and not received.
+
+        Until all are received, nothing but `send` and `recv` may be called.
+
+        Raises:
+            InvalidArgumentError: no environment has moved in this step; those that were sent after it count.
+            OutOfOrderError: if no step is under way; with autoreset disabled, if an episode has ended.
+            ServerConnectionError, ServerTimeoutError: and the environments are gone.
+        """
+        return self._outcome(self._client.session.recv())
+
     def snapshot(self, mask: NDArray[np.bool_] | None = None) -> list[bytes]:
         """Save the environments that the mask [N] selects, at first all: M pieces of bytes, in order."""
         return self._client.snapshot(None if mask is None else requests.mask(mask, self.num_envs, "mask"))
