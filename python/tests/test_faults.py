@@ -566,6 +566,23 @@ def test_without_the_program_the_error_says_how_to_get_it(monkeypatch: pytest.Mo
         gymnasium.make("perturb/CartPole-v1")
 
 
+def test_the_packages_own_program_comes_before_that_on_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    own, other = tmp_path / "own", tmp_path / "bin" / local_server.PROGRAM
+    other.parent.mkdir()
+    for program in (own, other):
+        program.write_text("#!/bin/sh")
+        program.chmod(0o755)
+    monkeypatch.setattr(local_server, "BUNDLED", own)
+    monkeypatch.setenv("PATH", str(other.parent))
+    monkeypatch.delenv(local_server.VARIABLE)
+    assert local_server.find_program() == own
+    own.unlink()
+    assert local_server.find_program() == other
+    monkeypatch.setenv(local_server.VARIABLE, str(other))
+    own.touch(0o755)
+    assert local_server.find_program() == other
+
+
 def test_a_program_that_is_no_server_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(local_server.VARIABLE, "/bin/false")
     with within(SECONDS), pytest.raises(perturb.ServerStartError, match="ended with status 1 before it listened"):
