@@ -64,7 +64,7 @@ endef
 
 .DEFAULT_GOAL := help
 .PHONY: help deps opengl toolchain build demo all-pairs report-check test slurm-test qemu-test slurm-acceptance lint bench \
-	bench-peers audit cargo-deny python-test python-wheel python-acceptance \
+	bench-peers audit cargo-deny python-test wheel wheel-test python-acceptance \
 	python-venv docker docker-base docker-test
 
 help: ## this list
@@ -131,7 +131,7 @@ cargo-deny: toolchain
 		cargo install --locked --version $(CARGO_DENY_VERSION) cargo-deny; \
 	}
 
-python-test python-wheel python-acceptance: export PERTURB_SERVER := $(abspath $(PROGRAMS))/perturb-server
+python-test wheel python-acceptance: export PERTURB_SERVER := $(abspath $(PROGRAMS))/perturb-server
 
 python-test: $(VENV)/installed opengl ## lint, type-check and test the Python package
 	cd python && $(abspath $(VENV))/bin/ruff check . && $(abspath $(VENV))/bin/ruff format --check .
@@ -140,12 +140,27 @@ python-test: $(VENV)/installed opengl ## lint, type-check and test the Python pa
 	cd python && $(abspath $(VENV))/bin/mypy
 	cd python && $(abspath $(VENV))/bin/pytest -q
 
-python-wheel: $(VENV)/installed ## build the Python package, install it in an empty environment, run its loop
-	rm -rf python/dist $(VENV)-empty
-	$(VENV)/bin/python -m build --outdir python/dist python
-	python3 -m venv $(VENV)-empty
-	$(VENV)-empty/bin/pip install -q --disable-pip-version-check python/dist/*.whl
-	$(VENV)-empty/bin/python python/examples/ten_lines.py
+wheel: $(VENV)/installed ## build the Python package's wheel, with perturb-server and MuJoCo inside, in python/dist
+	rm -rf python/dist $(TARGET)/wheel
+	$(VENV)/bin/pip wheel -q --disable-pip-version-check --no-deps --wheel-dir $(TARGET)/wheel ./python
+	PATH="$(abspath $(VENV))/bin:$$PATH" $(VENV)/bin/python python/bundle.py $(TARGET)/wheel/*.whl $(PROGRAMS)/perturb-server python/dist
+
+# Where there is no Docker, in a new environment on this machine. The container has Python 3.11, and no network.
+wheel-test: wheel ## install the wheel in a bare container, and run the program and the README's loop there
+	rm -rf $(TARGET)/wheel-dependencies
+	download="$(VENV)/bin/pip download -q --disable-pip-version-check --dest $(TARGET)/wheel-dependencies"; \
+	if docker info >/dev/null 2>&1; then \
+		$(MAKE) docker-base && \
+		$$download --only-binary :all: --python-version 3.11 --platform manylinux_2_28_x86_64 \
+			--platform manylinux_2_17_x86_64 gymnasium numpy && \
+		docker build --quiet --file docker/wheel-test.Dockerfile --tag perturb-wheel-test docker && \
+		docker run --rm --network none --env BARE=1 --volume $(CURDIR)/python:/python:ro \
+			--volume $(abspath $(TARGET))/wheel-dependencies:/dependencies:ro \
+			perturb-wheel-test sh -c '/python/tests/wheel_test.sh /python/dist/*.whl /dependencies'; \
+	else \
+		echo "There is no Docker: the wheel is tested in an environment on this machine"; \
+		$$download gymnasium numpy && python/tests/wheel_test.sh python/dist/*.whl $(TARGET)/wheel-dependencies; \
+	fi
 
 python-acceptance: $(VENV)/installed ## train with stable-baselines3, measure beside EnvPool; gigabytes, minutes
 	$(VENV)/bin/pip install -q --disable-pip-version-check -r python/requirements-acceptance.txt
@@ -155,8 +170,9 @@ python-acceptance: $(VENV)/installed ## train with stable-baselines3, measure be
 $(PROGRAMS)/perturb-server: deps
 	cargo build --package perturb --release --locked
 
-# The protocol's messages are generated when the package is installed, and the server is asked for its catalogue.
-$(VENV)/installed: python/requirements-dev.txt python/pyproject.toml python/hatch_build.py proto/perturb/v1/perturb.proto \
+# The native module is compiled when the package is installed, and the server is asked for its catalogue.
+$(VENV)/installed: python/requirements-dev.txt python/pyproject.toml python/build_backend.py proto/perturb/v1/perturb.proto \
+		$(wildcard python/native/Cargo.toml python/native/src/*.rs crates/protocol/src/*.rs) Cargo.lock \
 		$(PROGRAMS)/perturb-server | python-venv
 	python3 -m venv $(VENV)
 	$(VENV)/bin/pip install -q --disable-pip-version-check -r python/requirements-dev.txt

@@ -1,19 +1,22 @@
-"""Has the server play: sends a policy, gets a trajectory, with nothing but gRPC and the protocol's messages.
+"""Has the server play: sends a policy, gets a trajectory, with nothing but gRPC and the protocol, which is in proto/.
 
 A feed-forward policy of random weights plays 200 steps in each of 8 CartPoles, in one round trip. Then its values and
 log-probabilities are computed again here, with NumPy. docs/protocol.md says what the arrays hold.
-Run: perturb-server, and beside it: python act.py [--server unix:/path]
+Run, with grpcio-tools: perturb-server, and beside it: python act.py [--server unix:/path]
 """
 
 import argparse
 import queue
+import sys
+from pathlib import Path
 from typing import Any
 
 import grpc
 import numpy as np
 from numpy.typing import NDArray
 
-from perturb._proto import perturb_pb2 as pb
+sys.path.append(str(Path(__file__).parents[2] / "proto/perturb"))
+pb = grpc.protos("v1/perturb.proto")  # compiles it
 
 N, T, HIDDEN = 8, 200, 64
 # Networks for the actions and for the values: [out, in] and [out] of each layer, from the input to the output.
@@ -38,7 +41,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--server", default="127.0.0.1:7447", help="unix:/path or host:port")
     options = [("grpc.default_authority", "localhost"), ("grpc.max_receive_message_length", -1)]
-    requests: queue.SimpleQueue[pb.SessionRequest | None] = queue.SimpleQueue()
+    requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
     with grpc.insecure_channel(parser.parse_args().server, options=options) as channel:
         responses: Any = channel.stream_stream(
             "/perturb.v1.Perturb/Session",

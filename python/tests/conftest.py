@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import grpc
 import pytest
 
 from perturb import local_server
@@ -17,6 +19,14 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 ROOT = Path(__file__).parents[2]
+
+
+def messages() -> Any:
+    """Compile the protocol's messages for gRPC's own Python, so that tests have another's view of the protocol."""
+    folder = str(ROOT / "proto/perturb")  # above it they would be a part of the package perturb
+    if folder not in sys.path:
+        sys.path.append(folder)
+    return grpc.protos("v1/perturb.proto")
 
 
 def identifier(name: str) -> str:

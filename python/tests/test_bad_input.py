@@ -241,21 +241,6 @@ def test_addresses_are_refused_as_in_rust(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "local"),
-    [
-        ("unix:/run/perturb.sock", True),
-        ("worker-1:7447", False),
-        ("http://worker-1:7447/", False),
-        ("tcp://127.0.0.1:7447", True),
-        ("localhost:7447", True),
-        ("[::1]:7447", True),
-    ],
-)
-def test_between_this_machine_and_itself_stands_no_proxy(text: str, local: bool) -> None:
-    assert parse_address(text).local == local
-
-
-@pytest.mark.parametrize(
     ("text", "says"),
     [
         ("", "port is missing"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import multiprocessing
 import os
 import signal
@@ -215,50 +214,12 @@ def test_a_server_that_hangs_is_given_up(start_server: Callable[..., Any]) -> No
     env.reset()
 
 
-class Watched:
-    """A session's replies, and a watchdog that looks just when one has come."""
-
-    def __init__(self, watched: session.Session, now: float) -> None:
-        self._replies, self._session, self._now = watched._responses, watched, now
-
-    def __next__(self) -> Any:
-        reply = next(self._replies)
-        self._session.expire(self._now)
-        return reply
-
-    def cancel(self) -> None:
-        self._replies.cancel()
-
-
-def test_a_wait_that_ends_as_its_reply_comes_is_not_blamed_on_the_next_call(server: str) -> None:
-    env = perturb.PerturbEnv("CartPole", server=server)
-    expected, _ = env.reset(seed=1)
-    watched = env._client.session
-    watched._responses = Watched(watched, now=math.inf)
-    with pytest.raises(perturb.ServerTimeoutError, match="did not answer step within 60 s"):
-        env.step(0)
-    with pytest.raises(perturb.OutOfOrderError, match="did not answer step"):
-        env.step(0)
-    assert env.reset(seed=1)[0].tobytes() == expected.tobytes()
-
-
-def test_a_watchdog_that_is_late_finds_nothing_overdue(server: str) -> None:
-    env = perturb.PerturbEnv("CartPole", server=server)
-    env.reset(seed=1)
-    watched = env._client.session
-    watched.expire(math.inf)  # the call that it looked for has its reply
-    env.step(0)
-    watched._responses = Watched(watched, now=time.monotonic())  # or the next one waits already
-    env.step(0)
-    env.close()
-
-
 def test_a_server_that_answers_no_pings_is_given_up(
     start_server: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With other limits, since the real ones are half a minute; the limit of replies, a minute, has no part in it."""
-    monkeypatch.setattr(session, "KEEPALIVE_INTERVAL", 1)
-    monkeypatch.setattr(session, "KEEPALIVE_LIMIT", 5)  # which holds during the reset, too
+    monkeypatch.setattr(session, "KEEPALIVE_INTERVAL", 1.0)
+    monkeypatch.setattr(session, "KEEPALIVE_LIMIT", 5.0)  # which holds during the reset, too
     running = start_server(listen="tcp://127.0.0.1:0")
     env = perturb.PerturbEnv("CartPole", server=running.address)
     env.reset(seed=1)
@@ -298,7 +259,7 @@ def test_an_interrupt_leaves_no_reply_behind(start_server: Callable[..., Any]) -
         raise KeyboardInterrupt
 
     def interrupt_the_step() -> None:
-        wait_until(lambda: envs._client.session.deadline is not None)
+        wait_until(lambda: envs._client.session.waits)
         signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGUSR1)
 
     before = signal.signal(signal.SIGUSR1, interrupt)
@@ -315,6 +276,127 @@ def test_an_interrupt_leaves_no_reply_behind(start_server: Callable[..., Any]) -
     running.process.send_signal(signal.SIGCONT)
     assert envs.reset(seed=2)[0].tobytes() == expected
     envs.close()
+
+
+INTERRUPTED = """
+import os, signal, threading, time, numpy as np, perturb
+envs = perturb.PerturbVectorEnv("CartPole", 4, server={address!r}, timeout=float("inf"))
+envs.reset(seed=1)
+os.kill({server}, signal.SIGSTOP)
+
+def interrupt():
+    while not envs._client.session.waits:
+        time.sleep(0.01)
+    os.kill(os.getpid(), signal.SIGINT)
+    sent.append(time.monotonic())
+
+sent = []
+threading.Thread(target=interrupt).start()
+try:
+    envs.step(np.zeros(4, dtype=np.int64))
+except KeyboardInterrupt:
+    print("interrupted", time.monotonic() - sent[0] < 1)
+"""
+
+
+def test_ctrl_c_interrupts_a_step_at_once_and_the_process_ends(start_server: Callable[..., Any]) -> None:
+    running = start_server()
+    code = INTERRUPTED.format(address=running.address, server=running.process.pid)
+    with within(SECONDS):
+        assert output_of(code) == ("interrupted True\n", "")
+
+
+def test_a_session_that_nobody_uses_tells_the_server_that_it_lives(start_server: Callable[..., Any]) -> None:
+    env = perturb.PerturbEnv("CartPole", server=start_server("--keepalive-seconds", "1").address)
+    env.reset(seed=1)
+    time.sleep(5)
+    env.step(0)
+    env.close()
+
+
+TENDING = """
+import perturb
+from perturb import session
+session.TEND_INTERVAL = 1e-6
+for seed in range(40):
+    envs = [perturb.PerturbEnv("CartPole", server={address!r}) for _ in range(20)]
+    for env in envs:
+        env.reset(seed=seed)
+        env.step(0)
+    for env in envs:
+        env.close()
+print("went on")
+"""
+
+
+def test_the_keeper_is_in_nobodys_way(server: str) -> None:
+    assert output_of(TENDING.format(address=server)) == ("went on\n", "")
+
+
+def test_a_wait_ends_when_another_thread_closes_the_environment(start_server: Callable[..., Any]) -> None:
+    running = start_server()
+    envs = perturb.PerturbVectorEnv("CartPole", 4, server=running.address)
+    envs.reset(seed=1)
+    freeze(running.process)
+    caught: list[BaseException] = []
+
+    def step() -> None:
+        try:
+            envs.step(np.zeros(4, dtype=np.int64))
+        except perturb.PerturbError as error:
+            caught.append(error)
+
+    stepping = threading.Thread(target=step, daemon=True)
+    stepping.start()
+    wait_until(lambda: envs._client.session.waits)
+    with pytest.raises(perturb.OutOfOrderError, match="another thread waits for a reply"):
+        envs.step(np.zeros(4, dtype=np.int64))
+    with within(SECONDS):
+        envs.close()
+        stepping.join()
+    assert isinstance(caught[0], perturb.OutOfOrderError)
+    assert "it was closed" in str(caught[0])
+
+
+def test_many_environments_of_a_process_share_file_descriptors(server: str) -> None:
+    def descriptors() -> int:
+        return len(list(Path("/proc/self/fd").iterdir()))
+
+    envs = [perturb.PerturbEnv("CartPole", server=server) for _ in range(64)]
+    before = descriptors()
+    for env in envs:
+        env.reset(seed=1)
+    assert descriptors() - before <= 64 + 16 * 4 + 8
+    expected = envs[0].step(0)[0].tobytes()
+    assert all(env.step(0)[0].tobytes() == expected for env in envs[1:])
+    for env in envs:
+        env.close()
+    assert descriptors() <= before + 8
+
+
+ENDING = """
+import perturb, threading, time, numpy as np
+envs = perturb.PerturbVectorEnv("CartPole", 4, server={address!r})
+envs.reset(seed=1)
+
+def run():
+    try:
+        while True:
+            envs.step(np.zeros(4, dtype=np.int64))
+    except perturb.PerturbError:
+        pass
+
+threading.Thread(target=run, daemon=True).start()
+time.sleep(0.3)
+print("ends")
+"""
+
+
+def test_a_process_may_end_while_a_thread_of_it_steps(server: str) -> None:
+    for _ in range(3):
+        process = python(ENDING.format(address=server))
+        assert process.communicate(timeout=60) == ("ends\n", "")
+        assert process.returncode == 0
 
 
 def test_proxy_variables_do_not_reach_loopback_and_sockets(
@@ -484,6 +566,23 @@ def test_without_the_program_the_error_says_how_to_get_it(monkeypatch: pytest.Mo
         gymnasium.make("perturb/CartPole-v1")
 
 
+def test_the_packages_own_program_comes_before_that_on_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    own, other = tmp_path / "own", tmp_path / "bin" / local_server.PROGRAM
+    other.parent.mkdir()
+    for program in (own, other):
+        program.write_text("#!/bin/sh")
+        program.chmod(0o755)
+    monkeypatch.setattr(local_server, "BUNDLED", own)
+    monkeypatch.setenv("PATH", str(other.parent))
+    monkeypatch.delenv(local_server.VARIABLE)
+    assert local_server.find_program() == own
+    own.unlink()
+    assert local_server.find_program() == other
+    monkeypatch.setenv(local_server.VARIABLE, str(other))
+    own.touch(0o755)
+    assert local_server.find_program() == other
+
+
 def test_a_program_that_is_no_server_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(local_server.VARIABLE, "/bin/false")
     with within(SECONDS), pytest.raises(perturb.ServerStartError, match="ended with status 1 before it listened"):
@@ -558,8 +657,7 @@ if child:
 """
 
 
-def test_grpc_prepares_for_forks(server: str) -> None:
-    """Otherwise it says that it does not, and whether the child hangs is a matter of luck."""
+def test_a_forked_process_goes_on_beside_its_parent(server: str) -> None:
     assert output_of(FORKING.format(address=server)) == ("both went on\n", "")
 
 

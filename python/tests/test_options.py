@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import re
 from typing import Any
 
-import grpc
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
 import perturb
-from perturb import session
-from perturb._proto import perturb_pb2 as pb
+from perturb import _native
 from perturb.catalogue import CATALOGUE, Description
 from perturb.registration import register_all
 
@@ -39,22 +38,16 @@ def test_the_package_has_the_version_of_the_server() -> None:
 
 
 def test_the_catalogue_is_the_servers(server: str) -> None:
-    with grpc.insecure_channel(server, options=[("grpc.default_authority", "localhost")]) as channel:
-        served = channel.unary_unary(
-            f"/{session.SERVICE}/ListEnvironments",
-            pb.ListEnvironmentsRequest.SerializeToString,
-            pb.ListEnvironmentsResponse.FromString,
-        )(pb.ListEnvironmentsRequest())
-    assert [environment.name for environment in served.environments] == list(CATALOGUE)
-    for environment in served.environments:
-        CATALOGUE[environment.name].require_equal(environment)
-        environment.revision += 1
-        with pytest.raises(perturb.ProtocolError, match=f"has revision {environment.revision} of {environment.name}"):
-            CATALOGUE[environment.name].require_equal(environment)
-        environment.revision -= 1
-        environment.observation[0].low = -7
-        with pytest.raises(perturb.ProtocolError, match=r"-7\.0"):
-            CATALOGUE[environment.name].require_equal(environment)
+    served = json.loads(_native.catalogue(server, 10.0))["environments"]
+    assert [environment["name"] for environment in served] == list(CATALOGUE)
+    for environment in served:
+        CATALOGUE[environment["name"]].require_equal(Description.read(environment))
+        other = {**environment, "revision": environment["revision"] + 1}
+        with pytest.raises(perturb.ProtocolError, match=f"has revision {other['revision']} of {other['name']}"):
+            CATALOGUE[environment["name"]].require_equal(Description.read(other))
+        environment["observation"][0]["low"] = -7
+        with pytest.raises(perturb.ProtocolError, match=r"-7\b"):
+            CATALOGUE[environment["name"]].require_equal(Description.read(environment))
 
 
 def test_an_environment_that_is_new_to_the_server_needs_nothing_here(monkeypatch: pytest.MonkeyPatch) -> None:

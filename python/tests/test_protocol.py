@@ -10,12 +10,13 @@ import grpc
 import pytest
 
 import perturb
-from perturb._proto import perturb_pb2 as pb
-from perturb.session import SERVICE
+
+from .conftest import messages
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+pb = messages()
 Answer = pb.SessionResponse
 
 
@@ -25,17 +26,19 @@ class FakeServer:
     def __init__(self, method: str = "Session") -> None:
         self._directory = tempfile.TemporaryDirectory(prefix="perturb-test-")
         self.address = f"unix:{self._directory.name}/fake.sock"
-        self.answers: list[Answer] = []
+        self.answers: list[Any] = []
         self.sessions = 0
         handler = grpc.stream_stream_rpc_method_handler(
             self._session, pb.SessionRequest.FromString, pb.SessionResponse.SerializeToString
         )
         self._server = grpc.server(futures.ThreadPoolExecutor(4))
-        self._server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, {method: handler}),))
+        self._server.add_generic_rpc_handlers(
+            (grpc.method_handlers_generic_handler("perturb.v1.Perturb", {method: handler}),)
+        )
         self._server.add_insecure_port(self.address)
         self._server.start()
 
-    def _session(self, requests: Iterator[pb.SessionRequest], _: grpc.ServicerContext) -> Iterator[Answer]:
+    def _session(self, requests: Iterator[Any], _: grpc.ServicerContext) -> Iterator[Any]:
         self.sessions += 1
         for answer, _request in zip(self.answers, requests, strict=False):
             yield answer
@@ -45,7 +48,7 @@ class FakeServer:
         self._directory.cleanup()
 
 
-def opened() -> pb.Opened:
+def opened() -> Any:
     channels = [pb.Channel(name=str(i), low=-float("inf"), high=float("inf")) for i in range(4)]
     action = pb.ActionSpace(discrete=pb.Discrete(names=["left", "right"]))
     environment = pb.Environment(
@@ -54,15 +57,15 @@ def opened() -> pb.Opened:
     return pb.Opened(environment=environment, observations=bytes(16))
 
 
-def reset_done() -> pb.ResetDone:
+def reset_done() -> Any:
     return pb.ResetDone(observations=bytes(16))
 
 
-def stepped() -> pb.Stepped:
+def stepped() -> Any:
     return pb.Stepped(observations=bytes(16), rewards=bytes(4), terminated=bytes(1), truncated=bytes(1))
 
 
-def ended(**outcome: Any) -> pb.Stepped:
+def ended(**outcome: Any) -> Any:
     end = pb.EpisodeEnd(**outcome)
     return pb.Stepped(
         observations=bytes(16),
@@ -129,7 +132,7 @@ def test_a_reply_of_another_kind_is_refused(fake: FakeServer) -> None:
 
 def test_an_empty_reply_is_refused(fake: FakeServer) -> None:
     fake.answers = [Answer()]
-    with pytest.raises(perturb.ProtocolError, match="answered open with None"):
+    with pytest.raises(perturb.ProtocolError, match="answered open with an empty reply"):
         perturb.PerturbEnv("CartPole", server=fake.address).reset()
 
 
@@ -193,7 +196,7 @@ def test_another_service_is_no_perturb_server() -> None:
     other.end()
 
 
-def drawn(env: perturb.PerturbEnv, fake: FakeServer, *answers: Answer) -> perturb.PerturbEnv:
+def drawn(env: perturb.PerturbEnv, fake: FakeServer, *answers: Any) -> perturb.PerturbEnv:
     fake.answers = [Answer(opened=opened()), *answers]
     env.reset()
     return env
@@ -224,7 +227,7 @@ def test_a_server_that_cannot_draw_says_so_and_steps_on(code: int, message: str,
         pb.Rendered(),
     ],
 )
-def test_a_picture_of_another_size_is_refused(rendered: pb.Rendered, fake: FakeServer) -> None:
+def test_a_picture_of_another_size_is_refused(rendered: Any, fake: FakeServer) -> None:
     env = perturb.PerturbEnv("CartPole", server=fake.address, render_mode="rgb_array", width=20, height=16)
     good = pb.Rendered(pixels=bytes(range(240)) * 4, width=20, height=16)
     picture = drawn(env, fake, Answer(render=good), Answer(render=rendered)).render()

@@ -40,7 +40,8 @@ impl Environment {
     }
 }
 
-fn environment(environment: &Environment) -> Value {
+/// One of them, as [`to_json`] has it.
+pub fn environment(environment: &Environment) -> Value {
     let action = match environment.action.as_ref().and_then(|action| action.kind.as_ref()) {
         Some(Kind::Discrete(discrete)) => json!({ "discrete": discrete.names }),
         Some(Kind::Continuous(continuous)) => json!({ "continuous": continuous.channels }),

@@ -17,20 +17,38 @@ use crate::proto::{self, perturb_client::PerturbClient};
 
 /// How long each part of making a connection may take.
 const CONNECT_LIMIT: Duration = Duration::from_secs(5);
-/// After so long without a word from the server it is asked whether it lives …
-const KEEPALIVE_INTERVAL: Duration = Duration::from_secs(5);
-/// … and is taken for dead after so long without an answer.
-const KEEPALIVE_LIMIT: Duration = Duration::from_secs(15);
 /// The largest reply that is accepted, in bytes.
 const LARGEST_MESSAGE: usize = 256 << 20;
 /// Flow-control window, in bytes: a reply of a large batch must not wait for permission to be sent.
 const WINDOW: u32 = 16 << 20;
+
+/// How long a client waits for a server.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Patience {
+    /// For a reply.
+    pub reply: Duration,
+    /// Without a word from the server, before it is asked whether it lives …
+    pub keepalive_interval: Duration,
+    /// … and for the answer, before it is taken for dead.
+    pub keepalive_limit: Duration,
+}
+
+impl Default for Patience {
+    fn default() -> Self {
+        Self {
+            reply: REPLY_LIMIT,
+            keepalive_interval: Duration::from_secs(5),
+            keepalive_limit: Duration::from_secs(15),
+        }
+    }
+}
 
 /// A connection to a server that takes sessions.
 #[derive(Clone, Debug)]
 pub struct Connection {
     address: Address,
     client: PerturbClient<Channel>,
+    patience: Patience,
 }
 
 impl Connection {
@@ -39,14 +57,22 @@ impl Connection {
     /// # Errors
     /// [`ClientError::Connect`].
     pub async fn open(address: &Address) -> Result<Self, ClientError> {
+        Self::open_with(address, Patience::default()).await
+    }
+
+    /// The same, with another patience.
+    ///
+    /// # Errors
+    /// [`ClientError::Connect`].
+    pub async fn open_with(address: &Address, patience: Patience) -> Result<Self, ClientError> {
         let fail = |reason: String| ClientError::Connect { address: address.clone(), reason };
         let transport = |error: tonic::transport::Error| fail(causes(&error).join(": "));
         let channel = Endpoint::from_shared(address.to_string())
             .map_err(transport)?
             .connect_timeout(CONNECT_LIMIT)
             .tcp_nodelay(true)
-            .http2_keep_alive_interval(KEEPALIVE_INTERVAL)
-            .keep_alive_timeout(KEEPALIVE_LIMIT)
+            .http2_keep_alive_interval(patience.keepalive_interval)
+            .keep_alive_timeout(patience.keepalive_limit)
             .initial_stream_window_size(WINDOW)
             .initial_connection_window_size(WINDOW)
             .connect()
@@ -56,12 +82,17 @@ impl Connection {
         let client = PerturbClient::new(channel)
             .max_decoding_message_size(LARGEST_MESSAGE)
             .max_encoding_message_size(LARGEST_MESSAGE);
-        Ok(Self { address: address.clone(), client })
+        Ok(Self { address: address.clone(), client, patience })
     }
 
     /// Where the server is.
     pub fn address(&self) -> &Address {
         &self.address
+    }
+
+    /// How long its replies are waited for.
+    pub fn patience(&self) -> Patience {
+        self.patience
     }
 
     /// What calls are made with.
@@ -76,13 +107,14 @@ impl Connection {
     pub async fn catalogue(&self) -> Result<proto::ListEnvironmentsResponse, ClientError> {
         let what = "the catalogue";
         let mut client = self.client();
-        tokio::time::timeout(REPLY_LIMIT, client.list_environments(proto::ListEnvironmentsRequest {}))
+        tokio::time::timeout(self.patience.reply, client.list_environments(proto::ListEnvironmentsRequest {}))
             .await
-            .map_err(|_| timed_out(&self.address, what))?
+            .map_err(|_| timed_out(&self.address, what, self.patience.reply))?
             .map(tonic::Response::into_inner)
             .map_err(|status| lost(&self.address, what, &status))
     }
 }
+
 /// The machines that addresses stand for.
 #[derive(Debug, Default, PartialEq)]
 pub struct Machines {

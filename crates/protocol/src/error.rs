@@ -7,7 +7,7 @@ use tonic::{Code, Status};
 
 use crate::address::Address;
 
-/// How long a server may take for one reply; also that of a batch of thousands of environments comes much sooner.
+/// How long a server may take for one reply unless told otherwise; also that of a batch of thousands of environments comes much sooner.
 pub const REPLY_LIMIT: Duration = Duration::from_secs(60);
 
 /// A failure of a server, of the connection to it, or of a request.
@@ -133,6 +133,6 @@ pub(crate) fn lost(address: &Address, request: &'static str, status: &Status) ->
     ClientError::Lost { address: address.clone(), request, code: status.code(), reason: describe(status) }
 }
 
-pub(crate) fn timed_out(address: &Address, request: &'static str) -> ClientError {
-    ClientError::TimedOut { address: address.clone(), request, limit: REPLY_LIMIT }
+pub(crate) fn timed_out(address: &Address, request: &'static str, limit: Duration) -> ClientError {
+    ClientError::TimedOut { address: address.clone(), request, limit }
 }

@@ -18,7 +18,7 @@ mod stream;
 mod version;
 
 pub use address::{Address, AddressError};
-pub use connection::{Connection, Machines, first_of, machines};
+pub use connection::{Connection, Machines, Patience, first_of, machines};
 pub use distribution::{Distribution, DistributionError, Interval};
 pub use error::{ClientError, REPLY_LIMIT};
 pub use private_server::PrivateServer;

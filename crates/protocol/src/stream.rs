@@ -1,12 +1,15 @@
 //! A session's stream, typed: every request has its reply.
 
+use std::collections::VecDeque;
+use std::time::Duration;
+
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Status, Streaming};
 
 use crate::address::Address;
 use crate::connection::Connection;
-use crate::error::{ClientError, REPLY_LIMIT, lost, timed_out};
+use crate::error::{ClientError, lost, timed_out};
 use crate::proto::{self, SessionRequest, SessionResponse, session_request::Request, session_response::Response};
 
 /// Requests that may lie in the channel before they are sent.
@@ -19,7 +22,7 @@ pub trait Ask: Into<Request> {
     /// What it is called in errors.
     const NAME: &'static str;
 
-    /// Its reply in a response, or what another one is called that came instead.
+    /// Its reply in a response, or what the protocol calls another one that came instead.
     ///
     /// # Errors
     /// The other response's name.
@@ -27,7 +30,7 @@ pub trait Ask: Into<Request> {
 }
 
 macro_rules! requests {
-    ($($request:ident => $reply:ident, $variant:ident, $answer:ident, $name:literal;)*) => {
+    ($($request:ident => $reply:ident, $variant:ident, $answer:ident, $field:literal, $name:literal;)*) => {
         $(
             impl From<proto::$request> for Request {
                 fn from(request: proto::$request) -> Self {
@@ -50,31 +53,34 @@ macro_rules! requests {
 
         fn name_of(response: &Response) -> &'static str {
             match response {
-                $(Response::$answer(_) => stringify!($reply),)*
-                Response::Error(_) => "Error",
+                $(Response::$answer(_) => $field,)*
+                Response::Error(_) => "error",
             }
         }
     };
 }
 
 requests! {
-    Open => Opened, Open, Opened, "to open a session";
-    Step => Stepped, Step, Stepped, "a step";
-    Reset => ResetDone, Reset, Reset, "a reset";
-    Snapshot => Snapshotted, Snapshot, Snapshot, "a snapshot";
-    Restore => Restored, Restore, Restore, "to restore snapshots";
-    Render => Rendered, Render, Render, "a picture";
-    Release => Released, Release, Release, "to release environments";
-    Act => Acted, Act, Act, "to act";
-    SavePlayer => PlayerSaved, SavePlayer, SavePlayer, "to save a player";
+    Open => Opened, Open, Opened, "opened", "to open a session";
+    Step => Stepped, Step, Stepped, "stepped", "a step";
+    Reset => ResetDone, Reset, Reset, "reset", "a reset";
+    Snapshot => Snapshotted, Snapshot, Snapshot, "snapshot", "a snapshot";
+    Restore => Restored, Restore, Restore, "restore", "to restore snapshots";
+    Render => Rendered, Render, Render, "render", "a picture";
+    Release => Released, Release, Release, "release", "to release environments";
+    Act => Acted, Act, Act, "act", "to act";
+    SavePlayer => PlayerSaved, SavePlayer, SavePlayer, "save_player", "to save a player";
 }
 
 /// One session. Requests may be sent ahead; replies are taken in the order of their requests.
 #[derive(Debug)]
 pub struct Stream {
     address: Address,
+    limit: Duration,
     requests: mpsc::Sender<SessionRequest>,
     replies: Streaming<SessionResponse>,
+    /// Replies that came while a request could not be sent.
+    arrived: VecDeque<SessionResponse>,
 }
 
 impl Stream {
@@ -84,19 +90,19 @@ impl Stream {
     /// [`ClientError::Refused`] with the server's sentence, and the failures of a connection.
     pub async fn open(connection: &Connection, open: proto::Open) -> Result<(Self, proto::Opened), ClientError> {
         let (requests, receiver) = mpsc::channel(QUEUE);
-        let address = connection.address().clone();
+        let (address, limit) = (connection.address().clone(), connection.patience().reply);
         let lost = |status: &Status| lost(&address, proto::Open::NAME, status);
         // The request lies in the channel before the call is made: a server may wait for it before it answers at all.
         let message = SessionRequest { request: Some(open.into()) };
         requests.try_send(message).map_err(|error| lost(&Status::internal(error.to_string())))?;
         let mut client = connection.client();
         let call = client.session(ReceiverStream::new(receiver));
-        let replies = tokio::time::timeout(REPLY_LIMIT, call)
+        let replies = tokio::time::timeout(limit, call)
             .await
-            .map_err(|_| timed_out(&address, proto::Open::NAME))?
+            .map_err(|_| timed_out(&address, proto::Open::NAME, limit))?
             .map_err(|status| lost(&status))?
             .into_inner();
-        let mut stream = Self { address, requests, replies };
+        let mut stream = Self { address, limit, requests, replies, arrived: VecDeque::new() };
         let opened = stream.receive::<proto::Open>().await?;
         Ok((stream, opened))
     }
@@ -117,16 +123,41 @@ impl Stream {
         self.requests.send(message).await.map_err(ended)
     }
 
+    /// Sends one of many requests whose replies are taken later. A server that has no room for replies reads no requests
+    /// either: so those that come are kept while this one has to wait.
+    ///
+    /// # Errors
+    /// [`ClientError::Lost`].
+    pub async fn send_ahead<A: Ask>(&mut self, request: A) -> Result<(), ClientError> {
+        let message = SessionRequest { request: Some(request.into()) };
+        let ended = || lost(&self.address, A::NAME, &Status::unavailable("the stream has ended"));
+        loop {
+            let arrived = tokio::select! {
+                biased;
+                room = self.requests.reserve() => {
+                    room.map_err(|_| ended())?.send(message);
+                    return Ok(());
+                }
+                arrived = self.replies.message() => arrived,
+            };
+            let arrived = arrived.map_err(|status| lost(&self.address, A::NAME, &status))?;
+            self.arrived.push_back(arrived.ok_or_else(ended)?);
+        }
+    }
+
     /// Takes the reply to the oldest request that has none yet, which must have been an `A`.
     ///
     /// # Errors
     /// [`ClientError::Refused`] with the server's sentence; then the session lives on. Otherwise the failures of a
     /// connection.
     pub async fn receive<A: Ask>(&mut self) -> Result<A::Reply, ClientError> {
-        let message = tokio::time::timeout(REPLY_LIMIT, self.replies.message())
-            .await
-            .map_err(|_| timed_out(&self.address, A::NAME))?
-            .map_err(|status| lost(&self.address, A::NAME, &status))?;
+        let message = match self.arrived.pop_front() {
+            Some(arrived) => Some(arrived),
+            None => tokio::time::timeout(self.limit, self.replies.message())
+                .await
+                .map_err(|_| timed_out(&self.address, A::NAME, self.limit))?
+                .map_err(|status| lost(&self.address, A::NAME, &status))?,
+        };
         match message.map(|message| message.response) {
             Some(Some(Response::Error(proto::Error { code, message }))) => {
                 let address = self.address.clone();

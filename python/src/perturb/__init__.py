@@ -28,7 +28,7 @@ from .errors import (
 from .registration import register_all as _register_all
 from .vector import PerturbVectorEnv
 
-__version__ = _version("perturb-client")
+__version__ = _version("perturb")
 
 __all__ = [
     "InvalidArgumentError",

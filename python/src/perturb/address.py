@@ -12,11 +12,9 @@ from .errors import InvalidArgumentError
 
 @dataclass(frozen=True)
 class Address:
-    """Where a server listens, as gRPC wants it: `unix:/path` or `host:port`."""
+    """Where a server listens: `unix:/path` or `host:port`."""
 
     target: str
-    # Whether the server is on this machine, where no proxy stands between.
-    local: bool
 
     def __str__(self) -> str:
         return self.target
@@ -42,7 +40,7 @@ def parse_address(text: str) -> Address:
             raise refuse("the path of the socket must be absolute")
         if len(path.encode()) > LONGEST_SOCKET_PATH:
             raise refuse(f"the path of the socket is longer than the {LONGEST_SOCKET_PATH} bytes that Linux allows")
-        return Address(f"unix:{path}", local=True)
+        return Address(f"unix:{path}")
     if text.startswith("https://"):
         raise refuse("encrypted connections are not supported, tunnel them instead")
     rest = text.removeprefix("http://") if text.startswith("http://") else text.removeprefix("tcp://")
@@ -57,20 +55,11 @@ def parse_address(text: str) -> Address:
             raise refuse(f"{host[1:-1]!r} is not an IPv6 address")
     elif not re.fullmatch(r"[A-Za-z0-9._-]+", host):
         raise refuse(f"{host!r} is not a host name; an IPv6 address must stand in brackets")
-    return Address(f"{host}:{port}", local=_is_loopback(host.strip("[]")))
+    return Address(f"{host}:{port}")
 
 
 def _is_ipv6(host: str) -> bool:
     try:
         return ipaddress.IPv6Address(host).scope_id is None  # a scope is not for URLs
-    except ValueError:
-        return False
-
-
-def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False

@@ -20,8 +20,6 @@ from .errors import InvalidArgumentError, ProtocolError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from ._proto import perturb_pb2 as pb
-
 Range = tuple[float, float]
 
 
@@ -57,13 +55,13 @@ class Description:
 
     @classmethod
     def read(cls, entry: Mapping[str, Any]) -> Description:
-        """Understand an environment of catalogue.json, where an open end of a range is null."""
+        """Understand an environment of catalogue.json, or of a server, where an open end of a range is null."""
 
         def ranges(channels: Iterable[Mapping[str, float | None]]) -> tuple[Range, ...]:
             ends = ((channel["low"], channel["high"]) for channel in channels)
             return tuple((-math.inf if low is None else low, math.inf if high is None else high) for low, high in ends)
 
-        action = entry["action"]
+        action, success = entry["action"] or {"continuous": []}, entry.get("success")
         return cls(
             name=entry["name"],
             revision=entry["revision"],
@@ -71,7 +69,7 @@ class Description:
             actions=len(action["discrete"]) if "discrete" in action else ranges(action["continuous"]),
             control_timestep=entry["control_timestep"],
             parameter_observations=ranges(seen["entry"] for seen in entry.get("parameter_observations", [])),
-            success=Success(**entry["success"]),
+            success=None if success is None else Success(**success),
         )
 
     def observing_parameters(self) -> Description:
@@ -96,25 +94,15 @@ class Description:
         """Discrete from 0, or a float32 Box [A]."""
         return spaces.Discrete(self.actions) if isinstance(self.actions, int) else _box(self.actions)
 
-    def require_equal(self, served: pb.Environment) -> None:
+    def require_equal(self, served: Description) -> None:
         """Raise ProtocolError if the server's environment is not this one."""
-        action = served.action
-        theirs = Description(
-            served.name,
-            served.revision,
-            tuple((channel.low, channel.high) for channel in served.observation),
-            len(action.discrete.names)
-            if action.WhichOneof("kind") == "discrete"
-            else tuple((channel.low, channel.high) for channel in action.continuous.channels),
-            served.control_timestep,
-        )
-        if theirs.revision != self.revision:
+        if served.revision != self.revision:
             raise ProtocolError(
-                f"the server has revision {theirs.revision} of {self.name}, this package has {self.revision}: "
-                "install the perturb-client of the server's version"
+                f"the server has revision {served.revision} of {self.name}, this package has {self.revision}: "
+                "install the package perturb of the server's version"
             )
-        if theirs != self:
-            raise ProtocolError(f"the server describes {self.name} as {theirs}, this package as {self}")
+        if served != self:
+            raise ProtocolError(f"the server describes {self.name} as {served}, this package as {self}")
 
 
 def _box(ranges: tuple[Range, ...]) -> spaces.Box:

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numpy as np
+import json
+from typing import TYPE_CHECKING, Any
 
 from . import catalogue, local_server, requests
-from ._proto import perturb_pb2 as pb
 from .address import parse_address
 from .errors import InvalidArgumentError, OutOfOrderError, ProtocolError
-from .infos import Names
 from .session import Session
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    import numpy as np
     from gymnasium.vector import AutoresetMode
     from numpy.typing import NDArray
+
+    from ._native import Events, Opened
 
 # How long a reply may take unless told otherwise, s.
 TIMEOUT = 60.0
@@ -44,6 +44,7 @@ class Client:
         render_mode: str | None,
         width: int,
         height: int,
+        single: bool,
     ) -> None:
         requests.render_mode(render_mode)
         self._drawn = render_mode is not None
@@ -57,21 +58,20 @@ class Client:
         if server is None:
             local_server.find_program()  # better now than at the first reset
         self._timeout = requests.seconds(timeout, "timeout")
-        self._request = pb.Open(
-            environment=environment,
-            version=requests.version(version),
-            parameters=requests.distributions(parameters),
-            batch_size=self.num_envs,
-            first_environment_index=requests.count(first_environment_index, "first_environment_index", 0),
-            episodes_per_trial=requests.count(episodes_per_trial, "episodes_per_trial", 1),
-            autoreset_mode=requests.autoreset(autoreset_mode),
-            receipts=receipts,
-            reward_terms=reward_terms,
-            observe_parameters=observe_parameters,
-        )
+        self._single = single
+        self._parameters = requests.distributions(parameters)
+        self._request: dict[str, Any] = {
+            "environment": environment,
+            "version": requests.version(version),
+            "first_environment_index": requests.count(first_environment_index, "first_environment_index", 0),
+            "episodes_per_trial": requests.count(episodes_per_trial, "episodes_per_trial", 1),
+            "autoreset_mode": autoreset_mode.value,
+            "receipts": bool(receipts),
+            "reward_terms": bool(reward_terms),
+            "observe_parameters": observe_parameters,
+        }
         self._partly_changed = False
         self._session: Session | None = None
-        self._names: Names | None = None
         self._closed = False
 
     @property
@@ -86,14 +86,7 @@ class Client:
             raise OutOfOrderError("call reset() first: no episode has begun")
         return self._session
 
-    @property
-    def names(self) -> Names:
-        """The names of what the session's replies hold."""
-        if self._names is None:
-            raise OutOfOrderError("call reset() first: no episode has begun")
-        return self._names
-
-    def open(self, seeds: Sequence[int], generator: np.random.Generator) -> pb.Opened | None:
+    def open(self, seeds: Sequence[int], generator: np.random.Generator) -> Opened | None:
         """Open a session, unless one is open. Without seeds, which a reset is to give, the generator draws one.
 
         Raises:
@@ -110,50 +103,48 @@ class Client:
                 )
             self._session.close()
             self._session = None
-        session = Session(self._server, self._timeout)
+        session = Session(self._server, self._timeout, self.description, self.num_envs, single=self._single)
         try:
-            self._request.seed = seeds[0] if seeds else int(generator.integers(2**63))
-            opened = session.open(self._request)
-            if opened.observes_parameters != self._request.observe_parameters:
+            seed = seeds[0] if seeds else int(generator.integers(2**63))
+            opened = session.open(**self._request, parameters=self._parameters, seed=seed)
+            if opened.observes_parameters != self._request["observe_parameters"]:
                 raise ProtocolError(
                     "the server does not know observe='parameters': it is older than this package; "
                     "run the perturb-server of the package's version, or leave it out"
                 )
-            self.description.require_equal(opened.environment)
+            self.description.require_equal(catalogue.Description.read(json.loads(opened.environment)))
         except BaseException:
             session.close()
             raise
-        self._session, self._names = session, Names(opened.environment)
+        self._session = session
         return opened
 
     def reset(
         self,
         mask: NDArray[np.bool_] | None,
         seeds: Sequence[int],
-        parameters: dict[str, pb.Distribution],
+        parameters: requests.Intervals,
         states: bytes,
-    ) -> pb.ResetDone:
+    ) -> tuple[NDArray[np.float32], Events]:
         """Begin new episodes. Parameters stay, also if the session has to be opened again."""
-        request = pb.Reset(mask=_bytes(mask), seeds=seeds, parameters=parameters, states=states)
-        done = self.session.reset(request)
+        done = self.session.reset(_bytes(mask), seeds, parameters, states)
         if parameters and mask is not None and not mask.all():
             self._partly_changed = True
-        elif parameters:
-            for name, distribution in parameters.items():
-                self._request.parameters[name].CopyFrom(distribution)
+        else:
+            self._parameters |= parameters
         return done
 
     def snapshot(self, mask: NDArray[np.bool_] | None) -> list[bytes]:
         """Save the selected environments."""
-        return list(self.session.snapshot(pb.Snapshot(mask=_bytes(mask))).snapshots)
+        return self.session.snapshot(_bytes(mask))
 
-    def restore(self, snapshots: Sequence[bytes], mask: NDArray[np.bool_] | None) -> pb.Restored:
-        """Bring saved environments back."""
+    def restore(self, snapshots: Sequence[bytes], mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
+        """Bring saved environments back: observations [M, O]."""
         if not all(isinstance(snapshot, bytes) for snapshot in snapshots):
             raise InvalidArgumentError("a snapshot is not of the type bytes; expected what snapshot() returned")
         session = self.session
         try:
-            restored = session.restore(pb.Restore(mask=_bytes(mask), snapshots=snapshots))
+            restored = session.restore(_bytes(mask), snapshots)
         except BaseException:
             # A refusal, after which the session is usable, has changed nothing.
             self._partly_changed = self._partly_changed or not session.usable()
@@ -162,28 +153,10 @@ class Client:
         return restored
 
     def render(self, slot: int) -> NDArray[np.uint8]:
-        """Draw an environment: a read-only array [height, width, 3] of the bytes that came."""
+        """Draw an environment: a read-only array [height, width, 3]."""
         if not self._drawn:
             raise OutOfOrderError("render() is for environments that were made with render_mode='rgb_array'")
-        rendered = self.session.render(pb.Render(slot=slot, width=self._width, height=self._height))
-        shape, size = (rendered.height, rendered.width, 3), len(rendered.pixels)
-        if shape[:2] != (self._height, self._width) or size != np.prod(shape):
-            what = f"the server sent a picture {list(shape)} in {size} bytes; expected {[self._height, self._width, 3]}"
-            raise ProtocolError(what)
-        return np.frombuffer(rendered.pixels, np.uint8).reshape(shape)
-
-    def floats(self, data: bytes, *shape: int) -> NDArray[np.float32]:
-        """Look at a reply's numbers as a read-only array, without a copy."""
-        size = int(np.prod(shape)) * 4
-        if len(data) != size:
-            raise ProtocolError(f"the server sent {len(data)} bytes for float32 {list(shape)}; expected {size}")
-        return np.frombuffer(data, "<f4").reshape(shape)
-
-    def flags(self, data: bytes) -> NDArray[np.bool_]:
-        """Copy flags [N]."""
-        if len(data) != self.num_envs:
-            raise ProtocolError(f"the server sent {len(data)} flags; expected {self.num_envs}")
-        return np.frombuffer(data, np.bool_).copy()
+        return self.session.render(slot, self._width, self._height)
 
     def close(self) -> None:
         """Close the session; this process's own server ends with its last session."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
@@ -83,12 +84,15 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
             render_mode=render_mode,
             width=width,
             height=height,
+            single=True,
         )
         self.render_mode = render_mode
         self.metadata = self._client.description.metadata()
-        self._reward_terms = reward_terms
         self.observation_space = cast("spaces.Space[NDArray[np.float32]]", self._client.description.observation_space())
         self.action_space = self._client.description.action_space()
+        self._encode = partial(
+            requests.actions, description=self._client.description, shape=self.action_space.shape or ()
+        )
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
@@ -113,11 +117,11 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
         super().reset(seed=seeds[0] if seeds else None)
 
         opened = self._client.open(seeds, self.np_random)
-        done: Any = opened
         if opened is None or seeds or parameters or states:
-            done = self._client.reset(None, seeds, parameters, states)
-        info = self._client.names.started(done.started[0]) if done.started else {}
-        return self._observation(done.observations), info
+            observations, events = self._client.reset(None, seeds, parameters, states)
+        else:
+            observations, events = opened.observations, opened.events
+        return observations[0].copy(), events.single()
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Advance by one step. Actions beyond the range of a Box are clipped by the environment.
@@ -127,18 +131,9 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
             OutOfOrderError: before the first reset, and after the end of an episode.
             ServerConnectionError, ServerTimeoutError: and the environment is gone.
         """
-        client = self._client
-        session = client.session
-        actions = requests.actions(action, client.description, self.action_space.shape or ())
-        stepped = session.step(actions)
-        info: dict[str, Any] = {}
-        if self._reward_terms:
-            info |= client.names.terms(client.floats(stepped.reward_terms, len(client.names.reward_terms)))
-        if stepped.ended:
-            info |= client.names.ended(stepped.ended[0])
-        observation = self._observation(stepped.observations)
-        reward = float(client.floats(stepped.rewards, 1)[0])
-        return observation, reward, bool(stepped.terminated[0]), bool(stepped.truncated[0]), info
+        observations, rewards, terminated, truncated, events = self._client.session.step(action, self._encode)
+        info = {} if events is None else events.single()
+        return observations[0].copy(), float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def snapshot(self) -> bytes:
         """Save the environment whole: physics, parameters, counters, random streams."""
@@ -150,7 +145,8 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
         What follows is what followed the snapshot, byte for byte.
         """
         self._client.open([], self.np_random)
-        return self._observation(self._client.restore([snapshot], None).observations)
+        observation: NDArray[np.float32] = self._client.restore([snapshot], None)[0].copy()
+        return observation
 
     def render(self) -> NDArray[np.uint8]:
         """Draw the environment as it is now: red, green and blue, uint8 [height, width, 3]. Changes nothing.
@@ -165,6 +161,3 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
     def close(self) -> None:
         """Free the environment on the server."""
         self._client.close()
-
-    def _observation(self, data: bytes) -> NDArray[np.float32]:
-        return self._client.floats(data, len(self._client.description.observation)).copy()

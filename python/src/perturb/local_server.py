@@ -25,6 +25,8 @@ from .errors import PerturbError, ServerStartError
 PROGRAM = "perturb-server"
 # Overrides where the program is looked for.
 VARIABLE = "PERTURB_SERVER"
+# Where wheels have it, if they do.
+BUNDLED = Path(__file__).with_name("_server") / PROGRAM
 # How long a start may take, s.
 START_LIMIT = 20.0
 # How long a server may take to end before it is killed, s.
@@ -32,13 +34,14 @@ END_LIMIT = 5.0
 
 
 def find_program() -> Path:
-    """Find the program perturb-server.
+    """Find the program perturb-server: what PERTURB_SERVER names, else the package's own, else that on PATH.
 
     Raises:
         ServerStartError: with how to get it.
     """
     how = (
-        "build it with `make build` in a clone of perturb and set PERTURB_SERVER to target/release/perturb-server, "
+        "install a wheel that has it (`make wheel`), build it with `make build` in a clone of perturb and set "
+        "PERTURB_SERVER to target/release/perturb-server, "
         "or name a running server: server='unix:/path' or server='host:port'"
     )
     named = os.environ.get(VARIABLE)
@@ -47,9 +50,12 @@ def find_program() -> Path:
         if found is None:
             raise ServerStartError(f"{VARIABLE}={named} is not a program that can be run; {how}")
         return Path(found)
-    found = shutil.which(PROGRAM)
+    found = shutil.which(BUNDLED) or shutil.which(PROGRAM)
     if found is None:
-        raise ServerStartError(f"the program {PROGRAM} is not on PATH, and {VARIABLE} is not set; {how}")
+        raise ServerStartError(
+            f"the program {PROGRAM} is not on PATH, {VARIABLE} is not set, and the package was installed without it; "
+            f"{how}"
+        )
     return Path(found)
 
 

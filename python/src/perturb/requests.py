@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from ._proto import perturb_pb2 as pb
 from .catalogue import LEAST_PIXELS, MOST_PIXELS
 from .errors import InvalidArgumentError
 
@@ -27,28 +26,21 @@ if TYPE_CHECKING:
 ParameterSet: TypeAlias = float | tuple[float, float] | Sequence[tuple[float, float]]
 Parameters: TypeAlias = Mapping[str, ParameterSet]
 
-_VERSIONS = {
-    "D": pb.VERSION_DEFAULT,
-    "R": pb.VERSION_RANDOM,
-    "E": pb.VERSION_EXTREME,
-    "R+E": pb.VERSION_RANDOM_OR_EXTREME,
-}
-_AUTORESET = {
-    AutoresetMode.NEXT_STEP: pb.AUTORESET_MODE_NEXT_STEP,
-    AutoresetMode.SAME_STEP: pb.AUTORESET_MODE_SAME_STEP,
-    AutoresetMode.DISABLED: pb.AUTORESET_MODE_DISABLED,
-}
+# The same by name, as the protocol has it.
+Intervals: TypeAlias = dict[str, list[tuple[float, float]]]
+
+_VERSIONS = ("D", "R", "E", "R+E")
 _INT32 = np.iinfo(np.int32)
 
 
-def version(name: str) -> pb.Version:
+def version(name: str) -> str:
     """D, R, E or R+E."""
     if name not in _VERSIONS:
         raise InvalidArgumentError(
             f"version={name!r} is none of 'D' (default physics), 'R' (random), 'E' (extreme) and 'R+E' (each in half "
             "of the trials)"
         )
-    return _VERSIONS[name]
+    return name
 
 
 def observes_parameters(observe: Any) -> bool:
@@ -56,11 +48,6 @@ def observes_parameters(observe: Any) -> bool:
     if observe not in ("state", "parameters"):
         raise InvalidArgumentError(f"observe={observe!r} is none of 'state' and 'parameters' (both, state first)")
     return bool(observe == "parameters")
-
-
-def autoreset(mode: AutoresetMode) -> pb.AutoresetMode:
-    """The protocol's name of the mode."""
-    return _AUTORESET[mode]
 
 
 def autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
@@ -72,7 +59,7 @@ def autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
         raise InvalidArgumentError(f"autoreset_mode={mode!r} is none of gymnasium's AutoresetMode ({known})") from error
 
 
-def distributions(parameters: Parameters | None) -> dict[str, pb.Distribution]:
+def distributions(parameters: Parameters | None) -> Intervals:
     """The sets that replace those of the version."""
     if parameters is None:
         return {}
@@ -89,7 +76,7 @@ def _name(name: Any) -> str:
     return name
 
 
-def _distribution(name: str, value: ParameterSet) -> pb.Distribution:
+def _distribution(name: str, value: ParameterSet) -> list[tuple[float, float]]:
     wrong = InvalidArgumentError(
         f"parameters[{name!r}] is {value!r}; expected a number, an interval (low, high), "
         "or several intervals [(low, high), …]"
@@ -101,7 +88,7 @@ def _distribution(name: str, value: ParameterSet) -> pb.Distribution:
         numbers = numbers[np.newaxis]
     if numbers.ndim != 2 or numbers.shape[1] != 2:
         raise wrong
-    return pb.Distribution(intervals=[pb.Interval(low=low, high=high) for low, high in numbers.tolist()])
+    return [(low, high) for low, high in numbers.tolist()]
 
 
 def _numbers(value: Any, wrong: InvalidArgumentError) -> NDArray[np.float64]:

@@ -1,7 +1,8 @@
 """A session: one stream to a server, which owns a batch of environments. Requests go out, replies come back in order.
 
-gRPC's threads do not survive a fork. So a session belongs to the process that opened it, and is opened when it is first
-needed, not when an environment is made: a process that is forked in between opens its own.
+The native module has the stream; here are its errors' sentences and the private server. A session belongs to the
+process that opened it, and is opened when it is first needed, not when an environment is made: a process that is forked
+in between opens its own.
 """
 
 from __future__ import annotations
@@ -10,24 +11,13 @@ import atexit
 import collections
 import contextlib
 import os
-import queue
 import subprocess
-import sys
 import threading
-import time
 import weakref
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
-# gRPC reads this once, when it is first imported. Without it a process that is forked from one with open channels hangs
-# in its first call.
-GRPC_WAS_IMPORTED = "grpc" in sys.modules
-os.environ.setdefault("GRPC_ENABLE_FORK_SUPPORT", "1")
-
-import grpc  # noqa: E402
-
-from . import local_server  # noqa: E402
-from ._proto import perturb_pb2 as pb  # noqa: E402
-from .errors import (  # noqa: E402
+from . import _native, local_server
+from .errors import (
     InvalidArgumentError,
     OutOfOrderError,
     PerturbError,
@@ -40,25 +30,25 @@ from .errors import (  # noqa: E402
 )
 
 if TYPE_CHECKING:
-    from .address import Address
+    from collections.abc import Callable, Sequence
 
-SERVICE = pb.DESCRIPTOR.services_by_name["Perturb"].full_name
-# Which reply each request gets.
-REPLIES = {
-    "open": "opened",
-    "step": "stepped",
-    "reset": "reset",
-    "snapshot": "snapshot",
-    "restore": "restore",
-    "render": "render",
-}
-# How long a connection may take to be made, s.
-CONNECT_LIMIT = 10
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from .address import Address
+    from .catalogue import Description
+
+    Intervals: TypeAlias = dict[str, list[tuple[float, float]]]
+
+Reply = TypeVar("Reply")
+
 # How often a silent server is asked whether it lives, and how long it may take to answer, s. A very busy machine is no
 # reason to lose environments; the sockets of a server that ended are closed by its system at once.
-KEEPALIVE_INTERVAL, KEEPALIVE_LIMIT = 10, 20
-# How often the watchdog looks for requests that are overdue, s.
-WATCH_INTERVAL = 0.25
+KEEPALIVE_INTERVAL, KEEPALIVE_LIMIT = 10.0, 20.0
+# How often a session that nobody waits in answers the server's question whether it lives, s.
+TEND_INTERVAL = 0.25
+# gRPC's codes of streams that a server ended.
+RESOURCE_EXHAUSTED, OUT_OF_RANGE, UNIMPLEMENTED = 8, 11, 12
 
 
 class Session:
@@ -67,7 +57,9 @@ class Session:
     A session that is lost (the server died, a reply took too long, the wait for it was interrupted) stays lost.
     """
 
-    def __init__(self, server: Address | None, timeout: float) -> None:
+    def __init__(
+        self, server: Address | None, timeout: float, description: Description, num_envs: int, *, single: bool
+    ) -> None:
         _close_forgotten()
         self._local: local_server.LocalServer | None = None
         if server is None:
@@ -75,26 +67,36 @@ class Session:
             server = self._local.address
         self.address: Address = server
         self._owner = os.getpid()
-        self._timeout = timeout
+        self._limit = timeout
         self._lost: str | None = None
         self._opened = False
-        # When the reply that is waited for is overdue. Under the lock the watchdog sees that of the present call, or
-        # none: it cannot blame the next one.
-        self.deadline: float | None = None
-        self._overdue = False
-        self._watched = threading.Lock()
-        self._requests: queue.SimpleQueue[pb.SessionRequest | None] = queue.SimpleQueue()
-        self._channel = grpc.insecure_channel(str(self.address), options=_channel_options(self.address))
-        self._responses: Any = self._channel.stream_stream(
-            f"/{SERVICE}/Session",
-            request_serializer=pb.SessionRequest.SerializeToString,
-            response_deserializer=pb.SessionResponse.FromString,
-        )(iter(self._requests.get, None))
-        self._parts: _Parts = (self._requests, self._responses, self._channel, self._local, self._owner)
+        self._native = _native.Session(
+            str(server),
+            timeout,
+            (KEEPALIVE_INTERVAL, KEEPALIVE_LIMIT),
+            num_envs,
+            len(description.observation),
+            None if isinstance(description.actions, int) else len(description.actions),
+            single,
+        )
+        self._parts: _Parts = (self._native, self._local, self._owner)
         # Wherever Python happens to collect a forgotten session, also where a lock is held: so nothing but this.
         self._forget = weakref.finalize(self, _forgotten.append, self._parts)
         self._forget.atexit = False  # _at_exit closes what is left
-        _watchdog.watch(self)
+        _keeper.keep(self)
+
+    @property
+    def waits(self) -> bool:
+        """Whether a thread waits for a reply."""
+        return self._native.waits
+
+    @property
+    def _timeout(self) -> float:
+        return self._limit
+
+    @_timeout.setter
+    def _timeout(self, seconds: float) -> None:
+        self._limit = self._native.timeout = seconds
 
     def usable(self) -> bool:
         """Whether requests can be sent: it is neither lost nor another process's."""
@@ -114,36 +116,45 @@ class Session:
         if self._lost is not None:
             raise OutOfOrderError(f"call reset() to begin anew, this environment is gone: {self._lost}")
 
-    def open(self, request: pb.Open) -> pb.Opened:
+    def open(self, **request: Any) -> _native.Opened:
         """Create the environments and begin their first episodes."""
-        opened: pb.Opened = self._call("open", pb.SessionRequest(open=request))
+        opened = self._call("open", self._native.open, **request)
         self._opened = True
         return opened
 
-    def step(self, actions: bytes) -> pb.Stepped:
+    def step(self, actions: Any, encode: Callable[[Any], bytes]) -> _native.Stepped:
         """Advance every environment."""
-        stepped: pb.Stepped = self._call("step", pb.SessionRequest(step=pb.Step(actions=actions)))
-        return stepped
+        return self._call("step", self._native.step, actions, encode)
 
-    def reset(self, request: pb.Reset) -> pb.ResetDone:
-        """Begin new episodes."""
-        done: pb.ResetDone = self._call("reset", pb.SessionRequest(reset=request))
-        return done
+    def send(self, actions: Any, encode: Callable[[Any], bytes]) -> None:
+        """Ask for a step, whose outcome `recv` gives."""
+        self._call("step", self._native.send, actions, encode)
 
-    def snapshot(self, request: pb.Snapshot) -> pb.Snapshotted:
+    def recv(self) -> _native.Stepped:
+        """Wait for the oldest step that was sent."""
+        return self._call("step", self._native.recv)
+
+    def reset(
+        self, mask: bytes, seeds: Sequence[int], parameters: Intervals, states: bytes
+    ) -> tuple[NDArray[np.float32], _native.Events]:
+        """Begin new episodes: observations [M, O], and the episodes."""
+        return self._call("reset", self._native.reset, mask, seeds, parameters, states)
+
+    def snapshot(self, mask: bytes) -> list[bytes]:
         """Save environments."""
-        saved: pb.Snapshotted = self._call("snapshot", pb.SessionRequest(snapshot=request))
-        return saved
+        return self._call("snapshot", self._native.snapshot, mask)
 
-    def restore(self, request: pb.Restore) -> pb.Restored:
-        """Bring saved environments back."""
-        restored: pb.Restored = self._call("restore", pb.SessionRequest(restore=request))
-        return restored
+    def restore(self, mask: bytes, snapshots: Sequence[bytes]) -> NDArray[np.float32]:
+        """Bring saved environments back: observations [M, O]."""
+        return self._call("restore", self._native.restore, mask, snapshots)
 
-    def render(self, request: pb.Render) -> pb.Rendered:
-        """Draw an environment."""
-        rendered: pb.Rendered = self._call("render", pb.SessionRequest(render=request))
-        return rendered
+    def render(self, slot: int, width: int, height: int) -> NDArray[np.uint8]:
+        """Draw an environment: [height, width, 3]."""
+        return self._call("render", self._native.render, slot, width, height)
+
+    def tend(self) -> None:
+        """Answer the server's question whether this side lives; called by the keeper."""
+        self._native.tend()
 
     def close(self) -> None:
         """End the session; the server frees its environments."""
@@ -155,122 +166,83 @@ class Session:
         if self._forget.detach() is not None:
             _close(*self._parts)
 
-    def expire(self, now: float) -> None:
-        """Give up waiting for the reply, if it is overdue; called by the watchdog."""
-        with self._watched:
-            if self.deadline is not None and now > self.deadline:
-                self.deadline = None
-                self._overdue = True
-                self._responses.cancel()
-
-    def _call(self, kind: str, request: pb.SessionRequest) -> Any:
-        self.require_usable()
-        self._lost = f"the wait for the reply to {kind} was interrupted"  # unless it comes, or fails otherwise
+    def _call(self, kind: str, call: Callable[..., Reply], *arguments: Any, **fields: Any) -> Reply:
         try:
-            with self._watched:
-                self.deadline = time.monotonic() + self._timeout
-            self._requests.put(request)
-            response = next(self._responses)
-        except grpc.RpcError as error:
-            raise self._fail(self._explain(kind, error)) from error
-        except StopIteration:
-            raise self._fail(ServerConnectionError(f"{self._lost_during(kind)}: it ended the stream")) from None
-        except BaseException:  # Ctrl-C: the reply to come would be taken for that to the next request
+            return call(*arguments, **fields)
+        except BaseException as error:  # noqa: BLE001  (Ctrl-C ends a session, too)
+            raise self._failed(kind, error) from None
+
+    def _failed(self, kind: str, error: BaseException) -> BaseException:
+        """What to raise in place of an error; nearly all cost the session."""
+        if not isinstance(error, _native.Failure):
+            if not self._native.ended:
+                return error  # the actions' shape or kind: nothing was sent
+            # Ctrl-C: the reply to come would have been taken for that to the next request.
+            self._lost = self._lost or f"the wait for the reply to {kind} was interrupted"
             self._close()
-            raise
-        finally:
-            with self._watched:
-                self.deadline = None
-        if self._overdue:  # the reply and the end of the wait for it crossed: the stream is cancelled
-            raise self._fail(self._timed_out(kind))
-        self._lost = None
-        answered = response.WhichOneof("response")
-        if answered == "error":
-            refused = refusal(kind, response.error.code, response.error.message)
+            return error
+        what, code, words = error.args
+        if what == "refused":
+            refused = refusal(kind, code, words)
             # A refusal changes nothing; a defect of the server costs the environments.
-            raise self._fail(refused) if isinstance(refused, ServerDefectError) else refused
-        if answered != REPLIES[kind]:
-            what = f"the server at {self.address} answered {kind} with {answered}: are both of one version?"
-            raise self._fail(ProtocolError(what))
-        return getattr(response, answered)
+            return self._fail(refused) if isinstance(refused, ServerDefectError) else refused
+        if what == "malformed":
+            return ProtocolError(words)
+        if what == "invalid":
+            return InvalidArgumentError(words)
+        if what == "unusable":
+            try:
+                self.require_usable()
+            except OutOfOrderError as unusable:
+                return unusable
+            return OutOfOrderError(words)
+        return self._fail(self._explain(kind, what, code, words))
 
     def _fail(self, error: PerturbError) -> PerturbError:
-        self._lost = str(error)
+        self._lost = self._lost or str(error)
         self._close()
         return error
 
-    def _lost_during(self, kind: str) -> str:
-        return f"lost the server at {self.address} during {kind}"
-
-    def _timed_out(self, kind: str) -> ServerTimeoutError:
-        forked = (
-            " (gRPC was imported before perturb, and cannot be used in forked processes then: import perturb first)"
-        )
-        hint = forked if GRPC_WAS_IMPORTED and not self._opened else ""
-        return ServerTimeoutError(
-            f"the server at {self.address} did not answer {kind} within {self._timeout:g} s{hint}; "
-            "look at its log, or give slow environments more time with timeout="
-        )
-
-    def _explain(self, kind: str, error: grpc.RpcError) -> PerturbError:
-        """Turn the status that ended the stream into what happened and what to do."""
-        status, details = error.code(), error.details()
-        if self._overdue:
-            return self._timed_out(kind)
-        if status is grpc.StatusCode.RESOURCE_EXHAUSTED:
-            return ServerFullError(f"the server at {self.address} refused {kind}: {details}")
-        if status is grpc.StatusCode.OUT_OF_RANGE:
+    def _explain(self, kind: str, what: str, code: int, words: str) -> PerturbError:
+        """Say what ended the stream and what to do."""
+        lost = f"lost the server at {self.address} during {kind}"
+        if what == "timed out":
+            return ServerTimeoutError(
+                f"the server at {self.address} did not answer {kind} within {self._limit:g} s; "
+                "look at its log, or give slow environments more time with timeout="
+            )
+        if what == "mismatch":
+            return ProtocolError(f"the server at {self.address} answered {kind} with {words}: are both of one version?")
+        if code == RESOURCE_EXHAUSTED:
+            return ServerFullError(f"the server at {self.address} refused {kind}: {words}")
+        if code == OUT_OF_RANGE:
             return InvalidArgumentError(
-                f"the server at {self.address} refused {kind}, which is too large for it: {details}; "
+                f"the server at {self.address} refused {kind}, which is too large for it: {words}; "
                 "start it with a larger --max-message-bytes, or use fewer environments"
             )
-        if status is grpc.StatusCode.UNIMPLEMENTED:
-            return ProtocolError(f"what answers at {self.address} is no perturb-server: {details}")
+        if code == UNIMPLEMENTED:
+            return ProtocolError(f"what answers at {self.address} is no perturb-server: {words}")
         if self._local is not None:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                code = self._local.process.wait(1)
+                status = self._local.process.wait(1)
                 return ServerConnectionError(
-                    f"{self._lost_during(kind)}: this process's perturb-server ended with status {code}; "
-                    "reset() starts another"
+                    f"{lost}: this process's perturb-server ended with status {status}; reset() starts another"
                 )
         if not self._opened:
             return ServerConnectionError(
-                f"no server answers at {self.address}: {details}; "
+                f"no server answers at {self.address}: {words}; "
                 f"start one with `perturb-server --listen {_listen(self.address)}`, or correct server="
             )
-        return ServerConnectionError(f"{self._lost_during(kind)}: {details}; reset() begins anew when it runs again")
+        return ServerConnectionError(f"{lost}: {words}; reset() begins anew when it runs again")
 
 
 def _listen(address: Address) -> str:
     return str(address) if str(address).startswith("unix:") else f"tcp://{address}"
 
 
-def _channel_options(address: Address) -> list[tuple[str, int | str]]:
-    options: list[tuple[str, int | str]] = [
-        ("grpc.max_receive_message_length", -1),
-        ("grpc.max_send_message_length", -1),
-        # A channel of one's own has no memory of a server that was at this address before.
-        ("grpc.use_local_subchannel_pool", 1),
-        ("grpc.min_reconnect_backoff_ms", CONNECT_LIMIT * 1000),  # this is also the limit of the first attempt
-        ("grpc.keepalive_time_ms", KEEPALIVE_INTERVAL * 1000),
-        ("grpc.keepalive_timeout_ms", KEEPALIVE_LIMIT * 1000),
-        # Pings of other purposes, which hold back those of keepalive, would be waited for for a minute.
-        ("grpc.http2.ping_timeout_ms", (KEEPALIVE_INTERVAL + KEEPALIVE_LIMIT) * 1000),
-        ("grpc.http2.max_pings_without_data", 0),
-    ]
-    if address.local:
-        options.append(("grpc.enable_http_proxy", 0))
-    if str(address).startswith("unix:"):
-        # Otherwise the socket's path is sent as the host's name, which the server refuses.
-        options.append(("grpc.default_authority", "localhost"))
-    return options
-
-
-# What of a session has to be closed: requests, responses, channel, the private server, the process that opened it.
-_Parts: TypeAlias = tuple[
-    "queue.SimpleQueue[pb.SessionRequest | None]", Any, grpc.Channel, "local_server.LocalServer | None", int
-]
-# Of sessions that nobody closed. The next session that is opened or closed closes them, or the watchdog.
+# What of a session has to be closed: the stream, the private server, the process that opened it.
+_Parts: TypeAlias = "tuple[_native.Session, local_server.LocalServer | None, int]"
+# Of sessions that nobody closed. The next session that is opened or closed closes them, or the keeper.
 _forgotten: collections.deque[_Parts] = collections.deque()
 
 
@@ -280,69 +252,62 @@ def _close_forgotten() -> None:
             _close(*_forgotten.popleft())
 
 
-def _close(
-    requests: queue.SimpleQueue[pb.SessionRequest | None],
-    responses: Any,
-    channel: grpc.Channel,
-    local: local_server.LocalServer | None,
-    owner: int,
-) -> None:
+def _close(native: _native.Session, local: local_server.LocalServer | None, owner: int) -> None:
     if os.getpid() != owner:
-        _abandoned.append((responses, channel))
-        return
-    requests.put(None)
-    responses.cancel()
-    channel.close()
+        return  # what a forked process inherited is the parent's
+    native.close()
     if local is not None:
         local_server.release(local)
 
 
-# What a forked process inherited: to destroy another process's channel can hang, so it is kept.
-_abandoned: list[object] = []
-
-
-class _Watchdog:
-    """One thread that cancels calls whose reply is overdue: gRPC has deadlines for streams, not for messages."""
+class _Keeper:
+    """One thread that looks after the sessions that nobody waits in: a connection has no thread of its own."""
 
     def __init__(self) -> None:
         self._sessions: weakref.WeakSet[Session] = weakref.WeakSet()
         self._lock = threading.Lock()
-        self._started = False
+        self._thread: threading.Thread | None = None
+        self._ended = threading.Event()
 
-    def watch(self, session: Session) -> None:
+    def keep(self, session: Session) -> None:
         with self._lock:
             self._sessions.add(session)
-            if not self._started:
-                threading.Thread(target=self._run, name="perturb-watchdog", daemon=True).start()
-                self._started = True
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="perturb-keeper", daemon=True)
+                self._thread.start()
 
-    def _run(self) -> None:
-        while True:
-            time.sleep(WATCH_INTERVAL)
-            self._look()  # in a frame of its own: a sleeping watchdog keeps no session alive
-            _close_forgotten()
+    def end(self) -> None:
+        """End the thread: where Python ends it, it must not be in the native module."""
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join()
 
     def sessions(self) -> list[Session]:
         """All that somebody holds."""
         with self._lock:
             return list(self._sessions)
 
+    def _run(self) -> None:
+        while not self._ended.wait(TEND_INTERVAL):
+            self._look()  # in a frame of its own: a sleeping keeper keeps no session alive
+            _close_forgotten()
+
     def _look(self) -> None:
-        now = time.monotonic()
         for session in self.sessions():
-            session.expire(now)
+            session.tend()
 
 
-_watchdog = _Watchdog()
+_keeper = _Keeper()
 
 
 def _after_fork_in_child() -> None:
-    global _watchdog
-    _watchdog = _Watchdog()
+    global _keeper
+    _keeper = _Keeper()
 
 
 def _at_exit() -> None:
-    for session in _watchdog.sessions():
+    _keeper.end()
+    for session in _keeper.sessions():
         session.close()
     _close_forgotten()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,10 +15,9 @@ from . import requests
 from .catalogue import USUAL_PIXELS
 from .client import TIMEOUT, Client
 from .errors import InvalidArgumentError
-from .infos import BatchInfos
 
 if TYPE_CHECKING:
-    from ._proto import perturb_pb2 as pb
+    from ._native import Stepped
 
 OPTIONS = ("parameters", "state", "reset_mask")
 
@@ -89,6 +89,7 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
             render_mode=render_mode,
             width=width,
             height=height,
+            single=False,
         )
         self.render_mode = render_mode
         description = self._client.description
@@ -98,13 +99,12 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         self.single_action_space = description.action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._action_shape = self.action_space.shape or ()
-        self._observation_size = len(description.observation)
+        self._encode = partial(requests.actions, description=description, shape=self.action_space.shape or ())
         self._reward_terms = reward_terms
         self._copy = copy
         # What was last returned: a masked reset or restore leaves the other environments as they are.
         self._observations: NDArray[np.float32] | None = None
-        # Whose next step is an autoreset, in next-step mode.
+        # Whose next step is an autoreset, in next-step mode: it has no reward, and no terms of one.
         self._resetting = np.zeros(self.num_envs, dtype=np.bool_)
 
     def reset(
@@ -139,12 +139,11 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         super().reset(seed=seeds[0] if seeds else None)
 
         opened = self._client.open(seeds, self.np_random)
-        done: Any = opened
         if opened is None or seeds or parameters or states:
-            done = self._client.reset(mask, [seeds[i] for i in selected] if seeds else [], parameters, states)
-        collected = BatchInfos(self._client.names, self.num_envs)
-        collected.episodes([], done.started)
-        return self._merge(done.observations, mask), collected.infos
+            rows, events = self._client.reset(mask, [seeds[i] for i in selected] if seeds else [], parameters, states)
+        else:
+            rows, events = opened.observations, opened.events
+        return self._merge(rows, mask), events.batch(None, False)
 
     def step(
         self, actions: Any
@@ -156,16 +155,34 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
             OutOfOrderError: before the first reset; with autoreset disabled, if an episode has ended and was not reset.
             ServerConnectionError, ServerTimeoutError: and the environments are gone.
         """
-        client = self._client
-        session = client.session
-        stepped = session.step(requests.actions(actions, client.description, self._action_shape))
-        observations = self._store(client.floats(stepped.observations, self.num_envs, self._observation_size))
-        rewards = client.floats(stepped.rewards, self.num_envs).copy()  # Gymnasium's wrappers write into it
-        terminated, truncated = client.flags(stepped.terminated), client.flags(stepped.truncated)
-        infos = self._infos(stepped) if stepped.ended or stepped.started or self._reward_terms else {}
-        if self._mode is AutoresetMode.NEXT_STEP:
-            self._resetting = terminated | truncated
-        return observations, rewards, terminated, truncated, infos
+        return self._outcome(self._client.session.step(actions, self._encode))
+
+    def send(self, actions: Any) -> None:
+        """The first half of `step`: the server computes, and nobody waits for it.
+
+        So several batches, each with a session of its own, can be under way together. The same batch can have up to 64
+        steps under way, with actions that do not depend on what they lead to.
+
+        Raises:
+            InvalidArgumentError: for a wrong shape or kind of numbers; wrong values are told by `recv`.
+            OutOfOrderError: before the first reset, or if 64 steps are under way.
+            ServerConnectionError, ServerTimeoutError: and the environments are gone.
+        """
+        self._client.session.send(actions, self._encode)
+
+    def recv(
+        self,
+    ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """The second half: what `step` returns, of the oldest step that was sent and not received.
+
+        Until all are received, nothing but `send` and `recv` may be called.
+
+        Raises:
+            InvalidArgumentError: no environment has moved in this step; those that were sent after it count.
+            OutOfOrderError: if no step is under way; with autoreset disabled, if an episode has ended.
+            ServerConnectionError, ServerTimeoutError: and the environments are gone.
+        """
+        return self._outcome(self._client.session.recv())
 
     def snapshot(self, mask: NDArray[np.bool_] | None = None) -> list[bytes]:
         """Save the environments that the mask [N] selects, at first all: M pieces of bytes, in order."""
@@ -183,7 +200,7 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
             self._client.session.require_usable()
         self._client.open([], self.np_random)
         restored = self._client.restore(snapshots, selected)
-        return self._merge(restored.observations, selected)
+        return self._merge(restored, selected)
 
     def render(self) -> tuple[NDArray[np.uint8], ...]:
         """Draw the environments as they are now: of each, red, green and blue, uint8 [height, width, 3].
@@ -218,41 +235,27 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         self._observations = observations
         return observations.copy() if self._copy else observations
 
-    def _merge(self, data: bytes, mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
+    def _merge(self, rows: NDArray[np.float32], mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
         """The observations [N, O] after M rows have changed."""
         if mask is None:
             self._resetting[:] = False
-            return self._store(self._client.floats(data, self.num_envs, self._observation_size))
+            return self._store(rows)
         self._resetting &= ~mask
-        rows = self._client.floats(data, int(mask.sum()), self._observation_size)
         if self._observations is None:
             return self._store(rows)
         merged = self._observations.copy()
         merged[mask] = rows
         merged.flags.writeable = False
-        return self._store(merged)
+        return self._store(merged.view())
 
-    def _infos(self, stepped: pb.Stepped) -> dict[str, Any]:
-        names = self._client.names
-        infos = BatchInfos(names, self.num_envs)
-        slots = [end.slot for end in stepped.ended]
-        moved = np.ones(self.num_envs, dtype=np.bool_) & ~self._resetting
-        ended = infos
-        if self._mode is AutoresetMode.SAME_STEP and slots:
-            # The infos of ended episodes and those of the next ones come in one step.
-            ended = BatchInfos(names, self.num_envs)
-            finals = self._client.floats(stepped.final_observations, len(slots), self._observation_size)
-            infos.final_observations(finals.copy(), slots)
-            infos.final_infos(ended, slots)
-            moved[slots] = False
-        if ended is infos:
-            infos.episodes(stepped.ended, stepped.started)
-        else:
-            ended.episodes(stepped.ended, [])
-            infos.episodes([], stepped.started)
-        if self._reward_terms:
-            terms = self._client.floats(stepped.reward_terms, self.num_envs, len(names.reward_terms))
-            infos.terms(terms, np.flatnonzero(moved))
-            if ended is not infos:
-                ended.terms(terms, np.array(slots, dtype=np.intp))
-        return infos.infos
+    def _outcome(
+        self, stepped: Stepped
+    ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        observations, rewards, terminated, truncated, events = stepped
+        infos: dict[str, Any] = {}
+        if events is not None:
+            moved = ~self._resetting if self._reward_terms else None
+            infos = events.batch(moved, self._mode is AutoresetMode.SAME_STEP)
+        if self._reward_terms and self._mode is AutoresetMode.NEXT_STEP:
+            self._resetting = terminated | truncated
+        return self._store(observations), rewards, terminated, truncated, infos

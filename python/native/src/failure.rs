@@ -1,0 +1,47 @@
+//! What went wrong, as data: the package's errors, with their sentences, are Python's.
+
+use perturb_protocol::ClientError;
+use pyo3::create_exception;
+use pyo3::exceptions::PyException;
+use pyo3::prelude::*;
+
+create_exception!(
+    perturb._native,
+    Failure,
+    PyException,
+    "Arguments: the kind of failure, a gRPC code or 0, and the other side's or the transport's words."
+);
+
+/// The server's sentence; the session lives on.
+pub const REFUSED: &str = "refused";
+/// No connection could be made.
+pub const UNREACHABLE: &str = "unreachable";
+/// The connection or the stream ended.
+pub const LOST: &str = "lost";
+/// A reply did not come in time.
+pub const TIMED_OUT: &str = "timed out";
+/// A reply of another kind.
+pub const MISMATCH: &str = "mismatch";
+/// A reply whose arrays have another length.
+pub const MALFORMED: &str = "malformed";
+/// A value that cannot be sent.
+pub const INVALID: &str = "invalid";
+/// The session has ended, is another process's, or another thread waits in it.
+pub const UNUSABLE: &str = "unusable";
+
+/// A failure for Python.
+pub fn failure(kind: &'static str, code: i32, words: impl Into<String>) -> PyErr {
+    Failure::new_err((kind, code, words.into()))
+}
+
+/// What the protocol's client says, for Python.
+pub fn of(error: &ClientError) -> PyErr {
+    match error {
+        ClientError::Refused { code, message, .. } => failure(REFUSED, *code as i32, message),
+        ClientError::Lost { code, reason, .. } => failure(LOST, *code as i32, reason),
+        ClientError::TimedOut { .. } => failure(TIMED_OUT, 0, ""),
+        ClientError::Protocol { got, .. } => failure(MISMATCH, 0, got),
+        ClientError::Connect { reason, .. } => failure(UNREACHABLE, 0, reason),
+        other => failure(UNREACHABLE, 0, other.to_string()),
+    }
+}

@@ -1,0 +1,28 @@
+//! The Python package's native module, `perturb._native`: sessions of the protocol, as Python objects and NumPy arrays.
+//!
+//! - [`session`]: a session that waits for its replies without Python's lock, hears of signals, and survives forks.
+//! - [`line`]: the connection under it, which is driven by the thread that waits.
+//! - [`requests`]: requests, made of what Python gives.
+//! - [`arrays`], [`infos`]: replies, as arrays and dictionaries.
+//! - [`failure`]: what went wrong, for the package to say it as one of its errors.
+#![forbid(unsafe_code)]
+
+use pyo3::prelude::*;
+
+mod arrays;
+mod failure;
+mod infos;
+mod line;
+mod requests;
+mod session;
+
+/// What the Python package stands on; `perturb/_native.pyi` has the types.
+#[pymodule]
+mod _native {
+    #[pymodule_export]
+    use super::failure::Failure;
+    #[pymodule_export]
+    use super::infos::Events;
+    #[pymodule_export]
+    use super::session::{Session, catalogue};
+}

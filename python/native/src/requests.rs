@@ -1,0 +1,104 @@
+//! Requests, made of what Python gives. The package has checked kinds and shapes; values are for the server to judge.
+
+use std::collections::HashMap;
+
+use bytes::Bytes;
+use numpy::{Element, PyArrayDyn, PyArrayMethods, PyUntypedArrayMethods};
+use perturb_protocol::{Version, proto};
+use pyo3::prelude::*;
+use pyo3::types::{PyBool, PyBytes, PyInt};
+
+use crate::failure::{INVALID, failure};
+
+/// Sets of parameters: by name, intervals from low to high.
+pub type Intervals = HashMap<String, Vec<(f64, f64)>>;
+
+/// The same for the protocol.
+pub fn distributions(parameters: Intervals) -> HashMap<String, proto::Distribution> {
+    let interval = |(low, high)| proto::Interval { low, high };
+    let distribution =
+        |intervals: Vec<_>| proto::Distribution { intervals: intervals.into_iter().map(interval).collect() };
+    parameters.into_iter().map(|(name, intervals)| (name, distribution(intervals))).collect()
+}
+
+/// D, R, E or R+E.
+///
+/// # Errors
+/// For another text.
+pub fn version(name: &str) -> PyResult<proto::Version> {
+    let version: Version =
+        name.parse().map_err(|error: perturb_protocol::UnknownVersion| failure(INVALID, 0, error.to_string()))?;
+    Ok(version.to_proto())
+}
+
+/// Gymnasium's name of a mode.
+///
+/// # Errors
+/// For another text.
+pub fn autoreset_mode(name: &str) -> PyResult<proto::AutoresetMode> {
+    match name {
+        "NextStep" => Ok(proto::AutoresetMode::NextStep),
+        "SameStep" => Ok(proto::AutoresetMode::SameStep),
+        "Disabled" => Ok(proto::AutoresetMode::Disabled),
+        _ => Err(failure(INVALID, 0, format!("`{name}` is none of NextStep, SameStep and Disabled"))),
+    }
+}
+
+/// What the actions of a session are.
+pub struct Actions {
+    /// N.
+    pub num_envs: usize,
+    /// A; `None` for choices.
+    pub size: Option<usize>,
+    /// Whether there is no first axis: one environment by itself.
+    pub single: bool,
+}
+
+impl Actions {
+    /// As the protocol has them: int32 `[N]`, or float32 `[N, A]`. The usual kinds of arrays of the right shape are
+    /// read here; everything else, wrong actions too, is for `fallback`, which returns bytes.
+    ///
+    /// # Errors
+    /// What `fallback` raises.
+    pub fn encode(&self, actions: &Bound<'_, PyAny>, fallback: &Bound<'_, PyAny>) -> PyResult<Bytes> {
+        let known = match self.size {
+            None => self.choices(actions),
+            Some(_) => self
+                .read(actions, |number: f32| Some(number.to_le_bytes()))
+                .or_else(|| self.read(actions, |number: f64| Some((number as f32).to_le_bytes()))),
+        };
+        if let Some(bytes) = known {
+            return Ok(bytes);
+        }
+        let bytes = fallback.call1((actions,))?;
+        Ok(Bytes::copy_from_slice(bytes.cast::<PyBytes>()?.as_bytes()))
+    }
+
+    fn choices(&self, actions: &Bound<'_, PyAny>) -> Option<Bytes> {
+        if self.single && actions.is_exact_instance_of::<PyInt>() && !actions.is_instance_of::<PyBool>() {
+            return Some(Bytes::copy_from_slice(&actions.extract::<i32>().ok()?.to_le_bytes()));
+        }
+        self.read(actions, |choice: i64| i32::try_from(choice).ok().map(i32::to_le_bytes))
+            .or_else(|| self.read(actions, |choice: i32| Some(choice.to_le_bytes())))
+    }
+
+    /// The numbers of an array that has this type, the expected shape, and its elements in a row.
+    fn read<T: Element + Copy>(
+        &self,
+        actions: &Bound<'_, PyAny>,
+        encode: impl Fn(T) -> Option<[u8; 4]>,
+    ) -> Option<Bytes> {
+        let array = actions.cast::<PyArrayDyn<T>>().ok()?;
+        let shape = [self.num_envs, self.size.unwrap_or(1)];
+        let expected = &shape[usize::from(self.single)..if self.size.is_some() { 2 } else { 1 }];
+        if array.shape() != expected {
+            return None;
+        }
+        let array = array.try_readonly().ok()?;
+        let mut bytes = Vec::with_capacity(array.len() * 4);
+        for &number in array.as_slice().ok()? {
+            bytes.extend_from_slice(&encode(number)?);
+        }
+        Some(bytes.into())
+    }
+}

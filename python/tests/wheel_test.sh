@@ -1,0 +1,54 @@
+#!/bin/sh
+# wheel_test.sh WHEEL DEPENDENCIES: installs the wheel, with the wheels in the directory DEPENDENCIES and nothing else, in a new
+# environment, and runs what it brings: the program, the README's loop, robots. BARE=1: where there is no compiler.
+set -eu
+wheel=$1 dependencies=$2
+here=$(cd "$(dirname "$0")" && pwd)
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+for tool in cc gcc clang cargo rustc; do
+    if [ -n "${BARE:-}" ] && command -v "$tool" >/dev/null; then
+        echo "$tool is here; the wheel is to be tested where there is nothing of the kind" >&2
+        exit 1
+    fi
+done
+unset PERTURB_SERVER
+
+seconds() { # command …: runs it quietly, and prints how long it took
+    start=$(date +%s.%N)
+    "$@" >"$work/output" 2>&1 || { cat "$work/output" >&2; exit 1; }
+    echo "$(date +%s.%N) $start" | awk '{ printf "%.1f s\n", $1 - $2 }'
+}
+
+python3 --version
+ldd --version | head -1
+python3 -m venv "$work/venv"
+python=$work/venv/bin/python
+took=$(seconds "$work/venv/bin/pip" install -q --disable-pip-version-check --no-index --find-links "$dependencies" "$wheel")
+echo "install: $took"
+"$work/venv/bin/pip" check
+files=$(echo "$work"/venv/lib/python3*/site-packages/perturb*)
+# shellcheck disable=SC2086  # they are several, without spaces
+echo "wheel: $(du -k "$wheel" | cut -f1) kB; installed: $(du -kc $files | tail -1 | cut -f1) kB"
+
+took=$(seconds "$work/venv/bin/perturb-server" --help)
+echo "perturb-server --help: $took"
+grep -q -- --listen "$work/output"
+"$work/venv/bin/perturb-server" --version
+took=$(seconds "$python" "$here/../examples/ten_lines.py")
+echo "README's loop, eight Hoppers: $took"
+grep -q "ended:" "$work/output"
+"$python" - <<'END'
+import numpy as np
+import perturb
+
+envs = perturb.PerturbVectorEnv("HalfCheetah", 4, render_mode="rgb_array")
+envs.reset(seed=1)
+assert envs.step(np.zeros((4, 6), dtype=np.float32))[0].shape == (4, 26)
+try:
+    print("picture:", envs.render()[0].shape)
+except perturb.RenderError as error:
+    print("without OpenGL:", error)
+envs.close()
+END
+echo "the wheel needs nothing else"
