@@ -145,12 +145,11 @@ wheel: $(VENV)/installed ## build the Python package's wheel, with perturb-serve
 	$(VENV)/bin/pip wheel -q --disable-pip-version-check --no-deps --wheel-dir $(TARGET)/wheel ./python
 	PATH="$(abspath $(VENV))/bin:$$PATH" $(VENV)/bin/python python/bundle.py $(TARGET)/wheel/*.whl $(PROGRAMS)/perturb-server python/dist
 
-# Where there is no Docker, in a new environment on this machine. The container has Python 3.11, and no network.
+# Where there is no Docker, or no base image, in a new environment on this machine. The container has Python 3.11, and no network.
 wheel-test: wheel ## install the wheel in a bare container, and run the program and the README's loop there
 	rm -rf $(TARGET)/wheel-dependencies
 	download="$(VENV)/bin/pip download -q --disable-pip-version-check --dest $(TARGET)/wheel-dependencies"; \
-	if docker info >/dev/null 2>&1; then \
-		$(MAKE) docker-base && \
+	if docker info >/dev/null 2>&1 && $(MAKE) docker-base; then \
 		$$download --only-binary :all: --python-version 3.11 --platform manylinux_2_28_x86_64 \
 			--platform manylinux_2_17_x86_64 gymnasium numpy && \
 		docker build --quiet --file docker/wheel-test.Dockerfile --tag perturb-wheel-test docker && \
@@ -158,7 +157,7 @@ wheel-test: wheel ## install the wheel in a bare container, and run the program 
 			--volume $(abspath $(TARGET))/wheel-dependencies:/dependencies:ro \
 			perturb-wheel-test sh -c '/python/tests/wheel_test.sh /python/dist/*.whl /dependencies'; \
 	else \
-		echo "There is no Docker: the wheel is tested in an environment on this machine"; \
+		echo "Without Docker's images the wheel is tested in an environment on this machine"; \
 		$$download gymnasium numpy && python/tests/wheel_test.sh python/dist/*.whl $(TARGET)/wheel-dependencies; \
 	fi
 
