@@ -24,11 +24,13 @@ PUREJAXRL ?= https://github.com/luchris429/purejaxrl
 PUREJAXRL_COMMIT := 31756b197773a52db763fdbe6d635e4b46522a73
 
 # Arguments of `make demo`, `make bench`, `make bench-peers` and `make all-pairs`, e.g.
-# make demo DEMO_ARGS="--episodes 200 --test-episodes 50", make bench-peers PEERS_ARGS="--rounds 1 HalfCheetah",
+# make demo DEMO_ARGS="--episodes 200 --test-episodes 50", make bench-python BENCH_PYTHON_ARGS="--rounds 9 CartPole",
+# make bench-peers PEERS_ARGS="--rounds 1 HalfCheetah",
 # make all-pairs ALL_PAIRS_ARGS="20 /tmp/runs": episodes, directory.
 DEMO_ARGS ?=
 ALL_PAIRS_ARGS ?=
 BENCH_ARGS ?=
+BENCH_PYTHON_ARGS ?=
 PEERS_ARGS ?=
 # More arguments for `docker build`, e.g. make docker DOCKER_ARGS="--build-arg RENDERING=1".
 DOCKER_ARGS ?=
@@ -64,7 +66,7 @@ endef
 
 .DEFAULT_GOAL := help
 .PHONY: help deps opengl toolchain build demo all-pairs report-check test slurm-test qemu-test slurm-acceptance lint bench \
-	bench-peers audit cargo-deny python-test wheel wheel-test python-acceptance \
+	bench-peers audit cargo-deny python-test wheel wheel-test python-acceptance bench-python \
 	python-venv docker docker-base docker-test
 
 help: ## this list
@@ -131,7 +133,7 @@ cargo-deny: toolchain
 		cargo install --locked --version $(CARGO_DENY_VERSION) cargo-deny; \
 	}
 
-python-test wheel python-acceptance: export PERTURB_SERVER := $(abspath $(PROGRAMS))/perturb-server
+python-test wheel python-acceptance bench-python: export PERTURB_SERVER := $(abspath $(PROGRAMS))/perturb-server
 
 python-test: $(VENV)/installed opengl ## lint, type-check and test the Python package
 	cd python && $(abspath $(VENV))/bin/ruff check . && $(abspath $(VENV))/bin/ruff format --check .
@@ -161,10 +163,13 @@ wheel-test: wheel ## install the wheel in a bare container, and run the program 
 		$$download gymnasium numpy && python/tests/wheel_test.sh python/dist/*.whl $(TARGET)/wheel-dependencies; \
 	fi
 
-python-acceptance: $(VENV)/installed ## train with stable-baselines3, measure beside EnvPool; gigabytes, minutes
+python-acceptance: $(VENV)/installed ## train with stable-baselines3; gigabytes, minutes
 	$(VENV)/bin/pip install -q --disable-pip-version-check -r python/requirements-acceptance.txt
 	cd python && $(abspath $(VENV))/bin/pytest -q -m slow
-	$(VENV)/bin/python python/benchmarks/throughput.py
+
+bench-python: $(VENV)/installed ## measure the Python package beside EnvPool, in one run; some two minutes
+	$(VENV)/bin/pip install -q --disable-pip-version-check -r python/requirements-bench.txt
+	$(VENV)/bin/python -W ignore python/benchmarks/throughput.py $(BENCH_PYTHON_ARGS)
 
 $(PROGRAMS)/perturb-server: deps
 	cargo build --package perturb --release --locked

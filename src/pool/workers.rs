@@ -18,8 +18,9 @@ use tokio::sync::Notify;
 /// is more than a step of many small environments.
 const YIELDS_BEFORE_SLEEP: usize = 200;
 
-/// A job of at most so many µs is done by whoever asks: to have a worker do it takes longer.
-const TINY: f64 = 8.0;
+/// A job of at most so many µs is done by whoever asks. To have a worker do it takes longer, and no more than one would be
+/// set to it.
+const TINY: f64 = 20.0;
 /// One of at most so many µs is short, …
 const SHORT: f64 = 50.0;
 /// … and looked after so often before its session sleeps, about twice that time.

@@ -18,7 +18,7 @@
 use std::sync::Arc;
 
 use bytes::Bytes;
-use numpy::{Element, PyArray1, PyReadonlyArray1};
+use numpy::{Element, PyArray1, PyArrayMethods, PyReadonlyArray1};
 use perturb_protocol::proto;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyString};
@@ -211,15 +211,15 @@ impl Events {
             self.terms(&infos, &moved)?;
             return Ok(infos);
         }
-        let (finals, mut over) = (PyDict::new(py), vec![false; n]);
+        let finals = PyDict::new(py);
         let mut observations: Vec<Py<PyAny>> = (0..n).map(|_| py.None()).collect();
         for (end, row) in self.ended.iter().zip(self.final_observations.chunks(self.observation_size.max(1))) {
             observations[end.slot as usize] = PyArray1::from_slice(py, row).into_any().unbind();
-            over[end.slot as usize] = true;
             moved[end.slot as usize] = false;
         }
-        set(&infos, &known.final_obs, PyArray1::from_vec(py, observations), &over)?;
-        set(&infos, &known.final_info, &finals, &over)?;
+        let (over, mask) = self.mask(py, self.ended.iter().map(|end| end.slot as usize));
+        set(&infos, &known.final_obs, PyArray1::from_vec(py, observations), &mask)?;
+        set(&infos, &known.final_info, &finals, &mask)?;
         self.outcomes(&finals)?;
         self.receipts(&finals, ended(&self.ended).collect())?;
         self.terms(&finals, &over)?;
@@ -229,17 +229,25 @@ impl Events {
     }
 }
 
+/// A mask of infos.
+type Mask<'py> = Bound<'py, PyArray1<bool>>;
+
 impl Events {
     fn outcomes(&self, infos: &Bound<'_, PyDict>) -> PyResult<()> {
         if self.ended.is_empty() {
             return Ok(());
         }
-        let known = &self.labels.known;
-        self.put(infos, &known.is_success, self.ended.iter().map(|end| (end.slot as usize, end.success)))?;
-        self.put(infos, &known.diverged, self.ended.iter().map(|end| (end.slot as usize, end.diverged)))?;
-        let mut reached = self.ended.iter().filter_map(|end| Some((end.slot as usize, end.achieved?))).peekable();
-        if reached.peek().is_some() {
-            self.put(infos, &known.achieved, reached)?;
+        let (py, known) = (infos.py(), &self.labels.known);
+        let slots = || self.ended.iter().map(|end| end.slot as usize);
+        let (_, mask) = self.mask(py, slots());
+        let success = slots().zip(self.ended.iter().map(|end| end.success));
+        set(infos, &known.is_success, self.column(py, success), &mask)?;
+        let diverged = slots().zip(self.ended.iter().map(|end| end.diverged));
+        set(infos, &known.diverged, self.column(py, diverged), &mask)?;
+        let reached = || slots().zip(&self.ended).filter_map(|(slot, end)| Some((slot, end.achieved?)));
+        if reached().next().is_some() {
+            let (_, mask) = self.mask(py, reached().map(|(slot, _)| slot));
+            set(infos, &known.achieved, self.column(py, reached()), &mask)?;
         }
         Ok(())
     }
@@ -249,65 +257,65 @@ impl Events {
             return Ok(());
         }
         let (py, known, labels) = (infos.py(), &self.labels.known, &*self.labels);
-        let mask = self.mask(told.iter().map(|(slot, ..)| *slot));
-        let trials = || told.iter().map(|(slot, episode, _)| (*slot, episode.trial_index as i64));
-        let named = |labels: &[Label], values: fn(&proto::Receipt) -> &[f64]| {
+        let (_, mask) = self.mask(py, told.iter().map(|(slot, ..)| *slot));
+        // All columns in two pieces of memory: a piece for each would take longer than to fill it.
+        let (n, applied) = (labels.num_envs, labels.parameters.len());
+        let mut values = vec![0.0_f64; (applied + labels.applied.len()) * n];
+        let mut counts = vec![0_i64; 4 * n];
+        for (slot, episode, receipt) in &told {
+            for (i, value) in receipt.requested.iter().chain(&receipt.applied).enumerate() {
+                values[i * n + slot] = *value;
+            }
+            let trial = episode.trial_index as i64;
+            let row = [trial, i64::from(episode.environment_index), trial, episode.episode_index as i64];
+            row.into_iter().enumerate().for_each(|(i, count)| counts[i * n + slot] = count);
+        }
+        let values = PyArray1::from_vec(py, values).reshape([applied + labels.applied.len(), n])?;
+        let counts = PyArray1::from_vec(py, counts).reshape([4, n])?;
+        let named = |labels: &[Label], first: usize| {
             let named = PyDict::new(py);
             for (i, label) in labels.iter().enumerate() {
-                let column = told.iter().map(|(slot, _, receipt)| (*slot, values(receipt)[i]));
-                set(&named, label, self.column(py, column), &mask)?;
+                set(&named, label, values.get_item(first + i)?, &mask)?;
             }
             PyResult::Ok(named)
         };
-        self.put(infos, &known.context_id, trials())?;
-        set(infos, &known.parameters, named(&labels.parameters, |receipt| &receipt.requested)?, &mask)?;
+        set(infos, &known.context_id, counts.get_item(0)?, &mask)?;
+        set(infos, &known.parameters, named(&labels.parameters, 0)?, &mask)?;
         let receipt = PyDict::new(py);
-        let indices = told.iter().map(|(slot, episode, _)| (*slot, i64::from(episode.environment_index)));
-        self.put(&receipt, &known.environment_index, indices)?;
-        self.put(&receipt, &known.trial_index, trials())?;
-        let episodes = told.iter().map(|(slot, episode, _)| (*slot, episode.episode_index as i64));
-        self.put(&receipt, &known.episode_index, episodes)?;
-        set(&receipt, &known.applied, named(&labels.applied, |receipt| &receipt.applied)?, &mask)?;
+        set(&receipt, &known.environment_index, counts.get_item(1)?, &mask)?;
+        set(&receipt, &known.trial_index, counts.get_item(2)?, &mask)?;
+        set(&receipt, &known.episode_index, counts.get_item(3)?, &mask)?;
+        set(&receipt, &known.applied, named(&labels.applied, applied)?, &mask)?;
         let mut hashes: Vec<Py<PyAny>> = (0..labels.num_envs).map(|_| py.None()).collect();
         // All are of one model, mostly: one text for all of them.
         let mut last: Option<(&str, Py<PyAny>)> = None;
         for (slot, _, receipt) in &told {
-            let text = match &last {
-                Some((known, text)) if *known == receipt.model_hash => text.clone_ref(py),
+            let text = match last.take() {
+                Some((known, text)) if same(known, &receipt.model_hash) => text,
                 _ => PyString::new(py, &receipt.model_hash).into_any().unbind(),
             };
-            last = Some((&receipt.model_hash, text.clone_ref(py)));
-            hashes[*slot] = text;
+            hashes[*slot] = text.clone_ref(py);
+            last = Some((&receipt.model_hash, text));
         }
         set(&receipt, &known.model_hash, PyArray1::from_vec(py, hashes), &mask)?;
         set(infos, &known.receipt, receipt, &mask)
     }
 
     fn terms(&self, infos: &Bound<'_, PyDict>, moved: &[bool]) -> PyResult<()> {
-        let names = &self.labels.reward_terms;
+        let (py, names) = (infos.py(), &self.labels.reward_terms);
         if self.reward_terms.is_empty() || !moved.contains(&true) {
             return Ok(());
         }
-        let named = PyDict::new(infos.py());
+        let slots = || (0..moved.len()).filter(|&slot| moved[slot]);
+        let (named, (_, mask)) = (PyDict::new(py), self.mask(py, slots()));
         for (i, label) in names.iter().enumerate() {
-            let rows = self.reward_terms.chunks(names.len()).zip(moved);
-            let column = rows.map(|(row, &moved)| if moved { f64::from(row[i]) } else { 0.0 }).collect();
-            set(&named, label, PyArray1::from_vec(infos.py(), column), moved)?;
+            let column = slots().map(|slot| (slot, f64::from(self.reward_terms[slot * names.len() + i])));
+            set(&named, label, self.column(py, column), &mask)?;
         }
-        set(infos, &self.labels.known.reward_terms, named, moved)
+        set(infos, &self.labels.known.reward_terms, named, &mask)
     }
 
-    fn put<T: Element + Copy + Default>(
-        &self,
-        infos: &Bound<'_, PyDict>,
-        label: &Label,
-        values: impl Iterator<Item = (usize, T)> + Clone,
-    ) -> PyResult<()> {
-        let mask = self.mask(values.clone().map(|(slot, _)| slot));
-        set(infos, label, self.column(infos.py(), values), &mask)
-    }
-
-    /// Values [N], zero where there are none.
+    /// Values `[N]`, zero where there are none.
     fn column<'py, T: Element + Copy + Default>(
         &self,
         py: Python<'py>,
@@ -318,17 +326,29 @@ impl Events {
         PyArray1::from_vec(py, column)
     }
 
-    fn mask(&self, slots: impl Iterator<Item = usize>) -> Vec<bool> {
+    /// A mask `[N]`, not to change: many keys have the same one.
+    fn mask<'py>(&self, py: Python<'py>, slots: impl Iterator<Item = usize>) -> (Vec<bool>, Mask<'py>) {
         let mut mask = vec![false; self.labels.num_envs];
         slots.for_each(|slot| mask[slot] = true);
-        mask
+        let array = PyArray1::from_slice(py, &mask);
+        array.readwrite().make_nonwriteable();
+        (mask, array)
     }
 }
 
-/// Each mask is the caller's own, to change.
-fn set<'py>(infos: &Bound<'py, PyDict>, label: &Label, value: impl IntoPyObject<'py>, mask: &[bool]) -> PyResult<()> {
+fn set<'py>(
+    infos: &Bound<'py, PyDict>,
+    label: &Label,
+    value: impl IntoPyObject<'py>,
+    mask: &Mask<'py>,
+) -> PyResult<()> {
     infos.set_item(&label.key, value)?;
-    infos.set_item(&label.mask, PyArray1::from_slice(infos.py(), mask))
+    infos.set_item(&label.mask, mask)
+}
+
+/// Whether two texts are equal. To compare empty ones, which lie nowhere, takes some processors 100 ns.
+fn same(one: &str, other: &str) -> bool {
+    one.len() == other.len() && (one.is_empty() || one == other)
 }
 
 fn started(started: &[proto::EpisodeStart]) -> impl Iterator<Item = Told<'_>> {

@@ -6,7 +6,6 @@ use std::io;
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, Weak};
-use std::task::Poll;
 use std::time::{Duration, Instant};
 
 use pyo3::prelude::*;
@@ -16,8 +15,6 @@ use tokio::task::yield_now;
 
 /// How often a waiting thread looks for signals, which Python answers between two of its instructions.
 const SLICE: Duration = Duration::from_millis(20);
-/// How long a thread waits awake for a reply that came as soon the last time: to be woken takes longer than a small step.
-const AWAKE: Duration = Duration::from_micros(100);
 /// So often the connection gets a turn to write what a request, or a session's end, has for it: a task takes it up, and
 /// another one sends it.
 const TURNS: usize = 4;
@@ -109,8 +106,6 @@ impl Drop for Reactor {
 /// Where a session waits.
 pub struct Line {
     reactor: Arc<Reactor>,
-    /// How long the last reply took.
-    last_wait: Duration,
 }
 
 impl Line {
@@ -119,7 +114,7 @@ impl Line {
     /// # Errors
     /// If the system has no more file descriptors.
     pub fn new() -> io::Result<Self> {
-        Ok(Self { reactor: Reactor::find()?, last_wait: Duration::MAX })
+        Ok(Self { reactor: Reactor::find()? })
     }
 
     /// Waits, at most until the deadline, without Python's lock but for a look for signals now and then.
@@ -127,43 +122,37 @@ impl Line {
     /// # Errors
     /// [`Broken`]; what was waited for is gone then.
     pub fn wait<T: Send>(
-        &mut self,
+        &self,
         py: Python<'_>,
         mut pending: Pending<T>,
         deadline: Option<Instant>,
         closing: &Arc<Closing>,
     ) -> Result<T, Broken> {
         let Some(runtime) = self.reactor.runtime.as_ref() else { return Err(Broken::Closed) };
-        let begun = Instant::now();
-        let awake = if self.last_wait <= AWAKE { AWAKE } else { Duration::ZERO };
-        let come = py.detach(|| runtime.block_on(look(&mut pending, begun, awake)));
-        let come = match come {
-            Some(come) => come,
-            None => loop {
-                let slice =
-                    deadline.map_or(SLICE, |deadline| SLICE.min(deadline.saturating_duration_since(Instant::now())));
-                let come = py.detach(|| {
-                    runtime.block_on(async {
-                        tokio::select! {
-                            biased;
-                            come = &mut pending => Some(come),
-                            () = closing.told.notified() => None,
-                            () = tokio::time::sleep(slice) => None,
-                        }
-                    })
-                });
-                match come {
-                    Some(come) => break come,
-                    None if closing.is_closed() => return Err(Broken::Closed),
-                    None => py.check_signals().map_err(Broken::Interrupted)?,
-                }
-                if deadline.is_some_and(|deadline| Instant::now() >= deadline) {
-                    return Err(Broken::Overdue);
-                }
-            },
-        };
-        self.last_wait = begun.elapsed();
-        Ok(come)
+        loop {
+            let slice = match deadline {
+                Some(deadline) => SLICE.min(deadline.saturating_duration_since(Instant::now())),
+                None => SLICE,
+            };
+            let come = py.detach(|| {
+                runtime.block_on(async {
+                    tokio::select! {
+                        biased;
+                        come = &mut pending => Some(come),
+                        () = closing.told.notified() => None,
+                        () = tokio::time::sleep(slice) => None,
+                    }
+                })
+            });
+            match come {
+                Some(come) => return Ok(come),
+                None if closing.is_closed() => return Err(Broken::Closed),
+                None => py.check_signals().map_err(Broken::Interrupted)?,
+            }
+            if deadline.is_some_and(|deadline| Instant::now() >= deadline) {
+                return Err(Broken::Overdue);
+            }
+        }
     }
 
     /// Lets the connection write what it has, and answer the server's questions whether this side lives. Not for who
@@ -176,19 +165,5 @@ impl Line {
                 }
             });
         }
-    }
-}
-
-/// Polls without sleeping for so long; others may have the core meanwhile.
-async fn look<T>(pending: &mut Pending<T>, begun: Instant, awake: Duration) -> Option<T> {
-    loop {
-        if let Poll::Ready(come) = std::future::poll_fn(|context| Poll::Ready(pending.as_mut().poll(context))).await {
-            return Some(come);
-        }
-        if begun.elapsed() >= awake {
-            return None;
-        }
-        std::thread::yield_now();
-        yield_now().await;
     }
 }

@@ -181,7 +181,7 @@ impl Session {
             }
         }
         let unopened = Unopened(self);
-        let mut line = Line::new().map_err(|error| failure(UNREACHABLE, 0, error.to_string()))?;
+        let line = Line::new().map_err(|error| failure(UNREACHABLE, 0, error.to_string()))?;
         let (address, patience) = (self.address.clone(), self.patience);
         let opening = Box::pin(async move {
             let connection = Connection::open_with(&address, patience).await?;
@@ -221,7 +221,7 @@ impl Session {
     fn send(&self, py: Python<'_>, actions: &Bound<'_, PyAny>, encode: &Bound<'_, PyAny>) -> PyResult<()> {
         let request = proto::Step { actions: self.actions.encode(actions, encode)? };
         let mut open = self.take(MOST_UNDER_WAY - 1)?;
-        let Open { mut stream, connection, mut line, labels, under_way } = *open;
+        let Open { mut stream, connection, line, labels, under_way } = *open;
         let sending = Box::pin(async move {
             let sent = stream.send_ahead(request).await;
             (stream, sent)
@@ -429,7 +429,7 @@ impl Session {
         A: Ask + Send + 'static,
         A::Reply: Send,
     {
-        let Open { mut stream, connection, mut line, labels, under_way } = *open;
+        let Open { mut stream, connection, line, labels, under_way } = *open;
         let pending = Box::pin(async move {
             let reply = match request {
                 Some(request) => stream.ask(request).await,
@@ -507,7 +507,7 @@ impl Drop for Unopened<'_> {
 #[pyfunction]
 pub fn catalogue(py: Python<'_>, address: &str, timeout: f64) -> PyResult<String> {
     let address = Address::from_str(address).map_err(|error| failure(INVALID, 0, error.to_string()))?;
-    let mut line = Line::new().map_err(|error| failure(UNREACHABLE, 0, error.to_string()))?;
+    let line = Line::new().map_err(|error| failure(UNREACHABLE, 0, error.to_string()))?;
     let asking = Box::pin(async move { Connection::open(&address).await?.catalogue().await });
     let deadline = duration(timeout).and_then(|timeout| Instant::now().checked_add(timeout));
     let come: Result<_, ClientError> = line.wait(py, asking, deadline, &Arc::default()).map_err(explain)?;
