@@ -4,6 +4,7 @@
 //! - [`line`]: the connection under it, which is driven by the thread that waits.
 //! - [`requests`]: requests, made of what Python gives.
 //! - [`arrays`], [`infos`]: replies, as arrays and dictionaries.
+//! - [`policy`]: trained policies that act here, by the learner's arithmetic.
 //! - [`failure`]: what went wrong, for the package to say it as one of its errors.
 #![forbid(unsafe_code)]
 
@@ -13,6 +14,7 @@ mod arrays;
 mod failure;
 mod infos;
 mod line;
+mod policy;
 mod requests;
 mod session;
 
@@ -23,6 +25,8 @@ mod _native {
     use super::failure::Failure;
     #[pymodule_export]
     use super::infos::Events;
+    #[pymodule_export]
+    use super::policy::{Player, Policy};
     #[pymodule_export]
     use super::session::{Session, catalogue};
 }

@@ -16,6 +16,7 @@ from .errors import (
     InvalidArgumentError,
     OutOfOrderError,
     PerturbError,
+    PolicyError,
     ProtocolError,
     RenderError,
     ServerConnectionError,
@@ -25,17 +26,21 @@ from .errors import (
     ServerTimeoutError,
     UnknownNameError,
 )
+from .policy import Actor, Policy, load_policy
 from .registration import register_all as _register_all
 from .vector import PerturbVectorEnv
 
 __version__ = _version("perturb")
 
 __all__ = [
+    "Actor",
     "InvalidArgumentError",
     "OutOfOrderError",
     "PerturbEnv",
     "PerturbError",
     "PerturbVectorEnv",
+    "Policy",
+    "PolicyError",
     "ProtocolError",
     "RenderError",
     "ServerConnectionError",
@@ -44,6 +49,7 @@ __all__ = [
     "ServerStartError",
     "ServerTimeoutError",
     "UnknownNameError",
+    "load_policy",
 ]
 
 _register_all()
