@@ -11,6 +11,8 @@ Importing this package registers its environments:
 
 from importlib.metadata import version as _version
 
+from .assess import assess
+from .assessment import Assessment, Part, Result
 from .env import PerturbEnv
 from .errors import (
     InvalidArgumentError,
@@ -34,8 +36,10 @@ __version__ = _version("perturb")
 
 __all__ = [
     "Actor",
+    "Assessment",
     "InvalidArgumentError",
     "OutOfOrderError",
+    "Part",
     "PerturbEnv",
     "PerturbError",
     "PerturbVectorEnv",
@@ -43,12 +47,14 @@ __all__ = [
     "PolicyError",
     "ProtocolError",
     "RenderError",
+    "Result",
     "ServerConnectionError",
     "ServerDefectError",
     "ServerFullError",
     "ServerStartError",
     "ServerTimeoutError",
     "UnknownNameError",
+    "assess",
     "load_policy",
 ]
 
