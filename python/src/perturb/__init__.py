@@ -14,6 +14,7 @@ from importlib.metadata import version as _version
 from .assess import assess
 from .assessment import Assessment, Part, Result
 from .env import PerturbEnv
+from .environments import Environment, Parameter, environments
 from .errors import (
     InvalidArgumentError,
     OutOfOrderError,
@@ -30,6 +31,7 @@ from .errors import (
 )
 from .policy import Actor, Policy, load_policy
 from .registration import register_all as _register_all
+from .requests import Version
 from .vector import PerturbVectorEnv
 
 __version__ = _version("perturb")
@@ -37,8 +39,10 @@ __version__ = _version("perturb")
 __all__ = [
     "Actor",
     "Assessment",
+    "Environment",
     "InvalidArgumentError",
     "OutOfOrderError",
+    "Parameter",
     "Part",
     "PerturbEnv",
     "PerturbError",
@@ -54,7 +58,9 @@ __all__ = [
     "ServerStartError",
     "ServerTimeoutError",
     "UnknownNameError",
+    "Version",
     "assess",
+    "environments",
     "load_policy",
 ]
 
