@@ -13,9 +13,10 @@ import perturb
 from perturb.catalogue import CATALOGUE
 
 STEPS = 12
+VERSIONS: tuple[perturb.Version, ...] = ("D", "E")
 
 
-def picture(name: str, version: str, server: str | None) -> np.ndarray:
+def picture(name: str, version: perturb.Version, server: str | None) -> np.ndarray:
     """The environment after some random actions, which are the same in every version."""
     env = perturb.PerturbEnv(name, version=version, server=server, render_mode="rgb_array")
     env.action_space.seed(1)
@@ -37,7 +38,7 @@ def main() -> None:
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     for name in CATALOGUE:
-        both = np.hstack([picture(name, version, args.server) for version in ("D", "E")])
+        both = np.hstack([picture(name, version, args.server) for version in VERSIONS])
         file = args.out / f"{name}.png"
         Image.fromarray(both).save(file)
         print(file)

@@ -13,7 +13,7 @@ import perturb
 EPISODES = 100
 
 
-def success_rate(model: PPO, environment: str, version: str) -> float:
+def success_rate(model: PPO, environment: str, version: perturb.Version) -> float:
     """Successful episodes, in percent."""
     env = perturb.PerturbEnv(environment, version=version)
     successes = 0
@@ -41,7 +41,8 @@ def main() -> None:
     env = perturb.PerturbEnv(arguments.environment, version=arguments.train)
     model = PPO("MlpPolicy", env, seed=1, device="cpu").learn(arguments.steps)
     env.close()
-    for version in "DRE":
+    versions: tuple[perturb.Version, ...] = ("D", "R", "E")
+    for version in versions:
         rate = success_rate(model, arguments.environment, version)
         print(f"trained on {arguments.train}, tested on {version}: {rate:.0f} % of {EPISODES} episodes succeeded")
 

@@ -3,6 +3,7 @@
 //! - [`settings`]: of a training.
 //! - [`Plan`] expands an experiment file to cells, [`Folder`] is where they are kept, [`scheduler`] has processes or a
 //!   cluster do them.
+//! - [`trained`] has the policies that came of trainings, [`testing`] says which episodes they are tested in.
 //! - [`Results`] reads them back and selects; [`paper`] is what was published.
 //! - [`report`] compares them, in [`table::Table`]s and on a page; [`plot`] draws.
 #![forbid(unsafe_code)]
@@ -35,6 +36,8 @@ pub mod settings;
 pub mod statistics;
 pub mod success;
 pub mod table;
+pub mod testing;
+pub mod trained;
 mod tuning;
 mod value_error;
 mod verify;

@@ -85,6 +85,24 @@ pub fn number(environment: &str, method: &Method, metric: Metric) -> Option<Summ
     Some(Summary { mean: record.mean_percent, std: Some(record.std_percent), runs: RUNS })
 }
 
+/// The methods that the paper has numbers of in `environment`, in its order.
+pub fn methods(environment: &str) -> Vec<Method> {
+    let mut methods = Vec::new();
+    for record in records().filter(|record| record.environment == environment) {
+        let method = Method {
+            algorithm: record.algorithm.to_lowercase(),
+            architecture: record.architecture.to_lowercase(),
+            episodes_per_trial: record.episodes_per_trial,
+            preset: Preset::default(),
+            observe: Observe::default(),
+        };
+        if !methods.contains(&method) {
+            methods.push(method);
+        }
+    }
+    methods
+}
+
 /// The paper's average over `environments`: the published one if they are all six, otherwise the mean of theirs.
 pub fn average(environments: &[&str], method: &Method, metric: Metric) -> Option<Summary> {
     let means: Option<Vec<f64>> = environments.iter().map(|name| Some(number(name, method, metric)?.mean)).collect();
@@ -135,6 +153,18 @@ mod tests {
         assert_eq!(number("Pendulum", &method("rl2-a2c", "rc", None), Metric::Default), None, "it has trials");
         let with = |trials| number("Average", &method("rl2-a2c", "rc", Some(trials)), Metric::Default).unwrap().mean;
         assert_eq!([1, 2, 5].map(with), [66.83, 45.79, 41.08]);
+    }
+
+    #[test]
+    fn every_method_of_an_environment_has_its_three_numbers() {
+        for environment in ALL {
+            let methods = methods(environment);
+            assert_eq!(methods.len(), 14, "{methods:?}");
+            for (method, metric) in methods.iter().flat_map(|method| Metric::ALL.map(|metric| (method, metric))) {
+                assert!(number(environment, method, metric).is_some(), "{environment} {method} {metric}");
+            }
+        }
+        assert_eq!(methods("Ant"), []);
     }
 
     #[test]

@@ -29,6 +29,9 @@ pub const INVALID: &str = "invalid";
 /// The session has ended, is another process's, or another thread waits in it.
 pub const UNUSABLE: &str = "unusable";
 
+/// A policy that cannot be loaded, does not fit, or cannot act.
+pub const POLICY: &str = "policy";
+
 /// A failure for Python.
 pub fn failure(kind: &'static str, code: i32, words: impl Into<String>) -> PyErr {
     Failure::new_err((kind, code, words.into()))

@@ -136,6 +136,11 @@ impl Events {
         .map(Some)
     }
 
+    /// The episodes that ended.
+    pub fn ended(&self) -> &[proto::EpisodeEnd] {
+        &self.ended
+    }
+
     fn checked(self) -> PyResult<Self> {
         let slots = self.ended.iter().map(|end| end.slot).chain(self.started.iter().map(|start| start.slot));
         let receipts = self.ended.iter().map(|end| &end.receipt).chain(self.started.iter().map(|start| &start.receipt));

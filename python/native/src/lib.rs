@@ -4,6 +4,8 @@
 //! - [`line`]: the connection under it, which is driven by the thread that waits.
 //! - [`requests`]: requests, made of what Python gives.
 //! - [`arrays`], [`infos`]: replies, as arrays and dictionaries.
+//! - [`policy`]: trained policies that act here, by the learner's arithmetic.
+//! - [`testing`], [`records`]: tests of whatever acts in Python, recorded as the program `perturb` records its own.
 //! - [`failure`]: what went wrong, for the package to say it as one of its errors.
 #![forbid(unsafe_code)]
 
@@ -13,8 +15,11 @@ mod arrays;
 mod failure;
 mod infos;
 mod line;
+mod policy;
+mod records;
 mod requests;
 mod session;
+mod testing;
 
 /// What the Python package stands on; `perturb/_native.pyi` has the types.
 #[pymodule]
@@ -24,5 +29,11 @@ mod _native {
     #[pymodule_export]
     use super::infos::Events;
     #[pymodule_export]
+    use super::policy::{Player, Policy};
+    #[pymodule_export]
+    use super::records::{Records, metrics, published};
+    #[pymodule_export]
     use super::session::{Session, catalogue};
+    #[pymodule_export]
+    use super::testing::Tests;
 }

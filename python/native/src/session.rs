@@ -72,6 +72,7 @@ pub struct Opened {
     /// Whether observations have parameters at their end.
     #[pyo3(get)]
     observes_parameters: bool,
+    served: Arc<proto::Environment>,
     observations: Bytes,
     shape: [usize; 2],
     /// The begun episodes.
@@ -85,6 +86,13 @@ impl Opened {
     #[getter]
     fn observations<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f32>>> {
         arrays::rows(py, &self.observations, self.shape[0], self.shape[1])
+    }
+}
+
+impl Opened {
+    /// What was opened.
+    pub fn served(&self) -> &Arc<proto::Environment> {
+        &self.served
     }
 }
 
@@ -198,6 +206,7 @@ impl Session {
         Ok(Opened {
             environment: perturb_protocol::catalogue::environment(&served).to_string(),
             observes_parameters: opened.observes_parameters,
+            served: Arc::new(served),
             observations: opened.observations,
             shape: [n, self.observation_size],
             events: Py::new(py, events)?,

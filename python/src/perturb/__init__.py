@@ -11,11 +11,15 @@ Importing this package registers its environments:
 
 from importlib.metadata import version as _version
 
+from .assess import assess
+from .assessment import Assessment, Part, Result
 from .env import PerturbEnv
+from .environments import Environment, Parameter, environments
 from .errors import (
     InvalidArgumentError,
     OutOfOrderError,
     PerturbError,
+    PolicyError,
     ProtocolError,
     RenderError,
     ServerConnectionError,
@@ -25,25 +29,39 @@ from .errors import (
     ServerTimeoutError,
     UnknownNameError,
 )
+from .policy import Actor, Policy, load_policy
 from .registration import register_all as _register_all
+from .requests import Version
 from .vector import PerturbVectorEnv
 
 __version__ = _version("perturb")
 
 __all__ = [
+    "Actor",
+    "Assessment",
+    "Environment",
     "InvalidArgumentError",
     "OutOfOrderError",
+    "Parameter",
+    "Part",
     "PerturbEnv",
     "PerturbError",
     "PerturbVectorEnv",
+    "Policy",
+    "PolicyError",
     "ProtocolError",
     "RenderError",
+    "Result",
     "ServerConnectionError",
     "ServerDefectError",
     "ServerFullError",
     "ServerStartError",
     "ServerTimeoutError",
     "UnknownNameError",
+    "Version",
+    "assess",
+    "environments",
+    "load_policy",
 ]
 
 _register_all()

@@ -113,8 +113,10 @@ def _box(ranges: tuple[Range, ...]) -> spaces.Box:
 _WRITTEN: Mapping[str, Any] = json.loads(resources.files(__package__).joinpath("catalogue.json").read_text("utf-8"))
 _LIMITS: Mapping[str, Any] = _WRITTEN["limits"]
 
+# All that the server told of its environments.
+CATALOGUE_ENTRIES: tuple[Mapping[str, Any], ...] = tuple(_WRITTEN["environments"])
 CATALOGUE: dict[str, Description] = {
-    description.name: description for description in map(Description.read, _WRITTEN["environments"])
+    description.name: description for description in map(Description.read, CATALOGUE_ENTRIES)
 }
 # Width and height of a picture: the least and the most, and unless told otherwise.
 LEAST_PIXELS, MOST_PIXELS = _LIMITS["picture_pixels"]

@@ -30,7 +30,7 @@ class Client:
         self,
         *,
         environment: str,
-        version: str,
+        version: requests.Version,
         num_envs: int,
         server: str | None,
         parameters: requests.Parameters | None,
@@ -73,6 +73,15 @@ class Client:
         self._partly_changed = False
         self._session: Session | None = None
         self._closed = False
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the session: a copy, here or in another process, has to be reset."""
+        if self._partly_changed:
+            raise OutOfOrderError(
+                "the environments do not all have the parameters that the batch was made with, which a copy would not "
+                "know: copy them before parameters are given to some, or a snapshot is restored"
+            )
+        return {**self.__dict__, "_session": None}
 
     @property
     def session(self) -> Session:

@@ -55,7 +55,7 @@ class PerturbEnv(gymnasium.Env[NDArray[np.float32], Any]):
         self,
         environment: str,
         *,
-        version: str = "D",
+        version: requests.Version = "D",
         server: str | None = None,
         parameters: requests.Parameters | None = None,
         environment_index: int = 0,

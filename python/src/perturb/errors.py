@@ -17,6 +17,10 @@ class UnknownNameError(PerturbError, KeyError):
     __str__ = Exception.__str__  # a KeyError would put quotation marks around the sentence
 
 
+class PolicyError(PerturbError, ValueError):
+    """A policy cannot be loaded, does not fit the environment, or gives what is no action."""
+
+
 class ServerFullError(PerturbError, RuntimeError):
     """The server has no room for so many environments or sessions."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numbers
 import operator
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -29,18 +29,22 @@ Parameters: TypeAlias = Mapping[str, ParameterSet]
 # The same by name, as the protocol has it.
 Intervals: TypeAlias = dict[str, list[tuple[float, float]]]
 
-_VERSIONS = ("D", "R", "E", "R+E")
+# Where parameters come from.
+Version: TypeAlias = Literal["D", "R", "E", "R+E"]
+VERSIONS: tuple[Version, ...] = get_args(Version)
+
 _INT32 = np.iinfo(np.int32)
 
 
-def version(name: str) -> str:
-    """D, R, E or R+E."""
-    if name not in _VERSIONS:
-        raise InvalidArgumentError(
-            f"version={name!r} is none of 'D' (default physics), 'R' (random), 'E' (extreme) and 'R+E' (each in half "
-            "of the trials)"
-        )
-    return name
+def version(name: Any, what: str = "version") -> Version:
+    """D, R, E or R+E, in large letters."""
+    for known in VERSIONS:
+        if isinstance(name, str) and name == known:
+            return known
+    raise InvalidArgumentError(
+        f"{what}={name!r} is none of 'D' (default physics), 'R' (random), 'E' (extreme) and 'R+E' (each in half "
+        "of the trials)"
+    )
 
 
 def observes_parameters(observe: Any) -> bool:

@@ -57,7 +57,7 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         environment: str,
         num_envs: int = 1,
         *,
-        version: str = "D",
+        version: requests.Version = "D",
         server: str | None = None,
         parameters: requests.Parameters | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,

@@ -13,7 +13,8 @@ use crate::selection::{MethodResults, Selected};
 use crate::sets::Contexts;
 use crate::success::Criterion;
 
-pub(crate) use sweeps::{Bin, Counted, bins, success_at, success_within, thresholds};
+pub use sweeps::{Bin, Counted, bins, success_within};
+pub(crate) use sweeps::{success_at, thresholds};
 pub use worst::{SHARE, conditional_value_at_risk, worst_contexts};
 
 /// The recorded episodes of selected policies, by their cells' ids. Filled while the records are read for
@@ -85,7 +86,8 @@ impl PolicyOutcomes {
 }
 
 impl Outcomes {
-    fn of(records: &Records, name: &str) -> Self {
+    /// Of the test on the set called `name`; empty if there was none.
+    pub fn of(records: &Records, name: &str) -> Self {
         let rows = || records.of(name);
         let parameter =
             |place: usize| rows().map(|row| row.requested.get(place).copied().unwrap_or(f64::NAN)).collect();

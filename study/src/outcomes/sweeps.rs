@@ -11,26 +11,30 @@ const THRESHOLDS: usize = 40;
 
 /// Values from `low` on and below `high`, which the last one of an interval includes.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Bin {
-    pub(crate) low: f64,
-    pub(crate) high: f64,
+pub struct Bin {
+    /// Belongs to it.
+    pub low: f64,
+    /// Does not, but in the last one.
+    pub high: f64,
 }
 
 /// Successes among episodes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Counted {
-    pub(crate) successes: u64,
-    pub(crate) episodes: u64,
+pub struct Counted {
+    /// Of the episodes.
+    pub successes: u64,
+    /// All.
+    pub episodes: u64,
 }
 
 impl Counted {
     /// %; NaN without episodes.
-    pub(crate) fn rate(self) -> f64 {
+    pub fn rate(self) -> f64 {
         100.0 * self.successes as f64 / self.episodes as f64
     }
 
     /// The 95 % interval of [`Counted::rate`] after Wilson (1927), [low, high], %.
-    pub(crate) fn interval(self) -> [f64; 2] {
+    pub fn interval(self) -> [f64; 2] {
         let (low, high) = wilson(self.successes, self.episodes);
         [100.0 * low, 100.0 * high]
     }
@@ -59,7 +63,7 @@ impl std::iter::Sum for Counted {
 
 /// Equal parts of the range that the parameter at `place` has in `tests`, ten if it has values everywhere. Where a tenth of
 /// the range has none, as between E's two intervals, a part ends and another begins. None if it does not vary.
-pub(crate) fn bins<'a>(tests: impl Iterator<Item = &'a Outcomes>, place: usize) -> Vec<Bin> {
+pub fn bins<'a>(tests: impl Iterator<Item = &'a Outcomes>, place: usize) -> Vec<Bin> {
     let values = tests.filter_map(|outcomes| outcomes.parameters.get(place)).flatten();
     let mut values: Vec<f64> = values.copied().filter(|value| value.is_finite()).collect();
     values.sort_unstable_by(f64::total_cmp);
@@ -80,7 +84,7 @@ pub(crate) fn bins<'a>(tests: impl Iterator<Item = &'a Outcomes>, place: usize) 
 }
 
 /// The episodes of `outcomes` by the bins that the parameter at `place` lies in.
-pub(crate) fn success_within(outcomes: &Outcomes, place: usize, bins: &[Bin]) -> Vec<Counted> {
+pub fn success_within(outcomes: &Outcomes, place: usize, bins: &[Bin]) -> Vec<Counted> {
     let mut counted = vec![Counted::default(); bins.len()];
     let values = outcomes.parameters.get(place).into_iter().flatten();
     for (value, success) in values.zip(&outcomes.successes) {

@@ -19,7 +19,7 @@ use parquet::file::writer::{SerializedColumnWriter, SerializedFileWriter};
 use parquet::schema::parser::parse_message_type;
 use parquet::schema::types::Type;
 
-use super::{About, Ending, EpisodeRecord, Records};
+use super::{About, ColumnValues, Ending, EpisodeRecord, Records};
 use crate::AnyError;
 use crate::files::{FileError, read_if_there, write_atomically};
 
@@ -48,18 +48,7 @@ pub enum RecordsError {
     },
 }
 
-/// The values of a column.
-enum ColumnValues {
-    Text(Vec<ByteArray>),
-    Unsigned64(Vec<i64>),
-    Unsigned32(Vec<i32>),
-    Flag(Vec<bool>),
-    Number(Vec<f64>),
-    /// Those that are there, and for each row whether it has one.
-    Optional(Vec<f64>, Vec<i16>),
-}
-
-impl ColumnValues {
+impl ColumnValues<'_> {
     /// What the schema calls their type, before and after the column's name.
     fn kind(&self) -> (&'static str, &'static str) {
         match self {
@@ -68,68 +57,39 @@ impl ColumnValues {
             Self::Unsigned32(_) => ("required int32", " (INTEGER(32,false))"),
             Self::Flag(_) => ("required boolean", ""),
             Self::Number(_) => ("required double", ""),
-            Self::Optional(..) => ("optional double", ""),
+            Self::Optional(_) => ("optional double", ""),
         }
     }
 
     fn write(&self, writer: &mut SerializedColumnWriter<'_>) -> Result<usize, ParquetError> {
         match self {
-            Self::Text(texts) => writer.typed::<ByteArrayType>().write_batch(texts, None, None),
-            Self::Unsigned64(numbers) => writer.typed::<Int64Type>().write_batch(numbers, None, None),
-            Self::Unsigned32(numbers) => writer.typed::<Int32Type>().write_batch(numbers, None, None),
+            Self::Text(texts) => {
+                let texts: Vec<ByteArray> = texts.iter().map(|&text| text.into()).collect();
+                writer.typed::<ByteArrayType>().write_batch(&texts, None, None)
+            }
+            // Parquet's unsigned numbers are signed ones of the same bits.
+            Self::Unsigned64(numbers) => {
+                let numbers: Vec<i64> = numbers.iter().map(|number| number.cast_signed()).collect();
+                writer.typed::<Int64Type>().write_batch(&numbers, None, None)
+            }
+            Self::Unsigned32(numbers) => {
+                let numbers: Vec<i32> = numbers.iter().map(|number| number.cast_signed()).collect();
+                writer.typed::<Int32Type>().write_batch(&numbers, None, None)
+            }
             Self::Flag(flags) => writer.typed::<BoolType>().write_batch(flags, None, None),
             Self::Number(numbers) => writer.typed::<DoubleType>().write_batch(numbers, None, None),
-            Self::Optional(numbers, there) => writer.typed::<DoubleType>().write_batch(numbers, Some(there), None),
+            Self::Optional(numbers) => {
+                // Those that are there, and for each row whether it has one.
+                let there: Vec<i16> = numbers.iter().map(|number| number.is_some().into()).collect();
+                let numbers: Vec<f64> = numbers.iter().flatten().copied().collect();
+                writer.typed::<DoubleType>().write_batch(&numbers, Some(&there), None)
+            }
         }
     }
 }
 
-impl Ending {
-    const NAMED: [(&str, Self); 3] =
-        [("terminated", Self::Terminated), ("truncated", Self::Truncated), ("diverged", Self::Diverged)];
-}
-
-/// The columns of `records` by their names, in order. [`episodes`] reads them back.
-fn columns(Records { about, episodes }: &Records) -> Vec<(String, ColumnValues)> {
-    let rows = || episodes.iter();
-    let texts = |of: fn(&EpisodeRecord) -> &str| ColumnValues::Text(rows().map(|row| of(row).into()).collect());
-    // Parquet's unsigned numbers are signed ones of the same bits.
-    let longs =
-        |of: fn(&EpisodeRecord) -> u64| ColumnValues::Unsigned64(rows().map(|row| of(row).cast_signed()).collect());
-    let ints =
-        |of: fn(&EpisodeRecord) -> u32| ColumnValues::Unsigned32(rows().map(|row| of(row).cast_signed()).collect());
-    let nth = |index: usize, of: fn(&EpisodeRecord) -> &Vec<f64>| {
-        ColumnValues::Number(rows().map(|row| of(row).get(index).copied().unwrap_or(f64::NAN)).collect())
-    };
-    let parameters = about.parameters.iter().enumerate();
-    let requested = parameters
-        .map(|(index, parameter)| (format!("requested_{}", parameter.name), nth(index, |row| &row.requested)));
-    let quantities = about.applied.iter().enumerate();
-    let applied = quantities.map(|(index, name)| (format!("applied_{name}"), nth(index, |row| &row.applied)));
-    let optional = |of: fn(&EpisodeRecord) -> Option<f64>| {
-        ColumnValues::Optional(rows().filter_map(of).collect(), rows().map(|row| of(row).is_some().into()).collect())
-    };
-    let first = [
-        ("set", texts(|row| &row.set)),
-        ("seed", longs(|row| row.seed)),
-        ("environment_index", ints(|row| row.environment_index)),
-        ("episode_index", longs(|row| row.episode_index)),
-    ];
-    let last = [
-        ("model_hash", texts(|row| &row.model_hash)),
-        ("return", ColumnValues::Number(rows().map(|row| row.episode_return).collect())),
-        ("length", ints(|row| row.length)),
-        ("success", ColumnValues::Flag(rows().map(|row| row.success).collect())),
-        ("ending", texts(|row| Ending::NAMED[row.ending as usize].0)),
-        ("achieved", optional(|row| row.achieved)),
-    ];
-    let also = about.also.iter().map(|_| ("also_achieved".to_owned(), optional(|row| row.also_achieved)));
-    let named = |(name, values): (&str, ColumnValues)| (name.to_owned(), values);
-    first.map(named).into_iter().chain(requested).chain(applied).chain(last.map(named)).chain(also).collect()
-}
-
-fn schema(columns: &[(String, ColumnValues)]) -> Result<Type, ParquetError> {
-    let line = |(name, values): &(String, ColumnValues)| {
+fn schema(columns: &[(String, ColumnValues<'_>)]) -> Result<Type, ParquetError> {
+    let line = |(name, values): &(String, ColumnValues<'_>)| {
         let (kind, annotation) = values.kind();
         format!("{kind} {name}{annotation};")
     };
@@ -148,7 +108,7 @@ impl Records {
     }
 
     fn encode(&self) -> Result<Vec<u8>, AnyError> {
-        let columns = columns(self);
+        let columns = self.columns();
         let about = serde_json::to_string(&self.about)?;
         let properties = WriterProperties::builder()
             .set_compression(Compression::SNAPPY)
@@ -185,7 +145,7 @@ impl Records {
         let about = about.ok_or_else(|| format!("its metadata have no `{KEY}`"))?;
         let mut records = Self::new(serde_json::from_str(about)?);
         let there = metadata.schema().get_fields();
-        for (index, column) in schema(&columns(&records))?.get_fields().iter().enumerate() {
+        for (index, column) in schema(&records.columns())?.get_fields().iter().enumerate() {
             let name = column.name();
             match there.get(index) {
                 Some(field) if field == column => {}
@@ -202,7 +162,7 @@ impl Records {
     }
 }
 
-/// The rows of a part of the file, whose columns are those of [`columns`]: by columns, since row by row takes four times as
+/// The rows of a part of the file, whose columns are those of [`Records::columns`]: by columns, since row by row takes four times as
 /// long, and a report reads millions.
 fn episodes(about: &About, group: &dyn RowGroupReader) -> Result<Vec<EpisodeRecord>, AnyError> {
     let mut columns = Columns { group, place: 0 };

@@ -1,0 +1,246 @@
+//! Trained policies, as they act: the learner's arithmetic.
+
+use std::path::PathBuf;
+use std::sync::{Mutex, MutexGuard, TryLockError};
+
+use numpy::{PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
+use perturb_policy::{ActionKind, Ended, Outcome};
+use perturb_study::trained::{EnvironmentSeen, TrainedError, TrainedPolicy};
+use pyo3::prelude::*;
+
+use crate::failure::{POLICY, UNUSABLE, failure};
+
+/// A checkpoint that was read.
+#[pyclass(frozen, module = "perturb._native")]
+pub struct Policy {
+    pub(crate) trained: TrainedPolicy,
+    /// Iterations of its training, and a checksum of its weights.
+    #[pyo3(get)]
+    id: String,
+}
+
+#[pymethods]
+impl Policy {
+    /// Reads the checkpoint in a folder, or in its folder `checkpoint`.
+    #[staticmethod]
+    fn load(path: PathBuf) -> PyResult<Self> {
+        let trained = TrainedPolicy::load(&path).map_err(|error: TrainedError| refused(&error))?;
+        let id = trained.id().map_err(|reason| failure(POLICY, 0, reason))?;
+        Ok(Self { trained, id })
+    }
+
+    /// In what it was trained.
+    #[getter]
+    fn environment(&self) -> &str {
+        &self.trained.state.config.common.environment
+    }
+
+    /// Where parameters came from in training.
+    #[getter]
+    fn version(&self) -> String {
+        self.trained.state.config.common.version.to_string()
+    }
+
+    /// The same with the sets that replaced the version's.
+    #[getter]
+    fn trained_on(&self) -> String {
+        self.trained.state.config.common.trained_on()
+    }
+
+    /// What trained it, e.g. "ppo ff".
+    #[getter]
+    fn method(&self) -> String {
+        self.trained.state.config.method().to_string()
+    }
+
+    /// Episodes in a trial, over which it remembers.
+    #[getter]
+    fn episodes_per_trial(&self) -> u32 {
+        self.trained.state.config.settings.episodes_per_trial()
+    }
+
+    /// Whether it sees rewards and ends of episodes, too.
+    #[getter]
+    fn sees_rewards(&self) -> bool {
+        self.trained.state.config.settings.has_trials()
+    }
+
+    /// Whether it remembers.
+    #[getter]
+    fn has_memory(&self) -> bool {
+        self.trained.spec.memory_size() > 0
+    }
+
+    /// "state" or "parameters".
+    #[getter]
+    fn observe(&self) -> String {
+        self.trained.state.config.common.observe.to_string()
+    }
+
+    /// That of its training.
+    #[getter]
+    fn seed(&self) -> u64 {
+        self.trained.state.config.common.seed
+    }
+
+    /// O.
+    #[getter]
+    fn observation_size(&self) -> usize {
+        self.trained.state.environment_spec.observation.len()
+    }
+
+    /// Plays in N environments with successive indices.
+    fn player(&self, num_envs: usize, seed: u64, first_environment_index: u32) -> PyResult<Player> {
+        let player = self.trained.player(num_envs, seed, first_environment_index).map_err(|error| refused(&error))?;
+        let finals = Vec::with_capacity(num_envs * player.observation_size());
+        Ok(Player(Mutex::new(Playing {
+            player,
+            action: self.trained.spec.action,
+            seed,
+            trials: vec![(0, 0); num_envs],
+            ended: Vec::new(),
+            finals,
+        })))
+    }
+}
+
+impl Policy {
+    /// Whether `served` is the environment that it was trained in.
+    ///
+    /// # Errors
+    /// With what differs.
+    pub(crate) fn check_unchanged(&self, served: &perturb_protocol::proto::Environment) -> PyResult<()> {
+        let trained = &self.trained.state.environment_spec;
+        let name = self.environment();
+        let (what, trained, served) = match EnvironmentSeen::of(served) {
+            None => ("actions", format!("{:?}", trained.action), "none".into()),
+            Some(served) => match trained.difference(&served) {
+                None => return Ok(()),
+                Some(difference) => difference,
+            },
+        };
+        let words = format!(
+            "the checkpoint was trained in {name} with {what} {trained}, the server's has {served}: test with the version \
+             of perturb that trained it, or train again"
+        );
+        Err(failure(POLICY, 0, words))
+    }
+}
+
+/// Acts in N environments, and remembers. It is for one thread at a time.
+#[pyclass(frozen, module = "perturb._native")]
+pub struct Player(Mutex<Playing>);
+
+struct Playing {
+    player: perturb_policy::Player,
+    action: ActionKind,
+    seed: u64,
+    /// `[N]` the present trial, and the episode in it.
+    trials: Vec<(u64, u32)>,
+    ended: Vec<Ended>,
+    /// Final observations, which acting has no use for.
+    finals: Vec<f32>,
+}
+
+#[pymethods]
+impl Player {
+    /// Begins the first trial in every environment, with observations `[N, O]`.
+    fn begin(&self, observations: PyReadonlyArray2<'_, f32>) -> PyResult<()> {
+        self.own()?.begin(&observations)
+    }
+
+    /// The next actions: int64 `[N]`, or float32 `[N, A]`.
+    fn act<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        self.own()?.act(py)
+    }
+
+    /// Takes what came of the last actions: observations `[N, O]`, rewards `[N]`, and `starts` `[N]`, where an episode
+    /// ended and the observation is the first of the next.
+    fn observe(
+        &self,
+        observations: PyReadonlyArray2<'_, f32>,
+        rewards: PyReadonlyArray1<'_, f32>,
+        starts: PyReadonlyArray1<'_, bool>,
+    ) -> PyResult<()> {
+        self.own()?.observe(&observations, &rewards, &starts)
+    }
+}
+
+impl Player {
+    fn own(&self) -> PyResult<MutexGuard<'_, Playing>> {
+        match self.0.try_lock() {
+            Ok(playing) => Ok(playing),
+            Err(TryLockError::Poisoned(poisoned)) => Ok(poisoned.into_inner()),
+            Err(TryLockError::WouldBlock) => {
+                Err(failure(UNUSABLE, 0, "another thread acts with it: a policy's actor is for one thread at a time"))
+            }
+        }
+    }
+}
+
+impl Playing {
+    fn begin(&mut self, observations: &PyReadonlyArray2<'_, f32>) -> PyResult<()> {
+        let observations = self.rows(observations)?;
+        self.trials.fill((0, 0));
+        self.player.begin(&observations, None).map_err(|error| refused(&error))?;
+        // The streams may be those of later trials.
+        (0..self.trials.len()).for_each(|slot| self.player.begin_trial(slot, self.seed, 0));
+        Ok(())
+    }
+
+    fn act<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let bytes = self.player.act().map_err(|error| refused(&error))?;
+        let words = bytes.as_chunks::<4>().0;
+        match self.action {
+            ActionKind::Discrete { .. } => {
+                let choices = words.iter().map(|word| i64::from(i32::from_le_bytes(*word))).collect();
+                Ok(PyArray1::from_vec(py, choices).into_any())
+            }
+            ActionKind::Continuous { size } => {
+                let numbers = words.iter().map(|word| f32::from_le_bytes(*word)).collect();
+                Ok(PyArray1::from_vec(py, numbers).reshape([self.trials.len(), size])?.into_any())
+            }
+        }
+    }
+
+    fn observe(
+        &mut self,
+        observations: &PyReadonlyArray2<'_, f32>,
+        rewards: &PyReadonlyArray1<'_, f32>,
+        starts: &PyReadonlyArray1<'_, bool>,
+    ) -> PyResult<()> {
+        let observations = self.rows(observations)?;
+        let (rewards, starts) = (rewards.as_array().to_vec(), starts.as_array().to_vec());
+        self.ended.clear();
+        let episodes_per_trial = self.player.episodes_per_trial();
+        for (slot, trial) in self.trials.iter_mut().enumerate().filter(|(slot, _)| starts.get(*slot) == Some(&true)) {
+            self.ended.push(Ended { slot, trial_index: trial.0, episode_in_trial: trial.1 });
+            *trial = if trial.1 + 1 >= episodes_per_trial { (trial.0 + 1, 0) } else { (trial.0, trial.1 + 1) };
+        }
+        self.finals.clear();
+        self.finals.resize(self.ended.len() * self.player.observation_size(), 0.0);
+        let outcome = Outcome {
+            observations: &observations,
+            rewards: &rewards,
+            terminated: &starts,
+            truncated: &vec![false; starts.len()],
+            final_observations: &self.finals,
+            ended: &self.ended,
+        };
+        self.player.observe(&outcome, None).map_err(|error| refused(&error))
+    }
+
+    /// Observations `[N, O]` in a row.
+    fn rows(&self, observations: &PyReadonlyArray2<'_, f32>) -> PyResult<Vec<f32>> {
+        let expected = [self.trials.len(), self.player.observation_size()];
+        if observations.shape() != expected {
+            let words = format!("observations have the shape {:?}; expected {expected:?}", observations.shape());
+            return Err(failure(POLICY, 0, words));
+        }
+        Ok(observations.as_array().iter().copied().collect())
+    }
+}
+
+fn refused(error: &dyn std::error::Error) -> PyErr {
+    failure(POLICY, 0, error.to_string())
+}

@@ -1,0 +1,142 @@
+//! Tests of a policy that acts in Python: which episodes are played, and how they are recorded, as `perturb evaluate` does.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
+
+use numpy::PyReadonlyArray1;
+use perturb_protocol::{Distribution, Interval, Version, proto};
+use perturb_study::records::About;
+use perturb_study::sets::{self, Contexts, TestSet};
+use perturb_study::success::Rule;
+use perturb_study::testing::Counting;
+use pyo3::prelude::*;
+
+use crate::failure::{INVALID, MALFORMED, UNUSABLE, failure};
+use crate::infos::Events;
+use crate::policy::Policy;
+use crate::records::Records;
+use crate::requests::Intervals;
+use crate::session::Opened;
+
+/// A set: its name, its version, what is drawn in place of the version's, and the contexts if they are listed.
+type Set = (String, String, Intervals, Option<Vec<BTreeMap<String, f64>>>);
+
+/// The tests of a policy, one set after the other.
+#[pyclass(module = "perturb._native")]
+pub struct Tests {
+    sets: Vec<TestSet>,
+    episodes: u64,
+    seed: u64,
+    success: Option<Rule>,
+    policy: String,
+    episodes_per_trial: u32,
+    /// What the first session opened, and what was recorded in it.
+    begun: Option<(Arc<proto::Environment>, perturb_study::records::Records)>,
+    counting: Option<Counting>,
+}
+
+#[pymethods]
+impl Tests {
+    #[new]
+    fn new(
+        sets: Vec<Set>,
+        episodes: u64,
+        seed: u64,
+        success: Option<&str>,
+        policy: String,
+        episodes_per_trial: u32,
+    ) -> PyResult<Self> {
+        let sets = sets.into_iter().map(set).collect::<PyResult<Vec<TestSet>>>()?;
+        sets::distinct(&sets).map_err(|error| invalid(&error))?;
+        let success = success.map(str::parse).transpose().map_err(|error| invalid(&error))?;
+        Ok(Self { sets, episodes, seed, success, policy, episodes_per_trial, begun: None, counting: None })
+    }
+
+    /// Begins the test on the set in this place: the seed of its environments, and their number N.
+    fn plan(&mut self, place: usize) -> PyResult<(u64, usize)> {
+        let Some(set) = self.sets.get(place) else { return Err(failure(UNUSABLE, 0, "there is no such set")) };
+        let counting = Counting::new(set.clone(), self.seed, self.episodes, self.episodes_per_trial);
+        let plan = (counting.test().seed, counting.num_envs());
+        self.counting = Some(counting);
+        Ok(plan)
+    }
+
+    /// The session of the test was opened. The first one's environment is compared with all sets, and with the one that a
+    /// loaded policy was trained in.
+    #[pyo3(signature = (opened, policy))]
+    fn opened(&mut self, opened: &Opened, policy: Option<&Policy>) -> PyResult<()> {
+        let served = opened.served();
+        if let Some((environment, _)) = &self.begun {
+            if **environment == **served {
+                return Ok(());
+            }
+            return Err(failure(MALFORMED, 0, "the server describes the environment otherwise than at the first test"));
+        }
+        policy.map_or(Ok(()), |policy| policy.check_unchanged(served))?;
+        self.sets.iter().try_for_each(|set| set.check(served)).map_err(|error| invalid(&error))?;
+        let mut about = About::new(served, self.policy.clone(), self.episodes_per_trial);
+        if let Some(rule) = &self.success {
+            about.judge_by(rule).map_err(|error| invalid(&error))?;
+        }
+        self.begun = Some((Arc::clone(served), perturb_study::records::Records::new(about)));
+        Ok(())
+    }
+
+    /// Takes the episodes that ended in a step: how many were counted, and how many there are to be.
+    fn take(&mut self, events: Option<&Events>, terminated: PyReadonlyArray1<'_, bool>) -> PyResult<(u64, u64)> {
+        let Some(counting) = &mut self.counting else { return Err(failure(UNUSABLE, 0, "no test has begun")) };
+        if let Some(events) = events {
+            counting.take(events.ended().iter(), &terminated.as_array().to_vec());
+        }
+        Ok(counting.progress())
+    }
+
+    /// Records the episodes.
+    fn finish(&mut self) -> PyResult<()> {
+        let (Some(counting), Some((environment, records))) = (self.counting.take(), &mut self.begun) else {
+            return Err(failure(UNUSABLE, 0, "no test has begun"));
+        };
+        counting.finish(environment, records).map_err(|error| failure(MALFORMED, 0, error.to_string()))
+    }
+
+    /// What was recorded.
+    fn records(&self) -> PyResult<Records> {
+        let Some((_, records)) = &self.begun else { return Err(failure(UNUSABLE, 0, "no test has begun")) };
+        Ok(Records(records.clone()))
+    }
+}
+
+fn set((name, version, drawn, contexts): Set) -> PyResult<TestSet> {
+    let version: Version = version.parse().map_err(|error| invalid(&error))?;
+    let contexts = match contexts {
+        Some(listed) if listed.is_empty() => {
+            return Err(failure(INVALID, 0, format!("{name} has no contexts; expected at least one")));
+        }
+        Some(listed) => {
+            if let Some(value) = listed.iter().flat_map(BTreeMap::values).find(|value| !value.is_finite()) {
+                return Err(failure(
+                    INVALID,
+                    0,
+                    format!("a context of {name} has the value {value}; expected a number"),
+                ));
+            }
+            Contexts::Listed(listed)
+        }
+        None => Contexts::Drawn(parameters(drawn)?),
+    };
+    Ok(TestSet { name, version, contexts })
+}
+
+fn parameters(drawn: Intervals) -> PyResult<BTreeMap<String, Distribution>> {
+    let distribution = |(name, intervals): (String, Vec<(f64, f64)>)| {
+        let intervals: Vec<Interval> = intervals.into_iter().map(|(low, high)| Interval::new(low, high)).collect();
+        let values = Distribution::union(&intervals);
+        let values = values.map_err(|error| failure(INVALID, 0, format!("the parameter {name}: {error}")))?;
+        Ok((name, values))
+    };
+    HashMap::into_iter(drawn).map(distribution).collect()
+}
+
+fn invalid(error: &dyn std::error::Error) -> PyErr {
+    failure(INVALID, 0, error.to_string())
+}

@@ -1,0 +1,110 @@
+"""Checkpoints in Python: they act as they did where they were trained. Those of a shipped experiment are here."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import perturb
+
+from .conftest import ROOT
+
+CELLS = ROOT / "results/beyond/confirm-2/cells"
+CART_POLE = CELLS / "CartPole-ppo-ff-D-9bd6546b-s7/training"
+PENDULUM = CELLS / "Pendulum-ppo-ff-R-9bd6546b-s8/training"
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Path:
+    """Give a checkpoint to spoil."""
+    return Path(shutil.copytree(CART_POLE / "checkpoint", tmp_path / "checkpoint"))
+
+
+def spoil(folder: Path, old: str, new: str) -> None:
+    document = (folder / "checkpoint.json").read_text()
+    assert old in document
+    (folder / "checkpoint.json").write_text(document.replace(old, new, 1))
+
+
+def test_a_policy_says_what_it_is() -> None:
+    policy = perturb.load_policy(PENDULUM)
+    assert (policy.environment, policy.version, policy.trained_on) == ("Pendulum", "R", "R")
+    assert (policy.method, policy.observe, policy.seed) == ("ppo ff", "state", 8)
+    assert (policy.episodes_per_trial, policy.has_memory, policy.sees_rewards) == (1, False, False)
+    assert policy.observation_size == 3
+    assert f"weights-{policy.id}.safetensors" in [path.name for path in (PENDULUM / "checkpoint").iterdir()]
+    assert repr(policy) == f"<perturb policy {policy.id}: ppo ff in Pendulum, trained on R>"
+    assert perturb.load_policy(str(PENDULUM / "checkpoint")).id == policy.id
+
+
+@pytest.mark.parametrize(("path", "shape", "kind"), [(CART_POLE, (3,), np.int64), (PENDULUM, (3, 1), np.float32)])
+def test_an_actor_samples_what_its_seed_indices_and_trials_say(path: Path, shape: tuple[int, ...], kind: type) -> None:
+    policy = perturb.load_policy(path)
+    rng = np.random.default_rng(1)
+    # Where the policy is not sure what to do.
+    rows = [rng.normal(0, 0.02, (3, policy.observation_size)).astype(np.float32) for _ in range(20)]
+    starts = [np.array([step == 5, False, step == 9]) for step in range(20)]
+
+    def act(actor: perturb.Actor, slots: slice = slice(None)) -> Any:
+        return np.array([actor(row[slots], starts=start[slots]) for row, start in zip(rows, starts, strict=True)])
+
+    actor = policy.actor(3, seed=5)
+    first = act(actor)
+    assert first[0].shape == shape
+    assert first.dtype == kind
+    actor.reset()
+    np.testing.assert_array_equal(act(actor), first)
+    np.testing.assert_array_equal(act(policy.actor(1, seed=5, first_environment_index=2), slice(2, 3)), first[:, 2:])
+    assert (act(policy.actor(3, seed=6)) != first).any()
+
+
+def test_an_actor_refuses_what_it_cannot_see(copied: Path) -> None:
+    policy = perturb.load_policy(copied)
+    actor = policy.actor(2)
+    wrongs: list[tuple[Any, str]] = [
+        (np.zeros((2, 3), np.float32), r"observations have the shape \[2, 3\]; expected \[2, 4\]"),
+        (np.zeros(4), r"observations have the shape \(4,\); expected \[N, O\]"),
+        ([["a", "b"]], "observations have the type"),
+    ]
+    for wrong, words in wrongs:
+        with pytest.raises(perturb.PolicyError, match=words):
+            actor(wrong)
+    actor(np.zeros((2, 4)))
+    with pytest.raises(perturb.PolicyError, match="starts have the type int64; expected bool"):
+        actor(np.zeros((2, 4)), starts=[0, 1])
+    with pytest.raises(perturb.PolicyError, match="rewards"):
+        actor(np.zeros((2, 4)), rewards=[0.0])
+    with pytest.raises(perturb.PolicyError):
+        actor(np.full((2, 4), np.nan))
+    with pytest.raises(perturb.InvalidArgumentError, match="num_envs=0"):
+        policy.actor(0)
+
+
+def test_what_is_no_checkpoint_is_refused_with_what_is_wrong(copied: Path, tmp_path: Path) -> None:
+    with pytest.raises(perturb.PolicyError, match=r"holds no checkpoint: expected checkpoint\.json"):
+        perturb.load_policy(tmp_path / "nothing")
+    with pytest.raises(perturb.InvalidArgumentError, match="path is 7"):
+        perturb.load_policy(7)  # type: ignore[arg-type]
+    spoil(copied, '"format_version": 2', '"format_version": 9')
+    with pytest.raises(perturb.PolicyError, match="it has format 9, this program reads 1 to 2"):
+        perturb.load_policy(copied)
+
+
+def test_damage_is_named(copied: Path) -> None:
+    weights = copied / json.loads((copied / "checkpoint.json").read_text())["weights"]["file"]
+    content = weights.read_bytes()
+    weights.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    with pytest.raises(perturb.PolicyError, match=f"{weights.name} is not a usable checkpoint: .* another checksum"):
+        perturb.load_policy(copied)
+    weights.unlink()
+    with pytest.raises(perturb.PolicyError, match=weights.name):
+        perturb.load_policy(copied)
+    weights.write_bytes(content)
+    spoil(copied, '"observation_normaliser": {', '"observation_normaliser": null, "left": {')
+    with pytest.raises(perturb.PolicyError, match="observation_normaliser: there is none"):
+        perturb.load_policy(copied)
