@@ -8,6 +8,8 @@
 //! - [`testing`], [`records`]: tests of whatever acts in Python, recorded as the program `perturb` records its own.
 //! - [`failure`]: what went wrong, for the package to say it as one of its errors.
 #![forbid(unsafe_code)]
+// The map above is for who reads this crate: all that it has is Python's, and private.
+#![allow(rustdoc::private_intra_doc_links)]
 
 use pyo3::prelude::*;
 
