@@ -140,6 +140,10 @@ impl Backend for Local<'_> {
         true
     }
 
+    fn tells_ends(&self) -> bool {
+        true
+    }
+
     fn poll(&mut self, _now: Instant) -> Result<Vec<News>> {
         let mut news = Vec::new();
         for mut worker in std::mem::take(&mut self.workers) {

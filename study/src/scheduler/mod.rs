@@ -45,6 +45,8 @@ pub trait Backend {
     /// Whether a cell that is broken off too often has failed. If not, its machines may be to blame: nothing is
     /// recorded, and the next run tries again.
     fn convicts(&self) -> bool;
+    /// Whether it tells of every cell that has begun how it ends, so that a run can wait for that.
+    fn tells_ends(&self) -> bool;
     /// What has happened since the last call.
     ///
     /// # Errors
@@ -395,11 +397,12 @@ impl<'a> Scheduler<'a> {
     /// Takes note of what is in the folder, whoever did it, and of cells that others have given up.
     fn look(&mut self, now: Instant) -> Result<()> {
         let begun = Instant::now();
+        let waits = self.backend.tells_ends();
         for cell in 0..self.cells.len() {
             let Tracked { phase, begun, .. } = self.cells[cell];
             // Whoever does it for this run has yet to say so: a result is written before that.
-            let is_heard = phase == Phase::Running && begun.is_some();
-            if !is_heard
+            let is_to_be_told = waits && phase == Phase::Running && begun.is_some();
+            if !is_to_be_told
                 && !self.settled(cell)
                 && self.cells[cell].phase == Phase::Elsewhere
                 && self.folder.cell(self.id(cell)).try_lock()?.is_some()

@@ -72,6 +72,10 @@ impl<const CONVICTS: bool> Backend for Fake<'_, CONVICTS> {
         CONVICTS
     }
 
+    fn tells_ends(&self) -> bool {
+        CONVICTS
+    }
+
     fn poll(&mut self, now: Instant) -> Result<Vec<News>> {
         self.now = now;
         let mut news = Vec::new();
@@ -378,6 +382,15 @@ fn a_run_does_not_end_before_its_last_cell_is_told_to_be_done() {
     let ran = place.run(&|_, _| vec![server(), Succeeds, Wait(5), ends(CellEvent::Done)]);
     assert_eq!(ran.end, place.finished(&[]));
     assert_eq!(ran.told, [0, 1, 2, 3].map(|cell| place.id(cell)));
+}
+
+#[test]
+fn a_run_whose_jobs_do_not_tell_their_ends_sees_the_results() {
+    let place = Place::new();
+    let ran = place.run_on::<false>(4, false, &|_, _| vec![server(), Succeeds, Wait(9_000), ends(CellEvent::Done)]);
+    assert_eq!(ran.end, place.finished(&[]));
+    assert_eq!(ran.attempts(), [1, 1, 1, 1]);
+    assert!(ran.told.is_empty(), "{:?}", ran.told);
 }
 
 #[test]

@@ -341,6 +341,11 @@ impl Backend for Jobs<'_> {
         false
     }
 
+    /// Results are seen in the folder.
+    fn tells_ends(&self) -> bool {
+        false
+    }
+
     fn poll(&mut self, now: Instant) -> Result<Vec<News>> {
         self.deciding = None;
         if self.ask_at.is_none_or(|time| now >= time) {
