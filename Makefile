@@ -8,7 +8,7 @@ OPENGL := libegl1 libgl1-mesa-dri
 SLURM_PACKAGES := slurmctld slurmd slurm-client munge
 # Emulates other processors, for the test that all compute the same.
 QEMU := qemu-user
-# What encodes the .mp4 files of `perturb video`, some 60 MB; everything else runs without it.
+# What encodes the .mp4 files of `perturb video`, some 60 MB; everything else but the site runs without it.
 FFMPEG := ffmpeg
 CARGO_DENY_VERSION := 0.20.2
 TARGET := $(or $(CARGO_TARGET_DIR),target)
@@ -17,6 +17,8 @@ PROGRAMS := $(TARGET)/release
 VENV := $(TARGET)/python
 # The Python package whose compliance cases `make test` runs.
 DM_ENV_RPC := $(TARGET)/dm_env_rpc
+# The site and what builds it.
+DOCS := $(TARGET)/docs
 # What perturb's training is compared with. PUREJAXRL is an address that git can clone, or where GitHub is out of reach the
 # path of a clone.
 PEERS := $(TARGET)/peers
@@ -28,6 +30,8 @@ PUREJAXRL_COMMIT := 31756b197773a52db763fdbe6d635e4b46522a73
 # make bench-peers PEERS_ARGS="--rounds 1 HalfCheetah",
 # make all-pairs ALL_PAIRS_ARGS="20 /tmp/runs": episodes, directory.
 DEMO_ARGS ?=
+# Where `make install` puts things.
+PREFIX ?= $(HOME)/.local
 ALL_PAIRS_ARGS ?=
 BENCH_ARGS ?=
 BENCH_PYTHON_ARGS ?=
@@ -65,9 +69,9 @@ missing=; \
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help deps opengl toolchain build demo all-pairs report-check test slurm-test qemu-test slurm-acceptance lint bench \
+.PHONY: help deps opengl toolchain build install demo all-pairs report-check serve-test test slurm-test qemu-test slurm-acceptance lint bench \
 	bench-peers audit cargo-deny python-test wheel wheel-test python-acceptance bench-python \
-	python-venv docker docker-base docker-test
+	python-venv docs docs-test docker docker-base docker-test
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -81,10 +85,20 @@ opengl:
 toolchain:
 	@command -v cargo >/dev/null || { echo "cargo is missing; install Rust 1.95 or later, see https://rustup.rs" >&2; exit 1; }
 
-build: deps ## compile the programs perturb-server and perturb
+build: deps ## compile the programs perturb-server, perturb and perturb-recurrent
 	cargo build $(ALL)
 
-demo: build ## train and test PPO on CartPole over gRPC; the paper's row beside it
+install: build ## copy the programs, manual pages and completions to PREFIX, by default ~/.local
+	install -D --target-directory $(PREFIX)/bin $(addprefix $(PROGRAMS)/,perturb perturb-recurrent perturb-server)
+	mkdir -p $(PREFIX)/share/man/man1 $(PREFIX)/share/bash-completion/completions $(PREFIX)/share/zsh/site-functions \
+		$(PREFIX)/share/fish/vendor_completions.d
+	$(PROGRAMS)/perturb --quiet man $(PREFIX)/share/man/man1
+	$(PROGRAMS)/perturb completions bash > $(PREFIX)/share/bash-completion/completions/perturb
+	$(PROGRAMS)/perturb completions zsh > $(PREFIX)/share/zsh/site-functions/_perturb
+	$(PROGRAMS)/perturb completions fish > $(PREFIX)/share/fish/vendor_completions.d/perturb.fish
+	@echo "installed in $(PREFIX)/bin; if it is not on your PATH: export PATH=$(PREFIX)/bin:\$$PATH"
+
+demo: build opengl ## train Hopper on default and on random physics, and see what still works; some three minutes
 	$(PROGRAMS)/perturb demo $(DEMO_ARGS)
 
 all-pairs: build ## train and test every algorithm and architecture on every environment, shortly
@@ -93,6 +107,10 @@ all-pairs: build ## train and test every algorithm and architecture on every env
 report-check: build ## make the report of a small experiment and look at it in Chromium, which it installs; minutes
 	@$(call install,chromium python3)
 	PROGRAMS=$(PROGRAMS) cli/tests/report_check.sh $(TARGET)/report-check
+
+serve-test: build opengl ## watch a training and an experiment on the live page in Chromium, which it installs; minutes
+	@$(call install,chromium python3)
+	python3 cli/tests/serve_check/watch.py chromium $(PROGRAMS) $(TARGET)/serve-test
 
 test: export PERTURB_TEST_DM_ENV_RPC_PYTHON := $(abspath $(DM_ENV_RPC))/bin/python
 test: deps opengl $(DM_ENV_RPC)/installed ## run all tests, then those of the server without MuJoCo
@@ -171,16 +189,33 @@ bench-python: $(VENV)/installed ## measure the Python package beside EnvPool, in
 	$(VENV)/bin/pip install -q --disable-pip-version-check -r python/requirements-bench.txt
 	$(VENV)/bin/python -W ignore python/benchmarks/throughput.py $(BENCH_PYTHON_ARGS)
 
+docs: build $(DOCS)/installed ## build the site in target/docs/site; a link to nowhere fails
+	@$(call install,$(FFMPEG))
+	$(DOCS)/venv/bin/python docs/site/build.py $(PROGRAMS) $(DOCS)
+
+docs-test: docs $(VENV)/installed ## run the tutorials' blocks, follow all links, look at the site in Chromium; minutes
+	@$(call install,chromium)
+	$(VENV)/bin/ruff check --config python/pyproject.toml --extend-ignore ANN,D101,D102,D103 docs/site
+	$(VENV)/bin/ruff format --check --config python/pyproject.toml docs/site
+	$(VENV)/bin/python docs/site/run_blocks.py $(PROGRAMS)
+	python3 docs/site/links.py $(DOCS)/site
+	python3 docs/site/look.py chromium $(DOCS)/site $(DOCS)/pictures
+
 $(PROGRAMS)/perturb-server: deps
 	cargo build --package perturb --release --locked
 
 # The native module is compiled when the package is installed, and the server is asked for its catalogue.
 $(VENV)/installed: python/requirements-dev.txt python/pyproject.toml python/build_backend.py proto/perturb/v1/perturb.proto \
-		$(wildcard python/native/Cargo.toml python/native/src/*.rs crates/p*/src/*.rs study/src/*.rs study/src/*/*.rs) Cargo.lock \
+		$(wildcard python/native/Cargo.toml python/native/src/*.rs python/native/src/*/*.rs crates/p*/src/*.rs study/src/*.rs study/src/*/*.rs) Cargo.lock \
 		$(PROGRAMS)/perturb-server | python-venv
 	python3 -m venv $(VENV)
 	$(VENV)/bin/pip install -q --disable-pip-version-check -r python/requirements-dev.txt
 	$(VENV)/bin/pip install -q --disable-pip-version-check --no-deps --editable python
+	touch $@
+
+$(DOCS)/installed: docs/site/requirements.txt | python-venv
+	python3 -m venv $(DOCS)/venv
+	$(DOCS)/venv/bin/pip install -q --disable-pip-version-check -r $<
 	touch $@
 
 $(DM_ENV_RPC)/installed: tests/server/dm_env_rpc/requirements.txt | python-venv

@@ -1,4 +1,4 @@
-# The program perturb with libtorch and OpenBLAS, and the experiments. From the repository's root:
+# The programs perturb and, with libtorch and OpenBLAS, perturb-recurrent, and the experiments. From the repository's root:
 #   docker build --file docker/learner.Dockerfile --tag perturb-learner \
 #     --build-arg PERTURB_COMMIT=$(git rev-parse --short=12 HEAD) .
 
@@ -21,16 +21,16 @@ COPY . .
 # The commit, which results name: the repository is not in the build's context.
 ARG PERTURB_COMMIT="unknown commit"
 RUN cargo build --package perturb-cli --release --locked
-# The shared libraries that the program loads: some 280, nearly all of them because libtorch does. Debian's packages
+# The shared libraries that the programs load: some 280, nearly all of them because libtorch does. Debian's packages
 # would bring 360 MB more, which nobody loads. The C library is left out: the image has its own.
 RUN mkdir /libraries \
-    && ldd target/release/perturb | awk '$3 ~ "^/" { print $3 }' | grep -vE '/lib(c|m|dl|pthread|rt|resolv)\.so' \
+    && ldd target/release/perturb-recurrent | awk '$3 ~ "^/" { print $3 }' | grep -vE '/lib(c|m|dl|pthread|rt|resolv)\.so' \
     | xargs cp --dereference --target-directory /libraries
 
 FROM debian:bookworm-slim
 COPY --from=build /libraries /usr/local/lib/
 RUN ldconfig && useradd --uid 10001 --user-group --no-create-home --home-dir / --shell /usr/sbin/nologin perturb
-COPY --from=build /perturb/target/release/perturb /usr/local/bin/
+COPY --from=build /perturb/target/release/perturb /perturb/target/release/perturb-recurrent /usr/local/bin/
 COPY experiments /experiments
 # The learner's threads are its own; more inside matrix products only get in their way.
 ENV OPENBLAS_NUM_THREADS=1

@@ -176,6 +176,16 @@ impl TryFrom<String> for ListenAddress {
     }
 }
 
+impl ListenAddress {
+    /// As `--listen` takes it.
+    pub fn written(&self) -> String {
+        match self {
+            Self::Tcp(address) => format!("tcp://{address}"),
+            Self::Unix(path) => format!("unix:{}", path.display()),
+        }
+    }
+}
+
 impl fmt::Display for ListenAddress {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {

@@ -71,6 +71,7 @@ fn rollout(policy: &Policy, n_steps: usize, n_envs: usize) -> Rollout {
 
 /// Recurrent policies of the paper's size.
 fn recurrent(task: &str, observation_size: usize, action: ActionKind) {
+    perturb_torch::register();
     let mut policy = Policy::new(PolicySpec::recurrent(observation_size, action), 1).expect("a policy");
     for n_envs in [1, 16] {
         let mut actor = Actor::new(policy.spec(), n_envs);

@@ -39,9 +39,6 @@ pub enum Error {
         /// Steps that the rollout holds.
         n_steps: usize,
     },
-    /// libtorch refused an operation.
-    #[error("libtorch: {0}")]
-    Torch(#[from] tch::TchError),
 }
 
 /// A result with this module's [`Error`].

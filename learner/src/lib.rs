@@ -8,13 +8,10 @@ pub mod checkpoint;
 pub mod client;
 pub mod error;
 pub mod evaluation;
-#[cfg(test)]
-mod fixture;
 pub mod logging;
 pub mod measure;
 pub mod policy;
 pub mod rollout;
-pub mod torch;
 pub mod training;
 
 pub use perturb_protocol::proto;

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use perturb_study::files::{FileError, io};
-use perturb_study::interrupt::StopFlag;
+use perturb_study::interrupt::{Scratch, StopFlag};
 use perturb_study::scheduler::CellEvent;
 use perturb_study::{Cell, Folder, Measurement, Speed};
 
@@ -52,19 +52,32 @@ pub enum MeasureError {
     /// What was learned cannot be tested.
     #[error(transparent)]
     Test(#[from] TestError),
+    /// The program was asked to end.
+    #[error("stopped by signal {signal} while measuring; nothing is kept of it")]
+    Stopped {
+        /// The signal.
+        signal: i32,
+    },
 }
 
 /// Trains the cells of `group`, at least one, as a run would do them together, `jobs` times at once, for about `limit`,
 /// at least two iterations; then tests one. Forgets what was learned.
 ///
 /// # Errors
-/// [`MeasureError`].
-pub fn measure(servers: &Servers, group: &[&Cell], jobs: usize, limit: Duration) -> Result<Measurement, MeasureError> {
+/// [`MeasureError`]; [`MeasureError::Stopped`] soon after `stop` is raised.
+pub fn measure(
+    servers: &Servers,
+    group: &[&Cell],
+    jobs: usize,
+    limit: Duration,
+    stop: &StopFlag,
+) -> Result<Measurement, MeasureError> {
     let addresses: Vec<Address> = servers.addresses().cloned().collect();
     let one = |job| {
         let servers = Servers::connect_to_one(&addresses, job)?;
-        let scratch = tempfile::tempdir().map_err(io("create a folder in", &std::env::temp_dir()))?;
-        measure_one(&servers, group, scratch.path(), limit)
+        let scratch = Scratch::new().map_err(io("create a folder in", &std::env::temp_dir()))?;
+        let measured = measure_one(&servers, group, scratch.path(), limit, stop);
+        stop.signal().map_or(measured, |signal| Err(MeasureError::Stopped { signal }))
     };
     let one = &one;
     let speeds: Vec<Speed> = std::thread::scope(|scope| {
@@ -81,11 +94,17 @@ pub fn measure(servers: &Servers, group: &[&Cell], jobs: usize, limit: Duration)
     })
 }
 
-fn measure_one(servers: &Servers, group: &[&Cell], scratch: &Path, limit: Duration) -> Result<Speed, MeasureError> {
+fn measure_one(
+    servers: &Servers,
+    group: &[&Cell],
+    scratch: &Path,
+    limit: Duration,
+    stop: &StopFlag,
+) -> Result<Speed, MeasureError> {
     if group[0].config.settings.is_random() {
         let directory = RunDirectory::choose(scratch, true)?;
         let made = train(servers, &group[0].config, &directory, 1, &StopFlag::default(), |_| {})?;
-        return Ok(Speed { training: 0.0, testing: measure_test(servers, group[0], &made.checkpoint)? });
+        return Ok(Speed { training: 0.0, testing: measure_test(servers, group[0], &made.checkpoint, stop)? });
     }
     let endless = |cell: &&Cell| {
         let mut cell = Cell::clone(cell);
@@ -96,17 +115,17 @@ fn measure_one(servers: &Servers, group: &[&Cell], scratch: &Path, limit: Durati
     let folder = Folder::new(scratch);
     let order = |cell| CellOrder { cell, folder: folder.cell(&cell.id), retry: None };
     let orders: Vec<CellOrder<'_>> = cells.iter().map(order).collect();
-    let stop = StopFlag::default();
+    let enough = StopFlag::default();
     let mut meter = Meter::new();
-    run_cells(servers, &orders, &stop, &mut |cell, event| {
-        if meter.hear(&cell.id, event) >= limit {
-            stop.raise(1);
+    run_cells(servers, &orders, &enough, &mut |cell, event| {
+        if meter.hear(&cell.id, event) >= limit || stop.signal().is_some() {
+            enough.raise(1);
         }
     });
     let (trained, training) = meter.end()?;
     let cell = cells.iter().find(|cell| cell.id == trained).unwrap_or(&cells[0]);
     let checkpoint = Checkpoint::load(&folder.cell(&cell.id).training())?;
-    Ok(Speed { training, testing: measure_test(servers, cell, &checkpoint)? })
+    Ok(Speed { training, testing: measure_test(servers, cell, &checkpoint, stop)? })
 }
 
 /// The time from one iteration to another of the cell that is heard of first, and all steps of all cells between: where
@@ -152,7 +171,7 @@ impl Meter {
                     None => drop(self.timesteps.insert(id.to_owned(), timesteps)),
                 }
             }
-            CellEvent::Failed { reason } | CellEvent::LostServer { reason } => {
+            CellEvent::Failed { reason } | CellEvent::LostServer { reason } | CellEvent::FileFault { reason } => {
                 self.ended.get_or_insert(MeasureError::Ended { id: id.to_owned(), reason });
             }
             _ => {}
@@ -175,13 +194,13 @@ impl Meter {
 }
 
 /// The seconds of a step in tests: they go on in all environments until the last has had its episode.
-fn measure_test(servers: &Servers, cell: &Cell, checkpoint: &Checkpoint) -> Result<f64, MeasureError> {
+fn measure_test(servers: &Servers, cell: &Cell, checkpoint: &Checkpoint, stop: &StopFlag) -> Result<f64, MeasureError> {
     let episodes = cell.tests.episodes.min(TEST_EPISODES);
     let (seed, success) = (cell.config.common.seed, cell.tests.success.clone());
     let options = TestOptions { episodes, seed, selects: false, success };
     let sets = &cell.tests.sets[..1.min(cell.tests.sets.len())];
     let start = Instant::now();
-    let records = Tester::new(servers, checkpoint, options)?.test(sets, &StopFlag::default(), &mut |_, _| {})?;
+    let records = Tester::new(servers, checkpoint, options)?.test(sets, stop, &mut |_, _| {})?;
     let seconds = start.elapsed().as_secs_f64();
     // Each environment plays one episode, or trial, and all go on until the longest has ended.
     let mut lengths: BTreeMap<u32, u64> = BTreeMap::new();

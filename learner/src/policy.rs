@@ -3,16 +3,15 @@
 use perturb_policy::math::exp;
 use perturb_policy::random::{Purpose, stream};
 use perturb_policy::{
-    Acting, ActionKind, Descent, Differentiator, Losses, NamedArray, Objective, PolicySpec, Samples, Weights,
-    initial_weights,
+    Acting, ActionKind, Descent, Differentiator, Losses, NamedArray, Objective, PolicySpec, RecurrentBatch,
+    RecurrentDifferentiator, Samples, SequenceSamples, Weights, initial_weights, recurrent_differentiator,
 };
 
 use crate::error::Result;
 use crate::rollout::{Estimates, Rollout};
-use crate::torch::{self, TensorBatch, TorchPolicy};
 
 /// A policy of either architecture, its weights, and what differentiates losses by them: plain arithmetic for a
-/// feed-forward policy, libtorch for a recurrent one.
+/// feed-forward policy, for a recurrent one [what is registered](perturb_policy::register_recurrent).
 pub struct Policy {
     spec: PolicySpec,
     /// `[P]`.
@@ -26,7 +25,7 @@ pub type Room = Box<Differentiator>;
 enum Calculus {
     /// Whether the room has the weights as they are now.
     FeedForward(Room, bool),
-    Recurrent(TorchPolicy),
+    Recurrent(Box<dyn RecurrentDifferentiator>),
 }
 
 /// What a policy learns from: a rollout, as M sequences that it must see whole. A recurrent policy needs the steps of an
@@ -35,7 +34,7 @@ pub struct Batch<'a>(Data<'a>);
 
 enum Data<'a> {
     FeedForward { samples: Samples<'a>, indices: Vec<u32>, acting: Option<ActingOutputs> },
-    Recurrent(Box<TensorBatch>),
+    Recurrent(Box<dyn RecurrentBatch>),
 }
 
 /// The distributions of the policy that acted.
@@ -49,7 +48,7 @@ impl Batch<'_> {
     pub fn sequences(&self) -> Vec<u32> {
         match &self.0 {
             Data::FeedForward { indices, .. } => indices.clone(),
-            Data::Recurrent(batch) => (0..batch.sequences.count() as u32).collect(),
+            Data::Recurrent(batch) => (0..batch.count() as u32).collect(),
         }
     }
 }
@@ -69,14 +68,14 @@ impl Policy {
     /// A policy with the given weights, whose names and shapes must be those of [`PolicySpec::layout`].
     ///
     /// # Errors
-    /// A shape that is empty somewhere, or other weights.
+    /// A shape that is empty somewhere, other weights, or a recurrent policy that nothing differentiates.
     pub fn from_weights(spec: PolicySpec, weights: &Weights) -> Result<Self> {
         spec.validate()?;
         spec.check(weights)?;
         let weights: Vec<f32> = weights.iter().flat_map(|array| array.data.iter().copied()).collect();
         let calculus = match spec.lstm {
             None => Calculus::FeedForward(Box::new(Differentiator::new(&spec, 1)?), false),
-            Some(_) => Calculus::Recurrent(TorchPolicy::new(&spec, &weights)?),
+            Some(_) => Calculus::Recurrent(recurrent_differentiator(&spec)?),
         };
         Ok(Policy { spec, weights, calculus })
     }
@@ -160,11 +159,8 @@ impl Policy {
     /// All of a rollout, with what was estimated from it.
     ///
     /// # Errors
-    /// What libtorch refuses.
+    /// What the library refuses that differentiates recurrent policies.
     pub fn batch<'a>(&self, rollout: &'a Rollout, estimates: &'a Estimates) -> Result<Batch<'a>> {
-        if self.spec.lstm.is_some() {
-            return Ok(Batch(Data::Recurrent(Box::new(TensorBatch::new(rollout, &self.spec, estimates)?))));
-        }
         let samples = Samples {
             observations: rollout.observations(),
             actions: rollout.actions(),
@@ -174,8 +170,19 @@ impl Policy {
             returns: &estimates.returns,
             acting: None,
         };
-        let indices = rollout.samples().unwrap_or_else(|| (0..rollout.values().len() as u32).collect());
-        Ok(Batch(Data::FeedForward { samples, indices, acting: None }))
+        Ok(Batch(match &self.calculus {
+            Calculus::FeedForward(..) => {
+                let all = || (0..rollout.values().len() as u32).collect();
+                Data::FeedForward { samples, indices: rollout.samples().unwrap_or_else(all), acting: None }
+            }
+            Calculus::Recurrent(networks) => Data::Recurrent(networks.batch(&SequenceSamples {
+                samples,
+                n_steps: rollout.n_steps(),
+                starts: rollout.starts(),
+                memory: rollout.memory(),
+                lengths: rollout.lengths(),
+            })?),
+        }))
     }
 
     /// Takes the policy as it is for the one that acted in `batch`, from which the KL divergence is measured.
@@ -190,7 +197,7 @@ impl Policy {
                 networks.outputs(samples.observations, &mut outputs)?;
                 *acting = Some(ActingOutputs { outputs, log_std: self.log_std().to_vec() });
             }
-            (Calculus::Recurrent(networks), Data::Recurrent(batch)) => batch.remember_acting(networks),
+            (Calculus::Recurrent(_), Data::Recurrent(batch)) => batch.remember_acting(&self.weights)?,
             _ => unreachable!("a batch is made by a policy of its architecture"),
         }
         Ok(())
@@ -211,9 +218,8 @@ impl Policy {
     ) -> Result<(Losses, f64)> {
         let losses = self.gradient(batch, sequences, objective, descent.gradient_mut())?;
         let norm = descent.step(losses.total, &mut self.weights, learning_rate)?;
-        match &mut self.calculus {
-            Calculus::FeedForward(_, is_current) => *is_current = false,
-            Calculus::Recurrent(networks) => networks.load(&self.weights)?,
+        if let Calculus::FeedForward(_, is_current) = &mut self.calculus {
+            *is_current = false;
         }
         Ok((losses, norm))
     }
@@ -221,7 +227,7 @@ impl Policy {
     /// The losses of `objective` over `sequences` of `batch`, and in `gradient` `[P]` the derivatives of their total.
     ///
     /// # Errors
-    /// A gradient of another length, or what libtorch refuses.
+    /// A gradient of another length, or what the library refuses that differentiates recurrent policies.
     pub fn gradient(
         &mut self,
         batch: &Batch<'_>,
@@ -236,14 +242,8 @@ impl Policy {
                     acting.as_ref().map(|acting| Acting { outputs: &acting.outputs, log_std: &acting.log_std });
                 Ok(networks.gradient(&Samples { acting, ..*samples }, sequences, objective, gradient)?)
             }
-            (Calculus::Recurrent(networks), Data::Recurrent(batch)) => {
-                let whole = sequences.iter().copied().eq(0..batch.sequences.count() as u32);
-                let part = if whole { None } else { Some(batch.select(sequences)?) };
-                let batch = part.as_ref().unwrap_or(batch);
-                let evaluated = networks.evaluate(&batch.sequences, &batch.actions);
-                let (total, losses) = torch::evaluate(objective, &evaluated, &batch.targets()?)?;
-                networks.gradient(&evaluated, &total, gradient)?;
-                Ok(losses)
+            (Calculus::Recurrent(_), Data::Recurrent(batch)) => {
+                Ok(batch.gradient(&self.weights, sequences, objective, gradient)?)
             }
             _ => unreachable!("a batch is made by a policy of its architecture"),
         }

@@ -6,10 +6,12 @@ import faulthandler
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium
 import pytest
 
+import perturb
 from perturb.catalogue import CATALOGUE
 
 from .conftest import ROOT, identifier
@@ -58,3 +60,29 @@ def test_ppo_in_one_file_learns_cart_pole(server: str) -> None:
     returns = [float(value) for value in re.findall(r"episodes +([\d.]+)", run("cleanrl_ppo.py", "--server", server))]
     assert returns[-1] >= 195, returns
     assert returns[0] < 100, returns
+
+
+def test_the_report_has_an_agent_of_stable_baselines3_and_its_checkpoint_gives_the_same_bytes(
+    server: str, tmp_path: Path
+) -> None:
+    from stable_baselines3 import PPO
+
+    lines = [line for line in (EXAMPLES / "sb3_report.py").read_text().splitlines() if line]
+    assert len(lines) <= 25
+    output = run("sb3_report.py", "2048", "20", str(tmp_path))
+    assert output.count("paper: ppo ff") == 2, "CartPole and Hopper"
+    page = (tmp_path / "report.html").read_text("utf-8")
+    for row in ("SB3 PPO (trained elsewhere)", "ppo ff", "CartPole", "Hopper"):
+        assert row in page
+    models = {version: PPO.load(tmp_path / f"CartPole-{version}", device="cpu") for version in ("D", "R")}
+    again = perturb.assess(models, "CartPole", episodes=20, seed=1, name="SB3 PPO", server=server)
+    again.save(tmp_path / "again")
+    files = sorted(path.name for path in (tmp_path / "again").iterdir())
+    assert files == ["assessment.json", "episodes-D.parquet", "episodes-R.parquet"]
+    for name in files:
+        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "CartPole" / name).read_bytes()
+    other = perturb.assess(models, "CartPole", episodes=20, seed=2, name="SB3 PPO", server=server)
+    other.save(tmp_path / "other")
+    assert (tmp_path / "other" / files[1]).read_bytes() != (tmp_path / "again" / files[1]).read_bytes()
+    known = '"timesteps": 2048'
+    assert known in (tmp_path / "again/assessment.json").read_text("utf-8")

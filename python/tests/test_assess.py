@@ -27,13 +27,14 @@ def evaluated(checkpoint: Path, records: Path, server: str, *arguments: str) -> 
     run("evaluate", "--checkpoint", str(checkpoint), "--records", str(records), "--server", server, *arguments)
 
 
-def run(*arguments: str) -> None:
+def run(*arguments: str, status: int = 0) -> str:
     program = os.environ.get(VARIABLE) or shutil.which(ROOT / "target/release/perturb") or shutil.which("perturb")
     if program is None:
         pytest.skip(f"the program perturb is neither built nor on PATH, and {VARIABLE} is not set")
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     ended = subprocess.run([program, *arguments], capture_output=True, text=True, check=False, env=environment)
-    assert ended.returncode == 0, ended.stderr
+    assert ended.returncode == status, ended.stderr
+    return ended.stdout + ended.stderr
 
 
 def saved(assessment: perturb.Assessment, folder: Path) -> bytes:
@@ -249,6 +250,7 @@ def test_what_is_saved_is_loaded(tmp_path: Path, server: str) -> None:
     assessment = perturb.assess(trained, "CartPole", episodes=20, server=server)
     assessment.save(tmp_path / "saved")
     loaded = perturb.Assessment.load(tmp_path / "saved")
+    assert loaded.agent == assessment.agent == "ppo ff, function upright"
     assert loaded.results == assessment.results
     assert str(loaded) == str(assessment)
     same_episodes(loaded, assessment)
@@ -276,9 +278,9 @@ def test_what_is_no_assessment_is_refused(tmp_path: Path, server: str) -> None:
         perturb.Assessment.load(tmp_path)
     for document, words in [
         ("{", "is damaged"),
-        ('{"format_version": 2, "policies": []}', "has format 2; this package reads 1"),
-        ('{"format_version": 1, "policies": []}', "no environment"),
-        ('{"format_version": 1, "policies": [{"trained_on": "X", "file": "a"}]}', "trained_on='X' is none of"),
+        ('{"format_version": 2, "policies": []}', "has format 2; this program reads 1"),
+        ('{"format_version": 1, "environment": "CartPole", "agent": "PPO", "policies": []}', "there is none"),
+        ('{"format_version": 1, "policies": []}', "is damaged: missing field"),
     ]:
         (tmp_path / "assessment.json").write_text(document)
         with pytest.raises(perturb.InvalidArgumentError, match=words):
@@ -312,12 +314,17 @@ class NoPolicy:
         ({"policy": lambda _: np.zeros(5)}, perturb.InvalidArgumentError, "expected integers"),
         ({"policy": lambda _: np.full(5, 9)}, perturb.InvalidArgumentError, "9"),
         ({"policy": {}}, perturb.InvalidArgumentError, "empty mapping"),
-        ({"policy": {"d": upright}}, perturb.InvalidArgumentError, "'d' is none of"),
+        ({"policy": {"x": upright}}, perturb.InvalidArgumentError, "'x' is none of"),
         ({"policy": {"D": upright}, "trained_on": "D"}, perturb.InvalidArgumentError, "said by the keys"),
         ({"environment": "Cart"}, perturb.InvalidArgumentError, "'Cart' is none of"),
         ({"versions": "DRE"}, perturb.InvalidArgumentError, "expected several"),
-        ({"versions": ["r"]}, perturb.InvalidArgumentError, "'r' is none of"),
+        ({"versions": ["x"]}, perturb.InvalidArgumentError, "'x' is none of"),
         ({"versions": []}, perturb.InvalidArgumentError, "nothing to test on"),
+        (
+            {"versions": ["D", perturb.sets.listed("D_", [{"size": 1}])]},
+            perturb.InvalidArgumentError,
+            "`size`, but must",
+        ),
         ({"episodes": 0}, perturb.InvalidArgumentError, "episodes=0"),
         ({"seed": -1}, perturb.InvalidArgumentError, "seed=-1"),
         ({"success": "soon"}, perturb.InvalidArgumentError, "QUANTITY=NUMBER"),

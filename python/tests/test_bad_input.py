@@ -72,7 +72,7 @@ def test_wrong_actions_of_a_batch_move_nothing(actions: Any, says: str, server: 
 @pytest.mark.parametrize(
     ("settings", "error", "says"),
     [
-        ({"environment": "Cartpole"}, perturb.InvalidArgumentError, "CartPole"),
+        ({"environment": "CartPool"}, perturb.InvalidArgumentError, "did you mean 'CartPole'"),
         ({"version": "X"}, perturb.InvalidArgumentError, "'D'"),
         ({"observe": "everything"}, perturb.InvalidArgumentError, "observe='everything' is none of 'state'"),
         ({"observe": True}, perturb.InvalidArgumentError, "observe=True"),

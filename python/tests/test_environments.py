@@ -93,7 +93,7 @@ def test_a_copied_batch_plays_the_same_episodes_after_a_reset(server: str) -> No
     other.close()
 
 
-@pytest.mark.parametrize("version", ["r", "RE", "", None, 1, ["R"]])
+@pytest.mark.parametrize("version", ["x", "RE", "", None, 1, ["R"]])
 def test_versions_are_refused_alike_everywhere(version: Any) -> None:
     words = "none of 'D'"
     with pytest.raises(perturb.InvalidArgumentError, match=words):
@@ -110,3 +110,18 @@ def test_versions_are_refused_alike_everywhere(version: Any) -> None:
 
 def test_versions_are_typed() -> None:
     assert get_args(perturb.Version) == ("D", "R", "E", "R+E")
+
+
+@pytest.mark.parametrize("name", ["CartPole", "cartpole", "cart-pole", "perturb/CartPole-v1", "Perturb/cart_pole"])
+def test_names_are_spelled_as_one_likes(name: str, server: str) -> None:
+    env = perturb.PerturbEnv(name, version="r", server=server)  # type: ignore[arg-type]
+    _, infos = env.reset(seed=1)
+    expected = perturb.PerturbEnv("CartPole", version="R", server=server).reset(seed=1)[1]
+    assert infos["parameters"] == expected["parameters"]
+
+
+def test_what_was_meant_is_said() -> None:
+    with pytest.raises(perturb.InvalidArgumentError, match=r"did you mean 'CartPole'\?"):
+        perturb.PerturbEnv("CartPol")
+    with pytest.raises(perturb.InvalidArgumentError, match="another revision than this package's perturb/CartPole-v1"):
+        perturb.PerturbEnv("perturb/CartPole-v0")

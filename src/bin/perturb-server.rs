@@ -3,7 +3,7 @@
 
 use clap::Parser;
 use perturb::{
-    config::{Arguments, Config},
+    config::{Arguments, Config, ListenAddress},
     server::{self, listen::Listener, probe::probe},
     tasks,
 };
@@ -36,18 +36,49 @@ fn main() -> ExitCode {
     } else if arguments.catalogue {
         catalogue(&config)
     } else {
-        run(&config)
+        let done = run(&config);
+        if arguments.private && !matches!(done, Err(Failure::Address(_))) {
+            remove_folders(&config);
+        }
+        done
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
+        Err(Failure::Address(error)) => {
+            eprintln!("perturb-server: {error}");
+            ExitCode::from(2)
+        }
+        Err(Failure::Other(error)) => {
             eprintln!("perturb-server: {error}");
             ExitCode::FAILURE
         }
     }
 }
 
-fn run(config: &Config) -> Result<(), Box<dyn Error>> {
+/// Why the program fails.
+enum Failure {
+    /// An address cannot be had.
+    Address(io::Error),
+    Other(Box<dyn Error>),
+}
+
+impl<E: Into<Box<dyn Error>>> From<E> for Failure {
+    fn from(error: E) -> Self {
+        Self::Other(error.into())
+    }
+}
+
+/// The folders of a private server's sockets, which it has listened at: whoever made them may have been killed. What has
+/// files in it stays.
+fn remove_folders(config: &Config) {
+    for address in &config.listen {
+        if let ListenAddress::Unix(path) = address {
+            let _ = path.parent().map(std::fs::remove_dir);
+        }
+    }
+}
+
+fn run(config: &Config) -> Result<(), Failure> {
     // One thread for I/O: physics has threads of its own, and a hand-over between runtime threads doubles latency.
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let result = runtime.block_on(async {
@@ -55,7 +86,7 @@ fn run(config: &Config) -> Result<(), Box<dyn Error>> {
         let shutdown = shutdown(config.exit_with_stdin)?;
         let mut listeners = Vec::new();
         for address in &config.listen {
-            let listener = Listener::bind(address).await?;
+            let listener = Listener::bind(address).await.map_err(Failure::Address)?;
             // Whoever started the server need not read on.
             let _ = writeln!(io::stdout(), "listening on {}", listener.address()?);
             listeners.push(listener);
@@ -69,14 +100,14 @@ fn run(config: &Config) -> Result<(), Box<dyn Error>> {
 }
 
 /// Prints what would be served.
-fn catalogue(config: &Config) -> Result<(), Box<dyn Error>> {
+fn catalogue(config: &Config) -> Result<(), Failure> {
     let listing = server::listing(&tasks::catalogue(), config)?;
     writeln!(io::stdout(), "{:#}", perturb_protocol::catalogue::to_json(&listing))?;
     Ok(())
 }
 
 /// Asks the server that runs with the same settings.
-fn health(config: &Config) -> Result<(), Box<dyn Error>> {
+fn health(config: &Config) -> Result<(), Failure> {
     let listen = config.listen.first().ok_or("no address is given")?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     Ok(runtime.block_on(probe(listen))?)

@@ -1,5 +1,7 @@
 //! The environments that a server has, by name.
 
+use perturb_protocol::names::EnvironmentName;
+
 use super::{EnvironmentSpec, Error, shorten};
 
 /// Environments in a fixed order. Each has a name of its own.
@@ -28,13 +30,12 @@ impl Catalogue {
         self.specs().map(|spec| spec.name)
     }
 
-    /// The environment of that name.
+    /// The environment of that name, or of that id in Gymnasium, however it is [spelled](perturb_protocol::names).
     ///
     /// # Errors
     /// [`Error::UnknownEnvironment`].
     pub fn find(&self, name: &str) -> Result<&'static EnvironmentSpec, Error> {
-        let known = || self.names().collect::<Vec<_>>().join(", ");
-        let found = self.specs().find(|spec| spec.name == name);
-        found.ok_or_else(|| Error::UnknownEnvironment { name: shorten(name), known: known() })
+        let known = self.0.iter().map(|spec| (spec.name, spec.revision));
+        Ok(self.0[EnvironmentName::new(&shorten(name)).find(known)?])
     }
 }

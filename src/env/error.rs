@@ -1,6 +1,7 @@
 //! What can be wrong with a request about environments.
 
 use super::DistributionError;
+use perturb_protocol::names::UnknownEnvironment;
 
 /// The most characters of a client's text that a refusal repeats.
 const MOST_SHOWN: usize = 100;
@@ -18,13 +19,8 @@ pub(crate) fn shorten(text: &str) -> String {
 #[non_exhaustive]
 pub enum Error {
     /// No environment has this name.
-    #[error("environment {name:?} is unknown; this server has {known}")]
-    UnknownEnvironment {
-        /// What was asked for.
-        name: String,
-        /// The names there are, separated by commas.
-        known: String,
-    },
+    #[error(transparent)]
+    UnknownEnvironment(#[from] UnknownEnvironment),
     /// The environment has no parameter of this name.
     #[error("{environment} has no parameter {name:?}; it has {known}")]
     UnknownParameter {

@@ -47,6 +47,29 @@ pub fn unix_connections(listener: UnixListener, file: SocketFile) -> impl Stream
     })
 }
 
+/// Why an address cannot be had, and what to do.
+fn explain(address: &ListenAddress, error: &io::Error) -> String {
+    let text = address.written();
+    match (address, error.kind()) {
+        (ListenAddress::Tcp(tcp), ErrorKind::AddrInUse) => {
+            let free = ListenAddress::Tcp(std::net::SocketAddr::new(tcp.ip(), 0)).written();
+            format!("cannot listen at {text}: another program does; end it, or take a free port with --listen {free}")
+        }
+        (_, ErrorKind::AddrInUse) => {
+            format!(
+                "cannot listen at {text}: another program does, or the file is no socket; give --listen another path"
+            )
+        }
+        (_, ErrorKind::AddrNotAvailable) => {
+            format!("cannot listen at {text}: it is no address of this machine; --listen tcp://0.0.0.0:PORT means all")
+        }
+        (_, ErrorKind::NotFound) => {
+            format!("cannot listen at {text}: its folder is not there; create it, or correct --listen")
+        }
+        _ => format!("cannot listen at {text}: {error}; correct --listen"),
+    }
+}
+
 /// Out of file descriptors, most likely: trying again at once would keep the thread from those it serves.
 async fn pause(error: &io::Error) {
     tracing::warn!(%error, "cannot accept a connection");
@@ -69,7 +92,7 @@ impl Listener {
     /// # Errors
     /// If the address is in use or may not be bound; the message names it.
     pub async fn bind(address: &ListenAddress) -> io::Result<Self> {
-        let explain = |error: io::Error| io::Error::new(error.kind(), format!("cannot listen at {address}: {error}"));
+        let explain = |error: io::Error| io::Error::new(error.kind(), explain(address, &error));
         match address {
             ListenAddress::Tcp(tcp) => Ok(Self::Tcp(TcpListener::bind(tcp).await.map_err(explain)?)),
             ListenAddress::Unix(path) => {

@@ -125,7 +125,7 @@ impl Refusal {
     pub fn code(&self) -> Code {
         match self {
             Self::Environment(error) | Self::Pool(pool::Error::Environment(error)) => match error {
-                env::Error::UnknownEnvironment { .. } | env::Error::UnknownParameter { .. } => Code::NotFound,
+                env::Error::UnknownEnvironment(_) | env::Error::UnknownParameter { .. } => Code::NotFound,
                 env::Error::Model { .. } => Code::Internal,
                 _ => Code::InvalidArgument,
             },

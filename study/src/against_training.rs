@@ -31,7 +31,7 @@ pub(crate) fn against_training<'a>(selections: &'a [MethodResults<'a>]) -> Vec<M
             selection.runs.values().flat_map(|run| run.0.keys().copied()).collect();
         for trained_on in trained_on {
             let selected: Vec<Selected<'a>> =
-                selection.runs.values().filter_map(|run| run.trained_on(trained_on)).collect();
+                selection.runs.values().filter_map(|run| run.cell_trained_on(trained_on)).collect();
             let marked = selected.iter().filter(|of| !of.result.marks.is_empty());
             let moments: BTreeSet<u64> = marked.clone().flat_map(moments_of).collect();
             let tested = marked.flat_map(|of| &of.cell.tests.sets).map(|set| set.name.as_str());

@@ -133,7 +133,7 @@ pub fn estimates(plan: &Plan, measurements: &[Measurement], step_limits: &HashMa
         let pair = pair(cell);
         let speed = *speeds.entry(pair.clone()).or_insert_with(|| speed_of(&pair, measurements));
         let limit = f64::from(step_limits.get(pair.0).copied().unwrap_or_default());
-        let training_steps = generated_episodes(&cell.config) * limit;
+        let training_steps = generated_episodes(&cell.config, cell.config.common.episodes) * limit;
         let times = cell.tests.sets.len() as u64 * (1 + cell.tests.marks.len() as u64);
         let trials = cell.tests.episodes * times + cell.tests.selection.unwrap_or_default();
         let testing_steps = (trials * u64::from(cell.config.settings.episodes_per_trial())) as f64 * limit;
@@ -147,12 +147,13 @@ pub fn estimates(plan: &Plan, measurements: &[Measurement], step_limits: &HashMa
     plan.cells.iter().map(estimate).collect()
 }
 
-/// How many episodes a training has: more than its budget if it learns from the worst of them only, none if nothing learns.
-fn generated_episodes(config: &TrainConfig) -> f64 {
+/// How many episodes a training has had when its budget counts so many: more if it learns from the worst of them only, none
+/// if nothing learns.
+pub fn generated_episodes(config: &TrainConfig, counted: u64) -> f64 {
     if config.settings.is_random() {
         return 0.0;
     }
-    let budget = config.common.episodes as f64;
+    let budget = counted as f64;
     let Wrapper::Epopt(epopt) = &config.settings.wrapper else { return budget };
     let full = (epopt.full_iterations as f64 * epopt.episodes_per_iteration as f64).min(budget);
     full + (budget - full) / epopt.epsilon

@@ -157,7 +157,7 @@ fn read_runs(
     folder: &Folder,
 ) -> Result<Vec<Vec<Episode>>, FolderError> {
     let mut runs = Vec::new();
-    for selected in selection.runs.values().filter_map(|run| run.trained_on(TrainedOn::Version(version))) {
+    for selected in selection.runs.values().filter_map(|run| run.cell_trained_on(TrainedOn::Version(version))) {
         let episodes = read_monitor(&folder.cell(&selected.cell.id).training().join("monitor.csv"))?;
         if !episodes.is_empty() {
             runs.push(episodes);

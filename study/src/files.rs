@@ -21,6 +21,15 @@ pub struct FileError {
     pub source: std::io::Error,
 }
 
+impl FileError {
+    /// Whether the machine is at fault, a full disk or a lost mount for instance, and not what is or is not in a folder.
+    pub fn is_fault(&self) -> bool {
+        use ErrorKind::{AlreadyExists, InvalidData, InvalidInput, IsADirectory, NotADirectory, NotFound};
+        let kind = self.source.kind();
+        !matches!(kind, AlreadyExists | InvalidData | InvalidInput | IsADirectory | NotADirectory | NotFound)
+    }
+}
+
 /// A result with a [`FileError`].
 pub type Result<T> = std::result::Result<T, FileError>;
 
@@ -73,6 +82,14 @@ pub fn list(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
+/// Makes sure that there is a folder.
+///
+/// # Errors
+/// The operating system's.
+pub fn require_folder(path: &Path) -> Result<()> {
+    fs::read_dir(path).map(drop).map_err(io("list", path))
+}
+
 /// Deletes a file, or a folder with everything in it, if it is there.
 ///
 /// # Errors
@@ -101,6 +118,33 @@ pub fn write_atomically(path: &Path, content: &[u8]) -> Result<()> {
     file.write_all(content).and_then(|()| file.as_file().sync_all()).map_err(io("write", path))?;
     file.persist(path).map_err(|error| io("rename a file to", path)(error.error))?;
     sync_folder(folder)
+}
+
+/// Makes sure, before there is anything to write, that [`write_atomically`] will find its folder and may write there.
+///
+/// # Errors
+/// [`FileError`], with what to do.
+pub fn require_writable(path: &Path) -> Result<()> {
+    let refuse = |kind, words: String| Err(io("write", path)(std::io::Error::new(kind, words)));
+    let folder = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    match path.metadata() {
+        Ok(metadata) if metadata.is_dir() => {
+            return refuse(ErrorKind::IsADirectory, "it is a folder; give the name of a file".into());
+        }
+        Ok(metadata) if !metadata.is_file() => return Ok(()), // a pipe, or a terminal
+        _ => {}
+    }
+    if !folder.is_dir() {
+        let (kind, words) = match folder.exists() {
+            true => (ErrorKind::NotADirectory, format!("{} is no folder", folder.display())),
+            false => {
+                let command = format!("mkdir -p {}", folder.display());
+                (ErrorKind::NotFound, format!("there is no folder {}; make it with `{command}`", folder.display()))
+            }
+        };
+        return refuse(kind, words);
+    }
+    tempfile::tempfile_in(folder).map(drop).map_err(io("write", path))
 }
 
 /// Writes a document as JSON, in one piece.
@@ -153,6 +197,12 @@ impl Lock {
     }
 }
 
+/// Whether somebody has the lock of the folder or file at `path`. Whoever takes it in this very moment is refused.
+pub fn is_locked(path: &Path) -> bool {
+    let Ok(file) = File::open(path) else { return false };
+    matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock))
+}
+
 /// `None` if what was asked for is not there.
 fn if_there<T>(result: std::io::Result<T>) -> std::io::Result<Option<T>> {
     match result {
@@ -185,6 +235,20 @@ mod tests {
         write_atomically(&whole, b"x").unwrap();
         let [plain, whole] = [plain, whole].map(|path| fs::metadata(path).unwrap().permissions().mode());
         assert_eq!(plain, whole);
+    }
+
+    #[test]
+    fn whether_a_file_can_be_written_is_known_before_it_is() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| directory.path().join(name);
+        fs::write(path("file"), "x").unwrap();
+        for (name, words) in [("", "it is a folder"), ("no/file", "mkdir -p "), ("file/file", "is no folder")] {
+            let error = require_writable(&path(name)).unwrap_err().to_string();
+            assert!(error.starts_with("cannot write ") && error.contains(words), "{name}: {error}");
+        }
+        assert!(["new", "file"].iter().all(|name| require_writable(&path(name)).is_ok()));
+        require_writable(Path::new("/dev/null")).unwrap();
+        assert_eq!(list(directory.path()).unwrap(), [path("file")], "nothing is made");
     }
 
     #[test]

@@ -3,9 +3,11 @@
 use super::folder::{CellResult, CellState, Training};
 use super::plan::{Cell, Plan};
 use super::selection::Results;
-use crate::records::{Ending, EpisodeRecord};
+use crate::records::{About, Ending, EpisodeRecord, RecordedParameter, RecordedTest, Records};
 use crate::results::Counters;
-use crate::{Axis, Heatmap, HeatmapPoint, TestResult, Version};
+use crate::settings::Observe;
+use crate::success::{Criterion, Side};
+use crate::{Assessed, AssessedPolicy, Axis, Heatmap, HeatmapPoint, Known, TestResult, Version};
 
 /// A result with success rates, %, on D, R and E, and the same mean return on all.
 pub fn result(cell: &Cell, [d, r, e]: [f64; 3], mean_return: f64) -> CellResult {
@@ -90,4 +92,41 @@ pub fn heatmap(grid: usize, figures: impl Fn(f64, f64) -> (f64, f64)) -> Heatmap
     let points = (0..grid * grid).map(point).collect();
     let environment = "Pendulum".into();
     Heatmap { environment, base: Version::D, fixed: Default::default(), grid, episodes: 20, points, axes }
+}
+
+/// An agent in `environment` that took so many steps in each of the ten episodes of its tests on D, R and E, where 195 are a
+/// success; a policy for each of what was `trained_on`.
+pub fn assessed(agent: &str, environment: &str, trained_on: &[Option<Version>], steps: [u32; 3]) -> Assessed {
+    let criterion = |threshold| Criterion {
+        quantity: "steps".into(),
+        unit: "1".into(),
+        side: Side::AtLeast,
+        threshold,
+        most: Some(200.0),
+    };
+    let policy = |&trained_on: &Option<Version>| {
+        let parameter = RecordedParameter { name: "length".into(), unit: "m".into(), applied: "length".into() };
+        let mut records = Records::new(About {
+            environment: environment.into(),
+            revision: 1,
+            parameters: vec![parameter],
+            applied: vec!["length".into()],
+            policy: format!("{agent} 01234567"),
+            episodes_per_trial: 1,
+            success: Some(criterion(195.0)),
+            text_success: Some(criterion(195.0)),
+            code_success: Some(criterion(100.0)),
+            also: None,
+            tests: Vec::new(),
+        });
+        for (version, steps) in Version::ALL.into_iter().zip(steps) {
+            let set = version.to_string();
+            let one = |index: u32| episode(&set, index, f64::from(index), steps + index, steps + index >= 195);
+            records.add(RecordedTest { set: version.into(), seed: 7 }, (0..10).map(one).collect());
+        }
+        let (timesteps, observe, deterministic) = (Some(100_000), Observe::State, Some(false));
+        AssessedPolicy::new(Known { trained_on, timesteps, seed: 1, episodes: 10, observe, deterministic }, records)
+    };
+    let policies = trained_on.iter().map(policy).collect();
+    Assessed::new("mine".into(), agent.into(), policies).expect("one environment, each trained on something else")
 }

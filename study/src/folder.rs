@@ -143,6 +143,14 @@ pub struct Failure {
     pub reason: String,
     /// The program's version and the commit that it was built from.
     pub commit: String,
+    /// Whether another attempt must begin anew: from its last checkpoint the training would come to the same.
+    #[serde(default = "yes")]
+    pub begins_anew: bool,
+}
+
+/// What earlier programs meant.
+fn yes() -> bool {
+    true
 }
 
 /// `timing.json`.
@@ -316,13 +324,19 @@ impl CellFolder {
         files::write_json(&self.path.join("failure.json"), failure)
     }
 
-    /// Forgets a failure, and the training that led to it.
+    /// Forgets a failure, and the training that led to it if another attempt [must begin anew](Failure::begins_anew).
     ///
     /// # Errors
-    /// [`FileError`].
+    /// [`FileError`]; nothing was forgotten then.
     pub fn forget_failure(&self) -> files::Result<()> {
-        files::delete(&self.training())?;
-        files::delete(&self.path.join("failure.json"))
+        let path = self.path.join("failure.json");
+        match read::<Failure>(&path) {
+            Ok(None) => return Ok(()),
+            Ok(Some(Failure { begins_anew: false, .. })) => {}
+            Err(FolderError::File(error)) => return Err(error),
+            Ok(Some(_)) | Err(_) => files::delete(&self.training())?,
+        }
+        files::delete(&path)
     }
 
     /// Forgets the failure `mark`, and no other. Says whether that was possible: not while somebody works on the cell.
@@ -396,6 +410,7 @@ mod tests {
                     episodes_per_trial: None,
                     preset: Preset::Perturb,
                     observe: Default::default(),
+                    elsewhere: false,
                 },
                 configuration: "00000000".into(),
                 run: 2,
@@ -417,7 +432,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let cell = Folder::new(directory.path()).cell("a");
         assert_eq!(cell.state().unwrap(), CellState::Missing);
-        let failure = Failure { id: "a".into(), reason: "NaN".into(), commit: "x".into() };
+        let failure = Failure { id: "a".into(), reason: "NaN".into(), commit: "x".into(), begins_anew: true };
         cell.write_failure(&failure).unwrap();
         assert_eq!(cell.state().unwrap(), CellState::Failed(failure));
         assert!(cell.is_settled(true) && !cell.is_settled(false));
@@ -430,10 +445,30 @@ mod tests {
     }
 
     #[test]
+    fn what_was_trained_is_forgotten_with_a_failure_of_its_numbers_only() {
+        let directory = tempfile::tempdir().unwrap();
+        let cell = Folder::new(directory.path()).cell("a");
+        let earlier = r#"{"id": "a", "reason": "NaN", "commit": "x"}"#;
+        for (failure, stays) in [
+            (serde_json::json!({"id": "a", "reason": "another revision", "commit": "x", "begins_anew": false}), true),
+            (serde_json::json!({"id": "a", "reason": "NaN", "commit": "x", "begins_anew": true}), false),
+            (serde_json::from_str(earlier).unwrap(), false),
+        ] {
+            files::write_json(&cell.training().join("checkpoint.json"), &0).unwrap();
+            files::write_json(&cell.path().join("failure.json"), &failure).unwrap();
+            cell.forget_failure().unwrap();
+            assert_eq!(cell.training().exists(), stays, "{failure}");
+            assert_eq!(cell.failure_mark(), None);
+            cell.forget_failure().unwrap();
+            assert_eq!(cell.training().exists(), stays, "there is nothing to forget any more");
+        }
+    }
+
+    #[test]
     fn a_failure_recorded_again_is_another_one() {
         let directory = tempfile::tempdir().unwrap();
         let cell = Folder::new(directory.path()).cell("a");
-        let failure = Failure { id: "a".into(), reason: "NaN".into(), commit: "x".into() };
+        let failure = Failure { id: "a".into(), reason: "NaN".into(), commit: "x".into(), begins_anew: true };
         assert_eq!(cell.failure_mark(), None);
         cell.write_failure(&failure).unwrap();
         let first = cell.failure_mark().unwrap();

@@ -188,7 +188,8 @@ impl Heatmap {
         let fits = |(index, point): (usize, &HeatmapPoint)| {
             (point.x, point.y) == (x.value(index % grid, grid), y.value(index / grid, grid))
         };
-        self.points.len() == grid * grid && self.points.iter().enumerate().all(fits)
+        // None of a file that was not written here may be empty, or larger than numbers can say.
+        grid > 0 && grid.checked_mul(grid) == Some(self.points.len()) && self.points.iter().enumerate().all(fits)
     }
 
     /// What is said of the parameters that are no axes.
@@ -249,6 +250,10 @@ mod tests {
             [text.replace(line, ""), text.replace(line, "1,2,3,4"), text.replace(line, "1,2,3,many"), String::new()]
         {
             assert_eq!(empty().with_points(other.as_bytes()), None, "{other}");
+        }
+        let head = text.lines().next().unwrap();
+        for grid in [0, usize::MAX] {
+            assert_eq!(Heatmap { grid, ..empty() }.with_points(head.as_bytes()), None, "{grid}");
         }
     }
 

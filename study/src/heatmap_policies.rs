@@ -41,7 +41,7 @@ pub fn policies_side_by_side(policies: &[PolicyHeatmap]) -> Option<(HeatmapPanel
     let panels = HeatmapPanels {
         title: vec![name, tested],
         axes: axes.clone(),
-        returns: common_returns(columns.iter().map(|(.., mean)| mean)),
+        returns: common_returns(environment, columns.iter().map(|(.., mean)| mean)),
         columns: columns
             .iter()
             .map(|(caption, _, mean)| HeatmapColumn { caption: caption.clone(), content: Ok(mean.clone()) })
@@ -92,7 +92,7 @@ mod tests {
         let success: Vec<f64> =
             panels.columns.iter().map(|column| column.content.as_ref().unwrap().points[0].success_percent).collect();
         assert_eq!(success, [50.0, 30.0]);
-        assert_eq!(panels.returns, 30.75..51.25, "of both");
+        assert_eq!(panels.returns, -1600.0..-200.0, "the environment's");
         let csv = String::from_utf8(table.to_csv()).unwrap();
         let begin = "trained,policies,mass,length,mean_return,success_percent\n\
                      \"trained on D, 2 policies\",2,0.75,0.75,50.75,50\n";

@@ -101,11 +101,11 @@ pub enum NoHeatmap {
 /// The policies that a plan has heatmaps of, in the order of `selections`, of what it trains on and of runs.
 pub fn heatmap_places<'a>(selections: &'a [MethodResults<'a>]) -> Vec<HeatmapPlace<'a>> {
     let mut places = Vec::new();
-    for MethodResults { environment, method, runs, .. } in selections {
+    for MethodResults { environment, method, runs, .. } in selections.iter().filter(|row| !row.method.elsewhere) {
         let trained_on: BTreeSet<TrainedOn<'a>> = runs.values().flat_map(|run| run.0.keys().copied()).collect();
         for trained_on in trained_on {
             places.extend(runs.iter().map(|(&run, of_run)| {
-                let selected = of_run.trained_on(trained_on);
+                let selected = of_run.cell_trained_on(trained_on);
                 HeatmapPlace { environment, method, trained_on, run, selected }
             }));
         }

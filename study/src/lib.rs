@@ -3,12 +3,15 @@
 //! - [`settings`]: of a training.
 //! - [`Plan`] expands an experiment file to cells, [`Folder`] is where they are kept, [`scheduler`] has processes or a
 //!   cluster do them.
-//! - [`trained`] has the policies that came of trainings, [`testing`] says which episodes they are tested in.
+//! - [`runs`] finds trainings and experiments, and says how far they are.
+//! - [`checkpoint`] has the policies that came of trainings, [`testing`] says which episodes they are tested in.
 //! - [`Results`] reads them back and selects; [`paper`] is what was published.
 //! - [`report`] compares them, in [`table::Table`]s and on a page; [`plot`] draws.
 #![forbid(unsafe_code)]
 
 mod against_training;
+mod assessed;
+pub mod checkpoint;
 mod cost;
 mod curves;
 pub mod files;
@@ -28,6 +31,7 @@ pub mod records;
 pub mod report;
 mod reselection;
 mod results;
+pub mod runs;
 mod scenarios;
 pub mod scheduler;
 mod selection;
@@ -37,12 +41,13 @@ pub mod statistics;
 pub mod success;
 pub mod table;
 pub mod testing;
-pub mod trained;
 mod tuning;
 mod value_error;
 mod verify;
+pub mod words;
 
-pub use cost::{Estimate, Measurement, Speed, Taken, estimates, representatives};
+pub use assessed::{ASSESSMENT, Assessed, AssessedError, AssessedPolicy, Known, add_assessed};
+pub use cost::{Estimate, Measurement, Speed, Taken, estimates, generated_episodes, representatives};
 pub use curves::{Curve, EnvironmentCurves, Footing, Point, curves_table, read_curves};
 pub use folder::{
     CellFolder, CellResult, CellState, Failure, FailureMark, Folder, FolderError, MarkResult, Timing, Training,
@@ -57,7 +62,7 @@ pub use paper::Method;
 pub use plan::{Cell, Counts, Grouping, Plan, PlanError, SELECTION_TEST, Selection, Tests, TrainedOn};
 pub use results::{Counters, TestResult};
 pub use scenarios::{Metric, Scenario, Version};
-pub use selection::{MethodResults, Results, Selected, SelectedRun, average, interquartile};
+pub use selection::{MethodResults, Reported, Results, Selected, SelectedRun, average, interquartile};
 pub use statistics::{Bootstrapped, Summary};
 pub use tuning::{Chosen, Tuned, tuned};
 pub use value_error::ValueError;

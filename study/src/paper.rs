@@ -10,8 +10,8 @@ use super::statistics::Summary;
 
 /// Every number of its tables.
 const TABLE: &str = include_str!("../data/paper_results.csv");
-/// What it averages over.
-const ENVIRONMENTS: usize = 6;
+/// Its environments, as they are spelled here.
+pub const ENVIRONMENTS: [&str; 6] = ["CartPole", "MountainCar", "Acrobot", "Pendulum", "HalfCheetah", "Hopper"];
 const RUNS: usize = 5;
 
 /// An algorithm with its architecture and, of RL², the episodes in a trial: a row of the paper's tables.
@@ -29,12 +29,15 @@ pub struct Method {
     /// What its policies see.
     #[serde(default, skip_serializing_if = "Observe::is_default")]
     pub observe: Observe,
+    /// Whether it is an agent that no cell trained: `algorithm` is what its assessment calls it, and no more is known.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub elsewhere: bool,
 }
 
 impl Method {
     /// Whether it learns nothing.
     fn is_random(&self) -> bool {
-        self.algorithm == "random"
+        self.algorithm == "random" && !self.elsewhere
     }
 
     /// Whether it is a line to compare with: it learns nothing, or sees what others have to find out.
@@ -47,13 +50,16 @@ impl fmt::Display for Method {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if self.is_random() {
             f.write_str("random policy (reference)")?;
+        } else if self.elsewhere {
+            f.write_str(&self.algorithm)?;
         } else {
             write!(f, "{} {}", self.algorithm, self.architecture)?;
         }
         self.episodes_per_trial.map_or(Ok(()), |episodes| write!(f, " N={episodes}"))?;
         let preset = (!self.preset.is_default()).then(|| self.preset.to_string());
         let sees = self.observe.note().map(str::to_owned);
-        let notes = preset.into_iter().chain(sees).collect::<Vec<_>>().join(", ");
+        let elsewhere = self.elsewhere.then(|| "trained elsewhere".to_owned());
+        let notes = preset.into_iter().chain(elsewhere).chain(sees).collect::<Vec<_>>().join(", ");
         if notes.is_empty() { Ok(()) } else { write!(f, " ({notes})") }
     }
 }
@@ -76,6 +82,7 @@ impl Record {
             && self.architecture.eq_ignore_ascii_case(&method.architecture)
             && self.episodes_per_trial == method.episodes_per_trial
             && !method.observe.sees_parameters()
+            && !method.elsewhere
     }
 }
 
@@ -95,6 +102,7 @@ pub fn methods(environment: &str) -> Vec<Method> {
             episodes_per_trial: record.episodes_per_trial,
             preset: Preset::default(),
             observe: Observe::default(),
+            elsewhere: false,
         };
         if !methods.contains(&method) {
             methods.push(method);
@@ -107,7 +115,7 @@ pub fn methods(environment: &str) -> Vec<Method> {
 pub fn average(environments: &[&str], method: &Method, metric: Metric) -> Option<Summary> {
     let means: Option<Vec<f64>> = environments.iter().map(|name| Some(number(name, method, metric)?.mean)).collect();
     let means = means?;
-    if means.len() == ENVIRONMENTS {
+    if means.len() == ENVIRONMENTS.len() {
         return number("Average", method, metric);
     }
     Some(Summary { mean: means.iter().sum::<f64>() / means.len() as f64, std: None, runs: RUNS })
@@ -121,8 +129,6 @@ fn records() -> impl Iterator<Item = Record> {
 mod tests {
     use super::*;
 
-    const ALL: [&str; ENVIRONMENTS] = ["Acrobot", "CartPole", "MountainCar", "Pendulum", "HalfCheetah", "Hopper"];
-
     fn method(algorithm: &str, architecture: &str, episodes_per_trial: Option<u32>) -> Method {
         Method {
             algorithm: algorithm.into(),
@@ -130,6 +136,7 @@ mod tests {
             episodes_per_trial,
             preset: Preset::Perturb,
             observe: Observe::State,
+            elsewhere: false,
         }
     }
 
@@ -157,7 +164,7 @@ mod tests {
 
     #[test]
     fn every_method_of_an_environment_has_its_three_numbers() {
-        for environment in ALL {
+        for environment in ENVIRONMENTS {
             let methods = methods(environment);
             assert_eq!(methods.len(), 14, "{methods:?}");
             for (method, metric) in methods.iter().flat_map(|method| Metric::ALL.map(|metric| (method, metric))) {
@@ -172,7 +179,7 @@ mod tests {
         let a2c = method("a2c", "ff", None);
         let two = average(&["CartPole", "MountainCar"], &a2c, Metric::Default).unwrap();
         assert!((two.mean - (100.0 + 79.78) / 2.0).abs() < 1e-9 && two.std.is_none());
-        assert_eq!(average(&ALL, &a2c, Metric::Default), number("Average", &a2c, Metric::Default));
+        assert_eq!(average(&ENVIRONMENTS, &a2c, Metric::Default), number("Average", &a2c, Metric::Default));
         assert_eq!(average(&["CartPole", "Ant"], &a2c, Metric::Default), None);
     }
 
@@ -193,8 +200,8 @@ mod tests {
         assert_eq!(averages.len(), 42);
         for Record { algorithm, architecture, episodes_per_trial, metric, mean_percent, .. } in averages {
             let (preset, observe) = (Preset::Paper, Observe::State);
-            let method = Method { algorithm, architecture, episodes_per_trial, preset, observe };
-            let means = ALL.map(|environment| number(environment, &method, metric).unwrap().mean);
+            let method = Method { algorithm, architecture, episodes_per_trial, preset, observe, elsewhere: false };
+            let means = ENVIRONMENTS.map(|environment| number(environment, &method, metric).unwrap().mean);
             let mean = means.iter().sum::<f64>() / means.len() as f64;
             // Either is rounded to 0.01: half of that each, and some for the binary fractions.
             assert!((mean - mean_percent).abs() < 0.0101, "{method} {metric}: {mean} is not {mean_percent}");

@@ -123,7 +123,7 @@ impl<'a> Reselection<'a> {
         for (number, scores) in common_runs(selections, metric) {
             for ((runs, selection), score) in reported.iter_mut().zip(selections).zip(scores) {
                 let selected = Version::ALL.map(|version| {
-                    let selected = selection.runs[&number].trained_on(TrainedOn::Version(version));
+                    let selected = selection.runs[&number].cell_trained_on(TrainedOn::Version(version));
                     let selected = selected.filter(|_| needs(version))?;
                     let key = key(selected.cell, self.rule, number);
                     let contest = self.contests.get(&key)?;

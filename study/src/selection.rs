@@ -9,6 +9,7 @@
 
 use std::collections::BTreeMap;
 
+use super::assessed::{Assessed, AssessedPolicy};
 use super::folder::{CellResult, CellState, Failure, Folder, FolderError};
 use super::plan::{Cell, Plan, Selection, TrainedOn};
 use super::statistics::{Bootstrapped, Summary, interquartile_mean};
@@ -39,9 +40,18 @@ pub struct MethodResults<'a> {
     pub runs: BTreeMap<u32, SelectedRun<'a>>,
 }
 
-/// What was selected in a run, by all that the plan trains on; `None` where nothing has a result yet.
+/// What is reported of a run, by all that the plan trains on; `None` where nothing has a result yet.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct SelectedRun<'a>(pub BTreeMap<TrainedOn<'a>, Option<Selected<'a>>>);
+pub struct SelectedRun<'a>(pub BTreeMap<TrainedOn<'a>, Option<Reported<'a>>>);
+
+/// A policy whose tests are reported.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Reported<'a> {
+    /// Of a cell that was selected.
+    Cell(Selected<'a>),
+    /// Of an agent that was trained elsewhere.
+    Elsewhere(&'a Assessed, &'a AssessedPolicy),
+}
 
 /// A cell that was selected.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -127,8 +137,8 @@ impl<'a> MethodResults<'a> {
         let CellState::Done(result) = state else { return };
         self.done += is_papers;
         let candidate = Selected { cell, result };
-        if best.is_none_or(|best| candidate.rank() > best.rank()) {
-            *best = Some(candidate);
+        if best.and_then(|best| best.cell()).is_none_or(|best| candidate.rank() > best.rank()) {
+            *best = Some(Reported::Cell(candidate));
         }
     }
 
@@ -158,13 +168,41 @@ impl<'a> MethodResults<'a> {
 
 impl<'a> SelectedRun<'a> {
     /// What was trained on this.
-    pub fn trained_on(&self, trained_on: TrainedOn<'_>) -> Option<Selected<'a>> {
+    pub fn trained_on(&self, trained_on: TrainedOn<'_>) -> Option<Reported<'a>> {
         self.0.get(&trained_on).copied().flatten()
+    }
+
+    /// The cell that was trained on this; `None` of an agent that was trained elsewhere.
+    pub fn cell_trained_on(&self, trained_on: TrainedOn<'_>) -> Option<Selected<'a>> {
+        self.trained_on(trained_on)?.cell()
     }
 
     /// The success rate of a scenario, %; `None` if nothing was tested there.
     pub fn rate(&self, Scenario { train, test }: Scenario) -> Option<f64> {
         self.trained_on(TrainedOn::Version(train))?.rate(test)
+    }
+}
+
+impl<'a> Reported<'a> {
+    /// The cell; `None` of an agent that was trained elsewhere.
+    pub fn cell(&self) -> Option<Selected<'a>> {
+        match self {
+            Self::Cell(selected) => Some(*selected),
+            Self::Elsewhere(..) => None,
+        }
+    }
+
+    /// The figures of its test on a set or version; `None` if it was not tested there.
+    pub fn test(&self, tested_on: &str) -> Option<&'a TestResult> {
+        match self {
+            Self::Cell(selected) => selected.test(tested_on),
+            Self::Elsewhere(_, policy) => policy.test(tested_on),
+        }
+    }
+
+    /// The success rate on `version`, %; `None` if it was not tested there.
+    pub fn rate(&self, version: Version) -> Option<f64> {
+        Some(self.test(&version.to_string())?.success_percent)
     }
 }
 

@@ -76,7 +76,7 @@ fn each_run_and_training_version_has_its_best_configuration() {
     assert_eq!(selections.len(), 2);
     let chosen = |run: u32| {
         let trained_on = |version| {
-            selections[0].runs[&run].trained_on(TrainedOn::Version(version)).map(|selected| is_a(selected.cell))
+            selections[0].runs[&run].cell_trained_on(TrainedOn::Version(version)).map(|selected| is_a(selected.cell))
         };
         Version::ALL.map(trained_on)
     };

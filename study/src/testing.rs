@@ -1,10 +1,10 @@
 //! Which episodes a test plays, and how they are recorded, whoever plays them: equal policies have equal records.
 
 use perturb_policy::random::{Purpose, stream};
-use perturb_protocol::{Distribution, Version, proto};
+use perturb_protocol::{Distribution, EndedEpisode, Version, proto};
 use rand::Rng;
 
-use crate::records::{About, Difference, Ending, EpisodeRecord, RecordedTest, Records};
+use crate::records::{Difference, EpisodeRecord, RecordedTest, Records};
 use crate::sets::{Context, TestSet};
 
 /// The most environments that are tested together, unless a set has more contexts.
@@ -23,25 +23,23 @@ pub enum NotRecorded {
         "testing on {set}: the server was asked for {parameter} in {asked}, but its receipt says {got}; mend the server"
     )]
     NotRequested { set: String, parameter: String, asked: String, got: f64 },
-    /// The server ended an episode without saying which, or with what physics.
-    #[error("testing on {set}: the server sent the end of an episode without its address or its receipt")]
-    NoReceipt { set: String },
 }
 
 /// The seed of the test environments on `version`.
 ///
-/// It is the first, second, third or fourth number (D, R, E, R+E) of the stream of `seed` for test environments, so that a
-/// policy never meets its training episodes again, whatever seeds are used, and the versions are independent. Sets have the
-/// seed of their base version: what differs between two of them is parameters, not initial states.
-pub fn environment_seed(seed: u64, version: Version) -> u64 {
-    let mut rng = stream(seed, Purpose::TestEnvironments);
+/// It is the first, second, third or fourth number (D, R, E, R+E) of the stream of `seed` for `purpose`, which is
+/// [`Purpose::TestEnvironments`] or [`Purpose::SelectionEnvironments`], so that a policy never meets its training episodes
+/// again, whatever seeds are used, nor those that selected it, and the versions are independent. Sets have the seed of
+/// their base version: what differs between two of them is parameters, not initial states.
+pub fn environment_seed(purpose: Purpose, seed: u64, version: Version) -> u64 {
+    let mut rng = stream(seed, purpose);
     let drawn: [u64; Version::KNOWN.len()] = std::array::from_fn(|_| rng.next_u64());
     drawn[version as usize]
 }
 
 /// `[N]` how many trials each environment is tested for. Environment i has context i modulo their number, and every
 /// context equally many episodes, at least 1; `contexts` is at least 1.
-pub fn quotas(episodes: u64, contexts: usize) -> Vec<u64> {
+fn quotas(episodes: u64, contexts: usize) -> Vec<u64> {
     let each = episodes.div_ceil(contexts as u64).max(1);
     // One context has as many environments as it can use, each of several its share.
     let copies = ((MOST_ENVS / contexts) as u64).clamp(1, each);
@@ -55,15 +53,15 @@ pub struct Counting {
     test: RecordedTest,
     quotas: Vec<u64>,
     episodes_per_trial: u32,
-    /// With whether the task ended the episode.
-    counted: Vec<(proto::EpisodeEnd, bool)>,
+    counted: Vec<EndedEpisode>,
 }
 
 impl Counting {
-    /// Of `episodes` episodes on `set`, of a test with `seed`.
-    pub fn new(set: TestSet, seed: u64, episodes: u64, episodes_per_trial: u32) -> Self {
+    /// Of `episodes` episodes on `set`, of a test with `seed` for `purpose`, see [`environment_seed`]. Of a trial of
+    /// several episodes the last one counts.
+    pub fn new(set: TestSet, purpose: Purpose, seed: u64, episodes: u64, episodes_per_trial: u32) -> Self {
         let quotas = quotas(episodes, set.listed().len());
-        let seed = environment_seed(seed, set.version);
+        let seed = environment_seed(purpose, seed, set.version);
         Self { test: RecordedTest { set, seed }, quotas, episodes_per_trial, counted: Vec::new() }
     }
 
@@ -77,18 +75,14 @@ impl Counting {
         self.quotas.len()
     }
 
-    /// Takes the episodes that `ended` in a step; `terminated` `[N]`. Those that do not count are passed over.
-    pub fn take<'a>(&mut self, ended: impl Iterator<Item = &'a proto::EpisodeEnd>, terminated: &[bool]) {
-        for end in ended {
-            let slot = end.slot as usize;
-            let counts = end.episode.as_ref().is_none_or(|episode| {
-                episode.episode_in_trial + 1 == self.episodes_per_trial
-                    && self.quotas.get(slot).is_some_and(|quota| episode.trial_index < *quota)
-            });
-            if counts {
-                self.counted.push((end.clone(), terminated.get(slot).copied().unwrap_or_default()));
-            }
-        }
+    /// Takes the episodes that `ended` in some steps. Those that do not count are passed over.
+    pub fn take(&mut self, ended: impl IntoIterator<Item = EndedEpisode>) {
+        let Self { quotas, episodes_per_trial, .. } = self;
+        let counts = |end: &EndedEpisode| {
+            end.episode_in_trial + 1 == *episodes_per_trial
+                && quotas.get(end.slot).is_some_and(|quota| end.trial_index < *quota)
+        };
+        self.counted.extend(ended.into_iter().filter(counts));
     }
 
     /// Episodes that were counted, and how many there are to be.
@@ -102,17 +96,16 @@ impl Counting {
     /// [`NotRecorded`], if the server played something else; nothing was added then.
     pub fn finish(self, environment: &proto::Environment, records: &mut Records) -> Result<(), NotRecorded> {
         let Self { test, mut counted, .. } = self;
-        counted.sort_by_key(|(end, _)| end.episode.as_ref().map(|at| (at.environment_index, at.episode_index)));
+        counted.sort_by_key(|end| (end.environment_index, end.episode_index));
         let contexts = test.set.listed();
         let parts = test.set.version.parts();
         let asked_in = |context| parts.iter().map(|&part| asked(environment, &test.set, part, context)).collect();
         let asked: Vec<Vec<Vec<Distribution>>> = contexts.iter().map(asked_in).collect();
-        let mut episodes = Vec::with_capacity(counted.len());
-        for (end, terminated) in counted {
-            let requested = end.receipt.as_ref().map(|receipt| receipt.requested.as_slice()).unwrap_or_default();
-            check_requested(environment, &test.set, &asked[end.slot as usize % contexts.len()], requested)?;
-            episodes.push(record(&records.about, &test, end, terminated)?);
+        for end in &counted {
+            check_requested(environment, &test.set, &asked[end.slot % contexts.len()], &end.receipt.requested)?;
         }
+        let record = |end| EpisodeRecord::of(&records.about, &test.set.name, test.seed, end);
+        let episodes = counted.into_iter().map(record).collect();
         let mut added = Records::new(records.about.clone());
         added.episodes = episodes;
         if let Some(difference) = added.agreement().largest.filter(Difference::is_real) {
@@ -167,43 +160,10 @@ fn wrong(asked: &[Vec<Distribution>], requested: &[f64]) -> Option<usize> {
     wrongs?.into_iter().max()
 }
 
-fn record(
-    about: &About,
-    test: &RecordedTest,
-    end: proto::EpisodeEnd,
-    terminated: bool,
-) -> Result<EpisodeRecord, NotRecorded> {
-    let (Some(episode), Some(receipt)) = (end.episode, end.receipt) else {
-        return Err(NotRecorded::NoReceipt { set: test.set.name.clone() });
-    };
-    let (achieved, also_achieved) = match about.also.is_some().then_some(end.code_achieved).flatten() {
-        code if about.is_judged_by_code() => (code, end.achieved),
-        code => (end.achieved, code),
-    };
-    Ok(EpisodeRecord {
-        set: test.set.name.clone(),
-        seed: test.seed,
-        environment_index: episode.environment_index,
-        episode_index: episode.episode_index,
-        ending: match (end.diverged, terminated) {
-            (true, _) => Ending::Diverged,
-            (false, true) => Ending::Terminated,
-            (false, false) => Ending::Truncated,
-        },
-        requested: receipt.requested,
-        applied: receipt.applied,
-        model_hash: receipt.model_hash,
-        episode_return: end.r#return,
-        length: end.length,
-        success: about.success.as_ref().map_or(end.success, |criterion| criterion.holds(achieved)),
-        achieved,
-        also_achieved,
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::records::{About, Ending};
 
     fn environment() -> proto::Environment {
         let drawn = |low, high| Some(proto::Distribution { intervals: vec![proto::Interval { low, high }] });
@@ -222,32 +182,26 @@ mod tests {
         proto::Environment { name: "Toy".into(), parameters: vec![length], applied, ..Default::default() }
     }
 
-    fn end(slot: u32, trial_index: u64, length: f64, applied: f64) -> proto::EpisodeEnd {
-        proto::EpisodeEnd {
-            slot,
-            episode: Some(proto::Episode {
-                environment_index: slot,
-                trial_index,
-                episode_index: trial_index,
-                episode_in_trial: 0,
-            }),
+    fn end(slot: u32, trial_index: u64, length: f64, applied: f64) -> EndedEpisode {
+        let episode =
+            proto::Episode { environment_index: slot, trial_index, episode_index: trial_index, episode_in_trial: 0 };
+        let receipt = proto::Receipt { requested: vec![length], applied: vec![applied], model_hash: String::new() };
+        let end = proto::EpisodeEnd {
+            episode: Some(episode),
             r#return: f64::from(slot),
             length: 7,
             success: true,
-            receipt: Some(proto::Receipt {
-                requested: vec![length],
-                applied: vec![applied],
-                model_hash: String::new(),
-            }),
+            receipt: Some(receipt),
             ..Default::default()
-        }
+        };
+        EndedEpisode::of(end, slot as usize, slot == 0).unwrap()
     }
 
-    fn finished(version: Version, ends: &[proto::EpisodeEnd]) -> Result<Records, NotRecorded> {
+    fn finished(version: Version, ends: &[EndedEpisode]) -> Result<Records, NotRecorded> {
         let mut records = Records::new(About::new(&environment(), "policy".into(), 1));
-        let mut counting = Counting::new(version.into(), 1, 2, 1);
+        let mut counting = Counting::new(version.into(), Purpose::TestEnvironments, 1, 2, 1);
         for end in ends {
-            counting.take([end].into_iter(), &[true, false]);
+            counting.take([end.clone()]);
         }
         counting.finish(&environment(), &mut records)?;
         Ok(records)
@@ -259,7 +213,7 @@ mod tests {
         let told: Vec<(u32, u64, Ending)> =
             records.episodes.iter().map(|row| (row.environment_index, row.episode_index, row.ending)).collect();
         assert_eq!(told, [(0, 0, Ending::Terminated), (1, 0, Ending::Truncated)]);
-        assert_eq!(records.about.tests[0].seed, environment_seed(1, Version::D));
+        assert_eq!(records.about.tests[0].seed, environment_seed(Purpose::TestEnvironments, 1, Version::D));
     }
 
     #[test]
@@ -269,11 +223,25 @@ mod tests {
             (Version::E, end(0, 0, 1.0, 1.0), "asked for length in [3, 4], but its receipt says 1"),
             (Version::RE, end(0, 0, 2.5, 2.5), "length in [0.5, 2], like all others, or in [3, 4]"),
             (Version::E, end(0, 0, 3.5, 3.6), "length was requested as 3.5, but the physics ran with 3.6"),
-            (Version::D, proto::EpisodeEnd { episode: None, ..end(0, 0, 1.0, 1.0) }, "without its address"),
         ] {
             let error = finished(version, &[end]).unwrap_err().to_string();
             assert!(error.contains(part), "{error}");
         }
+    }
+
+    #[test]
+    fn all_parameters_of_an_episode_are_of_one_part_of_its_version() {
+        let part = |low, high| vec!["low..high".replace("low", low).replace("high", high).parse().unwrap(); 2];
+        let (r, e) = (part("1", "2"), part("2", "3"));
+        let both = [r, e];
+        assert_eq!([wrong(&both, &[1.5, 1.0]), wrong(&both, &[2.5, 3.0])], [None, None]);
+        assert_eq!(wrong(&both, &[1.5, 2.5]), Some(1), "the second is not of R, the first not of E");
+        assert_eq!(wrong(&both, &[4.0, 1.5]), Some(0));
+        assert_eq!(
+            (wrong(&both[..1], &[1.5, 2.5]), wrong(&both[..1], &[1.5])),
+            (Some(1), Some(1)),
+            "nor is what is missing"
+        );
     }
 
     #[test]
@@ -283,6 +251,30 @@ mod tests {
         let uneven = quotas(250, 1);
         assert_eq!((uneven.len(), uneven.iter().sum::<u64>()), (100, 250));
         assert_eq!((uneven[0], uneven[49], uneven[50], uneven[99]), (3, 3, 2, 2));
-        assert_eq!(quotas(11, 5), [vec![1; 5], vec![1; 5], vec![1; 5]].concat());
+    }
+
+    #[test]
+    fn every_context_gets_equally_many_episodes() {
+        for (episodes, contexts, each) in
+            [(10, 5, 2), (11, 5, 3), (1, 5, 1), (1000, 1600, 1), (1000, 3, 334), (7, 100, 1)]
+        {
+            let quotas = quotas(episodes, contexts);
+            for context in 0..contexts {
+                let own: u64 = quotas.iter().skip(context).step_by(contexts).sum();
+                assert_eq!(own, each, "{episodes} episodes in {contexts} contexts");
+            }
+            assert!(quotas.len() <= MOST_ENVS.max(contexts) && quotas.iter().all(|&quota| quota > 0));
+        }
+    }
+
+    #[test]
+    fn test_environments_have_seeds_of_their_own() {
+        let of = |purpose| {
+            (0..100).flat_map(move |seed| Version::KNOWN.map(|version| environment_seed(purpose, seed, version)))
+        };
+        let seeds: Vec<u64> = of(Purpose::TestEnvironments).chain(of(Purpose::SelectionEnvironments)).collect();
+        let distinct: std::collections::HashSet<u64> = seeds.iter().copied().collect();
+        assert_eq!(distinct.len(), 800, "those of a test never select");
+        assert!(seeds.iter().all(|&seed| seed > 1000), "none is a seed that people train with");
     }
 }

@@ -46,7 +46,8 @@ fn done(plan: &Plan, folder: &Folder, known: Known, failed: bool) {
                 place.write_result(&result).unwrap();
             }
             None if failed => {
-                let failure = Failure { id: cell.id.clone(), reason: "NaN".into(), commit: "x".into() };
+                let failure =
+                    Failure { id: cell.id.clone(), reason: "NaN".into(), commit: "x".into(), begins_anew: true };
                 place.write_failure(&failure).unwrap();
             }
             None => {}

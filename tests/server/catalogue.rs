@@ -32,9 +32,15 @@ fn names_are_unique_and_found() {
         assert!(ptr::eq(tasks::catalogue().find(spec.name).unwrap(), spec));
         assert!(ptr::eq((spec.make)().unwrap().spec(), spec));
     }
-    for name in ["", "cartpole", "CartPole-v0", "CartPole "] {
+    for name in ["cartpole", "cart-pole", "perturb/CartPole-v1"] {
+        assert_eq!(tasks::catalogue().find(name).unwrap().name, "CartPole");
+    }
+    for name in ["", "CartPol", "CartPole-v0", "perturb/CartPole-v0", "CartPole "] {
         let refused = tasks::catalogue().find(name).unwrap_err();
-        assert!(matches!(refused, Error::UnknownEnvironment { .. }) && refused.to_string().contains("MountainCar"));
+        assert!(
+            matches!(refused, Error::UnknownEnvironment(_)) && refused.to_string().contains("CartPole"),
+            "{refused}"
+        );
     }
 }
 

@@ -259,9 +259,9 @@ async fn a_stale_socket_is_replaced_a_live_one_and_a_file_are_not() {
     assert_eq!(server.addresses, std::slice::from_ref(&address));
 
     let second = finished(&mut listen());
-    assert_eq!(second.status.code(), Some(1));
+    assert_eq!(second.status.code(), Some(2));
     let message = String::from_utf8(second.stderr).unwrap();
-    assert!(message.contains("cannot listen at") && message.contains("in use"), "{message}");
+    assert!(message.contains("cannot listen at") && message.contains("another program does"), "{message}");
     assert_eq!(health(&address, SERVICE).await.unwrap(), ServingStatus::Serving, "the first is still there");
     drop(server); // killed: its socket stays
     assert!(UnixStream::connect(&socket).is_err() && socket.exists());
@@ -271,7 +271,7 @@ async fn a_stale_socket_is_replaced_a_live_one_and_a_file_are_not() {
 
     std::fs::remove_file(&socket).unwrap();
     std::fs::write(&socket, "precious").unwrap();
-    assert_eq!(finished(&mut listen()).status.code(), Some(1));
+    assert_eq!(finished(&mut listen()).status.code(), Some(2));
     assert_eq!(std::fs::read_to_string(&socket).unwrap(), "precious");
 }
 
@@ -281,8 +281,9 @@ fn a_port_in_use_is_an_error_that_names_it() {
     let address = format!("tcp://{}", taken.local_addr().unwrap());
     let output = finished(command().args(["--listen", &address]));
     let message = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(1));
-    assert!(message.contains(&taken.local_addr().unwrap().to_string()) && message.contains("in use"), "{message}");
+    assert_eq!(output.status.code(), Some(2));
+    let named = message.contains(&taken.local_addr().unwrap().to_string());
+    assert!(named && message.contains("another program does"), "{message}");
 }
 
 #[test]

@@ -9,7 +9,7 @@ use perturb_learner::client::Servers;
 use perturb_learner::evaluation::{Audit, audit};
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::{FILE, Records};
-use perturb_study::{Folder, files};
+use perturb_study::{Assessed, Folder, files};
 
 use super::args::AuditArgs;
 use super::display::Display;
@@ -75,7 +75,14 @@ fn tested(args: &AuditArgs) -> Result<Vec<Tested>> {
         records: path.join(FILE),
         checkpoint: path.join("training"),
     };
-    if let Some(checkpoint) = &args.checkpoint {
+    if Assessed::is_in(path) {
+        return of_assessment(path, &args.checkpoint);
+    }
+    if let [_, second, ..] = &args.checkpoint[..] {
+        let message = format!("--checkpoint has {} beside another: these records are of one policy", second.display());
+        return Err(CommandError::Usage(message));
+    }
+    if let Some(checkpoint) = args.checkpoint.first() {
         let name = path.display().to_string();
         return Ok(vec![Tested { name, records: file_in(path), checkpoint: checkpoint.clone() }]);
     }
@@ -93,7 +100,10 @@ fn tested(args: &AuditArgs) -> Result<Vec<Tested>> {
         return cells(path);
     }
     if !path.exists() {
-        return Err(CommandError::Usage(format!("there is no {}", path.display())));
+        return Err(CommandError::Usage(format!(
+            "there is no {}: give the --out of `perturb run`, or the --records of `perturb evaluate`",
+            path.display()
+        )));
     }
     if !path.is_dir() {
         let message = format!("{} is a file of records: give --checkpoint, the policy that was tested", path.display());
@@ -106,6 +116,36 @@ fn tested(args: &AuditArgs) -> Result<Vec<Tested>> {
     let tested = paths.map(|path| cells(&path)).collect::<Result<Vec<_>>>()?.concat();
     if tested.is_empty() {
         return Err(CommandError::Failed(format!("no cell of {} has recorded episodes", path.display())));
+    }
+    Ok(tested)
+}
+
+/// The policies of an assessment that `checkpoints` have; the others are told.
+fn of_assessment(path: &Path, checkpoints: &[PathBuf]) -> Result<Vec<Tested>> {
+    let assessed = Assessed::read(path)?;
+    let id = |path: &PathBuf| -> Result<(PathBuf, String)> {
+        let id = Checkpoint::load(path)?.id().map_err(|reason| CommandError::Failed(format!("{path:?}: {reason}")))?;
+        Ok((path.clone(), id))
+    };
+    let ids = checkpoints.iter().map(id).collect::<Result<Vec<_>>>()?;
+    let mut tested = Vec::new();
+    for policy in assessed.policies() {
+        let (recorded, name) = (&policy.records.about.policy, format!("trained on {}", policy.trained_on()));
+        match ids.iter().find(|(_, id)| id == recorded) {
+            Some((checkpoint, _)) => {
+                tested.push(Tested { name, records: path.join(policy.file_name()), checkpoint: checkpoint.clone() });
+            }
+            None => eprintln!(
+                "{name}: {recorded} is no checkpoint that was given; Assessment.audit(policy) replays it in Python"
+            ),
+        }
+    }
+    if tested.is_empty() {
+        let message = format!(
+            "no policy of {} can be played here: give the checkpoints of those that perturb trained with --checkpoint",
+            path.display()
+        );
+        return Err(CommandError::Usage(message));
     }
     Ok(tested)
 }

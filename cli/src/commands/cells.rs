@@ -3,14 +3,19 @@
 use std::collections::HashMap;
 use std::process::ExitCode;
 
+use super::again::this_command;
 use super::args::RunArgs;
-use super::display::Display;
+use super::display::{Display, note};
 use super::error::{CommandError, Result};
 use super::report;
 use super::signal_code;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::scheduler::{Announcement, Backend, RunEnd, count, run as run_plan, write_line};
+use perturb_study::report::Sources;
+use perturb_study::scheduler::{Announcement, Backend, Rate, RunEnd, RunError, count, run as run_plan, write_line};
 use perturb_study::{FailureMark, Folder, Plan};
+
+/// So many kinds of cells are told of at the end.
+const MOST_RATES: usize = 24;
 
 /// A run, which does a plan's cells and, when these select others, those too.
 pub(super) struct Doing<'a> {
@@ -23,6 +28,8 @@ pub(super) struct Doing<'a> {
     forgiven: HashMap<String, FailureMark>,
     /// `None` before anything is done.
     end: Option<RunEnd>,
+    /// Success of what is done.
+    rates: Vec<Rate>,
 }
 
 impl<'a> Doing<'a> {
@@ -30,7 +37,7 @@ impl<'a> Doing<'a> {
     pub(super) fn begin(args: &'a RunArgs, plan: Plan, folder: &'a Folder, stop: &'a StopFlag) -> Result<Self> {
         keep_plan(args, &plan, folder)?;
         let forgiven = if args.retry_failed { folder.failures()? } else { HashMap::new() };
-        Ok(Self { args, folder, stop, plan, forgiven, end: None })
+        Ok(Self { args, folder, stop, plan, forgiven, end: None, rates: Vec::new() })
     }
 
     /// The cells to do next: the plan's, then those that it has beside them when these are done; `None` at the end.
@@ -44,7 +51,7 @@ impl<'a> Doing<'a> {
                 if new == 0 {
                     return Ok(None);
                 }
-                eprintln!("tuning is done; {} with what is selected", count(new, "cell"));
+                note(format_args!("tuning is done; {} with what is selected", count(new, "cell")));
                 self.plan = Plan { candidates: Vec::new(), ..plan };
             }
         }
@@ -54,25 +61,41 @@ impl<'a> Doing<'a> {
     /// Has `backend` do all cells of `plan`, and shows how far that is.
     pub(super) fn run(&mut self, plan: &Plan, backend: &mut dyn Backend) -> Result<()> {
         let mut display = Display::of_cells(plan.cells.len());
+        let mut rates = Vec::new();
         let mut report = |report: Announcement<'_>| match report {
-            Announcement::Status(status) => display.cells(status),
+            Announcement::Status(status) => {
+                display.cells(status);
+                rates.clone_from(&status.rates);
+            }
             Announcement::Note(sentence) => display.say(sentence),
             Announcement::Line(line) if self.args.json => write_line(&mut std::io::stdout(), line),
             Announcement::Line(_) => {}
         };
-        self.end = Some(run_plan(plan, self.folder, backend, &self.forgiven, self.stop, &mut report)?);
+        let end = run_plan(plan, self.folder, backend, &self.forgiven, self.stop, &mut report);
+        drop(display);
+        self.rates = rates;
+        self.end = Some(end.map_err(|error| match error {
+            RunError::NoServer(_) => CommandError::Failed(format!("{error}; go on with: {}", this_command())),
+            error => error.into(),
+        })?);
         Ok(())
     }
 
     /// Says how everything ended.
     pub(super) fn end(self) -> Result<ExitCode> {
-        let Self { args, folder, plan, end, .. } = self;
+        let Self { args, folder, plan, end, rates, .. } = self;
+        rates.iter().take(MOST_RATES).for_each(note);
+        if rates.len() > MOST_RATES {
+            note(format_args!("and {} more: perturb report {}", rates.len() - MOST_RATES, folder.path().display()));
+        }
         let failed = match end {
             Some(RunEnd::Stopped { signal, left }) => {
                 let jobs = left.join(" ");
-                eprintln!("stopped by signal {signal}; the same command goes on");
+                note(format_args!("stopped by signal {signal}; the same command goes on: {}", this_command()));
                 if !left.is_empty() {
-                    eprintln!("Slurm job {jobs} runs meanwhile, and is watched again then; to end it: scancel {jobs}");
+                    note(format_args!(
+                        "Slurm job {jobs} runs meanwhile, and is watched again then; to end it: scancel {jobs}"
+                    ));
                 }
                 return Ok(signal_code(signal));
             }
@@ -80,11 +103,13 @@ impl<'a> Doing<'a> {
             None => Vec::new(),
         };
         if let Some(page) = &args.html {
-            report::write(folder, None, Some(page))?;
-            eprintln!("the report is in {} and {}", page.display(), folder.path().join("report").display());
+            let sources = Sources { folder: Some(folder.clone()), ..Sources::default() };
+            report::write(sources, None, Some(page))?;
+            let tables = folder.path().join("report");
+            note(format_args!("the report is in {} and {}", page.display(), tables.display()));
         }
         let Some(first) = failed.first() else {
-            eprintln!("all {} cells are done; perturb report {}", plan.cells.len(), folder.path().display());
+            note(format_args!("all {} cells are done; perturb report {}", plan.cells.len(), folder.path().display()));
             return Ok(ExitCode::SUCCESS);
         };
         Err(CommandError::Failed(format!(
@@ -104,7 +129,7 @@ fn keep_plan(args: &RunArgs, plan: &Plan, folder: &Folder) -> Result<()> {
         return Ok(());
     }
     if folder.keep_plan(plan)? {
-        eprintln!("{} was another plan; it is replaced, and cells that both have are kept", kept.display());
+        note(format_args!("{} was another plan; it is replaced, and cells that both have are kept", kept.display()));
     }
     Ok(())
 }

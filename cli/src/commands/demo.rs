@@ -1,140 +1,242 @@
-//! `perturb demo`: the paper's protocol on CartPole, small.
+//! `perturb demo`: the paper's question, small. Does a policy still work where it was not trained, and does it help to
+//! train on random physics?
 
 use std::collections::BTreeMap;
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Instant;
 
 use super::args::DemoArgs;
-use super::display::Display;
-use super::error::{Result, system};
-use super::train::describe;
+use super::display::{Display, note};
+use super::error::{CommandError, Result, system};
 use super::{servers, signal_code, threads};
+use crate::video::{VideoError, VideoFile, VideoOptions, film};
 use perturb_learner::checkpoint::Checkpoint;
-use perturb_learner::client::Servers;
-use perturb_learner::evaluation::test;
-use perturb_learner::training::{Outcome, RunDirectory, train};
+use perturb_learner::client::{ClientError, Servers};
+use perturb_learner::evaluation::{TestError, heatmap, test};
+use perturb_learner::logging::Progress;
+use perturb_learner::training::{RunDirectory, train};
+use perturb_study::files::write_atomically;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::settings::{Preset, TrainConfig};
+use perturb_study::plot;
+use perturb_study::sets::Context;
+use perturb_study::settings::TrainConfig;
 use perturb_study::table::Table;
-use perturb_study::{Method, Metric, Scenario, Version, paper};
+use perturb_study::words::{duration, grouped};
+use perturb_study::{HeatmapOptions, Metric, PolicyHeatmap, Scenario, Version, paper, policies_side_by_side};
 
 /// The paper's budgets.
 const PAPER_EPISODES: u64 = 15_000;
 const PAPER_TEST_EPISODES: u64 = 1000;
-const ENVIRONMENT: &str = "CartPole";
+const PAPER_RUNS: u64 = 5;
+/// What policies are trained on.
+const TRAINED_ON: [Version; 2] = [Version::D, Version::R];
+/// Points along each axis of the heatmap, and episodes at each.
+const GRID: usize = 12;
+const POINT_EPISODES: u64 = 5;
+/// Episodes that are looked through for one to film.
+const TRIES: u64 = 20;
+/// Width and height of the films' pictures, and steps from one to the next: a robot's takes some 60 ms to draw.
+const PIXELS: (u32, u32) = (240, 240);
+const EVERY: u32 = 6;
+
+/// A policy that was trained, and its success by what it was tested on, %.
+struct Trained {
+    version: Version,
+    checkpoint: Checkpoint,
+    rates: BTreeMap<Version, f64>,
+}
+
+struct Demo<'a> {
+    args: &'a DemoArgs,
+    servers: Servers,
+    stop: StopFlag,
+    out: PathBuf,
+}
 
 pub(super) fn run(args: &DemoArgs) -> Result<ExitCode> {
     let start = Instant::now();
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let servers = servers(&args.server)?;
-    let scratch = tempfile::tempdir().map_err(system("create a temporary directory"))?;
-    let mut out = std::io::stdout();
-    let directory = args.out.clone().unwrap_or_else(|| scratch.path().to_owned());
-
-    writeln!(out, "PPO with feed-forward networks on {ENVIRONMENT}: three trainings, nine tests.")?;
-    budget(&mut out, "training", args.episodes, PAPER_EPISODES)?;
-    budget(&mut out, "test", args.test_episodes, PAPER_TEST_EPISODES)?;
-    let mut rates = BTreeMap::new();
-    for version in Version::ALL {
-        let outcome = train_on(&servers, args, version, &directory.join(version.to_string()), &stop)?;
-        if let Some(number) = outcome.signal {
-            eprintln!("stopped by signal {number}");
-            return Ok(signal_code(number));
-        }
-        for test in Version::ALL {
-            let rate = success_percent(&servers, args, &outcome.checkpoint, test, &stop)?;
-            rates.insert(Scenario { train: version, test }, rate);
+    let usual = || PathBuf::from(format!("runs/demo-{}", chrono::Utc::now().format("%Y%m%d-%H%M%S")));
+    let out = args.out.clone().unwrap_or_else(usual);
+    if !perturb_study::files::list(&out)?.is_empty() {
+        let message = format!("{} is not empty: give the demo another --out, or delete that", out.display());
+        return Err(CommandError::Usage(message));
+    }
+    let demo = Demo { args, servers: servers(&args.server)?, stop, out };
+    match demo.run(start) {
+        Ok(()) => Ok(ExitCode::SUCCESS),
+        Err(error) => {
+            let Some(signal) = error.signal() else { return Err(error) };
+            note(format_args!("stopped by signal {signal}; what is done is kept in {}", demo.out.display()));
+            Ok(signal_code(signal))
         }
     }
-    writeln!(out, "\n{}", rates_table(&rates).to_text())?;
-    writeln!(out, "\n{}", metrics_table(&rates).to_text())?;
-    writeln!(out, "\n{:.0} s in all, seed {}", start.elapsed().as_secs_f64(), args.seed)?;
-    if let Some(kept) = &args.out {
-        writeln!(out, "the runs are kept in {}", kept.display())?;
-    }
-    Ok(ExitCode::SUCCESS)
 }
 
-fn budget(out: &mut impl Write, what: &str, episodes: u64, paper: u64) -> std::io::Result<()> {
-    match episodes.cmp(&paper) {
-        std::cmp::Ordering::Less => {
-            writeln!(out, "Reduced budget: {episodes} episodes in each {what}, where the paper has {paper}.")
+impl Demo<'_> {
+    fn run(&self, start: Instant) -> Result<()> {
+        let environment = self.servers.environment(&self.args.env)?;
+        let mut out = std::io::stdout();
+        writeln!(
+            out,
+            "{}: PPO with feed-forward networks is trained on default physics (D) and on random physics (R),\n\
+             and tested on both and on extreme physics (E), which neither has met.\n",
+            environment.name
+        )?;
+        let trained =
+            TRAINED_ON.into_iter().map(|version| self.train(&environment.name, version)).collect::<Result<Vec<_>>>()?;
+        writeln!(out, "{}\n", rates_table(&trained).to_text())?;
+        writeln!(out, "{}\n", self.papers_table(&environment.name, &trained).to_text())?;
+        if ["Hopper", "HalfCheetah"].contains(&environment.name.as_str()) {
+            writeln!(out, "The paper's robots ran in another simulator: compare what is lost, not the numbers.\n")?;
         }
-        _ => writeln!(out, "{episodes} episodes in each {what} (the paper: {paper})."),
+        writeln!(out, "{}", conclusion(&trained))?;
+        let heatmap = self.heatmap(&trained, environment.heatmap_axes.clone())?;
+        let films = self.films(&trained[0].checkpoint)?;
+        for (what, path) in heatmap.into_iter().chain(films) {
+            writeln!(out, "{what}: {}", path.display())?;
+        }
+        let seconds = duration(start.elapsed().as_secs_f64());
+        Ok(writeln!(out, "\n{seconds} in all, seed {}; the runs are in {}", self.args.seed, self.out.display())?)
+    }
+
+    /// Trains a policy and tests it on every version.
+    fn train(&self, environment: &str, version: Version) -> Result<Trained> {
+        let DemoArgs { episodes, test_episodes, seed, .. } = *self.args;
+        let settings = [
+            format!("environment={environment}"),
+            format!("version={version}"),
+            format!("episodes={episodes}"),
+            format!("seed={seed}"),
+        ];
+        let config = TrainConfig::load(None, &settings, toml::Table::new())?;
+        let directory = RunDirectory::choose(&self.out.join(format!("trained-on-{version}")), false)?;
+        let mut display = Display::of_training(config.to_string(), &config, 0, 0);
+        let report = |progress: &Progress| display.training(progress);
+        let outcome = train(&self.servers, &config, &directory, threads(None), &self.stop, report)?;
+        drop(display);
+        if let Some(signal) = outcome.signal {
+            return Err(TestError::Stopped { signal }.into());
+        }
+        let mut rates = BTreeMap::new();
+        for set in Version::ALL {
+            let mut display = Display::of_episodes(format!("trained on {version}, testing on {set}"), test_episodes);
+            let report = |episodes| display.episodes(episodes);
+            let result = test(&self.servers, &outcome.checkpoint, set, test_episodes, seed, &self.stop, report)?;
+            rates.insert(set, result.success_percent);
+        }
+        Ok(Trained { version, checkpoint: outcome.checkpoint, rates })
+    }
+
+    /// The paper's figures beside those of here, each with what it cost.
+    fn papers_table(&self, environment: &str, trained: &[Trained]) -> Table {
+        let rates: BTreeMap<Scenario, f64> = trained
+            .iter()
+            .flat_map(|one| one.rates.iter().map(|(&test, &rate)| (Scenario { train: one.version, test }, rate)))
+            .collect();
+        let method = trained[0].checkpoint.state.config.method();
+        let here = |metric: Metric| metric.of(|scenario| rates.get(&scenario).copied());
+        let DemoArgs { episodes, test_episodes, .. } = *self.args;
+        let rows = [("here", 1, episodes, test_episodes), ("paper", PAPER_RUNS, PAPER_EPISODES, PAPER_TEST_EPISODES)];
+        let shown = |row: &str, metric: Metric| match row {
+            "here" => here(metric).map(|percent| format!("{percent:.1}")),
+            _ => paper::number(environment, &method, metric).map(|number| number.to_string()),
+        };
+        let of = |metric| move |row: &(&str, u64, u64, u64)| shown(row.0, metric).unwrap_or_else(|| "–".into());
+        Table::of("", &rows)
+            .text("success, %", |(row, ..)| *row)
+            .number("runs", |(_, runs, ..)| runs)
+            .number("episodes each", |(.., episodes, _)| grouped(*episodes as usize))
+            .number("of a test", |(.., tested)| grouped(*tested as usize))
+            .number("Default", of(Metric::Default))
+            .number("Interpolation", of(Metric::Interpolation))
+            .number("Extrapolation", of(Metric::Extrapolation))
+            .build()
+    }
+
+    /// Both policies over two parameters, side by side.
+    fn heatmap(&self, trained: &[Trained], axes: Vec<String>) -> Result<Option<(&'static str, PathBuf)>> {
+        let Ok(parameters) = <[String; 2]>::try_from(axes) else { return Ok(None) };
+        let seed = self.args.seed;
+        let (grid, episodes, base, fixed) = (GRID, POINT_EPISODES, Version::D, Context::new());
+        let options = HeatmapOptions { parameters, base, grid, episodes, seed, fixed };
+        let mut policies = Vec::new();
+        for Trained { version, checkpoint, .. } in trained {
+            let total = (GRID * GRID) as u64 * POINT_EPISODES;
+            let mut display = Display::of_episodes(format!("trained on {version}, heatmap"), total);
+            let report = &mut |episodes| display.episodes(episodes);
+            let (heatmap, _) = heatmap(&self.servers, checkpoint, &options, &self.stop, report)?;
+            let config = &checkpoint.state.config;
+            let (method, trained_on) = (config.method().to_string(), config.common.trained_on());
+            policies.push(PolicyHeatmap { method, trained_on, seed, heatmap });
+        }
+        let Some((panels, _)) = policies_side_by_side(&policies) else { return Ok(None) };
+        let path = self.out.join("heatmap.png");
+        write_atomically(&path, &plot::png(&panels)?)?;
+        Ok(Some(("success over two parameters", path)))
+    }
+
+    /// The policy that was trained on D: an episode on D that goes well, and one on E that does not.
+    fn films(&self, checkpoint: &Checkpoint) -> Result<Vec<(&'static str, PathBuf)>> {
+        let wanted =
+            [("trained on D: success on D", Version::D, true), ("trained on D: failure on E", Version::E, false)];
+        let mut films = Vec::new();
+        for (what, version, success) in wanted {
+            let path = self.out.join(if success { "success.gif" } else { "failure.gif" });
+            let Some(seed) = self.episode(checkpoint, version, success)? else {
+                let kind = if success { "success" } else { "failure" };
+                note(format_args!("no film of a {kind}: none of {TRIES} episodes on {version} was one"));
+                continue;
+            };
+            match self.film(checkpoint, version, seed, &path) {
+                Ok(()) => films.push((what, path)),
+                // A server without OpenGL draws no robots, and says what is missing.
+                Err(VideoError::Test(TestError::Client(error @ ClientError::Refused { .. }))) => {
+                    note(format_args!("no films: {error}"));
+                    break;
+                }
+                Err(error) => return Err(error.into()),
+            }
+        }
+        Ok(films)
+    }
+
+    /// The seed of an episode that ends so.
+    fn episode(&self, checkpoint: &Checkpoint, version: Version, success: bool) -> Result<Option<u64>> {
+        for seed in self.args.seed..self.args.seed + TRIES {
+            let result = test(&self.servers, checkpoint, version, 1, seed, &self.stop, |_| {})?;
+            if (result.success_percent > 0.0) == success {
+                return Ok(Some(seed));
+            }
+        }
+        Ok(None)
+    }
+
+    fn film(&self, checkpoint: &Checkpoint, version: Version, seed: u64, path: &Path) -> Result<(), VideoError> {
+        let options =
+            VideoOptions { sets: vec![version.into()], episodes: 1, seed, size: PIXELS, fps: None, every: EVERY };
+        film(&self.servers, checkpoint, &options, VideoFile::create(path)?, &self.stop, &mut |_| {}).map(drop)
     }
 }
 
-fn train_on(
-    servers: &Servers,
-    args: &DemoArgs,
-    version: Version,
-    directory: &Path,
-    stop: &StopFlag,
-) -> Result<Outcome> {
-    let settings = [
-        format!("environment={ENVIRONMENT}"),
-        format!("version={version}"),
-        format!("episodes={}", args.episodes),
-        format!("seed={}", args.seed),
-    ];
-    let config = TrainConfig::load(None, &settings, toml::Table::new())?;
-    let directory = RunDirectory::choose(directory, false)?;
-    let start = Instant::now();
-    let mut display = Display::of_episodes(describe(&config), args.episodes);
-    let outcome = train(servers, &config, &directory, threads(None), stop, |progress| display.training(progress))?;
-    drop(display);
-    let (progress, seconds) = (&outcome.progress, start.elapsed().as_secs_f64());
-    writeln!(
-        std::io::stdout(),
-        "trained on {version}: {} episodes, {} steps, {seconds:.0} s",
-        progress.episodes,
-        progress.timesteps
-    )?;
-    Ok(outcome)
-}
-
-fn success_percent(
-    servers: &Servers,
-    args: &DemoArgs,
-    checkpoint: &Checkpoint,
-    version: Version,
-    stop: &StopFlag,
-) -> Result<f64> {
-    let mut display = Display::of_episodes(format!("testing on {version}"), args.test_episodes);
-    let report = |episodes| display.episodes(episodes);
-    Ok(test(servers, checkpoint, version, args.test_episodes, args.seed, stop, report)?.success_percent)
-}
-
-fn rates_table(rates: &BTreeMap<Scenario, f64>) -> Table {
-    let mut table = Table::of("", &Version::ALL).text("success, %", |train| format!("train {train}"));
+fn rates_table(trained: &[Trained]) -> Table {
+    let mut table = Table::of("", trained).text("success, %", |one| format!("trained on {}", one.version));
     for test in Version::ALL {
-        let shown = |&train| rates.get(&Scenario { train, test }).map_or_else(String::new, |rate| format!("{rate:.1}"));
-        table = table.number(format!("test {test}"), shown);
+        let shown = move |one: &Trained| one.rates.get(&test).map_or_else(String::new, |rate| format!("{rate:.1}"));
+        table = table.number(format!("tested on {test}"), shown);
     }
     table.build()
 }
 
-fn metrics_table(rates: &BTreeMap<Scenario, f64>) -> Table {
-    let method = Method {
-        algorithm: "ppo".into(),
-        architecture: "ff".into(),
-        episodes_per_trial: None,
-        preset: Preset::Perturb,
-        observe: Default::default(),
-    };
-    let here = |metric: Metric| metric.of(|scenario| rates.get(&scenario).copied());
-    let paper = |metric| paper::number(ENVIRONMENT, &method, metric);
-    Table::of("", &Metric::ALL)
-        .text("", |metric| match metric {
-            Metric::Default => "Default (DD)",
-            Metric::Interpolation => "Interpolation (RR)",
-            Metric::Extrapolation => "Extrapolation (DR, DE, RE)",
-        })
-        .number("here", |&metric| here(metric).map_or_else(String::new, |percent| format!("{percent:.1}")))
-        .text("paper (mean ± std of 5 runs)", |&metric| {
-            paper(metric).map_or_else(|| "not given".into(), |number| number.to_string())
-        })
-        .build()
+/// What the table says.
+fn conclusion(trained: &[Trained]) -> String {
+    let rate = |policy: usize, test| trained[policy].rates.get(&test).copied().unwrap_or_default();
+    let [dd, dr, de] = Version::ALL.map(|test| rate(0, test));
+    let [_, rr, re] = Version::ALL.map(|test| rate(1, test));
+    format!(
+        "Trained on default physics, a policy that succeeds in {dd:.0} % of its own episodes succeeds in {dr:.0} % where the\n\
+         physics is random, and in {de:.0} % where it is extreme. Trained on random physics, it is {rr:.0} % and {re:.0} %."
+    )
 }

@@ -1,108 +1,200 @@
-//! How far something is, on standard error: a bar on a terminal, plain lines elsewhere.
+//! How far something is, on standard error: a bar on a terminal, which fits its width, plain lines elsewhere.
 
 use std::io::IsTerminal;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 
-use super::plan::duration;
 use perturb_learner::logging::{EpisodeFigures, Progress};
-use perturb_study::scheduler::Status;
+use perturb_study::generated_episodes;
+use perturb_study::scheduler::{Pace, Status};
+use perturb_study::settings::TrainConfig;
+use perturb_study::words::{duration, grouped};
 
 /// How often a plain line is printed.
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
-/// Of so many groups of cells in work a terminal shows what is being done.
-const MOST_GROUPS: usize = 8;
+/// Of so many groups of cells in work, and of so many kinds that are done, a terminal shows what is known.
+const MOST_SHOWN: usize = 8;
+/// The time that is left is not told before so much has passed: it would be a guess.
+const LEAST_ELAPSED: Duration = Duration::from_secs(1);
+
+/// Whether nothing is said but errors.
+static QUIET: AtomicBool = AtomicBool::new(false);
+
+/// Has [`note`] and displays say nothing from now on.
+pub(super) fn be_quiet() {
+    QUIET.store(true, Ordering::Relaxed);
+}
+
+pub(super) fn is_quiet() -> bool {
+    QUIET.load(Ordering::Relaxed)
+}
+
+/// A sentence on standard error, unless nobody wants to hear it.
+pub(super) fn note(sentence: impl std::fmt::Display) {
+    if !is_quiet() {
+        eprintln!("{sentence}");
+    }
+}
 
 /// The episodes of a training or a test, or the cells of a run.
 pub(super) struct Display {
-    bar: Option<ProgressBar>,
+    bar: Option<Bar>,
     what: String,
     unit: &'static str,
     total: u64,
+    /// Of a training: its pace, and how many episodes it generates.
+    pace: Option<(Pace, f64)>,
+    start: Instant,
     last_line: Option<Instant>,
 }
 
+/// A bar with lines below it, which are cut where the terminal ends.
+struct Bar {
+    all: MultiProgress,
+    bar: ProgressBar,
+    lines: Vec<ProgressBar>,
+}
+
 impl Display {
+    /// Of a training that has had so many episodes and steps.
+    pub(super) fn of_training(what: String, config: &TrainConfig, episodes: u64, timesteps: u64) -> Self {
+        let budget = config.common.episodes;
+        let mut pace = Pace::default();
+        pace.hear(generated_episodes(config, episodes), timesteps);
+        let mut display = Self::of_episodes(what, budget);
+        display.pace = Some((pace, generated_episodes(config, budget)));
+        display
+    }
+
     /// Of `what`, which has `total` episodes.
     pub(super) fn of_episodes(what: impl Into<String>, total: u64) -> Self {
-        let template = "{prefix}{wide_bar} {pos}/{len} episodes, {eta} left  {msg}";
-        Self::new(format!("{}: ", what.into()), "episodes", total, template)
+        Self::new(format!("{} ", what.into()), "episodes", total)
     }
 
     /// Of a run of so many cells.
     pub(super) fn of_cells(total: usize) -> Self {
-        Self::new(String::new(), "cells", total as u64, "{wide_bar} {pos}/{len} cells  {msg}\n{prefix}")
+        Self::new(String::new(), "cells", total as u64)
     }
 
-    fn new(what: String, unit: &'static str, total: u64, template: &str) -> Self {
-        let bar = std::io::stderr().is_terminal().then(|| {
-            let style = ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
-            ProgressBar::new(total).with_style(style).with_prefix(what.clone())
-        });
+    fn new(what: String, unit: &'static str, total: u64) -> Self {
+        let bar = (std::io::stderr().is_terminal() && !is_quiet()).then(|| Bar::new(&what, total));
         // What is over soon needs no line.
         let last_line = (unit == "episodes").then(Instant::now);
-        Self { bar, what, unit, total, last_line }
+        Self { bar, what, unit, total, pace: None, start: Instant::now(), last_line }
     }
 
     /// After an iteration of a training.
     pub(super) fn training(&mut self, progress: &Progress) {
-        let figures = match progress.recent {
-            Some(EpisodeFigures { episode_return, success, .. }) => {
-                let percent = 100.0 * success;
-                format!("return {episode_return:.1}, success {percent:.0} %, {:.0} steps/s", progress.fps())
-            }
-            None => format!("{:.0} steps/s", progress.fps()),
-        };
-        self.show(progress.episodes, &figures);
+        let left = self.pace.as_mut().and_then(|(pace, total)| {
+            pace.hear(progress.generated_episodes as f64, progress.timesteps);
+            pace.left(*total)
+        });
+        let mut figures = Vec::from_iter(self.left(left));
+        if let Some(EpisodeFigures { episode_return, success, .. }) = progress.recent {
+            figures.push(format!("success {:.0} %, return {episode_return:.1}", 100.0 * success));
+        }
+        figures.push(format!("{} steps/s", grouped(progress.fps() as usize)));
+        self.show(progress.episodes, &figures, Vec::new);
     }
 
     /// So many episodes.
     pub(super) fn episodes(&mut self, episodes: u64) {
-        self.show(episodes, "");
+        let rest = self.total.saturating_sub(episodes) as f64 / episodes as f64;
+        let left = self.left((episodes > 0).then_some(rest));
+        self.show(episodes, &Vec::from_iter(left), Vec::new);
     }
 
-    /// How far a run is, and on a terminal what is done with its groups of cells.
+    /// How far a run is, and on a terminal what is done with its groups of cells, and what came of those that are done.
     pub(super) fn cells(&mut self, status: &Status) {
-        let Status { done, failed, running, doing, remaining, .. } = status;
-        let left = remaining.map_or_else(String::new, |left| format!(", {} left", duration(left.as_secs_f64())));
-        let lost = if *failed > 0 { format!(", {failed} failed") } else { String::new() };
-        if let Some(bar) = &self.bar {
-            let mut in_work: Vec<String> = running.iter().take(MOST_GROUPS).map(|group| format!("  {group}")).collect();
-            if running.len() > MOST_GROUPS {
-                in_work.push(format!("  and {} more", running.len() - MOST_GROUPS));
-            }
-            bar.set_prefix(in_work.join("\n"));
+        let Status { done, failed, running, doing, remaining, rates, .. } = status;
+        let mut figures = vec![doing.clone()];
+        if *failed > 0 {
+            figures.push(format!("{failed} failed"));
         }
-        self.show((done + failed) as u64, &format!("{doing}{lost}{left}"));
+        if let Some(left) = remaining {
+            let most = if left.at_most { "at most " } else { "" };
+            figures.push(format!("{most}{} left", duration(left.time.as_secs_f64())));
+        }
+        let lines = || {
+            let mut lines = first(running.iter().map(|group| format!("  {group}")).collect());
+            lines.extend(first(rates.iter().map(|rate| format!("  done: {rate}")).collect()));
+            lines
+        };
+        self.show((done + failed) as u64, &figures, lines);
     }
 
-    fn show(&mut self, position: u64, figures: &str) {
-        if let Some(bar) = &self.bar {
-            bar.set_position(position.min(self.total));
-            if !figures.is_empty() {
-                bar.set_message(figures.to_owned());
-            }
-        } else if self.last_line.is_none_or(|time| time.elapsed() >= LINE_INTERVAL) {
+    /// "3 min 10 s left", given what is left in terms of what is done.
+    fn left(&self, rest: Option<f64>) -> Option<String> {
+        let elapsed = self.start.elapsed();
+        let rest = rest.filter(|rest| rest.is_finite() && elapsed >= LEAST_ELAPSED)?;
+        Some(format!("{} left", duration(elapsed.as_secs_f64() * rest)))
+    }
+
+    fn show(&mut self, position: u64, figures: &[String], lines: impl FnOnce() -> Vec<String>) {
+        let position = position.min(self.total);
+        let unit = self.unit;
+        let counted = format!("{}/{} {unit}", grouped(position as usize), grouped(self.total as usize));
+        let words = [&[counted], figures].concat().join(", ");
+        if let Some(bar) = &mut self.bar {
+            bar.show(position, [vec![words], lines()].concat());
+        } else if !is_quiet() && self.last_line.is_none_or(|time| time.elapsed() >= LINE_INTERVAL) {
             self.last_line = Some(Instant::now());
-            let separator = if figures.is_empty() { "" } else { ": " };
-            eprintln!("{}{position}/{} {}{separator}{figures}", self.what, self.total, self.unit);
+            eprintln!("{}{words}", self.what);
         }
     }
 
     /// A sentence beside it.
     pub(super) fn say(&self, sentence: &str) {
         match &self.bar {
-            Some(bar) => bar.suspend(|| eprintln!("{sentence}")),
-            None => eprintln!("{sentence}"),
+            Some(bar) => bar.all.suspend(|| note(sentence)),
+            None => note(sentence),
         }
     }
 }
 
+/// As many lines as are shown, and how many more there are.
+fn first(mut lines: Vec<String>) -> Vec<String> {
+    let more = lines.len().saturating_sub(MOST_SHOWN);
+    lines.truncate(MOST_SHOWN);
+    lines.extend((more > 0).then(|| format!("  and {more} more")));
+    lines
+}
+
+impl Bar {
+    fn new(what: &str, total: u64) -> Self {
+        let all = MultiProgress::new();
+        let bar = ProgressBar::new(total).with_style(style("{prefix}{wide_bar} {percent:>3} %"));
+        bar.set_prefix(what.to_owned());
+        let bar = all.add(bar);
+        Self { all, bar, lines: Vec::new() }
+    }
+
+    fn show(&mut self, position: u64, lines: Vec<String>) {
+        while self.lines.len() < lines.len() {
+            self.lines.push(self.all.add(ProgressBar::no_length().with_style(style("{wide_msg}"))));
+        }
+        for gone in self.lines.drain(lines.len()..) {
+            gone.finish_and_clear();
+            self.all.remove(&gone);
+        }
+        self.bar.set_position(position);
+        self.lines.iter().zip(lines).for_each(|(line, words)| line.set_message(words));
+    }
+}
+
+/// A style that is written here, and can be understood.
+fn style(template: &str) -> ProgressStyle {
+    ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar())
+}
+
 impl Drop for Display {
     fn drop(&mut self) {
-        if let Some(bar) = &self.bar {
+        if let Some(Bar { all, bar, lines }) = &self.bar {
+            lines.iter().for_each(ProgressBar::finish_and_clear);
             bar.finish_and_clear();
+            let _ = all.clear(); // the terminal is gone
         }
     }
 }

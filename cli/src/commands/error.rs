@@ -7,13 +7,15 @@ use perturb_learner::client::ClientError;
 use perturb_learner::evaluation::{AuditError, HeatmapError, TestError};
 use perturb_learner::measure::MeasureError;
 use perturb_learner::training::{RunDirectoryError, TrainError};
+use perturb_serve::ServeError;
 use perturb_study::files::FileError;
 use perturb_study::plot::PlotError;
 use perturb_study::records::RecordsError;
+use perturb_study::report::ReportError;
 use perturb_study::scheduler::RunError;
 use perturb_study::scheduler::slurm::{OptionError, SlurmError};
 use perturb_study::settings::ConfigError;
-use perturb_study::{FolderError, PlanError, ValueError, VerifyError};
+use perturb_study::{AssessedError, FolderError, PlanError, ValueError, VerifyError};
 
 use crate::video::VideoError;
 
@@ -35,6 +37,8 @@ pub(super) enum CommandError {
     /// One of several heatmaps.
     #[error("{place}: {source}")]
     Place { place: String, source: Box<CommandError> },
+    #[error(transparent)]
+    Assessed(#[from] AssessedError),
     #[error(transparent)]
     Audit(#[from] AuditError),
     #[error(transparent)]
@@ -62,7 +66,11 @@ pub(super) enum CommandError {
     #[error(transparent)]
     Records(#[from] RecordsError),
     #[error(transparent)]
+    Report(#[from] ReportError),
+    #[error(transparent)]
     Run(#[from] RunError),
+    #[error(transparent)]
+    Serve(#[from] ServeError),
     #[error(transparent)]
     Slurm(#[from] SlurmError),
     #[error(transparent)]
@@ -84,23 +92,44 @@ impl CommandError {
             Self::Place { source, .. } => source.signal(),
             Self::Test(error)
             | Self::Audit(AuditError::Test(error))
+            | Self::Measure(MeasureError::Test(error))
             | Self::Heatmap(HeatmapError::Test(error))
             | Self::Video(VideoError::Test(error)) => error.signal(),
+            Self::Measure(MeasureError::Stopped { signal }) => Some(*signal),
             _ => None,
         }
     }
 
-    /// Whether the command itself was wrong.
+    /// Whether something that was given is missing or wrong, so that nothing was begun.
     pub(super) fn is_usage(&self) -> bool {
-        matches!(
-            self,
+        match self {
             Self::Usage(_)
-                | Self::Config(_)
-                | Self::Option(_)
-                | Self::Plan(_)
-                | Self::Value(_)
-                | Self::Video(VideoError::Extension { .. })
-        )
+            | Self::Config(_)
+            | Self::Option(_)
+            | Self::Plan(_)
+            | Self::Report(
+                ReportError::Plan(_)
+                | ReportError::Value(_)
+                | ReportError::Neither { .. }
+                | ReportError::Experiments { .. },
+            )
+            | Self::Value(_)
+            | Self::Serve(ServeError::NoFolder { .. } | ServeError::Address { .. })
+            | Self::Checkpoint(CheckpointError::Missing { .. })
+            | Self::Records(RecordsError::Missing { .. })
+            | Self::Folder(FolderError::NoPlan { .. })
+            | Self::Video(VideoError::Extension { .. } | VideoError::NoFfmpeg { .. })
+            | Self::Test(TestError::Value(_))
+            | Self::Heatmap(HeatmapError::Parameter { .. } | HeatmapError::Fixed { .. }) => true,
+            Self::Client(error) => is_wrong_server(error),
+            Self::Directory(error) | Self::Train(TrainError::Directory(error)) => is_wrong_directory(error),
+            Self::File(error)
+            | Self::Serve(ServeError::File(error))
+            | Self::Video(VideoError::File(error))
+            | Self::Records(RecordsError::File(error))
+            | Self::Train(TrainError::File(error)) => is_wrong_file(error),
+            _ => false,
+        }
     }
 
     /// Whether nobody reads any further, which is how `perturb envs | head` ends.
@@ -115,4 +144,42 @@ impl CommandError {
 /// Says what the operating system refused.
 pub(super) fn system(action: &'static str) -> impl FnOnce(std::io::Error) -> CommandError {
     move |source| CommandError::System { action, source }
+}
+
+/// Whether --server, or what was asked of it, was wrong from the beginning.
+fn is_wrong_server(error: &ClientError) -> bool {
+    matches!(
+        error,
+        ClientError::Connect { .. }
+            | ClientError::NotPerturb { .. }
+            | ClientError::NoneConnects { .. }
+            | ClientError::NoServerProgram { .. }
+            | ClientError::NoEnvironment(_)
+            | ClientError::NoParameters { .. }
+            | ClientError::Disagreement { .. }
+    )
+}
+
+/// Whether the directory of a run was the wrong one.
+fn is_wrong_directory(error: &RunDirectoryError) -> bool {
+    match error {
+        RunDirectoryError::File(error) => is_wrong_file(error),
+        RunDirectoryError::Locked { .. }
+        | RunDirectoryError::Checkpoint(CheckpointError::Damaged { .. } | CheckpointError::File(_)) => false,
+        _ => true,
+    }
+}
+
+/// Whether a file cannot be where it was given, rather than that the disk is full or broken.
+fn is_wrong_file(error: &FileError) -> bool {
+    matches!(
+        error.source.kind(),
+        ErrorKind::NotFound
+            | ErrorKind::PermissionDenied
+            | ErrorKind::AlreadyExists
+            | ErrorKind::IsADirectory
+            | ErrorKind::NotADirectory
+            | ErrorKind::ReadOnlyFilesystem
+            | ErrorKind::InvalidFilename
+    )
 }

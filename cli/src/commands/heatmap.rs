@@ -14,7 +14,7 @@ use perturb_learner::client::Servers;
 use perturb_learner::evaluation::{heatmap, heatmap_again};
 use perturb_learner::proto;
 use perturb_protocol::{Distribution, Version};
-use perturb_study::files::write_atomically;
+use perturb_study::files::{require_writable, write_atomically};
 use perturb_study::interrupt::StopFlag;
 use perturb_study::plot;
 use perturb_study::records::Records;
@@ -53,6 +53,7 @@ fn of_checkpoints(args: &HeatmapArgs) -> Result<()> {
     }
     let fixed = fixed(args)?;
     let path = args.out.clone().unwrap_or_else(|| default_path(&checkpoints, &kind));
+    require_writable(&path.with_added_extension("csv"))?;
     let mut out = std::io::stdout();
     let mut policies = Vec::new();
     for (index, checkpoint) in checkpoints.iter().enumerate() {

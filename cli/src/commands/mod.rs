@@ -1,9 +1,11 @@
-//! The command line: `perturb envs | train | evaluate | demo | plan | run | report | curves |
-//! heatmap | video | audit | rates`.
+//! The command line: `perturb envs | ls | serve | train | evaluate | demo | plan | run | report | curves |
+//! heatmap | video | audit | rates | completions | man`.
 //!
-//! Results go to standard output, everything else to standard error. Exit status: 0 done, 1 failed (of `audit`: an
-//! episode came out otherwise, too), 2 wrong usage, 128 + the signal's number if Ctrl-C or SIGTERM ended it.
+//! Results go to standard output, everything else to standard error. Exit status: 0 done; 1 failed (of `audit`: an
+//! episode came out otherwise, too); 2 something that was given is missing or wrong, and nothing was begun; 128 + the
+//! signal's number if Ctrl-C or SIGTERM ended it.
 
+mod again;
 mod args;
 mod audit;
 mod cells;
@@ -13,12 +15,15 @@ mod envs;
 mod error;
 mod evaluate;
 mod heatmap;
+mod ls;
 mod plan;
 mod rates;
+mod recurrent;
 mod report;
 mod run;
+mod serve;
 mod sets;
-mod single_thread;
+mod shell;
 mod slurm;
 mod train;
 mod video;
@@ -26,27 +31,38 @@ mod video;
 use std::io::IsTerminal;
 use std::process::ExitCode;
 
-use clap::Parser;
-
 use args::{Cli, Command, PlayArgs, ServerArgs};
 use error::{CommandError, Result};
 use perturb_learner::client::{ActAt, Servers};
+use perturb_study::interrupt::end_on_signals;
 use perturb_study::{Folder, Plan};
 
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let cli = Cli::of_process();
+    let usual = match (cli.quiet, cli.verbose) {
+        (true, _) => "error",
+        (_, 0) => "warn",
+        (_, 1) => "info",
+        _ => "debug",
+    };
+    if cli.quiet {
+        display::be_quiet();
+    }
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn"));
-    let colours = std::io::stderr().is_terminal(); // a worker's is a file
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new(usual));
+    let no_color = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
+    let colours = std::io::stderr().is_terminal() && !no_color; // a worker's is a file
     tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours).with_writer(std::io::stderr).init();
-    if matches!(cli.command, Command::Train(_) | Command::Demo(_) | Command::Plan(_) | Command::Run(_)) {
-        // An experiment's results must not depend on what a cluster's profile exports.
-        single_thread::ensure(matches!(cli.command, Command::Run(_)));
+    if matches!(cli.command, Command::Envs(_) | Command::Report(_) | Command::Curves(_) | Command::Serve(_)) {
+        // They have nothing to finish; the others look at a flag.
+        let _ = end_on_signals(); // without it they end as any program does
     }
     let done = |()| ExitCode::SUCCESS;
     let result = match cli.command {
         Command::Envs(args) => envs::run(&args).map(done),
+        Command::Ls(args) => ls::run(&args).map(done),
+        Command::Serve(args) => serve::run(&args).map(done),
         Command::Train(args) => train::run(&args),
         Command::Evaluate(args) => evaluate::run(&args).map(done),
         Command::Demo(args) => demo::run(&args),
@@ -58,6 +74,8 @@ pub fn main() -> ExitCode {
         Command::Video(args) => video::run(&args).map(done),
         Command::Audit(args) => audit::run(&args),
         Command::Rates(args) => rates::run(&args).map(done),
+        Command::Completions(args) => shell::completions(&args).map(done),
+        Command::Man(args) => shell::man(&args).map(done),
     };
     result.unwrap_or_else(|error| fail(&error))
 }

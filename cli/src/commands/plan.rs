@@ -7,19 +7,25 @@ use std::time::Duration;
 use serde_json::json;
 
 use super::args::PlanArgs;
-use super::error::{CommandError, Result};
-use super::{cores, servers};
+use super::error::{CommandError, Result, system};
+use super::{cores, recurrent, servers};
 use perturb_learner::client::Servers;
 use perturb_learner::measure::measure;
+use perturb_study::interrupt::StopFlag;
 use perturb_study::scheduler::count;
 use perturb_study::table::Table;
+use perturb_study::words::{duration, grouped};
 use perturb_study::{
     Cell, Estimate, Folder, Grouping, Measurement, Plan, Selection, Taken, estimates, representatives,
 };
 
 pub(super) fn run(args: &PlanArgs) -> Result<()> {
     let plan = Plan::load(&args.file)?;
+    if args.measure > 0 && !args.json && args.missing.is_none() {
+        recurrent::prepare_for(&plan)?;
+    }
     let mut out = std::io::stdout();
+    let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     if args.json && !args.cells && args.missing.is_none() {
         return Err(CommandError::Usage("--json lists cells: give --cells or --missing DIR with it".into()));
     }
@@ -53,6 +59,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
         if plan.selection == Selection::Clean { " to select from" } else { "" }
     )?;
     let from = args.from.as_deref().map(Folder::new);
+    from.iter().try_for_each(|folder| folder.require_plan().map(drop))?;
     let known = plan.in_full(from.as_ref())?;
     let anew = &known.cells[plan.cells.len()..];
     if let Some(pairs) = anew.first().map(|cell| cell.tests.sets.len()) {
@@ -67,7 +74,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     writeln!(out, "{}", groups_line(&groups, grouping))?;
     let grouping = Grouping { at_a_time: grouping.at_a_time.min(groups.len()), ..grouping };
     let taken = from.map(|folder| (folder.clone(), Taken::read(&plan, &folder)));
-    estimate(args, &plan, grouping, taken.as_ref(), &mut out)
+    estimate(args, &plan, grouping, taken.as_ref(), &stop, &mut out)
 }
 
 /// "24 cells in 4 groups of 5 to 7, 2 at a time".
@@ -85,6 +92,7 @@ fn estimate(
     plan: &Plan,
     grouping: Grouping,
     taken: Option<&(Folder, Taken<'_>)>,
+    stop: &StopFlag,
     out: &mut impl Write,
 ) -> Result<()> {
     let as_others = |cell: &Cell| taken.and_then(|(_, taken)| taken.seconds(cell));
@@ -108,7 +116,7 @@ fn estimate(
     if args.measure > 0 && !unknown.is_empty() {
         let servers = servers(&args.server)?;
         let limits = step_limits(&servers, plan)?;
-        let measurements = measurements(args, plan, grouping, &unknown, &servers, out)?;
+        let measurements = measurements(args, plan, grouping, &unknown, &servers, stop, out)?;
         let estimates = estimates(plan, &measurements, &limits);
         unknown.iter().for_each(|&cell| seconds[cell] = Some(estimates[cell].seconds()));
         print_most(out, unknown.len(), &unknown.iter().map(|&cell| estimates[cell]).sum())?;
@@ -136,6 +144,7 @@ fn measurements(
     grouping: Grouping,
     cells: &[usize],
     servers: &Servers,
+    stop: &StopFlag,
     out: &mut impl Write,
 ) -> Result<Vec<Measurement>> {
     let groups = representatives(plan, cells, grouping);
@@ -147,7 +156,7 @@ fn measurements(
         args.measure,
         if jobs == 1 { "1 process".to_owned() } else { format!("{jobs} processes at once, steps/s of each") }
     )?;
-    let measure_one = |group: Vec<&Cell>| measure(servers, &group, jobs, Duration::from_secs(args.measure));
+    let measure_one = |group: Vec<&Cell>| measure(servers, &group, jobs, Duration::from_secs(args.measure), stop);
     let measurements: Vec<Measurement> = groups.into_iter().map(measure_one).collect::<Result<_, _>>()?;
     writeln!(out, "{}", speeds(&measurements).to_text())?;
     Ok(measurements)
@@ -157,7 +166,7 @@ fn measurements(
 pub(super) fn step_limits<'a>(servers: &Servers, plan: &'a Plan) -> Result<HashMap<&'a str, u32>> {
     let limit = |name: &'a str| {
         let environment = servers.environment(name)?;
-        plan.check(&environment).map_err(|refused| CommandError::Failed(refused.to_string()))?;
+        plan.check(&environment)?;
         Ok((name, environment.step_limit))
     };
     plan.environments().into_iter().map(limit).collect()
@@ -193,41 +202,9 @@ fn cells(number: usize) -> String {
     if number == 1 { "1 cell".into() } else { format!("{} cells", grouped(number)) }
 }
 
-/// A number with its digits in groups of three.
-pub(super) fn grouped(number: usize) -> String {
-    let digits = number.to_string();
-    let mut text = String::new();
-    for (i, digit) in digits.chars().enumerate() {
-        if i > 0 && (digits.len() - i).is_multiple_of(3) {
-            text.push(' ');
-        }
-        text.push(digit);
-    }
-    text
-}
-
-/// A time in two of its units.
-pub(super) fn duration(seconds: f64) -> String {
-    let seconds = seconds.round() as u64;
-    let (minutes, hours, days) = (seconds / 60, seconds / 3600, seconds / 86_400);
-    match (days, hours, minutes) {
-        (0, 0, 0) => format!("{seconds} s"),
-        (0, 0, _) => format!("{minutes} min {} s", seconds % 60),
-        (0, _, _) => format!("{hours} h {} min", minutes % 60),
-        (0..1000, _, _) => format!("{days} d {} h", hours % 24),
-        _ => format!("{} years", grouped((days as f64 / 365.25).round() as usize)),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn digits_stand_in_groups_of_three() {
-        let shown = [0, 12, 183, 3294, 9882, 49_410, 1_234_567].map(grouped);
-        assert_eq!(shown, ["0", "12", "183", "3 294", "9 882", "49 410", "1 234 567"]);
-    }
 
     #[test]
     fn groups_are_said_in_a_line() {
@@ -237,11 +214,5 @@ mod tests {
         };
         assert_eq!(line(&[36, 35, 36, 1], 2), "108 cells in 4 groups of 1 to 36, 2 at a time");
         assert_eq!(line(&[3], 8), "3 cells in 1 group of 3, 1 at a time");
-    }
-
-    #[test]
-    fn times_have_two_units() {
-        let shown = [0.4, 59.4, 61.0, 3600.0, 90_000.0, 86_400.0 * 400.0, 86_400.0 * 3652.5].map(duration);
-        assert_eq!(shown, ["0 s", "59 s", "1 min 1 s", "1 h 0 min", "1 d 1 h", "400 d 0 h", "10 years"]);
     }
 }

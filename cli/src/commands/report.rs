@@ -4,52 +4,60 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use super::args::{CurvesArgs, ReportArgs};
-use super::error::Result;
+use super::display::note;
+use super::error::{CommandError, Result};
 use super::plan_in;
-use perturb_study::files::write_atomically;
-use perturb_study::outcomes::Recorded;
+use perturb_study::files::{require_writable, write_atomically};
 use perturb_study::plot::{Quantity, draw_curves, save};
-use perturb_study::report::{Figures, Picture, Report, heatmap_pictures, html, save_heatmaps};
-use perturb_study::{Folder, Footing, Plan, Results, Selection, curves_table, read_curves, verify};
+use perturb_study::report::{Sources, save_heatmaps};
+use perturb_study::{Folder, Footing, Results, curves_table, read_curves};
 
 pub(super) fn run(args: &ReportArgs) -> Result<()> {
-    let folder = Folder::new(&args.dir);
-    let (text, out) = write(&folder, args.selection, args.html.as_deref())?;
+    let mut sources = Sources { rule: args.selection, ..Sources::default() };
+    for dir in &args.dirs {
+        sources.add(dir)?;
+    }
+    let (text, out) = write(sources, args.out.clone(), args.html.as_deref())?;
     write!(std::io::stdout(), "{text}")?;
-    eprintln!("\nthe tables are also in {}", out.display());
+    note(format_args!("\nthe tables are also in {}", out.display()));
     Ok(())
 }
 
-/// Writes the tables of an experiment and, with `page`, everything as HTML; returns the tables as text, and where they are.
-pub(super) fn write(folder: &Folder, rule: Option<Selection>, page: Option<&Path>) -> Result<(String, PathBuf)> {
-    let plan = Plan::load(&folder.require_plan()?)?;
+/// Writes tables and pictures and, with `page`, everything as HTML; returns the tables as text, and where they are.
+pub(super) fn write(sources: Sources, out: Option<PathBuf>, page: Option<&Path>) -> Result<(String, PathBuf)> {
+    let out = match out {
+        Some(out) => out,
+        None => usual_place(&sources)?,
+    };
+    // The folder of the tables is made.
+    let inside = |page: &Path| page.parent().is_some_and(|folder| folder.starts_with(&out));
+    page.filter(|page| !inside(page)).map_or(Ok(()), require_writable)?;
+    sources.read(|whole| {
+        let report = &whole.report;
+        write_atomically(&out.join("report.md"), report.markdown().as_bytes())?;
+        for table in report.files() {
+            write_atomically(&out.join(&table.title), &table.to_csv())?;
+        }
+        report.pictures().iter().try_for_each(|picture| picture.save(&out))?;
+        save_heatmaps(whole.heatmaps, &out)?;
+        if let Some(path) = page {
+            write_atomically(path, whole.page()?.as_bytes())?;
+        }
+        Ok((report.text(), out.clone()))
+    })
+}
+
+/// In the folder of the experiment, which keeps what is its own alone.
+fn usual_place(sources: &Sources) -> Result<PathBuf> {
+    let Some(folder) = sources.folder.as_ref().filter(|_| sources.assessed.is_empty()) else {
+        let message = "give --out: a report with assessments does not go into an experiment's folder";
+        return Err(CommandError::Usage(message.into()));
+    };
     let mut out = folder.path().join("report");
-    if let Some(rule) = rule.filter(|rule| *rule != plan.selection) {
+    if let Some(rule) = sources.another_rule()? {
         out = out.join(rule.to_string()); // beside what the plan asks for
     }
-    let rule = rule.unwrap_or(plan.selection);
-    let plan = plan.by(rule)?.in_folder(folder)?;
-    let results = Results::read(&plan, folder)?;
-    let selections = results.select();
-    let mut recorded = Recorded::of(&selections);
-    verify(&results, folder, |result, records| recorded.add(result, records))?;
-    let curves = read_curves(&selections, folder)?;
-    let report = Report::new(&results, &selections, &recorded, &curves);
-
-    write_atomically(&out.join("report.md"), report.markdown().as_bytes())?;
-    for table in report.files() {
-        write_atomically(&out.join(&table.title), &table.to_csv())?;
-    }
-    for Picture { file, panels, .. } in report.pictures() {
-        save(&panels, &out.join(file))?;
-    }
-    let heatmaps = heatmap_pictures(&selections, folder)?;
-    save_heatmaps(&heatmaps, &out)?;
-    if let Some(path) = page {
-        let figures = Figures::draw(&report, &curves, &heatmaps)?;
-        write_atomically(path, html(&report, &figures).as_bytes())?;
-    }
-    Ok((report.text(), out))
+    Ok(out)
 }
 
 pub(super) fn curves(args: &CurvesArgs) -> Result<()> {
@@ -62,14 +70,14 @@ pub(super) fn curves(args: &CurvesArgs) -> Result<()> {
     let mut stdout = std::io::stdout();
     for curves in &all {
         if curves.curves.is_empty() {
-            eprintln!("{}: no finished training with a monitor.csv", curves.environment);
+            note(format_args!("{}: no finished training with a monitor.csv", curves.environment));
             continue;
         }
         for (by, ending) in [(Footing::Episodes, ""), (Footing::Steps, "-steps")] {
             for quantity in Quantity::ALL {
-                let path = out.join(format!("{}-{quantity}{ending}.svg", curves.environment));
+                let path = out.join(format!("{}-{quantity}{ending}", curves.environment));
                 save(&draw_curves(curves, quantity, by), &path)?;
-                writeln!(stdout, "{} and .png", path.display())?;
+                writeln!(stdout, "{}.svg and .png", path.display())?;
             }
         }
     }

@@ -1,20 +1,29 @@
 //! `perturb run`.
 
+use std::collections::HashSet;
 use std::io::{BufRead, Read};
 use std::os::unix::process::CommandExt;
+use std::path::Path;
 use std::process::{Command, ExitCode};
 use std::sync::Mutex;
+use std::time::Duration;
 
 use super::args::{Engine, RunArgs};
 use super::cells::Doing;
+use super::display::{is_quiet, note};
 use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
-use super::{cores, refuse_workers, single_thread, slurm};
+use super::{cores, recurrent, refuse_workers, slurm};
 use perturb_learner::cell::{CellOrder, run_cells};
 use perturb_learner::client::{Address, PrivateServer, Servers};
+use perturb_learner::measure::{MeasureError, measure};
+use perturb_study::files::require_writable;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::scheduler::{CellEvent, Local, Order, OrderedCell, Teller};
-use perturb_study::{Cell, Folder, Grouping, Plan};
+use perturb_study::scheduler::{CellEvent, Local, Order, OrderedCell, Teller, count};
+use perturb_study::{Cell, Folder, Grouping, Plan, Taken, estimates, representatives};
+
+/// How long each group of trainings is measured.
+const MEASURE: Duration = Duration::from_secs(1);
 
 pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
     let folder = Folder::new(&args.out);
@@ -23,6 +32,12 @@ pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
         return work(args, &folder, &stop);
     }
     let plan = Plan::load(&args.plan)?;
+    // What is in the folder of the results, or beside it, has its folder when it is written.
+    let is_made = |page: &Path| {
+        let beside = |folder: &Path| args.out.starts_with(folder) || folder.starts_with(&args.out);
+        !page.exists() && page.parent().is_some_and(beside)
+    };
+    args.html.iter().filter(|page| !is_made(page)).try_for_each(|page| require_writable(page))?;
     if args.engine.engine == Some(Engine::Slurm) {
         return slurm::run(args, plan, &stop);
     }
@@ -100,13 +115,13 @@ fn stop_with_input(stop: &StopFlag) -> Result<()> {
 
 /// Does all cells in worker processes.
 fn all_cells(args: &RunArgs, plan: Plan, folder: &Folder, stop: &StopFlag) -> Result<ExitCode> {
+    recurrent::prepare_for(&plan)?; // the workers are this program
     let grouping = Grouping { most: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
     let (local, addresses) = shared_servers(args)?;
     let local = local.map(Mutex::new);
     let (servers, troubles) = Servers::connect_to_some(&addresses)?;
     troubles.iter().for_each(|trouble| eprintln!("perturb: {trouble}; going on with the other servers"));
     step_limits(&servers, &plan)?; // refuses environments that there are not
-    drop(servers);
     let addresses: Vec<String> = addresses.iter().map(Address::to_string).collect();
     let command = || worker(args, folder, &addresses);
     let server_ended = || {
@@ -115,9 +130,48 @@ fn all_cells(args: &RunArgs, plan: Plan, folder: &Folder, stop: &StopFlag) -> Re
     };
     let mut doing = Doing::begin(args, plan, folder, stop)?;
     while let Some(plan) = doing.next()? {
-        doing.run(&plan, &mut Local::new(&plan, folder, grouping, &command, &server_ended))?;
+        let most = if is_quiet() { Vec::new() } else { most(&servers, &plan, folder, grouping, stop)? };
+        doing.run(&plan, &mut Local::new(&plan, folder, grouping, &command, &server_ended).with_most(most))?;
     }
     doing.end()
+}
+
+/// What cells may take at most that are of kinds which do not begin at once, so that the time that is left can be told: by
+/// a short measurement.
+fn most(
+    servers: &Servers,
+    plan: &Plan,
+    folder: &Folder,
+    grouping: Grouping,
+    stop: &StopFlag,
+) -> Result<Vec<Option<f64>>> {
+    let kind = |cell: usize| (&plan.cells[cell].config.common.environment, plan.cells[cell].method());
+    let left: Vec<usize> =
+        (0..plan.cells.len()).filter(|&cell| !folder.cell(&plan.cells[cell].id).is_settled(true)).collect();
+    let groups = plan.groups(&left, grouping);
+    let first: HashSet<_> = groups.iter().take(grouping.at_a_time).flatten().map(|&cell| kind(cell)).collect();
+    let taken = Taken::read(plan, folder);
+    let unknown = |&cell: &usize| !first.contains(&kind(cell)) && taken.seconds(&plan.cells[cell]).is_none();
+    let unknown: Vec<usize> = left.into_iter().filter(unknown).collect();
+    if unknown.is_empty() {
+        return Ok(Vec::new());
+    }
+    let groups = representatives(plan, &unknown, grouping);
+    note(format_args!("measuring what cells cost that begin later: {}", count(groups.len(), "group")));
+    let measure = |group: Vec<&Cell>| measure(servers, &group, grouping.at_a_time, MEASURE, stop);
+    let measured = match groups.into_iter().map(measure).collect::<Result<Vec<_>, _>>() {
+        Err(MeasureError::Stopped { .. }) => return Ok(Vec::new()), // the run hears of it, too
+        // Settings that come to numbers that are not finite, for instance: the cell will say so, when its turn comes.
+        Err(error) => {
+            tracing::warn!("the time that is left will be told late: {error}");
+            return Ok(Vec::new());
+        }
+        Ok(measured) => measured,
+    };
+    let estimates = estimates(plan, &measured, &step_limits(servers, plan)?);
+    let mut most = vec![None; plan.cells.len()];
+    unknown.into_iter().for_each(|cell| most[cell] = Some(estimates[cell].seconds()));
+    Ok(most)
 }
 
 /// The servers that all workers share.
@@ -140,6 +194,6 @@ fn worker(args: &RunArgs, folder: &Folder, addresses: &[String]) -> Command {
     let plan = if args.cell.is_empty() { folder.plan_path() } else { args.plan.clone() };
     command.arg0("perturb").arg("run").arg(plan).arg("--out").arg(folder.path());
     command.args(["--worker", "--server", &addresses.join(",")]);
-    single_thread::set(&mut command);
+    recurrent::set_one_thread(&mut command);
     command
 }

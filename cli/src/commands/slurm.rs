@@ -5,9 +5,10 @@ use std::time::Duration;
 
 use super::args::RunArgs;
 use super::cells::Doing;
-use super::error::{CommandError, Result, system};
+use super::display::note;
+use super::error::{Result, system};
 use super::plan::step_limits;
-use super::refuse_workers;
+use super::{recurrent, refuse_workers};
 use perturb_learner::client::{Address, Servers};
 use perturb_learner::measure::measure;
 use perturb_study::interrupt::StopFlag;
@@ -21,6 +22,7 @@ const MEASURE: Duration = Duration::from_secs(2);
 const QUEUE_INTERVAL: Duration = Duration::from_secs(15);
 
 pub(super) fn run(args: &RunArgs, plan: Plan, stop: &StopFlag) -> Result<ExitCode> {
+    recurrent::prepare_for(&plan)?; // costs are measured here
     let path = std::path::absolute(&args.out).map_err(system("find out where --out is"))?;
     let folder = Folder::new(&path);
     let options = options(args)?;
@@ -46,7 +48,7 @@ fn options(args: &RunArgs) -> Result<SlurmOptions> {
     }
     let jobs = args.jobs.unwrap_or(1);
     let task = Task {
-        program: std::env::current_exe().map_err(system("find out where this program is"))?,
+        program: recurrent::usual_program()?,
         jobs,
         group: args.group,
         workers: args.server.workers.unwrap_or(jobs),
@@ -67,13 +69,11 @@ fn options(args: &RunArgs) -> Result<SlurmOptions> {
 fn costs(servers: &Servers, plan: &Plan, grouping: Grouping, stop: &StopFlag) -> Result<Vec<f64>> {
     let all: Vec<usize> = (0..plan.cells.len()).collect();
     let groups = representatives(plan, &all, grouping);
-    eprintln!("measuring what cells cost: {} for {} s each", count(groups.len(), "group"), MEASURE.as_secs());
+    let groups_shown = count(groups.len(), "group");
+    note(format_args!("measuring what cells cost: {groups_shown} for {} s each", MEASURE.as_secs()));
     let mut measurements = Vec::new();
     for group in groups {
-        if stop.signal().is_some() {
-            return Err(CommandError::Failed("stopped".into()));
-        }
-        measurements.push(measure(servers, &group, grouping.at_a_time, MEASURE)?);
+        measurements.push(measure(servers, &group, grouping.at_a_time, MEASURE, stop)?);
     }
     let limits = step_limits(servers, plan)?;
     Ok(estimates(plan, &measurements, &limits).iter().map(Estimate::seconds).collect())

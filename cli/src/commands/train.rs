@@ -1,78 +1,111 @@
 //! `perturb train`.
 
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use toml::{Table, Value};
 
+use super::again::{explain, resume_command};
 use super::args::TrainArgs;
-use super::display::Display;
+use super::display::{Display, note};
 use super::error::{CommandError, Result, system};
-use super::{playing_servers, sets, signal_code, threads};
+use super::{playing_servers, recurrent, sets, signal_code, threads};
+use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::logging::{EpisodeFigures, Progress, TimeShares};
 use perturb_learner::training::{Outcome, RunDirectory, is_over, resume, train};
 use perturb_study::Version;
+use perturb_study::files::{create_folder, io, write_atomically};
 use perturb_study::interrupt::StopFlag;
-use perturb_study::settings::{Common, TrainConfig};
+use perturb_study::settings::TrainConfig;
+
+/// What a TOML file can hold.
+const MOST_EPISODES: u64 = i64::MAX as u64;
 
 pub(super) fn run(args: &TrainArgs) -> Result<ExitCode> {
-    match (&args.resume, &args.out) {
-        (Some(path), _) => go_on(args, path),
-        (None, Some(path)) => begin(args, path),
-        (None, None) => Err(CommandError::Usage("give --out DIR for a new run, or --resume DIR".into())),
+    match &args.resume {
+        Some(path) => go_on(args, path),
+        None => begin(args),
     }
 }
 
-/// A new run in `out`.
-fn begin(args: &TrainArgs, out: &Path) -> Result<ExitCode> {
-    let config = TrainConfig::load(args.config.as_deref(), &args.set, flags(args)?)?;
+/// A new run.
+fn begin(args: &TrainArgs) -> Result<ExitCode> {
+    if args.extend.is_some() {
+        let message = "--extend is for a run that is there: give --resume DIR with it, or --episodes for a new one";
+        return Err(CommandError::Usage(message.into()));
+    }
+    let mut config = TrainConfig::load(args.config.as_deref(), &args.set, flags(args)?)?;
+    recurrent::prepare(config.common.architecture, false)?;
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let directory = RunDirectory::choose(out, args.overwrite)?;
+    let chosen = args.out.as_deref().map(|out| RunDirectory::choose(out, args.overwrite)).transpose()?;
     let servers = playing_servers(&args.play)?;
     let environment = servers.environment_seen(&config.common)?; // its refusal lists the names
+    config.common.environment = environment.name.clone(); // however it was spelled
     perturb_study::sets::check("--parameters", &config.common.parameters, &environment)?;
-    let mut display = Display::of_episodes(describe(&config), config.common.episodes);
-    let outcome =
-        train(&servers, &config, &directory, threads(args.threads), &stop, |progress| display.training(progress))?;
+    let directory = match chosen {
+        Some(directory) => directory,
+        None => RunDirectory::choose(&usual_directory(&config)?, false)?,
+    };
+    let mut display = Display::of_training(config.to_string(), &config, 0, 0);
+    let report = |progress: &Progress| display.training(progress);
+    let outcome = train(&servers, &config, &directory, threads(args.threads), &stop, report);
     drop(display);
-    end(&config, &directory, &outcome)
+    end(args, &config, &directory, &outcome.map_err(|error| explain(error, &args.play))?)
 }
 
 /// The run in `path`, from its last checkpoint.
 fn go_on(args: &TrainArgs, path: &Path) -> Result<ExitCode> {
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let (directory, checkpoint, state) = RunDirectory::resume(path)?;
+    let (directory, mut checkpoint, state) = RunDirectory::resume(path)?;
+    recurrent::prepare(checkpoint.state.config.common.architecture, false)?;
+    if let Some(more) = args.extend {
+        let budget = &mut checkpoint.state.config.common.episodes;
+        *budget = budget.saturating_add(more).min(MOST_EPISODES);
+    }
     let config = checkpoint.state.config.clone();
     let (done, budget) = (checkpoint.state.counters.episodes, config.common.episodes);
     if is_over(&config.common, &checkpoint.state.counters, state.history.recent.iter()) {
-        let enough = if done < budget { ", and stopped at its success rate" } else { "" };
-        eprintln!("the training in {} is finished: it has {done} of {budget} episodes{enough}", path.display());
+        let finished = format!("the training in {} is finished: it has {done} of {budget} episodes", path.display());
+        let rate = config.common.stop_at_success;
+        match (done < budget, args.extend) {
+            (true, Some(_)) => {
+                let message = format!("{finished}, and stopped at {rate} % success, which --extend does not change");
+                return Err(CommandError::Usage(message));
+            }
+            (true, None) => note(format_args!("{finished}, and stopped at {rate} % success")),
+            (false, _) => note(format_args!("{finished}; train on with --extend EPISODES")),
+        }
         print_policy(&directory)?;
         return Ok(ExitCode::SUCCESS);
     }
-    eprintln!("{}: going on after {done} of {budget} episodes", describe(&config));
+    note(format_args!("{config}: going on after {done} of {budget} episodes"));
     let servers = playing_servers(&args.play)?;
-    let mut display = Display::of_episodes(describe(&config), budget);
+    let mut display = Display::of_training(config.to_string(), &config, done, checkpoint.state.counters.timesteps);
     let report = |progress: &Progress| display.training(progress);
-    let outcome = resume(&servers, &directory, (checkpoint, state), threads(args.threads), &stop, report)?;
+    let outcome = resume(&servers, &directory, (checkpoint, state), threads(args.threads), &stop, report);
     drop(display);
-    end(&config, &directory, &outcome)
+    // The budget is the larger one as soon as a checkpoint has it.
+    let saved = args.extend.and_then(|_| Checkpoint::load(path).ok());
+    if saved.is_some_and(|saved| saved.state.config == config) {
+        write_atomically(&path.join("config.toml"), config.to_toml().as_bytes())?;
+    }
+    end(args, &config, &directory, &outcome.map_err(|error| explain(error, &args.play))?)
 }
 
 /// Says what a training came to.
-fn end(config: &TrainConfig, directory: &RunDirectory, outcome: &Outcome) -> Result<ExitCode> {
+fn end(args: &TrainArgs, config: &TrainConfig, directory: &RunDirectory, outcome: &Outcome) -> Result<ExitCode> {
     if !config.settings.is_random() {
         summarise(&outcome.progress);
     }
     match outcome.signal {
         Some(number) => {
-            eprintln!(
-                "stopped by signal {number} after {} of {} episodes; go on with: perturb train --resume {}",
+            note(format_args!(
+                "stopped by signal {number} after {} of {} episodes; go on with: {}",
                 outcome.progress.episodes,
                 config.common.episodes,
-                directory.path().display()
-            );
+                resume_command(directory.path(), &args.play)
+            ));
             Ok(signal_code(number))
         }
         None => {
@@ -88,10 +121,20 @@ fn print_policy(directory: &RunDirectory) -> std::io::Result<()> {
     writeln!(out, "test it: perturb evaluate --checkpoint {}", directory.path().display())
 }
 
-/// What is trained, in a few words.
-pub(super) fn describe(config: &TrainConfig) -> String {
-    let Common { environment, version, .. } = &config.common;
-    format!("{environment} {version} {}", config.method())
+/// Makes the folder of a run that nobody gave a place: another one for each, also of those that begin in the same second.
+fn usual_directory(config: &TrainConfig) -> Result<PathBuf> {
+    let runs = Path::new("runs");
+    create_folder(runs)?;
+    let time = chrono::Utc::now().format("%Y%m%d-%H%M%S");
+    let name = format!("{}-{}-{time}", config.common.environment, config.settings.name());
+    let names = std::iter::once(name.clone()).chain((2..).map(|count: u32| format!("{name}-{count}")));
+    for path in names.map(|name| runs.join(name)) {
+        match std::fs::create_dir(&path) {
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
+            made => return Ok(made.map(|()| path.clone()).map_err(io("create", &path))?),
+        }
+    }
+    unreachable!("there is a number for each run")
 }
 
 /// A line of figures, with the shares of the time.
@@ -103,11 +146,14 @@ pub(super) fn summarise(progress: &Progress) {
         }
         None => String::new(),
     };
-    eprintln!("{} episodes, {} steps in {:.1} s{recent}", progress.episodes, progress.timesteps, progress.elapsed);
-    eprintln!(
+    note(format_args!(
+        "{} episodes, {} steps in {:.1} s{recent}",
+        progress.episodes, progress.timesteps, progress.elapsed
+    ));
+    note(format_args!(
         "{:.0} steps/s: {acting:.0} % acting, {waiting:.0} % waiting for the server, {updating:.0} % updating",
         progress.fps()
-    );
+    ));
 }
 
 /// The settings among the flags.

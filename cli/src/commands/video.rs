@@ -4,26 +4,37 @@ use std::io::Write;
 
 use super::args::VideoArgs;
 use super::display::Display;
-use super::error::{Result, system};
+use super::error::{CommandError, Result, system};
 use super::{servers, sets};
-use crate::video::{Footage, VideoFile, VideoOptions, film};
+use crate::video::{Footage, Format, VideoFile, VideoOptions, film};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::table::Table;
 
 pub(super) fn run(args: &VideoArgs) -> Result<()> {
+    let is_sheet = Format::of(&args.out)? == Format::Png;
+    if is_sheet && args.fps.is_some() {
+        return Err(CommandError::Usage(
+            "--fps is how fast a film is shown: leave it out, or write a .gif or .mp4".into(),
+        ));
+    }
     let file = VideoFile::create(&args.out)?;
     let checkpoint = Checkpoint::load(&args.checkpoint)?;
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = servers(&args.server)?;
+    let width = args.width.unwrap_or(if is_sheet { 240 } else { 480 });
+    let sets = args.version.iter().map(|&version| sets::drawn(version, &args.parameters));
     let options = VideoOptions {
-        set: sets::drawn(args.version, &args.parameters)?,
+        sets: sets.collect::<Result<_>>()?,
         episodes: args.episodes,
         seed: args.seed.unwrap_or(checkpoint.state.config.common.seed),
-        size: (args.width, args.height),
+        size: (width, args.height.unwrap_or(width)),
         fps: args.fps,
+        every: 1,
     };
-    let mut display = Display::of_episodes(format!("filming on {}", options.set.name), args.episodes);
+    let names: Vec<&str> = options.sets.iter().map(|set| &*set.name).collect();
+    let total = args.episodes.saturating_mul(names.len() as u64);
+    let mut display = Display::of_episodes(format!("filming on {}", names.join(", ")), total);
     let footage = film(&servers, &checkpoint, &options, file, &stop, &mut |episodes| display.episodes(episodes))?;
     drop(display);
     let mut out = std::io::stdout();
@@ -33,12 +44,19 @@ pub(super) fn run(args: &VideoArgs) -> Result<()> {
         .number("return", |(_, episode)| format!("{:.2}", episode.episode_return))
         .number("steps", |(_, episode)| episode.length)
         .text("success", |(_, episode)| if episode.success { "yes" } else { "no" })
+        .text("on", |(_, episode)| episode.set.clone())
         .text("parameters", |(_, episode)| {
             let parameters = episode.parameters.iter().map(|(name, value)| format!("{name}={value}"));
             parameters.collect::<Vec<_>>().join(" ")
         });
     writeln!(out, "{}", table.build().to_text())?;
-    Ok(writeln!(out, "{}: {}", args.out.display(), figures(&footage))?)
+    let what = if is_sheet { sheet(&footage) } else { figures(&footage) };
+    Ok(writeln!(out, "{}: {what}", args.out.display())?)
+}
+
+/// What a contact sheet has.
+fn sheet(Footage { frames, size: (width, height), .. }: &Footage) -> String {
+    format!("moments out of {frames} frames, on {width} × {height} pixels")
 }
 
 /// How many frames there are, how fast they are shown, and how fast they were made.

@@ -10,7 +10,8 @@ use super::VideoError;
 use super::encode::Encode;
 use super::gif::{self, GifEncoder};
 use super::mp4::{self, Mp4Encoder};
-use perturb_study::files::{create_folder, io};
+use super::sheet::{Grid, SheetEncoder};
+use perturb_study::files::{io, require_writable};
 
 /// How a video is encoded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -19,6 +20,8 @@ pub enum Format {
     Gif,
     /// `.mp4`: H.264, by the program ffmpeg.
     Mp4,
+    /// `.png`: a contact sheet, with some frames of each episode; needs nothing.
+    Png,
 }
 
 impl Format {
@@ -31,6 +34,7 @@ impl Format {
         match ending.as_ref().and_then(|ending| ending.to_str()) {
             Some("gif") => Ok(Self::Gif),
             Some("mp4") => Ok(Self::Mp4),
+            Some("png") => Ok(Self::Png),
             _ => Err(VideoError::Extension { path: path.to_owned() }),
         }
     }
@@ -45,21 +49,18 @@ pub struct VideoFile {
 }
 
 impl VideoFile {
-    /// Makes sure that `path` can be written before anything is played. A folder that is missing is created; a video that
-    /// is there is replaced at the end.
+    /// Makes sure that `path` can be written before anything is played. A video that is there is
+    /// replaced at the end.
     ///
     /// # Errors
     /// [`VideoError::Extension`], [`VideoError::NoFfmpeg`] and [`VideoError::File`].
     pub fn create(path: &Path) -> Result<Self, VideoError> {
         let format = Format::of(path)?;
-        if path.is_dir() {
-            return Err(io("write", path)(std::io::ErrorKind::IsADirectory.into()).into());
-        }
+        require_writable(path)?;
         if format == Format::Mp4 {
             mp4::find_ffmpeg()?;
         }
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        create_folder(folder)?;
         let temporary = tempfile::Builder::new()
             .prefix(".perturb-video-")
             .permissions(fs::Permissions::from_mode(0o666)) // as any file; the umask takes its part
@@ -72,20 +73,22 @@ impl VideoFile {
     pub fn frame_seconds(&self, fps: f64) -> f64 {
         match self.format {
             Format::Gif => f64::from(gif::delay(1.0 / fps)) / 100.0,
-            Format::Mp4 => 1.0 / fps,
+            Format::Mp4 | Format::Png => 1.0 / fps,
         }
     }
 
     /// Begins to encode frames of `size`, width and height in pixels, both even. One is shown for 1 / `fps` seconds, or for
-    /// a whole multiple of it; in a GIF for whole hundredths of a second.
+    /// a whole multiple of it; in a GIF for whole hundredths of a second. A contact sheet has a place for each episode of
+    /// `grid`.
     ///
     /// # Errors
     /// [`VideoError::Encode`].
-    pub fn begin(self, size: (u32, u32), fps: f64) -> Result<VideoWriter, VideoError> {
+    pub fn begin(self, size: (u32, u32), fps: f64, grid: Grid) -> Result<VideoWriter, VideoError> {
         let (path, failed) = (self.temporary.path(), encoding(&self.path));
         let encoder: Box<dyn Encode> = match self.format {
             Format::Gif => Box::new(GifEncoder::new(path, size, fps).map_err(failed)?),
             Format::Mp4 => Box::new(Mp4Encoder::new(path, size, fps).map_err(failed)?),
+            Format::Png => Box::new(SheetEncoder::new(path, size, grid).map_err(failed)?),
         };
         Ok(VideoWriter { encoder, file: self })
     }
@@ -99,12 +102,22 @@ pub struct VideoWriter {
 }
 
 impl VideoWriter {
+    /// Of the video, width and height in pixels.
+    pub fn size(&self) -> (u32, u32) {
+        self.encoder.size()
+    }
+
     /// Adds a frame `[height, width, 3]` that is shown for about so many `seconds`, but at least as long as any.
     ///
     /// # Errors
     /// [`VideoError::Encode`].
     pub fn write(&mut self, frame: &[u8], seconds: f64) -> Result<(), VideoError> {
         self.encoder.write(frame, seconds).map_err(encoding(&self.file.path))
+    }
+
+    /// The frames since the last call are an episode.
+    pub fn end_episode(&mut self) {
+        self.encoder.end_episode();
     }
 
     /// Completes the video and puts it into its place.
@@ -130,7 +143,9 @@ mod tests {
 
     #[test]
     fn the_ending_says_the_format() {
-        for (name, format) in [("a.gif", Format::Gif), ("a/b.c.mp4", Format::Mp4), ("A.GIF", Format::Gif)] {
+        for (name, format) in
+            [("a.gif", Format::Gif), ("a/b.c.mp4", Format::Mp4), ("A.GIF", Format::Gif), ("a.png", Format::Png)]
+        {
             assert_eq!(Format::of(Path::new(name)).unwrap(), format, "{name}");
         }
         for name in ["a", "a.avi", ".gif", "gif", "a.mp4.txt"] {
@@ -142,17 +157,19 @@ mod tests {
     fn a_video_that_is_not_finished_leaves_nothing() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("new/a.gif");
+        assert!(VideoFile::create(&path).unwrap_err().to_string().contains("mkdir -p"), "no folder is made");
+        fs::create_dir(folder.path().join("new")).unwrap();
         let frame = [7; 2 * 2 * 3];
         let names = || fs::read_dir(folder.path().join("new")).unwrap().count();
 
-        let mut writer = VideoFile::create(&path).unwrap().begin((2, 2), 10.0).unwrap();
+        let mut writer = VideoFile::create(&path).unwrap().begin((2, 2), 10.0, Grid { sets: 1, episodes: 1 }).unwrap();
         writer.write(&frame, 0.1).unwrap();
         assert_eq!((names(), path.exists()), (1, false), "a hidden file");
         drop(writer);
         assert_eq!(names(), 0);
 
         fs::write(&path, "the one before").unwrap();
-        let mut writer = VideoFile::create(&path).unwrap().begin((2, 2), 10.0).unwrap();
+        let mut writer = VideoFile::create(&path).unwrap().begin((2, 2), 10.0, Grid { sets: 1, episodes: 1 }).unwrap();
         writer.write(&frame, 0.1).unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"the one before");
         writer.finish().unwrap();
@@ -167,7 +184,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         fs::write(folder.path().join("file"), "").unwrap();
         fs::create_dir(folder.path().join("folder.gif")).unwrap();
-        for (name, part) in [("file/a.gif", "file"), ("folder.gif", "is a directory"), ("a.avi", "a.avi")] {
+        for (name, part) in [("file/a.gif", "file"), ("folder.gif", "it is a folder"), ("a.avi", "a.avi")] {
             let error = VideoFile::create(&folder.path().join(name)).unwrap_err().to_string();
             assert!(error.contains(part), "{error}");
         }

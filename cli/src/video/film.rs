@@ -3,10 +3,10 @@
 use std::time::{Duration, Instant};
 
 use super::panel::{Panel, Shown, ShownEnding, parameter};
-use super::{VideoError, VideoFile, VideoWriter};
-use perturb_learner::checkpoint::{Checkpoint, EnvironmentSummary, State};
+use super::{Grid, VideoError, VideoFile, VideoWriter};
+use perturb_learner::checkpoint::{Checkpoint, State};
 use perturb_learner::client::{BegunEpisode, ClientError, Picture, Servers, Single, StepReply};
-use perturb_learner::evaluation::{TestError, check_unchanged, open_options, player};
+use perturb_learner::evaluation::{TestError, open_options};
 use perturb_learner::proto;
 use perturb_policy::{Ended, Player};
 use perturb_study::interrupt::StopFlag;
@@ -18,9 +18,9 @@ const HOLD: f64 = 1.0;
 /// What to film.
 #[derive(Clone, Debug)]
 pub struct VideoOptions {
-    /// Where parameters come from: a version, or a set whose parameters are drawn.
-    pub set: TestSet,
-    /// How many episodes, at least 1.
+    /// Where parameters come from, at least one: versions, or sets whose parameters are drawn.
+    pub sets: Vec<TestSet>,
+    /// How many episodes on each, at least 1.
     pub episodes: u64,
     /// Fixes all randomness.
     pub seed: u64,
@@ -28,11 +28,15 @@ pub struct VideoOptions {
     pub size: (u32, u32),
     /// Frames shown in a second, more than 0; `None` is real time.
     pub fps: Option<f64>,
+    /// Steps from one frame to the next, at least 1; the first state and the last are always shown.
+    pub every: u32,
 }
 
 /// An episode that was filmed.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Filmed {
+    /// What set its parameters are from.
+    pub set: String,
     /// The parameters' names and values, in the catalogue's order.
     pub parameters: Vec<(String, f64)>,
     /// The undiscounted sum of its rewards.
@@ -46,11 +50,11 @@ pub struct Filmed {
 /// What was filmed, and how fast.
 #[derive(Clone, Debug, Default)]
 pub struct Footage {
-    /// In order.
+    /// In order: those of the first set, of the second, …
     pub episodes: Vec<Filmed>,
-    /// One for each step and one for each episode's start.
+    /// One for each step, or for some of them, and one for each episode's start.
     pub frames: u64,
-    /// Of a frame, width and height in pixels.
+    /// Of the video, width and height in pixels.
     pub size: (u32, u32),
     /// Simulated seconds that pass in one second of the video: 1 is real time.
     pub speed: f64,
@@ -62,11 +66,11 @@ pub struct Footage {
     pub writing: Duration,
 }
 
-/// Plays `options.episodes` episodes with the policy of `checkpoint`, sampled actions and frozen statistics, and writes
-/// them to `file`: a frame of the start of each episode and one after each step. Calls `report` with the number of
-/// episodes done.
+/// Plays `options.episodes` episodes on each set with the policy of `checkpoint`, sampled actions and frozen statistics,
+/// and writes them to `file`: a frame of the start of each episode and one after each step. Calls `report` with the number
+/// of episodes done.
 ///
-/// It is environment 0 of a test with the same seed: what is filmed of one episode is what a test of one episode sees. Of
+/// On each set it is environment 0 of a test with the same seed: what is filmed of one episode is what a test of one episode sees. Of
 /// a policy that was trained in trials all episodes of a trial are filmed, and the policy remembers them.
 ///
 /// # Errors
@@ -80,28 +84,40 @@ pub fn film(
     report: &mut dyn FnMut(u64),
 ) -> Result<Footage, VideoError> {
     let start = Instant::now();
-    let mut film = Film::open(servers, checkpoint, options)?;
-    film.footage.speed = film.environment.control_timestep / file.frame_seconds(film.fps);
-    let mut writer = file.begin(film.footage.size, film.fps)?;
-    loop {
-        if let Some(signal) = stop.signal() {
-            return Err(TestError::Stopped { signal }.into());
-        }
-        // The next step is on its way before the picture of this state is there: server and learner work at once.
-        let next = film.request_next()?;
-        film.expose(&mut writer)?;
-        match next {
-            Next::Step => film.step()?,
-            Next::Episode => film.begin()?,
-            Next::Nothing => break,
-        }
-        report(film.footage.episodes.len() as u64);
+    let (mut footage, mut place) = (Footage::default(), Place::Empty(file));
+    for set in &options.sets {
+        let mut film = Film::open(servers, checkpoint, options, set, footage)?;
+        let mut writer = place.begin(&mut film)?;
+        film.run(&mut writer, stop, report)?;
+        (footage, place) = (film.footage, Place::Begun(writer));
     }
-    let completing = Instant::now();
-    writer.finish()?;
-    film.footage.writing += completing.elapsed();
-    film.footage.total = start.elapsed();
-    Ok(film.footage)
+    if let Place::Begun(writer) = place {
+        let completing = Instant::now();
+        writer.finish()?;
+        footage.writing += completing.elapsed();
+    }
+    footage.total = start.elapsed();
+    Ok(footage)
+}
+
+/// Where frames go, whose size the first film knows.
+enum Place {
+    Empty(VideoFile),
+    Begun(VideoWriter),
+}
+
+impl Place {
+    fn begin(self, film: &mut Film<'_>) -> Result<VideoWriter, VideoError> {
+        let file = match self {
+            Self::Empty(file) => file,
+            Self::Begun(writer) => return Ok(writer),
+        };
+        film.footage.speed = film.frame_seconds() / file.frame_seconds(film.fps);
+        let grid = Grid { sets: film.options.sets.len(), episodes: film.options.episodes as usize };
+        let writer = file.begin(film.panel.size(), film.fps, grid)?;
+        film.footage.size = writer.size();
+        Ok(writer)
+    }
 }
 
 /// What follows a state.
@@ -114,6 +130,9 @@ enum Next {
 /// A policy that acts and is filmed.
 struct Film<'a> {
     options: &'a VideoOptions,
+    set: &'a TestSet,
+    /// Episodes that the sets before have.
+    before: usize,
     state: &'a State,
     single: Single<'a>,
     environment: proto::Environment,
@@ -123,6 +142,8 @@ struct Film<'a> {
     begun: BegunEpisode,
     panel: Panel,
     shown: Shown,
+    /// Whether a picture of the present state was asked for, and of the next one.
+    pictured: [bool; 2],
     /// The last picture.
     last: Option<Picture>,
     frame: Vec<u8>,
@@ -132,33 +153,42 @@ struct Film<'a> {
 
 impl<'a> Film<'a> {
     /// At the start of the first episode, whose picture has been asked for.
-    fn open(servers: &'a Servers, checkpoint: &'a Checkpoint, options: &'a VideoOptions) -> Result<Self, VideoError> {
+    fn open(
+        servers: &'a Servers,
+        checkpoint: &'a Checkpoint,
+        options: &'a VideoOptions,
+        set: &'a TestSet,
+        footage: Footage,
+    ) -> Result<Self, VideoError> {
         let state = &checkpoint.state;
-        let open = open_options(&state.config, &options.set, options.seed);
+        let open = open_options(&state.config, set, options.seed);
         let mut reply = StepReply::default();
         let (single, begun) = Single::open(servers, &open, &mut reply.observations)?;
-        check_unchanged(checkpoint, EnvironmentSummary::of(single.environment()))?;
+        checkpoint.state.check_unchanged(single.environment()).map_err(TestError::from)?;
         let environment = single.environment().clone();
-        options.set.check(&environment).map_err(TestError::Value)?;
-        let mut player = player(checkpoint, 1, open.seed).map_err(TestError::Numbers)?;
+        set.check(&environment).map_err(TestError::Value)?;
+        let mut player = checkpoint.player(1, open.seed, 0).map_err(TestError::Numbers)?;
         player.begin(&reply.observations, None).map_err(TestError::Numbers)?;
         let title = (
-            format!("{} {}", environment.name, options.set.name),
+            format!("{} {}", environment.name, set.name),
             format!("{}, trained on {}", state.config.method(), state.config.common.trained_on()),
         );
         let panel = Panel::new(options.size, title, environment.parameters.len())?;
         let mut film = Self {
             options,
+            set,
+            before: footage.episodes.len(),
             state,
             single,
             player,
             ended: Vec::new(),
             reply,
             shown: Shown::default(),
+            pictured: [true, true],
             last: None,
             frame: Vec::new(),
-            fps: options.fps.unwrap_or(1.0 / environment.control_timestep),
-            footage: Footage { size: panel.size(), ..Footage::default() },
+            fps: options.fps.unwrap_or(1.0 / (f64::from(options.every) * environment.control_timestep)),
+            footage,
             begun,
             panel,
             environment,
@@ -168,19 +198,55 @@ impl<'a> Film<'a> {
         Ok(film)
     }
 
-    /// Asks for what follows the present state, and for a picture of that.
+    fn run(
+        &mut self,
+        writer: &mut VideoWriter,
+        stop: &StopFlag,
+        report: &mut dyn FnMut(u64),
+    ) -> Result<(), VideoError> {
+        loop {
+            if let Some(signal) = stop.signal() {
+                return Err(TestError::Stopped { signal }.into());
+            }
+            // The next step is on its way before the picture of this state is there: server and learner work at once.
+            let next = self.request_next()?;
+            self.expose(writer)?;
+            match next {
+                Next::Step => self.step()?,
+                Next::Episode => self.begin()?,
+                Next::Nothing => return Ok(()),
+            }
+            report(self.footage.episodes.len() as u64);
+        }
+    }
+
+    /// Episodes on this set.
+    fn episodes(&self) -> usize {
+        self.footage.episodes.len() - self.before
+    }
+
+    /// How much simulated time a frame stands for, s.
+    fn frame_seconds(&self) -> f64 {
+        f64::from(self.options.every) * self.environment.control_timestep
+    }
+
+    /// Asks for what follows the present state, and for a picture of that if it is to be shown.
     fn request_next(&mut self) -> Result<Next, VideoError> {
+        self.pictured[1] = true;
         let next = if self.shown.ending.is_none() {
             let action = self.player.act().map_err(TestError::Numbers)?;
             self.single.request_step(action)?;
+            self.pictured[1] = (self.shown.step + 1).is_multiple_of(self.options.every);
             Next::Step
-        } else if (self.footage.episodes.len() as u64) < self.options.episodes {
+        } else if (self.episodes() as u64) < self.options.episodes {
             self.single.request_reset()?;
             Next::Episode
         } else {
             return Ok(Next::Nothing);
         };
-        self.request_picture()?;
+        if self.pictured[1] {
+            self.request_picture()?;
+        }
         Ok(next)
     }
 
@@ -189,8 +255,11 @@ impl<'a> Film<'a> {
         Ok(self.single.request_picture(width, height)?)
     }
 
-    /// Takes the picture of the present state, and writes its frame.
+    /// Takes the picture of the present state, if one was asked for, and writes its frame.
     fn expose(&mut self, writer: &mut VideoWriter) -> Result<(), VideoError> {
+        if !self.pictured[0] {
+            return Ok(());
+        }
         let asked = Instant::now();
         let picture = match (self.single.picture(), &self.last) {
             // Physics that diverged ends its episode and cannot be drawn: the picture before it stays.
@@ -203,7 +272,11 @@ impl<'a> Film<'a> {
         };
         let came = Instant::now();
         self.panel.compose(&picture, &self.shown, &mut self.frame)?;
-        writer.write(&self.frame, if self.shown.ending.is_some() { HOLD } else { 0.0 })?;
+        let is_end = self.shown.ending.is_some();
+        writer.write(&self.frame, if is_end { HOLD } else { 0.0 })?;
+        if is_end {
+            writer.end_episode();
+        }
         self.footage.frames += 1;
         self.last = Some(picture);
         self.footage.waiting += came - asked;
@@ -216,6 +289,7 @@ impl<'a> Film<'a> {
         let asked = Instant::now();
         self.single.stepped(&mut self.reply)?;
         self.footage.waiting += asked.elapsed();
+        self.pictured[0] = self.pictured[1];
         let Self { reply, shown, player, ended, .. } = self;
         player.observe(&reply.all().outcome(ended), None).map_err(TestError::Numbers)?;
         shown.step += 1;
@@ -227,11 +301,16 @@ impl<'a> Film<'a> {
         shown.ending = Some(ShownEnding { success: end.success, terminated: end.terminated, truncated });
         let names = self.environment.parameters.iter().map(|parameter| parameter.name.clone());
         self.footage.episodes.push(Filmed {
+            set: self.set.name.clone(),
             parameters: names.zip(self.begun.parameters.iter().copied()).collect(),
             episode_return: end.episode_return,
             length: end.length,
             success: end.success,
         });
+        if !self.pictured[0] {
+            self.request_picture()?; // nothing else has been asked for yet
+            self.pictured[0] = true;
+        }
         Ok(())
     }
 
@@ -239,6 +318,7 @@ impl<'a> Film<'a> {
     fn begin(&mut self) -> Result<(), VideoError> {
         let asked = Instant::now();
         self.begun = self.single.begun(&mut self.reply.observations)?;
+        self.pictured[0] = true;
         self.player.see(0, &self.reply.observations).map_err(TestError::Numbers)?;
         self.footage.waiting += asked.elapsed();
         self.announce();
@@ -247,7 +327,7 @@ impl<'a> Film<'a> {
 
     /// Shows the episode that has begun.
     fn announce(&mut self) {
-        let (number, episodes) = (self.footage.episodes.len() + 1, self.options.episodes);
+        let (number, episodes) = (self.episodes() + 1, self.options.episodes);
         let trial = match self.state.config.settings.episodes_per_trial() {
             1 => String::new(),
             _ => format!(", trial {}", self.begun.trial_index + 1),

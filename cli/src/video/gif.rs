@@ -40,6 +40,10 @@ impl GifEncoder {
 }
 
 impl Encode for GifEncoder {
+    fn size(&self) -> (u32, u32) {
+        (self.size.0.into(), self.size.1.into())
+    }
+
     fn write(&mut self, frame: &[u8], seconds: f64) -> io::Result<()> {
         let (width, height) = self.size;
         let expected = usize::from(width) * usize::from(height) * 3;

@@ -1,7 +1,8 @@
 //! Videos of a policy that acts: `perturb video`.
 //!
 //! [`film`] plays the episodes and asks the server for a picture of every state; `panel` writes below it which episode
-//! it is and how it goes; [`VideoFile`] is where the frames end up, through `gif` or `mp4`.
+//! it is and how it goes; [`VideoFile`] is where the frames end up, through `gif`, `mp4` or, some of them side by side,
+//! `sheet`.
 
 mod encode;
 mod file;
@@ -9,12 +10,14 @@ mod film;
 mod gif;
 mod mp4;
 mod panel;
+mod sheet;
 
 use std::path::PathBuf;
 
-pub use file::{VideoFile, VideoWriter};
+pub use file::{Format, VideoFile, VideoWriter};
 pub use film::{Footage, VideoOptions, film};
 pub use panel::PIXELS;
+pub use sheet::Grid;
 
 use perturb_learner::evaluation::TestError;
 use perturb_study::files::FileError;
@@ -29,7 +32,7 @@ pub enum VideoError {
     #[error(transparent)]
     Test(#[from] TestError),
     /// The file's name does not say what to write.
-    #[error("`{}` is not a video: expected a name that ends in .mp4 or .gif", path.display())]
+    #[error("`{}` is not a video: expected a name that ends in .mp4 or .gif, or in .png for a contact sheet", path.display())]
     Extension { path: PathBuf },
     /// The program that encodes .mp4 is missing, or cannot do it.
     #[error(

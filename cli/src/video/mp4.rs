@@ -34,16 +34,17 @@ pub(super) struct Mp4Encoder {
     child: Child,
     /// What ffmpeg says: in a file, since nobody reads a pipe while frames are written.
     words: File,
+    size: (u32, u32),
     fps: f64,
 }
 
 impl Mp4Encoder {
-    pub(super) fn new(path: &Path, (width, height): (u32, u32), fps: f64) -> io::Result<Self> {
+    pub(super) fn new(path: &Path, size: (u32, u32), fps: f64) -> io::Result<Self> {
         let words = tempfile::tempfile()?;
-        let (size, fps_text) = (format!("{width}x{height}"), fps.to_string());
+        let (size_text, fps_text) = (format!("{}x{}", size.0, size.1), fps.to_string());
         let child = Command::new(PROGRAM)
             .args(["-hide_banner", "-loglevel", "error", "-y"])
-            .args(["-f", "rawvideo", "-pixel_format", "rgb24", "-video_size", &size, "-framerate", &fps_text])
+            .args(["-f", "rawvideo", "-pixel_format", "rgb24", "-video_size", &size_text, "-framerate", &fps_text])
             .args(["-i", "pipe:0"])
             // What every player can show; RGB is turned into the colours of HD video, and says so.
             .args(["-c:v", "libx264", "-crf", QUALITY, "-pix_fmt", "yuv420p", "-vf", "scale=out_color_matrix=bt709"])
@@ -58,7 +59,7 @@ impl Mp4Encoder {
             .process_group(0)
             .spawn()
             .map_err(|error| io::Error::other(format!("`{PROGRAM}` cannot be started: {error}")))?;
-        Ok(Self { child, words, fps })
+        Ok(Self { child, words, size, fps })
     }
 
     /// Why ffmpeg ended.
@@ -75,6 +76,10 @@ impl Mp4Encoder {
 }
 
 impl Encode for Mp4Encoder {
+    fn size(&self) -> (u32, u32) {
+        self.size
+    }
+
     fn write(&mut self, frame: &[u8], seconds: f64) -> io::Result<()> {
         // Frames of H.264 all take the same time; equal ones take no room.
         for _ in 0..((seconds * self.fps).round() as u64).max(1) {

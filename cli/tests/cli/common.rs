@@ -14,6 +14,7 @@ use tempfile::TempDir;
 pub const LIMIT: Duration = Duration::from_secs(300);
 
 pub fn server(workers: usize) -> PrivateServer {
+    perturb_torch::register(); // for what trains on it in this process
     PrivateServer::start(Some(workers)).unwrap_or_else(|error| panic!("{error}"))
 }
 
@@ -22,6 +23,7 @@ pub fn addresses(servers: &[PrivateServer]) -> Vec<Address> {
 }
 
 pub fn config(text: &str) -> TrainConfig {
+    perturb_torch::register();
     TrainConfig::from_table("the test", text.parse().expect("TOML")).unwrap_or_else(|error| panic!("{error}"))
 }
 

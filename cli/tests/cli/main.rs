@@ -5,8 +5,12 @@ mod common;
 
 mod end_to_end;
 mod experiments;
+mod misuse;
 mod processors;
+mod programs;
+mod recurrent;
 mod resume;
+mod serve;
 mod servers;
 mod sets;
 mod slurm;

@@ -210,7 +210,7 @@ fn what_no_environment_has_is_refused_before_anything_begins() {
         ("mass = 0.2", "mass = -1", "mass of CartPole is -1, but must be within"),
         ("steps=15", "metres=15", "metres=15, but must be one of steps"),
         ("steps=15", "steps=201", "at most 200, the step limit"),
-        ("CartPole = 'steps", "Cartpole = 'steps", "`Cartpole`, but must be one of CartPole"),
+        ("CartPole = 'steps", "CartPool = 'steps", "`CartPool`, but must be one of CartPole"),
         ("length = '0.7..0.8,0.9..1.0'\nmass = 0.2", "version = 'R'", "without parameters"),
         ("test_versions = ['E'", "test_versions = ['X'", "`X`"),
         ("rows.csv", "../rows.csv", "not the name of a file"),

@@ -121,9 +121,13 @@ fn a_gif_is_shown_as_fast_as_was_asked_for() {
 
 /// Plays with the library, into a file that is thrown away.
 fn filmed(servers: &Servers, checkpoint: &Checkpoint, version: Version, episodes: u64) -> Footage {
+    filmed_every(1, servers, checkpoint, version, episodes)
+}
+
+fn filmed_every(every: u32, servers: &Servers, checkpoint: &Checkpoint, version: Version, episodes: u64) -> Footage {
     let folder = tempfile::tempdir().expect("a folder");
     let file = VideoFile::create(&folder.path().join("a.gif")).expect("a file");
-    let options = VideoOptions { set: version.into(), episodes, seed: 5, size: (240, 240), fps: None };
+    let options = VideoOptions { sets: vec![version.into()], episodes, seed: 5, size: (240, 240), fps: None, every };
     film(servers, checkpoint, &options, file, &StopFlag::default(), &mut |_| {})
         .unwrap_or_else(|error| panic!("{error}"))
 }
@@ -163,11 +167,58 @@ fn each_episode_has_its_own_parameters() {
     let summary = filmed(&servers, &checkpoint, Version::E, 3);
     let steps: u64 = summary.episodes.iter().map(|episode| u64::from(episode.length)).sum();
     assert_eq!(summary.frames, steps + 3);
+    let thinned = filmed_every(6, &servers, &checkpoint, Version::E, 3);
+    assert_eq!(thinned.episodes, summary.episodes, "what is played does not depend on what is shown");
+    let shown = |steps: u32| 1 + u64::from(steps.div_ceil(6)); // the start, every sixth state, the last one
+    assert_eq!(thinned.frames, thinned.episodes.iter().map(|episode| shown(episode.length)).sum::<u64>());
     let forces: Vec<f64> = summary.episodes.iter().map(|episode| episode.parameters[0].1).collect();
     assert!(forces[0] != forces[1] && forces[1] != forces[2], "{forces:?}");
     let extreme = |force: &f64| (1.0..=5.0).contains(force) || (15.0..=20.0).contains(force);
     assert!(forces.iter().all(extreme), "{forces:?}");
     assert_eq!(summary.episodes[0].parameters[0].0, "force");
+}
+
+#[test]
+fn a_contact_sheet_has_the_versions_side_by_side() {
+    let server = server(1);
+    let (out, _) = trained(&server, CART_POLE);
+    let folder = tempfile::tempdir().expect("a folder");
+    let address = server.address().to_string();
+    let sheet = |name: &str, versions: &str| {
+        let file = folder.path().join(name);
+        let more = ["--server", &address, "--version", versions, "--episodes", "2", "--seed", "4"];
+        let stdout = done(video(&out, &file, &more));
+        let file = std::io::BufReader::new(File::open(file).expect("a file"));
+        let mut reader = png::Decoder::new(file).read_info().expect("a PNG");
+        let mut pixels = vec![0; reader.output_buffer_size().expect("a size")];
+        reader.next_frame(&mut pixels).expect("a whole PNG");
+        let (width, height) = (reader.info().width as usize, reader.info().height as usize);
+        assert!(stdout.contains(&format!(" frames, on {width} × {height} pixels")), "{stdout}");
+        (stdout, pixels.chunks(3 * width).map(<[u8]>::to_vec).collect::<Vec<_>>())
+    };
+    let (stdout, both) = sheet("a.png", "D,E");
+    assert_eq!(lengths(&stdout).len(), 4, "{stdout}");
+    let column = |name: &str| stdout.lines().skip(1).filter(|row| row.split_whitespace().nth(4) == Some(name)).count();
+    assert_eq!((column("D"), column("E")), (2, 2), "{stdout}");
+    let across = 2 * 3 * 240 + 8;
+    assert!(both.iter().all(|row| row.len() == 3 * across));
+    // Each side begins as a sheet of its version does, with the same episodes in the same rows.
+    for (version, start) in [("D", 0), ("E", 3 * 240 + 8)] {
+        let (_, alone) = sheet("b.png", version);
+        assert_eq!(alone.len(), both.len());
+        let first = |row: &Vec<u8>, x: usize| row[3 * x..3 * (x + 240)].to_vec();
+        assert!(alone.iter().zip(&both).all(|(alone, both)| first(alone, 0) == first(both, start)), "{version}");
+        let last = (first, 5 * 240, start + 2 * 240);
+        assert!(alone.iter().zip(&both).all(|(alone, both)| last.0(alone, last.1) == last.0(both, last.2)));
+        assert!(alone.iter().any(|row| first(row, 0) != first(row, 5 * 240)), "time passes");
+    }
+    let refused = video(&out, &folder.path().join("c.png"), &["--fps", "5"]).output().expect("perturb");
+    assert_eq!(refused.status.code(), Some(2));
+    assert!(stderr(&refused).contains("--fps is how fast a film is shown"), "{}", stderr(&refused));
+    let refused = video(&out, &folder.path().join("c.png"), &["--server", &address, "--episodes", "100000"]);
+    let refused = { refused }.output().expect("perturb");
+    assert!(stderr(&refused).contains("give fewer episodes or smaller pictures"), "{}", stderr(&refused));
+    assert!(!folder.path().join("c.png").exists());
 }
 
 /// What ffprobe says of a video's stream.
@@ -224,7 +275,7 @@ fn without_ffmpeg_an_mp4_is_refused_before_anything_is_played() {
     let folder = tempfile::tempdir().expect("a folder");
     let mut command = video(&out, &folder.path().join("a.mp4"), &["--server", &server.address().to_string()]);
     let output = command.env("PATH", "/nowhere").output().expect("perturb");
-    assert_eq!(output.status.code(), Some(1));
+    assert_eq!(output.status.code(), Some(2));
     let words = stderr(&output);
     assert!(words.contains("apt-get install ffmpeg") && words.contains(".gif, which needs nothing"), "{words}");
     assert!(names(&folder).is_empty());

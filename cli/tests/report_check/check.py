@@ -2,8 +2,8 @@
 
     check.py CHROMIUM DIR PAGE SCREENSHOTS
 
-DIR is an experiment with its folder report/, PAGE its HTML page, SCREENSHOTS a folder for pictures of the whole page. The
-browser is driven over a pipe (the DevTools protocol), so that Python's own library is enough. Ends with 1 and a list of
+DIR is an experiment with its folder report/, PAGE its HTML page, SCREENSHOTS a folder for pictures of the whole page: by
+day at three widths, in the dark, and printed. The browser is driven over a pipe (the DevTools protocol), so that Python's own library is enough. Ends with 1 and a list of
 what is wrong.
 """
 
@@ -16,8 +16,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-# CSS pixels: a desktop, and a window as narrow as half of one.
-WIDTHS = (1280, 700)
+# CSS pixels: a desktop, a window as narrow as half of one, and a telephone.
+WIDTHS = (1280, 700, 400)
 HEIGHT = 1600
 
 # What the page shows, by its own account.
@@ -33,6 +33,8 @@ LOOK = """
     }).length,
     tables: [...document.querySelectorAll('table')].filter(seen).length,
     curves: [...document.querySelectorAll('#curves svg')].filter(seen).length,
+    findings: [...document.querySelectorAll('#finding svg, #metrics svg')].filter(seen).length,
+    first: document.querySelector('main svg').closest('section').id,
     pictures: [...document.querySelectorAll('#profiles svg, #parameters svg, #thresholds svg')].filter(seen).length,
     heatmaps: [...document.querySelectorAll('#heatmaps svg')].filter(seen).length,
     without_heatmap: [...document.querySelectorAll('#heatmaps figure.missing')].filter(seen).length,
@@ -43,15 +45,83 @@ LOOK = """
     links: document.querySelectorAll('nav a').length,
     overflow: document.documentElement.scrollWidth - document.documentElement.clientWidth,
     height: document.documentElement.scrollHeight,
+    // Pictures that a line across the page meets, at most.
+    abreast: (() => {
+      const boxes = [...document.querySelectorAll('main svg')].map(svg => svg.getBoundingClientRect());
+      return Math.max(...boxes.map(a => boxes.filter(b => b.top < a.top + 1 && a.top + 1 < b.bottom).length));
+    })(),
+    // Where the contents are when the middle of the page is read.
+    contents: (() => {
+      scrollTo(0, document.documentElement.scrollHeight / 2);
+      const top = document.querySelector('nav').getBoundingClientRect().top;
+      scrollTo(0, 0);
+      return top;
+    })(),
+  };
+})()
+"""
+
+# Figures whose links do not lead to what is shown and to its numbers; of what they are.
+FILES = """
+[...document.querySelectorAll('figure:not(.missing)')].filter(figure => {
+  const content = kind => {
+    const link = figure.querySelector(`a[download$=".${kind}"]`);
+    return link && link.href.startsWith('data:') ? decodeURIComponent(link.href.slice(link.href.indexOf(',') + 1)) : '';
+  };
+  const drawn = new DOMParser().parseFromString(content('svg'), 'image/svg+xml').documentElement;
+  const same = drawn.tagName === 'svg' && drawn.textContent === figure.querySelector('svg').textContent;
+  return !same || content('csv').trim().split('\\n').length < 2;
+}).map(figure => figure.querySelector('[aria-label]').getAttribute('aria-label'))
+"""
+
+# Texts of pictures, by what is wrong with them: less than 9 pt in a column of 85 mm, or less contrast than WCAG asks for.
+TEXTS = """
+(() => {
+  const linear = c => c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4;
+  const luminance = colour => {
+    const [r, g, b] = colour.match(/[0-9.]+/g).slice(0, 3).map(c => linear(c / 255));
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+  };
+  const paper = luminance(getComputedStyle(document.body).backgroundColor);
+  const contrast = colour => (Math.max(luminance(colour), paper) + 0.05) / (Math.min(luminance(colour), paper) + 0.05);
+  const texts = [...document.querySelectorAll('main svg text')];
+  const points = text => text.getAttribute('font-size') / text.ownerSVGElement.viewBox.baseVal.width * 85 / 25.4 * 72;
+  const words = [...document.querySelectorAll('h1, h2, h3, p, th, dt, dd, figcaption, a, td:not([style])')];
+  return {
+    texts: texts.length,
+    paper,
+    small: texts.filter(text => points(text) < 9).length,
+    faint: texts.filter(text => contrast(getComputedStyle(text).fill) < 4.5).length
+      + words.filter(word => contrast(getComputedStyle(word).color) < 4.5).length,
+    // A picture's own paper is the page's.
+    sheets: [...document.querySelectorAll('main svg')].filter(svg =>
+      Math.abs(luminance(getComputedStyle(svg.querySelector('[fill="#FFFFFF"]')).fill) - paper) > 0.001).length,
+  };
+})()
+"""
+
+# How the page is printed.
+PRINTED = """
+(() => {
+  const millimetres = pixels => pixels / 96 * 25.4;
+  const figures = [...document.querySelectorAll('figure:not(.missing)')];
+  return {
+    contents: getComputedStyle(document.querySelector('nav')).display,
+    paper: getComputedStyle(document.body).backgroundColor,
+    widths: [...new Set([...document.querySelectorAll('main svg')].map(svg =>
+      Math.round(millimetres(svg.getBoundingClientRect().width))))],
+    // A page of A4 has 269 mm within its margins.
+    cut: figures.filter(figure => millimetres(figure.getBoundingClientRect().height) > 269
+      || getComputedStyle(figure).breakInside !== 'avoid').length,
   };
 })()
 """
 
 
 class Browser:
-    """Chromium with one page."""
+    """Chromium with one page, which reaches no host but `reachable`."""
 
-    def __init__(self, program, profile):
+    def __init__(self, program, profile, reachable=""):
         to_browser, self.requests = os.pipe()
         self.replies, from_browser = os.pipe()
 
@@ -61,7 +131,8 @@ class Browser:
             os.dup2(writing, 4)
 
         command = [program, "--headless", "--remote-debugging-pipe", f"--user-data-dir={profile}", "--disable-gpu"]
-        command += ["--no-first-run", "--disable-background-networking", "--host-resolver-rules=MAP * ~NOTFOUND"]
+        rules = f"MAP * ~NOTFOUND, EXCLUDE {reachable}" if reachable else "MAP * ~NOTFOUND"
+        command += ["--no-first-run", "--disable-background-networking", f"--host-resolver-rules={rules}"]
         if os.geteuid() == 0:
             command.append("--no-sandbox")  # which root cannot have
         self.process = subprocess.Popen(
@@ -100,8 +171,19 @@ class Browser:
         message, self.rest = self.rest.split(b"\0", 1)
         return json.loads(message)
 
-    def look(self):
-        return self.call("Runtime.evaluate", expression=LOOK, returnByValue=True)["result"]["value"]
+    def look(self, expression=LOOK):
+        return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"]["value"]
+
+    def show(self, media="", scheme="light"):
+        features = [{"name": "prefers-color-scheme", "value": scheme}]
+        self.call("Emulation.setEmulatedMedia", media=media, features=features)
+
+    def shoot(self, folder, name, width, height):
+        """Pictures of the whole page, from above to below."""
+        for number, top in enumerate(range(0, height, HEIGHT)):
+            clip = {"x": 0, "y": top, "width": width, "height": min(HEIGHT, height - top), "scale": 1}
+            shot = self.call("Page.captureScreenshot", clip=clip, captureBeyondViewport=True)
+            (folder / f"{name}-{number:02}.png").write_bytes(base64.b64decode(shot["data"]))
 
     def resize(self, width):
         self.call(
@@ -155,6 +237,8 @@ def expectations(directory):
         },
         # Metrics, two over all environments, comparisons, Extrapolation and scenarios, worst and footing, settings, cells.
         "tables": environments + several + 2 + compared + 2 * environments + detailed + settings + 1 + bool(failures),
+        "findings": len(list(report.glob("*finding.svg"))),
+        "first": "finding",
         "curves": 4 * len(with_curves),
         "pictures": sum(len(list(report.glob(f"*{name}.svg"))) for name in ("profiles", "-parameters", "-thresholds")),
         "without_curves": environments - len(with_curves),
@@ -193,10 +277,24 @@ def main():
             check(f"pictures without a name at {width}", seen["unnamed"], 0)
             check(f"links to nowhere at {width}", seen["dangling"], [])
             check(f"pixels wider than the window of {width}", seen["overflow"], 0)
-            for number, top in enumerate(range(0, seen["height"], HEIGHT)):
-                clip = {"x": 0, "y": top, "width": width, "height": min(HEIGHT, seen["height"] - top), "scale": 1}
-                shot = browser.call("Page.captureScreenshot", clip=clip, captureBeyondViewport=True)
-                (screenshots / f"{width}-{number:02}.png").write_bytes(base64.b64decode(shot["data"]))
+            check(f"pictures abreast at {width}", seen["abreast"], 2 if width > 800 else 1)
+            check(f"contents in sight at {width}", 0 <= seen["contents"] < HEIGHT, True)
+            browser.shoot(screenshots, width, width, seen["height"])
+        check("figures whose links do not lead to their files", browser.look(FILES), [])
+        for scheme in ("light", "dark"):
+            browser.show(scheme=scheme)
+            texts = browser.look(TEXTS)
+            check(f"there are texts in pictures, {scheme}", texts["texts"] > 100, True)
+            check(f"the page is {scheme}", texts["paper"] > 0.5, scheme == "light")
+            for what in ("small", "faint", "sheets"):
+                check(f"{what}, {scheme}", texts[what], 0)
+        browser.resize(WIDTHS[0])
+        browser.shoot(screenshots, "dark", WIDTHS[0], browser.look()["height"])
+        browser.show(media="print", scheme="dark")  # paper is light by night, too
+        printed = browser.look(PRINTED)
+        expected_print = {"contents": "none", "paper": "rgb(255, 255, 255)", "widths": [85], "cut": 0}
+        check("printed", printed, expected_print)
+        browser.show()
         pdf = browser.call("Page.printToPDF", preferCSSPageSize=True, printBackground=False)
         (screenshots / "print.pdf").write_bytes(base64.b64decode(pdf["data"]))
         said = {"Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded"}
@@ -214,7 +312,7 @@ def main():
     figures = ", ".join(f"{number} {name}" for name, number in expected["rows"].items())
     print(
         f"{page}: rows of {figures}; {expected['tables']} tables, {expected['curves']} curves,"
-        f" {expected['pictures']} other pictures and {expected['heatmaps']} heatmaps; pictures of it in {screenshots}"
+        f" {expected['findings']} of the finding, {expected['pictures']} other pictures and {expected['heatmaps']} heatmaps; pictures of it in {screenshots}"
     )
 
 

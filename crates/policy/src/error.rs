@@ -59,6 +59,17 @@ pub enum Error {
         /// What the system says.
         reason: String,
     },
+    /// Nothing is registered that differentiates recurrent policies.
+    #[error("this program cannot train recurrent policies: use perturb-recurrent, which has libtorch")]
+    NoRecurrentGradients,
+    /// The library that differentiates recurrent policies refused an operation.
+    #[error("{library}: {reason}")]
+    Library {
+        /// Its name.
+        library: &'static str,
+        /// What it says.
+        reason: String,
+    },
     /// Statistics that none can be.
     #[error("the statistics of {name} cannot be right: {reason}")]
     Statistics {

@@ -1,6 +1,7 @@
 //! A policy as portable arithmetic, the same bytes on every processor: what it is ([`PolicySpec`], [`Weights`]), how it acts
 //! ([`Actor`]), what stands between an environment and it ([`Inputs`], [`Normalisers`]), how it plays ([`Player`]), and how
-//! a feed-forward one learns ([`Objective`], [`Differentiator`], [`Descent`]). Plain f32 loops, without libtorch.
+//! a feed-forward one learns ([`Objective`], [`Differentiator`], [`Descent`]). Plain f32 loops, without libtorch, which
+//! [differentiates recurrent ones](register_recurrent) where it is.
 #![forbid(unsafe_code)]
 #![deny(clippy::disallowed_methods)]
 
@@ -20,6 +21,7 @@ mod optimiser;
 mod perceptron;
 mod player;
 pub mod random;
+mod recurrent;
 mod sample;
 mod spec;
 mod task;
@@ -35,6 +37,10 @@ pub use normalisers::{Normalisers, Statistics};
 pub use objective::{Acting, Losses, Objective, Surrogate};
 pub use optimiser::{Adam, Descent, Optimiser, RmsProp};
 pub use player::{Ended, Outcome, Player, PlayerState, Role, RolloutStep, TrialStreams};
+pub use recurrent::{
+    MakeRecurrent, RecurrentBatch, RecurrentDifferentiator, SequenceSamples, has_recurrent, recurrent_differentiator,
+    register_recurrent,
+};
 pub use spec::{ActionKind, PolicySpec};
 pub use task::{Dues, Task};
 pub use weights::{NamedArray, Weights, check_arrays};

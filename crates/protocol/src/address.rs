@@ -1,6 +1,7 @@
 //! Addresses of servers.
 
 use std::fmt;
+use std::net::Ipv4Addr;
 use std::path::PathBuf;
 use std::str::FromStr;
 
@@ -37,6 +38,23 @@ impl FromStr for Address {
 
     fn from_str(text: &str) -> Result<Self, AddressError> {
         parse(text).map_err(|reason| AddressError { text: text.to_owned(), reason })
+    }
+}
+
+impl Address {
+    /// What starts a server there, where it can be said.
+    pub fn start_command(&self) -> String {
+        match self {
+            Self::Unix(path) => format!("perturb-server --listen unix:{}", path.display()),
+            Self::Tcp { host, port } if host.contains(':') => format!("perturb-server --listen tcp://[{host}]:{port}"),
+            Self::Tcp { host, port } if host.parse::<Ipv4Addr>().is_ok() => {
+                format!("perturb-server --listen tcp://{host}:{port}")
+            }
+            Self::Tcp { host, port } if host == "localhost" => {
+                format!("perturb-server --listen tcp://127.0.0.1:{port}")
+            }
+            Self::Tcp { port, .. } => format!("perturb-server --listen tcp://0.0.0.0:{port}"),
+        }
     }
 }
 
@@ -130,6 +148,20 @@ mod tests {
         for text in ["unix:/a/b", "127.0.0.1:1", "[::1]:80", "tcp://host:65535"] {
             let address: Address = text.parse().unwrap();
             assert_eq!(address.to_string().parse(), Ok(address));
+        }
+    }
+
+    #[test]
+    fn a_server_is_started_at_an_address_that_it_understands() {
+        for (text, expected) in [
+            ("unix:/a/b", "unix:/a/b"),
+            ("10.0.0.2:7", "tcp://10.0.0.2:7"),
+            ("http://localhost:7", "tcp://127.0.0.1:7"),
+            ("[::1]:7", "tcp://[::1]:7"),
+            ("node-3:7", "tcp://0.0.0.0:7"),
+        ] {
+            let command = text.parse::<Address>().unwrap().start_command();
+            assert_eq!(command, format!("perturb-server --listen {expected}"));
         }
     }
 

@@ -11,7 +11,7 @@ use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
 use crate::address::Address;
-use crate::error::{ClientError, REPLY_LIMIT, causes, describe, lost, timed_out};
+use crate::error::{ClientError, REPLY_LIMIT, describe, lost, system_words, timed_out};
 use crate::limits::SERVICE;
 use crate::proto::{self, perturb_client::PerturbClient};
 
@@ -66,7 +66,12 @@ impl Connection {
     /// [`ClientError::Connect`].
     pub async fn open_with(address: &Address, patience: Patience) -> Result<Self, ClientError> {
         let fail = |reason: String| ClientError::Connect { address: address.clone(), reason };
-        let transport = |error: tonic::transport::Error| fail(causes(&error).join(": "));
+        let transport = |error: tonic::transport::Error| {
+            fail(
+                system_words(&error)
+                    .unwrap_or_else(|| format!("it did not answer within {} s", CONNECT_LIMIT.as_secs())),
+            )
+        };
         let channel = Endpoint::from_shared(address.to_string())
             .map_err(transport)?
             .connect_timeout(CONNECT_LIMIT)
@@ -78,7 +83,7 @@ impl Connection {
             .connect()
             .await
             .map_err(transport)?;
-        takes_sessions(&channel).await.map_err(fail)?;
+        takes_sessions(address, &channel).await?;
         let client = PerturbClient::new(channel)
             .max_decoding_message_size(LARGEST_MESSAGE)
             .max_encoding_message_size(LARGEST_MESSAGE);
@@ -111,7 +116,10 @@ impl Connection {
             .await
             .map_err(|_| timed_out(&self.address, what, self.patience.reply))?
             .map(tonic::Response::into_inner)
-            .map_err(|status| lost(&self.address, what, &status))
+            .map_err(|status| match status.code() {
+                Code::Unimplemented => ClientError::NotPerturb { address: self.address.clone() },
+                _ => lost(&self.address, what, &status),
+            })
     }
 }
 
@@ -193,18 +201,23 @@ pub async fn first_of(machines: &[Address]) -> Result<Connection, Vec<ClientErro
 }
 
 /// Asks a server for its health. A stopped or overloaded machine may accept connections and never answer.
-async fn takes_sessions(channel: &Channel) -> Result<(), String> {
+async fn takes_sessions(address: &Address, channel: &Channel) -> Result<(), ClientError> {
+    let refuse = |reason| ClientError::Connect { address: address.clone(), reason };
     let request = HealthCheckRequest { service: SERVICE.into() };
-    let answer = timeout(CONNECT_LIMIT, HealthClient::new(channel.clone()).check(request))
-        .await
-        .map_err(|_| format!("it accepted the connection, but did not answer within {} s", CONNECT_LIMIT.as_secs()))?;
+    let answer = timeout(CONNECT_LIMIT, HealthClient::new(channel.clone()).check(request)).await.map_err(|_| {
+        refuse(format!("it accepted the connection, but did not answer within {} s", CONNECT_LIMIT.as_secs()))
+    })?;
     match answer.map(|reply| reply.into_inner().status()) {
-        Ok(ServingStatus::NotServing) => Err("it is shutting down".into()),
+        Ok(ServingStatus::NotServing) => Err(refuse("it is shutting down".into())),
         Ok(_) => Ok(()),
         Err(status) => match status.code() {
             // Something in between that lets only perturb's own calls through.
             Code::NotFound | Code::PermissionDenied | Code::Unauthenticated | Code::Unimplemented => Ok(()),
-            _ => Err(describe(&status)),
+            // What comes back is not even a refusal.
+            _ if std::error::Error::source(&status).is_some() => {
+                Err(ClientError::NotPerturb { address: address.clone() })
+            }
+            _ => Err(refuse(describe(&status))),
         },
     }
 }

@@ -1,11 +1,13 @@
 //! What can go wrong between a client and its servers.
 
+use std::io::ErrorKind;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use tonic::{Code, Status};
 
 use crate::address::Address;
+use crate::names::UnknownEnvironment;
 
 /// How long a server may take for one reply unless told otherwise; also that of a batch of thousands of environments comes much sooner.
 pub const REPLY_LIMIT: Duration = Duration::from_secs(60);
@@ -16,19 +18,27 @@ pub const REPLY_LIMIT: Duration = Duration::from_secs(60);
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum ClientError {
     /// Nobody answers at the address.
-    #[error("no server answers at {address}: {reason}; start one with `perturb-server --listen …` or correct --server")]
+    #[error("no server answers at {address}: {reason}; start one with `{}`, or correct --server", address.start_command())]
     Connect { address: Address, reason: String },
+    /// Something answers at the address that is no server of ours.
+    #[error(
+        "what answers at {address} is no perturb-server: correct --server, or start one at a free port with \
+         `perturb-server --listen tcp://127.0.0.1:0`"
+    )]
+    NotPerturb { address: Address },
     /// None of several servers takes sessions.
-    #[error("no server answers ({reasons}); start one with `perturb-server --listen …` or correct --server")]
+    #[error(
+        "no server answers ({reasons}); start one of them with `perturb-server --listen ADDRESS`, or correct --server"
+    )]
     NoneConnects {
-        /// Every address with the transport's words.
+        /// Every address with what is wrong there.
         reasons: String,
     },
     /// The server understood a request and refused it. The session lives on.
     #[error("the server at {address} refused {request}: {message}")]
     Refused { address: Address, request: &'static str, code: Code, message: String },
     /// The connection or the server is gone, and with it the session's environments.
-    #[error("lost the server at {address} during {request}: {reason}")]
+    #[error("lost the server at {address} {}: {reason}", when(request))]
     Lost {
         address: Address,
         request: &'static str,
@@ -45,6 +55,9 @@ pub enum ClientError {
     /// Servers of one run must serve the same environment.
     #[error("the servers at {first} and {other} describe {environment} differently: run one version of perturb-server")]
     Disagreement { first: Address, other: Address, environment: String },
+    /// The server has no such environment.
+    #[error(transparent)]
+    NoEnvironment(#[from] UnknownEnvironment),
     /// The server does not know [`Open::observe_parameters`](crate::proto::Open::observe_parameters).
     #[error(
         "the server at {address} cannot let a policy observe parameters: it is older than this program; run a \
@@ -76,6 +89,7 @@ impl ClientError {
     pub(crate) fn in_short(&self) -> String {
         match self {
             Self::Connect { address, reason } => format!("{address}: {reason}"),
+            Self::NotPerturb { address } => format!("{address}: what answers there is no perturb-server"),
             other => other.to_string(),
         }
     }
@@ -92,8 +106,9 @@ impl ClientError {
     pub fn can_be_retried(&self) -> bool {
         match self {
             Self::Refused { code, .. } => *code == Code::ResourceExhausted, // full; others' sessions will end
-            Self::Snapshots { .. } => false,
+            Self::Snapshots { .. } | Self::NoEnvironment(_) => false,
             Self::Connect { .. }
+            | Self::NotPerturb { .. } // a name that stands for another machine tomorrow
             | Self::NoneConnects { .. }
             | Self::Lost { .. }
             | Self::TimedOut { .. }
@@ -107,26 +122,37 @@ impl ClientError {
     }
 }
 
-/// A status in words, with the transport's cause.
-pub(crate) fn describe(status: &Status) -> String {
-    let mut words = vec![format!("{} ({:?})", status.message(), status.code())];
-    if let Some(source) = std::error::Error::source(status) {
-        words.extend(causes(source));
-    }
-    words.dedup();
-    words.join(": ")
+/// "during a step", "when it was to save a player".
+fn when(request: &str) -> String {
+    if request.starts_with("to ") { format!("when it was {request}") } else { format!("during {request}") }
 }
 
-/// An error and its causes; without those whose words are contained in others.
-pub(crate) fn causes(error: &dyn std::error::Error) -> Vec<String> {
-    let chain = std::iter::successors(Some(error), |error| error.source());
-    let mut words: Vec<String> = Vec::new();
-    for text in chain.map(ToString::to_string) {
-        if !words.iter().any(|known| known.contains(&text)) {
-            words.push(text);
-        }
+/// What ended a call: the server's own words, if it said any.
+pub(crate) fn describe(status: &Status) -> String {
+    match std::error::Error::source(status) {
+        // The transport's words, of frames and streams, help nobody who did not write it.
+        Some(cause) => system_words(cause).unwrap_or_else(|| "the connection broke off".into()),
+        None if status.message().is_empty() => format!("{:?}", status.code()),
+        None => status.message().to_owned(),
     }
-    words
+}
+
+/// What the operating system has against a connection; `None` if it is not at fault.
+pub(crate) fn system_words(error: &(dyn std::error::Error + 'static)) -> Option<String> {
+    let mut chain = std::iter::successors(Some(error), |error| error.source());
+    let system = chain.find_map(|error| error.downcast_ref::<std::io::Error>())?;
+    Some(match system.kind() {
+        ErrorKind::ConnectionRefused => "nobody listens there".into(),
+        ErrorKind::NotFound => "there is no such socket".into(),
+        ErrorKind::PermissionDenied => "this user may not open it".into(),
+        ErrorKind::TimedOut => "it does not answer".into(),
+        ErrorKind::ConnectionReset
+        | ErrorKind::ConnectionAborted
+        | ErrorKind::BrokenPipe
+        | ErrorKind::NotConnected
+        | ErrorKind::UnexpectedEof => "the connection broke off".into(),
+        _ => system.to_string(),
+    })
 }
 
 pub(crate) fn lost(address: &Address, request: &'static str, status: &Status) -> ClientError {

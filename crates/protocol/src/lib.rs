@@ -2,8 +2,10 @@
 //!
 //! - [`proto`]: the messages.
 //! - [`Version`], [`Distribution`], [`Address`], [`limits`]: what both sides mean by them.
+//! - [`names`]: how people may spell names.
 //! - [`catalogue`]: the environments and limits as JSON.
 //! - [`Connection`] and [`Stream`]: a client's side of a session, one typed reply for each request.
+//! - [`EndedEpisode`]: what came of an episode.
 //! - [`PrivateServer`]: a server of a program's own.
 #![forbid(unsafe_code)]
 
@@ -11,8 +13,10 @@ mod address;
 pub mod catalogue;
 mod connection;
 mod distribution;
+mod ended;
 mod error;
 pub mod limits;
+pub mod names;
 mod private_server;
 mod stream;
 mod version;
@@ -20,6 +24,7 @@ mod version;
 pub use address::{Address, AddressError};
 pub use connection::{Connection, Machines, Patience, first_of, machines};
 pub use distribution::{Distribution, DistributionError, Interval};
+pub use ended::EndedEpisode;
 pub use error::{ClientError, REPLY_LIMIT};
 pub use private_server::PrivateServer;
 pub use stream::{Ask, Stream};

@@ -9,6 +9,7 @@ use crate::proto;
 
 /// Where an environment's parameters come from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(try_from = "String")]
 pub enum Version {
     /// Default: fixed values.
     D,
@@ -75,10 +76,18 @@ impl fmt::Display for Version {
 impl FromStr for Version {
     type Err = UnknownVersion;
 
-    /// The name, as it is written: other letters would be taken by some interfaces and refused by others.
+    /// The name, in large letters or small ones.
     fn from_str(text: &str) -> Result<Self, UnknownVersion> {
-        let named = |version: &Version| Version::NAMES[*version as usize] == text;
+        let named = |version: &Version| Version::NAMES[*version as usize].eq_ignore_ascii_case(text);
         Version::KNOWN.into_iter().find(named).ok_or_else(|| UnknownVersion(text.into()))
+    }
+}
+
+impl TryFrom<String> for Version {
+    type Error = UnknownVersion;
+
+    fn try_from(text: String) -> Result<Self, UnknownVersion> {
+        text.parse()
     }
 }
 
@@ -90,8 +99,10 @@ mod tests {
     fn a_version_is_read_from_what_it_is_called_everywhere() {
         for version in Version::KNOWN {
             assert_eq!(version.to_string().parse(), Ok(version));
-            assert!(version.to_string().to_lowercase().parse::<Version>().is_err());
+            assert_eq!(version.to_string().to_lowercase().parse(), Ok(version));
             assert_eq!(serde_json::to_value(version).unwrap(), version.to_string());
+            let small = serde_json::Value::from(version.to_string().to_lowercase());
+            assert_eq!(serde_json::from_value::<Version>(small).unwrap(), version);
             assert_eq!(Version::from_proto(version.to_proto()), Some(version));
             let plain = |c: char| c.is_ascii_alphanumeric() || c == '-';
             assert!(version.file_name().chars().all(plain), "{}", version.file_name());

@@ -2,7 +2,6 @@
 
 mod result;
 
-use std::fmt::Display;
 use std::path::Path;
 use std::time::Instant;
 
@@ -36,14 +35,34 @@ pub enum CellError {
 }
 
 impl CellError {
-    /// Whether the fault is that of the servers or of the way to them, not of what was trained.
-    fn can_be_retried(&self) -> bool {
+    /// Whose fault it is.
+    fn fault(&self) -> Fault {
         match self {
-            Self::Train(error) => error.can_be_retried(),
-            Self::Test(error) => error.can_be_retried(),
-            Self::Records(_) => false,
+            Self::Train(error) if error.is_for_want_of_room() => Fault::Room,
+            Self::Train(error) if error.can_be_retried() => Fault::Server,
+            Self::Test(error) if error.can_be_retried() => Fault::Server,
+            Self::Train(error) if error.is_file_fault() => Fault::Files,
+            Self::Records(RecordsError::File(error)) if error.is_fault() => Fault::Files,
+            Self::Train(error) if error.must_begin_anew() => Fault::Training,
+            Self::Test(TestError::Numbers(_)) => Fault::Training,
+            _ => Fault::Other,
         }
     }
+}
+
+/// Whose fault it is that a cell has no result, which decides whether it may have one later.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Fault {
+    /// That of the servers or of the way to them.
+    Server,
+    /// The same: the server has no room for so many environments.
+    Room,
+    /// That of the disk.
+    Files,
+    /// That of what was trained, from which another attempt would come to the same.
+    Training,
+    /// Anything else of the cell.
+    Other,
 }
 
 /// A cell that is to be done.
@@ -67,13 +86,11 @@ struct Work<'a> {
     trained: Option<Result<Checkpoint, Broken>>,
 }
 
-/// Why a cell has no result, and whether it may have one later.
+/// Why a cell has no result.
 #[derive(Clone, Debug)]
 struct Broken {
     reason: String,
-    can_be_retried: bool,
-    /// The server had no room for so many environments.
-    for_want_of_room: bool,
+    fault: Fault,
 }
 
 /// Trains and tests the cells of `orders`, which have the same environment and architecture: trains all in lockstep over one
@@ -97,7 +114,7 @@ pub fn run_cells(servers: &Servers, orders: &[CellOrder<'_>], stop: &StopFlag, t
         let left: Vec<usize> = places.iter().copied().filter(|&place| all[place].trained.is_none()).collect();
         for place in left {
             // One that is refused must not keep the others from their turn, nor a server that has no room for all at once.
-            let alone = if places.len() == 1 || (broken.can_be_retried && !broken.for_want_of_room) {
+            let alone = if places.len() == 1 || broken.fault == Fault::Server {
                 Err(broken.clone())
             } else {
                 all[place].look_back_again(tell).and_then(|()| train(servers, &mut all, &[place], stop, tell))
@@ -246,11 +263,13 @@ impl<'a> Work<'a> {
             (Ok(None), signal) => Ok(CellEvent::Stopped { signal: signal.unwrap_or(SIGTERM) }),
             // Whoever stops a run may end its servers too.
             (Err(_), Some(signal)) => Ok(CellEvent::Stopped { signal }),
-            (Err(Broken { reason, can_be_retried: true, .. }), None) => Ok(CellEvent::LostServer { reason }),
-            (Err(Broken { reason, .. }), None) => {
+            (Err(Broken { reason, fault: Fault::Server | Fault::Room }), None) => Ok(CellEvent::LostServer { reason }),
+            (Err(Broken { reason, fault: Fault::Files }), None) => Ok(CellEvent::FileFault { reason }),
+            (Err(Broken { reason, fault }), None) => {
                 // Without the folder's place: wherever the same happens, the same is recorded.
                 let reason = reason.replace(&format!("{}/", folder.path().display()), "");
-                let failure = Failure { id: cell.id.clone(), reason, commit: perturb_study::VERSION.into() };
+                let (commit, begins_anew) = (perturb_study::VERSION.into(), fault == Fault::Training);
+                let failure = Failure { id: cell.id.clone(), reason, commit, begins_anew };
                 folder.write_failure(&failure)?;
                 Ok(CellEvent::Failed { reason: failure.reason })
             }
@@ -260,14 +279,18 @@ impl<'a> Work<'a> {
 
 impl From<CellError> for Broken {
     fn from(error: CellError) -> Self {
-        let for_want_of_room = matches!(&error, CellError::Train(error) if error.is_for_want_of_room());
-        Self { reason: error.to_string(), can_be_retried: error.can_be_retried(), for_want_of_room }
+        Self { reason: error.to_string(), fault: error.fault() }
     }
 }
 
 /// How a cell ends whose folder cannot be read or written.
-fn failed(error: impl Display) -> CellEvent {
-    CellEvent::Failed { reason: error.to_string() }
+fn failed(error: impl Into<FolderError>) -> CellEvent {
+    let error = error.into();
+    let reason = error.to_string();
+    match error {
+        FolderError::File(error) if error.is_fault() => CellEvent::FileFault { reason },
+        _ => CellEvent::Failed { reason },
+    }
 }
 
 /// What is left of a training that was broken off; `None` if there is nothing that could go on.

@@ -7,12 +7,11 @@ use bytes::Bytes;
 use perturb_policy::{
     Normalisers, ObservationNormaliser, Player, PlayerState, PolicySpec, RewardNormaliser, Role, RunningMoments,
 };
-use perturb_protocol::ClientError;
+use perturb_protocol::{ClientError, EndedEpisode};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
 use super::part::Part;
-use super::reply::EndedEpisode;
 use super::session::Session;
 use crate::proto;
 

@@ -15,8 +15,8 @@ mod single;
 
 pub use acting::{ActAt, Played};
 pub use options::OpenOptions;
-pub use perturb_protocol::{Address, AddressError, ClientError, PrivateServer};
-pub use reply::{EndedEpisode, StepReply, StepSlice};
+pub use perturb_protocol::{Address, AddressError, ClientError, EndedEpisode, PrivateServer};
+pub use reply::{StepReply, StepSlice};
 pub use servers::Servers;
 pub use session::Session;
 pub use single::{BegunEpisode, Picture, Single};

@@ -3,10 +3,10 @@
 use std::ops::Range;
 
 use bytes::{Bytes, BytesMut};
-use perturb_protocol::{Address, Ask, ClientError, Connection, Stream};
+use perturb_protocol::{Address, Ask, ClientError, Connection, EndedEpisode, Stream};
 
 use super::options::{OpenOptions, open_request};
-use super::reply::{EndedEpisode, StepReply};
+use super::reply::StepReply;
 use crate::proto::{self, AutoresetMode};
 
 /// The part of a batch that one server owns.

@@ -8,6 +8,7 @@ use std::time::Duration;
 use tokio::runtime::{Builder, Runtime};
 use tokio::sync::oneshot;
 
+use perturb_protocol::names::EnvironmentName;
 use perturb_protocol::{Address, ClientError, Connection, Machines, PrivateServer, first_of, machines};
 
 use super::acting::ActAt;
@@ -158,10 +159,11 @@ impl Servers {
         self.runtime.block_on(connection.catalogue()).map_err(|error| self.explain(error))
     }
 
-    /// The entry `name` of the catalogues, which must be the same in all of them.
+    /// The entry `name`, however it is [spelled](perturb_protocol::names), of the catalogues, which must be the same in all of
+    /// them.
     ///
     /// # Errors
-    /// [`ClientError::Refused`] with the names that there are, [`ClientError::Disagreement`], and those of
+    /// [`ClientError::NoEnvironment`] with the names that there are, [`ClientError::Disagreement`], and those of
     /// [`Servers::catalogue`].
     pub fn environment(&self, name: &str) -> Result<proto::Environment, ClientError> {
         let Some((first, others)) = self.connections.split_first() else {
@@ -198,14 +200,9 @@ impl Servers {
 
     fn environment_of(&self, connection: &Connection, name: &str) -> Result<proto::Environment, ClientError> {
         let catalogue = self.catalogue_of(connection)?.environments;
-        let names: Vec<&str> = catalogue.iter().map(|environment| environment.name.as_str()).collect();
-        let message = format!("there is no environment `{name}`; there are {}", names.join(", "));
-        catalogue.iter().find(|environment| environment.name == name).cloned().ok_or_else(|| ClientError::Refused {
-            address: connection.address().clone(),
-            request: "the environment",
-            code: tonic::Code::NotFound,
-            message,
-        })
+        let known = catalogue.iter().map(|environment| (environment.name.as_str(), environment.revision));
+        let place = EnvironmentName::new(name).find(known)?;
+        Ok(catalogue[place].clone())
     }
 
     /// Says how the private server ended, if it did and a stream was lost with it.

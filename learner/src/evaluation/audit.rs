@@ -6,10 +6,9 @@ use perturb_protocol::Version;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::{About, EpisodeRecord, Records};
 
-use super::player;
-use super::test::{TestError, achieved, check_unchanged, ending};
+use super::test::TestError;
 use super::trials::Trials;
-use crate::checkpoint::{Checkpoint, EnvironmentSummary};
+use crate::checkpoint::Checkpoint;
 use crate::client::{EndedEpisode, OpenOptions, Servers, Session};
 
 /// What came of playing recorded episodes again.
@@ -83,7 +82,7 @@ pub fn audit(
         for end in replay.trials.step()? {
             let Some(recorded) = running.remove(&end.slot) else { continue };
             audit.episodes += 1;
-            audit.different.extend(difference(&records.about, recorded, &end));
+            audit.different.extend(difference(&records.about, recorded, end));
         }
         report(audit.episodes);
     }
@@ -125,8 +124,8 @@ impl<'a> Replay<'a> {
         };
         let mut observations = Vec::new();
         let session = Session::open(servers, &options, &mut observations)?;
-        check_unchanged(checkpoint, EnvironmentSummary::of(session.environment()))?;
-        let player = player(checkpoint, num_envs, 0)?;
+        checkpoint.state.check_unchanged(session.environment()).map_err(TestError::from)?;
+        let player = checkpoint.player(num_envs, 0, 0)?;
         Ok(Self {
             trials: Trials::begin(session, player, &observations)?,
             names: about.parameters.iter().map(|parameter| parameter.name.clone()).collect(),
@@ -150,21 +149,21 @@ impl<'a> Replay<'a> {
 }
 
 /// In what an episode differs from its record; `None` if in nothing.
-fn difference(about: &About, recorded: &EpisodeRecord, end: &EndedEpisode) -> Option<String> {
-    let (achieved, also) = achieved(about, end);
-    let place =
-        format!("{}, environment {}, episode {}", recorded.set, recorded.environment_index, recorded.episode_index);
+fn difference(about: &About, recorded: &EpisodeRecord, end: EndedEpisode) -> Option<String> {
+    let got = EpisodeRecord::of(about, &recorded.set, recorded.seed, end);
+    let what = |told: fn(&EpisodeRecord) -> String| (told(recorded), told(&got));
     let parts = [
-        ("episode", recorded.episode_index.to_string(), end.episode_index.to_string()),
-        ("requested", format!("{:?}", recorded.requested), format!("{:?}", end.receipt.requested)),
-        ("applied", format!("{:?}", recorded.applied), format!("{:?}", end.receipt.applied)),
-        ("model", recorded.model_hash.clone(), end.receipt.model_hash.clone()),
-        ("length", recorded.length.to_string(), end.length.to_string()),
-        ("return", format!("{:?}", recorded.episode_return), format!("{:?}", end.episode_return)),
-        ("ending", format!("{:?}", recorded.ending), format!("{:?}", ending(end))),
-        ("achieved", format!("{:?}", recorded.achieved), format!("{achieved:?}")),
-        ("the other it achieved", format!("{:?}", recorded.also_achieved), format!("{also:?}")),
+        ("episode", what(|it| it.episode_index.to_string())),
+        ("requested", what(|it| format!("{:?}", it.requested))),
+        ("applied", what(|it| format!("{:?}", it.applied))),
+        ("model", what(|it| it.model_hash.clone())),
+        ("length", what(|it| it.length.to_string())),
+        ("return", what(|it| format!("{:?}", it.episode_return))),
+        ("ending", what(|it| format!("{:?}", it.ending))),
+        ("achieved", what(|it| format!("{:?}", it.achieved))),
+        ("the other it achieved", what(|it| format!("{:?}", it.also_achieved))),
     ];
-    let (what, recorded, got) = parts.into_iter().find(|(_, recorded, got)| recorded != got)?;
-    Some(format!("{place}: {what} was {recorded}, is {got}"))
+    let (what, (was, is)) = parts.into_iter().find(|(_, (recorded, got))| recorded != got)?;
+    let EpisodeRecord { set, environment_index, episode_index, .. } = recorded;
+    Some(format!("{set}, environment {environment_index}, episode {episode_index}: {what} was {was}, is {is}"))
 }

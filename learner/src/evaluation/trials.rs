@@ -49,8 +49,7 @@ impl<'a> Trials<'a> {
 impl<'a> RemoteTrials<'a> {
     /// `player`, which plays the policy of `checkpoint`, begins trials in the environments of `session`.
     pub(super) fn new(session: Session<'a>, player: &Player, checkpoint: &Checkpoint) -> Self {
-        let weights: Vec<f32> = checkpoint.weights.iter().flat_map(|array| array.data.iter().copied()).collect();
-        let policy = (acting::policy(&checkpoint.policy, player), acting::floats(&weights));
+        let policy = (acting::policy(&checkpoint.policy, player), acting::floats(&checkpoint.flat_weights()));
         Self { session, policy: Some(policy), episodes_per_trial: player.episodes_per_trial() }
     }
 

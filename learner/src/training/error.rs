@@ -81,7 +81,7 @@ pub enum TrainError {
         source: Box<TrainError>,
     },
     /// A training that had begun ended.
-    #[error("training failed{}: {source}", what_is_left(last.as_ref(), source))]
+    #[error("{source}; {}", what_is_left(last.as_ref(), source))]
     Failed {
         /// The last checkpoint, if there is one.
         last: Option<LastCheckpoint>,
@@ -109,6 +109,29 @@ impl TrainError {
         }
     }
 
+    /// Whether the machine is at fault that has the files, see [`FileError::is_fault`].
+    pub fn is_file_fault(&self) -> bool {
+        match self {
+            Self::File(error)
+            | Self::Log(LogError::File(error))
+            | Self::Checkpoint(CheckpointError::File(error))
+            | Self::Directory(RunDirectoryError::File(error))
+            | Self::Directory(RunDirectoryError::Checkpoint(CheckpointError::File(error))) => error.is_fault(),
+            Self::Restore { source, .. } | Self::Failed { source, .. } => source.is_file_fault(),
+            _ => false,
+        }
+    }
+
+    /// Whether the training would come to the same from its last checkpoint: to numbers that are not finite, for instance.
+    pub fn must_begin_anew(&self) -> bool {
+        match self {
+            Self::Numbers(_) | Self::Log(LogError::Changed { .. }) => true,
+            Self::Restore { source, .. } => !source.can_be_retried() && !source.is_file_fault(),
+            Self::Failed { source, .. } => source.must_begin_anew(),
+            _ => false,
+        }
+    }
+
     /// Whether the same may go well later or with another server, see [`ClientError::can_be_retried`].
     pub fn can_be_retried(&self) -> bool {
         match self {
@@ -129,13 +152,9 @@ impl From<CollectError> for TrainError {
 }
 
 fn what_is_left(last: Option<&LastCheckpoint>, error: &TrainError) -> String {
-    let Some(LastCheckpoint { episodes, run }) = last else { return " before its first checkpoint".into() };
-    let run = run.display();
-    let next = match error {
-        TrainError::Numbers(_) => " (resumed, it would come to the same numbers)".into(),
-        _ => format!("; go on from there: perturb train --resume {run}"),
-    };
-    format!("; the checkpoint after {episodes} episodes is kept in {run}{next}")
+    let Some(LastCheckpoint { episodes, run }) = last else { return "there was no checkpoint yet".into() };
+    let again = if let TrainError::Numbers(_) = error { ": resumed, it would come to the same numbers" } else { "" };
+    format!("the checkpoint after {episodes} episodes is kept in {}{again}", run.display())
 }
 
 #[cfg(test)]
@@ -168,12 +187,10 @@ mod tests {
             TrainError::Failed { last, source: Box::new(source) }.to_string()
         };
         let numbers = || TrainError::Numbers(perturb_policy::Error::PolicyOutput { environment: 0 }.into());
-        assert!(
-            shown(false, numbers()).starts_with("training failed before its first checkpoint: the policy's output")
-        );
-        let kept = "training failed; the checkpoint after 7 episodes is kept in runs/a";
-        assert!(shown(true, numbers()).starts_with(&format!("{kept} (resumed, it would come to the same numbers): ")));
-        let next = "; go on from there: perturb train --resume runs/a: the server does not";
-        assert!(shown(true, TrainError::NoActions).starts_with(&format!("{kept}{next}")));
+        assert!(shown(false, numbers()).ends_with("; there was no checkpoint yet"));
+        let kept = "; the checkpoint after 7 episodes is kept in runs/a";
+        assert!(shown(true, numbers()).ends_with(&format!("{kept}: resumed, it would come to the same numbers")));
+        let other = shown(true, TrainError::NoActions);
+        assert!(other.starts_with("the server does not") && other.ends_with(kept), "{other}");
     }
 }

@@ -343,7 +343,7 @@ impl<'a> Learning<'a> {
         };
         let collector = CollectorState { snapshots, player };
         let state = ResumeState { collector, algorithm: self.algorithm.state(), history };
-        self.checkpoint.save(&self.directory.checkpoint(), Some(&state))?;
+        state.save(&self.checkpoint, &self.directory.checkpoint())?;
         self.saved = Some(self.checkpoint.state.counters);
         Ok(())
     }

@@ -74,7 +74,6 @@ fn weights(policy: &PolicySpec, environment: &Environment) -> Result<Weights> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::evaluation::player;
     use crate::proto::{ActionSpace, Continuous, Discrete};
 
     fn checkpoint_for(kind: Kind) -> Result<Checkpoint> {
@@ -92,7 +91,7 @@ mod tests {
 
     /// The actions of the first step in so many environments, which all see something else.
     fn actions(checkpoint: &Checkpoint, n: usize) -> Vec<[u8; 4]> {
-        let mut player = player(checkpoint, n, 7).unwrap();
+        let mut player = checkpoint.player(n, 7, 0).unwrap();
         let observations: Vec<f32> = (0..3 * n).map(|i| i as f32 - 100.0).collect();
         player.begin(&observations, None).unwrap();
         player.act().unwrap().as_chunks::<4>().0.to_vec()

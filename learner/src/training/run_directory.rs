@@ -2,6 +2,7 @@
 
 use std::cell::OnceCell;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use perturb_study::files::{self, FileError, Lock};
 
@@ -130,7 +131,7 @@ impl RunDirectory {
         }
         let directory = Self { path: path.to_owned(), overwrite: false, lock: OnceCell::new() };
         directory.lock()?;
-        match Checkpoint::load_with_resume(&directory.checkpoint()) {
+        match ResumeState::load(&directory.checkpoint()) {
             Err(CheckpointError::Missing { .. }) => Err(directory.nothing_to_resume()?),
             loaded => loaded.map(|(checkpoint, state)| (directory, checkpoint, state)).map_err(Into::into),
         }
@@ -150,7 +151,15 @@ impl RunDirectory {
 
     /// Keeps other processes out.
     fn lock(&self) -> Result<()> {
-        let lock = Lock::try_take(&self.path)?.ok_or_else(|| RunDirectoryError::Locked { path: self.path.clone() })?;
+        let lock = match Lock::try_take(&self.path)? {
+            Some(lock) => Some(lock),
+            None => {
+                // Somebody may only have looked.
+                std::thread::sleep(Duration::from_millis(20));
+                Lock::try_take(&self.path)?
+            }
+        };
+        let lock = lock.ok_or_else(|| RunDirectoryError::Locked { path: self.path.clone() })?;
         self.lock.get_or_init(|| lock);
         Ok(())
     }

@@ -11,6 +11,7 @@ use perturb_study::settings::{A2cConfig, PpoConfig};
 
 /// A server with one physics thread.
 pub fn server() -> PrivateServer {
+    perturb_torch::register(); // for what trains on it
     PrivateServer::start(Some(1)).unwrap_or_else(|error| panic!("{error}"))
 }
 
@@ -35,6 +36,7 @@ pub fn options(environment: &str, num_envs: usize, episodes_per_trial: u32) -> O
 
 /// A policy whose every number, biases and log_std too, differs from its initial one by about 0.1.
 pub fn moved(spec: &PolicySpec) -> Policy {
+    perturb_torch::register();
     let mut rng = stream(9, Purpose::Weights);
     let mut weights = Policy::new(spec.clone(), 1).expect("a policy").weights();
     weights.iter_mut().flat_map(|array| &mut array.data).for_each(|x| *x += 0.1 * normal(&mut rng) as f32);

@@ -12,12 +12,12 @@ use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{
     Collector, Estimates, Normalisers, Rollout, RolloutStep, Span, Trajectories, gae, n_step_returns,
 };
-use perturb_learner::torch::{Sequences, TorchPolicy};
 use perturb_policy::random::{Purpose, normal, stream, uniform};
 use perturb_policy::{
     ActionKind, Actor, Acts, Inputs, ObservationNormaliser, Player, PolicySpec, RewardNormaliser, Role,
 };
 use perturb_study::settings::{A2cConfig, EpoptConfig, PpoConfig, Ranking};
+use perturb_torch::{Sequences, TorchPolicy};
 use proptest::prelude::*;
 use rand_chacha::ChaCha8Rng;
 use rstest::rstest;
@@ -28,6 +28,7 @@ const DISCRETE: ActionKind = ActionKind::Discrete { n: 3 };
 const CONTINUOUS: ActionKind = ActionKind::Continuous { size: 2 };
 
 fn spec(action: ActionKind, lstm: Option<usize>) -> PolicySpec {
+    perturb_torch::register();
     PolicySpec { observation_size: O, action, hidden: vec![8], lstm }
 }
 
@@ -569,6 +570,7 @@ const COUNT: usize = 10;
 
 /// A recurrent policy that pushes to either side as often, whatever it sees.
 fn blind(input_size: usize) -> Policy {
+    perturb_torch::register();
     let spec = PolicySpec {
         observation_size: input_size,
         action: ActionKind::Discrete { n: 2 },

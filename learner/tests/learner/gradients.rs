@@ -1,12 +1,12 @@
 //! Policies as plain arithmetic against libtorch: acting, gradients, updates.
 
 use perturb_learner::policy::Policy;
-use perturb_learner::torch::{Sequences, Targets, TorchPolicy, evaluate};
 use perturb_policy::random::{Purpose, normal, stream, uniform};
 use perturb_policy::{
     Acting, ActionKind, Actor, Acts, Descent, Differentiator, Losses, Objective, Optimiser, PolicySpec, Samples,
     Surrogate,
 };
+use perturb_torch::{Sequences, Targets, TorchPolicy, evaluate};
 use rstest::rstest;
 use tch::Tensor;
 

@@ -1,4 +1,4 @@
-//! Advantages against numbers from numpy (`fixtures/make_losses.py`), and against identities.
+//! Advantages against numbers from numpy (`crates/torch/tests/fixtures/make_losses.py`), and against identities.
 
 use perturb_learner::rollout::{Trajectories, explained_variance, gae, n_step_returns};
 use proptest::prelude::*;
@@ -7,7 +7,8 @@ use proptest::prelude::*;
 const TOLERANCE: f64 = 2e-6;
 
 fn fixture(case: &str, name: &str) -> Vec<f32> {
-    let cases: serde_json::Value = serde_json::from_str(include_str!("../fixtures/losses.json")).expect("JSON");
+    let cases: serde_json::Value =
+        serde_json::from_str(include_str!("../../../crates/torch/tests/fixtures/losses.json")).expect("JSON");
     let numbers = cases[case][name].as_array().unwrap_or_else(|| panic!("no {case}.{name}"));
     numbers.iter().map(|x| x.as_f64().expect("a number") as f32).collect()
 }

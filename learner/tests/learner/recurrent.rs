@@ -5,10 +5,10 @@ use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Ppo};
 use perturb_learner::error::Error;
 use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Rollout, RolloutStep};
-use perturb_learner::torch::{Evaluated, Sequences, TorchPolicy};
 use perturb_policy::random::{Purpose, normal, stream, uniform};
 use perturb_policy::{ActionKind, Actor, Acts, PolicySpec, Weights};
 use perturb_study::settings::{A2cConfig, PpoConfig};
+use perturb_torch::{Evaluated, Sequences, TorchPolicy};
 use rand_chacha::ChaCha8Rng;
 use rstest::rstest;
 use tch::{Kind, Tensor};
@@ -18,6 +18,7 @@ const CONTINUOUS: ActionKind = ActionKind::Continuous { size: 2 };
 const O: usize = 5;
 
 fn spec(action: ActionKind, hidden: &[usize], width: usize) -> PolicySpec {
+    perturb_torch::register();
     PolicySpec { observation_size: O, action, hidden: hidden.to_vec(), lstm: Some(width) }
 }
 
@@ -448,7 +449,7 @@ fn what_does_not_fit_a_recurrent_policy_is_refused() {
     ));
     assert!(matches!(
         Sequences::new(training.policy.spec(), 2, &[0.0; 8], &[false; 5], &[]),
-        Err(Error::Policy(perturb_policy::Error::Length { .. }))
+        Err(perturb_torch::Error::Policy(perturb_policy::Error::Length { .. }))
     ));
     let spec = PolicySpec { lstm: Some(0), ..training.policy.spec().clone() };
     assert!(matches!(

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use perturb_learner::checkpoint::Checkpoint;
+use perturb_learner::checkpoint::{Checkpoint, ResumeState};
 use perturb_learner::client::{ActAt, PrivateServer, Servers};
 use perturb_learner::evaluation::{TestOptions, Tester};
 use perturb_learner::logging::Progress;
@@ -43,7 +43,7 @@ fn config(task: &str, training: &str) -> TrainConfig {
 
 /// All that decides what a training does next, and what it has done.
 fn kept(directory: &Path) -> String {
-    let (checkpoint, resume) = Checkpoint::load_with_resume(directory).expect("a checkpoint");
+    let (checkpoint, resume) = ResumeState::load(directory).expect("a checkpoint");
     let state = checkpoint.state;
     assert!(resume.history.logs.monitor > 0);
     format!(

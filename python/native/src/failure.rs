@@ -45,6 +45,7 @@ pub fn of(error: &ClientError) -> PyErr {
         ClientError::TimedOut { .. } => failure(TIMED_OUT, 0, ""),
         ClientError::Protocol { got, .. } => failure(MISMATCH, 0, got),
         ClientError::Connect { reason, .. } => failure(UNREACHABLE, 0, reason),
+        ClientError::NotPerturb { .. } => failure(UNREACHABLE, 0, "what answers there is no perturb-server"),
         other => failure(UNREACHABLE, 0, other.to_string()),
     }
 }

@@ -5,7 +5,8 @@
 //! - [`requests`]: requests, made of what Python gives.
 //! - [`arrays`], [`infos`]: replies, as arrays and dictionaries.
 //! - [`policy`]: trained policies that act here, by the learner's arithmetic.
-//! - [`testing`], [`records`]: tests of whatever acts in Python, recorded as the program `perturb` records its own.
+//! - [`sets`], [`testing`], [`records`]: tests of whatever acts in Python, recorded as the program `perturb` records its own.
+//! - [`assessed`]: such tests as folders, and in reports.
 //! - [`failure`]: what went wrong, for the package to say it as one of its errors.
 #![forbid(unsafe_code)]
 // The map above is for who reads this crate: all that it has is Python's, and private.
@@ -14,6 +15,7 @@
 use pyo3::prelude::*;
 
 mod arrays;
+mod assessed;
 mod failure;
 mod infos;
 mod line;
@@ -21,11 +23,14 @@ mod policy;
 mod records;
 mod requests;
 mod session;
+mod sets;
 mod testing;
 
 /// What the Python package stands on; `perturb/_native.pyi` has the types.
 #[pymodule]
 mod _native {
+    #[pymodule_export]
+    use super::assessed::{Assessment, report_page};
     #[pymodule_export]
     use super::failure::Failure;
     #[pymodule_export]
@@ -33,9 +38,11 @@ mod _native {
     #[pymodule_export]
     use super::policy::{Player, Policy};
     #[pymodule_export]
-    use super::records::{Records, metrics, published};
+    use super::records::{Records, metrics, published, wilson};
     #[pymodule_export]
     use super::session::{Session, catalogue};
+    #[pymodule_export]
+    use super::sets::{make_set, read_csv_set, read_sets};
     #[pymodule_export]
     use super::testing::Tests;
 }

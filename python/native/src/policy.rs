@@ -5,7 +5,7 @@ use std::sync::{Mutex, MutexGuard, TryLockError};
 
 use numpy::{PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
 use perturb_policy::{ActionKind, Ended, Outcome};
-use perturb_study::trained::{EnvironmentSeen, TrainedError, TrainedPolicy};
+use perturb_study::checkpoint::Checkpoint;
 use pyo3::prelude::*;
 
 use crate::failure::{POLICY, UNUSABLE, failure};
@@ -13,7 +13,7 @@ use crate::failure::{POLICY, UNUSABLE, failure};
 /// A checkpoint that was read.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Policy {
-    pub(crate) trained: TrainedPolicy,
+    pub(crate) checkpoint: Checkpoint,
     /// Iterations of its training, and a checksum of its weights.
     #[pyo3(get)]
     id: String,
@@ -24,78 +24,85 @@ impl Policy {
     /// Reads the checkpoint in a folder, or in its folder `checkpoint`.
     #[staticmethod]
     fn load(path: PathBuf) -> PyResult<Self> {
-        let trained = TrainedPolicy::load(&path).map_err(|error: TrainedError| refused(&error))?;
-        let id = trained.id().map_err(|reason| failure(POLICY, 0, reason))?;
-        Ok(Self { trained, id })
+        let checkpoint = Checkpoint::load(&path).map_err(|error| refused(&error))?;
+        let id = checkpoint.id().map_err(|reason| failure(POLICY, 0, reason))?;
+        Ok(Self { checkpoint, id })
     }
 
     /// In what it was trained.
     #[getter]
     fn environment(&self) -> &str {
-        &self.trained.state.config.common.environment
+        &self.checkpoint.state.config.common.environment
     }
 
     /// Where parameters came from in training.
     #[getter]
     fn version(&self) -> String {
-        self.trained.state.config.common.version.to_string()
+        self.checkpoint.state.config.common.version.to_string()
     }
 
     /// The same with the sets that replaced the version's.
     #[getter]
     fn trained_on(&self) -> String {
-        self.trained.state.config.common.trained_on()
+        self.checkpoint.state.config.common.trained_on()
     }
 
     /// What trained it, e.g. "ppo ff".
     #[getter]
     fn method(&self) -> String {
-        self.trained.state.config.method().to_string()
+        self.checkpoint.state.config.method().to_string()
     }
 
     /// Episodes in a trial, over which it remembers.
     #[getter]
     fn episodes_per_trial(&self) -> u32 {
-        self.trained.state.config.settings.episodes_per_trial()
+        self.checkpoint.state.config.settings.episodes_per_trial()
     }
 
     /// Whether it sees rewards and ends of episodes, too.
     #[getter]
     fn sees_rewards(&self) -> bool {
-        self.trained.state.config.settings.has_trials()
+        self.checkpoint.state.config.settings.has_trials()
     }
 
     /// Whether it remembers.
     #[getter]
     fn has_memory(&self) -> bool {
-        self.trained.spec.memory_size() > 0
+        self.checkpoint.policy.memory_size() > 0
     }
 
     /// "state" or "parameters".
     #[getter]
     fn observe(&self) -> String {
-        self.trained.state.config.common.observe.to_string()
+        self.checkpoint.state.config.common.observe.to_string()
     }
 
     /// That of its training.
     #[getter]
     fn seed(&self) -> u64 {
-        self.trained.state.config.common.seed
+        self.checkpoint.state.config.common.seed
+    }
+
+    /// Steps of its training, of all environments together.
+    #[getter]
+    fn timesteps(&self) -> u64 {
+        self.checkpoint.state.counters.timesteps
     }
 
     /// O.
     #[getter]
     fn observation_size(&self) -> usize {
-        self.trained.state.environment_spec.observation.len()
+        self.checkpoint.state.environment_spec.observation.len()
     }
 
     /// Plays in N environments with successive indices.
     fn player(&self, num_envs: usize, seed: u64, first_environment_index: u32) -> PyResult<Player> {
-        let player = self.trained.player(num_envs, seed, first_environment_index).map_err(|error| refused(&error))?;
+        let player =
+            self.checkpoint.player(num_envs, seed, first_environment_index).map_err(|error| refused(&error))?;
         let finals = Vec::with_capacity(num_envs * player.observation_size());
         Ok(Player(Mutex::new(Playing {
             player,
-            action: self.trained.spec.action,
+            action: self.checkpoint.policy.action,
             seed,
             trials: vec![(0, 0); num_envs],
             ended: Vec::new(),
@@ -110,20 +117,7 @@ impl Policy {
     /// # Errors
     /// With what differs.
     pub(crate) fn check_unchanged(&self, served: &perturb_protocol::proto::Environment) -> PyResult<()> {
-        let trained = &self.trained.state.environment_spec;
-        let name = self.environment();
-        let (what, trained, served) = match EnvironmentSeen::of(served) {
-            None => ("actions", format!("{:?}", trained.action), "none".into()),
-            Some(served) => match trained.difference(&served) {
-                None => return Ok(()),
-                Some(difference) => difference,
-            },
-        };
-        let words = format!(
-            "the checkpoint was trained in {name} with {what} {trained}, the server's has {served}: test with the version \
-             of perturb that trained it, or train again"
-        );
-        Err(failure(POLICY, 0, words))
+        self.checkpoint.state.check_unchanged(served).map_err(|error| refused(&error))
     }
 }
 

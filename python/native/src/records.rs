@@ -3,19 +3,33 @@
 use std::path::PathBuf;
 
 use numpy::PyArray1;
-use perturb_study::outcomes::{Outcomes, SHARE, bins, conditional_value_at_risk, success_within, worst_contexts};
+use perturb_study::outcomes::{
+    Bin, Counted, Outcomes, SHARE, bins, conditional_value_at_risk, success_within, success_within_both, worst_contexts,
+};
 use perturb_study::records::{self, ColumnValues};
-use perturb_study::{Metric, paper};
+use perturb_study::statistics::bootstrap;
+use perturb_study::{Metric, mean, paper};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::failure::{INVALID, failure};
+use crate::sets::{Set, to_python};
+
+/// Resamples of the bootstrap over episodes.
+const RESAMPLES: usize = 1000;
 
 /// Mean and deviation, %.
 type Number = (f64, Option<f64>);
 
 /// A part of a parameter's range: low, high, successes, episodes, and the interval of the success rate, %.
 type Part = (f64, f64, u64, u64, f64, f64);
+
+/// A part of two parameters' ranges: low and high of either, successes, episodes.
+type Cell = ((f64, f64), (f64, f64), u64, u64);
+
+/// Episodes, success % and its interval, mean return and its interval, mean length, the mean of the worst tenth of returns
+/// and its interval, and the success rate in the worst tenth of contexts, %.
+type Figures = (u64, f64, (f64, f64), f64, (f64, f64), f64, f64, (f64, f64), Option<f64>);
 
 /// The recorded tests of a policy.
 #[pyclass(frozen, module = "perturb._native")]
@@ -83,30 +97,70 @@ impl Records {
         Ok(columns)
     }
 
-    /// The figures of the test on a set: episodes, success % and its interval, mean return and length, the mean of the worst
-    /// tenth of returns, and the success rate in the worst tenth of contexts, %.
-    fn result(&self, name: &str) -> (u64, f64, (f64, f64), f64, f64, f64, Option<f64>) {
-        let result = self.0.result(name, None);
+    /// The sets that were tested on, in order.
+    fn tests(&self) -> Vec<Set> {
+        self.0.about.tests.iter().map(|test| to_python(&test.set)).collect()
+    }
+
+    /// What decided about success, as it is typed; `None` if the server's word was taken.
+    #[getter]
+    fn rule(&self) -> Option<String> {
+        let success = self.0.about.success.as_ref();
+        success.map(|criterion| format!("{}={}", criterion.quantity, criterion.threshold))
+    }
+
+    /// The figures of the test on a set.
+    fn result(&self, py: Python<'_>, name: &str) -> Figures {
+        py.detach(|| {
+            let result = self.0.result(name, None);
+            let outcomes = Outcomes::of(&self.0, name);
+            let statistics = |returns: &[Vec<f64>]| {
+                vec![mean(returns[0].iter().copied()), conditional_value_at_risk(&returns[0], SHARE)]
+            };
+            let numbers =
+                bootstrap(std::slice::from_ref(&outcomes.returns), RESAMPLES, 1, statistics).unwrap_or_default();
+            let interval = |place: usize| {
+                let [low, high] =
+                    numbers.get(place).map_or([f64::NAN; 2], |it| it.interval_95.unwrap_or([it.point; 2]));
+                (low, high)
+            };
+            let [low, high] = result.success_percent_95;
+            (
+                result.episodes,
+                result.success_percent,
+                (low, high),
+                result.mean_return,
+                interval(0),
+                result.mean_length,
+                conditional_value_at_risk(&outcomes.returns, SHARE),
+                interval(1),
+                worst_contexts(&outcomes),
+            )
+        })
+    }
+
+    /// `[n]` the part of the parameter space, from 0, that each episode of the test on a set lies in.
+    fn parts(&self, name: &str) -> Vec<usize> {
+        Outcomes::of(&self.0, name).parts()
+    }
+
+    /// Success over two parameters on a set, by y, then x.
+    fn success_by_parameters(&self, name: &str, x: &str, y: &str) -> PyResult<Vec<Cell>> {
+        let places = [self.place(x)?, self.place(y)?];
         let outcomes = Outcomes::of(&self.0, name);
-        let [low, high] = result.success_percent_95;
-        (
-            result.episodes,
-            result.success_percent,
-            (low, high),
-            result.mean_return,
-            result.mean_length,
-            conditional_value_at_risk(&outcomes.returns, SHARE),
-            worst_contexts(&outcomes),
-        )
+        let bins = places.map(|place| bins(std::iter::once(&outcomes), place));
+        let [over_x, over_y] = [&bins[0], &bins[1]];
+        let counted = success_within_both(&outcomes, places, [over_x, over_y]);
+        let pairs = over_y.iter().flat_map(|y| over_x.iter().map(move |x| (x, y)));
+        let cell = |((x, y), counted): ((&Bin, &Bin), Counted)| {
+            ((x.low, x.high), (y.low, y.high), counted.successes, counted.episodes)
+        };
+        Ok(pairs.zip(counted).map(cell).collect())
     }
 
     /// Success over a parameter on a set.
     fn success_by_parameter(&self, name: &str, parameter: &str) -> PyResult<Vec<Part>> {
-        let names: Vec<&str> = self.0.about.parameters.iter().map(|it| it.name.as_str()).collect();
-        let Some(place) = names.iter().position(|known| *known == parameter) else {
-            let words = format!("there is no parameter '{parameter}'; expected one of {}", names.join(", "));
-            return Err(failure(INVALID, 0, words));
-        };
+        let place = self.place(parameter)?;
         let outcomes = Outcomes::of(&self.0, name);
         let bins = bins(std::iter::once(&outcomes), place);
         let counted = success_within(&outcomes, place, &bins);
@@ -116,6 +170,23 @@ impl Records {
         });
         Ok(told.collect())
     }
+}
+
+impl Records {
+    /// Where a parameter is among those of the environment.
+    fn place(&self, parameter: &str) -> PyResult<usize> {
+        let names: Vec<&str> = self.0.about.parameters.iter().map(|it| it.name.as_str()).collect();
+        names.iter().position(|known| *known == parameter).ok_or_else(|| {
+            let words = format!("there is no parameter '{parameter}'; expected one of {}", names.join(", "));
+            failure(INVALID, 0, words)
+        })
+    }
+}
+
+/// The 95 % interval of a success rate after Wilson (1927), 0 … 1.
+#[pyfunction]
+pub fn wilson(successes: u64, episodes: u64) -> (f64, f64) {
+    perturb_study::wilson(successes, episodes)
 }
 
 /// The paper's three numbers, Default, Interpolation and Extrapolation, of success rates, %, by scenario, e.g. "DR".

@@ -1,12 +1,12 @@
 //! Tests of a policy that acts in Python: which episodes are played, and how they are recorded, as `perturb evaluate` does.
 
-use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
 use numpy::PyReadonlyArray1;
-use perturb_protocol::{Distribution, Interval, Version, proto};
+use perturb_policy::random::Purpose;
+use perturb_protocol::{EndedEpisode, proto};
 use perturb_study::records::About;
-use perturb_study::sets::{self, Contexts, TestSet};
+use perturb_study::sets::{self, TestSet};
 use perturb_study::success::Rule;
 use perturb_study::testing::Counting;
 use pyo3::prelude::*;
@@ -15,11 +15,8 @@ use crate::failure::{INVALID, MALFORMED, UNUSABLE, failure};
 use crate::infos::Events;
 use crate::policy::Policy;
 use crate::records::Records;
-use crate::requests::Intervals;
 use crate::session::Opened;
-
-/// A set: its name, its version, what is drawn in place of the version's, and the contexts if they are listed.
-type Set = (String, String, Intervals, Option<Vec<BTreeMap<String, f64>>>);
+use crate::sets::{Set, from_python};
 
 /// The tests of a policy, one set after the other.
 #[pyclass(module = "perturb._native")]
@@ -46,7 +43,7 @@ impl Tests {
         policy: String,
         episodes_per_trial: u32,
     ) -> PyResult<Self> {
-        let sets = sets.into_iter().map(set).collect::<PyResult<Vec<TestSet>>>()?;
+        let sets = sets.into_iter().map(from_python).collect::<PyResult<Vec<TestSet>>>()?;
         sets::distinct(&sets).map_err(|error| invalid(&error))?;
         let success = success.map(str::parse).transpose().map_err(|error| invalid(&error))?;
         Ok(Self { sets, episodes, seed, success, policy, episodes_per_trial, begun: None, counting: None })
@@ -55,7 +52,8 @@ impl Tests {
     /// Begins the test on the set in this place: the seed of its environments, and their number N.
     fn plan(&mut self, place: usize) -> PyResult<(u64, usize)> {
         let Some(set) = self.sets.get(place) else { return Err(failure(UNUSABLE, 0, "there is no such set")) };
-        let counting = Counting::new(set.clone(), self.seed, self.episodes, self.episodes_per_trial);
+        let counting =
+            Counting::new(set.clone(), Purpose::TestEnvironments, self.seed, self.episodes, self.episodes_per_trial);
         let plan = (counting.test().seed, counting.num_envs());
         self.counting = Some(counting);
         Ok(plan)
@@ -86,7 +84,14 @@ impl Tests {
     fn take(&mut self, events: Option<&Events>, terminated: PyReadonlyArray1<'_, bool>) -> PyResult<(u64, u64)> {
         let Some(counting) = &mut self.counting else { return Err(failure(UNUSABLE, 0, "no test has begun")) };
         if let Some(events) = events {
-            counting.take(events.ended().iter(), &terminated.as_array().to_vec());
+            let terminated = terminated.as_array();
+            let ended = |end: &proto::EpisodeEnd| {
+                let slot = end.slot as usize;
+                EndedEpisode::of(end.clone(), slot, terminated.get(slot).copied().unwrap_or_default())
+            };
+            let ended: Option<Vec<EndedEpisode>> = events.ended().iter().map(ended).collect();
+            let unnamed = "the server sent the end of an episode without its address or its receipt: mend the server";
+            counting.take(ended.ok_or_else(|| failure(MALFORMED, 0, unnamed))?);
         }
         Ok(counting.progress())
     }
@@ -104,37 +109,6 @@ impl Tests {
         let Some((_, records)) = &self.begun else { return Err(failure(UNUSABLE, 0, "no test has begun")) };
         Ok(Records(records.clone()))
     }
-}
-
-fn set((name, version, drawn, contexts): Set) -> PyResult<TestSet> {
-    let version: Version = version.parse().map_err(|error| invalid(&error))?;
-    let contexts = match contexts {
-        Some(listed) if listed.is_empty() => {
-            return Err(failure(INVALID, 0, format!("{name} has no contexts; expected at least one")));
-        }
-        Some(listed) => {
-            if let Some(value) = listed.iter().flat_map(BTreeMap::values).find(|value| !value.is_finite()) {
-                return Err(failure(
-                    INVALID,
-                    0,
-                    format!("a context of {name} has the value {value}; expected a number"),
-                ));
-            }
-            Contexts::Listed(listed)
-        }
-        None => Contexts::Drawn(parameters(drawn)?),
-    };
-    Ok(TestSet { name, version, contexts })
-}
-
-fn parameters(drawn: Intervals) -> PyResult<BTreeMap<String, Distribution>> {
-    let distribution = |(name, intervals): (String, Vec<(f64, f64)>)| {
-        let intervals: Vec<Interval> = intervals.into_iter().map(|(low, high)| Interval::new(low, high)).collect();
-        let values = Distribution::union(&intervals);
-        let values = values.map_err(|error| failure(INVALID, 0, format!("the parameter {name}: {error}")))?;
-        Ok((name, values))
-    };
-    HashMap::into_iter(drawn).map(distribution).collect()
 }
 
 fn invalid(error: &dyn std::error::Error) -> PyErr {

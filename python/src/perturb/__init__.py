@@ -11,8 +11,9 @@ Importing this package registers its environments:
 
 from importlib.metadata import version as _version
 
+from . import sets
 from .assess import assess
-from .assessment import Assessment, Part, Result
+from .assessment import Assessment
 from .env import PerturbEnv
 from .environments import Environment, Parameter, environments
 from .errors import (
@@ -32,6 +33,7 @@ from .errors import (
 from .policy import Actor, Policy, load_policy
 from .registration import register_all as _register_all
 from .requests import Version
+from .results import Audit, Cell, Context, Part, Result
 from .vector import PerturbVectorEnv
 
 __version__ = _version("perturb")
@@ -39,6 +41,9 @@ __version__ = _version("perturb")
 __all__ = [
     "Actor",
     "Assessment",
+    "Audit",
+    "Cell",
+    "Context",
     "Environment",
     "InvalidArgumentError",
     "OutOfOrderError",
@@ -62,6 +67,7 @@ __all__ = [
     "assess",
     "environments",
     "load_policy",
+    "sets",
 ]
 
 _register_all()

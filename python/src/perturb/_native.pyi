@@ -109,6 +109,8 @@ class Policy:
     def seed(self) -> int: ...
     @property
     def observation_size(self) -> int: ...
+    @property
+    def timesteps(self) -> int: ...
     def player(self, num_envs: int, seed: int, first_environment_index: int) -> Player: ...
 
 class Player:
@@ -120,8 +122,35 @@ class Player:
         self, observations: NDArray[np.float32], rewards: NDArray[np.float32], starts: NDArray[np.bool_]
     ) -> None: ...
 
+# What is known of a policy: the version that it was trained on, steps of its training, the seed of its tests, their
+# episodes, what it observed, and whether it was deterministic.
+Known: TypeAlias = tuple[str | None, int | None, int, int, str, bool | None]
+
+class Assessment:
+    """The tests of an agent in one environment."""
+
+    def __init__(self, agent: str, policies: list[tuple[Known, Records]]) -> None: ...
+    @staticmethod
+    def read(path: str) -> Assessment: ...
+    def write(self, path: str, overwrite: bool) -> None: ...
+    @property
+    def agent(self) -> str: ...
+    def policies(self) -> list[tuple[Known, Records]]: ...
+
+def report_page(assessments: list[Assessment], beside: list[str]) -> str:
+    """The report page, HTML."""
+
 # A set of a test: its name, its version, what is drawn in place of the version's, and the contexts if they are listed.
 Set: TypeAlias = tuple[str, str, dict[str, list[tuple[float, float]]], list[dict[str, float]] | None]
+
+def make_set(name: str, version: str, values: list[tuple[str, str]]) -> Set:
+    """The set that texts of experiment files make."""
+
+def read_csv_set(name: str, version: str, path: str) -> Set:
+    """The set of the rows of a CSV file."""
+
+def read_sets(path: str) -> list[Set]:
+    """The sets of an experiment file."""
 
 class Tests:
     """The tests of a policy, one set after the other."""
@@ -152,8 +181,30 @@ class Records:
     @property
     def sets(self) -> list[str]: ...
     def columns(self) -> dict[str, Any]: ...
-    def result(self, name: str) -> tuple[int, float, tuple[float, float], float, float, float, float | None]: ...
+    @property
+    def rule(self) -> str | None: ...
+    def tests(self) -> list[Set]: ...
+    def parts(self, name: str) -> list[int]: ...
+    def result(
+        self, name: str
+    ) -> tuple[
+        int,
+        float,
+        tuple[float, float],
+        float,
+        tuple[float, float],
+        float,
+        float,
+        tuple[float, float],
+        float | None,
+    ]: ...
+    def success_by_parameters(
+        self, name: str, x: str, y: str
+    ) -> list[tuple[tuple[float, float], tuple[float, float], int, int]]: ...
     def success_by_parameter(self, name: str, parameter: str) -> list[tuple[float, float, int, int, float, float]]: ...
+
+def wilson(successes: int, episodes: int) -> tuple[float, float]:
+    """The 95 % interval of a rate, 0 … 1."""
 
 def metrics(rates: dict[str, float]) -> tuple[float | None, float | None, float | None]:
     """The paper's three numbers of success rates by scenario."""

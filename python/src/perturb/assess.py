@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +12,13 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from . import _native, catalogue, players, requests
-from .assessment import Assessed, Assessment
+from .assessment import Assessment
 from .catalogue import USUAL_PIXELS
 from .client import TIMEOUT, Client
 from .errors import InvalidArgumentError, PolicyError
 from .policy import Policy, native
+from .results import Assessed, Audit, Known
+from .sets import Set
 
 if TYPE_CHECKING:
     from .requests import Version
@@ -28,7 +31,7 @@ def assess(
     policy: Any,
     environment: str,
     *,
-    versions: Sequence[Version] | None = None,
+    versions: Sequence[Version | Set] | None = None,
     episodes: int = 1000,
     seed: int | None = None,
     parameters: requests.Parameters | None = None,
@@ -65,8 +68,8 @@ def assess(
             - a mapping of such by the version that each was trained on, `{"D": …, "R": …, "E": …}`: all pairs are
               tested, with all three the paper's nine scenarios.
         environment: a name of docs/environments.md, such as `CartPole`.
-        versions: to test on, `D`, `R`, `E` and `R+E`, at first the paper's three; none if parameters or contexts are
-            given.
+        versions: to test on, `D`, `R`, `E` and `R+E`, and sets of `perturb.sets`; at first the paper's three; none if
+            parameters or contexts are given.
         episodes: of each test, at least 1. Of a policy trained over trials these are trials, of each of which the last
             episode counts. A list of contexts has equally many in each, at least 1.
         seed: fixes all randomness, 0 … 2^64 - 1; at first that of the loaded policy's training, or 1.
@@ -83,7 +86,8 @@ def assess(
         deterministic: of a stable-baselines3 model: whether it takes the mode instead of sampling.
         normalizer: of a stable-baselines3 model: a VecNormalize, which is only read; at first the model's own, which a
             model that was loaded without its environment no longer has. With a mapping of policies, a mapping, too.
-        name: what records call the policy; at first its id, its kind with a checksum of its weights, or its function.
+        name: what records and reports call the policy; at first records have its id, its kind with a checksum of its
+            weights, or its function, and reports its kind.
         server: `unix:/path` or `host:port`; None starts a server of this process's own.
         timeout: how long a reply may take, s.
 
@@ -98,26 +102,116 @@ def assess(
         ProtocolError: if episodes ran with other parameters than they were to run with.
         ServerConnectionError, ServerTimeoutError, ServerStartError: and nothing was recorded.
     """
-    description = catalogue.find(environment)
+    environment = catalogue.find(environment).name
     requests.count(episodes, "episodes", 1)
     policies = _policies(policy, trained_on, normalizer)
     sets = _sets(versions, parameters, contexts, base)
-    assessed = []
+    assessed, agents = [], []
     for trained, one, own_normalizer in policies:
-        seen = observe or "state"
-        if isinstance(one, Policy):
-            seen = _of_loaded(one, environment, trained, observe)
-            trained = trained or (one.version if one.trained_on == one.version else None)
-        fits = description.observing_parameters() if requests.observes_parameters(seen) else description
-        tested = players.tested(one, fits, deterministic=deterministic, normalizer=own_normalizer, name=name)
-        the_seed = requests.seed((1 if tested.loaded is None else tested.loaded.seed) if seed is None else seed)
-        trials = 1 if tested.loaded is None else tested.loaded.episodes_per_trial
-        tests = native(_native.Tests, sets, episodes, the_seed, success, tested.name, trials)
-        for place, one_set in enumerate(sets):
-            settings = {"environment": environment, "server": server, "observe": seen, "timeout": timeout}
-            _test(tests, place, one_set, tested, settings, trials)
-        assessed.append(Assessed(trained, tests.records()))
-    return Assessment(assessed)
+        settings = Settings(environment, sets, episodes, seed, success, observe, deterministic, server, timeout)
+        agent, tested = play(one, settings, trained, own_normalizer, name)
+        agents.append(agent)
+        assessed.append(tested)
+    return Assessment(", ".join(dict.fromkeys(agents)), assessed)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a policy is tested."""
+
+    environment: str
+    sets: list[_native.Set]
+    episodes: int
+    seed: int | None
+    success: str | None
+    observe: str | None
+    deterministic: bool
+    server: str | None
+    timeout: float
+
+
+def again(
+    recorded: Sequence[Assessed], agent: str, policy: Any, normalizer: Any, server: str | None, timeout: float
+) -> Audit:
+    """Play all recorded tests again; see `Assessment.audit`."""
+    given = {trained: (one, own) for trained, one, own in _policies(policy, None, normalizer)}
+    keys = [one.trained_on for one in recorded]
+    if not isinstance(policy, Mapping) and len(keys) == 1:
+        given = {keys[0]: given[None]}
+    if set(given) != set(keys):
+        expected = "one policy" if keys == [None] else f"a mapping with the keys {', '.join(map(repr, keys))}"
+        raise InvalidArgumentError(
+            f"the recorded tests are of other policies than those that are given; expected {expected}"
+        )
+    episodes, different = 0, []
+    for one in recorded:
+        known, records = one.known, one.records
+        acts, own_normalizer = given[one.trained_on]
+        name = agent if records.policy == agent and not isinstance(acts, Policy) else None
+        settings = Settings(
+            records.environment,
+            records.tests(),
+            known.episodes,
+            known.seed,
+            records.rule,
+            known.observe,
+            bool(known.deterministic),
+            server,
+            timeout,
+        )
+        _, tested = play(acts, settings, known.trained_on, own_normalizer, name, records.policy)
+        episodes += len(records.columns()["seed"])
+        different += _differences(records.columns(), tested.records.columns())
+    return Audit(episodes, tuple(different))
+
+
+def _differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
+    """A sentence for each episode in which something came out otherwise."""
+    same: dict[str, Any] = {}
+    for name, values in before.items():
+        a, b = np.asarray(values), np.asarray(after[name])
+        same[name] = (a == b) | ((a != a) & (b != b)) if a.dtype.kind == "f" else a == b
+    wrong = np.flatnonzero(~np.logical_and.reduce(list(same.values())))
+    sentences = []
+    for row in wrong.tolist():
+        tested_on, *address = (before[name][row] for name in ("set", "environment_index", "episode_index"))
+        where = f"{tested_on}, environment {address[0]}, episode {address[1]}"
+        parts = [f"{name} was {before[name][row]}, is {after[name][row]}" for name in same if not same[name][row]]
+        sentences.append(f"{where}: {'; '.join(parts)}")
+    return sentences
+
+
+def play(
+    policy: Any,
+    settings: Settings,
+    trained_on: str | None,
+    normalizer: Any,
+    name: str | None,
+    expected: str | None = None,
+) -> tuple[str, Assessed]:
+    """Test one policy, which records call as expected: what reports call the agent, and its records."""
+    environment, observe = settings.environment, settings.observe
+    description = catalogue.find(environment)
+    seen = observe or "state"
+    if isinstance(policy, Policy):
+        seen = _of_loaded(policy, environment, trained_on, observe)
+        trained_on = trained_on or (policy.version if policy.trained_on == policy.version else None)
+    fits = description.observing_parameters() if requests.observes_parameters(seen) else description
+    tested = players.tested(policy, fits, deterministic=settings.deterministic, normalizer=normalizer, name=name)
+    if expected not in (None, tested.name):
+        raise PolicyError(
+            f"the tests were recorded of {expected}, this is {tested.name}: give the policy that was tested"
+        )
+    seed = requests.seed(
+        (1 if tested.loaded is None else tested.loaded.seed) if settings.seed is None else settings.seed
+    )
+    trials = 1 if tested.loaded is None else tested.loaded.episodes_per_trial
+    tests = native(_native.Tests, settings.sets, settings.episodes, seed, settings.success, tested.name, trials)
+    for place, one_set in enumerate(settings.sets):
+        client = {"environment": environment, "server": settings.server, "observe": seen, "timeout": settings.timeout}
+        _test(tests, place, one_set, tested, client, trials)
+    known = Known(trained_on, tested.timesteps, seed, settings.episodes, seen, tested.deterministic)
+    return tested.agent, Assessed(known, tests.records())
 
 
 def _policies(policy: Any, trained_on: str | None, normalizer: Any) -> list[tuple[str | None, Any, Any]]:
@@ -131,10 +225,11 @@ def _policies(policy: Any, trained_on: str | None, normalizer: Any) -> list[tupl
     normalizers = {} if normalizer is None else normalizer
     if not isinstance(normalizers, Mapping) or set(normalizers) - set(policy):
         raise InvalidArgumentError("normalizer must be a mapping with keys of the mapping of policies")
-    for key in policy:
-        requests.version(key, "a key of the mapping of policies")
-    in_order = [key for key in requests.VERSIONS if key in policy]
-    return [(key, policy[key], normalizers.get(key)) for key in in_order]
+    keys = {requests.version(key, "a key of the mapping of policies"): key for key in policy}
+    if len(keys) < len(policy):
+        raise InvalidArgumentError(f"the mapping of policies has a version twice: {', '.join(map(repr, policy))}")
+    in_order = [version for version in requests.VERSIONS if version in keys]
+    return [(version, policy[keys[version]], normalizers.get(keys[version])) for version in in_order]
 
 
 def _of_loaded(policy: Policy, environment: str, trained: str | None, observe: str | None) -> str:
@@ -149,32 +244,27 @@ def _of_loaded(policy: Policy, environment: str, trained: str | None, observe: s
 
 
 def _sets(
-    versions: Sequence[str] | None,
+    versions: Sequence[Any] | None,
     parameters: requests.Parameters | None,
     contexts: Sequence[Mapping[str, float]] | None,
     base: str,
 ) -> list[_native.Set]:
-    requests.version(base, "base")
+    base = requests.version(base, "base")
     own = parameters is not None or contexts is not None
-    named: Sequence[str] = (() if own else ("D", "R", "E")) if versions is None else versions
+    named: Sequence[Any] = (() if own else ("D", "R", "E")) if versions is None else versions
     if isinstance(named, str) or not isinstance(named, Sequence):
         raise InvalidArgumentError(f"versions={versions!r}; expected several, such as ('D', 'R', 'E')")
-    named = [requests.version(version) for version in named]
-    sets: list[_native.Set] = [(version, version, {}, None) for version in requests.VERSIONS if version in named]
+    chosen = [one for one in named if isinstance(one, Set)]
+    plain = [requests.version(one) for one in named if not isinstance(one, Set)]
+    sets: list[_native.Set] = [(version, version, {}, None) for version in requests.VERSIONS if version in plain]
+    sets += [one._plain() for one in chosen]
     if parameters is not None:
         sets.append((DRAWN, base, requests.distributions(parameters), None))
     if contexts is not None:
-        sets.append((LISTED, base, {}, [_context(context) for context in contexts]))
+        sets.append((LISTED, base, {}, requests.contexts(contexts)))
     if not sets:
         raise InvalidArgumentError("there is nothing to test on: give versions, parameters or contexts")
     return sets
-
-
-def _context(context: Mapping[str, float]) -> dict[str, float]:
-    values = requests.distributions(context)
-    if any(len(intervals) != 1 or intervals[0][0] != intervals[0][1] for intervals in values.values()):
-        raise InvalidArgumentError(f"the context {context!r} has intervals; expected a value of each parameter")
-    return {name: intervals[0][0] for name, intervals in values.items()}
 
 
 def _test(
@@ -202,23 +292,16 @@ def _test(
         width=USUAL_PIXELS,
         height=USUAL_PIXELS,
         single=False,
+        contexts=contexts,
     )
     description = client.description
     shape = (num_envs,) if description.discrete else (num_envs, *(description.action_space().shape or ()))
     encode = partial(requests.actions, description=description, shape=shape)
     try:
-        opened = client.open([seed], np.random.default_rng())
-        assert opened is not None
-        native(tests.opened, opened, None if tested.loaded is None else tested.loaded._native)
-        observations = opened.observations
-        if contexts is not None:
-            observations = observations.copy()
-            for slot in range(num_envs):
-                mask = np.zeros(num_envs, np.bool_)
-                mask[slot] = True
-                values = {name: [(value, value)] for name, value in contexts[slot % len(contexts)].items()}
-                rows, _ = client.reset(mask, [seed], values, b"")
-                observations[slot] = rows[0]
+        begun = client.open([seed], np.random.default_rng())
+        assert begun is not None
+        native(tests.opened, begun.opened, None if tested.loaded is None else tested.loaded._native)
+        observations = begun.observations
         with players.seeded(seed) if tested.loaded is None else contextlib.nullcontext():
             player = tested.player(num_envs, seed)
             native(player.begin, observations)

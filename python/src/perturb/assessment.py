@@ -3,89 +3,37 @@
 from __future__ import annotations
 
 import html
-import json
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import _native, requests
+from . import _native, plots, requests
 from .errors import InvalidArgumentError, UnknownNameError
 from .policy import native
+from .results import Assessed, Audit, Cell, Context, Known, Part, Result
+from .tables import METRICS, as_html, tables, text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-# What a folder says of the files beside it.
-MANIFEST = "assessment.json"
-FORMAT_VERSION = 1
-METRICS = ("Default", "Interpolation", "Extrapolation")
-
-
-@dataclass(frozen=True)
-class Assessed:
-    """The recorded tests of one policy, and what it was trained on, if that is known."""
-
-    trained_on: str | None
-    records: _native.Records
-
-
-@dataclass(frozen=True)
-class Result:
-    """The figures of one test. Rates are in %, their intervals hold with 95 % confidence (Wilson, 1927)."""
-
-    # The version that the policy was trained on, if that is known, and the set that it was tested on.
-    trained_on: str | None
-    tested_on: str
-    # What records call the policy.
-    policy: str
-    episodes: int
-    success_percent: float
-    success_interval: tuple[float, float]
-    # Undiscounted, never normalised; lengths in steps.
-    mean_return: float
-    mean_length: float
-    # CVaR 10 %: the mean of the worst tenth of returns, rounded up (Rockafellar and Uryasev, 2000).
-    cvar_return: float
-    # The success rate in the worst tenth of contexts: parts of the parameter space of some 40 episodes each, chosen by
-    # one half of the episodes and judged by the other. None where there are fewer than ten parts, as on D.
-    worst_contexts_percent: float | None
-
-    @property
-    def scenario(self) -> str:
-        """Training and test, such as `DR`; `D on parameters` of one's own set; the test alone if no more is known."""
-        if self.trained_on is None:
-            return self.tested_on
-        named = self.tested_on in requests.VERSIONS
-        return f"{self.trained_on}{self.tested_on}" if named else f"{self.trained_on} on {self.tested_on}"
-
-
-@dataclass(frozen=True)
-class Part:
-    """Success in a part of a parameter's range, `low` to `high`. Rates are in %, None without episodes."""
-
-    low: float
-    high: float
-    successes: int
-    episodes: int
-    success_percent: float | None
-    success_interval: tuple[float, float] | None
-
 
 class Assessment:
-    """Recorded tests of policies in one environment. Shown as a table, in a notebook too.
+    """Recorded tests of an agent's policies in one environment. Shown as a table, in a notebook too.
 
     Attributes:
+        agent: what reports call it: the `name` of the tests, or the policies' kind.
         environment: its name.
         success: what counted as a success, such as `steps at least 195`.
         parameters: the environment's parameters and their units.
         results: the figures of each test, in the order of training and test versions.
     """
 
-    def __init__(self, assessed: Sequence[Assessed]) -> None:
+    def __init__(self, agent: str, assessed: Sequence[Assessed]) -> None:
         self._assessed = tuple(assessed)
+        self._native = native(_native.Assessment, agent, [(one.known.plain(), one.records) for one in assessed])
+        self.agent = agent
         first = self._assessed[0].records
         self.environment: str = first.environment
         self.success: str | None = first.success
@@ -131,8 +79,7 @@ class Assessment:
             UnknownNameError: for a scenario that was not tested.
             InvalidArgumentError: for another parameter than the environment's.
         """
-        result = self[scenario]
-        records = next(one.records for one in self._assessed if one.trained_on == result.trained_on)
+        result, records = self._find(scenario)
         parts = native(records.success_by_parameter, result.tested_on, parameter)
         return tuple(
             Part(
@@ -145,6 +92,93 @@ class Assessment:
             )
             for part_low, part_high, successes, episodes, low, high in parts
         )
+
+    def success_by_parameters(self, scenario: str, x: str, y: str) -> tuple[Cell, ...]:
+        """Success over two parameters in a test: in the parts of `success_by_parameter` of either, by y, then x.
+
+        Nothing if one of them does not vary.
+
+        Raises:
+            UnknownNameError: for a scenario that was not tested.
+            InvalidArgumentError: for another parameter than the environment's.
+        """
+        result, records = self._find(scenario)
+        cells = native(records.success_by_parameters, result.tested_on, x, y)
+        return tuple(
+            Cell(in_x, in_y, successes, episodes, 100 * successes / episodes if episodes else None)
+            for in_x, in_y, successes, episodes in cells
+        )
+
+    def worst_contexts(self, scenario: str, count: int = 10) -> tuple[Context, ...]:
+        """Give the contexts of a test with the lowest success rates, the worst first; of equal ones the lowest return.
+
+        Contexts of a list are themselves; where parameters are drawn, they are parts of the parameter space of some 40
+        episodes each. These are chosen by the same episodes that then say how bad they are, so that the worst look
+        worse than they are; a result's `worst_contexts_percent` does not.
+
+        Raises:
+            UnknownNameError: for a scenario that was not tested.
+        """
+        result, records = self._find(scenario)
+        every = records.columns()
+        tested = np.array(every["set"]) == result.tested_on
+        columns = {name: np.asarray(values)[tested] for name, values in every.items()}
+        parts = np.array(records.parts(result.tested_on))
+        varying = [name for name in self.parameters if len(set(columns[f"requested_{name}"].tolist())) > 1]
+        contexts = []
+        for part in np.unique(parts):
+            rows = parts == part
+            values = {name: columns[f"requested_{name}"][rows] for name in varying}
+            successes, episodes = int(columns["success"][rows].sum()), int(rows.sum())
+            low, high = _native.wilson(successes, episodes)
+            contexts.append(
+                Context(
+                    {name: (float(it.min()), float(it.max())) for name, it in values.items()},
+                    successes,
+                    episodes,
+                    100 * successes / episodes,
+                    (100 * low, 100 * high),
+                    float(columns["return"][rows].mean()),
+                )
+            )
+        contexts.sort(key=lambda context: (context.success_percent, context.mean_return))
+        return tuple(contexts[: requests.count(count, "count", 1)])
+
+    def plot_curves(self, parameter: str, scenarios: Sequence[str] | None = None, *, axes: Any = None) -> Any:
+        """Draw success over a parameter, with 95 % Wilson intervals: a line for each scenario where it varies.
+
+        Args:
+            parameter: its name.
+            scenarios: at first all.
+            axes: of matplotlib, to draw on; at first new ones.
+
+        Returns the axes. Needs matplotlib: `pip install perturb[plot]`.
+
+        Raises:
+            ImportError: if matplotlib is not installed.
+            UnknownNameError, InvalidArgumentError: for an unknown scenario or parameter, or one that does not vary.
+        """
+        named = [result.scenario for result in self.results] if scenarios is None else list(scenarios)
+        lines = {name: self.success_by_parameter(name, parameter) for name in named}
+        return plots.curves(lines, parameter, self.parameters, self._title(), axes)
+
+    def plot_heatmap(self, scenario: str, x: str, y: str, *, axes: Any = None) -> Any:
+        """Draw success over two parameters of a test as a heatmap.
+
+        Args:
+            scenario: such as `DE`.
+            x: the parameter along x.
+            y: the parameter along y.
+            axes: of matplotlib, to draw on; at first new ones.
+
+        Returns the axes. Needs matplotlib: `pip install perturb[plot]`.
+
+        Raises:
+            ImportError: if matplotlib is not installed.
+            UnknownNameError, InvalidArgumentError: for an unknown scenario or parameter, or one that does not vary.
+        """
+        cells = self.success_by_parameters(scenario, x, y)
+        return plots.heatmap(cells, x, y, self.parameters, f"{self._title()}: {scenario}", axes)
 
     def columns(self) -> dict[str, Any]:
         """Every episode, as arrays [episodes] by name: those of `perturb evaluate --records`, after `trained_on`.
@@ -179,7 +213,10 @@ class Assessment:
         return pd.DataFrame(self.columns())
 
     def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write every record: of each policy a Parquet file, as `perturb evaluate --records` writes it.
+        """Write everything: `assessment.json`, and of each policy a file such as `perturb evaluate --records` writes.
+
+        `perturb report` takes such folders beside an experiment's, `to_html` beside others, `perturb audit` replays the
+        tests of perturb's policies.
 
         Args:
             folder: it must be new or empty, unless an assessment in it may be overwritten.
@@ -189,24 +226,8 @@ class Assessment:
             InvalidArgumentError: if it holds something else.
             OSError: if it cannot be written.
         """
-        path = Path(folder)
-        if path.is_dir() and any(path.iterdir()):
-            if not overwrite or not (path / MANIFEST).is_file():
-                instead = "overwrite=True replaces it" if (path / MANIFEST).is_file() else "name another folder"
-                raise InvalidArgumentError(f"{path} is not empty; {instead}")
-            (path / MANIFEST).unlink()  # what is half overwritten is no assessment
-            for earlier in path.glob("episodes*.parquet"):
-                earlier.unlink()
-        path.mkdir(parents=True, exist_ok=True)
-        policies = []
-        for one in self._assessed:
-            file = "episodes.parquet" if one.trained_on is None else f"episodes-{one.trained_on}.parquet"
-            native(one.records.write, str(path / file))
-            policies.append({"trained_on": one.trained_on, "file": file})
-        written = path / f".{MANIFEST}.tmp"
-        document = {"format_version": FORMAT_VERSION, "environment": self.environment, "policies": policies}
-        written.write_text(json.dumps(document, indent=2) + "\n", "utf-8")
-        written.replace(path / MANIFEST)
+        native(self._native.write, os.fspath(folder), overwrite)
+        self._native = native(_native.Assessment.read, os.fspath(folder))  # which knows its folder's name
 
     @staticmethod
     def load(folder: str | os.PathLike[str]) -> Assessment:
@@ -215,79 +236,71 @@ class Assessment:
         Raises:
             InvalidArgumentError: if there is no assessment, or one that is damaged or of a later version of perturb.
         """
-        path = Path(folder)
-        try:
-            document = json.loads((path / MANIFEST).read_text("utf-8"))
-            version = document["format_version"]
-            entries = [(policy["trained_on"], policy["file"]) for policy in document["policies"]]
-        except FileNotFoundError as error:
-            raise InvalidArgumentError(f"{path} holds no assessment: {MANIFEST} is not there") from error
-        except (ValueError, KeyError, TypeError) as error:
-            raise InvalidArgumentError(f"{path / MANIFEST} is damaged: {error!r}") from error
-        if version != FORMAT_VERSION:
-            raise InvalidArgumentError(f"{path / MANIFEST} has format {version!r}; this package reads {FORMAT_VERSION}")
-        assessed = []
-        for trained_on, file in entries:  # a file's name is that of one beside this, whatever is said of its folder
-            if trained_on is not None:
-                requests.version(trained_on, f"{path / MANIFEST}: trained_on")
-            assessed.append(Assessed(trained_on, native(_native.Records.read, str(path / Path(str(file)).name))))
-        if len({one.records.environment for one in assessed}) != 1:
-            raise InvalidArgumentError(f"{path / MANIFEST} names policies of no environment, or of several")
-        return Assessment(assessed)
+        read = native(_native.Assessment.read, os.fspath(folder))
+        assessment = Assessment(read.agent, [Assessed(Known(*known), records) for known, records in read.policies()])
+        assessment._native = read  # which knows its folder's name
+        return assessment
+
+    def to_html(
+        self,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        beside: Sequence[str | os.PathLike[str] | Assessment] = (),
+    ) -> str:
+        """Make the page of `perturb report`: tables and figures in one file that needs nothing else.
+
+        Args:
+            path: a file to write it to, too.
+            beside: what else is on the page: other assessments, or their folders, and the folder of at most one
+                experiment (the `--out` of `perturb run`), whose rule of success then judges all.
+
+        Returns the page, HTML.
+
+        Raises:
+            InvalidArgumentError: for a folder that is neither, or is damaged.
+            OSError: if a file cannot be read or written.
+        """
+        if isinstance(beside, str | os.PathLike | Assessment):
+            raise InvalidArgumentError(f"beside is {beside!r}; expected a list of folders and assessments")
+        others = [one for one in beside if isinstance(one, Assessment)]
+        folders = [os.fspath(one) for one in beside if not isinstance(one, Assessment)]
+        page: str = native(_native.report_page, [self._native, *(one._native for one in others)], folders)
+        if path is not None:
+            Path(path).write_text(page, "utf-8")
+        return page
+
+    def audit(self, policy: Any, *, normalizer: Any = None, server: str | None = None, timeout: float = 60.0) -> Audit:
+        """Test the same policy again, in all recorded episodes, and compare everything that came of them.
+
+        For policies that only Python can load; `perturb audit` replays those of perturb, on any machine. What samples
+        with torch or NumPy gives the same again on the same kind of machine, with the same packages.
+
+        Args:
+            policy: what was tested: a policy, or a mapping of all by what they were trained on.
+            normalizer: as in `assess`.
+            server: likewise.
+            timeout: likewise.
+
+        Raises:
+            PolicyError: for another policy than the recorded one, or one that fails.
+            InvalidArgumentError: for a mapping with other keys than what was trained on.
+            ServerConnectionError, ServerTimeoutError, ServerStartError: likewise.
+        """
+        from .assess import again  # which makes assessments
+
+        return again(self._assessed, self.agent, policy, normalizer, server, timeout)
+
+    def _find(self, scenario: str) -> tuple[Result, _native.Records]:
+        result = self[scenario]
+        return result, next(one.records for one in self._assessed if one.trained_on == result.trained_on)
 
     def __str__(self) -> str:
-        tests, comparison = self._tables()
-        return "\n\n".join([self._title(), _text(tests), *([_text(comparison)] if comparison else [])])
+        return "\n\n".join([self._title(), *map(text, tables(self))])
 
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        tests, comparison = self._tables()
-        tables = "".join(_html(table) for table in (tests, comparison) if table)
-        return f"<p>{html.escape(self._title())}</p>{tables}"
+        return f"<p>{html.escape(self._title())}</p>{''.join(map(as_html, tables(self)))}"
 
     def _title(self) -> str:
         return f"{self.environment}, a success is {self.success or 'what the server says'}"
-
-    def _tables(self) -> tuple[list[list[str]], list[list[str]]]:
-        """The tests' figures; and the paper's three numbers beside the paper's, if there are any."""
-        known = any(result.trained_on is not None for result in self.results)
-        head = ["scenario" if known else "tested on", "episodes", "success, %", "95 %", "worst contexts, %"]
-        tests = [[*head, "return", "CVaR 10 %", "length", "policy"]]
-        for it in self.results:
-            low, high = it.success_interval
-            worst = "" if it.worst_contexts_percent is None else f"{it.worst_contexts_percent:.1f}"
-            figures = [it.scenario, str(it.episodes), f"{it.success_percent:.1f}", f"[{low:.1f}, {high:.1f}]", worst]
-            numbers = [it.mean_return, it.cvar_return, it.mean_length]
-            tests.append([*figures, *(f"{number:.1f}" for number in numbers), it.policy])
-        metrics = self.metrics
-        if all(number is None for number in metrics.values()) or not self.published:
-            return tests, []
-        comparison = [["%", *METRICS]]
-        comparison.append(["here", *("" if number is None else f"{number:.1f}" for number in metrics.values())])
-        comparison += [[f"paper: {method}", *map(_spread, its.values())] for method, its in self.published.items()]
-        return tests, comparison
-
-
-def _spread(number: tuple[float, float | None] | None) -> str:
-    if number is None:
-        return ""
-    mean, std = number
-    return f"{mean:.1f}" if std is None else f"{mean:.1f} ± {std:.1f}"
-
-
-def _text(table: list[list[str]]) -> str:
-    """Columns under each other, the first to the left."""
-    widths = [max(len(row[column]) for row in table) for column in range(len(table[0]))]
-    lines = (
-        [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
-        for row in table
-    )
-    return "\n".join("  ".join(line).rstrip() for line in lines)
-
-
-def _html(table: list[list[str]]) -> str:
-    def row(cells: list[str], tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
-
-    return "<table>" + row(table[0], "th") + "".join(row(cells, "td") for cells in table[1:]) + "</table>"

@@ -6,8 +6,10 @@ opens; a difference is an error.
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
+import re
 from dataclasses import asdict, dataclass, field, replace
 from importlib import resources
 from typing import TYPE_CHECKING, Any
@@ -21,6 +23,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
 Range = tuple[float, float]
+
+# What ids in Gymnasium begin with.
+NAMESPACE = "perturb/"
 
 
 @dataclass(frozen=True)
@@ -126,11 +131,26 @@ LONGEST_SOCKET_PATH: int = _LIMITS["longest_socket_path"]
 
 
 def find(name: str) -> Description:
-    """Find an environment by its name.
+    """Find an environment by its name or id: letters count in either case, `-` and `_` not at all.
 
     Raises:
         InvalidArgumentError: with the names that there are.
     """
-    if name not in CATALOGUE:
-        raise InvalidArgumentError(f"environment={name!r} is none of {', '.join(CATALOGUE)}")
-    return CATALOGUE[name]
+    written, revision = str(name), None
+    if written.lower().startswith(NAMESPACE):
+        written = written[len(NAMESPACE) :]
+        if matched := re.fullmatch(r"(.*)-v(\d+)", written):
+            written, revision = matched[1], int(matched[2])
+    for description in CATALOGUE.values():
+        if _letters(description.name) == _letters(written):
+            if revision not in (None, description.revision):
+                current = f"{NAMESPACE}{description.name}-v{description.revision}"
+                raise InvalidArgumentError(f"environment={name!r} is another revision than this package's {current}")
+            return description
+    meant = difflib.get_close_matches(written, CATALOGUE, n=1)
+    hint = f" (did you mean {meant[0]!r}?)" if meant else ""
+    raise InvalidArgumentError(f"environment={name!r} is none of {', '.join(CATALOGUE)}{hint}")
+
+
+def _letters(name: str) -> str:
+    return re.sub("[-_]", "", name).lower()

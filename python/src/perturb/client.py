@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from . import catalogue, local_server, requests
 from .address import parse_address
@@ -11,9 +13,8 @@ from .errors import InvalidArgumentError, OutOfOrderError, ProtocolError
 from .session import Session
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
-    import numpy as np
     from gymnasium.vector import AutoresetMode
     from numpy.typing import NDArray
 
@@ -21,6 +22,14 @@ if TYPE_CHECKING:
 
 # How long a reply may take unless told otherwise, s.
 TIMEOUT = 60.0
+
+
+class Begun(NamedTuple):
+    """What opening a session gave: observations [N, O] and the first episodes."""
+
+    opened: Opened
+    observations: NDArray[np.float32]
+    events: Events
 
 
 class Client:
@@ -45,6 +54,7 @@ class Client:
         width: int,
         height: int,
         single: bool,
+        contexts: Sequence[Mapping[str, float]] | None = None,
     ) -> None:
         requests.render_mode(render_mode)
         self._drawn = render_mode is not None
@@ -60,8 +70,14 @@ class Client:
         self._timeout = requests.seconds(timeout, "timeout")
         self._single = single
         self._parameters = requests.distributions(parameters)
+        self._contexts = [] if contexts is None else requests.contexts(contexts)
+        if len(self._contexts) > self.num_envs:
+            raise InvalidArgumentError(
+                f"there are {len(self._contexts)} contexts for num_envs={self.num_envs}: each environment has one, so "
+                "give at least as many environments"
+            )
         self._request: dict[str, Any] = {
-            "environment": environment,
+            "environment": self.description.name,
             "version": requests.version(version),
             "first_environment_index": requests.count(first_environment_index, "first_environment_index", 0),
             "episodes_per_trial": requests.count(episodes_per_trial, "episodes_per_trial", 1),
@@ -95,8 +111,10 @@ class Client:
             raise OutOfOrderError("call reset() first: no episode has begun")
         return self._session
 
-    def open(self, seeds: Sequence[int], generator: np.random.Generator) -> Opened | None:
+    def open(self, seeds: Sequence[int], generator: np.random.Generator) -> Begun | None:
         """Open a session, unless one is open. Without seeds, which a reset is to give, the generator draws one.
+
+        Environment i then has context i modulo their number, if there are contexts.
 
         Raises:
             OutOfOrderError: if a session is gone whose environments did not all have the same parameters.
@@ -122,11 +140,23 @@ class Client:
                     "run the perturb-server of the package's version, or leave it out"
                 )
             self.description.require_equal(catalogue.Description.read(json.loads(opened.environment)))
+            begun = Begun(opened, opened.observations, opened.events)
+            if self._contexts:
+                begun = self._give_contexts(session, opened, seed)
         except BaseException:
             session.close()
             raise
         self._session = session
-        return opened
+        return begun
+
+    def _give_contexts(self, session: Session, opened: Opened, seed: int) -> Begun:
+        count = len(self._contexts)
+        for place, context in enumerate(self._contexts):
+            mask = np.arange(self.num_envs) % count == place
+            values = {name: [(value, value)] for name, value in context.items()}
+            session.reset(mask.tobytes(), [seed] * int(mask.sum()), values, b"")
+        # The same episodes once more, all together.
+        return Begun(opened, *session.reset(b"", [seed] * self.num_envs, {}, b""))
 
     def reset(
         self,
@@ -141,6 +171,9 @@ class Client:
             self._partly_changed = True
         else:
             self._parameters |= parameters
+            self._contexts = [
+                {name: value for name, value in context.items() if name not in parameters} for context in self._contexts
+            ]
         return done
 
     def snapshot(self, mask: NDArray[np.bool_] | None) -> list[bytes]:

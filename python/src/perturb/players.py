@@ -50,8 +50,14 @@ class Tested:
     name: str
     # Makes a player of N environments in a test with a seed.
     player: Callable[[int, int], Player]
+    # What reports call the agent: the same for policies that were trained alike.
+    agent: str = ""
     # perturb's own.
     loaded: Policy | None = None
+    # Steps of its training, if known.
+    timesteps: int | None = None
+    # Whether it takes the mode of its actions' distribution; None if that is its own business.
+    deterministic: bool | None = None
 
 
 def tested(policy: Any, description: Description, *, deterministic: bool, normalizer: Any, name: str | None) -> Tested:
@@ -67,7 +73,8 @@ def tested(policy: Any, description: Description, *, deterministic: bool, normal
                 "evaluate`: leave deterministic=, normalizer= and name= out"
             )
         loaded = policy._native
-        return Tested(policy.id, lambda num_envs, seed: native(loaded.player, num_envs, seed, 0), policy)
+        player = lambda num_envs, seed: native(loaded.player, num_envs, seed, 0)  # noqa: E731
+        return Tested(policy.id, player, policy.method, policy, loaded.timesteps, False)
     if _is(policy, "stable_baselines3.common.base_class", "BaseAlgorithm"):
         return _stable_baselines(policy, description, deterministic, normalizer, name)
     if deterministic:
@@ -77,11 +84,13 @@ def tested(policy: Any, description: Description, *, deterministic: bool, normal
     if _is(policy, "torch.nn", "Module"):
         digest = _digest(_tensors(policy.state_dict()))
         player = lambda _num_envs, _seed: _Module(policy, description)  # noqa: E731
-        return Tested(name or f"{type(policy).__name__} {digest}", player)
+        called = type(policy).__name__
+        return Tested(name or f"{called} {digest}", player, name or called)
     if callable(policy):
         remembers = _remembers(policy)
         called = getattr(policy, "__qualname__", type(policy).__qualname__)
-        return Tested(name or f"function {called}", lambda _num_envs, _seed: _Function(policy, remembers))
+        named = name or f"function {called}"
+        return Tested(named, lambda _num_envs, _seed: _Function(policy, remembers), named)
     raise PolicyError(
         f"policy is {policy!r}; expected one of load_policy(), a function of a batch of observations, a "
         "stable-baselines3 model, a torch module, or a mapping of such by the versions that they were trained on"
@@ -159,7 +168,14 @@ def _stable_baselines(
         seen = observations if normalizer is None else normalizer.normalize_obs(observations)
         return model.predict(seen, state=memory, episode_start=starts, deterministic=deterministic)
 
-    return Tested(name or f"{type(model).__name__} {digest}", lambda _num_envs, _seed: _Function(predict, True))
+    called, steps = type(model).__name__, getattr(model, "num_timesteps", None)
+    return Tested(
+        name or f"{called} {digest}",
+        lambda _num_envs, _seed: _Function(predict, True),
+        name or called,
+        timesteps=steps if isinstance(steps, int) and steps > 0 else None,
+        deterministic=deterministic,
+    )
 
 
 class _Module:

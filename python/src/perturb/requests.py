@@ -6,6 +6,7 @@ judge, whose sentences are better.
 
 from __future__ import annotations
 
+import math
 import numbers
 import operator
 from collections.abc import Mapping, Sequence
@@ -37,9 +38,9 @@ _INT32 = np.iinfo(np.int32)
 
 
 def version(name: Any, what: str = "version") -> Version:
-    """D, R, E or R+E, in large letters."""
+    """D, R, E or R+E, in large letters or small ones."""
     for known in VERSIONS:
-        if isinstance(name, str) and name == known:
+        if isinstance(name, str) and name.upper() == known:
             return known
     raise InvalidArgumentError(
         f"{what}={name!r} is none of 'D' (default physics), 'R' (random), 'E' (extreme) and 'R+E' (each in half "
@@ -72,6 +73,26 @@ def distributions(parameters: Parameters | None) -> Intervals:
             f"parameters is {parameters!r}; expected a dict of names, such as {{'length': 0.7, 'mass': (0.1, 0.2)}}"
         )
     return {_name(name): _distribution(name, value) for name, value in parameters.items()}
+
+
+def contexts(listed: Any) -> list[dict[str, float]]:
+    """Values of parameters by name, in each context those that it has: at least one context."""
+    if isinstance(listed, str | Mapping) or not isinstance(listed, Sequence):
+        raise InvalidArgumentError(
+            f"contexts is {listed!r}; expected a list such as [{{'length': 0.3}}, {{'length': 0.5}}]"
+        )
+    if not listed:
+        raise InvalidArgumentError("there are no contexts; expected at least one")
+    return [_context(context) for context in listed]
+
+
+def _context(context: Any) -> dict[str, float]:
+    values = distributions(context)
+    if not all(math.isfinite(end) for intervals in values.values() for interval in intervals for end in interval):
+        raise InvalidArgumentError(f"the context {context!r} has values that are no finite numbers")
+    if any(len(intervals) != 1 or intervals[0][0] != intervals[0][1] for intervals in values.values()):
+        raise InvalidArgumentError(f"the context {context!r} has intervals; expected a value of each parameter")
+    return {name: intervals[0][0] for name, intervals in values.items()}
 
 
 def _name(name: Any) -> str:

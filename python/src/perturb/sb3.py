@@ -42,8 +42,8 @@ def make_vec_env(environment: str, num_envs: int = 1, *, seed: int | None = None
         environment: a name of docs/environments.md, such as `CartPole`.
         num_envs: N.
         seed: environment i begins with the seed s + i; at first random ones.
-        **settings: those of `PerturbVectorEnv`, such as `version`, `parameters` and `server`, but for `autoreset_mode`
-            and `copy`.
+        **settings: those of `PerturbVectorEnv`, such as `version`, `parameters`, `contexts` and `server`, but for
+            `autoreset_mode` and `copy`.
 
     Raises:
         InvalidArgumentError: for settings that are wrong or not known.

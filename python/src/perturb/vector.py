@@ -15,6 +15,7 @@ from . import requests
 from .catalogue import USUAL_PIXELS
 from .client import TIMEOUT, Client
 from .errors import InvalidArgumentError
+from .sets import Set, contexts_of
 
 if TYPE_CHECKING:
     from ._native import Stepped
@@ -48,6 +49,9 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         render_mode: `rgb_array` lets `render` draw; None.
         width: of pictures, in pixels.
         height: likewise.
+        contexts: a list of values of parameters by name: environment i has context i modulo their number in all its
+            episodes. At most N, or a grid or list of `perturb.sets`. Of parameters that a context does not name the
+            version and `parameters` decide; a reset's parameters replace those of contexts.
 
     The connection is made by the first `reset`. Rewards are float32 [N], flags bool [N].
     """
@@ -71,7 +75,10 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
         render_mode: str | None = None,
         width: int = USUAL_PIXELS,
         height: int = USUAL_PIXELS,
+        contexts: Sequence[Mapping[str, float]] | Set | None = None,
     ) -> None:
+        if isinstance(contexts, Set):
+            contexts = contexts_of(contexts, version, parameters)
         self._mode = requests.autoreset_mode(autoreset_mode)
         self._client = Client(
             environment=environment,
@@ -90,6 +97,7 @@ class PerturbVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
             width=width,
             height=height,
             single=False,
+            contexts=contexts,
         )
         self.render_mode = render_mode
         description = self._client.description

@@ -37,7 +37,7 @@ pub(super) fn create(catalogue: &Catalogue, settings: &Settings) -> Result<(Batc
         let expected = format!("a STRING scalar, one of {}", catalogue.names().collect::<Vec<_>>().join(", "));
         Refusal::value(field(ENV_ID), "missing", expected)
     })?;
-    let spec = environment(catalogue, tensors::text(&field(ENV_ID), id)?)?;
+    let spec = catalogue.find(tensors::text(&field(ENV_ID), id)?)?;
     let own = [ENV_ID, VERSION, SEED, ENVIRONMENT_INDEX, EPISODES_PER_TRIAL];
     check_names(spec, "create_world", &own, settings)?;
     let integer = |name, default, low, high| match settings.get(name) {
@@ -101,14 +101,8 @@ pub(super) fn none(request: &'static str, settings: &Settings) -> Result<(), Ref
 /// # Errors
 /// If it is another letter.
 pub(super) fn version_of(field: String, letter: &str) -> Result<Version, Refusal> {
-    let found = Version::ALL.into_iter().find(|version| version.to_string() == letter);
+    let found = letter.parse().ok().filter(|version| Version::ALL.contains(version));
     found.ok_or_else(|| Refusal::value(field, format!("{:?}", shorten(letter)), "\"D\", \"R\" or \"E\""))
-}
-
-/// By the catalogue's name, or the id that Gymnasium knows it by.
-fn environment(catalogue: &Catalogue, id: &str) -> Result<&'static EnvironmentSpec, Refusal> {
-    let gymnasium = |spec: &&EnvironmentSpec| id == format!("perturb/{}-v{}", spec.name, spec.revision);
-    Ok(catalogue.specs().find(gymnasium).map_or_else(|| catalogue.find(id), Ok)?)
 }
 
 fn version(settings: &Settings) -> Result<Option<Version>, Refusal> {

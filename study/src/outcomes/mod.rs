@@ -9,11 +9,11 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::folder::CellResult;
 use crate::records::{RecordedParameter, RecordedTest, Records};
-use crate::selection::{MethodResults, Selected};
+use crate::selection::{MethodResults, Reported};
 use crate::sets::Contexts;
 use crate::success::Criterion;
 
-pub use sweeps::{Bin, Counted, bins, success_within};
+pub use sweeps::{Bin, Counted, bins, success_within, success_within_both};
 pub(crate) use sweeps::{success_at, thresholds};
 pub use worst::{SHARE, conditional_value_at_risk, worst_contexts};
 
@@ -26,7 +26,7 @@ pub struct Recorded {
 }
 
 /// The tests of a policy.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct PolicyOutcomes {
     /// In the order of [`Outcomes::parameters`].
     pub parameters: Vec<RecordedParameter>,
@@ -54,16 +54,15 @@ impl Recorded {
     /// Of the cells that `selections` are of; nothing so far.
     pub fn of(selections: &[MethodResults<'_>]) -> Self {
         let runs = selections.iter().flat_map(|selection| selection.runs.values());
-        let selected = runs.flat_map(|run| run.0.values().flatten());
+        let selected = runs.flat_map(|run| run.0.values().flatten()).filter_map(Reported::cell);
         Self { wanted: selected.map(|selected| selected.cell.id.clone()).collect(), policies: BTreeMap::new() }
     }
 
     /// Keeps what is needed of a cell's `records`, if it is one of those that were selected.
     pub fn add(&mut self, result: &CellResult, records: &Records) {
         if self.wanted.contains(&result.id) {
-            let tests = result.results.keys().map(|name| (name.clone(), Outcomes::of(records, name))).collect();
-            let (parameters, success) = (records.about.parameters.clone(), records.about.success.clone());
-            self.policies.insert(result.id.clone(), PolicyOutcomes { parameters, success, tests });
+            let names = result.results.keys().map(String::as_str);
+            self.policies.insert(result.id.clone(), PolicyOutcomes::of(records, names));
         }
     }
 
@@ -72,13 +71,22 @@ impl Recorded {
         (self.policies.len(), self.wanted.len())
     }
 
-    /// The policy that was selected; `None` without recorded episodes.
-    pub fn policy(&self, selected: &Selected<'_>) -> Option<&PolicyOutcomes> {
-        self.policies.get(&selected.cell.id)
+    /// The policy that is reported; `None` without recorded episodes.
+    pub fn policy<'a>(&'a self, reported: &Reported<'a>) -> Option<&'a PolicyOutcomes> {
+        match reported {
+            Reported::Cell(selected) => self.policies.get(&selected.cell.id),
+            Reported::Elsewhere(_, policy) => Some(policy.outcomes()),
+        }
     }
 }
 
 impl PolicyOutcomes {
+    /// Of the tests on sets with these names.
+    pub fn of<'a>(records: &Records, names: impl Iterator<Item = &'a str>) -> Self {
+        let tests = names.map(|name| (name.to_owned(), Outcomes::of(records, name))).collect();
+        Self { parameters: records.about.parameters.clone(), success: records.about.success.clone(), tests }
+    }
+
     /// Its test on a set; `None` if there was none.
     pub fn test(&self, tested_on: &str) -> Option<&Outcomes> {
         self.tests.get(tested_on).filter(|outcomes| !outcomes.returns.is_empty())

@@ -9,7 +9,7 @@ impl Outcomes {
     /// The part of the parameter space, from 0, that each episode's parameters lie in: of a set that lists its contexts the
     /// context; otherwise each parameter that varies is cut at quantiles of its own values, into as many intervals as give
     /// parts of about 40 episodes. Outcomes have no say in it.
-    pub(super) fn parts(&self) -> Vec<usize> {
+    pub fn parts(&self) -> Vec<usize> {
         if let Some(contexts) = &self.contexts {
             return contexts.clone();
         }

@@ -88,13 +88,31 @@ pub fn success_within(outcomes: &Outcomes, place: usize, bins: &[Bin]) -> Vec<Co
     let mut counted = vec![Counted::default(); bins.len()];
     let values = outcomes.parameters.get(place).into_iter().flatten();
     for (value, success) in values.zip(&outcomes.successes) {
-        let bin = bins.partition_point(|bin| bin.low <= *value).saturating_sub(1);
-        if let Some(bin) = counted.get_mut(bin) {
+        if let Some(bin) = counted.get_mut(bin_of(*value, bins)) {
             bin.episodes += 1;
             bin.successes += u64::from(*success);
         }
     }
     counted
+}
+
+/// The episodes of `outcomes` by the bins that two parameters lie in, those at `x` and `y`: `[Y, X]`, in a row. Nothing if
+/// one of them does not vary.
+pub fn success_within_both(outcomes: &Outcomes, [x, y]: [usize; 2], [over_x, over_y]: [&[Bin]; 2]) -> Vec<Counted> {
+    let mut counted = vec![Counted::default(); over_x.len() * over_y.len()];
+    let values = |place: usize| outcomes.parameters.get(place).into_iter().flatten();
+    for ((x, y), success) in values(x).zip(values(y)).zip(&outcomes.successes) {
+        if let Some(cell) = counted.get_mut(bin_of(*y, over_y) * over_x.len() + bin_of(*x, over_x)) {
+            cell.episodes += 1;
+            cell.successes += u64::from(*success);
+        }
+    }
+    counted
+}
+
+/// The place of the bin that `value` lies in.
+fn bin_of(value: f64, bins: &[Bin]) -> usize {
+    bins.partition_point(|bin| bin.low <= value).saturating_sub(1)
 }
 
 /// Thresholds over all that was achieved in `tests`, in ascending order, with the one of `criterion` among them; whole

@@ -2,12 +2,14 @@
 
 use std::collections::BTreeMap;
 
+use perturb_protocol::names::{self, EnvironmentName};
 use serde::Deserialize;
 use toml::Table;
 
 use super::SELECTION_TEST;
 use super::{Selection, distinct};
 use crate::Version;
+use crate::paper::ENVIRONMENTS;
 use crate::settings::Preset;
 use crate::success::Rule;
 use crate::value_error::{ValueError, require};
@@ -17,33 +19,56 @@ const OWN_KEYS: [&str; 7] = ["preset", "environment", "version", "parameters", "
 /// The most cells of a plan.
 const MOST_CELLS: usize = 1_000_000;
 
+/// The file's keys.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct File {
+    /// What reports of it are headed with (default: methods and environments).
+    pub(super) title: Option<String>,
+    /// What reports say its date is, `2026-11-23`: they depend on no clock (default: none).
+    pub(super) date: Option<toml::value::Datetime>,
+    /// Whose defaults settings have: "perturb" or "paper" (default: `"perturb"`).
     preset: Option<Preset>,
+    /// Names of the catalogue.
     pub(super) environments: Vec<String>,
+    /// What is trained on: "D", "R", "E", "R+E", or names of `sets` (default: `["D", "R", "E"]`).
     #[serde(default = "all_versions")]
     pub(super) versions: Vec<String>,
+    /// Who selects of a grid: "paper", the tests that are reported, or "clean", trainings and episodes of their own
+    /// (default: `"paper"`).
     #[serde(default)]
     pub(super) selection: Selection,
+    /// With "clean" alone: seeds that select, from `seed` on (default: `1`).
     tuning_runs: Option<u32>,
+    /// With "clean" alone: episodes of each test that selects (default: `test_episodes`).
     selection_episodes: Option<u64>,
+    /// Repetitions of the whole, each with a seed of its own, at least 1 (default: `1`).
     #[serde(default = "one")]
     pub(super) runs: u32,
+    /// The seed of run 1; each further run has the next (default: `1`).
     #[serde(default = "one")]
     pub(super) seed: u64,
+    /// Episodes of each test (default: `1000`).
     #[serde(default = "a_thousand")]
     pub(super) test_episodes: u64,
+    /// What every policy is tested on: versions, or names of `sets` (default: `["D", "R", "E"]`).
     #[serde(default = "all_versions")]
     pub(super) test_versions: Vec<String>,
+    /// Episodes of the budget after which the policy is tested, too, ascending (default: none).
     #[serde(default)]
     pub(super) evaluate_at: Vec<u64>,
+    /// Sets of parameters by name, `[sets.NAME]`: `version`, where other parameters come from (default: `"D"`), and by
+    /// parameter its values, or `file`, a CSV file of contexts beside this file.
     #[serde(default)]
     pub(super) sets: BTreeMap<String, Table>,
+    /// What decides about success: "text", "code", or by environment one of these or a threshold such as "steps=90"
+    /// (default: `"text"`, of the preset "paper" `"code"`).
     #[serde(default)]
     success: Success,
+    /// Settings of every training.
     #[serde(default)]
     pub(super) settings: Table,
+    /// What is trained: tables `[[algorithm]]`.
     pub(super) algorithm: Vec<Block>,
 }
 
@@ -67,13 +92,20 @@ impl Default for Success {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Block {
+    /// In place of the file's.
     preset: Option<Preset>,
+    /// An algorithm, as of `perturb train --algorithm`.
     pub(super) name: String,
+    /// "ff", "rc" or both; of RL² "rc" alone.
     pub(super) architectures: Vec<String>,
+    /// In place of the file's.
     environments: Option<Vec<String>>,
+    /// In place of the file's.
     versions: Option<Vec<String>>,
+    /// Settings of these trainings, over those of the file.
     #[serde(default)]
     pub(super) settings: Table,
+    /// Lists of values by setting; every combination is a configuration (default: one, of the defaults).
     #[serde(default)]
     pub(super) grid: Table,
 }
@@ -91,6 +123,42 @@ fn a_thousand() -> u64 {
 }
 
 impl File {
+    /// Spells names as they are spelled everywhere, and gives the revisions of environments that are asked for. An
+    /// environment that is not of the paper is one that a server has by just this name.
+    pub(super) fn spell(&mut self) -> Result<BTreeMap<String, u32>, ValueError> {
+        let mut revisions = BTreeMap::new();
+        let blocks = || self.algorithm.iter().flat_map(|block| block.environments.iter().flatten());
+        for written in self.environments.iter().chain(blocks()) {
+            let (name, revision) = environment(written);
+            let Some(revision) = revision else { continue };
+            let first = *revisions.entry(name.clone()).or_insert(revision);
+            let expected = format!("as above, perturb/{name}-v{first}");
+            require(first == revision, "environments", format!("`{written}`"), expected)?;
+        }
+        let spell_environments =
+            |names: &mut Vec<String>| names.iter_mut().for_each(|name| *name = environment(name).0);
+        let spell_versions = |names: &mut Vec<String>| {
+            for name in names {
+                *name = name.parse().map_or_else(|_| name.clone(), |version: Version| version.to_string());
+            }
+        };
+        spell_environments(&mut self.environments);
+        spell_versions(&mut self.versions);
+        spell_versions(&mut self.test_versions);
+        for block in &mut self.algorithm {
+            block.environments.iter_mut().for_each(spell_environments);
+            block.versions.iter_mut().for_each(spell_versions);
+        }
+        if let Success::Some(rules) = &mut self.success {
+            for (written, rule) in std::mem::take(rules) {
+                let name = environment(&written).0;
+                let expected = format!("an environment that has no rule yet: {name} has one");
+                require(rules.insert(name, rule).is_none(), "[success]", format!("`{written}`"), expected)?;
+            }
+        }
+        Ok(revisions)
+    }
+
     /// Those of the file itself, then those that only its tables name.
     pub(super) fn all_environments(&self) -> Vec<&str> {
         let own = self.algorithm.iter().flat_map(|block| block.environments.iter().flatten());
@@ -216,6 +284,13 @@ impl File {
             format!("{name}: the number of cells up to here, every combination of [algorithm.grid] in each run,");
         require(cells <= MOST_CELLS, what, cells, format!("at most {MOST_CELLS}"))
     }
+}
+
+/// How an environment is spelled, and the revision that is asked for.
+fn environment(written: &str) -> (String, Option<u32>) {
+    let EnvironmentName { name, revision } = EnvironmentName::new(written);
+    let known = names::find(&name, ENVIRONMENTS.into_iter());
+    (known.map_or(name, |place| ENVIRONMENTS[place].to_owned()), revision)
 }
 
 /// A list must name something, and nothing twice.

@@ -30,8 +30,14 @@ pub use groups::Grouping;
 pub struct Plan {
     /// The file, as it was written.
     pub text: String,
+    /// What a report of it is headed with; empty if it does not say.
+    pub title: String,
+    /// Its date, as it is written; empty if it does not say.
+    pub date: String,
     /// The files beside it that its sets name, with their content.
     pub beside: BTreeMap<String, Vec<u8>>,
+    /// The revisions of environments that it asks for, `perturb/CartPole-v1`; any of those that are missing.
+    pub revisions: BTreeMap<String, u32>,
     /// By which rule configurations are selected.
     pub selection: Selection,
     /// How often what is reported is repeated, each time with another seed.
@@ -151,12 +157,33 @@ pub enum PlanError {
 }
 
 impl Plan {
+    /// Of a report without an experiment.
+    pub fn without_cells() -> Self {
+        let (selection, cells, candidates) = (Selection::Paper, Vec::new(), Vec::new());
+        let (text, beside, revisions) = (String::new(), BTreeMap::new(), BTreeMap::new());
+        let (title, date) = Default::default();
+        Self { text, title, date, beside, revisions, selection, runs: 0, tuning_runs: 0, cells, candidates }
+    }
+
     /// Reads and expands the file at `path`.
     ///
     /// # Errors
     /// [`PlanError`], which names the table and the key.
     pub fn load(path: &Path) -> Result<Self, PlanError> {
         Self::parse(&path.display().to_string(), files::read_text(path)?)
+    }
+
+    /// The sets of the file at `path`, by their names.
+    ///
+    /// # Errors
+    /// [`PlanError`], which names the table and the key.
+    pub fn own_sets(path: &Path) -> Result<Vec<TestSet>, PlanError> {
+        let refused = |reason: AnyError| PlanError::Refused { path: path.display().to_string(), reason };
+        let text = files::read_text(path)?;
+        let file: File = toml::from_str(&text).map_err(|error| refused(error.to_string().trim().into()))?;
+        let folder = path.parent().unwrap_or(Path::new(""));
+        let sets = sets::read(&file.sets, folder, &mut BTreeMap::new()).map_err(|error| refused(error.into()))?;
+        Ok(sets.into_values().filter(|set| set.plain().is_none()).collect())
     }
 
     /// The files that it consists of, by their names: `plan.toml` and those that its sets name.
@@ -174,20 +201,33 @@ impl Plan {
     }
 
     fn expand(path: &str, text: String) -> Result<Self, AnyError> {
-        let file: File = toml::from_str(&text).map_err(|error| error.to_string().trim().to_owned())?;
+        let mut file: File = toml::from_str(&text).map_err(|error| error.to_string().trim().to_owned())?;
+        let revisions = file.spell()?;
         file.check()?;
         let mut beside = BTreeMap::new();
         let sets = sets::read(&file.sets, Path::new(path).parent().unwrap_or(Path::new("")), &mut beside)?;
         let (cells, candidates) = expansion::expand(&file, &sets)?;
         let (selection, runs, tuning_runs) = (file.selection, file.runs, file.tuning_runs());
-        Ok(Self { selection, runs, tuning_runs, cells, candidates, beside, text })
+        let title = file.title.unwrap_or_default();
+        let date = file.date.map(|date| date.to_string()).unwrap_or_default();
+        Ok(Self { selection, runs, tuning_runs, cells, candidates, title, date, beside, text, revisions })
     }
 
-    /// Whether `environment` has the parameters and thresholds that the plan's cells name for it.
+    /// Whether `environment` has the revision, the parameters and thresholds that the plan's cells name for it.
     ///
     /// # Errors
     /// [`ValueError`] for one that it does not take.
     pub fn check(&self, environment: &proto::Environment) -> Result<(), ValueError> {
+        if let Some(asked) = self.revisions.get(&environment.name) {
+            let (name, served) = (&environment.name, environment.revision);
+            let got = format!("perturb/{name}-v{asked}");
+            require(
+                *asked == served,
+                "an environment",
+                got,
+                format!("the server's perturb/{name}-v{served}, or {name}"),
+            )?;
+        }
         let (text, code) = (Criterion::of(environment), Criterion::of_code(environment));
         for cell in self.cells.iter().filter(|cell| cell.config.common.environment == environment.name) {
             let trained = cell.set.as_deref().unwrap_or_default();
@@ -247,6 +287,13 @@ impl Plan {
     pub fn methods(&self) -> Vec<Method> {
         distinct(self.cells.iter().map(Cell::method))
     }
+
+    /// Whether there is a choice: configurations of one method that are trained on the same.
+    pub fn selects(&self) -> bool {
+        let place = |cell: &&Cell| (cell.config.common.environment.clone(), cell.method(), cell.config.common.version);
+        let places = distinct(self.cells.iter().map(|cell| place(&cell))).len();
+        distinct(self.cells.iter().map(|cell| (place(&cell), &cell.configuration))).len() > places
+    }
 }
 
 /// What a policy is trained on.
@@ -256,7 +303,12 @@ pub enum TrainedOn<'a> {
     Version(Version),
     /// The plan's own set of that name.
     Set(&'a str),
+    /// Something that is not known, or none of these: of policies that were trained elsewhere.
+    Unknown,
 }
+
+/// What stands where it is not known what was trained on.
+const UNKNOWN: &str = "unknown";
 
 impl TrainedOn<'_> {
     /// Its name where a file has it.
@@ -264,6 +316,7 @@ impl TrainedOn<'_> {
         match self {
             TrainedOn::Version(version) => version.file_name(),
             TrainedOn::Set(name) => name,
+            TrainedOn::Unknown => UNKNOWN,
         }
     }
 }
@@ -273,6 +326,7 @@ impl std::fmt::Display for TrainedOn<'_> {
         match self {
             TrainedOn::Version(version) => version.fmt(f),
             TrainedOn::Set(name) => name.fmt(f),
+            TrainedOn::Unknown => UNKNOWN.fmt(f),
         }
     }
 }

@@ -25,7 +25,7 @@ pub(super) fn read(
         let key = format!("[sets.{name}]");
         let named = !name.is_empty() && is_plain(name);
         require(named, &key, format!("`{name}`"), "a name of letters, digits and _")?;
-        require(!sets.contains_key(name), &key, "there already", "another name than D, R, E and R+E")?;
+        require(name.parse::<Version>().is_err(), &key, "there already", "another name than D, R, E and R+E")?;
         let expected = "values of some parameters, or left out: it is a version";
         require(table.keys().any(|key| key != VERSION), &key, "without parameters", expected)?;
         let set = read_set(name, table, folder, beside)

@@ -42,6 +42,30 @@ fn a_file_expands_to_the_product_of_its_lists() {
 }
 
 #[test]
+fn names_are_spelled_as_one_likes_and_cells_are_the_same() {
+    let plan = parse(SMALL).unwrap();
+    let ids = |plan: &Plan| plan.cells.iter().map(|cell| cell.id.clone()).collect::<Vec<_>>();
+    let text = SMALL
+        .replace("['CartPole', 'Pendulum']", "['perturb/cart-pole-v1', 'PENDULUM']")
+        .replace("['D', 'E']", "['d', 'e']")
+        .replace("'a2c'", "'A2C'")
+        .replace("'rc'", "'RC'");
+    let spelled = parse(&text).unwrap();
+    assert_eq!(ids(&spelled), ids(&plan));
+    assert_eq!(spelled.environments(), ["CartPole", "Pendulum"]);
+    let mut served = proto::Environment { name: "CartPole".into(), revision: 1, ..Default::default() };
+    assert!(spelled.check(&served).is_ok());
+    served.revision = 2;
+    let refused = spelled.check(&served).unwrap_err().to_string();
+    assert!(
+        refused.contains("perturb/CartPole-v1, but must be the server's perturb/CartPole-v2, or CartPole"),
+        "{refused}"
+    );
+    assert!(refusal("'CartPole', 'Pendulum'", "'CartPole', 'cartpole'").contains("a list without repetitions"));
+    assert!(refusal("'D', 'E'", "'e', 'E'").contains("a list without repetitions"));
+}
+
+#[test]
 fn a_cell_has_all_settings_and_the_seed_of_its_run() {
     let plan = parse(SMALL).unwrap();
     let expected = |run: u32, version: &str| {
@@ -138,12 +162,31 @@ fn r_and_e_together_are_a_version_like_the_others_and_change_no_id_of_theirs() {
 }
 
 #[test]
+fn a_choice_is_between_configurations_of_one_method_on_the_same() {
+    let each = "environments = ['CartPole', 'Pendulum']\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
+    let two = format!(
+        "{each}\nenvironments = ['CartPole']\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff']\n\
+                       environments = ['Pendulum']\nsettings = {{ n_steps = 9 }}"
+    );
+    for (text, selects) in [(SMALL, true), (each, false), (&two, false)] {
+        assert_eq!(parse(text).unwrap().selects(), selects, "{text}");
+    }
+}
+
+#[test]
 fn an_invalid_cell_is_refused_with_its_table_and_key() {
     for (from, to, parts) in [
         ("7e-3,", "-1,", &["small.toml: [[algorithm]] 1 (a2c): [algorithm.grid]: learning_rate is -1"][..]),
         ("num_envs = 4", "num_envs = 0", &["[[algorithm]] 1 (a2c): [algorithm.settings]: num_envs is 0"]),
         ("episodes = 50 }", "gama = 0.9 }", &["(a2c): [settings]:", "unknown key `gama`"]),
-        ("n_steps = [5, 10]", "n_epochs = [1]", &["[algorithm.grid]:", "unknown key `n_epochs`; a2c's keys are"]),
+        (
+            "n_steps = [5, 10]",
+            "n_epochs = [1]",
+            &[
+                "[algorithm.grid]:",
+                "unknown key `n_epochs`; it is a setting of ppo, epopt-ppo, rl2-ppo; a2c's keys are",
+            ],
+        ),
         ("'a2c'", "'a3c'", &["[[algorithm]] 1 (a3c): algorithm is \"a3c\""]),
         ("'ff', 'rc'", "'ff', 'cnn'", &["(a2c): architecture is \"cnn\""]),
     ] {
@@ -256,6 +299,11 @@ fn a_plan_and_each_of_its_tables_may_name_a_preset_which_decides_about_success_t
     for (from, to, part) in [
         ("preset = 'paper'", "success = 'steps=85'", "success is steps=85, but must be \"text\" or \"code\""),
         ("preset = 'paper'", "success = 'mine'", "\"text\", \"code\", or a table of environments"),
+        (
+            "preset = 'paper'",
+            "success = { Acrobot = 'text', acrobot = 'code' }",
+            "[success] is `acrobot`, but must be an environment that has no rule yet: Acrobot has one",
+        ),
         ("preset = 'paper'", "preset = 'mine'", "unknown variant `mine`"),
         ("preset = 'paper'", "settings = { preset = 'paper' }", "[settings] preset is \"paper\", but must be left out"),
     ] {

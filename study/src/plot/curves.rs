@@ -1,4 +1,4 @@
-//! Training curves: three panels, D, R and E, side by side; and R+E, if anything is trained on it.
+//! Training curves: three panels, D, R and E, below each other; and R+E, if anything is trained on it.
 
 use std::ops::Range;
 
@@ -57,9 +57,10 @@ fn draw(curves: &EnvironmentCurves, trained_on: Option<Version>, quantity: Quant
         Quantity::Success => "success rate, %",
     };
     let environment = &curves.environment;
+    let shown = what.trim_end_matches(", %");
     let of = match trained_on {
-        None => format!("{environment}: {what} while training"),
-        Some(version) => format!("{environment}, trained on {version}: {what} in tests"),
+        None => format!("{environment}: {shown} while training, over {by}"),
+        Some(version) => format!("{environment}, trained on {version}: {shown} in tests after so many episodes"),
     };
     let (x, y) = ranges(&curves.curves, quantity, by);
     let versions = versions(|version| curves.curves.iter().any(|curve| curve.version == version));
@@ -67,6 +68,7 @@ fn draw(curves: &EnvironmentCurves, trained_on: Option<Version>, quantity: Quant
         caption: format!("{} {version}", if trained_on.is_some() { "tested on" } else { "trained on" }),
         x_name: by.to_string(),
         x: x.clone(),
+        y_name: what.into(),
         y: y.clone(),
         lines: curves
             .curves
@@ -77,10 +79,10 @@ fn draw(curves: &EnvironmentCurves, trained_on: Option<Version>, quantity: Quant
         mark: None,
     };
     Panels {
-        title: format!("{of}, mean and deviation over runs"),
-        columns: versions.len(),
+        title: of,
         panels: versions.into_iter().map(panel).collect(),
         legend: methods.iter().map(ToString::to_string).collect(),
+        note: "Lines: means over runs; bands: their standard deviation.".into(),
     }
 }
 

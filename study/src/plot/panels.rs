@@ -1,34 +1,42 @@
-//! Lines with bands in panels side by side, and what is drawn so.
+//! Lines with bands in panels below each other, and what is drawn so.
 
 use std::ops::Range;
 
 use plotters::coord::Shift;
 use plotters::prelude::*;
 
-use super::{AxisLook, LineStyle, Plot, PlotError, chart, drawing, font};
+use super::canvas::{Canvas, INSIDE, LINE, LineStyle, MARGIN, Side, text_width, wrapped};
+use super::colours::FRAME;
+use super::frame::{Frame, NAME, NUMBERS, y_numbers_width};
+use super::{Plot, PlotError, WIDTH};
+use crate::table::Table;
 
-const WIDTH: u32 = 960;
-const PANEL_HEIGHT: u32 = 260;
-const TITLE: u32 = 34;
-const LEGEND_LINE: u32 = 22;
-const LEGEND_COLUMNS: usize = 4;
+/// Of a panel's frame.
+const HEIGHT: f64 = 128.0;
+/// Between two panels, and around the legend.
+const GAP: f64 = 8.0;
+/// How long a sample of a line is in the legend, and what stands between its columns.
+const SAMPLE: f64 = 30.0;
+const BETWEEN: f64 = 16.0;
+/// Radius of a line's only point.
+const DOT: f64 = 3.0;
 /// A value that is marked.
-const MARK: LineStyle = LineStyle { colour: RGBColor(120, 120, 120), width: 1, dashes: Some((2, 3)) };
+const MARK: LineStyle = LineStyle { colour: FRAME, width: 2, dashes: Some((2, 3)) };
 
 /// The range of a success rate, %, with room for lines at its ends.
 pub(crate) const RATES: Range<f64> = -2.0..102.0;
 
-/// Panels that share their legend.
+/// Panels that share their legend. Where their x axes are the same, the lowest has its numbers.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Panels {
     /// Above all.
     pub(crate) title: String,
-    /// Panels in a row.
-    pub(crate) columns: usize,
-    /// By row.
+    /// From above to below.
     pub(crate) panels: Vec<Panel>,
     /// What lines are called, by their index.
     pub(crate) legend: Vec<String>,
+    /// What a line and a band is; below the legend.
+    pub(crate) note: String,
 }
 
 /// A chart.
@@ -37,6 +45,7 @@ pub(crate) struct Panel {
     pub(crate) caption: String,
     pub(crate) x_name: String,
     pub(crate) x: Range<f64>,
+    pub(crate) y_name: String,
     pub(crate) y: Range<f64>,
     pub(crate) lines: Vec<PanelLine>,
     /// Of x.
@@ -61,58 +70,137 @@ pub(crate) struct PanelPoint {
 }
 
 impl Plot for Panels {
-    fn size(&self) -> (u32, u32) {
-        let lines = self.legend.len().div_ceil(LEGEND_COLUMNS) as u32;
-        (WIDTH, TITLE + PANEL_HEIGHT * self.rows() as u32 + LEGEND_LINE * lines + 10)
+    fn height(&self) -> u32 {
+        let texts = self.title_lines().len() + self.legend_places().1 + self.note_lines().len();
+        let panels = |index| LINE + HEIGHT + if self.has_x_axis(index) { NUMBERS + LINE } else { 0.0 } + GAP;
+        let panels: f64 = (0..self.panels.len()).map(panels).sum();
+        (2.0 * MARGIN + LINE * texts as f64 + panels + GAP).ceil() as u32
     }
 
     fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError> {
-        area.fill(&WHITE).map_err(drawing)?;
-        let (title, rest) = area.split_vertically(TITLE * scale);
-        let (panels, legend) = rest.split_vertically(PANEL_HEIGHT * self.rows() as u32 * scale);
-        title.draw_text(&self.title, &font(15, scale), (12 * scale as i32, 10 * scale as i32)).map_err(drawing)?;
-        for (panel, place) in self.panels.iter().zip(panels.split_evenly((self.rows(), self.columns))) {
-            panel.draw(&place, scale)?;
+        let canvas = Canvas::new(area, scale)?;
+        let mut top = canvas.lines(&self.title_lines(), (MARGIN, MARGIN), Side::Left)?;
+        for (index, panel) in self.panels.iter().enumerate() {
+            let frame = self.frame(panel, top + LINE);
+            canvas.text(&panel.caption, (frame.left, top + LINE / 2.0), Side::Left)?;
+            panel.draw(&canvas, &frame, self.has_x_axis(index))?;
+            top = frame.bottom() + GAP;
+            if self.has_x_axis(index) {
+                canvas.text(&panel.x_name, (frame.middle().0, frame.bottom() + NUMBERS + LINE / 2.0), Side::Middle)?;
+                top += NUMBERS + LINE;
+            }
         }
-        self.draw_legend(&legend, scale)
+        let below = self.draw_legend(&canvas, top)?;
+        canvas.lines(&self.note_lines(), (MARGIN, below), Side::Left).map(|_| ())
     }
 }
 
 impl Panels {
-    fn rows(&self) -> usize {
-        self.panels.len().div_ceil(self.columns)
+    fn title_lines(&self) -> Vec<String> {
+        wrapped(&self.title, INSIDE)
     }
 
-    fn draw_legend<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError> {
-        let (width, unit) = ((WIDTH - 50) as i32 / LEGEND_COLUMNS as i32, scale as i32);
+    fn note_lines(&self) -> Vec<String> {
+        wrapped(&self.note, INSIDE)
+    }
+
+    /// Whether the panel below has another.
+    fn has_x_axis(&self, index: usize) -> bool {
+        let axis = |panel: &Panel| (panel.x_name.clone(), panel.x.clone());
+        self.panels.get(index + 1).is_none_or(|next| axis(next) != axis(&self.panels[index]))
+    }
+
+    /// All frames are as far from the left.
+    fn frame(&self, panel: &Panel, top: f64) -> Frame {
+        let numbers = self.panels.iter().map(|panel| y_numbers_width(&panel.y, HEIGHT)).fold(0.0, f64::max);
+        let left = MARGIN + NAME + numbers;
+        let width = f64::from(WIDTH) - left - MARGIN - 4.0; // half of the last number is beyond the frame
+        Frame { left, top, width, height: HEIGHT, x: panel.x.clone(), y: panel.y.clone() }
+    }
+
+    /// Where in the legend a line is: its left end, and its line; and how many lines there are.
+    fn legend_places(&self) -> (Vec<(f64, usize)>, usize) {
+        let widest = self.legend.iter().map(|name| text_width(name)).fold(0.0, f64::max) + SAMPLE + 8.0 + BETWEEN;
+        let columns = (((INSIDE + BETWEEN) / widest) as usize).clamp(1, self.legend.len().max(1));
+        let column = (INSIDE + BETWEEN) / columns as f64;
+        let mut line = 0;
+        let mut places = Vec::new();
         for (index, name) in self.legend.iter().enumerate() {
-            let (column, line) = ((index % LEGEND_COLUMNS) as i32, (index / LEGEND_COLUMNS) as i32);
-            let (x, y) = ((50 + column * width) * unit, (line * LEGEND_LINE as i32 + 11) * unit);
-            let sample = LineStyle::nth(index).along(vec![(x, y), (x + 34 * unit, y)], scale);
-            area.draw(&sample).map_err(drawing)?;
-            area.draw_text(name, &font(12, scale), (x + 42 * unit, y - 6 * unit)).map_err(drawing)?;
+            places.push((MARGIN + column * (index % columns) as f64, line));
+            let lines = if columns == 1 { wrapped(name, INSIDE - SAMPLE - 8.0).len() } else { 1 };
+            if (index + 1) % columns == 0 || index + 1 == self.legend.len() {
+                line += lines;
+            }
         }
-        Ok(())
+        (places, line)
+    }
+
+    /// Where it ends.
+    fn draw_legend<DB: DrawingBackend>(&self, canvas: &Canvas<'_, DB>, top: f64) -> Result<f64, PlotError> {
+        let (places, lines) = self.legend_places();
+        for (index, (name, (x, line))) in self.legend.iter().zip(places).enumerate() {
+            let line_top = top + LINE * line as f64;
+            let y = line_top + LINE / 2.0;
+            canvas.line(&[(x, y), (x + SAMPLE, y)], LineStyle::nth(index))?;
+            canvas.lines(&wrapped(name, INSIDE - SAMPLE - 8.0), (x + SAMPLE + 8.0, line_top), Side::Left)?;
+        }
+        Ok(top + LINE * lines as f64)
+    }
+
+    /// All that is drawn: a line for each point, with the names of the axes in `x_name` and `y_name`.
+    pub(crate) fn table(&self) -> Table {
+        let of_panel = |panel: &'_ Panel| {
+            let of_line = |line: &PanelLine| {
+                let index = line.index;
+                line.points.iter().map(move |point| (index, *point)).collect::<Vec<_>>()
+            };
+            let points: Vec<_> = panel.lines.iter().flat_map(of_line).collect();
+            points.into_iter().map(|(index, point)| (panel.clone_names(), index, point)).collect::<Vec<_>>()
+        };
+        let points: Vec<([String; 3], usize, PanelPoint)> = self.panels.iter().flat_map(of_panel).collect();
+        Table::of("", &points)
+            .text("panel", |([caption, ..], ..)| caption)
+            .text("line", |(_, index, _)| self.legend.get(*index).cloned().unwrap_or_default())
+            .text("x_name", |([_, x, _], ..)| x)
+            .number("x", |(.., point)| point.x)
+            .text("y_name", |([.., y], ..)| y)
+            .number("y", |(.., point)| point.y)
+            .number("low", |(.., point)| point.low)
+            .number("high", |(.., point)| point.high)
+            .build()
     }
 }
 
 impl Panel {
-    fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError> {
-        let x = AxisLook { name: self.x_name.clone(), range: self.x.clone(), ticks: 4 };
-        let y = AxisLook { name: String::new(), range: self.y.clone(), ticks: 6 };
-        let mut chart = chart(area, &self.caption, x, y, scale)?;
+    fn clone_names(&self) -> [String; 3] {
+        [self.caption.clone(), self.x_name.clone(), self.y_name.clone()]
+    }
+
+    fn draw<DB: DrawingBackend>(&self, canvas: &Canvas<'_, DB>, frame: &Frame, numbers: bool) -> Result<(), PlotError> {
+        canvas.frame(frame, true)?;
+        canvas.x_ticks(frame, numbers)?;
+        canvas.y_ticks(frame, true)?;
+        canvas.upright(&self.y_name, (MARGIN + LINE / 2.0, frame.middle().1))?;
         if let Some(mark) = self.mark {
-            let ends = vec![(mark, self.y.start), (mark, self.y.end)];
-            chart.plotting_area().draw(&MARK.along(ends, scale)).map_err(drawing)?;
+            canvas.line(&[(frame.x(mark), frame.top), (frame.x(mark), frame.bottom())], MARK)?;
         }
+        // What lies beyond the axis is at its end.
+        let within = |y: f64| frame.y(y).clamp(frame.top, frame.bottom());
         for PanelLine { index, points } in &self.lines {
             let style = LineStyle::nth(*index);
-            let there = points.iter().map(|point| (point.x, point.high));
-            let back = points.iter().rev().map(|point| (point.x, point.low));
-            let band: Vec<(f64, f64)> = there.chain(back).collect();
-            chart.draw_series([Polygon::new(band, style.colour.mix(0.16).filled())]).map_err(drawing)?;
-            let line = points.iter().map(|point| (point.x, point.y)).collect();
-            chart.plotting_area().draw(&style.along(line, scale)).map_err(drawing)?;
+            // A line of one point is none.
+            if let [point] = points[..] {
+                let (x, bar) = (frame.x(point.x), LineStyle { width: 1, dashes: None, ..style });
+                canvas.line(&[(x, within(point.low)), (x, within(point.high))], bar)?;
+                canvas.circle((x, within(point.y)), DOT, style.colour.filled())?;
+                continue;
+            }
+            let there = points.iter().map(|point| (frame.x(point.x), within(point.high)));
+            let back = points.iter().rev().map(|point| (frame.x(point.x), within(point.low)));
+            let band: Vec<_> = there.chain(back).collect();
+            canvas.polygon(&band, style.colour.mix(0.16).filled())?;
+            let line: Vec<_> = points.iter().map(|point| (frame.x(point.x), within(point.y))).collect();
+            canvas.line(&line, style)?;
         }
         Ok(())
     }

@@ -2,8 +2,6 @@
 
 use std::ops::Range;
 
-use super::tick;
-
 /// At most `most` multiples of 1, 2 or 5 times a power of ten in `range`, both ends included, with what is written there;
 /// the low end alone of a range that is none.
 pub(super) fn round_ticks(range: &Range<f64>, most: usize) -> Vec<(f64, String)> {
@@ -29,10 +27,46 @@ pub(super) fn round_ticks(range: &Range<f64>, most: usize) -> Vec<(f64, String)>
     (0..=(last - first) as i32).map(|index| (value(index), written(value(index), power))).collect()
 }
 
+/// From a tick to a tick, so that all of `range` is between; a range that is none stays.
+pub(super) fn rounded(range: &Range<f64>) -> Range<f64> {
+    match round_ticks(range, 6)[..] {
+        [(first, _), (second, _), ..] => {
+            let step = second - first;
+            let slack = 1e-9;
+            // Without the noise of binary fractions.
+            let tidy = |number: f64| format!("{number:.9e}").parse().unwrap_or(number);
+            tidy((range.start / step + slack).floor() * step)..tidy((range.end / step - slack).ceil() * step)
+        }
+        _ => range.clone(),
+    }
+}
+
 /// With as many digits as multiples of that power of ten need.
 fn written(value: f64, power: i32) -> String {
     // Adding 0 makes a negative zero positive.
-    if power < 0 { format!("{:.*}", power.unsigned_abs() as usize, value + 0.0) } else { tick(value) }
+    if power < 0 {
+        return format!("{:.*}", power.unsigned_abs() as usize, value + 0.0);
+    }
+    let decimals = |of: i32| (of - power).max(0) as usize;
+    match value.abs() {
+        1e6.. => format!("{:.*}M", decimals(6), value / 1e6),
+        10_000.0.. => format!("{:.*}k", decimals(3), value / 1e3),
+        _ => tick(value),
+    }
+}
+
+/// A number at an axis: short, and without the noise of binary fractions.
+fn tick(number: f64) -> String {
+    let digits = match number.abs() {
+        1e6.. => return format!("{}M", (number / 1e5).round() / 10.0),
+        10_000.0.. => return format!("{}k", (number / 100.0).round() / 10.0),
+        100.0.. => 0,
+        10.0.. => 1,
+        _ => 3,
+    };
+    let factor = 10_f64.powi(digits);
+    // Adding 0 makes a negative zero positive.
+    ((number * factor).round() / factor + 0.0).to_string()
 }
 
 #[cfg(test)]
@@ -40,6 +74,20 @@ mod tests {
     use rstest::rstest;
 
     use super::*;
+
+    #[rstest]
+    #[case(0.0, "0")]
+    #[case(-0.0001, "0")]
+    #[case(0.1 + 0.2, "0.3")]
+    #[case(-12.34, "-12.3")]
+    #[case(123.4, "123")]
+    #[case(9999.6, "10000")]
+    #[case(15_000.0, "15k")]
+    #[case(-12_345.0, "-12.3k")]
+    #[case(2_520_000.0, "2.5M")]
+    fn numbers_at_an_axis_are_short(#[case] number: f64, #[case] shown: &str) {
+        assert_eq!(tick(number), shown);
+    }
 
     #[rstest]
     #[case(0.0..100.0, 6, &["0", "20", "40", "60", "80", "100"])]
@@ -52,11 +100,22 @@ mod tests {
     #[case(-1613.2..-121.7, 5, &["-1500", "-1000", "-500"])]
     #[case(-0.31..0.29, 4, &["-0.2", "0.0", "0.2"])]
     #[case(-20000.0..20000.0, 5, &["-20k", "-10k", "0", "10k", "20k"])]
+    #[case(1e6..1.2e6, 6, &["1.00M", "1.05M", "1.10M", "1.15M", "1.20M"])]
+    #[case(101_000.0..101_250.0, 6, &["101.00k", "101.05k", "101.10k", "101.15k", "101.20k", "101.25k"])]
+    #[case(0.0..2e6, 3, &["0", "1M", "2M"])]
     #[case(3.0..3.0, 5, &["3"])]
     fn ticks_are_round_and_few(#[case] range: Range<f64>, #[case] most: usize, #[case] expected: &[&str]) {
         let ticks = round_ticks(&range, most);
         assert_eq!(ticks.iter().map(|(_, written)| written.as_str()).collect::<Vec<_>>(), expected);
-        let exact = |(value, written): &(f64, String)| written.ends_with('k') || written.parse() == Ok(*value);
+        let read = |written: &str| match written
+            .strip_suffix('k')
+            .map(|k| (k, 1e3))
+            .or(written.strip_suffix('M').map(|m| (m, 1e6)))
+        {
+            Some((number, unit)) => number.parse::<f64>().unwrap() * unit,
+            None => written.parse().unwrap(),
+        };
+        let exact = |(value, written): &(f64, String)| (read(written) - value).abs() <= 1e-9 * value.abs();
         assert!(ticks.iter().all(exact), "each number stands at its own place: {ticks:?}");
         let slack = 1e-6 * (range.end - range.start);
         assert!(ticks.iter().all(|(value, _)| *value >= range.start - slack && *value <= range.end + slack));

@@ -9,7 +9,7 @@ mod parquet;
 pub use columns::ColumnValues;
 pub use parquet::{FILE, RecordsError};
 
-use perturb_protocol::proto;
+use perturb_protocol::{EndedEpisode, proto};
 use serde::{Deserialize, Serialize};
 
 use crate::means::{mean, wilson};
@@ -191,10 +191,42 @@ impl About {
         Ok(())
     }
 
+    /// What an episode achieved of what decides about success, and of the environment's other quantity if it has two.
+    fn achieved(&self, end: &EndedEpisode) -> (Option<f64>, Option<f64>) {
+        let text = (end.achieved, self.also.is_some().then_some(end.code_achieved).flatten());
+        if self.is_judged_by_code() { (text.1, text.0) } else { text }
+    }
+
     /// Whether [`EpisodeRecord::achieved`] is what the code's rule compares, and another one than the text's does.
     pub fn is_judged_by_code(&self) -> bool {
         let quantity = |criterion: &Option<Criterion>| criterion.as_ref().map(|it| it.quantity.clone());
         self.also.is_some() && quantity(&self.success) == quantity(&self.code_success)
+    }
+}
+
+impl EpisodeRecord {
+    /// Of a test on `set` whose environments have `seed`.
+    pub fn of(about: &About, set: &str, seed: u64, end: EndedEpisode) -> Self {
+        let (achieved, also_achieved) = about.achieved(&end);
+        Self {
+            set: set.to_owned(),
+            seed,
+            environment_index: end.environment_index,
+            episode_index: end.episode_index,
+            ending: match (end.diverged, end.terminated) {
+                (true, _) => Ending::Diverged,
+                (false, true) => Ending::Terminated,
+                (false, false) => Ending::Truncated,
+            },
+            requested: end.receipt.requested,
+            applied: end.receipt.applied,
+            model_hash: end.receipt.model_hash,
+            episode_return: end.episode_return,
+            length: end.length,
+            success: about.success.as_ref().map_or(end.success, |criterion| criterion.holds(achieved)),
+            achieved,
+            also_achieved,
+        }
     }
 }
 
@@ -237,6 +269,23 @@ impl Records {
             mean_return: mean(episodes.iter().map(|episode| episode.episode_return)),
             mean_length: mean(episodes.iter().map(|episode| f64::from(episode.length))),
         }
+    }
+
+    /// The same episodes with `rule` in the place of what decided about success.
+    ///
+    /// # Errors
+    /// Those of [`About::criterion`].
+    pub fn judged_by(mut self, rule: &Rule) -> Result<Self, ValueError> {
+        let criterion = self.about.criterion(rule)?;
+        let swaps = self.about.also.as_ref() == Some(&criterion.quantity);
+        for episode in &mut self.episodes {
+            if swaps {
+                std::mem::swap(&mut episode.achieved, &mut episode.also_achieved);
+            }
+            episode.success = criterion.holds(episode.achieved);
+        }
+        self.about.judge_by(rule)?;
+        Ok(self)
     }
 
     /// What an episode achieved of what `criterion` compares.

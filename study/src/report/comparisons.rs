@@ -1,7 +1,7 @@
 //! Each two methods compared: by runs of the same seed in the same environments.
 
+use super::scope::Scope;
 use super::{MISSING, Report};
-use crate::plan::Plan;
 use crate::selection::{MethodResults, scores};
 use crate::statistics::{Bootstrapped, holm, probability_of_improvement, sign_flip_p};
 use crate::table::Table;
@@ -33,19 +33,20 @@ pub(super) struct Comparison {
 }
 
 /// All comparisons over all environments, then, if there are several, those in each of them.
-pub(super) fn comparisons(plan: &Plan, selections: &[MethodResults<'_>]) -> Vec<Comparison> {
-    let environments = plan.environments();
+pub(super) fn comparisons(scope: &Scope<'_>, selections: &[MethodResults<'_>]) -> Vec<Comparison> {
+    let environments = &scope.averaged;
     if let [environment] = environments[..] {
-        return of(plan, selections, environment, &[environment]);
+        return of(scope, selections, environment, &[environment]);
     }
-    let each = environments.iter().flat_map(|environment| of(plan, selections, environment, &[environment]));
-    of(plan, selections, ALL, &environments).into_iter().chain(each).collect()
+    let each = environments.iter().flat_map(|environment| of(scope, selections, environment, &[environment]));
+    of(scope, selections, ALL, environments).into_iter().chain(each).collect()
 }
 
-/// The family of comparisons over some environments. Reference lines are not in it: each would cost the others' p-values.
-fn of(plan: &Plan, selections: &[MethodResults<'_>], name: &str, environments: &[&str]) -> Vec<Comparison> {
-    let mut methods = plan.methods();
-    methods.retain(|method| !method.is_reference());
+/// The family of comparisons over some environments. Reference lines are not in it: each would cost the others' p-values; nor
+/// are agents that were trained elsewhere, whose runs have no seeds in common with others.
+fn of(scope: &Scope<'_>, selections: &[MethodResults<'_>], name: &str, environments: &[&str]) -> Vec<Comparison> {
+    let mut methods = scope.methods.clone();
+    methods.retain(|method| !method.is_reference() && !method.elsewhere);
     let found = |method: &Method| -> Option<Vec<&MethodResults<'_>>> {
         let of = |environment| selections.iter().find(|of| of.environment == environment && of.method == *method);
         environments.iter().map(|environment| of(*environment)).collect()
@@ -155,7 +156,7 @@ mod tests {
     #[test]
     fn runs_of_the_same_seed_are_pairs() {
         let plan = "environments = ['CartPole']\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff', 'rc']";
-        let methods = Plan::parse("test", plan.into()).unwrap().methods();
+        let methods = crate::Plan::parse("test", plan.into()).unwrap().methods();
         let compared = |scores: &[Vec<f64>]| compare(ALL, [&methods[0], &methods[1]], Metric::Default, scores);
         // Two environments: x is better by 1 in each run, however far runs lie apart.
         let [x, y] = [0.0, 1.0].map(|less| [10.0, 50.0, 90.0].map(|score| score - less).to_vec());
@@ -172,10 +173,11 @@ mod tests {
         let learners =
             "environments = ['CartPole']\nruns = 3\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff', 'rc']";
         let of = |text: String| {
-            let plan = Plan::parse("test", text).unwrap();
+            let plan = crate::Plan::parse("test", text).unwrap();
             let rate = |cell: &crate::Cell| 10.0 * f64::from(cell.run) + cell.method().to_string().len() as f64;
             let results = crate::fixture::results(&plan, |cell| Some(([rate(cell); 3], 1.0)));
-            comparisons(&plan, &results.select())
+            let selections = results.select();
+            comparisons(&Scope::of(&plan, &selections), &selections)
         };
         let without = of(learners.into());
         assert_eq!(without.len(), Metric::ALL.len());

@@ -1,6 +1,7 @@
 //! The numbers of a report as lines of files; an empty field is a number that there is not.
 
 use super::numbers::{MethodMetrics, counted, or_empty};
+use super::scope::has_scenarios_of;
 use super::{Cell, Report};
 use crate::statistics::{Bootstrapped, Summary};
 use crate::table::{Table, TableBuilder};
@@ -11,7 +12,9 @@ impl Report<'_> {
     pub fn files(&self) -> Vec<Table> {
         let sets = (!self.set_tests.is_empty()).then(|| self.sets_file());
         let tuned = (!self.tuned.is_empty()).then(|| self.tuned_file());
-        let files = [self.metrics_file(), self.iqm_file(), self.scenarios_file(), self.selected_file()];
+        let files =
+            [self.finding_file(), self.metrics_file(), self.iqm_file(), self.scenarios_file(), self.selected_file()];
+        let elsewhere = (!self.elsewhere.is_empty()).then(|| self.elsewhere_file());
         let marks = (!self.marks.is_empty()).then(|| self.marks_file());
         let more = [
             self.comparisons_file(),
@@ -24,7 +27,7 @@ impl Report<'_> {
             self.configurations_file(),
         ];
         let more = more.into_iter().filter(|table| !table.rows.is_empty());
-        files.into_iter().chain(sets).chain(tuned).chain(marks).chain(more).collect()
+        files.into_iter().chain(elsewhere).chain(sets).chain(tuned).chain(marks).chain(more).collect()
     }
 
     fn metrics_file(&self) -> Table {
@@ -72,7 +75,8 @@ impl Report<'_> {
     fn scenarios_file(&self) -> Table {
         let (trained, tested) = (self.trained_versions(), self.tested_versions());
         let of_selection = |selection| Scenario::of(&trained, &tested).map(move |scenario| (selection, scenario));
-        let lines: Vec<_> = self.selections.iter().flat_map(of_selection).collect();
+        let lines = self.with_scenarios().into_iter().flat_map(of_selection);
+        let lines: Vec<_> = lines.filter(|(row, scenario)| has_scenarios_of(row, scenario.train)).collect();
         Table::of("scenarios.csv", &lines)
             .text("environment", |(selection, _)| selection.environment)
             .method(|(selection, _)| &selection.method)
@@ -153,17 +157,19 @@ impl<'r, R> TableBuilder<'r, R> {
         self.method_as("", method)
     }
 
-    /// The same with names that begin with `prefix`. Presets and what is observed have a column only where one is not
-    /// the default, so that other files stay as they were.
+    /// The same with names that begin with `prefix`. Presets, what is observed, and whether it was trained elsewhere have a
+    /// column only where one is not the default, so that other files stay as they were.
     pub(crate) fn method_as(self, prefix: &str, method: impl Fn(&'r R) -> &'r Method) -> Self {
         let any = |is: fn(&Method) -> bool| self.sources().iter().any(|row| is(method(row)));
         let (presets, observes) = (any(|it| !it.preset.is_default()), any(|it| !it.observe.is_default()));
+        let elsewhere = any(|it| it.elsewhere);
         let table = self
             .text(format!("{prefix}algorithm"), |row| &method(row).algorithm)
             .text(format!("{prefix}architecture"), |row| &method(row).architecture)
             .text(format!("{prefix}episodes_per_trial"), |row| or_empty(method(row).episodes_per_trial));
         let table = if presets { table.text(format!("{prefix}preset"), |row| method(row).preset) } else { table };
-        if observes { table.text(format!("{prefix}observe"), |row| method(row).observe) } else { table }
+        let table = if observes { table.text(format!("{prefix}observe"), |row| method(row).observe) } else { table };
+        if elsewhere { table.text(format!("{prefix}elsewhere"), |row| method(row).elsewhere) } else { table }
     }
 
     pub(super) fn summary(self, summary: impl Fn(&'r R) -> Option<Summary>) -> Self {

@@ -3,7 +3,7 @@
 use crate::against_training::{against_training, test_curves};
 use crate::curves::{EnvironmentCurves, Footing};
 use crate::heatmaps::NoHeatmap;
-use crate::plot::{PlotError, Quantity, draw_curves, draw_tests, svg};
+use crate::plot::{Panels, PlotError, Quantity, draw_curves, draw_tests, svg};
 use crate::selection::MethodResults;
 
 use super::{HeatmapPicture, Picture, Report};
@@ -11,6 +11,10 @@ use super::{HeatmapPicture, Picture, Report};
 /// All pictures of a report.
 #[derive(Clone, Debug, Default)]
 pub struct Figures {
+    /// What the page opens with.
+    pub finding: Vec<Figure>,
+    /// The same of each environment, if the page opens with all together.
+    pub metrics: Vec<Figure>,
     /// Of all environments together.
     pub profiles: Vec<Figure>,
     /// One for each environment and version that was trained on.
@@ -36,6 +40,8 @@ pub struct Figures {
 pub struct Figure {
     /// Figures of one environment stand together.
     pub environment: String,
+    /// What its files are called, without their endings.
+    pub file: String,
     /// A few words for those who do not see it.
     pub name: String,
     /// What the picture shows, or why it is missing.
@@ -47,8 +53,13 @@ pub struct Figure {
 /// What is shown of a picture.
 #[derive(Clone, Debug)]
 pub enum FigureData {
-    /// An SVG element.
-    Svg(String),
+    /// Both are complete in themselves.
+    Svg {
+        /// An SVG element.
+        svg: String,
+        /// The numbers that are drawn, as a file.
+        csv: Vec<u8>,
+    },
     /// There is none; the caption says why.
     Missing,
 }
@@ -65,6 +76,8 @@ impl Figures {
     ) -> Result<Self, PlotError> {
         let drawn = |pictures: Vec<Picture>| pictures.iter().map(Picture::figure).collect::<Result<_, _>>();
         let mut figures = Self {
+            finding: drawn(report.finding_pictures())?,
+            metrics: drawn(report.environment_pictures())?,
             profiles: drawn(report.profiles_picture().into_iter().collect())?,
             parameters: drawn(report.parameter_pictures())?,
             thresholds: drawn(report.threshold_pictures())?,
@@ -86,9 +99,10 @@ impl Figures {
                     format!("{environment}, trained on {trained_on}: {quantity} in tests after so many episodes");
                 self.marks.push(Figure {
                     environment: environment.clone(),
+                    file: format!("{environment}-{}-tests-{quantity}", trained_on.file_name()),
                     caption: format!("{name}. Lines are means over runs, bands their standard deviation."),
                     name,
-                    picture: FigureData::Svg(svg(&draw_tests(&curves, trained_on, quantity))?),
+                    picture: figure_data(&draw_tests(&curves, trained_on, quantity))?,
                 });
             }
         }
@@ -105,17 +119,22 @@ impl Figures {
             for (by, quantity) in Footing::ALL.into_iter().flat_map(|by| Quantity::ALL.map(|quantity| (by, quantity))) {
                 self.curves.push(Figure {
                     environment: environment.clone(),
+                    file: format!("{environment}-{quantity}-over-{by}"),
                     name: format!("{environment}: {quantity} while training, over {by}"),
                     caption: format!(
                         "{environment}: {quantity} while training, over {by}, of the selected configurations. Lines are means \
                          over runs, bands their standard deviation."
                     ),
-                    picture: FigureData::Svg(svg(&draw_curves(curves, quantity, by))?),
+                    picture: figure_data(&draw_curves(curves, quantity, by))?,
                 });
             }
         }
         Ok(())
     }
+}
+
+fn figure_data(panels: &Panels) -> Result<FigureData, PlotError> {
+    Ok(FigureData::Svg { svg: svg(panels)?, csv: panels.table().to_csv() })
 }
 
 /// What to do about the heatmaps that are missing.

@@ -24,7 +24,7 @@ pub(super) struct Trainings<'a> {
 /// Those with results, in the order of `selections`.
 pub(super) fn trainings<'a>(selections: &'a [MethodResults<'a>], curves: &[EnvironmentCurves]) -> Vec<Trainings<'a>> {
     let of = |selection: &'a MethodResults<'a>, version: Version| {
-        let selected = selection.runs.values().filter_map(|run| run.trained_on(TrainedOn::Version(version)));
+        let selected = selection.runs.values().filter_map(|run| run.cell_trained_on(TrainedOn::Version(version)));
         let counters: Vec<Counters> = selected.map(|selected| selected.result.training.counters).collect();
         let of_environment = curves.iter().find(|of| of.environment == selection.environment);
         let same = || of_environment.into_iter().flat_map(|of| &of.curves).filter(|curve| curve.version == version);

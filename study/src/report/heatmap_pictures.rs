@@ -75,7 +75,7 @@ pub fn heatmap_pictures(selections: &[MethodResults<'_>], folder: &Folder) -> Re
             }
         }
         let shown = drafts.iter().flat_map(|draft| &draft.columns).filter_map(|column| column.mean.as_ref());
-        let returns = common_returns(shown);
+        let returns = common_returns(places[0].environment, shown);
         pictures.extend(drafts.iter().map(|draft| draft.picture(&returns)));
     }
     Ok(pictures)
@@ -215,9 +215,12 @@ impl Column<'_> {
 impl HeatmapPicture {
     /// As the page shows it.
     pub(super) fn figure(&self) -> Result<Figure, PlotError> {
-        let Self { environment, name, caption, panels, .. } = self.clone();
-        let picture = panels.map_or(Ok(FigureData::Missing), |panels| svg(&panels).map(FigureData::Svg))?;
-        Ok(Figure { environment, name, caption, picture })
+        let Self { environment, file, name, caption, panels, figures, .. } = self.clone();
+        let picture = match panels {
+            Some(panels) => FigureData::Svg { svg: svg(&panels)?, csv: figures.to_csv() },
+            None => FigureData::Missing,
+        };
+        Ok(Figure { environment, file, name, caption, picture })
     }
 
     /// Writes it into the folder `out` as SVG, PNG and CSV; whether there is something to write.

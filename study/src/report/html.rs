@@ -1,7 +1,9 @@
-//! A report as one HTML page, complete in itself: no network, no script, all pictures inside.
+//! A report as one HTML page, complete in itself: no network, no script, all pictures inside, and the files that its links
+//! lead to.
 
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
+use super::links::data_uri;
 use super::{Figure, FigureData, Figures, MISSING, Report};
 use crate::plot;
 use crate::table::{Column, Entry, Table};
@@ -11,8 +13,8 @@ const METRICS: &str = "Default is the success rate of policies that were trained
                        policies trained and tested on R. Extrapolation is the geometric mean of three: trained on D and \
                        tested on R, trained on D and tested on E, trained on R and tested on E.";
 const HEATMAPS: &str = "How the selected policies do over two parameters: means over runs. Colours are mean return and success \
-                        rate, the same in all pictures of an environment. The whole line is R's box, dashed lines are E's, \
-                        the ring is D.";
+                        rate, the same in all pictures of an environment; what lies beyond their scale has the colour of its \
+                        end. Boxes are R's and E's, the ring is D.";
 const COMPARISONS: &str = "Runs of two methods with the same seed, in each of the environments. P(X > Y) is the probability that \
                            a run of X is better than one of Y, where equal ones count half. Corrected p-values up to 0.05 \
                            are, all together, wrong with a probability of 5 % at most.";
@@ -45,10 +47,12 @@ pub fn html(report: &Report<'_>, figures: &Figures) -> String {
     let section = |id, title, notes, subsections| Section { id, title, notes, subsections };
     let tables = |tables: Vec<Table>| tables.into_iter().map(plain).collect();
     let said = |text: &str| html! { p { (text) } };
-    let gap_and_profiles = [plain(report.gap_table())].into_iter().chain(by_environment(&figures.profiles)).collect();
-    let cells = report.tuned_table().into_iter().chain([report.selected_table()]).chain(report.failure_table());
+    let gap_and_profiles = report.gap_table().into_iter().map(plain).chain(by_environment(&figures.profiles)).collect();
+    let cells = report.tuned_table().into_iter().chain(report.selected_table()).chain(report.failure_table());
+    let elsewhere = report.elsewhere_table().into_iter().collect();
     let cells = cells.map(plain).collect();
     let marks = report.marks_table().into_iter().map(plain).chain(by_environment(&figures.marks)).collect();
+    let metrics = metrics(report, &figures.metrics);
     let settings = report.settings_table().into_iter().map(plain).chain(by_environment(&figures.settings)).collect();
     let scenarios = report.scenario_tables().into_iter().map(shaded).collect();
     let worst = report.worst_tables().into_iter().map(shaded).collect();
@@ -56,8 +60,8 @@ pub fn html(report: &Report<'_>, figures: &Figures) -> String {
     let sets = report.set_table().into_iter().collect();
     let heatmap_notes = html! { p { (HEATMAPS) } (list(&figures.no_heatmaps)) };
     let sections = [
-        section("metrics", "Default, Interpolation, Extrapolation", said(METRICS), tables(report.metrics_tables())),
-        section("iqm", "Interquartile means", html! {}, vec![plain(report.iqm_table())]),
+        section("metrics", "Default, Interpolation, Extrapolation", said(METRICS), metrics),
+        section("iqm", "Interquartile means", html! {}, report.iqm_table().into_iter().map(plain).collect()),
         section("profiles", "Optimality gap and performance profiles", html! {}, gap_and_profiles),
         section("comparisons", "Methods in pairs", said(COMPARISONS), tables(comparisons)),
         section("extrapolation", "What Extrapolation is made of", html! {}, tables(report.extrapolation_tables())),
@@ -72,32 +76,78 @@ pub fn html(report: &Report<'_>, figures: &Figures) -> String {
         section("curves", "Training curves", list(&figures.no_curves), by_environment(&figures.curves)),
         section("heatmaps", "Heatmaps", heatmap_notes, by_environment(&figures.heatmaps)),
         section("cells", "Cells", html! {}, cells),
+        section("elsewhere", "Trained elsewhere", html! {}, tables(elsewhere)),
     ];
     // Curves and heatmaps say what is missing.
-    let always = |section: &&Section| ["curves", "heatmaps"].contains(&section.id) || !section.subsections.is_empty();
+    let says = !report.plan.cells.is_empty();
+    let always =
+        |section: &&Section| (says && ["curves", "heatmaps"].contains(&section.id)) || !section.subsections.is_empty();
     let shown: Vec<&Section> = sections.iter().filter(always).collect();
-    page(report, &shown).into_string()
+    page(report, &figures.finding, &shown).into_string()
 }
 
-fn page(report: &Report<'_>, sections: &[&Section]) -> Markup {
+/// Tables, of each environment with its figure.
+fn metrics(report: &Report<'_>, figures: &[Figure]) -> Vec<Subsection> {
+    let with_figure = |table: Table| {
+        let Subsection { title, content } = table_subsection(&table, false);
+        let figures: Vec<&Figure> = figures.iter().filter(|figure| figure.environment == title).collect();
+        Subsection { title, content: html! { (content) @if !figures.is_empty() { (figure_grid(&figures)) } } }
+    };
+    report.metrics_tables().into_iter().map(with_figure).collect()
+}
+
+fn page(report: &Report<'_>, finding: &[Figure], sections: &[&Section]) -> Markup {
+    let title = report.title();
     html! {
         (DOCTYPE)
         html lang="en" {
             head {
                 meta charset="utf-8";
                 meta name="viewport" content="width=device-width, initial-scale=1";
-                title { "perturb: results" }
+                meta name="color-scheme" content="light dark";
+                title { (title) " · perturb" }
                 link rel="icon" href="data:,";
                 style { (PreEscaped(STYLE)) }
             }
             body {
-                header {
-                    h1 { "Results" }
-                    @for line in &report.overview { p { (prose(line)) } }
+                nav aria-label="Contents" {
+                    ol {
+                        li { a href="#finding" { "Finding" } }
+                        @for section in sections { (section.contents()) }
+                    }
                 }
-                nav aria-label="Contents" { ol { @for section in sections { (section.contents()) } } }
-                main { @for section in sections { (section.body()) } }
+                main {
+                    header {
+                        h1 { (title) }
+                        @let said = report.abstract_text();
+                        @if !said.is_empty() { p.abstract { (prose(&said)) } }
+                        (facts(report))
+                    }
+                    section id="finding" aria-label="Finding" {
+                        @for one in finding { div.opening { (figure(one)) } }
+                        div.notes { @for line in &report.overview { p { (prose(line)) } } }
+                    }
+                    @for section in sections { (section.body()) }
+                }
             }
+        }
+    }
+}
+
+/// Names with what there is to say, and the plan's files.
+fn facts(report: &Report<'_>) -> Markup {
+    html! {
+        dl.facts {
+            @if !report.plan.text.is_empty() {
+                dt { "plan" }
+                dd {
+                    @for (i, (name, content)) in report.plan.files().enumerate() {
+                        @if i > 0 { ", " }
+                        a download=(name) href=(data_uri("text/plain", content)) { (name) }
+                    }
+                }
+            }
+            @for (name, said) in report.facts() { dt { (name) } dd { (prose(&said)) } }
         }
     }
 }
@@ -114,7 +164,8 @@ impl Section {
                 @if self.subsections.len() > 1 {
                     " "
                     span {
-                        @for (i, subsection) in self.subsections.iter().enumerate() {
+                        // Pictures of all environments together have no title.
+                        @for (i, subsection) in self.subsections.iter().enumerate().filter(|(_, it)| !it.title.is_empty()) {
                             @if i > 0 { " · " }
                             a href={ "#" (self.subsection_id(i)) } { (short(&subsection.title)) }
                         }
@@ -211,20 +262,39 @@ fn classes(names: &[(&str, bool)]) -> Option<String> {
 
 fn by_environment(figures: &[Figure]) -> Vec<Subsection> {
     let of_environments = figures.chunk_by(|a, b| a.environment == b.environment);
-    of_environments
-        .map(|of| Subsection { title: of[0].environment.clone(), content: html! { @for one in of { (figure(one)) } } })
-        .collect()
+    let subsection = |of: &[Figure]| Subsection {
+        title: of[0].environment.clone(),
+        content: html! {
+            @if !of[0].environment.is_empty() { h3 { (of[0].environment) } }
+            (figure_grid(&of.iter().collect::<Vec<_>>()))
+        },
+    };
+    of_environments.map(subsection).collect()
 }
 
-fn figure(Figure { name, caption, picture, .. }: &Figure) -> Markup {
+/// Side by side where there is room.
+fn figure_grid(figures: &[&Figure]) -> Markup {
+    html! { div.figures { @for one in figures { (figure(one)) } } }
+}
+
+fn figure(Figure { file, name, caption, picture, .. }: &Figure) -> Markup {
     html! {
         figure class=[matches!(picture, FigureData::Missing).then_some("missing")] {
             @match picture {
-                FigureData::Missing => {}
-                // Named for those who do not see it.
-                FigureData::Svg(svg) => div role="img" aria-label=(name) { (PreEscaped(svg)) }
+                FigureData::Missing => figcaption { (caption) },
+                FigureData::Svg { svg, csv } => {
+                    // Named for those who do not see it.
+                    div role="img" aria-label=(name) { (PreEscaped(svg)) }
+                    figcaption {
+                        (caption)
+                        span.files {
+                            a download=(format!("{file}.svg")) href=(data_uri("image/svg+xml", svg.as_bytes())) { "SVG" }
+                            " "
+                            a download=(format!("{file}.csv")) href=(data_uri("text/csv", csv)) { "CSV" }
+                        }
+                    }
+                }
             }
-            figcaption { (caption) }
         }
     }
 }

@@ -5,14 +5,20 @@
 
 mod comparisons;
 mod csv;
+mod elsewhere;
+mod facts;
 mod figures;
+mod finding;
 mod footing;
 mod heatmap_pictures;
 mod html;
+mod links;
 mod numbers;
 mod pictures;
 mod profiles;
+mod scope;
 mod settings;
+mod sources;
 mod sweep_pictures;
 mod sweeps;
 mod tables;
@@ -22,18 +28,21 @@ mod worst;
 use std::collections::BTreeSet;
 
 use super::against_training::{MarkTest, against_training};
+use super::assessed::elsewhere as elsewhere_in;
 use super::folder::Failure;
 use super::plan::{Cell, Plan, Selection};
 use super::reselection::Reselection;
-use super::selection::{MethodResults, Results, Selected};
+use super::selection::{MethodResults, Reported, Results, Selected};
 use super::table::Table;
 use super::tuning::Tuned;
 use crate::curves::EnvironmentCurves;
 use crate::outcomes::Recorded;
 use comparisons::Comparison;
+use elsewhere::Elsewhere;
 use footing::Trainings;
 use numbers::{MethodMetrics, SetTest};
 use profiles::Profile;
+use scope::Scope;
 use settings::{GridTests, grid_tests};
 use sweeps::{AtParameter, AtThreshold, Swept};
 use worst::Worst;
@@ -41,7 +50,8 @@ use worst::Worst;
 pub use figures::{Figure, FigureData, Figures};
 pub use heatmap_pictures::{HeatmapPicture, heatmap_pictures, save_heatmaps};
 pub use html::html;
-pub use pictures::Picture;
+pub use pictures::{Drawing, Picture};
+pub use sources::{ReportError, Sources, Whole};
 
 /// The paper's budgets.
 const PAPER_EPISODES: u64 = 15_000;
@@ -52,6 +62,7 @@ const MISSING: &str = "missing";
 /// What is reported of an experiment.
 pub struct Report<'a> {
     plan: &'a Plan,
+    scope: Scope<'a>,
     selections: &'a [MethodResults<'a>],
     /// Sentences, with `names` between backticks.
     overview: Vec<String>,
@@ -71,6 +82,7 @@ pub struct Report<'a> {
     /// By the clean rule, what was selected; otherwise nothing.
     tuned: Vec<Tuned<'a>>,
     failures: Vec<&'a Failure>,
+    elsewhere: Vec<Elsewhere<'a>>,
 }
 
 impl<'a> Report<'a> {
@@ -84,30 +96,33 @@ impl<'a> Report<'a> {
     ) -> Self {
         let plan = results.plan;
         let tuned = if plan.selection == Selection::Clean { results.tuned() } else { Vec::new() };
-        let averages = numbers::averages(plan, selections, &Reselection::of(results));
+        let scope = Scope::of(plan, selections);
+        let averages = numbers::averages(&scope, selections, &Reselection::of(results));
         Self {
             plan,
             selections,
             overview: overview(results, selections, recorded, &tuned),
             metrics: numbers::metrics(selections),
-            comparisons: comparisons::comparisons(plan, selections),
-            profiles: profiles::profiles(selections, &averages),
+            comparisons: comparisons::comparisons(&scope, selections),
+            profiles: profiles::profiles(&scope, selections, &averages),
             averages,
-            worst: worst::worst(plan, selections, recorded),
-            over_parameters: sweeps::over_parameters(plan, selections, recorded),
-            over_thresholds: sweeps::over_thresholds(plan, selections, recorded),
+            worst: worst::worst(&scope, selections, recorded),
+            over_parameters: sweeps::over_parameters(&scope, selections, recorded),
+            over_thresholds: sweeps::over_thresholds(&scope, selections, recorded),
             trainings: footing::trainings(selections, curves),
-            set_tests: numbers::set_tests(plan, selections),
+            set_tests: numbers::set_tests(&scope, selections),
             marks: against_training(selections),
             grid_tests: grid_tests(results),
             tuned,
             failures: results.failures().collect(),
+            elsewhere: elsewhere::all(selections),
+            scope,
         }
     }
 
     /// For a terminal, without what goes into details; `report.md` has them.
     pub fn text(&self) -> String {
-        let tables = self.number_tables().chain(self.failure_table());
+        let tables = self.number_tables().chain(self.failure_table()).chain(self.elsewhere_table());
         let shown = tables.map(|table| format!("\n{}\n{}\n", table.title, table.to_text()));
         format!("{}\n{}", self.overview.join("\n"), shown.collect::<String>())
     }
@@ -115,14 +130,15 @@ impl<'a> Report<'a> {
     /// For GitHub and the like.
     pub fn markdown(&self) -> String {
         let details = self.comparisons_table().into_iter().chain(self.worst_tables()).chain(self.footing_tables());
-        let cells = self.settings_table().into_iter().chain(self.tuned_table()).chain([self.selected_table()]);
-        let tables = self.number_tables().chain(details).chain(cells).chain(self.failure_table());
+        let cells = self.settings_table().into_iter().chain(self.tuned_table()).chain(self.selected_table());
+        let others = self.failure_table().into_iter().chain(self.elsewhere_table());
+        let tables = self.number_tables().chain(details).chain(cells).chain(others);
         let shown = tables.map(|table| format!("\n## {}\n\n{}\n", table.title, table.to_markdown()));
         format!("# Results\n\n{}\n{}", self.overview.join("\n\n"), shown.collect::<String>())
     }
 
     fn number_tables(&self) -> impl Iterator<Item = Table> {
-        let papers = self.metrics_tables().into_iter().chain([self.iqm_table(), self.gap_table()]);
+        let papers = self.metrics_tables().into_iter().chain(self.iqm_table()).chain(self.gap_table());
         let scenarios = self.extrapolation_tables().into_iter().chain(self.scenario_tables());
         papers.chain(scenarios).chain(self.set_table()).chain(self.marks_table())
     }
@@ -130,7 +146,7 @@ impl<'a> Report<'a> {
     /// All cells that numbers come from.
     fn selected(&self) -> Vec<Selected<'a>> {
         let runs = self.selections.iter().flat_map(|selection| selection.runs.values());
-        runs.flat_map(|run| run.0.values().flatten().copied()).collect()
+        runs.flat_map(|run| run.0.values().flatten()).filter_map(Reported::cell).collect()
     }
 }
 
@@ -141,16 +157,20 @@ fn overview(
     tuned: &[Tuned<'_>],
 ) -> Vec<String> {
     let (cells, done, failed) = (results.plan.cells.len(), results.done().count(), results.failures().count());
-    let mut lines =
-        vec![format!("{done} of {cells} cells are done, {failed} failed, {} are missing.", cells - done - failed)];
-    lines.push(rule(results.plan));
-    lines.extend(selected(tuned));
-    lines.extend(budgets(results.plan));
+    let mut lines = Vec::new();
+    if cells > 0 {
+        lines
+            .push(format!("{done} of {cells} cells are done, {failed} failed, {} are missing.", cells - done - failed));
+        lines.push(rule(results.plan));
+        lines.extend(selected(tuned));
+        lines.extend(budgets(results.plan));
+    }
+    lines.extend(elsewhere::overview(results, selections));
     let incomplete = selections.iter().filter(|selection| selection.done < selection.cells).count();
     if incomplete > 0 {
         lines.push(format!(
             "{incomplete} of {} rows lack cells{}; the column `cells` says which.",
-            selections.len(),
+            selections.iter().filter(|row| !row.method.elsewhere).count(),
             match results.plan.selection {
                 Selection::Paper => ", so that their configurations were selected among fewer than the plan has",
                 Selection::Clean => "",
@@ -161,7 +181,7 @@ fn overview(
     if !commits.is_empty() {
         lines.push(format!("Done by perturb {}.", commits.into_iter().collect::<Vec<_>>().join(", ")));
     }
-    lines.extend(agreement(results));
+    lines.extend(agreement(results, selections));
     let (known, selected) = recorded.count();
     if known < selected {
         lines.push(format!(
@@ -180,15 +200,11 @@ fn overview(
 
 /// By which rule configurations are selected, and on which seeds.
 fn rule(plan: &Plan) -> String {
-    let seeds = |cells: &mut dyn Iterator<Item = &Cell>| {
-        let seeds: BTreeSet<u64> = cells.map(|cell| cell.config.common.seed).collect();
-        match (seeds.first(), seeds.last()) {
-            (Some(first), Some(last)) if first < last => format!("seeds {first} to {last}"),
-            (first, _) => format!("seed {}", first.copied().unwrap_or_default()),
-        }
-    };
-    let tuning = seeds(&mut plan.cells.iter().filter(|cell| cell.tuned_as.is_none()));
+    let tuning = seeds(plan.cells.iter().filter(|cell| cell.tuned_as.is_none()));
     match plan.selection {
+        Selection::Paper if !plan.selects() => {
+            format!("Nothing is selected: each method has one configuration in each environment; {tuning}.")
+        }
         Selection::Paper => format!(
             "Selection: `paper`, as published. In each run, the test that selects a configuration is the test that is \
              reported; {tuning}."
@@ -197,8 +213,25 @@ fn rule(plan: &Plan) -> String {
             "Selection: `clean`. Configurations were selected by {} selection episodes of every training on {tuning}; \
              those that are reported were trained anew on {}, and tested on other episodes.",
             plan.cells.iter().find_map(|cell| cell.tests.selection).unwrap_or_default(),
-            seeds(&mut plan.candidates.iter())
+            seeds(plan.candidates.iter())
         ),
+    }
+}
+
+fn seeds<'a>(cells: impl Iterator<Item = &'a Cell>) -> String {
+    let seeds: BTreeSet<u64> = cells.map(|cell| cell.config.common.seed).collect();
+    match (seeds.first(), seeds.last()) {
+        (Some(first), Some(last)) if first < last => format!("seeds {first} to {last}"),
+        (first, _) => format!("seed {}", first.copied().unwrap_or_default()),
+    }
+}
+
+/// The number that all cells have, or the least and the most.
+fn range(cells: &[Cell], of: fn(&Cell) -> u64) -> String {
+    let numbers: BTreeSet<u64> = cells.iter().map(of).collect();
+    match (numbers.first(), numbers.last()) {
+        (Some(least), Some(most)) if least < most => format!("{least} to {most}"),
+        (least, _) => least.map(u64::to_string).unwrap_or_default(),
     }
 }
 
@@ -224,9 +257,12 @@ fn selected(tuned: &[Tuned<'_>]) -> Vec<String> {
 }
 
 /// How far requested and applied parameters agreed in all tests.
-fn agreement(results: &Results<'_>) -> Option<String> {
-    let tested: u64 = results.done().flat_map(|result| result.results.values()).map(|test| test.episodes).sum();
-    let agreements = || results.done().filter_map(|result| result.agreement.as_ref());
+fn agreement(results: &Results<'_>, selections: &[MethodResults<'_>]) -> Option<String> {
+    let of_cells: u64 = results.done().flat_map(|result| result.results.values()).map(|test| test.episodes).sum();
+    let others: Vec<_> = elsewhere_in(selections).into_iter().map(|(_, policy, _)| &policy.records).collect();
+    let of_others: Vec<_> = others.iter().map(|records| records.agreement()).collect();
+    let tested = of_cells + others.iter().map(|records| records.episodes.len() as u64).sum::<u64>();
+    let agreements = || results.done().filter_map(|result| result.agreement.as_ref()).chain(&of_others);
     let compared: u64 = agreements().map(|agreement| agreement.episodes).sum();
     let differences = agreements().filter_map(|agreement| agreement.largest.as_ref());
     let largest = differences.max_by(|a, b| a.relative.total_cmp(&b.relative)).map(|largest| match largest.relative {
@@ -241,21 +277,15 @@ fn agreement(results: &Results<'_>) -> Option<String> {
 
 /// Budgets that are not the paper's.
 fn budgets(plan: &Plan) -> Option<String> {
-    let distinct = |of: fn(&Cell) -> u64| plan.cells.iter().map(of).collect::<BTreeSet<u64>>();
-    let trained = distinct(|cell| cell.config.common.episodes);
-    let tested = distinct(|cell| cell.tests.episodes);
-    if trained == [PAPER_EPISODES].into() && tested == [PAPER_TEST_EPISODES].into() {
+    let trained = range(&plan.cells, |cell| cell.config.common.episodes);
+    let tested = range(&plan.cells, |cell| cell.tests.episodes);
+    if trained == PAPER_EPISODES.to_string() && tested == PAPER_TEST_EPISODES.to_string() {
         return None;
     }
-    let shown = |budgets: BTreeSet<u64>| match (budgets.first(), budgets.last()) {
-        (Some(least), Some(most)) if least < most => format!("{least} to {most}"),
-        (least, _) => least.map(u64::to_string).unwrap_or_default(),
-    };
     Some(format!(
         "Other budgets than the paper's: {} episodes in a training, where the paper has {PAPER_EPISODES}, and {} in a \
          test, where it has {PAPER_TEST_EPISODES}.",
-        shown(trained),
-        shown(tested)
+        trained, tested
     ))
 }
 

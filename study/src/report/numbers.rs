@@ -1,23 +1,26 @@
 //! The numbers of a report, beside the paper's.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
+use super::scope::{Scope, has_scenarios, version};
 use crate::outcomes::Counted;
 use crate::paper;
-use crate::plan::{Plan, TrainedOn};
+use crate::plan::TrainedOn;
 use crate::reselection::Reselection;
 use crate::selection::{MethodResults, average, interquartile, scores};
-use crate::statistics::{Bootstrapped, Summary, interquartile_mean, optimality_gap};
-use crate::{Method, Metric, Scenario, TestResult, Version};
+use crate::statistics::{Bootstrapped, Summary, are_enough, interquartile_mean, optimality_gap};
+use crate::{Method, Metric, Scenario, TestResult, mean};
 
 /// Resamples of a bootstrap, as many as rliable takes.
 const RESAMPLES: usize = 50_000;
 /// Of one that selects anew, hundreds of times in each of them.
 const RESELECTIONS: usize = 10_000;
+/// Of the means that the page opens with, of each environment and of all.
+const MEANS: usize = 10_000;
 /// The best success rate, %, from which the optimality gap is.
 const BEST: f64 = 100.0;
 /// What stands for all environments together, here and in the paper.
-const AVERAGE: &str = "Average";
+pub(super) const AVERAGE: &str = "Average";
 
 /// A method's metrics in an environment, or over all; a metric that is not known is not there.
 pub(super) struct MethodMetrics<'a> {
@@ -25,6 +28,8 @@ pub(super) struct MethodMetrics<'a> {
     pub(super) method: Method,
     pub(super) ours: BTreeMap<Metric, Summary>,
     pub(super) papers: BTreeMap<Metric, Summary>,
+    /// The means of `ours` again, with intervals where there are enough runs for one.
+    pub(super) means: BTreeMap<Metric, Bootstrapped>,
     /// Of all environments only.
     pub(super) iqms: BTreeMap<Metric, Bootstrapped>,
     /// Likewise.
@@ -69,25 +74,31 @@ pub(super) fn metrics<'a>(selections: &[MethodResults<'a>]) -> Vec<MethodMetrics
         method: selection.method.clone(),
         ours: known(|metric| selection.summary(metric)),
         papers: known(|metric| paper::number(selection.environment, &selection.method, metric)),
+        means: known(|metric| mean_with_interval(&[selection], metric)),
         iqms: BTreeMap::new(),
         gaps: BTreeMap::new(),
         reselected: BTreeMap::new(),
         done: selection.done,
         cells: selection.cells,
     };
-    selections.iter().map(of_selection).collect()
+    selections.iter().filter(|row| has_scenarios(row)).map(of_selection).collect()
 }
 
 /// Averaged over the plan's environments.
 pub(super) fn averages<'a>(
-    plan: &Plan,
+    scope: &Scope<'_>,
     selections: &[MethodResults<'a>],
     reselection: &Reselection<'a>,
 ) -> Vec<MethodMetrics<'static>> {
-    let environments = plan.environments();
+    let environments = &scope.averaged;
+    let is_everywhere = |method: &Method| {
+        let is_there = |name: &&str| selections.iter().any(|row| row.environment == *name && row.method == *method);
+        environments.iter().all(is_there)
+    };
     let of_method = |method: Method| {
-        let found: Vec<_> = selections.iter().filter(|selection| selection.method == method).collect();
-        let everywhere = found.len() == environments.len();
+        let is_averaged = |row: &&MethodResults<'_>| environments.contains(&row.environment);
+        let found: Vec<_> = selections.iter().filter(|row| row.method == method).filter(is_averaged).collect();
+        let everywhere = is_everywhere(&method);
         let gap = |strata: &[Vec<f64>]| optimality_gap(strata, BEST);
         let both = |strata: &[Vec<f64>]| vec![interquartile_mean(strata), gap(strata)];
         let reselected = |metric| reselection.bootstrap(&found, metric, RESELECTIONS, both)?.try_into().ok();
@@ -95,33 +106,43 @@ pub(super) fn averages<'a>(
         MethodMetrics {
             environment: AVERAGE,
             ours: known(|metric| average(&found, metric).filter(|_| everywhere)),
-            papers: known(|metric| paper::average(&environments, &method, metric)),
+            papers: known(|metric| paper::average(environments, &method, metric)),
+            means: known(|metric| mean_with_interval(&found, metric).filter(|_| everywhere)),
             iqms: known(|metric| interquartile(&found, metric, RESAMPLES).filter(|_| everywhere)),
             gaps: known(|metric| gap(metric).filter(|_| everywhere)),
-            reselected: known(|metric| reselected(metric).filter(|_| everywhere)),
+            reselected: known(|metric| reselected(metric).filter(|_| everywhere && !method.elsewhere)),
             done: found.iter().map(|selection| selection.done).sum(),
             cells: found.iter().map(|selection| selection.cells).sum(),
             method,
         }
     };
-    plan.methods().into_iter().map(of_method).collect()
+    // An agent that was tested in some environments has no average over all.
+    let methods = scope.methods.iter().filter(|method| !method.elsewhere || is_everywhere(method));
+    methods.cloned().map(of_method).collect()
 }
 
 /// In the order of `selections`, of what they were trained on, and of the plan's tests.
-pub(super) fn set_tests<'a>(plan: &'a Plan, selections: &'a [MethodResults<'a>]) -> Vec<SetTest<'a>> {
-    let is_version = |name: &str| Version::KNOWN.iter().any(|version| version.to_string() == name);
+pub(super) fn set_tests<'a>(scope: &Scope<'a>, selections: &'a [MethodResults<'a>]) -> Vec<SetTest<'a>> {
     let mut tests = Vec::new();
     for selection in selections {
-        for &trained_on in selection.runs.values().next().into_iter().flat_map(|run| run.0.keys()) {
-            let is_of_set = matches!(trained_on, TrainedOn::Set(_));
-            tests.extend(tested_on(plan).filter(|name| is_of_set || !is_version(name)).map(|tested_on| SetTest {
-                environment: selection.environment,
-                method: &selection.method,
-                trained_on,
-                tested_on,
-                success: selection.test(trained_on, tested_on, |test| test.success_percent),
-                mean_return: selection.test(trained_on, tested_on, |test| test.mean_return),
-            }));
+        // A run of an agent that was trained elsewhere may lack what another one has.
+        let trained: BTreeSet<TrainedOn<'a>> = selection.runs.values().flat_map(|run| run.0.keys().copied()).collect();
+        for trained_on in trained {
+            let is_of_set = !matches!(trained_on, TrainedOn::Version(_));
+            let names = scope.tested_on.iter().filter(|name| is_of_set || version(name).is_none());
+            let is_wanted = |test: &SetTest<'_>| !test.method.elsewhere || test.success.is_some();
+            tests.extend(
+                names
+                    .map(|&tested_on| SetTest {
+                        environment: selection.environment,
+                        method: &selection.method,
+                        trained_on,
+                        tested_on,
+                        success: selection.test(trained_on, tested_on, |test| test.success_percent),
+                        mean_return: selection.test(trained_on, tested_on, |test| test.mean_return),
+                    })
+                    .filter(is_wanted),
+            );
         }
     }
     tests
@@ -143,13 +164,16 @@ pub(super) fn or_empty(number: Option<impl ToString>) -> String {
     number.map(|number| number.to_string()).unwrap_or_default()
 }
 
-/// The names of what the plan tests on.
-pub(super) fn tested_on(plan: &Plan) -> impl Iterator<Item = &str> {
-    plan.cells.iter().take(1).flat_map(|cell| &cell.tests.sets).map(|set| set.name.as_str())
-}
-
 fn known<T>(of: impl Fn(Metric) -> Option<T>) -> BTreeMap<Metric, T> {
     Metric::ALL.into_iter().filter_map(|metric| Some((metric, of(metric)?))).collect()
+}
+
+/// Over environments and the runs that all of them have. A resample of few runs is too often the lowest or the highest of
+/// them alone for an interval to be more than these two.
+fn mean_with_interval(selections: &[&MethodResults<'_>], metric: Metric) -> Option<Bootstrapped> {
+    let strata = scores(selections, metric);
+    let mean = Bootstrapped::of(&strata, MEANS, 1, |strata| mean(strata.concat().into_iter()))?;
+    Some(Bootstrapped { interval_95: mean.interval_95.filter(|_| are_enough(&strata)), ..mean })
 }
 
 fn least(runs: impl Fn(Metric) -> Option<usize>) -> usize {

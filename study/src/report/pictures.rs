@@ -1,8 +1,15 @@
 //! Pictures of a report's numbers, which are drawn for its page and as files of their own.
 
+use std::path::Path;
+
+use plotters::coord::Shift;
+use plotters::prelude::{DrawingArea, DrawingBackend};
+
 use super::{Figure, FigureData, Report};
 use crate::Method;
-use crate::plot::{Panels, PlotError, svg};
+use crate::files::write_atomically;
+use crate::plot::{Intervals, Panels, Plot, PlotError, save, svg};
+use crate::table::Table;
 
 /// A picture.
 #[derive(Clone, Debug, PartialEq)]
@@ -16,22 +23,60 @@ pub struct Picture {
     /// What it shows.
     pub caption: String,
     /// What is drawn.
-    pub panels: Panels,
+    pub drawing: Drawing,
+    /// The numbers of it.
+    pub data: Table,
+}
+
+/// What is drawn of a report's numbers.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Drawing {
+    /// Lines.
+    Panels(Panels),
+    /// Numbers with intervals.
+    Intervals(Intervals),
+}
+
+impl Plot for Drawing {
+    fn height(&self) -> u32 {
+        match self {
+            Self::Panels(panels) => panels.height(),
+            Self::Intervals(intervals) => intervals.height(),
+        }
+    }
+
+    fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError> {
+        match self {
+            Self::Panels(panels) => panels.draw(area, scale),
+            Self::Intervals(intervals) => intervals.draw(area, scale),
+        }
+    }
 }
 
 impl Picture {
     /// As the page shows it.
     pub(super) fn figure(&self) -> Result<Figure, PlotError> {
-        let Self { environment, name, caption, panels, .. } = self.clone();
-        Ok(Figure { environment, name, caption, picture: FigureData::Svg(svg(&panels)?) })
+        let Self { environment, file, name, caption, drawing, data } = self.clone();
+        let picture = FigureData::Svg { svg: svg(&drawing)?, csv: data.to_csv() };
+        Ok(Figure { environment, file, name, caption, picture })
+    }
+
+    /// Writes it into the folder `out` as SVG, PNG and CSV.
+    ///
+    /// # Errors
+    /// [`PlotError`].
+    pub fn save(&self, out: &Path) -> Result<(), PlotError> {
+        save(&self.drawing, &out.join(&self.file))?;
+        Ok(write_atomically(&out.join(format!("{}.csv", self.file)), &self.data.to_csv())?)
     }
 }
 
 impl Report<'_> {
-    /// All of them: performance profiles, success over parameters and over the threshold, what settings do, as far as there
+    /// All of them: what the page opens with, performance profiles, success over parameters and over the threshold, what settings do, as far as there
     /// are numbers.
     pub fn pictures(&self) -> Vec<Picture> {
-        let profiles = self.profiles_picture().into_iter();
+        let finding = self.finding_pictures().into_iter().chain(self.environment_pictures());
+        let profiles = finding.chain(self.profiles_picture());
         let swept = self.parameter_pictures().into_iter().chain(self.threshold_pictures());
         profiles.chain(swept).chain(self.settings_pictures()).collect()
     }

@@ -2,8 +2,9 @@
 
 use super::Report;
 use super::numbers::MethodMetrics;
-use super::pictures::Picture;
-use crate::plot::panels::{Panel, PanelLine, PanelPoint, Panels, RATES};
+use super::pictures::{Drawing, Picture};
+use super::scope::Scope;
+use crate::plot::panels::{Panel, PanelLine, PanelPoint, Panels, RATES, index_of};
 use crate::selection::{MethodResults, scores};
 use crate::statistics::{Bootstrapped, bootstrap, profile};
 use crate::table::Table;
@@ -22,12 +23,17 @@ pub(super) struct Profile {
     shares: Vec<Bootstrapped>,
 }
 
-/// Of the methods that have runs in all of the plan's environments, as `averages` says.
-pub(super) fn profiles(selections: &[MethodResults<'_>], averages: &[MethodMetrics<'_>]) -> Vec<Profile> {
+/// Of the methods that have runs in all environments over which is averaged, as `averages` says.
+pub(super) fn profiles(
+    scope: &Scope<'_>,
+    selections: &[MethodResults<'_>],
+    averages: &[MethodMetrics<'_>],
+) -> Vec<Profile> {
     let thresholds: Vec<f64> = (0..=THRESHOLDS).map(f64::from).collect();
     let mut profiles = Vec::new();
     for MethodMetrics { method, iqms, .. } in averages {
-        let found: Vec<_> = selections.iter().filter(|selection| selection.method == *method).collect();
+        let is_averaged = |row: &&MethodResults<'_>| scope.averaged.contains(&row.environment);
+        let found: Vec<_> = selections.iter().filter(|row| row.method == *method).filter(is_averaged).collect();
         for &metric in iqms.keys() {
             let shares = bootstrap(&scores(&found, metric), RESAMPLES, 1, |strata| profile(strata, &thresholds));
             profiles.extend(shares.map(|shares| Profile { method: method.clone(), metric, shares }));
@@ -58,19 +64,20 @@ impl Report<'_> {
     /// `None` without a profile.
     pub(super) fn profiles_picture(&self) -> Option<Picture> {
         self.profiles.first()?;
-        let methods = self.plan.methods();
+        let methods = &self.scope.methods;
         let line = |profile: &Profile| {
             let point = |(threshold, share): (usize, &Bootstrapped)| {
                 let [low, high] = share.interval_95.unwrap_or([share.point; 2]).map(|end| 100.0 * end);
                 PanelPoint { x: threshold as f64, y: 100.0 * share.point, low, high }
             };
-            let index = methods.iter().position(|method| *method == profile.method).unwrap_or_default();
+            let index = index_of(methods, &profile.method);
             PanelLine { index, points: profile.shares.iter().enumerate().map(point).collect() }
         };
         let panel = |metric: Metric| Panel {
             caption: metric.to_string(),
             x_name: "success rate, %".into(),
             x: 0.0..100.0,
+            y_name: "share of runs, %".into(),
             y: RATES,
             lines: self.profiles.iter().filter(|profile| profile.metric == metric).map(line).collect(),
             mark: None,
@@ -82,12 +89,13 @@ impl Report<'_> {
             caption: "Performance profiles: the share of runs, over all environments, whose success rate is above that at the \
                       axis. Bands are 95 % stratified bootstrap intervals at each point; there are none of a single run."
                 .into(),
-            panels: Panels {
-                title: "share of runs above a success rate, %".into(),
-                columns: Metric::ALL.len(),
-                panels: Metric::ALL.map(panel).into(),
+            drawing: Drawing::Panels(Panels {
+                title: "All environments: share of runs above a success rate".into(),
+                panels: Metric::ALL.map(panel).into_iter().filter(|panel| !panel.lines.is_empty()).collect(),
                 legend: methods.iter().map(ToString::to_string).collect(),
-            },
+                note: "Bands: 95 % bootstrap intervals.".into(),
+            }),
+            data: self.profiles_file(),
         })
     }
 }

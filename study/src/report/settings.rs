@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::numbers::or_empty;
-use super::pictures::{Picture, file_name};
+use super::pictures::{Drawing, Picture, file_name};
 use super::{MISSING, Report};
 use crate::folder::{CellResult, CellState};
 use crate::means::mean;
@@ -256,11 +256,18 @@ fn picture(tests: &[GridTest<'_>]) -> Picture {
         caption: format!("tested on {name}"),
         x_name: "episodes".into(),
         x: 0.0..longest as f64,
+        y_name: "success rate, %".into(),
         y: RATES,
         lines: values.iter().enumerate().map(|value| line(value, name)).collect(),
         mark: None,
     };
     let of = format!("{environment}, {method} trained on {trained_on}");
+    let panels = Panels {
+        title: format!("{of}: success by {setting}"),
+        panels: names.iter().map(panel).collect(),
+        legend: values.iter().map(|value| format!("{setting} = {value}")).collect(),
+        note: "Bands: 95 % bootstrap intervals over runs.".into(),
+    };
     Picture {
         environment: (*environment).into(),
         file: format!("{environment}-{}-{}-{setting}", file_name(method), trained_on.file_name()),
@@ -269,12 +276,8 @@ fn picture(tests: &[GridTest<'_>]) -> Picture {
             "{of}: success in tests after so many episodes, by {setting}. Lines are means over all configurations with that \
              value and over runs, bands their 95 % bootstrap interval over runs."
         ),
-        panels: Panels {
-            title: format!("{of}: success rate, %, by {setting}"),
-            columns: names.len().min(3),
-            panels: names.iter().map(panel).collect(),
-            legend: values.iter().map(|value| format!("{setting} = {value}")).collect(),
-        },
+        data: panels.table(),
+        drawing: Drawing::Panels(panels),
     }
 }
 

@@ -94,7 +94,7 @@ fn pictures_follow_a_setting_over_the_training() {
     let pictures = report.settings_pictures();
     let files: Vec<&str> = pictures.iter().map(|picture| picture.file.as_str()).collect();
     assert_eq!(files, ["CartPole-a2c-ff-D-n_steps", "CartPole-a2c-ff-D-normalize_observations"]);
-    let panels = &pictures[0].panels;
+    let Drawing::Panels(panels) = &pictures[0].drawing else { unreachable!("lines") };
     assert_eq!(panels.legend, ["n_steps = 5", "n_steps = 15"]);
     assert_eq!(panels.panels.len(), 2, "tested on D and E");
     let line: Vec<(f64, f64)> = panels.panels[1].lines[1].points.iter().map(|point| (point.x, point.y)).collect();

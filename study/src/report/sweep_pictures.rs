@@ -1,12 +1,15 @@
 //! Pictures of success over parameters and over the threshold.
 
 use super::Report;
-use super::pictures::Picture;
+use super::pictures::{Drawing, Picture};
 use super::sweeps::{AtParameter, AtThreshold, Swept, side};
 use crate::plan::{TrainedOn, distinct};
-use crate::plot::panels::{Panel, PanelLine, Panels, RATES};
+use crate::plot::panels::{Panel, PanelLine, Panels, RATES, index_of};
 use crate::records::RecordedParameter;
 use crate::{Scenario, Version};
+
+/// What a band is.
+const WILSON: &str = "All runs together; bands: 95 % Wilson intervals.";
 
 impl Report<'_> {
     /// One for each environment and what was trained on: a panel for each parameter.
@@ -14,22 +17,30 @@ impl Report<'_> {
         let all = self.over_parameters.iter();
         let all: Vec<_> = all.filter(|row| Version::ALL.iter().any(|it| it.to_string() == row.tested_on)).collect();
         let mut pictures = Vec::new();
-        for environment in self.plan.environments() {
-            for version in Version::KNOWN {
-                let is_of = |row: &&&Swept<'_, AtParameter<'_>>| {
-                    row.environment == environment && row.trained_on == TrainedOn::Version(version)
-                };
+        for environment in self.scope.environments.iter().copied() {
+            for trained_on in Version::KNOWN.map(TrainedOn::Version).into_iter().chain([TrainedOn::Unknown]) {
+                let is_of =
+                    |row: &&&Swept<'_, AtParameter<'_>>| row.environment == environment && row.trained_on == trained_on;
                 let rows: Vec<_> = all.iter().filter(is_of).copied().collect();
                 if !rows.is_empty() {
-                    pictures.push(self.parameter_picture(environment, version, &rows));
+                    pictures.push(self.parameter_picture(environment, trained_on, &rows));
                 }
             }
         }
         pictures
     }
 
-    fn parameter_picture(&self, environment: &str, version: Version, rows: &[&Swept<'_, AtParameter<'_>>]) -> Picture {
-        let methods = self.plan.methods();
+    fn parameter_picture(
+        &self,
+        environment: &str,
+        trained_on: TrainedOn<'_>,
+        rows: &[&Swept<'_, AtParameter<'_>>],
+    ) -> Picture {
+        let trained = match trained_on {
+            TrainedOn::Unknown => "whose training's parameters are not known".to_owned(),
+            trained_on => format!("trained on {trained_on}"),
+        };
+        let methods = &self.scope.methods;
         let parameters = distinct(rows.iter().map(|row| &row.at.parameter.name));
         let panel = |name: &&String| {
             let rows: Vec<_> = rows.iter().copied().filter(|row| row.at.parameter.name == **name).collect();
@@ -39,7 +50,7 @@ impl Report<'_> {
                 (a.method, a.tested_on, a.at.bin.high) == (b.method, b.tested_on, b.at.bin.low)
             };
             let line = |rows: &[&Swept<'_, AtParameter<'_>>]| PanelLine {
-                index: methods.iter().position(|method| method == rows[0].method).unwrap_or_default(),
+                index: index_of(methods, rows[0].method),
                 points: rows.iter().map(|row| row.point((row.at.bin.low + row.at.bin.high) / 2.0)).collect(),
             };
             let low = rows.iter().map(|row| row.at.bin.low).fold(f64::INFINITY, f64::min);
@@ -48,26 +59,29 @@ impl Report<'_> {
                 caption: name.clone(),
                 x_name: if unit == "1" { name.clone() } else { format!("{name}, {unit}") },
                 x: low..high,
+                y_name: "success rate, %".into(),
                 y: RATES,
                 lines: rows.chunk_by(joined).map(line).collect(),
                 mark: None,
             }
         };
+        let panels = Panels {
+            title: format!("{environment}, {trained}: success over each parameter"),
+            panels: parameters.iter().map(panel).collect(),
+            legend: methods.iter().map(ToString::to_string).collect(),
+            note: WILSON.into(),
+        };
         Picture {
             environment: environment.into(),
-            file: format!("{environment}-{}-parameters", version.file_name()),
-            name: format!("{environment}: success over each parameter, trained on {version}"),
+            file: format!("{environment}-{}-parameters", trained_on.file_name()),
+            name: format!("{environment}: success over each parameter, {trained}"),
             caption: format!(
-                "{environment}: success of policies trained on {version}, by the value that a parameter had in tests on R \
+                "{environment}: success of policies {trained}, by the value that a parameter had in tests on R \
                  (inside) and on E (outside), where the others are drawn, too. All runs together; bands are 95 % Wilson \
                  intervals."
             ),
-            panels: Panels {
-                title: format!("{environment}, trained on {version}: success rate, %, over a parameter"),
-                columns: parameters.len(),
-                panels: parameters.iter().map(panel).collect(),
-                legend: methods.iter().map(ToString::to_string).collect(),
-            },
+            data: panels.table(),
+            drawing: Drawing::Panels(panels),
         }
     }
 
@@ -79,7 +93,7 @@ impl Report<'_> {
 
     fn threshold_picture(&self, rows: &[Swept<'_, AtThreshold<'_>>]) -> Picture {
         use Version::{D, E, R};
-        let methods = self.plan.methods();
+        let methods = &self.scope.methods;
         let (environment, criterion) = (rows[0].environment, rows[0].at.criterion);
         let ends = |row: &[Swept<'_, AtThreshold<'_>>]| {
             row.first().map(|a| a.at.threshold).zip(row.last().map(|b| b.at.threshold))
@@ -93,19 +107,26 @@ impl Report<'_> {
                 row.trained_on == TrainedOn::Version(scenario.train) && row.tested_on == scenario.test.to_string()
             };
             let line = |rows: &[Swept<'_, AtThreshold<'_>>]| PanelLine {
-                index: methods.iter().position(|method| method == rows[0].method).unwrap_or_default(),
+                index: index_of(methods, rows[0].method),
                 points: rows.iter().map(|row| row.point(row.at.threshold)).collect(),
             };
             Panel {
                 caption: format!("trained on {}, tested on {}", scenario.train, scenario.test),
                 x_name: format!("{} {} …{unit}", criterion.quantity, side(criterion)),
                 x: low..if high > low { high } else { low + 1.0 },
+                y_name: "success rate, %".into(),
                 y: RATES,
                 lines: of_lines().filter(|rows| is_of(&rows[0])).map(line).collect(),
                 mark: Some(criterion.threshold),
             }
         };
         let scenarios = [(D, D), (R, R), (D, R), (D, E), (R, E)].map(|(train, test)| Scenario { train, test });
+        let panels = Panels {
+            title: format!("{environment}: success over the threshold of success; dotted: the rule's"),
+            panels: scenarios.map(panel).into_iter().filter(|panel| !panel.lines.is_empty()).collect(),
+            legend: methods.iter().map(ToString::to_string).collect(),
+            note: WILSON.into(),
+        };
         Picture {
             environment: environment.into(),
             file: format!("{environment}-thresholds"),
@@ -114,12 +135,8 @@ impl Report<'_> {
                 "{environment}: success by other thresholds than the rule's, {criterion}, which the dotted line marks. All \
                  runs together; bands are 95 % Wilson intervals."
             ),
-            panels: Panels {
-                title: format!("{environment}: success rate, %, over the threshold of success"),
-                columns: 3,
-                panels: scenarios.map(panel).into(),
-                legend: methods.iter().map(ToString::to_string).collect(),
-            },
+            data: panels.table(),
+            drawing: Drawing::Panels(panels),
         }
     }
 }

@@ -1,11 +1,11 @@
 //! Success over parameters and over the threshold, of all runs together.
 
 use super::Report;
-use super::numbers::tested_on;
+use super::scope::Scope;
 use super::tested::{Trained, trained};
 use crate::Method;
 use crate::outcomes::{Bin, Counted, Recorded, bins, success_at, success_within, thresholds};
-use crate::plan::{Plan, TrainedOn};
+use crate::plan::TrainedOn;
 use crate::plot::panels::PanelPoint;
 use crate::records::RecordedParameter;
 use crate::selection::MethodResults;
@@ -48,14 +48,14 @@ impl<'a> Trained<'a> {
 
 /// Success over each parameter that varies in a test.
 pub(super) fn over_parameters<'a>(
-    plan: &'a Plan,
+    scope: &Scope<'a>,
     selections: &'a [MethodResults<'a>],
     recorded: &'a Recorded,
 ) -> Vec<Swept<'a, AtParameter<'a>>> {
     let mut all = Vec::new();
     for of_environment in trained(selections, recorded) {
         let Some(parameters) = of_environment.first().map(|trained| &trained.policies[0].parameters) else { continue };
-        for tested_on in tested_on(plan) {
+        for &tested_on in &scope.tested_on {
             for (place, parameter) in parameters.iter().enumerate() {
                 let bins = bins(of_environment.iter().flat_map(|trained| trained.tests(tested_on)), place);
                 for trained in &of_environment {
@@ -74,7 +74,7 @@ pub(super) fn over_parameters<'a>(
 
 /// Success over the threshold, in environments whose success compares something with one.
 pub(super) fn over_thresholds<'a>(
-    plan: &'a Plan,
+    scope: &Scope<'a>,
     selections: &'a [MethodResults<'a>],
     recorded: &'a Recorded,
 ) -> Vec<Swept<'a, AtThreshold<'a>>> {
@@ -84,11 +84,11 @@ pub(super) fn over_thresholds<'a>(
         let Some(criterion) = first else { continue };
         let tests = of_environment.iter().flat_map(|trained| {
             let trained = trained.clone();
-            tested_on(plan).flat_map(move |tested_on| trained.tests(tested_on))
+            scope.tested_on.iter().flat_map(move |tested_on| trained.tests(tested_on))
         });
         let thresholds = thresholds(tests, criterion);
         for trained in &of_environment {
-            for tested_on in tested_on(plan) {
+            for &tested_on in &scope.tested_on {
                 all.extend(thresholds.iter().filter_map(|&threshold| {
                     let counted = trained.tests(tested_on).map(|test| success_at(test, criterion, threshold));
                     trained.swept(tested_on, AtThreshold { criterion, threshold }, counted)

@@ -2,14 +2,15 @@
 
 use std::collections::BTreeMap;
 
-use super::numbers::{MethodMetrics, counted, tested_on};
+use super::numbers::{MethodMetrics, counted};
+use super::scope::{has_scenarios, has_scenarios_of};
 use super::{MISSING, MarkTest, Report};
 use crate::plan::{TrainedOn, distinct};
 use crate::scenarios::versions;
 use crate::selection::MethodResults;
 use crate::statistics::{Bootstrapped, Summary};
 use crate::table::{Column, Entry, Table};
-use crate::{Metric, Scenario, Version};
+use crate::{Method, Metric, Scenario, Version};
 
 /// What stands for a number that the paper does not have.
 const NOT_GIVEN: &str = "–";
@@ -17,7 +18,7 @@ const NOT_GIVEN: &str = "–";
 impl Report<'_> {
     /// The three metrics, averaged where there are several environments, and of each.
     pub(super) fn metrics_tables(&self) -> Vec<Table> {
-        let environments = self.plan.environments();
+        let environments = &self.scope.averaged;
         let averages = (environments.len() > 1)
             .then(|| self.metrics_table(format!("Average over {}", environments.join(", ")), &self.averages));
         let of_environments = self.metrics.chunk_by(|a, b| a.environment == b.environment);
@@ -39,18 +40,21 @@ impl Report<'_> {
                 });
         }
         table
-            .number("runs", |row| self.runs(row.runs()))
-            .number("cells", |row| format!("{}/{}", row.done, row.cells))
+            .number("runs", |row| self.runs(&row.method, row.runs()))
+            .number("cells", |row| match row.method.elsewhere {
+                true => NOT_GIVEN.to_owned(),
+                false => format!("{}/{}", row.done, row.cells),
+            })
             .build()
     }
 
-    pub(super) fn iqm_table(&self) -> Table {
+    pub(super) fn iqm_table(&self) -> Option<Table> {
         let title = "Interquartile mean over all environments and the runs that all of them have, with its 95 % stratified \
                      bootstrap interval, and the interval with every selection made anew in each resample";
         self.aggregate_table(title, |row| &row.iqms, 0)
     }
 
-    pub(super) fn gap_table(&self) -> Table {
+    pub(super) fn gap_table(&self) -> Option<Table> {
         let title = "Optimality gap: how far success rates stay below 100 % on average, over the same runs and with the same \
                      intervals; lower is better";
         self.aggregate_table(title, |row| &row.gaps, 1)
@@ -62,7 +66,7 @@ impl Report<'_> {
         title: &str,
         numbers: for<'m> fn(&'m MethodMetrics<'_>) -> &'m BTreeMap<Metric, Bootstrapped>,
         reselected: usize,
-    ) -> Table {
+    ) -> Option<Table> {
         let mut table = Table::of(title, &self.averages).text("method", |row| &row.method);
         for metric in Metric::ALL {
             let interval = move |row: &MethodMetrics<'_>| {
@@ -73,13 +77,13 @@ impl Report<'_> {
                 .number(metric.to_string(), move |row| or(MISSING, numbers(row).get(&metric)))
                 .number("selection anew", move |row| or(NOT_GIVEN, interval(row)));
         }
-        table.number("runs", |row| self.runs(row.iqm_runs())).build()
+        let table = table.number("runs", |row| self.runs(&row.method, row.iqm_runs())).build();
+        (!table.rows.is_empty()).then_some(table)
     }
 
     /// Extrapolation of each environment, and what it is the geometric mean of.
     pub(super) fn extrapolation_tables(&self) -> Vec<Table> {
-        let of_environments = self.selections.chunk_by(|a, b| a.environment == b.environment);
-        let table = |selections: &[MethodResults<'_>]| {
+        let table = |selections: &[&MethodResults<'_>]| {
             let title = format!(
                 "{}: Extrapolation and the three that it is the geometric mean of, with 95 % Wilson intervals",
                 selections[0].environment
@@ -95,20 +99,20 @@ impl Report<'_> {
             let metric = Metric::Extrapolation;
             table
                 .number(metric.to_string(), move |selection| or(MISSING, selection.summary(metric)))
-                .number("runs", move |selection| self.runs(selection.metric(metric).len()))
+                .number("runs", move |selection| self.runs(&selection.method, selection.metric(metric).len()))
                 .build()
         };
-        of_environments.map(table).collect()
+        self.with_scenarios().chunk_by(|a, b| a.environment == b.environment).map(table).collect()
     }
 
     /// The nine scenarios of each environment, and those of R+E.
     pub(super) fn scenario_tables(&self) -> Vec<Table> {
-        let of_environments = self.selections.chunk_by(|a, b| a.environment == b.environment);
         let (trained, tested) = (self.trained_versions(), self.tested_versions());
         let more = if trained.len() + tested.len() > 2 * Version::ALL.len() { ", and R+E for reference" } else { "" };
-        let table = |selections: &[_]| {
-            let trained = |selection| trained.iter().map(move |&train| (selection, train));
-            let rows: Vec<(&MethodResults<'_>, Version)> = selections.iter().flat_map(trained).collect();
+        let table = |selections: &[&MethodResults<'_>]| {
+            let pairs = selections.iter().flat_map(|row| trained.iter().map(move |&train| (*row, train)));
+            let rows: Vec<(&MethodResults<'_>, Version)> =
+                pairs.filter(|(row, train)| has_scenarios_of(row, *train)).collect();
             let mut table = Table::of(format!("{}: the nine scenarios{more}", rows[0].0.environment), &rows)
                 .text("method", |(selection, _)| &selection.method)
                 .text("trained on", |(_, train)| train);
@@ -118,7 +122,12 @@ impl Report<'_> {
             }
             table.build()
         };
-        of_environments.map(table).collect()
+        self.with_scenarios().chunk_by(|a, b| a.environment == b.environment).map(table).collect()
+    }
+
+    /// The rows that have places among the scenarios.
+    pub(super) fn with_scenarios(&self) -> Vec<&MethodResults<'_>> {
+        self.selections.iter().filter(|row| has_scenarios(row)).collect()
     }
 
     /// The paper's, and R+E if the plan trains on it.
@@ -129,19 +138,20 @@ impl Report<'_> {
 
     /// The paper's, and R+E if the plan tests on it.
     pub(super) fn tested_versions(&self) -> Vec<Version> {
-        versions(|version| tested_on(self.plan).any(|name| name == version.to_string()))
+        versions(|version| self.scope.tested_on.contains(&version.to_string().as_str()))
     }
 
     /// `None` if the plan has no sets of its own.
     pub(super) fn set_table(&self) -> Option<Table> {
-        let table = Table::of("Tests of and on the plan's own sets of parameters", &self.set_tests)
+        let title = "Tests that are no scenario: on own sets of parameters, or of policies trained on one, or on what is not known";
+        let table = Table::of(title, &self.set_tests)
             .text("environment", |test| test.environment)
             .text("method", |test| test.method)
             .text("trained on", |test| test.trained_on)
             .text("tested on", |test| test.tested_on)
             .number("success, %", |test| rate(test.success))
             .number("mean return", |test| or(MISSING, test.mean_return))
-            .number("runs", |test| self.runs(test.success.map_or(0, |summary| summary.runs)))
+            .number("runs", |test| self.runs(test.method, test.success.map_or(0, |summary| summary.runs)))
             .build();
         (!table.rows.is_empty()).then_some(table)
     }
@@ -186,10 +196,14 @@ impl Report<'_> {
         (!table.rows.is_empty()).then_some(table)
     }
 
-    pub(super) fn selected_table(&self) -> Table {
+    /// `None` of a report without cells.
+    pub(super) fn selected_table(&self) -> Option<Table> {
+        if self.plan.cells.is_empty() {
+            return None;
+        }
         let title =
             "Where the numbers come from: the selected cell of each run (selected.csv has its settings and command)";
-        Table::of(title, &self.selected())
+        let table = Table::of(title, &self.selected())
             .text("environment", |selected| &selected.result.training.environment)
             .text("method", |selected| &selected.result.training.method)
             .text("trained on", |selected| selected.cell.trained_on())
@@ -199,7 +213,8 @@ impl Report<'_> {
             .number("success on it", |selected| {
                 or(MISSING, selected.own_test().map(|test| format!("{:.1}", test.success_percent)))
             })
-            .build()
+            .build();
+        Some(table)
     }
 
     /// `None` if no cell failed.
@@ -211,9 +226,9 @@ impl Report<'_> {
         (!table.rows.is_empty()).then_some(table)
     }
 
-    fn runs(&self, runs: usize) -> String {
+    fn runs(&self, method: &Method, runs: usize) -> String {
         let all = self.plan.runs;
-        if runs == all as usize { all.to_string() } else { format!("{runs} of {all}") }
+        if method.elsewhere || runs == all as usize { runs.to_string() } else { format!("{runs} of {all}") }
     }
 }
 

@@ -1,5 +1,7 @@
 //! The selected policies that have recorded episodes.
 
+use std::collections::BTreeSet;
+
 use crate::Method;
 use crate::outcomes::{Outcomes, PolicyOutcomes, Recorded};
 use crate::plan::TrainedOn;
@@ -24,8 +26,9 @@ impl<'a> Trained<'a> {
 /// All that have recorded episodes, by environment, in the order of `selections`.
 pub(super) fn trained<'a>(selections: &'a [MethodResults<'a>], recorded: &'a Recorded) -> Vec<Vec<Trained<'a>>> {
     let of_selection = |selection: &'a MethodResults<'a>| {
-        let first = selection.runs.values().next().into_iter().flat_map(|run| run.0.keys());
-        first.map(|&trained_on| {
+        // A run of an agent that was trained elsewhere may lack what another one has.
+        let all: BTreeSet<TrainedOn<'a>> = selection.runs.values().flat_map(|run| run.0.keys().copied()).collect();
+        all.into_iter().map(|trained_on| {
             let selected = selection.runs.values().filter_map(|run| run.trained_on(trained_on));
             let policies = selected.filter_map(|selected| recorded.policy(&selected)).collect();
             Trained { environment: selection.environment, method: &selection.method, trained_on, policies }

@@ -1,10 +1,11 @@
 //! The worst tenth of episodes and of contexts.
 
 use super::Report;
-use super::numbers::{or_empty, tested_on};
+use super::numbers::or_empty;
+use super::scope::Scope;
 use super::tested::{Trained, trained};
 use crate::outcomes::{Outcomes, Recorded, SHARE, conditional_value_at_risk, worst_contexts};
-use crate::plan::{Plan, TrainedOn};
+use crate::plan::TrainedOn;
 use crate::selection::MethodResults;
 use crate::statistics::Summary;
 use crate::table::{Column, Entry, Table};
@@ -27,7 +28,11 @@ pub(super) struct Worst<'a> {
 }
 
 /// In the order of `selections`, of what they were trained on, and of the plan's tests.
-pub(super) fn worst<'a>(plan: &'a Plan, selections: &'a [MethodResults<'a>], recorded: &'a Recorded) -> Vec<Worst<'a>> {
+pub(super) fn worst<'a>(
+    scope: &Scope<'a>,
+    selections: &'a [MethodResults<'a>],
+    recorded: &'a Recorded,
+) -> Vec<Worst<'a>> {
     let of = |trained: &Trained<'a>, tested_on: &'a str| {
         let over_runs = |number: fn(&Outcomes) -> Option<f64>| {
             Summary::of(&trained.tests(tested_on).filter_map(number).collect::<Vec<_>>())
@@ -43,7 +48,7 @@ pub(super) fn worst<'a>(plan: &'a Plan, selections: &'a [MethodResults<'a>], rec
         })
     };
     let all = trained(selections, recorded).into_iter().flatten();
-    all.flat_map(|trained| tested_on(plan).filter_map(move |name| of(&trained, name)).collect::<Vec<_>>()).collect()
+    all.flat_map(|trained| scope.tested_on.iter().filter_map(|name| of(&trained, name)).collect::<Vec<_>>()).collect()
 }
 
 impl Report<'_> {

@@ -66,6 +66,9 @@ pub enum CellEvent {
     Busy,
     /// There is no server, or no longer, which is not the cell's failure.
     LostServer { reason: String },
+    /// A file could not be read or written, which is not the cell's failure: the disk is full, for instance. What was
+    /// trained is kept.
+    FileFault { reason: String },
     /// This signal asked to end. What was trained is kept.
     Stopped { signal: i32 },
     /// The order makes no sense to the worker.
@@ -106,6 +109,7 @@ impl std::fmt::Display for CellEvent {
             Self::Stopped { signal } => write!(f, "signal {signal} ended its process"),
             Self::Failed { reason }
             | Self::LostServer { reason }
+            | Self::FileFault { reason }
             | Self::Refused { reason }
             | Self::Killed { reason } => write!(f, "{reason}"),
         }
@@ -187,6 +191,7 @@ mod tests {
     #[case(CellEvent::Done, r#""done"}"#)]
     #[case(CellEvent::Failed { reason: "NaN".into() }, r#""failed","reason":"NaN"}"#)]
     #[case(CellEvent::Busy, r#""busy"}"#)]
+    #[case(CellEvent::FileFault { reason: "full".into() }, r#""file_fault","reason":"full"}"#)]
     #[case(CellEvent::LostServer { reason: "gone".into() }, r#""lost_server","reason":"gone"}"#)]
     #[case(CellEvent::Stopped { signal: 15 }, r#""stopped","signal":15}"#)]
     #[case(CellEvent::Refused { reason: "no".into() }, r#""refused","reason":"no"}"#)]

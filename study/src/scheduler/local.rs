@@ -21,6 +21,8 @@ pub struct Local<'a> {
     command: &'a dyn Fn() -> Command,
     server_ended: &'a dyn Fn() -> Option<String>,
     workers: Vec<Worker>,
+    /// What each cell may take at most, s of a process, as far as it was measured.
+    most: Vec<Option<f64>>,
 }
 
 struct Worker {
@@ -47,7 +49,12 @@ impl<'a> Local<'a> {
         command: &'a dyn Fn() -> Command,
         server_ended: &'a dyn Fn() -> Option<String>,
     ) -> Self {
-        Self { plan, folder, grouping, command, server_ended, workers: Vec::new() }
+        Self { plan, folder, grouping, command, server_ended, workers: Vec::new(), most: Vec::new() }
+    }
+
+    /// The same, which knows what cells may take at most, by their places in the plan, s of a process.
+    pub fn with_most(self, most: Vec<Option<f64>>) -> Self {
+        Self { most, ..self }
     }
 
     fn start(&self, group: &[Offer]) -> Result<Option<Worker>> {
@@ -167,6 +174,10 @@ impl Backend for Local<'_> {
             self.workers.extend(worker);
         }
         Ok(groups.iter().flatten().map(|offer| offer.cell).collect())
+    }
+
+    fn most(&self, cell: usize) -> Option<f64> {
+        self.most.get(cell).copied().flatten()
     }
 
     fn load(&self) -> (String, usize) {

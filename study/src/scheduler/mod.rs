@@ -6,6 +6,9 @@
 
 mod event;
 mod local;
+mod pace;
+mod rates;
+mod remaining;
 mod running;
 pub mod slurm;
 mod times;
@@ -13,12 +16,18 @@ mod times;
 use std::collections::{HashMap, VecDeque};
 use std::time::{Duration, Instant};
 
+use crate::cost::generated_episodes;
 use crate::files::FileError;
-use crate::folder::{Failure, FailureMark, Folder};
+use crate::folder::{CellState, Failure, FailureMark, Folder};
 use crate::interrupt::StopFlag;
-use crate::plan::{Grouping, Plan};
+use crate::plan::{Cell, Grouping, Plan, SELECTION_TEST, Tests};
 pub use event::{CellEvent, Line, Order, OrderedCell, Teller, write_line};
 pub use local::Local;
+pub use pace::Pace;
+pub use rates::Rate;
+pub(crate) use rates::Rates;
+pub use remaining::Remaining;
+use remaining::{Left, remaining};
 use running::Running;
 pub use running::RunningGroup;
 use slurm::SlurmError;
@@ -26,15 +35,17 @@ pub(crate) use times::Times;
 
 /// How often in a row a cell may be broken off without getting any further.
 pub const MOST_ATTEMPTS: u32 = 3;
-/// How often in a row a cell may be without a server before the run ends: after some fifteen seconds, in which a server
-/// may have been started again.
-const MOST_LOST_SERVERS: u32 = 5;
+/// How often in a row a cell may be without a server, or a disk, before the run ends: after some fifteen seconds, in which
+/// a server may have been started again.
+const MOST_LOST: u32 = 5;
 /// A cell that had a server for so long made some progress: what is lost then is not lost in a row.
 const HAD_A_SERVER: Duration = Duration::from_secs(60);
-/// How long nothing is begun after a cell had no server; doubled at each time in a row.
-const SERVER_PAUSE: Duration = Duration::from_secs(1);
+/// How long nothing is begun after a cell had no server or no disk; doubled at each time in a row.
+const PAUSE: Duration = Duration::from_secs(1);
 /// How often the folder is looked at, and it is said how far the run is.
 const LOOK_INTERVAL: Duration = Duration::from_secs(1);
+/// A test episode takes about so much of the time of a training's: there are no updates, and many at a time.
+const TEST_SHARE: f64 = 0.25;
 /// How long this process sleeps at a time.
 const TICK: Duration = Duration::from_millis(50);
 
@@ -62,6 +73,10 @@ pub trait Backend {
     fn begin(&mut self, groups: &[Vec<Offer>]) -> Result<Vec<usize>>;
     /// What it is doing, in a few words, and how many groups at a time.
     fn load(&self) -> (String, usize);
+    /// What a cell may take at most, s of a process, if it was measured.
+    fn most(&self, _cell: usize) -> Option<f64> {
+        None
+    }
     /// Ends all that cannot go on without this process, and names what can.
     fn stop(&mut self) -> Vec<String>;
 }
@@ -118,8 +133,10 @@ pub struct Status {
     pub running: Vec<RunningGroup>,
     /// What the backend is doing, in a few words.
     pub doing: String,
-    /// How long it may take, by what finished cells took; `None` before the first.
-    pub remaining: Option<Duration>,
+    /// How long it may take; `None` while there is a cell of whose kind nothing is known.
+    pub remaining: Option<Remaining>,
+    /// Success of the cells that are done.
+    pub rates: Vec<Rate>,
 }
 
 /// How a run ended.
@@ -150,8 +167,11 @@ pub enum RunError {
     #[error("a worker refused its order: {0}; did another run replace the folder's plan.toml meanwhile?")]
     Refused(String),
     /// The servers are gone.
-    #[error("the run cannot go on without a server: {0}; finished cells are kept, call it again to go on")]
+    #[error("the run cannot go on without a server: {0}; what is done is kept")]
     NoServer(String),
+    /// Files of a cell cannot be read or written.
+    #[error("the run cannot go on: {0}; when that is mended, the same command goes on from what was trained")]
+    FileFault(String),
     /// Cells were tried several times, which did not bring them any further.
     #[error(
         "{} without a result after {MOST_ATTEMPTS} attempts, the first is {}: {words}; when that is mended, the same \
@@ -214,6 +234,8 @@ struct Tracked {
     /// Steps of its training that are in a checkpoint, and that were when the last attempt began its training.
     saved: u64,
     saved_before: Option<u64>,
+    /// How far this attempt is.
+    pace: Pace,
     lost_servers: usize,
     lost_in_a_row: u32,
     /// When something first happened to it in this attempt: before its turn in a job, a cell takes no time; …
@@ -247,6 +269,7 @@ struct Scheduler<'a> {
     /// The cells that wait, in order.
     queue: VecDeque<usize>,
     times: Times<'a>,
+    rates: Rates,
     paused_until: Option<Instant>,
     look_at: Option<Instant>,
 }
@@ -269,6 +292,7 @@ impl<'a> Scheduler<'a> {
             cells: cells.collect(),
             queue: VecDeque::new(),
             times: Times::default(),
+            rates: Rates::default(),
             paused_until: None,
             look_at: None,
         };
@@ -297,11 +321,12 @@ impl<'a> Scheduler<'a> {
             self.look(now)?;
         }
         self.begin(now)?;
-        if looks {
+        let end = self.end();
+        if looks || matches!(end, Ok(Some(_))) {
             let status = self.status(now);
             (self.report)(Announcement::Status(&status));
         }
-        self.end()
+        end
     }
 
     fn hear(&mut self, cell: usize, event: CellEvent, now: Instant) -> Result<()> {
@@ -312,7 +337,8 @@ impl<'a> Scheduler<'a> {
         tracked.begun.get_or_insert(now);
         match event {
             CellEvent::Server { .. } => tracked.served = tracked.served.or(Some(now)),
-            CellEvent::Training { saved, .. } => {
+            CellEvent::Training { saved, episodes, timesteps } => {
+                tracked.pace.hear(generated_episodes(&self.plan.cells[cell].config, episodes), timesteps);
                 tracked.saved_before.get_or_insert(saved);
                 if saved > tracked.saved {
                     (tracked.saved, tracked.attempts) = (saved, 0);
@@ -331,14 +357,20 @@ impl<'a> Scheduler<'a> {
             CellEvent::Busy => tracked.phase = Phase::Elsewhere,
             CellEvent::Refused { reason } => return Err(RunError::Refused(reason)),
             CellEvent::Failed { reason } => self.record_failure(cell, reason)?,
-            CellEvent::LostServer { reason } => {
-                let served_long = tracked.served.is_some_and(|since| now - since >= HAD_A_SERVER);
-                tracked.lost_in_a_row = if served_long { 1 } else { tracked.lost_in_a_row + 1 };
-                tracked.lost_servers += 1;
-                if tracked.lost_in_a_row >= MOST_LOST_SERVERS {
-                    return Err(RunError::NoServer(format!("{}: {reason}", self.id(cell))));
+            CellEvent::LostServer { .. } | CellEvent::FileFault { .. } => {
+                let lost_server = matches!(end, CellEvent::LostServer { .. });
+                let progressed = if lost_server {
+                    tracked.served.is_some_and(|since| now - since >= HAD_A_SERVER)
+                } else {
+                    tracked.saved_before.is_some_and(|before| tracked.saved > before)
+                };
+                tracked.lost_in_a_row = if progressed { 1 } else { tracked.lost_in_a_row + 1 };
+                tracked.lost_servers += usize::from(lost_server);
+                if tracked.lost_in_a_row >= MOST_LOST {
+                    let words = format!("{}: {end}", self.id(cell));
+                    return Err(if lost_server { RunError::NoServer(words) } else { RunError::FileFault(words) });
                 }
-                let pause = SERVER_PAUSE * (1 << (tracked.lost_in_a_row - 1));
+                let pause = PAUSE * (1 << (tracked.lost_in_a_row - 1));
                 self.paused_until = self.paused_until.max(Some(now + pause));
                 // At the front: if the servers are gone, the run ends soon, however many cells it has.
                 tracked.phase = Phase::Waiting;
@@ -371,7 +403,12 @@ impl<'a> Scheduler<'a> {
             return Ok(());
         };
         if !self.settled(cell) {
-            place.write_failure(&Failure { id: self.id(cell).to_owned(), reason, commit: crate::VERSION.into() })?;
+            place.write_failure(&Failure {
+                id: self.id(cell).to_owned(),
+                reason,
+                commit: crate::VERSION.into(),
+                begins_anew: false,
+            })?;
             self.cells[cell].phase = Phase::Failed;
         }
         Ok(())
@@ -387,6 +424,10 @@ impl<'a> Scheduler<'a> {
             *phase = Phase::Done;
             if let Some(timing) = place.timing() {
                 self.times.add(&self.plan.cells[cell], timing.seconds);
+            }
+            // One that cannot be read is left out: the report says what is wrong with it.
+            if let Ok(CellState::Done(result)) = place.state() {
+                self.rates.add(&self.plan.cells[cell], &result);
             }
         } else if place.failure_mark().is_some_and(|failure| Some(failure) != *forgiven) {
             *phase = Phase::Failed;
@@ -447,6 +488,7 @@ impl<'a> Scheduler<'a> {
                 let tracked = &mut self.cells[cell];
                 tracked.phase = Phase::Running;
                 (tracked.begun, tracked.served, tracked.last, tracked.saved_before) = (None, None, None, None);
+                tracked.pace = Pace::default();
             }
         }
         self.queue.retain(|&cell| self.cells[cell].phase == Phase::Waiting);
@@ -475,31 +517,60 @@ impl<'a> Scheduler<'a> {
         let (doing, at_a_time) = self.backend.load();
         let number = |phase| self.cells.iter().filter(|cell| cell.phase == phase).count();
         let (mut running, mut left) = (Running::default(), Vec::new());
-        for (tracked, cell) in self.cells.iter().zip(&self.plan.cells) {
+        for (place, (tracked, cell)) in self.cells.iter().zip(&self.plan.cells).enumerate() {
+            let most = self.backend.most(place);
             match (tracked.phase, &tracked.last, tracked.begun) {
                 (Phase::Running, Some(event), Some(begun)) => {
                     running.add(cell, (!tracked.alone).then_some(tracked.group), event);
-                    left.push((cell, (now - begun).as_secs_f64()));
+                    let rest = rest(cell, event, &tracked.pace);
+                    left.push(Left { cell, elapsed: Some((now - begun).as_secs_f64()), rest, most });
                 }
-                (Phase::Waiting | Phase::Running, ..) => left.push((cell, 0.0)),
+                (Phase::Waiting | Phase::Running, ..) => left.push(Left { cell, elapsed: None, rest: None, most }),
                 _ => {}
             }
         }
-        // The time of a process is shared by the cells that it does together.
-        let share = (at_a_time as f64 / running.cells() as f64).min(1.0);
-        let left = left.into_iter().map(|(cell, seconds)| (cell, seconds * share));
         Status {
             cells: self.cells.len(),
             done: number(Phase::Done),
             failed: number(Phase::Failed),
             running: running.groups,
             doing,
-            remaining: self.times.remaining(left, at_a_time),
+            remaining: remaining(&self.times, &left, at_a_time),
+            rates: self.rates.list(),
         }
     }
 
     fn id(&self, cell: usize) -> &'a str {
         &self.plan.cells[cell].id
+    }
+}
+
+/// What is left of a cell under way, in terms of what was done of it.
+fn rest(cell: &Cell, event: &CellEvent, pace: &Pace) -> Option<f64> {
+    let training = generated_episodes(&cell.config, cell.config.common.episodes);
+    let testing = test_episodes(cell, None);
+    match event {
+        CellEvent::Training { .. } => pace.left(training + TEST_SHARE * testing),
+        CellEvent::Testing { set, episodes } => {
+            let tested = test_episodes(cell, Some(set)) + *episodes as f64;
+            let done = (training - pace.begun()).max(0.0) + TEST_SHARE * tested; // in this attempt
+            (done > 0.0).then(|| TEST_SHARE * (testing - tested).max(0.0) / done)
+        }
+        _ => None,
+    }
+}
+
+/// Episodes of a cell's tests: all of them, or those before the test of this name.
+fn test_episodes(cell: &Cell, before: Option<&str>) -> f64 {
+    let Tests { episodes, sets, selection, marks, .. } = &cell.tests;
+    let of_mark = marks.iter().map(|mark| format!(" after {mark} episodes"));
+    let names =
+        of_mark.chain([String::new()]).flat_map(|when| sets.iter().map(move |set| format!("{}{when}", set.name)));
+    let mut names = names.chain(selection.map(|_| SELECTION_TEST.to_owned()));
+    let tests = names.position(|name| Some(name.as_str()) == before);
+    match tests {
+        Some(tests) => (tests as u64 * episodes) as f64,
+        None => (((1 + marks.len()) * sets.len()) as u64 * episodes + selection.unwrap_or_default()) as f64,
     }
 }
 

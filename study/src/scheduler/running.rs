@@ -63,11 +63,6 @@ impl Running {
         let sees = observe.note().map_or_else(String::new, |sees| format!(" ({sees})"));
         self.groups.push(RunningGroup { kind: format!("{environment} {architecture}{sees}"), cells: vec![entry] });
     }
-
-    /// How many cells there are.
-    pub(super) fn cells(&self) -> usize {
-        self.groups.iter().map(|group| group.cells.len()).sum()
-    }
 }
 
 #[cfg(test)]

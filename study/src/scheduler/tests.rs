@@ -184,7 +184,8 @@ impl Place {
     }
 
     fn fail(&self, cell: usize) {
-        let failure = Failure { id: self.id(cell).to_owned(), reason: "NaN".into(), commit: "x".into() };
+        let failure =
+            Failure { id: self.id(cell).to_owned(), reason: "NaN".into(), commit: "x".into(), begins_anew: true };
         self.folder.cell(self.id(cell)).write_failure(&failure).unwrap();
     }
 
@@ -292,13 +293,33 @@ fn a_killed_cell_waits_until_the_others_had_their_turn() {
 fn servers_that_are_lost_in_a_row_are_waited_for_longer_and_longer_and_not_for_ever() {
     let place = Place::new();
     let ran = place.run(&|_, _| vec![lost()]);
-    let message = format!("the run cannot go on without a server: {}: gone; finished cells are kept", place.id(0));
+    let message = format!("the run cannot go on without a server: {}: gone; what is done is kept", place.id(0));
     assert!(ran.end.as_ref().is_err_and(|error| error.starts_with(&message)), "{:?}", ran.end);
     // The loss is heard a second after the beginning; then 1, 2, 4 and 8 s are waited.
     assert_eq!(ran.times(), [0, 2, 5, 10, 19], "at the front of the queue");
     assert_eq!(ran.attempts(), [5, 0, 0, 0]);
     assert_eq!(ran.begun.iter().map(|(.., lost)| *lost).collect::<Vec<_>>(), [0, 1, 2, 3, 4], "for their turns");
     assert!((0..4).all(|cell| !place.folder.cell(place.id(cell)).is_settled(true)), "no cell is blamed");
+}
+
+#[test]
+fn a_full_disk_is_waited_for_ends_the_run_and_is_no_cells_failure() {
+    let place = Place::new();
+    let full = || ends(CellEvent::FileFault { reason: "no space left".into() });
+    let ran = place.run(&|cell, attempt| if cell == 0 && attempt < 5 { vec![full()] } else { done() });
+    assert_eq!((ran.end.clone(), ran.attempts()), (place.finished(&[]), vec![5, 1, 1, 1]), "there is room again");
+    let place = Place::new();
+    let ran = place.run(&|_, _| vec![server(), Wait(90), full()]);
+    let message = format!("the run cannot go on: {}: no space left; when that is mended", place.id(0));
+    assert!(ran.end.as_ref().is_err_and(|error| error.starts_with(&message)), "{:?}", ran.end);
+    assert!((0..4).all(|cell| !place.folder.cell(place.id(cell)).is_settled(true)), "no cell is blamed");
+    // One that gets further each time may go on.
+    let place = Place::new();
+    let ran = place.run(&|cell, attempt| match (cell, attempt) {
+        (0, 1..=7) => vec![saved(100 * attempt as u64), saved(100 * attempt as u64 + 50), full()],
+        _ => done(),
+    });
+    assert_eq!(ran.end, place.finished(&[]));
 }
 
 #[rstest]
@@ -531,7 +552,7 @@ fn cells_of_a_group_share_the_time_of_its_process() {
         place.folder.cell(&cell.id).write_timing(&crate::folder::Timing { seconds: 10.0 }).unwrap();
     });
     let ran = place.run_in::<true>(THREES, false, &script);
-    let left = |second: usize| ran.statuses[second].remaining.map(|left| left.as_secs());
+    let left = |second: usize| ran.statuses[second].remaining.map(|left| left.time.as_secs());
     // The second group begins at 2 s and is heard of a second later; 6 s after that, each of its cells has had 2 s.
     assert_eq!((left(2), left(3), left(9)), (Some(30), Some(30), Some(24)));
 }

@@ -15,14 +15,19 @@ pub enum ConfigError {
     #[error("{origin}: {reason}")]
     Syntax { origin: String, reason: String },
     /// A key does not exist.
-    #[error("{origin}: unknown key `{key}`; {algorithm}'s keys are {keys}")]
+    #[error("{origin}: unknown key `{key}`{hint}; {algorithm}'s keys are {keys}")]
     UnknownKey {
         origin: String,
         key: String,
+        /// Which key was probably meant, or what else has this one.
+        hint: String,
         /// Whose keys were looked through.
         algorithm: &'static str,
         keys: String,
     },
+    /// The command line says two things of one setting.
+    #[error("{first} and {second} contradict each other: give one of them")]
+    Contradiction { first: String, second: String },
     /// A value has the wrong type or lies outside its range.
     #[error(transparent)]
     Value(#[from] ValueError),

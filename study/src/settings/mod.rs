@@ -1,7 +1,8 @@
 //! The configuration of a training: flat, by the field's names.
 //!
-//! Layers, each over the one before: the algorithm's defaults in the preset, `--config FILE.toml`, `--set key=value`, flags. The
-//! result is written to `config.toml` of the run; given back with `--config` it repeats the run.
+//! The algorithm's defaults in the preset come first, over them `--config FILE.toml`, over that the command line: flags and
+//! `--set key=value`, which may not contradict each other. The result is written to `config.toml` of the run; given back with
+//! `--config` it repeats the run.
 
 mod algorithms;
 mod architecture;
@@ -25,7 +26,7 @@ use config::{Config, File, FileFormat};
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use perturb_protocol::{Distribution, Version};
+use perturb_protocol::{Distribution, Version, names};
 
 use crate::Method;
 use crate::files;
@@ -120,7 +121,7 @@ fn is_zero(number: &f64) -> bool {
 }
 
 impl TrainConfig {
-    /// Merges and checks all layers, weakest first: a TOML file, pairs `key=value`, flags by the keys of the file.
+    /// Merges and checks a TOML file and, over it, the command line: pairs `key=value`, and flags by the keys of the file.
     ///
     /// # Errors
     /// [`ConfigError`], which names the key and what is accepted.
@@ -128,16 +129,20 @@ impl TrainConfig {
         let mut layers: Vec<(String, Table)> = Vec::new();
         if let Some(path) = file {
             let shown = path.display().to_string();
-            let table = files::read_text(path)?
-                .parse::<Table>()
-                .map_err(|error| ConfigError::Syntax { origin: shown.clone(), reason: error.to_string() })?;
+            let table = files::read_text(path)?.parse::<Table>().map_err(|error| ConfigError::Syntax {
+                origin: shown.clone(),
+                reason: error.to_string().trim().to_owned(),
+            })?;
             layers.push((shown, table));
         }
+        let mut typed: Vec<(String, Table)> = Vec::new();
         for set in sets {
-            layers.push((format!("--set {set}"), parse_set(set)?));
+            typed.push((format!("--set {set}"), parse_set(set)?));
         }
-        layers.push(("the command line".into(), flags));
-        resolve(&layers)
+        typed.extend(flags.into_iter().map(|(key, value)| (flag(&key, &value), Table::from_iter([(key, value)]))));
+        refuse_contradictions(&typed)?;
+        layers.append(&mut typed);
+        resolve(layers)
     }
 
     /// The configuration as TOML, every setting of it.
@@ -168,7 +173,7 @@ impl TrainConfig {
     /// # Errors
     /// [`ConfigError`], which names the key and what is accepted.
     pub fn from_table(origin: &str, table: Table) -> Result<Self, ConfigError> {
-        resolve(&[(origin.to_owned(), table)])
+        resolve(vec![(origin.to_owned(), table)])
     }
 
     /// What trains.
@@ -180,6 +185,7 @@ impl TrainConfig {
             episodes_per_trial: settings.has_trials().then(|| settings.episodes_per_trial()),
             preset: common.preset,
             observe: common.observe,
+            elsewhere: false,
         }
     }
 
@@ -207,6 +213,14 @@ impl TrainConfig {
     }
 }
 
+/// "Hopper R ppo ff": what is trained, in a few words.
+impl std::fmt::Display for TrainConfig {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Common { environment, version, .. } = &self.common;
+        write!(f, "{environment} {version} {}", self.method())
+    }
+}
+
 impl TryFrom<Table> for TrainConfig {
     type Error = ConfigError;
 
@@ -221,8 +235,54 @@ impl From<TrainConfig> for Table {
     }
 }
 
+/// A flag as it was typed, but for its values.
+fn flag(key: &str, value: &Value) -> String {
+    let name = if key == "environment" { "env".to_owned() } else { key.replace('_', "-") };
+    match value {
+        Value::Table(_) => format!("--{name}"),
+        Value::String(text) => format!("--{name} {text}"),
+        value => format!("--{name} {value}"),
+    }
+}
+
+/// Refuses a command line that says two things of one setting: nobody can know which was meant.
+fn refuse_contradictions(typed: &[(String, Table)]) -> Result<(), ConfigError> {
+    let same = |a: &Value, b: &Value| match (a, b) {
+        (Value::String(a), Value::String(b)) => names::is_spelled(a, b),
+        (a, b) => a == b,
+    };
+    let all = || typed.iter().flat_map(|(origin, table)| table.iter().map(move |entry| (origin, entry)));
+    for (index, (origin, (key, value))) in all().enumerate() {
+        if let Some((first, _)) = all().take(index).find(|(_, (known, other))| *known == key && !same(other, value)) {
+            return Err(ConfigError::Contradiction { first: first.clone(), second: origin.clone() });
+        }
+    }
+    Ok(())
+}
+
+/// The names that the setting `key` may have; `None` if it is no choice between names.
+fn choices(key: &str) -> Option<Vec<&'static str>> {
+    Some(match key {
+        ALGORITHM => Settings::names().to_vec(),
+        "version" => Version::NAMES.to_vec(),
+        ARCHITECTURE => Architecture::NAMES.to_vec(),
+        "learning_rate_schedule" => vec!["constant", "linear"],
+        PRESET => Preset::NAMES.to_vec(),
+        OBSERVE => Observe::NAMES.to_vec(),
+        "rank_by" => vec!["raw", "normalized"],
+        _ => return None,
+    })
+}
+
 /// Lays `layers` over the defaults of the algorithm that they name.
-fn resolve(layers: &[(String, Table)]) -> Result<TrainConfig, ConfigError> {
+fn resolve(mut layers: Vec<(String, Table)>) -> Result<TrainConfig, ConfigError> {
+    // Names are spelled as usual from here on.
+    for (key, value) in layers.iter_mut().flat_map(|(_, table)| table.iter_mut()) {
+        let known = choices(key).unwrap_or_default();
+        if let Some(place) = value.as_str().and_then(|written| names::find(written, known.iter().copied())) {
+            *value = known[place].into();
+        }
+    }
     let named = |key: &str| layers.iter().rev().find_map(|(_, table)| table.get(key));
     let algorithm = named(ALGORITHM).cloned().unwrap_or_else(|| "ppo".into());
     let algorithm = Settings::all()[choice(ALGORITHM, &algorithm, &Settings::names())?].clone();
@@ -241,13 +301,13 @@ fn resolve(layers: &[(String, Table)]) -> Result<TrainConfig, ConfigError> {
     defaults.insert(PARAMETERS.into(), Value::Table(Table::new()));
     defaults.insert("stop_at_success".into(), 0.0.into());
     defaults.insert(OBSERVE.into(), Observe::default().to_string().into());
-    for (origin, table) in layers {
+    for (origin, table) in &layers {
         for (key, value) in table {
             check(origin, key, value, &defaults, name)?;
         }
     }
     let mut builder = Config::builder().add_source(source(&defaults));
-    for (_, table) in layers {
+    for (_, table) in &layers {
         builder = builder.add_source(source(table));
     }
     let merged: Table = builder.build()?.try_deserialize()?;
@@ -281,33 +341,36 @@ fn source(table: &Table) -> File<config::FileSourceString, FileFormat> {
 /// Whether `key` exists and `value` has the type of its default.
 fn check(origin: &str, key: &str, value: &Value, defaults: &Table, algorithm: &'static str) -> Result<(), ConfigError> {
     let Some(default) = defaults.get(key) else {
-        let keys = defaults.keys().map(String::as_str).collect::<Vec<_>>().join(", ");
-        return Err(ConfigError::UnknownKey { origin: origin.to_owned(), key: key.to_owned(), algorithm, keys });
+        let keys = || defaults.keys().map(String::as_str);
+        let hint = others_setting(key).unwrap_or_else(|| names::did_you_mean(key, keys()));
+        let keys = keys().collect::<Vec<_>>().join(", ");
+        return Err(ConfigError::UnknownKey { origin: origin.to_owned(), key: key.to_owned(), hint, algorithm, keys });
     };
-    let algorithms = Settings::names();
-    let choices: Option<&[&str]> = match key {
-        ALGORITHM => Some(&algorithms),
-        "version" => Some(&Version::NAMES),
-        ARCHITECTURE => Some(&Architecture::NAMES),
-        "learning_rate_schedule" => Some(&["constant", "linear"]),
-        PRESET => Some(&Preset::NAMES),
-        OBSERVE => Some(&Observe::NAMES),
-        "rank_by" => Some(&["raw", "normalized"]),
-        _ => None,
-    };
+    let choices = choices(key);
     let expected = match (default, value) {
-        _ if choices.is_some() => return choice(key, value, choices.unwrap_or_default()).map(drop),
+        _ if choices.is_some() => return choice(key, value, &choices.unwrap_or_default()).map(drop),
         (Value::Float(_), Value::Float(_) | Value::Integer(_)) => return Ok(()),
         (Value::Integer(_), Value::Integer(0..)) => return Ok(()),
         (Value::Boolean(_), Value::Boolean(_)) | (Value::String(_), Value::String(_)) => return Ok(()),
         (Value::Table(_), Value::Table(parameters)) => return check_parameters(parameters),
         (Value::Table(_), _) => "a table of parameters and their values",
         (Value::Float(_), _) => "a number",
+        (Value::Integer(_), Value::Float(number)) if number.fract() == 0.0 && (0.0..1e15).contains(number) => {
+            let expected = format!("a whole number that is not negative, in digits: {number}");
+            return Err(ValueError::new(key, value, expected).into());
+        }
         (Value::Integer(_), _) => "a whole number that is not negative",
         (Value::Boolean(_), _) => "true or false",
         _ => "a text",
     };
     Err(ValueError::new(key, value, expected).into())
+}
+
+/// "; it is a setting of rl2-a2c, rl2-ppo", if it is one of some algorithms.
+fn others_setting(key: &str) -> Option<String> {
+    let having = Settings::all().into_iter().filter(|settings| settings.table().contains_key(key));
+    let names: Vec<&str> = having.map(|settings| settings.name()).collect();
+    (!names.is_empty()).then(|| format!("; it is a setting of {}", names.join(", ")))
 }
 
 /// Whether every value of the table `[parameters]` is a distribution.
@@ -321,10 +384,11 @@ fn check_parameters(parameters: &Table) -> Result<(), ConfigError> {
 }
 
 /// The place of a value among a few names.
-fn choice(key: &str, value: &Value, names: &[&str]) -> Result<usize, ConfigError> {
-    names.iter().position(|name| value.as_str() == Some(name)).ok_or_else(|| {
-        let names: Vec<String> = names.iter().map(|name| format!("\"{name}\"")).collect();
-        ValueError::new(key, value, format!("one of {}", names.join(", "))).into()
+fn choice(key: &str, value: &Value, known: &[&str]) -> Result<usize, ConfigError> {
+    known.iter().position(|name| value.as_str() == Some(name)).ok_or_else(|| {
+        let hint = names::did_you_mean(value.as_str().unwrap_or_default(), known.iter().copied());
+        let known: Vec<String> = known.iter().map(|name| format!("\"{name}\"")).collect();
+        ValueError::new(key, value, format!("one of {}{hint}", known.join(", "))).into()
     })
 }
 

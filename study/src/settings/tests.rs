@@ -21,13 +21,40 @@ fn ppo(config: &TrainConfig) -> &PpoConfig {
 }
 
 #[test]
-fn a_flag_beats_a_set_beats_the_file_beats_the_default() {
+fn the_command_line_beats_the_file_beats_the_default() {
     let file = "environment = 'CartPole'\nseed = 2\nn_steps = 256\ngamma = 0.9";
-    let config = load(Some(file), &["seed=3", "n_steps=512", "n_steps=64"], "seed = 4").unwrap();
+    let config = load(Some(file), &["n_steps=64"], "seed = 4").unwrap();
     assert_eq!(config.common.seed, 4);
-    assert_eq!(ppo(&config).n_steps, 64, "the later --set");
+    assert_eq!(ppo(&config).n_steps, 64);
     assert_eq!(ppo(&config).gamma, 0.9);
     assert_eq!(ppo(&config).gae_lambda, PpoConfig::default().gae_lambda);
+}
+
+#[test]
+fn the_command_line_does_not_contradict_itself() {
+    let refused = |sets: &[&str], flags: &str| load(None, sets, flags).unwrap_err().to_string();
+    let remedy = "contradict each other: give one of them";
+    let flags = "environment = 'CartPole'\nversion = 'D'";
+    assert_eq!(refused(&["version=R"], flags), format!("--set version=R and --version D {remedy}"));
+    assert_eq!(
+        refused(&["environment=Hopper"], flags),
+        format!("--set environment=Hopper and --env CartPole {remedy}")
+    );
+    assert_eq!(
+        refused(&["n_steps=512", "n_steps=64"], flags),
+        format!("--set n_steps=512 and --set n_steps=64 {remedy}")
+    );
+    let twice = load(None, &["version=d", "environment=cart-pole", "seed=1", "seed=1"], flags).unwrap();
+    assert_eq!((twice.common.seed, twice.common.environment.as_str()), (1, "CartPole"), "the same twice is one thing");
+}
+
+#[test]
+fn names_are_spelled_as_one_likes() {
+    let sets = ["algorithm=EPOpt_PPO", "architecture=RC", "version=r+e", "preset=Paper", "rank_by=RAW"];
+    let config = load(None, &sets, "environment = 'CartPole'").unwrap();
+    assert_eq!((config.settings.name(), config.common.architecture), ("epopt-ppo", Architecture::Rc));
+    assert_eq!((config.common.version, config.common.preset), (Version::RE, Preset::Paper));
+    assert_eq!(config, load(Some(&config.to_toml()), &[], "").unwrap());
 }
 
 #[test]
@@ -36,7 +63,8 @@ fn an_algorithm_brings_its_own_defaults_and_keys() {
     let own = A2cConfig { learning_rate: 7e-3, n_steps: 15, ent_coef: 1e-3, ..A2cConfig::default() };
     let base = Base::A2c(A2cConfig { rms_alpha: 0.9, ..own });
     assert_eq!(config.settings, Settings { base, wrapper: Wrapper::Plain });
-    assert!(refusal(None, &["rms_alpha=0.9"]).contains("unknown key `rms_alpha`; ppo's keys are"));
+    let other = "unknown key `rms_alpha`; it is a setting of a2c, epopt-a2c, rl2-a2c; ppo's keys are";
+    assert!(refusal(None, &["rms_alpha=0.9"]).contains(other));
 }
 
 #[test]
@@ -191,7 +219,7 @@ fn a_wrapper_brings_its_keys_and_takes_away_those_that_it_has_no_use_for() {
     assert_eq!(config.settings.wrapper, Wrapper::Epopt(expected));
     for key in ["n_steps", "n_minibatches", "episodes_per_trial"] {
         let message = refusal(None, &["algorithm=epopt-ppo", &format!("{key}=2")]);
-        assert!(message.contains(&format!("unknown key `{key}`; epopt-ppo's keys are")), "{message}");
+        assert!(message.contains(&format!("unknown key `{key}`; it is a setting of ")), "{message}");
     }
     let config = load(None, &["algorithm=rl2-ppo", "episodes_per_trial=5"], "environment = 'CartPole'").unwrap();
     assert_eq!(config.settings.episodes_per_trial(), 5);
@@ -201,7 +229,7 @@ fn a_wrapper_brings_its_keys_and_takes_away_those_that_it_has_no_use_for() {
 #[test]
 fn an_unknown_key_is_refused_with_all_valid_ones() {
     let message = refusal(Some("learning_rat = 0.1"), &[]);
-    assert!(message.contains("config.toml: unknown key `learning_rat`"), "{message}");
+    assert!(message.contains("config.toml: unknown key `learning_rat` (did you mean `learning_rate`?); "), "{message}");
     for key in ["learning_rate,", "n_steps", "num_envs", "normalize_observations", "checkpoint_interval"] {
         assert!(message.contains(key), "{key}: {message}");
     }
@@ -215,7 +243,6 @@ fn a_wrong_type_is_refused_with_the_right_one() {
         ("n_steps=12.5", "n_steps is 12.5, but must be a whole number"),
         ("n_steps=-1", "n_steps is -1, but must be a whole number that is not negative"),
         ("normalize_rewards=1", "normalize_rewards is 1, but must be true or false"),
-        ("environment=3", "environment is 3, but must be a text"),
         ("version=X", "version is \"X\", but must be one of \"D\", \"R\", \"E\""),
         ("algorithm=dqn", "algorithm is \"dqn\", but must be one of \"a2c\", \"ppo\", \"epopt-a2c\", "),
         ("architecture=mlp", "architecture is \"mlp\", but must be one of \"ff\", \"rc\""),
@@ -229,6 +256,8 @@ fn a_wrong_type_is_refused_with_the_right_one() {
         let message = refusal(None, &[set]);
         assert!(message.contains(part), "{set}: {message}");
     }
+    let environment = load(None, &["environment=3"], "").unwrap_err().to_string();
+    assert_eq!(environment, "environment is 3, but must be a text");
     for (sets, part) in [
         (["algorithm=epopt-a2c", "epsilon=0"], "epsilon is 0, but must be above 0 and at most 1"),
         (

@@ -64,6 +64,13 @@ pub fn bootstrap(
     Some(points.into_iter().zip(estimates).map(with_interval).collect())
 }
 
+/// Whether there are so many runs that fewer than one in 40 resamples is the lowest of all runs alone: with fewer the ends
+/// of a 95 % interval are the lowest and the highest run, whatever lies between. Of one stratum 4 are enough.
+pub fn are_enough(strata: &[Vec<f64>]) -> bool {
+    let lowest_alone = |runs: &Vec<f64>| (runs.len() as f64).powi(-(runs.len() as i32));
+    strata.iter().map(lowest_alone).product::<f64>() < 0.025
+}
+
 /// Draws runs anew, with replacement and as many, within each of the strata that have `sizes` runs, all of which have some.
 /// `each` is given the places of the drawn runs, by stratum, `resamples` times. The same seed draws the same.
 pub fn resample(sizes: &[usize], resamples: usize, seed: u64, mut each: impl FnMut(&[Vec<usize>])) {
@@ -131,6 +138,19 @@ mod tests {
         assert!(draws.iter().all(|draws| (draws[0].len(), draws[1].len()) == (2, 5)));
         let seen = |stratum: usize, run: usize| draws.iter().any(|draws| draws[stratum].contains(&run));
         assert!((0..2).all(|run| seen(0, run)) && (0..5).all(|run| seen(1, run)) && !seen(0, 2) && !seen(1, 5));
+    }
+
+    /// What the 2.5th percentile of all resamples is.
+    #[test]
+    fn enough_runs_have_an_interval_that_is_not_from_the_lowest_to_the_highest() {
+        let runs = |count: usize| (0..count).map(|run| (run * run) as f64).collect::<Vec<_>>();
+        for strata in [vec![1], vec![2], vec![3], vec![4], vec![5], vec![2, 2], vec![2, 2, 2], vec![3, 1], vec![1, 4]] {
+            let strata: Vec<Vec<f64>> = strata.into_iter().map(runs).collect();
+            let lowest = mean(&strata.iter().map(|runs| vec![runs[0]; runs.len()]).collect::<Vec<_>>());
+            let number = Bootstrapped::of(&strata, 100_000, 1, mean).unwrap();
+            let is_inside = number.interval_95.is_some_and(|[low, _]| low > lowest + 1e-9);
+            assert_eq!(are_enough(&strata), is_inside, "{strata:?}: {number}");
+        }
     }
 
     #[test]

@@ -9,7 +9,7 @@ mod bootstrap;
 mod paired;
 
 pub use aggregates::{interquartile_mean, optimality_gap, probability_of_improvement, profile};
-pub use bootstrap::{Bootstrapped, bootstrap, percentile_interval, resample};
+pub use bootstrap::{Bootstrapped, are_enough, bootstrap, percentile_interval, resample};
 pub use paired::{holm, sign_flip_p};
 
 /// Mean and deviation over runs.

@@ -67,7 +67,7 @@ async fn wrong_requests_before_open_are_refused_and_open_still_works() {
         Request::Reset(Reset::default()),
         Request::Snapshot(Snapshot::default()),
         Request::Restore(Restore::default()),
-        bad(|o| o.environment = "cartpole".into()),
+        bad(|o| o.environment = "cartpol".into()),
         bad(|o| o.environment.clear()),
         bad(|o| o.environment = "x\0\n".into()),
         bad(|o| o.version = 0),

@@ -5,6 +5,7 @@ use std::path::Path;
 
 use super::{options, test, wanted_axes};
 use crate::commands::args::HeatmapArgs;
+use crate::commands::display::note;
 use crate::commands::error::{CommandError, Result, system};
 use crate::commands::{plan_in, playing_servers};
 use perturb_learner::checkpoint::Checkpoint;
@@ -41,7 +42,7 @@ pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
     let mut count = Count::default();
     for places in wanted.chunk_by(|a, b| a.environment == b.environment) {
         let (done, waiting): (Vec<_>, Vec<_>) = places.iter().partition(|place| place.selected.is_some());
-        waiting.iter().for_each(|place| eprintln!("{place}: {}", NoHeatmap::NoResult));
+        waiting.iter().for_each(|place| note(format_args!("{place}: {}", NoHeatmap::NoResult)));
         if done.is_empty() {
             continue;
         }
@@ -51,14 +52,14 @@ pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
         };
         let environment = servers.environment(places[0].environment)?;
         if let Some(lack) = lack(args, &environment) {
-            eprintln!("{lack}: left out");
+            note(format_args!("{lack}: left out"));
             count.lacking += 1;
             continue;
         }
         let parameters = match wanted_axes(args, &environment) {
             Ok(parameters) => parameters,
             Err(why) => {
-                eprintln!("{}: {why}", environment.name);
+                note(format_args!("{}: {why}", environment.name));
                 count.lacking += 1;
                 continue;
             }
@@ -104,7 +105,7 @@ fn make(
     let Some(selected) = place.selected else { return Ok(false) };
     let options = options(args, kind, &selected.cell.config);
     if place.read(folder, kind)?.is_ok_and(|stored| stored.record.options == options) {
-        eprintln!("{place}: is there already");
+        note(format_args!("{place}: is there already"));
         return Ok(true);
     }
     let checkpoint = match checkpoint_of(folder, selected) {

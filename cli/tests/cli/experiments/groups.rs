@@ -41,7 +41,12 @@ fn each_cell_of_a_group_ends_once_whatever_the_others_do() {
     assert_eq!(ends(&experiment, &servers, &[(0, None)], &stop), [(0, CellEvent::Done)]);
 
     let lock = place(1).try_lock().expect("a file").expect("a lock");
-    let failure = Failure { id: experiment.plan.cells[2].id.clone(), reason: "NaN".into(), commit: "x".into() };
+    let failure = Failure {
+        id: experiment.plan.cells[2].id.clone(),
+        reason: "NaN".into(),
+        commit: "x".into(),
+        begins_anew: true,
+    };
     place(2).write_failure(&failure).expect("written");
     let failed = CellEvent::Failed { reason: "NaN".into() };
     let all = [0, 1, 2, 3].map(|cell| (cell, None));

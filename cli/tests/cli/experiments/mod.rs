@@ -1,5 +1,6 @@
 //! Experiments with real worker processes and servers.
 
+mod faults;
 mod groups;
 mod marks;
 mod reference;
@@ -94,7 +95,9 @@ impl Experiment {
         let folder = Folder::new(&self.out(name));
         let log = |cell: &Cell| std::fs::read_to_string(folder.cell(&cell.id).log()).unwrap_or_default();
         let logs: String = self.plan.cells.iter().map(log).collect();
-        let begins = |line: &&str| line.contains("training begins") || line.contains("training goes on");
+        // Not the warning that one begins again for want of a checkpoint, which names its folder, too.
+        let begins =
+            |line: &&str| ["begins", "goes on"].iter().any(|how| line.contains(&format!("training {how} directory=")));
         let lines: Vec<&str> = logs.lines().filter(begins).collect();
         let of = |cell: &Cell| lines.iter().filter(|line| line.contains(&format!("/{}/", cell.id))).count();
         self.plan.cells.iter().map(of).collect()

@@ -165,7 +165,12 @@ fn a_result_names_the_program_that_began_its_training_if_it_is_another() {
     assert!(copied.expect("cp").success());
     let text = std::fs::read_to_string(document("other")).expect("a checkpoint");
     assert_eq!(text.matches(perturb_study::VERSION).count(), 1, "{text}");
-    std::fs::write(document("other"), text.replace(perturb_study::VERSION, "0.0.9 (abc)")).expect("written");
+    // That program knew no checksum.
+    let mut earlier: serde_json::Value =
+        serde_json::from_str(&text.replace(perturb_study::VERSION, "0.0.9 (abc)")).expect("JSON");
+    earlier["format_version"] = 2.into();
+    earlier.as_object_mut().expect("entries").remove("crc32c");
+    std::fs::write(document("other"), earlier.to_string()).expect("written");
 
     for name in ["same", "other", "whole"] {
         succeeded(&experiment.run(name, &["--cell", "0"]));
@@ -213,7 +218,7 @@ fn a_lost_server_is_no_cells_failure() {
     assert!(experiment.plan.cells.iter().all(|cell| !folder.cell(&cell.id).is_settled(true)));
 
     let one = experiment.run("out", &["--cell", "0", "--server", &address]);
-    assert!(one.status.code() == Some(1) && stderr(&one).contains("no server answers at"), "{}", stderr(&one));
+    assert!(one.status.code() == Some(2) && stderr(&one).contains("no server answers at"), "{}", stderr(&one));
 }
 
 #[test]
@@ -235,8 +240,8 @@ fn a_cell_that_somebody_works_on_is_left_alone_until_they_have_given_it_up() {
 fn a_wrong_command_is_refused_before_anything_is_done() {
     let experiment = Experiment::new(&PLAN.replace("'Pendulum'", "'Pendulums'"));
     let output = experiment.run("out", &[]);
-    assert_eq!(output.status.code(), Some(1));
-    assert!(stderr(&output).contains("no environment `Pendulums`"), "{}", stderr(&output));
+    assert_eq!(output.status.code(), Some(2));
+    assert!(stderr(&output).contains("no environment \"Pendulums\" (did you mean `Pendulum`?)"), "{}", stderr(&output));
     assert!(!experiment.out("out").exists());
     let output = experiment.run("out", &["--cell", "8"]);
     assert_eq!(output.status.code(), Some(2));

@@ -404,6 +404,10 @@ impl Backend for Jobs<'_> {
         Ok(taken)
     }
 
+    fn most(&self, cell: usize) -> Option<f64> {
+        self.known_costs.as_ref()?.get(cell).copied()
+    }
+
     fn load(&self) -> (String, usize) {
         let (running, waiting): (Vec<&QueuedJob>, Vec<&QueuedJob>) = self.live().partition(|job| !job.node.is_empty());
         let nodes: HashSet<&str> = running.iter().map(|job| job.node.as_str()).collect();

@@ -386,7 +386,7 @@ fn failed_cells_are_tried_again_on_request_only() {
     ids[1..].iter().for_each(|id| fake.finish(id));
     let failed = fake.folder.cell(&ids[0]);
     fs::create_dir_all(failed.training()).unwrap();
-    let failure = Failure { id: ids[0].clone(), reason: "NaN".into(), commit: "x".into() };
+    let failure = Failure { id: ids[0].clone(), reason: "NaN".into(), commit: "x".into(), begins_anew: true };
     failed.write_failure(&failure).unwrap();
     assert_eq!(fake.run().unwrap(), RunEnd::Finished { failed: vec![ids[0].clone()] });
     assert!(fake.submissions().is_empty());
@@ -404,7 +404,7 @@ fn a_cell_that_failed_in_an_array_of_before_is_tried_again_while_the_array_goes_
     (fake.options.cells_per_job, fake.plan) = (Some(4), of_one_kind());
     let ids = fake.ids();
     assert_eq!(fake.run_until("submitted 4 cells as Slurm job 1: 1 job").unwrap(), stopped(&["1"]));
-    let failure = Failure { id: ids[0].clone(), reason: "NaN".into(), commit: "x".into() };
+    let failure = Failure { id: ids[0].clone(), reason: "NaN".into(), commit: "x".into(), begins_anew: true };
     fake.folder.cell(&ids[0]).write_failure(&failure).unwrap();
     fake.retry_failed = true;
     assert_eq!(fake.run_until("submitted 1 cell as Slurm job 2").unwrap(), stopped(&["1", "2"]));

@@ -1,0 +1,62 @@
+//! Commands that are printed for people to paste.
+
+use std::path::Path;
+
+use super::args::PlayArgs;
+use super::error::CommandError;
+use perturb_learner::training::{LastCheckpoint, TrainError};
+
+/// A word as a shell takes it for one.
+fn quoted(word: &str) -> String {
+    shlex::try_quote(word).map_or_else(|_| word.to_owned(), |quoted| quoted.into_owned())
+}
+
+/// What this process was given, as it was typed.
+pub(super) fn this_command() -> String {
+    let words = std::env::args_os().skip(1).map(|word| quoted(&word.to_string_lossy()));
+    ["perturb".to_owned()].into_iter().chain(words).collect::<Vec<_>>().join(" ")
+}
+
+/// What goes on with the run in `path`, with the same servers.
+pub(super) fn resume_command(path: &Path, play: &PlayArgs) -> String {
+    let mut command = format!("perturb train --resume {}", quoted(&path.to_string_lossy()));
+    let servers: Vec<String> = play.server.server.iter().map(ToString::to_string).collect();
+    if !servers.is_empty() {
+        command += &format!(" --server {}", quoted(&servers.join(",")));
+    }
+    if play.act == "client" {
+        command += " --act client";
+    }
+    command
+}
+
+/// Says with what command a training goes on that failed.
+pub(super) fn explain(error: TrainError, play: &PlayArgs) -> CommandError {
+    match &error {
+        TrainError::Failed { last: Some(LastCheckpoint { run, .. }), source }
+            if !matches!(**source, TrainError::Numbers(_)) =>
+        {
+            CommandError::Failed(format!("{error}; go on from there: {}", resume_command(run, play)))
+        }
+        _ => error.into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::commands::args::ServerArgs;
+
+    #[test]
+    fn a_run_goes_on_with_its_servers() {
+        let play = |servers: &[&str], act: &str| PlayArgs {
+            server: ServerArgs { server: servers.iter().map(|text| text.parse().unwrap()).collect(), workers: None },
+            act: act.into(),
+        };
+        assert_eq!(resume_command(Path::new("runs/a"), &play(&[], "server")), "perturb train --resume runs/a");
+        assert_eq!(
+            resume_command(Path::new("my runs/a"), &play(&["unix:/x", "h:7"], "client")),
+            "perturb train --resume 'my runs/a' --server 'unix:/x,http://h:7' --act client"
+        );
+    }
+}

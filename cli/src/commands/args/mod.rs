@@ -1,0 +1,165 @@
+//! What can be typed.
+
+mod experiments;
+mod testing;
+mod training;
+
+use std::fmt::Display;
+use std::ops::RangeInclusive;
+use std::str::FromStr;
+
+use clap::{Arg, ArgAction, Args, CommandFactory, FromArgMatches, Parser, Subcommand};
+
+pub use experiments::{CurvesArgs, Engine, PlanArgs, ReportArgs, RunArgs};
+use perturb_learner::client::Address;
+pub use testing::{AuditArgs, EvaluateArgs, HeatmapArgs, RatesArgs, SetArgs, VideoArgs};
+pub use training::{CompletionsArgs, DemoArgs, EnvsArgs, LsArgs, ManArgs, ServeArgs, TrainArgs};
+
+/// Trains policies over environment servers and tests whether they still work when the physics changes.
+///
+/// Names are spelled as one likes: `cart-pole` or `perturb/CartPole-v1` is CartPole, `r` is R. What is typed beats a file,
+/// and a file the defaults. Results go to standard output, everything else to standard error.
+#[derive(Debug, Parser)]
+#[command(
+    name = "perturb",
+    version,
+    after_help = "Examples:
+  perturb demo                                         # what this is about, in a few minutes
+  perturb train --env Hopper --version R               # then: perturb evaluate, heatmap, video
+  perturb run experiments/quick.toml --out runs/quick  # a whole study; then: perturb report runs/quick
+Exit status: 0 done; 1 failed; 2 something that was given is missing or wrong; 128 + a signal's number."
+)]
+pub struct Cli {
+    /// Say nothing on standard error but warnings and errors.
+    #[arg(short, long, global = true, conflicts_with = "verbose")]
+    pub quiet: bool,
+    /// Say more on standard error; twice: much more. RUST_LOG, a filter of tracing's, says exactly what.
+    #[arg(short, long, global = true, action = ArgAction::Count)]
+    pub verbose: u8,
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+impl Cli {
+    /// What the process was given. A wrong command ends it with status 2.
+    pub fn of_process() -> Self {
+        let matches = Self::parser().get_matches();
+        Self::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
+    }
+
+    /// The parser. A negative number is the value of the option before it, which then says what it takes.
+    pub fn parser() -> clap::Command {
+        let with_negative = |arg: Arg| match arg.get_action().takes_values() {
+            true => arg.allow_negative_numbers(true),
+            false => arg,
+        };
+        Self::command().mut_subcommands(|command| command.mut_args(with_negative))
+    }
+}
+
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// List the environments with their parameters.
+    Envs(EnvsArgs),
+    /// List the trainings and experiments in a folder: budget, result and state of each.
+    Ls(LsArgs),
+    /// Show the trainings and experiments in a folder as they go, on a page in the browser.
+    Serve(ServeArgs),
+    /// Train a policy.
+    Train(Box<TrainArgs>),
+    /// Test a trained policy.
+    Evaluate(EvaluateArgs),
+    /// Train on default and on random physics, and see in a few minutes which policy still works where it was not trained.
+    Demo(DemoArgs),
+    /// Say what an experiment file asks for, and what it costs.
+    Plan(PlanArgs),
+    /// Do all trainings and tests of an experiment file; called again, it goes on.
+    Run(RunArgs),
+    /// Make tables of an experiment's results, beside the paper's.
+    Report(ReportArgs),
+    /// Draw the training curves of an experiment.
+    Curves(CurvesArgs),
+    /// Draw how trained policies do over two parameters: one policy, or those that an experiment selected.
+    Heatmap(HeatmapArgs),
+    /// Film a trained policy.
+    Video(VideoArgs),
+    /// Play recorded test episodes again and compare every byte of what came of them.
+    Audit(AuditArgs),
+    /// Success rates of recorded test episodes at any threshold, without playing them again.
+    Rates(RatesArgs),
+    /// Print what lets a shell complete perturb's commands and options.
+    Completions(CompletionsArgs),
+    /// Write perturb's manual pages.
+    Man(ManArgs),
+}
+
+/// Where environments run.
+#[derive(Args, Clone, Debug)]
+pub struct ServerArgs {
+    /// Running servers, separated by commas: unix:/path, host:port, http://host:port or tcp://host:port. Without this,
+    /// perturb starts a server of its own and ends it afterwards.
+    #[arg(long, value_name = "ADDRESS", value_delimiter = ',')]
+    pub server: Vec<Address>,
+    /// Physics threads of the server that perturb starts itself [default: one a core].
+    #[arg(long, value_name = "N", value_parser = at_least_one::<usize>)]
+    pub workers: Option<usize>,
+}
+
+/// Where trained and tested policies play.
+#[derive(Args, Clone, Debug)]
+pub struct PlayArgs {
+    #[command(flatten)]
+    pub server: ServerArgs,
+    /// Where actions are chosen, which changes no byte: at the server, if it can, for a whole rollout at a time; or here, at
+    /// every step.
+    #[arg(long, value_name = "WHERE", default_value = "server", value_parser = ["server", "client"])]
+    pub act: String,
+}
+
+fn within<T: FromStr + PartialOrd + Display>(text: &str, range: RangeInclusive<T>) -> Result<T, String> {
+    let number = text.parse().ok().filter(|number| range.contains(number));
+    number.ok_or_else(|| format!("expected {} to {}", range.start(), range.end()))
+}
+
+fn at_least_one<T: TryFrom<u64>>(text: &str) -> Result<T, String> {
+    whole(text, 1)
+}
+
+fn natural<T: TryFrom<u64>>(text: &str) -> Result<T, String> {
+    whole(text, 0)
+}
+
+/// A whole number from `least` on that `T` can hold.
+fn whole<T: TryFrom<u64>>(text: &str, least: u64) -> Result<T, String> {
+    let number = text.parse::<u64>().ok().filter(|number| *number >= least);
+    number.and_then(|number| T::try_from(number).ok()).ok_or_else(|| {
+        let meant = text.parse::<f64>().ok().filter(|x| x.fract() == 0.0 && *x >= least as f64 && *x < 1e15);
+        let digits = meant.map_or_else(String::new, |number| format!(", in digits: {number}"));
+        format!("expected a whole number, at least {least}{digits}")
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    #[test]
+    fn the_parser_is_sound() {
+        Cli::parser().debug_assert();
+    }
+
+    #[test]
+    fn a_run_is_resumed_with_its_own_settings_only() {
+        let cli = Cli::command();
+        let train = cli.find_subcommand("train").unwrap();
+        let of = |name: &str| train.get_arguments().find(|argument| argument.get_id() == name).unwrap();
+        let refused: Vec<&str> =
+            train.get_arg_conflicts_with(of("resume")).iter().map(|argument| argument.get_id().as_str()).collect();
+        for argument in train.get_arguments().map(|argument| argument.get_id().as_str()) {
+            let accepted = ["resume", "extend", "server", "workers", "act", "threads", "help"].contains(&argument);
+            assert_ne!(refused.contains(&argument), accepted, "--{argument}");
+        }
+    }
+}

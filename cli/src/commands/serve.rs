@@ -1,0 +1,28 @@
+//! `perturb serve`.
+
+use std::io::Write;
+
+use super::args::ServeArgs;
+use super::display::note;
+use super::error::{Result, system};
+use perturb_serve::{Options, Server};
+
+pub(super) fn run(args: &ServeArgs) -> Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+    let runtime = runtime.map_err(system("wait for requests"))?;
+    let options = Options { folder: args.dir.clone(), address: args.address, server: args.server.clone() };
+    runtime.block_on(async {
+        let server = Server::bind(&options).await?;
+        let address = server.address();
+        if !address.ip().is_loopback() {
+            let warning = "anybody who reaches this address can see everything in the folder: there is neither \
+                           authentication nor encryption";
+            eprintln!("perturb: {warning}");
+        }
+        let mut out = std::io::stdout();
+        writeln!(out, "http://{address}")?;
+        out.flush()?;
+        note(format_args!("showing {} there; Ctrl-C ends it", args.dir.display()));
+        server.run().await.map_err(system("take connections"))
+    })
+}

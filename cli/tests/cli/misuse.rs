@@ -1,0 +1,288 @@
+//! Ways to misuse the programs, and to end them: what they say, with which status, and what remains.
+
+use std::collections::BTreeSet;
+use std::io::{Read, Write};
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+
+use insta::assert_snapshot;
+use rstest::rstest;
+use tempfile::TempDir;
+
+use crate::common::{child_server, kill, stderr, wait_for};
+
+/// Two cells of a few seconds.
+const PLAN: &str = "environments = ['CartPole']\nversions = ['D']\nruns = 2\ntest_episodes = 12
+settings = { episodes = 100000 }\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\n";
+
+/// A folder to work in, with a place of its own for what is temporary.
+struct Place(TempDir);
+
+impl Place {
+    fn new() -> Self {
+        let directory = tempfile::tempdir().expect("a directory");
+        std::fs::create_dir(directory.path().join("tmp")).expect("a folder");
+        let place = Self(directory);
+        for (name, content) in [
+            ("plan.toml", PLAN),
+            ("wrong.toml", &PLAN.replace("CartPole", "CartPol")),
+            ("bad.toml", "environment = 'CartPole\n"),
+            ("file", ""),
+        ] {
+            std::fs::write(place.path(name), content).expect("written");
+        }
+        place
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    /// `perturb`, or `perturb-server`, as it is typed here.
+    fn command(&self, words: &[&str]) -> Command {
+        let perturb = Path::new(env!("CARGO_BIN_EXE_perturb"));
+        let mut command = Command::new(perturb.with_file_name(words[0]));
+        command.args(&words[1..]).current_dir(self.0.path()).env("TMPDIR", self.path("tmp"));
+        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        command
+    }
+
+    fn output(&self, words: &[&str]) -> Output {
+        self.command(words).output().expect("it runs")
+    }
+
+    fn start(&self, words: &[&str]) -> Child {
+        self.command(words).spawn().expect("started")
+    }
+
+    /// Everything in here, but for what is in a checkpoint.
+    fn files(&self) -> BTreeSet<String> {
+        fn list(folder: &Path, root: &Path, files: &mut BTreeSet<String>) {
+            for entry in std::fs::read_dir(folder).expect("a list") {
+                let path = entry.expect("an entry").path();
+                files.insert(path.strip_prefix(root).expect("in here").display().to_string());
+                if path.is_dir() && !path.ends_with("checkpoint") {
+                    list(&path, root, files);
+                }
+            }
+        }
+        let mut files = BTreeSet::new();
+        list(self.0.path(), self.0.path(), &mut files);
+        files
+    }
+
+    /// How the program refuses these words, and what it leaves behind.
+    fn told(&self, words: &[&str]) -> String {
+        let before = self.files();
+        let output = self.output(words);
+        let status = output.status.code().expect("it ends by itself");
+        let new: Vec<String> = self.files().difference(&before).cloned().collect();
+        let remains = if new.is_empty() { "nothing".into() } else { new.join(", ") };
+        format!("$ {}\n{}status {status}, remains: {remains}\n\n", words.join(" "), stderr(&output))
+    }
+}
+
+/// What listens, and answers nobody in a way that perturb understands.
+fn babbling() -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
+    let address = listener.local_addr().expect("an address").to_string();
+    std::thread::spawn(move || {
+        for mut stream in listener.incoming().map_while(Result::ok) {
+            let _ = stream.read(&mut [0; 64]);
+            let _ = stream.write_all(b"HTTP/1.0 400 Bad request\r\n\r\n");
+        }
+    });
+    address
+}
+
+#[test]
+fn each_misuse_is_refused_with_a_remedy_and_leaves_nothing() {
+    let place = Place::new();
+    let trained = place.output(&["perturb", "train", "--env", "CartPole", "--episodes", "5", "--out", "run"]);
+    assert!(trained.status.success(), "{}", stderr(&trained));
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
+    let taken = format!("tcp://{}", listener.local_addr().expect("an address"));
+    let babbling = babbling();
+    let train = ["perturb", "train", "--env", "CartPole", "--out", "new"];
+    let with = |more: &[&'static str]| [&train[..], more].concat();
+    let wrong = [
+        vec!["perturb", "trian"],
+        vec!["perturb", "train", "--out", "new"],
+        vec!["perturb", "train", "--env", "cartpol", "--out", "new"],
+        vec!["perturb", "train", "--env", "perturb/CartPole-v0", "--out", "new"],
+        with(&["--set", "learning_rat=1e-3"]),
+        with(&["--set", "epsilon=0.1"]),
+        with(&["--set", "n_steps=1e4"]),
+        with(&["--algorithm", "pppo"]),
+        with(&["--algorithm", "rl2-ppo", "--architecture", "ff"]),
+        with(&["--version", "X"]),
+        with(&["--version", "D", "--set", "version=R"]),
+        with(&["--episodes", "1e4"]),
+        with(&["--episodes", "-5"]),
+        with(&["--extend", "5"]),
+        with(&["--config", "bad.toml"]),
+        with(&["--config", "missing.toml"]),
+        with(&["--parameters", "lenght=0.5"]),
+        vec!["perturb", "train", "--env", "CartPole", "--out", "run"],
+        vec!["perturb", "train", "--env", "CartPole", "--out", "run", "--overwrite", "--set", "n_minibatches=3"],
+        vec!["perturb", "train", "--env", "Pong", "--out", "run", "--overwrite"],
+        vec!["perturb", "train", "--env", "CartPole", "--out", "file"],
+        vec!["perturb", "train", "--env", "CartPole", "--out", "file/run"],
+        vec!["perturb", "train", "--resume", "missing"],
+        vec!["perturb", "evaluate", "--checkpoint", "missing"],
+        vec!["perturb", "evaluate", "--checkpoint", "run", "--json", "missing/result.json"],
+        vec!["perturb", "evaluate", "--checkpoint", "run", "--records", "file/records.parquet"],
+        vec!["perturb", "evaluate", "--checkpoint", "run", "--json", "tmp"],
+        vec!["perturb", "evaluate", "--checkpoint", "run", "--contexts", "missing.csv"],
+        vec!["perturb", "heatmap", "--checkpoint", "run", "--out", "missing/heatmap"],
+        vec!["perturb", "heatmap", "missing"],
+        vec!["perturb", "video", "--checkpoint", "run", "--out", "missing/a.gif"],
+        vec!["perturb", "plan", "bad.toml"],
+        vec!["perturb", "plan", "missing.toml"],
+        vec!["perturb", "plan", "plan.toml", "--from", "missing"],
+        vec!["perturb", "run", "wrong.toml", "--out", "out"],
+        vec!["perturb", "run", "plan.toml", "--out", "out", "--html", "missing/page.html"],
+        vec!["perturb", "report", "missing"],
+        vec!["perturb", "audit", "missing"],
+        vec!["perturb", "rates", "missing.parquet"],
+        vec!["perturb", "ls", "missing"],
+        vec!["perturb", "serve", "missing"],
+        vec!["perturb", "serve", "file"],
+        vec!["perturb", "serve", ".", "--address", taken.trim_start_matches("tcp://")],
+        vec!["perturb", "serve", ".", "--address", "example.org:80"],
+        vec!["perturb", "serve", ".", "--address", "192.0.2.1:8420"],
+        vec!["perturb", "serve", ".", "--server", "nowhere"],
+        vec!["perturb", "man", "missing"],
+        vec!["perturb", "envs", "--server", "127.0.0.1"],
+        vec!["perturb", "envs", "--server", "127.0.0.1:1"],
+        vec!["perturb", "envs", "--server", "unix:/nowhere.sock"],
+        vec!["perturb", "envs", "--server", &babbling],
+        vec!["perturb", "envs", "--server", "127.0.0.1:1", "--workers", "2"],
+        vec!["perturb-server", "--listen", &taken],
+        vec!["perturb-server", "--listen", "unix:/missing/folder/socket"],
+        vec!["perturb-server", "--workers", "0"],
+        vec!["perturb-server", "--config", "bad.toml"],
+    ];
+    let said: String = wrong.iter().map(|words| place.told(words)).collect();
+    assert!(place.path("run/checkpoint/checkpoint.json").exists(), "refusals delete nothing");
+    let names = [(taken.as_str(), "tcp://TAKEN"), (&taken[6..], "127.0.0.1:TAKEN"), (&babbling, "127.0.0.1:BABBLING")];
+    assert_snapshot!(names.iter().fold(said, |said, (long, name)| said.replace(long, name)));
+}
+
+/// Ctrl-C, once something has begun: what is said at last, in which numbers do not matter.
+#[rstest]
+#[case::train(
+    "perturb train --env CartPole --episodes 1000000 --out run",
+    "run/progress.csv",
+    "stopped by signal N after N of N episodes; go on with: perturb train --resume run"
+)]
+#[case::run(
+    "perturb run plan.toml --out out",
+    "out/plan.toml",
+    "stopped by signal N; the same command goes on: perturb run plan.toml --out out"
+)]
+#[case::plan(
+    "perturb plan plan.toml --measure 60",
+    "tmp",
+    "perturb: stopped by signal N while measuring; nothing is kept of it"
+)]
+#[case::evaluate(
+    "perturb evaluate --checkpoint short --episodes 1000000",
+    "tmp",
+    "perturb: stopped before all episodes were tested"
+)]
+#[case::demo(
+    "perturb demo --env CartPole --episodes 1000000 --out demo",
+    "demo/trained-on-D/progress.csv",
+    "stopped by signal N; what is done is kept in demo"
+)]
+fn ctrl_c_ends_soon_and_leaves_nothing_temporary(#[case] words: &str, #[case] begun: &str, #[case] said: &str) {
+    let place = Place::new();
+    if words.contains("short") {
+        place.output(&["perturb", "train", "--env", "CartPole", "--episodes", "5", "--out", "short"]);
+    }
+    let child = place.start(&words.split(' ').collect::<Vec<_>>());
+    // Whatever has begun has a server, and that a folder.
+    let has_begun = || match begun {
+        "tmp" => {
+            child_server(child.id()).is_some() && place.path("tmp").read_dir().is_ok_and(|mut tmp| tmp.next().is_some())
+        }
+        file => place.path(file).exists(),
+    };
+    wait_for("a beginning", has_begun);
+    std::thread::sleep(std::time::Duration::from_millis(300));
+    kill("-INT", child.id());
+    let output = child.wait_with_output().expect("ended");
+    assert_eq!(output.status.code(), Some(130), "{}", stderr(&output));
+    let words = stderr(&output);
+    let last = words.lines().last().unwrap_or_default();
+    let digits = |c: char| c.is_ascii_digit();
+    let last = last.split(digits).filter(|part| !part.is_empty()).collect::<Vec<_>>().join("N");
+    assert_eq!(last, said, "{words}");
+    assert_eq!(temporary(&place), Vec::<String>::new());
+}
+
+/// What is in the folder of temporary files.
+fn temporary(place: &Place) -> Vec<String> {
+    place.files().into_iter().filter(|file| file.starts_with("tmp/")).collect()
+}
+
+#[test]
+fn a_second_ctrl_c_and_even_kill_9_leave_no_temporary_folder() {
+    let place = Place::new();
+    for signals in [&["-INT", "-INT"][..], &["-KILL"]] {
+        let child = place.start(&["perturb", "train", "--env", "CartPole", "--episodes", "1000000", "--out", "run"]);
+        wait_for("a training", || place.path("run/progress.csv").exists());
+        assert_eq!(temporary(&place).len(), 2, "a folder with a socket");
+        signals.iter().for_each(|signal| kill(signal, child.id()));
+        child.wait_with_output().expect("ended");
+        wait_for("the end of the server", || temporary(&place).is_empty());
+        std::fs::remove_dir_all(place.path("run")).expect("removed");
+    }
+}
+
+#[test]
+fn a_lost_server_is_a_sentence_with_the_command_that_goes_on() {
+    let place = Place::new();
+    let address = format!("unix:{}", place.path("socket").display());
+    let mut server = place.command(&["perturb-server", "--listen", &address, "--log", "error"]);
+    let mut server = server.stdout(Stdio::null()).spawn().expect("a server");
+    wait_for("the server", || place.path("socket").exists());
+    let words =
+        ["perturb", "train", "--env", "CartPole", "--episodes", "1000000", "--out", "my run", "--server", &address];
+    let child = place.start(&words);
+    wait_for("a checkpoint", || place.path("my run/checkpoint/checkpoint.json").exists());
+    server.kill().and_then(|()| server.wait()).expect("killed");
+    let output = child.wait_with_output().expect("ended");
+    assert_eq!(output.status.code(), Some(1));
+    let said = stderr(&output);
+    assert!(said.starts_with(&format!("perturb: lost the server at {address} ")), "{said}");
+    assert!(said.contains("; the checkpoint after ") && !said.contains("h2") && !said.contains("transport"), "{said}");
+    let command =
+        format!("episodes is kept in my run; go on from there: perturb train --resume 'my run' --server {address}\n");
+    assert!(said.ends_with(&command), "{said}");
+}
+
+#[test]
+fn what_is_quiet_says_nothing_and_what_is_json_is_on_standard_output() {
+    let place = Place::new();
+    let trained = place.output(&["perturb", "-q", "train", "--env", "cart_pole", "--episodes", "5", "--out", "run"]);
+    assert!(trained.status.success() && trained.stderr.is_empty(), "{}", stderr(&trained));
+    let tested = place.output(&[
+        "perturb",
+        "evaluate",
+        "--checkpoint",
+        "run",
+        "--versions",
+        "d",
+        "--episodes",
+        "5",
+        "--json",
+        "-",
+    ]);
+    let value: serde_json::Value = serde_json::from_slice(&tested.stdout).expect("JSON");
+    assert_eq!((&value["environment"], &value["results"]["D"]["episodes"]), (&"CartPole".into(), &5.into()));
+    let refused = place.output(&["perturb", "-q", "evaluate", "--checkpoint", "missing"]);
+    assert!(refused.status.code() == Some(2) && !refused.stderr.is_empty(), "an error is said nevertheless");
+}

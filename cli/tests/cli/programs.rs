@@ -1,0 +1,178 @@
+//! What people see of longer work, and what helps them to find their way.
+
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+
+use perturb_learner::checkpoint::Checkpoint;
+use perturb_study::files::Lock;
+use tempfile::TempDir;
+
+use crate::common::{perturb, read, stderr};
+
+fn folder() -> TempDir {
+    tempfile::tempdir().expect("a directory")
+}
+
+/// Runs `perturb` in `folder`.
+fn run(folder: &Path, arguments: &[&str]) -> Output {
+    let output = perturb(arguments).current_dir(folder).output().expect("perturb runs");
+    assert!(output.status.success(), "{arguments:?}: {}", stderr(&output));
+    output
+}
+
+fn printed(output: &Output) -> String {
+    String::from_utf8(output.stdout.clone()).expect("text")
+}
+
+/// On a terminal of 80 columns.
+fn on_a_terminal(folder: &Path, command: &str) -> String {
+    let path = Path::new(env!("CARGO_BIN_EXE_perturb")).parent().expect("a folder").display().to_string();
+    let command = format!("stty cols 80 rows 24; PATH={path}:$PATH; {command}");
+    let output = Command::new("script")
+        .args(["-qec", &command, "/dev/null"])
+        .env("TERM", "xterm")
+        .current_dir(folder)
+        .stdin(Stdio::null())
+        .output()
+        .expect("script, of Debian's bsdutils");
+    String::from_utf8(output.stdout).expect("text")
+}
+
+/// The rows of 80 columns that were drawn, without what moves the cursor.
+fn lines(drawn: &str) -> Vec<String> {
+    let mut text = String::new();
+    let mut rest = drawn.chars();
+    while let Some(c) = rest.next() {
+        match c {
+            '\u{1b}' => drop(rest.by_ref().find(char::is_ascii_alphabetic)),
+            '\r' => text.push('\n'),
+            c => text.push(c),
+        }
+    }
+    let rows = text.lines().flat_map(|line| {
+        let letters: Vec<char> = line.chars().collect();
+        letters.chunks(80).map(String::from_iter).collect::<Vec<String>>()
+    });
+    rows.map(|row| row.trim_end().to_owned()).filter(|row| !row.is_empty()).collect()
+}
+
+#[test]
+fn a_bar_fits_80_columns_and_tells_the_time_that_is_left() {
+    let folder = folder();
+    let train =
+        "perturb train --env CartPole --version R+E --algorithm a2c --observe parameters --episodes 6000 --out run";
+    let drawn = lines(&on_a_terminal(folder.path(), train));
+    // The bar ends where the row does, and the figures begin the next one.
+    let bars = drawn.windows(2).filter(|rows| rows[0].contains('█') && rows[1].contains("/6 000 episodes, "));
+    let mut count = 0;
+    for rows in bars {
+        assert!(rows[0].starts_with("CartPole R+E a2c ff (sees parameters) ") && rows[0].ends_with(" %"), "{rows:?}");
+        assert!(rows[1].starts_with(|c: char| c.is_ascii_digit()), "{rows:?}");
+        count += 1;
+    }
+    assert!(count > 4, "{drawn:#?}");
+    assert!(drawn.iter().any(|row| row.contains(" s left, success ")), "{drawn:#?}");
+}
+
+#[test]
+fn a_run_shows_what_is_under_way_and_the_rates_of_what_is_done() {
+    let folder = folder();
+    let plan =
+        "environments = ['CartPole', 'Pendulum']\nversions = ['D']\ntest_versions = ['D', 'E']\ntest_episodes = 5
+        settings = { episodes = 600 }\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff']\n[[algorithm]]\nname = 'ppo'
+        architectures = ['ff']";
+    std::fs::write(folder.path().join("plan.toml"), plan).expect("written");
+    let drawn = lines(&on_a_terminal(folder.path(), "perturb run plan.toml --out out --jobs 1"));
+    let has = |part: &str| drawn.iter().any(|line| line.contains(part));
+    assert!(has("measuring what cells cost that begin later: 2 groups"), "{drawn:#?}");
+    assert!(has("/4 cells, ") && has("  Pendulum") && has(" of training"), "{drawn:#?}");
+    assert!(has("  done: CartPole a2c ff, trained on D: D ") && has(" left"), "{drawn:#?}");
+    let ending = &drawn[drawn.len() - 5..];
+    for (line, kind) in ending.iter().zip(["CartPole a2c", "CartPole ppo", "Pendulum a2c", "Pendulum ppo"]) {
+        assert!(line.starts_with(&format!("{kind} ff, trained on D: D ")) && line.ends_with(" % (1 cell)"), "{line}");
+    }
+    assert_eq!(ending[4], "all 4 cells are done; perturb report out");
+}
+
+#[test]
+fn a_run_has_a_place_of_its_own_unless_one_is_given_and_all_are_listed() {
+    let folder = folder();
+    let train = ["train", "--env", "CartPole", "--algorithm", "a2c", "--episodes", "30"];
+    let output = run(folder.path(), &train);
+    let name = std::fs::read_dir(folder.path().join("runs")).expect("runs").next().expect("one").expect("an entry");
+    let name = name.file_name().into_string().expect("a name");
+    let time = name.strip_prefix("CartPole-a2c-").expect("environment and algorithm");
+    assert!(time.len() == "20261123-065500".len() && time.starts_with("20"), "{name}");
+    assert!(printed(&output).ends_with(&format!("test it: perturb evaluate --checkpoint runs/{name}\n")));
+
+    run(folder.path(), &[&train[..], &["--out", "runs/group/b"]].concat());
+    let plan = "environments = ['CartPole']\nversions = ['D', 'R']\ntest_versions = ['D']\ntest_episodes = 5
+        settings = { episodes = 20 }\n[[algorithm]]\nname = 'random'\narchitectures = ['ff']";
+    std::fs::write(folder.path().join("plan.toml"), plan).expect("written");
+    run(folder.path(), &["run", "plan.toml", "--out", "runs/study", "--cell", "0"]);
+    let lock = Lock::try_take(&folder.path().join("runs/group/b")).expect("a folder").expect("a lock");
+    let listed: serde_json::Value =
+        serde_json::from_slice(&run(folder.path(), &["ls", "--json"]).stdout).expect("JSON");
+    let of = |index: usize, key: &str| listed[index][key].clone();
+    let path = format!("runs/{name}");
+    for (index, path, unit, budget, state) in [
+        (0, path.as_str(), "episodes", 30, "finished"),
+        (1, "runs/group/b", "episodes", 30, "in work"),
+        (2, "runs/study", "cells", 2, "broken off"),
+    ] {
+        assert_eq!([of(index, "path"), of(index, "unit"), of(index, "state")], [path, unit, state], "{listed:#}");
+        assert_eq!(of(index, "budget"), budget);
+    }
+    assert_eq!((of(1, "what"), of(2, "done")), ("CartPole D a2c ff".into(), 1.into()));
+    assert!(of(0, "success_percent").is_number() && of(2, "success_percent").is_number(), "{listed:#}");
+    drop(lock);
+    let table = printed(&run(folder.path(), &["ls"]));
+    assert!(table.contains("runs/group/b") && table.contains(" of 30 episodes"), "{table}");
+}
+
+#[test]
+fn a_training_that_is_extended_is_one_with_the_larger_budget() {
+    let folder = folder();
+    let train =
+        ["train", "--env", "CartPole", "--version", "R", "--set", "checkpoint_interval=10", "--set", "num_envs=2"];
+    let of =
+        |out: &str, episodes: &str| run(folder.path(), &[&train[..], &["--out", out, "--episodes", episodes]].concat());
+    of("whole", "60");
+    of("part", "40");
+    let output = run(folder.path(), &["train", "--resume", "part", "--extend", "20"]);
+    assert!(stderr(&output).contains(" of 60 episodes"), "{}", stderr(&output));
+    let checkpoint = |out: &str| Checkpoint::load(&folder.path().join(out)).expect("a checkpoint");
+    assert_eq!(checkpoint("part"), checkpoint("whole"));
+    let config = |out: &str| read(&folder.path().join(out), "config.toml");
+    assert_eq!(config("part"), config("whole"));
+    let again = run(folder.path(), &["train", "--resume", "part"]);
+    assert!(stderr(&again).contains("; train on with --extend EPISODES"), "{}", stderr(&again));
+}
+
+#[test]
+fn the_demo_says_what_is_lost_and_what_it_cost_beside_the_paper() {
+    let folder = folder();
+    let arguments = ["demo", "--env", "cartpole", "--episodes", "20", "--test-episodes", "20", "--out", "demo"];
+    let text = printed(&run(folder.path(), &arguments));
+    for part in ["trained on D", "trained on R", "tested on E", "Extrapolation", "15 000", "86.2 ± 12.6", "heatmap.png"]
+    {
+        assert!(text.contains(part), "{part}: {text}");
+    }
+    assert!(read(folder.path(), "demo/trained-on-R/config.toml").contains("version = \"R\""));
+    let picture = std::fs::read(folder.path().join("demo/heatmap.png")).expect("a picture");
+    assert!(picture.starts_with(b"\x89PNG"));
+    // Nobody balances a pole after twenty episodes.
+    assert!(text.contains("failure.gif") && folder.path().join("demo/failure.gif").exists(), "{text}");
+}
+
+#[test]
+fn shells_and_man_know_every_command() {
+    let folder = folder();
+    for shell in ["bash", "zsh", "fish"] {
+        let script = printed(&run(folder.path(), &["completions", shell]));
+        assert!(["evaluate", "heatmap", "episodes-per-trial", "epopt-ppo"].iter().all(|word| script.contains(word)));
+    }
+    run(folder.path(), &["man", "."]);
+    assert!(read(folder.path(), "perturb.1").contains("Exit status"));
+    assert!(read(folder.path(), "perturb-train.1").contains("perturb train \\-\\-resume runs/mine"));
+}

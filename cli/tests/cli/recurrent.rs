@@ -1,0 +1,94 @@
+//! The program that has libtorch: who becomes it, who does not, and what is said where it is missing.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use crate::common::{perturb, stderr};
+
+const PERTURB: &str = env!("CARGO_BIN_EXE_perturb");
+const RECURRENT: &str = env!("CARGO_BIN_EXE_perturb-recurrent");
+
+fn train(program: &Path, architecture: &str, out: &Path) -> Command {
+    let mut command = Command::new(program);
+    let options = ["--env", "CartPole", "--algorithm", "a2c", "--episodes", "20", "--architecture", architecture];
+    command.arg("train").args(options).arg("--out").arg(out);
+    // A copy of the program has no server beside it.
+    command.env("PERTURB_SERVER", Path::new(PERTURB).with_file_name("perturb-server"));
+    command
+}
+
+fn run(command: &mut Command) -> Output {
+    command.output().expect("it runs")
+}
+
+#[test]
+fn only_one_of_the_programs_loads_libtorch() {
+    let libraries = |program| {
+        let output = run(Command::new("ldd").arg(program));
+        String::from_utf8(output.stdout).expect("text")
+    };
+    assert!(libraries(RECURRENT).contains("libtorch_cpu"));
+    let of_perturb = libraries(PERTURB);
+    assert!(of_perturb.contains("libc.so") && !of_perturb.contains("libtorch"), "{of_perturb}");
+}
+
+#[test]
+fn a_program_without_the_other_one_trains_what_needs_no_libtorch_and_says_what_the_rest_needs() {
+    let folder = tempfile::tempdir().expect("a directory");
+    let alone = folder.path().join("perturb");
+    fs::copy(PERTURB, &alone).expect("copied");
+    let trained = run(&mut train(&alone, "ff", &folder.path().join("ff")));
+    assert!(trained.status.success(), "{}", stderr(&trained));
+
+    let out = folder.path().join("rc");
+    let refused = run(&mut train(&alone, "rc", &out));
+    assert_eq!(refused.status.code(), Some(2));
+    let said = stderr(&refused).replace(&folder.path().display().to_string(), "DIR");
+    let expected = "perturb: recurrent policies are trained by the program perturb-recurrent, which cannot be started: \
+                    DIR/perturb-recurrent: No such file or directory (os error 2); install it beside perturb (`make \
+                    install`), or train with --architecture ff\n";
+    assert_eq!(said, expected);
+    assert!(!out.exists());
+
+    // With it, by either name, to the same weights; and again without it, what was trained is tested and gone on with.
+    fs::copy(RECURRENT, folder.path().join("perturb-recurrent")).expect("copied");
+    let (out, other) = (folder.path().join("one"), folder.path().join("other"));
+    for (program, out) in [("perturb", &out), ("perturb-recurrent", &other)] {
+        let trained = run(&mut train(&folder.path().join(program), "rc", out));
+        assert!(trained.status.success(), "{}", stderr(&trained));
+    }
+    assert_eq!(weights(&out), weights(&other));
+    let evaluate = |program: &Path| {
+        let mut command = Command::new(program);
+        command.arg("evaluate").arg("--checkpoint").arg(&out).args(["--episodes", "5"]);
+        run(command.env("PERTURB_SERVER", Path::new(PERTURB).with_file_name("perturb-server")))
+    };
+    fs::remove_file(folder.path().join("perturb-recurrent")).expect("removed");
+    let (tested, tested_there) = (evaluate(&alone), evaluate(Path::new(RECURRENT)));
+    assert!(tested.status.success(), "{}", stderr(&tested));
+    assert_eq!(tested.stdout, tested_there.stdout);
+}
+
+/// The bytes of a run's weights.
+fn weights(out: &Path) -> Vec<u8> {
+    let is_weights = |path: &Path| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with("weights"));
+    let files = fs::read_dir(out.join("checkpoint")).expect("a checkpoint").map(|entry| entry.expect("a file").path());
+    let found: Vec<_> = files.filter(|path| is_weights(path)).collect();
+    assert_eq!(found.len(), 1);
+    fs::read(&found[0]).expect("read")
+}
+
+#[test]
+fn programs_of_two_builds_are_refused() {
+    let folder = tempfile::tempdir().expect("a directory");
+    let mut command = train(Path::new(RECURRENT), "rc", &folder.path().join("run"));
+    let output = run(command.env("PERTURB_STARTED_BY", "0.0.1 (other)"));
+    assert_eq!(output.status.code(), Some(2));
+    let said = stderr(&output);
+    assert!(said.contains("perturb is 0.0.1 (other), but perturb-recurrent is "), "{said}");
+    assert!(said.contains("install both from one build"), "{said}");
+    // Without a recurrent policy it does not matter.
+    let output = run(perturb(&["--version"]).env("PERTURB_STARTED_BY", "0.0.1 (other)"));
+    assert!(output.status.success());
+}

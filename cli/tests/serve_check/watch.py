@@ -1,0 +1,235 @@
+"""Watches trainings and an experiment on the pages of `perturb serve`, in headless Chromium.
+
+    watch.py CHROMIUM PROGRAMS DIR
+
+PROGRAMS is the folder of `perturb` and `perturb-server`, DIR a folder that is made anew: runs/ in it is what is served,
+pictures/ has what the pages look like at 1280 and at 400 pixels, light and dark. A training and an experiment are under way
+meanwhile: curves, cells and the report must grow without a page being loaded again, nothing may be said on the console or
+asked of another host, and no page be wider than its window. At the end Ctrl-C ends the server with open pages. Ends with 1 and
+a list of what is wrong.
+"""
+
+import base64
+import contextlib
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).parents[1] / "report_check"))
+from check import Browser
+
+WIDTHS = {1280: 900, 400: 800}
+LIMIT = 300  # seconds: much longer than anything takes, as the machine may be busy
+WIDER = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+LIVE = "document.getElementById('live').dataset.state === 'live'"
+# How far the curve reaches, in episodes.
+REACH = "Number(document.querySelector('[data-chart=return]').dataset.reach ?? 0)"
+DONE = "document.querySelectorAll('.map li.done').length"
+REPORTED = "document.querySelector('iframe.report').contentDocument?.body.innerText.includes('WORDS') ?? false"
+PAINTED = """
+[...document.querySelectorAll('figure.chart canvas')].map(canvas => {
+  const blank = document.createElement('canvas');
+  [blank.width, blank.height] = [canvas.width, canvas.height];
+  return canvas.toDataURL() !== blank.toDataURL();
+})
+"""
+UNNAMED = """
+[...document.querySelectorAll('img:not([alt]), [role=img]:not([aria-label]), iframe:not([title]), progress:not([aria-label])')]
+  .length
+"""
+BROKEN = "[...document.images].filter(image => image.complete && image.naturalWidth === 0).map(image => image.src)"
+
+
+class Pages:
+    """The pages of a server in a browser, and what is wrong with them."""
+
+    def __init__(self, browser, own, pictures):
+        self.browser, self.own, self.pictures, self.wrong = browser, own, pictures, []
+
+    def evaluate(self, expression):
+        reply = self.browser.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        return reply["result"].get("value")
+
+    def check(self, what, got, expected):
+        if got != expected:
+            self.wrong.append(f"{what}: {got}, expected {expected}")
+
+    def until(self, what, expression):
+        """Waits until the page says so; whether it did."""
+        start = time.monotonic()
+        while not (seen := self.evaluate(expression)):
+            if time.monotonic() - start > LIMIT:
+                self.wrong.append(f"{what} did not happen")
+                return False
+            time.sleep(0.2)
+        return seen
+
+    def open(self, path):
+        self.browser.events[:] = [event for event in self.browser.events if event["method"] != "Page.loadEventFired"]
+        self.browser.call("Page.navigate", url=self.own + path)
+        self.browser.wait_for("Page.loadEventFired")
+        self.evaluate("window.since = 'the beginning'")
+        self.until(f"{path or 'the list'}: live", LIVE)
+
+    def stayed(self, what):
+        self.check(f"{what}: the page was not loaded again", self.evaluate("window.since"), "the beginning")
+
+    def draw(self, name, schemes=("light", "dark")):
+        """Takes pictures, and looks at what must hold at any size."""
+        for scheme in schemes:
+            self.browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+            for width, height in WIDTHS.items():
+                metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
+                self.browser.call("Emulation.setDeviceMetricsOverride", **metrics)
+                time.sleep(0.7)
+                tall = min(2800, self.evaluate("document.documentElement.scrollHeight"))
+                clip = {"x": 0, "y": 0, "width": width, "height": tall, "scale": 1}
+                shot = self.browser.call("Page.captureScreenshot", clip=clip, captureBeyondViewport=True)
+                (self.pictures / f"{name}-{width}-{scheme}.png").write_bytes(base64.b64decode(shot["data"]))
+                self.check(f"{name}: pixels wider than {width}", max(0, self.evaluate(WIDER)), 0)
+                self.check(f"{name}: plots without a line at {width}", self.evaluate(PAINTED).count(False), 0)
+        self.check(f"{name}: without a name", self.evaluate(UNNAMED), 0)
+        self.check(f"{name}: pictures that do not load", self.evaluate(BROKEN), [])
+        first, last = schemes[0], next(iter(WIDTHS))
+        self.browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": first}])
+        metrics = {"width": last, "height": WIDTHS[last], "deviceScaleFactor": 1, "mobile": False}
+        self.browser.call("Emulation.setDeviceMetricsOverride", **metrics)
+
+    def complaints(self):
+        """What pages asked of others, and said on the console."""
+        for event in self.browser.events:
+            method, said = event["method"], event["params"]
+            if method == "Network.requestWillBeSent" and not said["request"]["url"].startswith((self.own, "data:", "about:")):
+                yield f"a page asks for {said['request']['url']}"
+            elif method in ("Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded"):
+                yield f"a page says {said}"
+
+
+def main():
+    chromium, programs, directory = sys.argv[1], Path(sys.argv[2]).resolve(), Path(sys.argv[3]).resolve()
+    shutil.rmtree(directory, ignore_errors=True)
+    runs, pictures = directory / "runs", directory / "pictures"
+    runs.mkdir(parents=True)
+    pictures.mkdir()
+    with contextlib.ExitStack() as ending:
+
+        def start(program, *arguments, log):
+            output = ending.enter_context(open(directory / log, "w"))
+            command = [programs / program, *map(str, arguments)]
+            process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=output, text=True, cwd=directory)
+            ending.callback(end, process)
+            return process
+
+        def perturb(*arguments):
+            subprocess.run([programs / "perturb", "-q", *map(str, arguments)], cwd=directory, check=True, stdout=subprocess.DEVNULL)
+
+        worker = start("perturb-server", "--listen", "tcp://127.0.0.1:0", "--workers", "2", log="server.log")
+        address = worker.stdout.readline().split()[-1]
+        server = start("perturb", "serve", "runs", "--address", "0", "--server", address, log="serve.log")
+        own = server.stdout.readline().strip() + "/"
+
+        mine = runs / "finished"
+        perturb("train", "--env", "CartPole", "--episodes", "300", "--out", mine, "--server", address)
+        perturb("heatmap", "--checkpoint", mine, "--grid", "8", "--episodes", "2", "--out", mine / "heatmap", "--server", address)
+        perturb("video", "--checkpoint", mine, "--out", mine / "film.gif", "--server", address)
+        training = ["--env", "CartPole", "--version", "R", "--episodes", "1000000", "--out", "runs/cart-pole-on-R"]
+        training = start("perturb", "train", *training, "--server", address, log="train.log")
+
+        browser = Browser(chromium, ending.enter_context(tempfile.TemporaryDirectory()), reachable="127.0.0.1")
+        ending.callback(browser.end)
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            browser.call(f"{domain}.enable")
+        pages = Pages(browser, own, pictures)
+        watch_training(pages)
+        plan = Path(__file__).with_name("plan.toml")
+        experiment = start("perturb", "run", plan, "--out", "runs/study", "--group", "2", "--server", address, log="run.log")
+        watch_experiment(pages, experiment)
+        pages.open("")
+        pages.check("rows of the list", pages.evaluate("document.querySelectorAll('.runs tbody tr').length"), 3)
+        pages.until("the server's answer", "document.getElementById('server').innerText.includes('takes sessions')")
+        pages.draw("list")
+        pages.open("run/finished")
+        loaded = "[...document.images].every(image => image.complete && image.naturalWidth > 0) && document.images.length >= 2"
+        pages.evaluate("document.images[0].scrollIntoView()")
+        pages.until("pictures of a run", loaded)
+        pages.evaluate("scrollTo(0, 0)")
+        pages.draw("finished", schemes=("light",))
+
+        wrong = pages.wrong + list(pages.complaints())
+        pages.open("run/cart-pole-on-R")
+        begun = time.monotonic()
+        server.send_signal(signal.SIGINT)
+        if (status := server.wait(timeout=LIMIT)) != 130 or time.monotonic() - begun > 5:
+            wrong.append(f"Ctrl-C ended the server with {status} after {time.monotonic() - begun:.1f} s, expected 130 at once")
+        if not pages.until("the word that it is lost", "document.getElementById('live').innerText.includes('lost')"):
+            wrong.append(pages.wrong[-1])
+        if training.poll() is not None:
+            wrong.append("the training ended before the pages were looked at")
+    if wrong:
+        sys.exit("\n".join(["The pages are not as they should be:", *wrong]))
+    print(f"trainings, an experiment and their list at {', '.join(map(str, WIDTHS))} pixels; pictures in {pictures}")
+
+
+def watch_training(pages):
+    """A curve that grows."""
+    wait_for_page(pages, "run/cart-pole-on-R")
+    pages.open("run/cart-pole-on-R")
+    pages.until("a curve", f"{REACH} > 0")
+    reach = pages.evaluate(REACH)
+    pages.until("a curve that grows", f"{REACH} > {reach}")
+    pages.until("a title that says how far it is", "document.title.includes('%')")
+    pages.draw("training")
+    pages.evaluate("document.querySelector('input[value=steps]').click()")
+    pages.check("over steps it reaches further", pages.evaluate(f"{REACH} > {reach}"), True)
+    pages.stayed("a curve that grows")
+
+
+def watch_experiment(pages, experiment):
+    """Cells that are begun and done, and a report that has them."""
+    wait_for_page(pages, "run/study")
+    pages.open("run/study")
+    pages.until("a cell in work", "document.querySelectorAll('.working tbody tr').length > 0")
+    pages.until("its curve", "document.querySelector('[data-chart=cells]').dataset.points > 1")
+    pages.draw("experiment", schemes=("light",))
+    done = pages.evaluate(DONE)
+    pages.until("a cell that is done", f"{DONE} > {done}")
+    pages.draw("experiment-later")
+    if status := experiment.wait(timeout=LIMIT):
+        pages.wrong.append(f"perturb run ended with {status}")
+    pages.until("all cells", f"{DONE} === 16")
+    pages.evaluate("document.querySelector('iframe.report').scrollIntoView()")
+    pages.until("the report of all cells", REPORTED.replace("WORDS", "16 of 16 cells are done"))
+    pages.stayed("cells that are done")
+    pages.draw("experiment-done")
+
+
+def wait_for_page(pages, path):
+    """Waits until the run is there: the browser would say on the console that it is not."""
+    start = time.monotonic()
+    while time.monotonic() - start < LIMIT:
+        try:
+            urllib.request.urlopen(pages.own + path).close()
+        except urllib.error.HTTPError:
+            time.sleep(0.2)
+        else:
+            return
+    pages.wrong.append(f"there is no {path}")
+
+
+def end(process):
+    if process.poll() is None:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(timeout=60)
+        except subprocess.TimeoutExpired:
+            process.kill()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+//! What clients keep of an episode's end.
+
+use crate::proto;
+
+/// An episode that ended, with the parameters that it ran with.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EndedEpisode {
+    /// Where in the session's batch, 0 … N-1.
+    pub slot: usize,
+    /// The environment's index: its place among those that were opened with it, unless that was given or restored.
+    pub environment_index: u32,
+    /// Counts the environment's episodes from 0.
+    pub episode_index: u64,
+    /// Counts the environment's trials from 0.
+    pub trial_index: u64,
+    /// Counts the trial's episodes from 0.
+    pub episode_in_trial: u32,
+    /// The undiscounted sum of its rewards.
+    pub episode_return: f64,
+    /// Its number of steps.
+    pub length: u32,
+    /// Whether it was a success.
+    pub success: bool,
+    /// Whether the task ended it, as opposed to the step limit alone.
+    pub terminated: bool,
+    /// Whether the physics diverged.
+    pub diverged: bool,
+    /// What it achieved of what the environment's success rule compares; `None` if nothing.
+    pub achieved: Option<f64>,
+    /// The same of the rule of the paper's published code.
+    pub code_achieved: Option<f64>,
+    /// The parameters that were drawn or given and what the physics had, in the catalogue's order.
+    pub receipt: proto::Receipt,
+}
+
+impl EndedEpisode {
+    /// What a server says of an episode, whose slot is `slot` of the batch; `None` if it leaves out the address or the
+    /// receipt.
+    pub fn of(end: proto::EpisodeEnd, slot: usize, terminated: bool) -> Option<Self> {
+        let (episode, receipt) = end.episode.zip(end.receipt)?;
+        Some(Self {
+            slot,
+            environment_index: episode.environment_index,
+            episode_index: episode.episode_index,
+            trial_index: episode.trial_index,
+            episode_in_trial: episode.episode_in_trial,
+            episode_return: end.r#return,
+            length: end.length,
+            success: end.success,
+            terminated,
+            diverged: end.diverged,
+            achieved: end.achieved,
+            code_achieved: end.code_achieved,
+            receipt,
+        })
+    }
+}

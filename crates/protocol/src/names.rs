@@ -1,0 +1,157 @@
+//! Names as people write them, the same everywhere: letters count in either case, `-` and `_` not at all, and an
+//! environment may have the id that Gymnasium knows it by. What is written otherwise is refused, with the name that was
+//! probably meant.
+
+/// How alike two names must be for one to be taken for the other, by Jaro and Winkler's measure: 1 is the same. Below
+/// it there is more chance than likeness.
+const ALIKE: f64 = 0.8;
+/// What ids in Gymnasium begin with.
+const NAMESPACE: &str = "perturb/";
+
+/// Whether `written` stands for the name `known`: `cart-pole` for `CartPole`, `r+e` for `R+E`.
+pub fn is_spelled(written: &str, known: &str) -> bool {
+    letters(written).eq(letters(known))
+}
+
+fn letters(name: &str) -> impl Iterator<Item = char> {
+    name.chars().filter(|c| !matches!(c, '-' | '_')).map(|c| c.to_ascii_lowercase())
+}
+
+/// The place of the name that `written` stands for: the one that is written so, or else the first that is spelled so.
+pub fn find<'a>(written: &str, known: impl Iterator<Item = &'a str> + Clone) -> Option<usize> {
+    known.clone().position(|name| name == written).or_else(|| known.clone().position(|name| is_spelled(written, name)))
+}
+
+/// The name that `written` is most like, if it is much like one.
+pub fn closest<'a>(written: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
+    let written: String = letters(written).collect();
+    let alike = |name: &str| strsim::jaro_winkler(&written, &letters(name).collect::<String>());
+    let (best, name) = known.map(|name| (alike(name), name)).max_by(|(a, _), (b, _)| a.total_cmp(b))?;
+    (best >= ALIKE).then_some(name)
+}
+
+/// " (did you mean `CartPole`?)", or nothing.
+pub fn did_you_mean<'a>(written: &str, known: impl Iterator<Item = &'a str>) -> String {
+    closest(written, known).map_or_else(String::new, |name| format!(" (did you mean `{name}`?)"))
+}
+
+/// An environment as it is written: its name in the catalogue, or its id in Gymnasium.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct EnvironmentName {
+    /// Without the id's other parts.
+    pub name: String,
+    /// The revision that an id asks for.
+    pub revision: Option<u32>,
+}
+
+/// A name that no environment has.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum UnknownEnvironment {
+    /// None is called so.
+    #[error("there is no environment {name:?}{hint}; there are {known}")]
+    Name {
+        /// What was asked for.
+        name: String,
+        /// The name that was probably meant, if one was.
+        hint: String,
+        /// The names there are.
+        known: String,
+    },
+    /// It has another revision.
+    #[error(
+        "`perturb/{name}-v{asked}` is another revision than that of the server, `perturb/{name}-v{served}`: write that, \
+         or just `{name}`, or run a server of the revision"
+    )]
+    Revision {
+        /// The environment.
+        name: String,
+        /// The revision that was asked for.
+        asked: u32,
+        /// That which there is.
+        served: u32,
+    },
+}
+
+impl EnvironmentName {
+    /// Takes an id apart; what is none is a name.
+    pub fn new(written: &str) -> Self {
+        let plain = |name: &str| Self { name: name.to_owned(), revision: None };
+        let id = written.get(..NAMESPACE.len()).filter(|start| start.eq_ignore_ascii_case(NAMESPACE));
+        let Some(rest) = id.map(|_| &written[NAMESPACE.len()..]) else { return plain(written) };
+        match rest.rsplit_once("-v").map(|(name, revision)| (name, revision.parse())) {
+            Some((name, Ok(revision))) => Self { name: name.to_owned(), revision: Some(revision) },
+            _ => plain(rest),
+        }
+    }
+
+    /// The place of the environment among the names and revisions that there are.
+    ///
+    /// # Errors
+    /// [`UnknownEnvironment`].
+    pub fn find<'a>(&self, known: impl Iterator<Item = (&'a str, u32)> + Clone) -> Result<usize, UnknownEnvironment> {
+        let names = known.clone().map(|(name, _)| name);
+        let Some(place) = find(&self.name, names.clone()) else {
+            let hint = did_you_mean(&self.name, names.clone());
+            let known = names.collect::<Vec<_>>().join(", ");
+            return Err(UnknownEnvironment::Name { name: self.name.clone(), hint, known });
+        };
+        match known.clone().nth(place).zip(self.revision) {
+            Some(((name, served), asked)) if asked != served => {
+                Err(UnknownEnvironment::Revision { name: name.to_owned(), asked, served })
+            }
+            _ => Ok(place),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const KNOWN: [(&str, u32); 3] = [("CartPole", 1), ("MountainCar", 0), ("HalfCheetah", 2)];
+
+    fn found(written: &str) -> Result<usize, String> {
+        EnvironmentName::new(written).find(KNOWN.into_iter()).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn an_environment_is_found_however_it_is_spelled() {
+        for written in
+            ["CartPole", "cartpole", "Cartpole", "cart_pole", "cart-pole", "perturb/CartPole-v1", "Perturb/cartpole"]
+        {
+            assert_eq!(found(written), Ok(0), "{written}");
+        }
+        assert_eq!(found("perturb/half-cheetah-v2"), Ok(2));
+    }
+
+    #[test]
+    fn another_name_is_refused_with_the_one_that_was_meant() {
+        let refused = |written| found(written).unwrap_err();
+        assert_eq!(
+            refused("CartPool"),
+            "there is no environment \"CartPool\" (did you mean `CartPole`?); there are CartPole, MountainCar, HalfCheetah"
+        );
+        assert_eq!(refused("Pong"), "there is no environment \"Pong\"; there are CartPole, MountainCar, HalfCheetah");
+        assert!(refused("perturb/CartPole-v0").starts_with("`perturb/CartPole-v0` is another revision"));
+        // Gymnasium's own environments are others.
+        assert!(refused("CartPole-v1").contains("(did you mean `CartPole`?)"));
+        assert!(refused("perturb/").starts_with("there is no environment \"\";"));
+        assert!(refused("pértürb/CartPole").starts_with("there is no environment \"pértürb/CartPole\""));
+    }
+
+    #[test]
+    fn a_name_that_is_written_exactly_is_that_one() {
+        let known = ["cart_pole", "CartPole"];
+        assert_eq!(find("CartPole", known.into_iter()), Some(1));
+        assert_eq!(find("CARTPOLE", known.into_iter()), Some(0));
+    }
+
+    #[test]
+    fn what_is_like_nothing_is_no_hint() {
+        let keys = ["learning_rate", "n_steps", "num_envs"];
+        assert_eq!(closest("learning-rat", keys.into_iter()), Some("learning_rate"));
+        assert_eq!(closest("nsteps", keys.into_iter()), Some("n_steps"));
+        assert_eq!(closest("foo", keys.into_iter()), None);
+    }
+}

@@ -1,0 +1,27 @@
+//! What libtorch refuses.
+
+use perturb_policy::Error as PolicyError;
+
+/// A failure of a policy on libtorch.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// A policy's arrays do not fit.
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
+    /// libtorch refused an operation.
+    #[error("libtorch: {0}")]
+    Torch(#[from] tch::TchError),
+}
+
+/// A result with this module's [`Error`].
+pub type Result<T> = std::result::Result<T, Error>;
+
+impl From<Error> for PolicyError {
+    fn from(error: Error) -> Self {
+        match error {
+            Error::Policy(error) => error,
+            Error::Torch(error) => PolicyError::Library { library: "libtorch", reason: error.to_string() },
+        }
+    }
+}

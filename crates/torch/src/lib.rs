@@ -1,0 +1,74 @@
+//! Policies on libtorch: the gradient of a recurrent policy, which a program that is to train them [registers](register),
+//! and a reference for the feed-forward one.
+#![forbid(unsafe_code)]
+
+mod batch;
+mod distribution;
+mod error;
+mod ff;
+#[cfg(test)]
+mod fixture;
+mod loss;
+mod policy;
+mod rc;
+mod sequences;
+
+use std::rc::Rc;
+
+use perturb_policy::{Losses, Objective, RecurrentBatch, RecurrentDifferentiator, SequenceSamples, register_recurrent};
+
+use batch::TensorBatch;
+pub use distribution::Distributions;
+pub use error::{Error, Result};
+pub use loss::{Targets, evaluate};
+pub use policy::{Evaluated, TorchPolicy};
+pub use sequences::Sequences;
+
+/// Has libtorch differentiate the recurrent policies of this process.
+pub fn register() {
+    register_recurrent(|spec| Ok(Box::new(Networks(Rc::new(TorchPolicy::zeros(spec)?)))));
+}
+
+/// The networks that all batches of a policy share.
+struct Networks(Rc<TorchPolicy>);
+
+impl RecurrentDifferentiator for Networks {
+    fn batch(&self, sequences: &SequenceSamples<'_>) -> perturb_policy::Result<Box<dyn RecurrentBatch>> {
+        let batch = TensorBatch::new(self.0.spec(), sequences)?;
+        Ok(Box::new(Batch { networks: Rc::clone(&self.0), batch }))
+    }
+}
+
+struct Batch {
+    networks: Rc<TorchPolicy>,
+    batch: TensorBatch,
+}
+
+impl RecurrentBatch for Batch {
+    fn count(&self) -> usize {
+        self.batch.sequences.count() as usize
+    }
+
+    fn remember_acting(&mut self, weights: &[f32]) -> perturb_policy::Result<()> {
+        self.networks.load(weights)?;
+        self.batch.remember_acting(&self.networks);
+        Ok(())
+    }
+
+    fn gradient(
+        &self,
+        weights: &[f32],
+        sequences: &[u32],
+        objective: &Objective,
+        gradient: &mut [f32],
+    ) -> perturb_policy::Result<Losses> {
+        self.networks.load(weights)?;
+        let whole = sequences.iter().copied().eq(0..self.count() as u32);
+        let part = if whole { None } else { Some(self.batch.select(sequences)?) };
+        let batch = part.as_ref().unwrap_or(&self.batch);
+        let evaluated = self.networks.evaluate(&batch.sequences, &batch.actions);
+        let (total, losses) = evaluate(objective, &evaluated, &batch.targets()?)?;
+        self.networks.gradient(&evaluated, &total, gradient)?;
+        Ok(losses)
+    }
+}

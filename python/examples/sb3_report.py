@@ -1,0 +1,25 @@
+"""Train stable-baselines3's PPO on D and R, test it on D, R and E, and report it beside the paper's and our agents.
+
+Run: python sb3_report.py STEPS EPISODES FOLDER, e.g. 200000 1000 /tmp/sb3-report
+"""
+
+import sys
+from pathlib import Path
+
+from stable_baselines3 import PPO
+
+import perturb.sb3
+
+steps, episodes, folder = int(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3])
+ours = Path(__file__).parents[2] / "results/beyond/confirm-2"  # an experiment: any --out of `perturb run`
+assessments = []
+for environment in ("CartPole", "Hopper"):
+    for version in ("D", "R"):
+        envs = perturb.sb3.make_vec_env(environment, 8, version=version, seed=1)
+        PPO("MlpPolicy", envs, n_steps=256, seed=1, device="cpu").learn(steps).save(folder / f"{environment}-{version}")
+        envs.close()
+    models = {version: PPO.load(folder / f"{environment}-{version}", device="cpu") for version in ("D", "R")}
+    assessments.append(perturb.assess(models, environment, episodes=episodes, seed=1, name="SB3 PPO"))
+    assessments[-1].save(folder / environment)
+    print(assessments[-1])
+assessments[0].to_html(folder / "report.html", beside=[assessments[1], ours])

@@ -1,0 +1,92 @@
+//! Assessments: an agent's recorded tests as folders, and as reports beside experiments.
+
+use std::path::PathBuf;
+
+use perturb_study::records::RecordsError;
+use perturb_study::report::{ReportError, Sources};
+use perturb_study::{Assessed, AssessedError, AssessedPolicy, Known};
+use pyo3::exceptions::PyOSError;
+use pyo3::prelude::*;
+
+use crate::failure::{INVALID, failure};
+use crate::records::Records;
+
+/// What is known of a policy beside its records: the version that it was trained on, the steps of its training, the seed of
+/// its tests, their episodes, what it observed, and whether it was deterministic.
+type KnownOf = (Option<String>, Option<u64>, u64, u64, String, Option<bool>);
+
+/// The tests of an agent in one environment.
+#[pyclass(frozen, module = "perturb._native")]
+pub struct Assessment(Assessed);
+
+#[pymethods]
+impl Assessment {
+    #[new]
+    fn new(agent: String, policies: Vec<(KnownOf, PyRef<'_, Records>)>) -> PyResult<Self> {
+        let policy = |(known, records): (KnownOf, PyRef<'_, Records>)| {
+            Ok(AssessedPolicy::new(known_of(known)?, records.0.clone()))
+        };
+        let policies = policies.into_iter().map(policy).collect::<PyResult<_>>()?;
+        Assessed::new(String::new(), agent, policies).map(Self).map_err(refused)
+    }
+
+    /// Reads what is in a folder.
+    #[staticmethod]
+    fn read(path: PathBuf) -> PyResult<Self> {
+        Assessed::read(&path).map(Self).map_err(refused)
+    }
+
+    /// Writes it into a folder.
+    fn write(&self, path: PathBuf, overwrite: bool) -> PyResult<()> {
+        self.0.write(&path, overwrite).map_err(refused)
+    }
+
+    /// What reports call the agent.
+    #[getter]
+    fn agent(&self) -> &str {
+        &self.0.agent
+    }
+
+    /// Its policies, with their records.
+    fn policies(&self) -> Vec<(KnownOf, Records)> {
+        let of = |policy: &AssessedPolicy| {
+            let Known { trained_on, timesteps, seed, episodes, observe, deterministic } = policy.known.clone();
+            let trained_on = trained_on.map(|version| version.to_string());
+            let known = (trained_on, timesteps, seed, episodes, observe.to_string(), deterministic);
+            (known, Records(policy.records.clone()))
+        };
+        self.0.policies().iter().map(of).collect()
+    }
+}
+
+/// The report page of assessments, and of the experiments and assessments in the folders `beside`, as HTML.
+#[pyfunction]
+pub fn report_page(py: Python<'_>, assessments: Vec<PyRef<'_, Assessment>>, beside: Vec<PathBuf>) -> PyResult<String> {
+    let assessed = assessments.iter().map(|one| one.0.clone()).collect();
+    py.detach(|| {
+        let mut sources = Sources { assessed, ..Sources::default() };
+        beside.iter().try_for_each(|path| sources.add(path))?;
+        sources.read(|whole| whole.page().map_err(ReportError::from))
+    })
+    .map_err(|error| match error {
+        ReportError::Assessed(error) => refused(error),
+        error => failure(INVALID, 0, error.to_string()),
+    })
+}
+
+fn known_of((trained_on, timesteps, seed, episodes, observe, deterministic): KnownOf) -> PyResult<Known> {
+    let invalid = |error: String| failure(INVALID, 0, error);
+    let trained_on = trained_on.map(|version| version.parse()).transpose();
+    let trained_on = trained_on.map_err(|error: perturb_protocol::UnknownVersion| invalid(error.to_string()))?;
+    let observe = serde_json::from_value(observe.into()).map_err(|error| invalid(error.to_string()))?;
+    Ok(Known { trained_on, timesteps, seed, episodes, observe, deterministic })
+}
+
+fn refused(error: AssessedError) -> PyErr {
+    match error {
+        AssessedError::File(error) | AssessedError::Records(RecordsError::File(error)) => {
+            PyOSError::new_err(error.to_string())
+        }
+        error => failure(INVALID, 0, error.to_string()),
+    }
+}

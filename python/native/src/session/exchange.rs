@@ -1,0 +1,195 @@
+//! Who has the stream: one thread of the process that opened it, which sends a request and waits for its reply.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use perturb_protocol::{Ask, ClientError, Connection, Stream};
+use pyo3::prelude::*;
+
+use super::Session;
+use crate::failure::{self, TIMED_OUT, UNUSABLE, failure};
+use crate::infos::Labels;
+use crate::line::{Broken, Line};
+
+/// How far a session is.
+pub(super) enum State {
+    New,
+    Idle(Box<Open>),
+    /// A thread waits, and has it.
+    Busy,
+    Ended,
+}
+
+/// An open session; the stream ends before the line that carries it.
+pub(super) struct Open {
+    pub(super) stream: Stream,
+    pub(super) connection: Connection,
+    pub(super) line: Line,
+    pub(super) labels: Arc<Labels>,
+    /// Steps that were sent and not received.
+    pub(super) under_way: usize,
+}
+
+impl Session {
+    pub(super) fn state(&self) -> MutexGuard<'_, State> {
+        unpoisoned(&self.state)
+    }
+
+    pub(super) fn deadline(&self) -> Option<Instant> {
+        let timeout = *unpoisoned(&self.timeout);
+        timeout.and_then(|timeout| Instant::now().checked_add(timeout))
+    }
+
+    /// M.
+    pub(super) fn selected(&self, mask: &[u8]) -> usize {
+        if mask.is_empty() { self.actions.num_envs } else { mask.iter().filter(|&&selected| selected != 0).count() }
+    }
+
+    /// A forked process leaves the parent's session alone, and its locks, which may be locked for ever.
+    pub(super) fn require_own(&self) -> PyResult<()> {
+        if std::process::id() == self.owner {
+            return Ok(());
+        }
+        Err(failure(UNUSABLE, 0, "another process opened the session"))
+    }
+
+    /// The session, with at most so many steps under way, for this thread alone.
+    pub(super) fn take(&self, most_under_way: usize) -> PyResult<Box<Open>> {
+        self.require_own()?;
+        let mut state = self.state();
+        match std::mem::replace(&mut *state, State::Busy) {
+            State::Idle(open) if open.under_way <= most_under_way => Ok(open),
+            State::Idle(open) => {
+                let under_way = open.under_way;
+                *state = State::Idle(open);
+                Err(failure(UNUSABLE, 0, format!("steps are under way, {under_way} of them: recv() first")))
+            }
+            State::Busy => Err(failure(
+                UNUSABLE,
+                0,
+                "another thread waits for a reply: an environment is for one thread at a time",
+            )),
+            before => {
+                *state = before;
+                Err(failure(UNUSABLE, 0, "the session is not open"))
+            }
+        }
+    }
+
+    pub(super) fn put_back(&self, py: Python<'_>, open: Box<Open>) {
+        let mut state = self.state();
+        if self.closing.is_closed() {
+            *state = State::Ended;
+            drop(state);
+            open.farewell(py);
+        } else {
+            *state = State::Idle(open);
+        }
+    }
+
+    pub(super) fn end(&self) {
+        *self.state() = State::Ended;
+    }
+
+    pub(super) fn ask<A>(&self, py: Python<'_>, open: Box<Open>, request: A) -> PyResult<(Arc<Labels>, A::Reply)>
+    where
+        A: Ask + Send + 'static,
+        A::Reply: Send,
+    {
+        self.exchange::<A>(py, open, Some(request))
+    }
+
+    pub(super) fn receive<A>(&self, py: Python<'_>, mut open: Box<Open>) -> PyResult<(Arc<Labels>, A::Reply)>
+    where
+        A: Ask + Send + 'static,
+        A::Reply: Send,
+    {
+        open.under_way -= 1;
+        self.exchange::<A>(py, open, None)
+    }
+
+    /// Sends a request, or none if it was sent before, and takes the reply. After a refusal the session lives on.
+    fn exchange<A>(&self, py: Python<'_>, open: Box<Open>, request: Option<A>) -> PyResult<(Arc<Labels>, A::Reply)>
+    where
+        A: Ask + Send + 'static,
+        A::Reply: Send,
+    {
+        let Open { mut stream, connection, line, labels, under_way } = *open;
+        let pending = Box::pin(async move {
+            let reply = match request {
+                Some(request) => stream.ask(request).await,
+                None => stream.receive::<A>().await,
+            };
+            (stream, reply)
+        });
+        let (stream, reply) = match line.wait(py, pending, self.deadline(), &self.closing) {
+            Ok(come) => come,
+            Err(broken) => {
+                // The reply to come would be taken for that to the next request.
+                drop(connection);
+                py.detach(|| line.tend());
+                self.end();
+                return Err(explain(broken));
+            }
+        };
+        match reply {
+            Ok(reply) => {
+                self.put_back(py, Box::new(Open { stream, connection, line, labels: Arc::clone(&labels), under_way }));
+                Ok((labels, reply))
+            }
+            Err(error @ ClientError::Refused { .. }) => {
+                self.put_back(py, Box::new(Open { stream, connection, line, labels, under_way }));
+                Err(failure::of(&error))
+            }
+            Err(error) => {
+                self.end();
+                Err(failure::of(&error))
+            }
+        }
+    }
+}
+
+impl Drop for Session {
+    fn drop(&mut self) {
+        if std::process::id() != self.owner {
+            // A copy of the parent's: its locks may be locked for ever, and its connection is the parent's.
+            let state = self.state.get_mut().unwrap_or_else(PoisonError::into_inner);
+            std::mem::forget(std::mem::replace(state, State::Ended));
+        }
+    }
+}
+
+impl Open {
+    /// Tells the server, so that it frees the environments even where another process has the socket, too.
+    pub(super) fn farewell(self, py: Python<'_>) {
+        let Self { stream, connection, line, .. } = self;
+        drop((stream, connection));
+        py.detach(|| line.tend());
+    }
+}
+
+/// A session whose opening has not gone well yet: it ends with this.
+pub(super) struct Unopened<'a>(pub(super) &'a Session);
+
+impl Drop for Unopened<'_> {
+    fn drop(&mut self) {
+        self.0.end();
+    }
+}
+
+pub(super) fn explain(broken: Broken) -> PyErr {
+    match broken {
+        Broken::Interrupted(error) => error,
+        Broken::Overdue => failure(TIMED_OUT, 0, ""),
+        Broken::Closed => failure(UNUSABLE, 0, "another thread closed the session"),
+    }
+}
+
+/// `None` for ever.
+pub(super) fn duration(seconds: f64) -> Option<Duration> {
+    Duration::try_from_secs_f64(seconds).ok()
+}
+
+pub(super) fn unpoisoned<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,337 @@
+//! A session as Python has it. Whatever it raises is a [`Failure`](crate::failure::Failure), or what a signal's handler
+//! raised.
+//!
+//! - [`exchange`]: who has the stream, requests and replies.
+//! - [`opened`]: what opening it gave.
+
+mod exchange;
+mod opened;
+
+use std::str::FromStr;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use numpy::{PyArray1, PyArray2, PyArray3};
+use perturb_protocol::proto;
+use perturb_protocol::{Address, ClientError, Connection, Patience, Stream};
+use pyo3::prelude::*;
+use pyo3::types::PyBytes;
+
+use crate::arrays;
+use crate::failure::{self, INVALID, MALFORMED, UNREACHABLE, UNUSABLE, failure};
+use crate::infos::{Events, Labels};
+use crate::line::{Closing, Line};
+use crate::requests::{self, Actions, Intervals};
+use exchange::{Open, State, Unopened, duration, explain, unpoisoned};
+
+pub use opened::Opened;
+
+/// The most steps that may be under way: their replies are kept until they are asked for.
+const MOST_UNDER_WAY: usize = 64;
+/// What a step gives: observations, rewards, both flags, and what began or ended.
+type Stepped<'py> = (
+    Bound<'py, PyArray2<f32>>,
+    Bound<'py, PyArray1<f32>>,
+    Bound<'py, PyArray1<bool>>,
+    Bound<'py, PyArray1<bool>>,
+    Option<Events>,
+);
+
+/// One stream to a server, which owns a batch of environments.
+#[pyclass(frozen, module = "perturb._native")]
+pub struct Session {
+    address: Address,
+    patience: Patience,
+    /// Of a reply; `None`: no limit.
+    timeout: Mutex<Option<Duration>>,
+    actions: Actions,
+    /// O.
+    observation_size: usize,
+    /// The process that made it.
+    owner: u32,
+    closing: Arc<Closing>,
+    state: Mutex<State>,
+}
+
+#[pymethods]
+impl Session {
+    /// Times are in seconds, and may be infinite. `action_size` is None for choices; of a `single` environment actions
+    /// have no first axis.
+    #[new]
+    #[pyo3(signature = (address, timeout, keepalive, num_envs, observation_size, action_size, single))]
+    fn new(
+        address: &str,
+        timeout: f64,
+        keepalive: (f64, f64),
+        num_envs: usize,
+        observation_size: usize,
+        action_size: Option<usize>,
+        single: bool,
+    ) -> PyResult<Self> {
+        let address = Address::from_str(address).map_err(|error| failure(INVALID, 0, error.to_string()))?;
+        let forever = |seconds| duration(seconds).unwrap_or(Duration::MAX);
+        let patience = Patience {
+            reply: Duration::MAX, // waits have a limit of their own, which can be changed
+            keepalive_interval: forever(keepalive.0),
+            keepalive_limit: forever(keepalive.1),
+        };
+        Ok(Self {
+            address,
+            patience,
+            timeout: Mutex::new(duration(timeout)),
+            actions: Actions { num_envs, size: action_size, single },
+            observation_size,
+            owner: std::process::id(),
+            closing: Arc::default(),
+            state: Mutex::new(State::New),
+        })
+    }
+
+    /// How long a reply may take, s.
+    #[setter]
+    fn set_timeout(&self, seconds: f64) {
+        *unpoisoned(&self.timeout) = duration(seconds);
+    }
+
+    /// Whether a thread waits for a reply.
+    #[getter]
+    fn waits(&self) -> bool {
+        matches!(*self.state(), State::Busy)
+    }
+
+    /// Whether it is of no more use.
+    #[getter]
+    fn ended(&self) -> bool {
+        self.require_own().is_err() || matches!(*self.state(), State::Ended)
+    }
+
+    /// Connects, and creates the environments.
+    #[pyo3(signature = (*, environment, version, parameters, seed, first_environment_index, episodes_per_trial, autoreset_mode, receipts, reward_terms, observe_parameters))]
+    #[expect(clippy::too_many_arguments, reason = "each is a field of the request, given by its name")]
+    fn open(
+        &self,
+        py: Python<'_>,
+        environment: String,
+        version: &str,
+        parameters: Intervals,
+        seed: u64,
+        first_environment_index: u32,
+        episodes_per_trial: u32,
+        autoreset_mode: &str,
+        receipts: bool,
+        reward_terms: bool,
+        observe_parameters: bool,
+    ) -> PyResult<Opened> {
+        self.require_own()?;
+        let n = self.actions.num_envs;
+        let request = proto::Open {
+            environment,
+            version: requests::version(version)?.into(),
+            parameters: requests::distributions(parameters),
+            batch_size: u32::try_from(n).map_err(|error| failure(INVALID, 0, error.to_string()))?,
+            seed,
+            first_environment_index,
+            episodes_per_trial,
+            autoreset_mode: requests::autoreset_mode(autoreset_mode)?.into(),
+            receipts,
+            reward_terms,
+            observe_parameters,
+            groups: Vec::new(),
+        };
+        {
+            let mut state = self.state();
+            match *state {
+                State::New => *state = State::Busy,
+                _ => return Err(failure(UNUSABLE, 0, "the session was opened before")),
+            }
+        }
+        let unopened = Unopened(self);
+        let line = Line::new().map_err(|error| failure(UNREACHABLE, 0, error.to_string()))?;
+        let (address, patience) = (self.address.clone(), self.patience);
+        let opening = Box::pin(async move {
+            let connection = Connection::open_with(&address, patience).await?;
+            let (stream, opened) = Stream::open(&connection, request).await?;
+            Ok((connection, stream, opened))
+        });
+        let come: Result<_, ClientError> = line.wait(py, opening, self.deadline(), &self.closing).map_err(explain)?;
+        let (connection, stream, opened) = come.map_err(|error| failure::of(&error))?;
+        let served = opened.environment.unwrap_or_default();
+        let labels = Arc::new(Labels::new(py, &served, n));
+        let events = Events::begun(&labels, opened.started)?;
+        std::mem::forget(unopened);
+        self.put_back(py, Box::new(Open { stream, connection, line, labels, under_way: 0 }));
+        Ok(Opened {
+            environment: perturb_protocol::catalogue::environment(&served).to_string(),
+            observes_parameters: opened.observes_parameters,
+            served: Arc::new(served),
+            observations: opened.observations,
+            shape: [n, self.observation_size],
+            events: Py::new(py, events)?,
+        })
+    }
+
+    /// Advances every environment. What cannot be sent as it is, `encode` makes bytes of, or refuses.
+    fn step<'py>(
+        &self,
+        py: Python<'py>,
+        actions: &Bound<'py, PyAny>,
+        encode: &Bound<'py, PyAny>,
+    ) -> PyResult<Stepped<'py>> {
+        let request = proto::Step { actions: self.actions.encode(actions, encode)? };
+        let open = self.take(0)?;
+        let (labels, stepped) = self.ask(py, open, request)?;
+        self.stepped(py, &labels, stepped)
+    }
+
+    /// The first half of a step: sends the actions, and waits for nothing.
+    fn send(&self, py: Python<'_>, actions: &Bound<'_, PyAny>, encode: &Bound<'_, PyAny>) -> PyResult<()> {
+        let request = proto::Step { actions: self.actions.encode(actions, encode)? };
+        let mut open = self.take(MOST_UNDER_WAY - 1)?;
+        let Open { mut stream, connection, line, labels, under_way } = *open;
+        let sending = Box::pin(async move {
+            let sent = stream.send_ahead(request).await;
+            (stream, sent)
+        });
+        match line.wait(py, sending, self.deadline(), &self.closing) {
+            Ok((stream, Ok(()))) => {
+                py.detach(|| line.tend());
+                open = Box::new(Open { stream, connection, line, labels, under_way: under_way + 1 });
+                self.put_back(py, open);
+                Ok(())
+            }
+            Ok((_, Err(error))) => {
+                self.end();
+                Err(failure::of(&error))
+            }
+            Err(broken) => {
+                self.end();
+                Err(explain(broken))
+            }
+        }
+    }
+
+    /// The second half: the outcome of the oldest step that was sent.
+    fn recv<'py>(&self, py: Python<'py>) -> PyResult<Stepped<'py>> {
+        let open = self.take(MOST_UNDER_WAY)?;
+        if open.under_way == 0 {
+            self.put_back(py, open);
+            return Err(failure(UNUSABLE, 0, "no step is under way: send() first"));
+        }
+        let (labels, stepped) = self.receive::<proto::Step>(py, open)?;
+        self.stepped(py, &labels, stepped)
+    }
+
+    /// Begins new episodes: observations `[M, O]`, and the episodes.
+    fn reset<'py>(
+        &self,
+        py: Python<'py>,
+        mask: &[u8],
+        seeds: Vec<u64>,
+        parameters: Intervals,
+        states: &[u8],
+    ) -> PyResult<(Bound<'py, PyArray2<f32>>, Events)> {
+        let selected = self.selected(mask);
+        let request = proto::Reset {
+            mask: Bytes::copy_from_slice(mask),
+            seeds,
+            parameters: requests::distributions(parameters),
+            states: Bytes::copy_from_slice(states),
+        };
+        let open = self.take(0)?;
+        let (labels, done) = self.ask(py, open, request)?;
+        let observations = arrays::rows(py, &done.observations, selected, self.observation_size)?;
+        Ok((observations, Events::begun(&labels, done.started)?))
+    }
+
+    /// Saves environments.
+    fn snapshot<'py>(&self, py: Python<'py>, mask: &[u8]) -> PyResult<Vec<Bound<'py, PyBytes>>> {
+        let open = self.take(0)?;
+        let (_, saved) = self.ask(py, open, proto::Snapshot { mask: Bytes::copy_from_slice(mask) })?;
+        let (got, expected) = (saved.snapshots.len(), self.selected(mask));
+        if got != expected {
+            return Err(failure(MALFORMED, 0, format!("the server sent {got} snapshots; expected {expected}")));
+        }
+        Ok(saved.snapshots.iter().map(|snapshot| PyBytes::new(py, snapshot)).collect())
+    }
+
+    /// Brings saved environments back: observations `[M, O]`.
+    fn restore<'py>(
+        &self,
+        py: Python<'py>,
+        mask: &[u8],
+        snapshots: Vec<Vec<u8>>,
+    ) -> PyResult<Bound<'py, PyArray2<f32>>> {
+        let snapshots = snapshots.into_iter().map(Bytes::from).collect();
+        let open = self.take(0)?;
+        let (_, restored) = self.ask(py, open, proto::Restore { mask: Bytes::copy_from_slice(mask), snapshots })?;
+        arrays::rows(py, &restored.observations, self.selected(mask), self.observation_size)
+    }
+
+    /// Draws an environment: uint8 `[height, width, 3]`.
+    fn render<'py>(&self, py: Python<'py>, slot: u32, width: u32, height: u32) -> PyResult<Bound<'py, PyArray3<u8>>> {
+        let open = self.take(0)?;
+        let (_, rendered) = self.ask(py, open, proto::Render { slot, width, height })?;
+        let size = [height as usize, width as usize, 3];
+        let came = [rendered.height as usize, rendered.width as usize, 3];
+        if came != size || rendered.pixels.len() != size.iter().product::<usize>() {
+            let bytes = rendered.pixels.len();
+            let words = format!("the server sent a picture {came:?} in {bytes} bytes; expected {size:?}");
+            return Err(failure(MALFORMED, 0, words));
+        }
+        arrays::picture(py, &rendered.pixels, size)
+    }
+
+    /// Answers the server's questions whether this side lives, while nobody waits.
+    fn tend(&self, py: Python<'_>) {
+        if std::process::id() != self.owner {
+            return;
+        }
+        // Locked and unlocked without Python's lock: who has that one may wait for this one.
+        py.detach(|| {
+            if let Ok(State::Idle(open)) = self.state.try_lock().as_deref() {
+                open.line.tend();
+            }
+        });
+    }
+
+    /// Ends the session; the server frees its environments. A thread that waits for a reply does so no longer.
+    fn close(&self, py: Python<'_>) {
+        if std::process::id() != self.owner {
+            return;
+        }
+        self.closing.close();
+        let mut state = self.state();
+        if matches!(*state, State::Busy) {
+            return; // whoever waits ends it
+        }
+        if let State::Idle(open) = std::mem::replace(&mut *state, State::Ended) {
+            drop(state);
+            open.farewell(py);
+        }
+    }
+}
+
+impl Session {
+    fn stepped<'py>(&self, py: Python<'py>, labels: &Arc<Labels>, stepped: proto::Stepped) -> PyResult<Stepped<'py>> {
+        let n = self.actions.num_envs;
+        Ok((
+            arrays::rows(py, &stepped.observations, n, self.observation_size)?,
+            arrays::floats(py, &stepped.rewards, n)?,
+            arrays::flags(py, &stepped.terminated, n)?,
+            arrays::flags(py, &stepped.truncated, n)?,
+            Events::stepped(labels, stepped, self.observation_size)?,
+        ))
+    }
+}
+
+/// What a server can run, as JSON.
+#[pyfunction]
+pub fn catalogue(py: Python<'_>, address: &str, timeout: f64) -> PyResult<String> {
+    let address = Address::from_str(address).map_err(|error| failure(INVALID, 0, error.to_string()))?;
+    let line = Line::new().map_err(|error| failure(UNREACHABLE, 0, error.to_string()))?;
+    let asking = Box::pin(async move { Connection::open(&address).await?.catalogue().await });
+    let deadline = duration(timeout).and_then(|timeout| Instant::now().checked_add(timeout));
+    let come: Result<_, ClientError> = line.wait(py, asking, deadline, &Arc::default()).map_err(explain)?;
+    Ok(perturb_protocol::catalogue::to_json(&come.map_err(|error| failure::of(&error))?).to_string())
+}

@@ -1,0 +1,91 @@
+"""Pictures of assessments, by matplotlib where it is installed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .errors import InvalidArgumentError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from .results import Cell, Part
+
+
+def curves(lines: Mapping[str, Sequence[Part]], parameter: str, units: Mapping[str, str], title: str, axes: Any) -> Any:
+    """Success, %, over the middles of a parameter's parts, with bands; a gap where parts do not touch."""
+    axes = _axes(axes)
+    drawn = {name: parts for name, parts in lines.items() if parts}
+    if not drawn:
+        raise InvalidArgumentError(f"{parameter} does not vary in {', '.join(lines)}: there is no curve over it")
+    for name, parts in drawn.items():
+        x: list[float] = []
+        rate: list[float] = []
+        low: list[float] = []
+        high: list[float] = []
+        for part, before in zip(parts, [None, *parts[:-1]], strict=True):
+            if before is not None and before.high != part.low:
+                x, rate = [*x, np.nan], [*rate, np.nan]
+                low, high = [*low, np.nan], [*high, np.nan]
+            ends = part.success_interval or (np.nan, np.nan)
+            x.append((part.low + part.high) / 2)
+            rate.append(np.nan if part.success_percent is None else part.success_percent)
+            low.append(ends[0])
+            high.append(ends[1])
+        (line,) = axes.plot(x, rate, marker="o", markersize=3, label=name)
+        axes.fill_between(x, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+    axes.set(title=title, xlabel=_named(parameter, units), ylabel="success, %", ylim=(-2, 102))
+    axes.legend()
+    return axes
+
+
+def heatmap(cells: Sequence[Cell], x: str, y: str, units: Mapping[str, str], title: str, axes: Any) -> Any:
+    """Success, %, in the parts of two parameters, each drawn where it lies; white without episodes."""
+    axes = _axes(axes)
+    if not cells:
+        raise InvalidArgumentError(f"{x} or {y} does not vary in this test: there is no heatmap over them")
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+    from matplotlib.patches import Rectangle
+
+    shades = ScalarMappable(Normalize(0, 100), "viridis")
+    parts_x, parts_y = _widened({cell.x for cell in cells}), _widened({cell.y for cell in cells})
+    for cell in cells:
+        if cell.success_percent is not None:
+            (left, right), (bottom, top) = parts_x[cell.x], parts_y[cell.y]
+            colour = tuple(shades.to_rgba(np.array([cell.success_percent]))[0])
+            axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, color=colour, linewidth=0))
+    axes.set(title=title, xlabel=_named(x, units), ylabel=_named(y, units))
+    axes.set_xlim(min(low for low, _ in parts_x.values()), max(high for _, high in parts_x.values()))
+    axes.set_ylim(min(low for low, _ in parts_y.values()), max(high for _, high in parts_y.values()))
+    axes.figure.colorbar(shades, ax=axes, label="success, %")
+    return axes
+
+
+def _widened(parts: set[tuple[float, float]]) -> dict[tuple[float, float], tuple[float, float]]:
+    """The points of a grid have no width: each is drawn halfway to its neighbours."""
+    ordered = sorted(parts)
+    if any(low != high for low, high in ordered):
+        return {part: part for part in ordered}
+    points = np.array([low for low, _ in ordered])
+    middles = (points[1:] + points[:-1]) / 2
+    lows = [2 * points[0] - middles[0], *middles]
+    highs = [*middles, 2 * points[-1] - middles[-1]]
+    return {part: (float(low), float(high)) for part, low, high in zip(ordered, lows, highs, strict=True)}
+
+
+def _axes(axes: Any) -> Any:
+    try:
+        import matplotlib.pyplot as plt
+    except ImportError as error:
+        raise ImportError(
+            "pictures need matplotlib, which perturb does not bring: pip install 'perturb[plot]', or pip install "
+            "matplotlib; success_by_parameter() and success_by_parameters() have the numbers, to_html() has pictures"
+        ) from error
+    return plt.subplots()[1] if axes is None else axes
+
+
+def _named(parameter: str, units: Mapping[str, str]) -> str:
+    return parameter if units[parameter] == "1" else f"{parameter}, {units[parameter]}"

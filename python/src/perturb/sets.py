@@ -1,0 +1,209 @@
+"""What policies are tested on beside D, R, E and R+E: sets of parameters, grids, lists, as in experiment files.
+
+    corners = perturb.sets.grid("corners", {"length": [0.1, 1.0], "mass": "0.05..0.5/4"})
+    long = perturb.sets.drawn("long_poles", {"length": (0.7, 0.8)}, base="R")
+    perturb.assess(policy, "CartPole", versions=["D", long, corners])
+
+Lists of contexts, of grids too, can also be trained on: `contexts=` of PerturbVectorEnv and `perturb.sb3.make_vec_env`.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from . import _native, catalogue, requests
+from .environments import environments
+from .errors import InvalidArgumentError
+from .policy import native
+
+__all__ = ["Set", "drawn", "grid", "listed", "read", "read_csv", "sampled"]
+
+
+@dataclass(frozen=True)
+class Set:
+    """What a policy is tested on. Made by the functions of this module.
+
+    Attributes:
+        name: what results call it.
+        base: the version that parameters come from of which the set says nothing.
+        parameters: of a set that is drawn from, for each episode: by name the intervals [(low, high), …], a fixed value
+            as one of length 0.
+        contexts: of a grid or a list: values of parameters by name, each for equally many episodes; else None.
+    """
+
+    name: str
+    base: requests.Version
+    parameters: Mapping[str, Sequence[tuple[float, float]]] = field(default_factory=dict)
+    contexts: tuple[Mapping[str, float], ...] | None = None
+
+    def _plain(self) -> _native.Set:
+        contexts = None if self.contexts is None else [dict(context) for context in self.contexts]
+        return self.name, self.base, {name: list(values) for name, values in self.parameters.items()}, contexts
+
+
+def drawn(name: str, parameters: Mapping[str, requests.ParameterSet | str], *, base: requests.Version = "D") -> Set:
+    """Make a set whose parameters are drawn anew for each episode.
+
+    Args:
+        name: letters, digits and _.
+        parameters: by name a value, an interval `(low, high)`, several `[(low, high), …]`, or a text as in experiment
+            files, `"0.3..0.4,0.8..0.9"`; in the parameter's unit.
+        base: where other parameters come from.
+
+    Raises:
+        InvalidArgumentError: for what is no such set.
+    """
+    made = _made(name, base, {key: _drawn(key, values) for key, values in _mapping(parameters).items()})
+    if made.contexts is not None:
+        raise InvalidArgumentError(f"the set {name!r} has points: give them to perturb.sets.grid()")
+    return made
+
+
+def grid(name: str, points: Mapping[str, float | Sequence[float] | str], *, base: requests.Version = "D") -> Set:
+    """Make a grid: every combination of these points for equally many episodes, the first parameter varying fastest.
+
+    Args:
+        name: letters, digits and _.
+        points: by name a value, several `[0.1, 0.2]`, or a text as in experiment files: `"0.1..1.0/10"` is ten points
+            from 0.1 to 1.0. In the parameter's unit. At most 16 384 combinations.
+        base: where other parameters come from.
+
+    Raises:
+        InvalidArgumentError: for what is no such grid.
+    """
+    made = _made(name, base, {key: _points(key, values) for key, values in _mapping(points).items()})
+    return made if made.contexts is not None else listed(name, [_values(made.parameters)], base=base)
+
+
+def listed(name: str, contexts: Sequence[Mapping[str, float]], *, base: requests.Version = "D") -> Set:
+    """Make a list of contexts, values of parameters by name, each for equally many episodes.
+
+    Raises:
+        InvalidArgumentError: for what is no such list.
+    """
+    return Set(_name(name), requests.version(base, "base"), {}, tuple(requests.contexts(contexts)))
+
+
+def sampled(name: str, environment: str, count: int, *, version: requests.Version = "R", seed: int = 1) -> Set:
+    """Make a list of contexts drawn from R or E once: for training on a chosen number of them, or for testing.
+
+    Each parameter is uniform over its intervals. The same seed gives the same contexts, of which those of a smaller
+    count are the first.
+
+    Raises:
+        InvalidArgumentError: for an environment that there is not, another version than R and E, or a count below 1.
+    """
+    parameters = environments()[catalogue.find(environment).name].parameters
+    version = requests.version(version)
+    if version not in ("R", "E"):
+        raise InvalidArgumentError(f"version={version!r}; expected 'R' or 'E', which contexts are drawn from")
+    generator = np.random.Generator(np.random.PCG64(requests.seed(seed)))
+    contexts: list[dict[str, float]] = []
+    for _ in range(requests.count(count, "count", 1)):
+        context = {}
+        for parameter in parameters.values():
+            intervals = parameter.random if version == "R" else parameter.extreme
+            place = generator.random() * sum(high - low for low, high in intervals)
+            for low, high in intervals:
+                if place <= high - low:
+                    break
+                place -= high - low
+            context[parameter.name] = min(low + place, high)
+        contexts.append(context)
+    return listed(name, contexts)
+
+
+def read_csv(name: str, path: str | os.PathLike[str], *, base: requests.Version = "D") -> Set:
+    """Read a list of contexts: a header of parameters, then a row for each context.
+
+    Raises:
+        OSError: if the file cannot be read.
+        InvalidArgumentError: for what is no such list, with the line.
+    """
+    return _set(native(_native.read_csv_set, _name(name), requests.version(base, "base"), os.fspath(path)))
+
+
+def read(path: str | os.PathLike[str]) -> dict[str, Set]:
+    """Read the sets of an experiment file, its tables `[sets.NAME]`, by their names.
+
+    Raises:
+        InvalidArgumentError: if it cannot be read, with the table and the key.
+    """
+    return {made[0]: _set(made) for made in native(_native.read_sets, os.fspath(path))}
+
+
+def contexts_of(
+    chosen: Set, version: requests.Version, parameters: requests.Parameters | None
+) -> Sequence[Mapping[str, float]]:
+    """Give the contexts of a grid or a list, for environments with this version and these parameters."""
+    if chosen.contexts is None:
+        raise InvalidArgumentError(
+            f"the set {chosen.name!r} is drawn from, and has no contexts: give parameters={dict(chosen.parameters)}"
+        )
+    version = requests.version(version)
+    if requests.version(chosen.base, "base") != version or parameters is not None:
+        raise InvalidArgumentError(
+            f"the set {chosen.name!r} has parameters that it does not name from {chosen.base!r}, the environments from "
+            f"version={version!r} and parameters={parameters!r}: give the same version, and no parameters"
+        )
+    return chosen.contexts
+
+
+def _made(name: str, base: str, texts: Mapping[str, str]) -> Set:
+    if not texts:
+        raise InvalidArgumentError(f"the set {name!r} names no parameter: it is a version")
+    return _set(native(_native.make_set, _name(name), requests.version(base, "base"), list(texts.items())))
+
+
+def _set(made: _native.Set) -> Set:
+    name, version, parameters, contexts = made
+    return Set(name, requests.version(version), parameters, None if contexts is None else tuple(contexts))
+
+
+def _name(name: Any) -> str:
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9_]+", name) or name.upper() in requests.VERSIONS:
+        raise InvalidArgumentError(
+            f"the name of a set is {name!r}; expected letters, digits and _, and none of D, R, E in either case"
+        )
+    return name
+
+
+def _mapping(values: Any) -> Mapping[str, Any]:
+    if not isinstance(values, Mapping):
+        raise InvalidArgumentError(f"a set's parameters are {values!r}; expected a dict by their names")
+    return values
+
+
+def _drawn(name: str, values: Any) -> str:
+    if isinstance(values, str):
+        return values
+    return ",".join(
+        repr(low) if low == high else f"{low!r}..{high!r}" for low, high in requests.distributions({name: values})[name]
+    )
+
+
+def _points(name: str, values: Any) -> str:
+    if isinstance(values, str):
+        return values
+    numbers = np.asarray(values)
+    if numbers.dtype.kind not in "iuf" or numbers.ndim > 1 or numbers.size == 0:
+        raise InvalidArgumentError(
+            f"the points of {name!r} are {values!r}; expected a number, several, or '0.1..1.0/10'"
+        )
+    return ",".join(repr(float(number)) for number in np.atleast_1d(numbers))
+
+
+def _values(parameters: Mapping[str, Sequence[tuple[float, float]]]) -> dict[str, float]:
+    """Of a grid of one point."""
+    wrong = [
+        name for name, intervals in parameters.items() if len(intervals) != 1 or intervals[0][0] != intervals[0][1]
+    ]
+    if wrong:
+        raise InvalidArgumentError(f"the grid has an interval of {wrong[0]}; expected points, such as '0.1..1.0/10'")
+    return {name: intervals[0][0] for name, intervals in parameters.items()}

@@ -1,0 +1,207 @@
+// What a page does by itself: hears of changes, puts new parts in their places, draws curves. Read-only, like its server.
+"use strict";
+
+(() => {
+  // Okabe and Ito's colours, which differ for everybody.
+  const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d00", "#7f7f7f"];
+  const NARROWEST = 200, HEIGHT = 220;
+  // What is drawn of a training, by the names of the places.
+  const CURVES = {
+    return: { colour: 0 },
+    success: { colour: 2, range: [0, 100] },
+    length: { colour: 3 },
+    speed: { colour: 1, range: [0, null] },
+  };
+  const REPORT_REST = 10_000;
+
+  const live = document.getElementById("live");
+  const plots = new Map();
+  const shown = new Map();
+  let charts = null;
+
+  const style = (name) => getComputedStyle(document.body).getPropertyValue(name).trim();
+  const over = () => document.querySelector("input[name=over]:checked")?.value ?? "episodes";
+  const short = (number) =>
+    number === null || number === undefined ? "–"
+      : Math.abs(number) >= 1e4 ? number.toLocaleString("en", { notation: "compact", maximumFractionDigits: 1 })
+      : number.toLocaleString("en", { maximumFractionDigits: 2 });
+
+  function say(words, state) {
+    if (live.textContent !== words) live.textContent = words;
+    live.dataset.state = state;
+  }
+
+  // Times of day as the reader has them.
+  function localTimes(within) {
+    for (const element of within.querySelectorAll("time[datetime]")) {
+      element.title = element.textContent;
+      const time = new Date(element.dateTime);
+      element.textContent = time.toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
+    }
+  }
+
+  function options(place, series, range, label) {
+    const ink = style("--ink-soft"), line = style("--line");
+    const axis = { stroke: ink, grid: { stroke: line, width: 1 }, ticks: { stroke: line, width: 1 }, font: "12px system-ui" };
+    const ticks = (self, values) => values.map(short);
+    return {
+      width: Math.max(NARROWEST, place.clientWidth),
+      height: HEIGHT,
+      scales: { x: { time: false }, y: range ? { range: (self, least, most) => [range[0], range[1] ?? most * 1.05] } : {} },
+      axes: [
+        { ...axis, values: ticks, size: 46, label, labelSize: 18, labelFont: "12px system-ui", space: 60 },
+        { ...axis, values: ticks, size: 52 },
+      ],
+      series: [{ label, value: (self, value) => short(value) }, ...series],
+      legend: { show: series.length === 1 },
+      cursor: { drag: { x: true, y: false }, points: { size: 7 } },
+    };
+  }
+
+  // Draws, or draws again if another kind of plot is there.
+  function plot(figure, key, data, make) {
+    const place = figure.querySelector(".plot");
+    const known = plots.get(figure);
+    if (known?.key === key && known.theme === style("--ink")) {
+      known.plot.setData(data);
+      return;
+    }
+    known?.plot.destroy();
+    place.replaceChildren();
+    plots.set(figure, { key, theme: style("--ink"), plot: new uPlot(make(place), data, place) });
+    sizes.observe(place);
+  }
+
+  function drawCurve(figure, curve) {
+    const name = figure.dataset.chart, { colour, range } = CURVES[name];
+    if (!curve || curve.episodes.length === 0) return;
+    const by = over(), label = by === "steps" ? "environment steps" : "episodes";
+    const stroke = COLOURS[colour];
+    const one = {
+      label: figure.querySelector("figcaption").textContent,
+      stroke,
+      width: 2,
+      spanGaps: true,
+      points: { show: curve.episodes.length < 12, size: 6, fill: stroke },
+      value: (self, value) => short(value),
+    };
+    const key = `${by} ${one.points.show}`;
+    plot(figure, key, [curve[by], curve[name]], (place) => options(place, [one], range, label));
+    const last = curve[name][curve[name].length - 1];
+    figure.querySelector(".plot").setAttribute("aria-label", `${one.label} over ${label}; the last point is ${short(last)}`);
+    figure.dataset.points = curve.episodes.length;
+    figure.dataset.reach = curve[by][curve[by].length - 1];
+  }
+
+  // The curves of the cells in work, one colour for a kind.
+  function drawCells(figure, cells) {
+    figure.parentElement.hidden = cells.length === 0;
+    if (cells.length === 0) return;
+    const kinds = [...new Set(cells.map((cell) => cell.kind))];
+    const colour = (cell) => COLOURS[kinds.indexOf(cell.kind) % COLOURS.length];
+    const data = uPlot.join(cells.map((cell) => [cell.episodes, cell.success]));
+    const series = cells.map((cell) => ({
+      label: cell.id, stroke: colour(cell), width: 1.5, spanGaps: true, points: { show: false },
+    }));
+    const key = cells.map((cell) => cell.id).join();
+    plot(figure, key, data, (place) => options(place, series, [0, 100], "episodes"));
+    figure.dataset.points = data[0].length;
+    let legend = figure.querySelector("ul");
+    if (!legend) {
+      legend = document.createElement("ul");
+      legend.className = "legend";
+      figure.append(legend);
+    }
+    legend.replaceChildren(...kinds.map((kind, place) => {
+      const item = document.createElement("li"), swatch = document.createElement("span");
+      swatch.className = "swatch";
+      swatch.style.backgroundColor = COLOURS[place % COLOURS.length];
+      item.append(swatch, kind);
+      return item;
+    }));
+  }
+
+  function draw() {
+    if (!charts) return;
+    for (const figure of document.querySelectorAll("figure.chart")) {
+      if (figure.dataset.chart === "cells") drawCells(figure, charts.cells ?? []);
+      else drawCurve(figure, charts.curve);
+    }
+  }
+
+  const sizes = new ResizeObserver((entries) => {
+    for (const { target } of entries) {
+      const known = plots.get(target.parentElement);
+      const width = Math.max(NARROWEST, Math.floor(target.clientWidth));
+      if (known && known.plot.width !== width) known.plot.setSize({ width, height: HEIGHT });
+    }
+  });
+
+  // The report is as high as it needs to be, and comes again when it is another one.
+  const report = document.querySelector("iframe.report");
+  let reported = 0, later = null;
+  function fit() {
+    const page = report.contentDocument?.documentElement;
+    if (page) report.style.height = `${page.scrollHeight + 4}px`;
+  }
+  function showReport(state) {
+    if (!report || report.dataset.report === state) return;
+    clearTimeout(later);
+    later = setTimeout(() => {
+      reported = Date.now();
+      report.dataset.report = state;
+      report.contentWindow.location.replace(report.src);
+    }, Math.max(0, reported + REPORT_REST - Date.now()));
+  }
+  if (report) {
+    report.addEventListener("load", fit);
+    new ResizeObserver(fit).observe(report.parentElement);
+  }
+
+  function apply(update) {
+    if (update.gone) return say(update.gone, "lost");
+    say("live", "live");
+    document.title = update.title;
+    for (const [name, part] of Object.entries(update.parts)) {
+      const place = document.getElementById(name);
+      if (place && shown.get(name) !== part) {
+        shown.set(name, part);
+        place.innerHTML = part;
+        localTimes(place);
+      }
+    }
+    charts = update.charts;
+    draw();
+    showReport(update.report);
+    document.body.dataset.updates = Number(document.body.dataset.updates ?? 0) + 1;
+  }
+
+  // A page that nobody sees keeps no connection: a browser has few for a server.
+  let source = null;
+  function listen() {
+    if (source || document.hidden) return;
+    say("connecting …", "lost");
+    source = new EventSource(document.body.dataset.events);
+    source.onmessage = (event) => apply(JSON.parse(event.data));
+    source.onopen = () => say("live", "live");
+    source.onerror = () => {
+      if (source.readyState === EventSource.CLOSED) {
+        source.close();
+        source = null;
+        say("not live: the server refuses, perhaps because too many pages are open; trying again", "lost");
+        setTimeout(listen, 10_000);
+      } else {
+        say("not live: the connection is lost; trying again", "lost");
+      }
+    };
+  }
+  document.addEventListener("visibilitychange", () => {
+    if (!document.hidden) return listen();
+    source?.close();
+    source = null;
+  });
+  for (const input of document.querySelectorAll("input[name=over]")) input.addEventListener("change", draw);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
+  localTimes(document);
+  listen();
+})();

@@ -1,0 +1,101 @@
+//! Sending a file of a run, or a part of it.
+
+use std::fs::{File, Metadata};
+use std::io::SeekFrom;
+use std::ops::RangeInclusive;
+use std::path::{Path, PathBuf};
+
+use axum::body::Body;
+use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use tokio::io::{AsyncReadExt, AsyncSeekExt};
+use tokio_util::io::ReaderStream;
+
+use crate::paths::media_type;
+
+/// The end of what is asked of a file.
+#[derive(Debug, PartialEq)]
+enum Asked {
+    Whole,
+    Part(RangeInclusive<u64>),
+    Beyond,
+}
+
+/// The file at `path`, which is below the folder; `None` if it is not sent.
+pub(crate) async fn send(path: PathBuf, headers: &HeaderMap) -> Option<Response> {
+    let kind = media_type(&path)?;
+    let opened = tokio::task::spawn_blocking(move || open(&path)).await.ok()?;
+    let (file, metadata) = opened.ok()?;
+    let (length, mut file) = (metadata.len(), tokio::fs::File::from_std(file));
+    let asked = headers
+        .get(header::RANGE)
+        .and_then(|range| range.to_str().ok())
+        .map_or(Asked::Whole, |range| part(range, length));
+    let (status, from, count) = match &asked {
+        Asked::Whole => (StatusCode::OK, 0, length),
+        Asked::Part(range) => (StatusCode::PARTIAL_CONTENT, *range.start(), range.end() - range.start() + 1),
+        Asked::Beyond => {
+            let range = [(header::CONTENT_RANGE, format!("bytes */{length}"))];
+            return Some((StatusCode::RANGE_NOT_SATISFIABLE, range).into_response());
+        }
+    };
+    file.seek(SeekFrom::Start(from)).await.ok()?;
+    let mut response = Body::from_stream(ReaderStream::with_capacity(file.take(count), 64 << 10)).into_response();
+    *response.status_mut() = status;
+    let headers = response.headers_mut();
+    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(kind));
+    headers.insert(header::CONTENT_LENGTH, count.into());
+    headers.insert(header::ACCEPT_RANGES, HeaderValue::from_static("bytes"));
+    if let Asked::Part(range) = asked {
+        let range = format!("bytes {}-{}/{length}", range.start(), range.end());
+        headers.insert(header::CONTENT_RANGE, HeaderValue::from_str(&range).ok()?);
+    }
+    Some(response)
+}
+
+/// Opens a plain file. What is none, a pipe for instance, is not waited for.
+fn open(path: &Path) -> std::io::Result<(File, Metadata)> {
+    let refused = || std::io::Error::from(std::io::ErrorKind::InvalidInput);
+    let plain = |metadata: Metadata| metadata.is_file().then_some(metadata).ok_or_else(refused);
+    plain(std::fs::symlink_metadata(path)?)?;
+    let file = File::open(path)?;
+    let metadata = plain(file.metadata()?)?;
+    Ok((file, metadata))
+}
+
+/// What a Range header asks of a file: one part, from somewhere, or so much of the end. What is not understood asks for
+/// all.
+fn part(header: &str, length: u64) -> Asked {
+    let Some((from, to)) = header.strip_prefix("bytes=").and_then(|range| range.split_once('-')) else {
+        return Asked::Whole;
+    };
+    let last = length.saturating_sub(1);
+    let (from, to) = match (from.parse::<u64>(), to.parse::<u64>()) {
+        (Ok(from), Ok(to)) if from <= to => (from, to.min(last)),
+        (Ok(from), Err(_)) if to.is_empty() => (from, last),
+        (Err(_), Ok(count)) if from.is_empty() => (length.saturating_sub(count), last),
+        _ => return Asked::Whole,
+    };
+    if from > to || length == 0 { Asked::Beyond } else { Asked::Part(from..=to) }
+}
+
+#[cfg(test)]
+mod tests {
+    use rstest::rstest;
+
+    use super::*;
+
+    #[rstest]
+    #[case("bytes=0-", Asked::Part(0..=9))]
+    #[case("bytes=2-3", Asked::Part(2..=3))]
+    #[case("bytes=2-99", Asked::Part(2..=9))]
+    #[case("bytes=-4", Asked::Part(6..=9))]
+    #[case("bytes=-99", Asked::Part(0..=9))]
+    #[case("bytes=10-", Asked::Beyond)]
+    #[case("bytes=3-2", Asked::Whole)]
+    #[case("bytes=0-1,4-5", Asked::Whole)]
+    #[case("lines=1-2", Asked::Whole)]
+    fn a_part_of_ten_bytes(#[case] header: &str, #[case] expected: Asked) {
+        assert_eq!(part(header, 10), expected);
+    }
+}

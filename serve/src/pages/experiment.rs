@@ -1,0 +1,257 @@
+//! The page of an experiment.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use maud::{Markup, html};
+use perturb_study::Cell;
+use perturb_study::runs::{CellStatus, ExperimentStatus, Kind};
+use perturb_study::words::{duration, grouped};
+use serde_json::json;
+
+use super::{Update, badge, bar, chart, crumbs, name_of, pictures, run_link, time, troubles};
+use crate::experiment::Experiment;
+use crate::paths::{Relative, Root};
+
+/// Of more cells no map is drawn.
+const MOST_MAPPED: usize = 1000;
+/// So many cells in work, and so many failures, are listed.
+const MOST_LISTED: usize = 48;
+
+pub(crate) fn update(root: &Root, relative: &Relative, path: &Path, experiment: &Experiment, report: u64) -> Update {
+    let name = name_of(root, relative);
+    let (title, parts) = match experiment.status() {
+        Err(reason) => (name, vec![("head", troubles(&[format!("This experiment is not understood: {reason}")]))]),
+        Ok(status) => {
+            let parts = vec![
+                ("head", head(status, experiment)),
+                ("kinds", kinds(status)),
+                ("working", working(status, experiment, relative)),
+                ("map", map(status, relative)),
+                ("failures", failures(status, relative)),
+                ("pictures", pictures::of_run(relative, path)),
+            ];
+            (title(&name, status, experiment), parts)
+        }
+    };
+    let charts = json!({ "cells": experiment.curves() });
+    Update { title, kind: Some(Kind::Experiment), parts, charts, report, files: experiment.files() }
+}
+
+pub(crate) fn page(root: &Root, relative: &Relative, update: &Update) -> String {
+    let report = format!("/report/{}", relative.encode());
+    let main = html! {
+        h1 { (name_of(root, relative)) }
+        (update.part("head"))
+        (update.part("failures"))
+        (update.part("kinds"))
+        (update.part("working"))
+        div.charts data-needs="cells" { (chart("cells", "Success while training of the cells in work, %, over the budget's episodes")) }
+        details open { summary { "All cells" } (update.part("map")) }
+        (update.part("pictures"))
+        h2 { "Report as it stands" }
+        p.note { a href=(report) { "The report alone" } ", as `perturb report --html` writes it when all is done." }
+        iframe.report src=(report) title="Report as it stands" loading="lazy" data-report=(format!("{:016x}", update.report)) {}
+        p.note {
+            "Files: " a href={ "/file/" (relative.join("plan.toml").encode()) } { "plan.toml" }
+        }
+    };
+    super::document(&update.title, &format!("/events/{}", relative.encode()), &crumbs(root, relative), &main)
+}
+
+fn title(name: &str, status: &ExperimentStatus, experiment: &Experiment) -> String {
+    let (done, all) = (status.count(CellStatus::is_settled), status.cells.len());
+    if experiment.state() == "in work" { format!("{done}/{all} · {name}") } else { format!("{name} · perturb") }
+}
+
+fn head(status: &ExperimentStatus, experiment: &Experiment) -> Markup {
+    let all = status.cells.len() as u64;
+    let (done, settled) = (status.done().count(), status.count(CellStatus::is_settled) as u64);
+    let count = |is: fn(&CellStatus) -> bool| status.count(is);
+    let failed = count(|cell| matches!(cell, CellStatus::Failed(_)));
+    let working = count(|cell| *cell == CellStatus::InWork);
+    let waiting = count(|cell| matches!(cell, CellStatus::Waiting { .. }));
+    let wrong: Vec<String> = status
+        .cells
+        .iter()
+        .filter_map(|cell| match cell {
+            CellStatus::NotUnderstood(reason) => Some(reason.clone()),
+            _ => None,
+        })
+        .take(MOST_LISTED)
+        .collect();
+    html! {
+        p.head { (status.plan.environments().join(", ")) " " (badge(experiment.state())) }
+        (bar(settled, all, "Cells that are done or have failed"))
+        p {
+            (grouped(done)) " of " (grouped(all as usize)) " cells done"
+            @for (number, what) in [(failed, "failed"), (working, "in work"), (waiting, "to do")] {
+                @if number > 0 { ", " (grouped(number)) " " (what) }
+            }
+            @if let Some(left) = experiment.left() { "; about " (duration(left)) " left" }
+            "; changed " (time(experiment.changed())) "."
+        }
+        (troubles(&wrong))
+    }
+}
+
+/// Success of what is done, and how many cells there are, by kinds.
+fn kinds(status: &ExperimentStatus) -> Markup {
+    let rates = status.rates();
+    let mut kinds: Vec<(String, usize, usize)> = Vec::new();
+    for (cell, known) in status.plan.cells.iter().zip(&status.cells) {
+        let kind = kind(cell);
+        let place = kinds.iter().position(|(name, ..)| *name == kind).unwrap_or_else(|| {
+            kinds.push((kind, 0, 0));
+            kinds.len() - 1
+        });
+        kinds[place].1 += usize::from(matches!(known, CellStatus::Done(_)));
+        kinds[place].2 += 1;
+    }
+    let mut seen = BTreeSet::new();
+    let sets: Vec<&str> = (status.plan.cells.iter().flat_map(|cell| &cell.tests.sets))
+        .map(|set| set.name.as_str())
+        .filter(|name| seen.insert(*name))
+        .collect();
+    html! {
+        h2 { "Success of what is done, %" }
+        div.wide {
+            table {
+                thead {
+                    tr {
+                        th scope="col" { "environment, learner, trained on" }
+                        th scope="col" { "cells" }
+                        @for set in &sets { th.number scope="col" { "on " (set) } }
+                    }
+                }
+                tbody {
+                    @for (kind, done, all) in &kinds {
+                        @let rate = rates.iter().find(|rate| rate.kind == *kind);
+                        tr {
+                            th scope="row" { (kind) }
+                            td.number { (done) " of " (all) }
+                            @for set in &sets {
+                                td.number {
+                                    @if let Some((_, percent)) = rate.and_then(|rate| rate.success.iter().find(|(name, _)| name == set)) {
+                                        (format!("{percent:.1}"))
+                                    }
+                                }
+                            }
+                        }
+                    }
+                }
+            }
+        }
+        p.note { "Means over settings and runs; the report below selects." }
+    }
+}
+
+/// As [`perturb_study::scheduler::Rate`] has it.
+fn kind(cell: &Cell) -> String {
+    format!("{} {}, trained on {}", cell.config.common.environment, cell.method(), cell.trained_on())
+}
+
+fn working(status: &ExperimentStatus, experiment: &Experiment, relative: &Relative) -> Markup {
+    let cells = || {
+        let all = status.plan.cells.iter().zip(&status.cells);
+        all.filter(|(_, known)| **known == CellStatus::InWork).map(|(cell, _)| cell)
+    };
+    let more = cells().count().saturating_sub(MOST_LISTED);
+    html! {
+        @if cells().next().is_some() {
+            h2 { "In work" }
+            div.wide {
+                table.working {
+                    thead { tr { @for name in ["cell", "training", "success, last 100", "doing"] { th scope="col" { (name) } } } }
+                    tbody { @for cell in cells().take(MOST_LISTED) { (one(cell, experiment, relative)) } }
+                }
+            }
+            @if more > 0 { p { "And " (more) " more." } }
+        }
+    }
+}
+
+fn one(cell: &Cell, experiment: &Experiment, relative: &Relative) -> Markup {
+    let training = experiment.training(&cell.id).and_then(|training| training.status().ok());
+    let (episodes, budget) = (training.map_or(0, |status| status.episodes), cell.config.common.episodes);
+    let success = training.and_then(|status| status.progress.as_ref()?.success_percent());
+    let doing = match () {
+        () if training.is_none() => "beginning",
+        () if episodes >= budget => "tests",
+        () => "training",
+    };
+    html! {
+        tr {
+            th scope="row" { a href=(cell_link(relative, cell)) { (cell.id) } }
+            td.amount {
+                (bar(episodes, budget, &format!("{}: episodes", cell.id)))
+                span { (grouped(episodes as usize)) " of " (grouped(budget as usize)) }
+            }
+            td.number data-name="success" { @if let Some(percent) = success { (format!("{percent:.0} %")) } }
+            td { (doing) }
+        }
+    }
+}
+
+/// Every cell as a square.
+fn map(status: &ExperimentStatus, relative: &Relative) -> Markup {
+    if status.cells.len() > MOST_MAPPED {
+        return html! { p { (grouped(status.cells.len())) " cells are too many to draw one by one." } };
+    }
+    let word = |known: &CellStatus| match known {
+        CellStatus::Done(_) => "done",
+        CellStatus::Failed(_) => "failed",
+        CellStatus::NotUnderstood(_) => "not understood",
+        CellStatus::InWork => "in work",
+        CellStatus::Waiting { begun: true } => "broken off",
+        CellStatus::Waiting { begun: false } => "to do",
+    };
+    html! {
+        ul.map {
+            @for (cell, known) in status.plan.cells.iter().zip(&status.cells) {
+                @let word = word(known);
+                @let label = format!("{}: {word}", cell.id);
+                li class={ "state " (word.replace(' ', "-")) } title=(label) {
+                    // Who was not begun has no page.
+                    @if *known == (CellStatus::Waiting { begun: false }) {
+                        span.hidden { (label) }
+                    } @else {
+                        a href=(cell_link(relative, cell)) { span.hidden { (label) } }
+                    }
+                }
+            }
+        }
+        ul.legend {
+            @for word in ["done", "failed", "in work", "broken off", "to do"] {
+                li { span class={ "swatch state " (word.replace(' ', "-")) } {} (word) }
+            }
+        }
+    }
+}
+
+fn failures(status: &ExperimentStatus, relative: &Relative) -> Markup {
+    let failed: Vec<(&Cell, &str)> = status
+        .plan
+        .cells
+        .iter()
+        .zip(&status.cells)
+        .filter_map(|(cell, known)| match known {
+            CellStatus::Failed(reason) => Some((cell, reason.as_str())),
+            _ => None,
+        })
+        .collect();
+    html! {
+        @if !failed.is_empty() {
+            ul.trouble {
+                @for (cell, reason) in failed.iter().take(MOST_LISTED) {
+                    li { a href=(cell_link(relative, cell)) { (cell.id) } " failed: " (reason) }
+                }
+                @if failed.len() > MOST_LISTED { li { "and " (failed.len() - MOST_LISTED) " more" } }
+            }
+        }
+    }
+}
+
+fn cell_link(relative: &Relative, cell: &Cell) -> String {
+    run_link(&relative.join("cells").join(&cell.id).join("training"))
+}

@@ -1,0 +1,192 @@
+//! What is shown, and when.
+
+use perturb_study::files::Lock;
+use perturb_study::{Folder, Plan};
+
+use crate::client::{Place, lines, write, write_training};
+
+/// The training's curve in an event.
+fn curve(event: &serde_json::Value) -> &serde_json::Value {
+    &event["charts"]["curve"]
+}
+
+fn part(event: &serde_json::Value, name: &str) -> String {
+    event["parts"][name].as_str().unwrap_or_else(|| panic!("no part {name} in {event:#}")).to_owned()
+}
+
+#[test]
+fn all_runs_are_listed_with_their_state_and_pictures_beside_them() {
+    let page = Place::new().get("/");
+    assert_eq!(page.status, 200);
+    assert!(page.head.contains("content-type: text/html"), "{}", page.head);
+    for words in [
+        "href=\"/run/one\"",
+        "training: CartPole D a2c ff",
+        "without a checkpoint",
+        "href=\"/run/study\"",
+        "experiment: CartPole",
+        "1 of 2 cells",
+        "92.0 %",
+        "broken off",
+        "/file/pictures/over%20%3Cb%3E.svg",
+        "over &lt;b&gt;.svg",
+    ] {
+        assert!(page.body.contains(words), "{words} is not in {}", page.body);
+    }
+    assert!(!page.body.contains("<b>."), "names are text");
+}
+
+#[test]
+fn a_training_has_its_curve_figures_and_settings() {
+    let place = Place::new();
+    let page = place.get("/run/one");
+    assert_eq!(page.status, 200);
+    for words in ["14.50", "50.0 %", "1 234", "waiting for servers", "20.0 %", "learning_rate", "data-chart=\"return\""]
+    {
+        assert!(page.body.contains(words), "{words} is not in {}", page.body);
+    }
+    let event = place.events("/events/one").until("an event", |_| true);
+    assert_eq!(curve(&event)["episodes"], serde_json::json!([5.0, 15.0, 25.0]));
+    assert_eq!(curve(&event)["return"], serde_json::json!([4.5, 14.5, 24.5]));
+    assert_eq!(curve(&event)["success"], serde_json::json!([50.0, 50.0, 50.0]));
+    assert_eq!(curve(&event)["steps"], serde_json::json!([20.0, 60.0, 100.0]));
+    assert_eq!(curve(&event)["speed"], serde_json::json!([4.0, 4.0, 4.0]));
+}
+
+#[test]
+fn an_experiment_has_its_cells_rates_and_report() {
+    let place = Place::new();
+    let page = place.get("/run/study");
+    assert_eq!(page.status, 200);
+    for words in
+        ["1 of 2 cells done, 1 to do", "CartPole ppo ff, trained on D", "91.0", "93.0", "src=\"/report/study\""]
+    {
+        assert!(page.body.contains(words), "{words} is not in {}", page.body);
+    }
+    let report = place.get("/report/study");
+    assert!(report.body.contains("1 of 2 cells are done"), "{}", report.body);
+    assert!(
+        report.head.contains("style-src 'unsafe-inline'") && !report.head.contains("script-src"),
+        "{}",
+        report.head
+    );
+    let plan = Plan::load(&place.path("study/plan.toml")).unwrap();
+    let cell = place.path("study/cells").join(&plan.cells[0].id).join("training");
+    write_training(&cell, 20);
+    let page = place.get(&format!("/run/study/cells/{}/training", plan.cells[0].id));
+    assert!(page.body.contains("90.0 … 92.0") && page.body.contains("href=\"/run/study\""), "{}", page.body);
+}
+
+#[test]
+fn a_curve_grows_with_its_file_and_nothing_is_sent_while_nothing_changes() {
+    let place = Place::new();
+    let mut events = place.events("/events/one");
+    events.until("the curve", |event| curve(event)["success"].as_array().unwrap().len() == 3);
+    let add = |text: &str| {
+        use std::io::Write;
+        let mut file = std::fs::File::options().append(true).open(place.path("one/monitor.csv")).unwrap();
+        file.write_all(text.as_bytes()).unwrap();
+    };
+    add(&(lines(30, 50) + "7,7"));
+    let event = events.until("more", |event| curve(event)["success"].as_array().unwrap().len() == 5);
+    assert_eq!(curve(&event)["return"][4], 44.5);
+    assert!(part(&event, "troubles").is_empty(), "half a line is not wrong: {event:#}");
+    // The next event is of the next change: what is in between says nothing.
+    std::thread::sleep(std::time::Duration::from_secs(3));
+    add(",8,1,1\n");
+    let event = events.until("the next event", |_| true);
+    assert_eq!(curve(&event)["episodes"], serde_json::json!([5.5, 16.5, 27.5, 38.5, 47.5]), "of 51 episodes");
+}
+
+#[test]
+fn a_run_in_work_says_so_as_soon_as_it_is() {
+    let place = Place::new();
+    let mut events = place.events("/events");
+    events.until("the list", |event| part(event, "runs").contains("without a checkpoint"));
+    let lock = Lock::try_take(&place.path("one")).unwrap().unwrap();
+    let event = events.until("work", |event| part(event, "runs").contains("in work"));
+    assert_eq!(event["title"], "1 in work · perturb");
+    drop(lock);
+    events.until("the end of work", |event| !part(event, "runs").contains("in work"));
+}
+
+#[test]
+fn a_cell_in_work_is_shown_with_its_curve_until_it_is_done() {
+    let place = Place::new();
+    let folder = Folder::new(&place.path("study"));
+    let plan = Plan::load(&folder.plan_path()).unwrap();
+    let cell = folder.cell(&plan.cells[1].id);
+    let mut events = place.events("/events/study");
+    let lock = cell.try_lock().unwrap().unwrap();
+    write_training(&cell.training(), 60);
+    let training = Lock::try_take(&cell.training()).unwrap().unwrap();
+    let event = events.until("the cell in work", |event| {
+        event["charts"]["cells"].as_array().is_some_and(|cells| cells.len() == 1)
+            && part(event, "working").contains("30 of 100")
+    });
+    assert_eq!(event["charts"]["cells"][0]["kind"], "CartPole ppo ff, R");
+    let report = event["report"].clone();
+    cell.write_result(&crate::client::result(&plan.cells[1])).unwrap();
+    drop((lock, training));
+    let event = events.until("the result", |event| part(event, "head").contains("2 of 2 cells done"));
+    assert_ne!(event["report"], report, "the report is another one");
+    assert!(event["charts"]["cells"].as_array().unwrap().is_empty() && part(&event, "head").contains("finished"));
+}
+
+#[test]
+fn what_is_broken_is_told_and_ends_nothing() {
+    let place = Place::new();
+    write(&place.path("one/config.toml"), "no = TOML =");
+    write(&place.path("bad/plan.toml"), "environments = 7");
+    let plan = Plan::load(&place.path("study/plan.toml")).unwrap();
+    let result = place.path("study/cells").join(&plan.cells[1].id).join("result.json");
+    write(&result, "{\"format_version\": 1, \"id");
+    let index = place.get("/");
+    assert_eq!((index.status, index.body.matches("not understood").count()), (200, 2), "{}", index.body);
+    for (run, words) in [("one", "This training is not understood"), ("bad", "This experiment is not understood")] {
+        let page = place.get(&format!("/run/{run}"));
+        assert!(page.status == 200 && page.body.contains(words), "{}", page.body);
+    }
+    let page = place.get("/run/study");
+    assert!(page.body.contains("result.json is not understood"), "{}", page.body);
+    let report = place.get("/report/study");
+    assert!(report.status == 200 && report.body.contains("There is no report now"), "{}", report.body);
+    write_training(&place.path("one"), 3);
+    write(&place.path("one/monitor.csv"), "r,l,t,success\n1,2,3,1\nx,2,4,1\n\u{0}\u{1}\n5,2,5,1\n");
+    write(&place.path("one/checkpoint/checkpoint.json"), "{");
+    write(&place.path("one/progress.csv"), "\u{fffd}\n\n,,,");
+    let page = place.get("/run/one");
+    assert!(page.body.contains("monitor.csv: line 3: `x` is no number"), "{}", page.body);
+    assert!(page.body.contains("checkpoint.json is not a usable checkpoint"), "{}", page.body);
+}
+
+#[test]
+fn a_folder_that_vanishes_is_told_and_one_that_comes_back_is_shown() {
+    let place = Place::new();
+    let mut events = place.events("/events/one");
+    let mut all = place.events("/events");
+    events.until("the curve", |event| curve(event).is_object());
+    std::fs::rename(place.path("one"), place.path(".hidden")).unwrap();
+    events.until("the end", |event| event["gone"].is_string());
+    assert_eq!(place.get("/run/one").status, 404);
+    std::fs::rename(place.path(".hidden"), place.path("one")).unwrap();
+    events.until("the run again", |event| curve(event).is_object());
+    std::fs::rename(place.path(""), place.path("").with_file_name("elsewhere")).unwrap();
+    all.until("the end of all", |event| event["gone"].is_string());
+    assert_eq!(place.get("/").status, 404);
+    std::fs::rename(place.path("").with_file_name("elsewhere"), place.path("")).unwrap();
+    all.until("all again", |event| event["parts"].is_object());
+    assert_eq!(place.get("/").status, 200);
+}
+
+#[test]
+fn a_run_itself_can_be_served() {
+    let place = Place::new();
+    let address = crate::client::serve(&place.path("study"));
+    let study = Place { address, ..place };
+    assert!(study.get("/").body.contains("href=\"/run/\""));
+    assert!(study.get("/run/").body.contains("1 of 2 cells done"));
+    assert!(study.get("/report/").body.contains("1 of 2 cells are done"));
+    study.events("/events/").until("an event", |event| event["parts"]["head"].is_string());
+    assert_eq!(study.get("/file/plan.toml").status, 200);
+}

@@ -1,0 +1,113 @@
+//! Arrays as safetensors.
+
+use std::collections::HashMap;
+
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+
+use perturb_policy::{NamedArray, PolicySpec, Weights};
+
+/// An array to be written: its elements are little-endian `bytes`.
+#[derive(Clone, Debug)]
+pub struct Array {
+    name: String,
+    dtype: Dtype,
+    shape: Vec<usize>,
+    bytes: Vec<u8>,
+}
+
+impl Array {
+    /// Of `shape`.
+    pub fn f32(name: impl Into<String>, shape: Vec<usize>, data: &[f32]) -> Self {
+        let bytes = data.iter().flat_map(|x| x.to_le_bytes()).collect();
+        Self { name: name.into(), dtype: Dtype::F32, shape, bytes }
+    }
+
+    /// Of one axis.
+    pub fn u64(name: &str, data: impl ExactSizeIterator<Item = u64>) -> Self {
+        let shape = vec![data.len()];
+        Self { name: name.to_owned(), dtype: Dtype::U64, shape, bytes: data.flat_map(u64::to_le_bytes).collect() }
+    }
+
+    /// Of one axis.
+    pub fn u8(name: &str, bytes: Vec<u8>) -> Self {
+        Self { name: name.to_owned(), dtype: Dtype::U8, shape: vec![bytes.len()], bytes }
+    }
+}
+
+/// A file of `arrays`.
+///
+/// # Errors
+/// Two arrays of one name.
+pub fn encode(arrays: &[Array]) -> Result<Vec<u8>, String> {
+    let views: Vec<(&str, TensorView<'_>)> = arrays
+        .iter()
+        .map(|Array { name, dtype, shape, bytes }| Ok((name.as_str(), TensorView::new(*dtype, shape.clone(), bytes)?)))
+        .collect::<Result<_, safetensors::SafeTensorError>>()
+        .map_err(|error| error.to_string())?;
+    let metadata = HashMap::from([("format".to_owned(), "perturb".to_owned())]);
+    safetensors::serialize(views, Some(metadata)).map_err(|error| error.to_string())
+}
+
+/// A file that was read.
+#[derive(Debug)]
+pub struct Arrays<'a>(SafeTensors<'a>);
+
+impl<'a> Arrays<'a> {
+    /// # Errors
+    /// What is wrong with the file.
+    pub fn decode(bytes: &'a [u8]) -> Result<Self, String> {
+        SafeTensors::deserialize(bytes).map(Self).map_err(|error| error.to_string())
+    }
+
+    /// The array `name` with its shape.
+    ///
+    /// # Errors
+    /// If it is not there, or of another type.
+    pub fn f32(&self, name: &str) -> Result<NamedArray, String> {
+        let tensor = self.get(name, Dtype::F32)?;
+        let data = tensor.data().as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+        Ok(NamedArray { name: name.to_owned(), shape: tensor.shape().to_vec(), data })
+    }
+
+    /// The array `name`.
+    ///
+    /// # Errors
+    /// If it is not there, or of another type.
+    pub fn u64(&self, name: &str) -> Result<Vec<u64>, String> {
+        let tensor = self.get(name, Dtype::U64)?;
+        Ok(tensor.data().as_chunks::<8>().0.iter().map(|bytes| u64::from_le_bytes(*bytes)).collect())
+    }
+
+    /// The array `name`.
+    ///
+    /// # Errors
+    /// If it is not there, or of another type.
+    pub fn u8(&self, name: &str) -> Result<&'a [u8], String> {
+        Ok(self.get(name, Dtype::U8)?.data())
+    }
+
+    fn get(&self, name: &str, dtype: Dtype) -> Result<TensorView<'a>, String> {
+        let tensor = self.0.tensor(name).map_err(|error| error.to_string())?;
+        if tensor.dtype() != dtype {
+            return Err(format!("{name} has the type {:?}, expected {dtype:?}", tensor.dtype()));
+        }
+        Ok(tensor)
+    }
+}
+
+pub(super) fn encode_weights(weights: &Weights) -> Result<Vec<u8>, String> {
+    let arrays = weights.iter().map(|array| Array::f32(&array.name, array.shape.clone(), &array.data));
+    encode(&arrays.collect::<Vec<_>>())
+}
+
+pub(super) fn decode_weights(bytes: &[u8], spec: &PolicySpec) -> Result<Weights, String> {
+    spec.validate().map_err(|error| error.to_string())?;
+    let arrays = Arrays::decode(bytes)?;
+    let layout = spec.layout();
+    if arrays.0.len() != layout.len() {
+        return Err(format!("it has {} arrays, expected {}", arrays.0.len(), layout.len()));
+    }
+    let weights = layout.iter().map(|(name, _)| arrays.f32(name)).collect::<Result<Weights, _>>()?;
+    spec.check(&weights).map_err(|error| error.to_string())?;
+    Ok(weights)
+}

@@ -1,0 +1,152 @@
+//! What pictures are drawn on: texts, lines and areas in units.
+
+use plotters::coord::Shift;
+use plotters::element::{DashedPathElement, DynElement};
+use plotters::prelude::*;
+use plotters::style::text_anchor::{HPos, Pos, VPos};
+
+use super::colours::{FRAME, INK, LINES, PAPER};
+use super::{FAMILY, PlotError, WIDTH, drawing, load_font};
+
+/// The size of all texts, as the library counts it: its SVG divides it by 1.24, which is 13.7 units, and in a column of 85 mm
+/// 9.2 pt.
+const TEXT: u32 = 17;
+/// From one line of text to the next.
+pub(super) const LINE: f64 = 18.0;
+/// Beside everything.
+pub(super) const MARGIN: f64 = 8.0;
+/// Where texts begin and end.
+pub(super) const INSIDE: f64 = WIDTH as f64 - 2.0 * MARGIN;
+/// See [`LineStyle::dashes`].
+const DASHES: [Option<(u32, u32)>; 3] = [None, Some((8, 4)), Some((2, 3))];
+/// Frames and ticks.
+pub(super) const TICK: LineStyle = LineStyle { colour: FRAME, width: 1, dashes: None };
+
+/// A place, from the upper left corner.
+pub(super) type Place = (f64, f64);
+
+/// How a line looks; widths and lengths are in units.
+#[derive(Clone, Copy)]
+pub(super) struct LineStyle {
+    pub(super) colour: RGBColor,
+    pub(super) width: u32,
+    /// Dash and gap; none of a whole line.
+    pub(super) dashes: Option<(u32, u32)>,
+}
+
+impl LineStyle {
+    /// Of the `index`th of several lines.
+    pub(super) fn nth(index: usize) -> Self {
+        Self { colour: LINES[index % LINES.len()], width: 2, dashes: DASHES[index % DASHES.len()] }
+    }
+
+    fn along<'a, DB>(self, points: Vec<(i32, i32)>, scale: u32) -> DynElement<'a, DB, (i32, i32)>
+    where
+        DB: DrawingBackend + 'a,
+    {
+        let style = self.colour.stroke_width(self.width * scale);
+        match self.dashes {
+            None => PathElement::new(points, style).into_dyn(),
+            Some((dash, gap)) => DashedPathElement::new(points, dash * scale, gap * scale, style).into_dyn(),
+        }
+    }
+}
+
+/// Where a text's place is: its side or middle.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum Side {
+    Left,
+    Middle,
+    Right,
+}
+
+/// How wide a text is.
+pub(super) fn text_width(text: &str) -> f64 {
+    let known = load_font().ok().and_then(|()| font(1).font.box_size(text).ok());
+    known.map_or(0.6 * f64::from(TEXT) * text.chars().count() as f64, |(width, _)| f64::from(width))
+}
+
+/// Lines that are at most so wide, unless a word is wider.
+pub(super) fn wrapped(text: &str, width: f64) -> Vec<String> {
+    let mut lines: Vec<String> = Vec::new();
+    for word in text.split_whitespace() {
+        match lines.last_mut() {
+            Some(line) if text_width(&format!("{line} {word}")) <= width => *line = format!("{line} {word}"),
+            _ => lines.push(word.to_owned()),
+        }
+    }
+    lines
+}
+
+fn font(scale: u32) -> TextStyle<'static> {
+    (FAMILY, TEXT * scale).into_font().color(&INK)
+}
+
+/// What is drawn on.
+pub(super) struct Canvas<'a, DB: DrawingBackend> {
+    pub(super) area: &'a DrawingArea<DB, Shift>,
+    pub(super) scale: u32,
+}
+
+impl<'a, DB: DrawingBackend> Canvas<'a, DB> {
+    /// An empty one.
+    pub(super) fn new(area: &'a DrawingArea<DB, Shift>, scale: u32) -> Result<Self, PlotError> {
+        area.fill(&PAPER).map_err(drawing)?;
+        Ok(Self { area, scale })
+    }
+
+    /// In the backend's steps.
+    pub(super) fn at(&self, (x, y): Place) -> (i32, i32) {
+        let step = |units: f64| (units * f64::from(self.scale)).round() as i32;
+        (step(x), step(y))
+    }
+
+    /// A text in one line, whose middle is at this height.
+    pub(super) fn text(&self, text: &str, at: Place, side: Side) -> Result<(), PlotError> {
+        let h = [HPos::Left, HPos::Center, HPos::Right][side as usize];
+        // The library's middle of a line of text is that of its letters in an SVG, and lies above them in a PNG.
+        self.styled(text, font(self.scale).pos(Pos::new(h, VPos::Center)), (at.0, at.1 + 1.0))
+    }
+
+    /// The same from below to above, with its middle there.
+    pub(super) fn upright(&self, text: &str, at: Place) -> Result<(), PlotError> {
+        let turned = font(self.scale).transform(FontTransform::Rotate270);
+        self.styled(text, turned.pos(Pos::new(HPos::Center, VPos::Center)), at)
+    }
+
+    fn styled(&self, text: &str, style: TextStyle<'_>, at: Place) -> Result<(), PlotError> {
+        self.area.draw_text(text, &style, self.at(at)).map_err(drawing)
+    }
+
+    /// Lines of text below each other, the first of which begins at `top`; where the next one would.
+    pub(super) fn lines(&self, lines: &[String], (x, top): Place, side: Side) -> Result<f64, PlotError> {
+        for (index, line) in lines.iter().enumerate() {
+            self.text(line, (x, top + LINE * (index as f64 + 0.5)), side)?;
+        }
+        Ok(top + LINE * lines.len() as f64)
+    }
+
+    pub(super) fn rectangle(&self, corners: [Place; 2], style: ShapeStyle) -> Result<(), PlotError> {
+        self.area.draw(&Rectangle::new(corners.map(|corner| self.at(corner)), style)).map_err(drawing)
+    }
+
+    pub(super) fn polygon(&self, corners: &[Place], style: ShapeStyle) -> Result<(), PlotError> {
+        let corners: Vec<_> = corners.iter().map(|corner| self.at(*corner)).collect();
+        self.area.draw(&Polygon::new(corners, style)).map_err(drawing)
+    }
+
+    pub(super) fn line(&self, points: &[Place], style: LineStyle) -> Result<(), PlotError> {
+        let points: Vec<_> = points.iter().map(|point| self.at(*point)).collect();
+        self.area.draw(&style.along(points, self.scale)).map_err(drawing)
+    }
+
+    pub(super) fn circle(&self, at: Place, radius: f64, style: ShapeStyle) -> Result<(), PlotError> {
+        let radius = (radius * f64::from(self.scale)).round() as i32;
+        self.area.draw(&Circle::new(self.at(at), radius, style)).map_err(drawing)
+    }
+
+    /// Width of a stroke.
+    pub(super) fn stroke(&self, colour: RGBColor, width: u32) -> ShapeStyle {
+        colour.stroke_width(width * self.scale)
+    }
+}

@@ -1,0 +1,90 @@
+use super::super::svg;
+use super::*;
+use crate::fixture;
+
+fn panels(heatmaps: &[Heatmap]) -> HeatmapPanels {
+    let (title, axes) = (vec!["Pendulum".to_owned()], heatmaps[0].axes.clone());
+    let column = |heatmap: &Heatmap| HeatmapColumn { caption: "trained on D".into(), content: Ok(heatmap.clone()) };
+    let returns = common_returns("Pendulum", heatmaps.iter());
+    HeatmapPanels { title, axes, returns, columns: heatmaps.iter().map(column).collect() }
+}
+
+/// The surfaces' paths: their colour and how they go, of those that are as wide.
+fn surfaces(shown: &str, width: i32) -> Vec<(&str, &str)> {
+    let lines = shown.lines().filter_map(|line| line.strip_prefix("<path fill=\"")?.split_once('"'));
+    lines.filter(|(_, rest)| rest.contains(&format!("h{width}v"))).collect()
+}
+
+#[test]
+fn a_perfect_policy_has_the_top_colour_everywhere_and_the_worst_the_last() {
+    for (figures, colour) in [((-120.0, 100.0), "#FDE725"), ((-1700.0, 0.0), "#440154")] {
+        let panels = panels(&[fixture::heatmap(5, |_, _| figures)]);
+        let shown = svg(&panels).unwrap();
+        // A line of a panel is as wide as the panel: each surface's five are of one colour.
+        let whole_lines = surfaces(&shown, (panels.size().0 * 4.0).round() as i32);
+        assert_eq!(whole_lines.len(), 2, "mean return and success");
+        for (got, path) in whole_lines {
+            assert_eq!((got, path.matches('M').count()), (colour, 5));
+        }
+    }
+}
+
+#[test]
+fn a_point_has_the_colour_of_its_share_of_the_scale() {
+    // From -1600 to -200: a quarter, and all of it.
+    let heatmap = fixture::heatmap(2, |mass, length| {
+        (if mass < 1.0 { -1250.0 } else { -200.0 }, if length > 1.0 { 75.0 } else { 0.0 })
+    });
+    let panels = panels(&[heatmap]);
+    let shown = svg(&panels).unwrap();
+    let colour = |share: f64| {
+        let RGBColor(r, g, b) = viridis(share);
+        format!("#{r:02X}{g:02X}{b:02X}")
+    };
+    let frame = panels.frame(0, 0.0);
+    let half = (frame.width * 2.0).round() as i32;
+    let left = (frame.left * 4.0).round() as i32;
+    let path_of = |share: f64, width: i32| {
+        let all = surfaces(&shown, width);
+        all.into_iter().find(|(got, _)| *got == colour(share)).map(|(_, path)| path.to_owned())
+    };
+    // Small masses are left.
+    assert!(path_of(0.25, half).unwrap().contains(&format!("M{left} ")));
+    assert!(!path_of(1.0, half).unwrap().contains(&format!("M{left} ")));
+    // Great lengths are above, along the whole panel.
+    assert_eq!(path_of(0.75, 2 * half).unwrap().matches('M').count(), 1);
+}
+
+#[test]
+fn d_r_and_e_stand_side_by_side_with_one_scale_and_unbroken_boxes() {
+    let of = [-1600.0, -900.0, -200.0].map(|value| fixture::heatmap(4, |_, _| (value, 50.0)));
+    let three = panels(&of);
+    let tops: Vec<f64> = (0..3).map(|column| three.frame(column, 7.0).top).collect();
+    assert_eq!((three.rows().count(), tops), (1, vec![7.0; 3]));
+    assert!((0..2).all(|column| three.frame(column, 0.0).right() < three.frame(column + 1, 0.0).left));
+    assert!(three.frame(2, 0.0).right() <= f64::from(WIDTH) - MARGIN);
+    let shown = svg(&three).unwrap();
+    for (name, boxes) in [("#C81E1E", 4), ("#FFFFFF", 1)] {
+        // Of each panel, and the legend's; whole lines in both.
+        let lines =
+            shown.lines().filter(|line| line.contains("<polyline") && line.contains(&format!("stroke=\"{name}\"")));
+        let core = lines.filter(|line| line.contains("stroke-width=\"8\"")).count();
+        assert_eq!(core, 6 * boxes + 1, "{name}");
+    }
+    assert!(!shown.contains("dasharray"));
+    assert_eq!(shown.matches("<circle").count(), 2 * (6 + 1), "the default, in two rings");
+    for name in KEY {
+        assert_eq!(shown.matches(name).count(), 1, "{name}");
+    }
+}
+
+#[test]
+fn many_columns_have_several_rows_and_what_is_missing_says_so() {
+    let mut panels = panels(&vec![fixture::heatmap(2, |_, _| (0.0, 0.0)); 7]);
+    panels.columns[6].content =
+        Err("no heatmap, since this training has no result yet; and why is a long story".into());
+    panels.columns[5].content = Err("not made".into());
+    assert_eq!(panels.rows().map(<[_]>::len).collect::<Vec<_>>(), [3, 3, 1]);
+    let shown = svg(&panels).unwrap();
+    assert_eq!((shown.matches("missing").count(), shown.matches("not made").count()), (2, 2));
+}

@@ -1,0 +1,245 @@
+//! Numbers with their intervals, in groups below each other, and others to compare them with.
+
+use std::ops::Range;
+
+use plotters::coord::Shift;
+use plotters::prelude::*;
+
+use super::canvas::{Canvas, INSIDE, LINE, LineStyle, MARGIN, Place, Side, text_width, wrapped};
+use super::colours::{INK, PAPER};
+use super::frame::{Frame, NUMBERS};
+use super::{Plot, PlotError, WIDTH};
+
+/// How much of the width names have at most.
+const NAMES: f64 = 150.0;
+/// Around what belongs to a row, and a group.
+const GAP: f64 = 5.0;
+/// How far from its row's middle a number is, if there is one to compare it with on the other side.
+const APART: f64 = 4.5;
+/// Of a marker.
+const RADIUS: f64 = 4.0;
+/// An interval has caps of this height on both sides.
+const CAP: f64 = 3.5;
+
+/// Rows in groups that share their x axis.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Intervals {
+    /// Above all.
+    pub(crate) title: String,
+    /// Of the axis.
+    pub(crate) x_name: String,
+    pub(crate) x: Range<f64>,
+    pub(crate) groups: Vec<Group>,
+    /// What a number is, its interval, and one to compare with, for the legend; the last two if there are any.
+    pub(crate) legend: [String; 3],
+    /// Below all.
+    pub(crate) note: String,
+}
+
+/// Rows under a heading.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Group {
+    pub(crate) name: String,
+    pub(crate) rows: Vec<IntervalRow>,
+}
+
+/// A number.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct IntervalRow {
+    pub(crate) name: String,
+    /// Its colour's.
+    pub(crate) index: usize,
+    pub(crate) point: Option<f64>,
+    pub(crate) interval: Option<[f64; 2]>,
+    /// What it is compared with.
+    pub(crate) other: Option<f64>,
+}
+
+impl Plot for Intervals {
+    fn height(&self) -> u32 {
+        let rows: f64 = self.groups.iter().flat_map(|group| &group.rows).map(|row| self.row_height(row)).sum();
+        let texts = self.title_lines().len() + self.groups.len() + 1 + self.entries().len() + self.note_lines().len();
+        let gaps = GAP * (self.groups.len() + 2) as f64;
+        (2.0 * MARGIN + rows + LINE * texts as f64 + gaps + NUMBERS).ceil() as u32
+    }
+
+    fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError> {
+        let canvas = Canvas::new(area, scale)?;
+        let mut top = canvas.lines(&self.title_lines(), (MARGIN, MARGIN), Side::Left)? + GAP;
+        for (index, group) in self.groups.iter().enumerate() {
+            let frame = self.frame(group, top + LINE);
+            canvas.text(&group.name, (frame.left, top + LINE / 2.0), Side::Left)?;
+            canvas.frame(&frame, true)?;
+            let mut above = frame.top;
+            for row in &group.rows {
+                let names = self.name_lines(row);
+                let height = self.row_height(row);
+                let first = above + (height - LINE * names.len() as f64) / 2.0;
+                canvas.lines(&names, (frame.left - 6.0, first), Side::Right)?;
+                self.draw_row(&canvas, &frame, row, above + height / 2.0)?;
+                above += height;
+            }
+            let is_last = index + 1 == self.groups.len();
+            canvas.x_ticks(&frame, is_last)?;
+            top = frame.bottom() + GAP;
+            if is_last {
+                let below = frame.bottom() + NUMBERS + LINE / 2.0;
+                canvas.text(&self.x_name, (frame.middle().0, below), Side::Middle)?;
+                top = below + LINE / 2.0 + GAP;
+            }
+        }
+        for (which, text) in self.entries() {
+            self.draw_entry(&canvas, which, text, top + LINE / 2.0)?;
+            top += LINE;
+        }
+        canvas.lines(&self.note_lines(), (MARGIN, top), Side::Left).map(|_| ())
+    }
+}
+
+impl Intervals {
+    fn title_lines(&self) -> Vec<String> {
+        wrapped(&self.title, INSIDE)
+    }
+
+    fn note_lines(&self) -> Vec<String> {
+        wrapped(&self.note, INSIDE)
+    }
+
+    fn rows(&self) -> impl Iterator<Item = &IntervalRow> {
+        self.groups.iter().flat_map(|group| &group.rows)
+    }
+
+    fn name_lines(&self, row: &IntervalRow) -> Vec<String> {
+        wrapped(&row.name, NAMES)
+    }
+
+    fn row_height(&self, row: &IntervalRow) -> f64 {
+        (LINE * self.name_lines(row).len() as f64).max(LINE + 2.0) + GAP
+    }
+
+    /// As wide as the names leave it.
+    fn frame(&self, group: &Group, top: f64) -> Frame {
+        let names = self.rows().flat_map(|row| self.name_lines(row));
+        let left = MARGIN + names.map(|name| text_width(&name)).fold(0.0, f64::max) + 6.0;
+        let height = group.rows.iter().map(|row| self.row_height(row)).sum();
+        let width = f64::from(WIDTH) - left - MARGIN - 6.0;
+        Frame { left, top, width, height, x: self.x.clone(), y: 0.0..0.0 }
+    }
+
+    fn draw_row<DB: DrawingBackend>(
+        &self,
+        canvas: &Canvas<'_, DB>,
+        frame: &Frame,
+        row: &IntervalRow,
+        y: f64,
+    ) -> Result<(), PlotError> {
+        let style = LineStyle { dashes: None, ..LineStyle::nth(row.index) };
+        let apart = if row.other.is_some() && row.point.is_some() { APART } else { 0.0 };
+        if let Some(interval) = row.interval {
+            draw_interval(canvas, interval.map(|end| frame.x(end)), y - apart, style)?;
+        }
+        match row.point {
+            Some(point) => canvas.circle((frame.x(point), y - apart), RADIUS, style.colour.filled())?,
+            None => canvas.text("missing", (frame.left + 6.0, y), Side::Left)?,
+        }
+        row.other.map_or(Ok(()), |other| draw_other(canvas, (frame.x(other), y + apart)))
+    }
+
+    /// What the legend has.
+    fn entries(&self) -> Vec<(usize, &str)> {
+        let is_there =
+            [true, self.rows().any(|row| row.interval.is_some()), self.rows().any(|row| row.other.is_some())];
+        let entries = self.legend.iter().enumerate().filter(|(which, _)| is_there[*which]);
+        entries.map(|(which, text)| (which, text.as_str())).collect()
+    }
+
+    fn draw_entry<DB: DrawingBackend>(
+        &self,
+        canvas: &Canvas<'_, DB>,
+        which: usize,
+        text: &str,
+        y: f64,
+    ) -> Result<(), PlotError> {
+        let (left, right) = (MARGIN, MARGIN + 30.0);
+        let middle = ((left + right) / 2.0, y);
+        match which {
+            0 => canvas.circle(middle, RADIUS, INK.filled())?,
+            1 => draw_interval(canvas, [left, right], y, LineStyle { colour: INK, width: 2, dashes: None })?,
+            _ => draw_other(canvas, middle)?,
+        }
+        canvas.text(text, (right + 8.0, y), Side::Left)
+    }
+}
+
+fn draw_interval<DB: DrawingBackend>(
+    canvas: &Canvas<'_, DB>,
+    [low, high]: [f64; 2],
+    y: f64,
+    style: LineStyle,
+) -> Result<(), PlotError> {
+    canvas.line(&[(low, y), (high, y)], style)?;
+    [low, high].into_iter().try_for_each(|end| canvas.line(&[(end, y - CAP), (end, y + CAP)], style))
+}
+
+/// A hollow diamond.
+fn draw_other<DB: DrawingBackend>(canvas: &Canvas<'_, DB>, (x, y): Place) -> Result<(), PlotError> {
+    let corners = [(x, y - 5.0), (x + 5.0, y), (x, y + 5.0), (x - 5.0, y)];
+    canvas.polygon(&corners, PAPER.filled())?;
+    let around = [corners[0], corners[1], corners[2], corners[3], corners[0], corners[1]];
+    canvas.line(&around, LineStyle { colour: INK, width: 1, dashes: None })
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use crate::plot::svg;
+
+    pub(crate) fn example() -> Intervals {
+        let row = |name: &str, index: usize, point: f64| IntervalRow {
+            name: name.into(),
+            index,
+            point: Some(point),
+            interval: Some([point - 5.0, point + 5.0]),
+            other: (index == 0).then_some(point - 10.0),
+        };
+        let group = |name: &str| Group {
+            name: name.into(),
+            rows: vec![row("ppo ff", 0, 75.0), row("rl2-ppo rc N=5 (paper, sees the parameters)", 1, 20.0)],
+        };
+        Intervals {
+            title: "CartPole: success rate where policies were trained, and elsewhere".into(),
+            x_name: "success rate, %".into(),
+            x: 0.0..100.0,
+            groups: ["Default", "Extrapolation"].map(group).into(),
+            legend: ["mean over runs".into(), "95 % bootstrap interval".into(), "the paper's mean".into()],
+            note: String::new(),
+        }
+    }
+
+    #[test]
+    fn a_number_stands_at_its_place_and_its_interval_reaches_over_it() {
+        let plot = example();
+        let shown = svg(&plot).unwrap();
+        let frame = plot.frame(&plot.groups[0], 0.0);
+        let at = |value: f64| (4.0 * frame.x(value)).round() as i32;
+        let circle = format!("<circle cx=\"{}\" ", at(75.0));
+        assert_eq!(shown.matches(&circle).count(), 2, "of two groups: {shown}");
+        assert!(shown.contains(&format!("points=\"{},", at(70.0))) && shown.contains(&format!(" {},", at(80.0))));
+        let diamonds = shown.matches("<polygon").count();
+        assert_eq!(diamonds, 3, "two rows are compared, and the legend says what that is");
+        assert!(frame.width > 150.0, "long names leave room");
+    }
+
+    #[test]
+    fn the_legend_has_what_is_there() {
+        let mut plot = example();
+        plot.groups.iter_mut().flat_map(|group| &mut group.rows).for_each(|row| {
+            row.interval = None;
+            row.other = None;
+            row.point = row.point.filter(|point| *point > 50.0);
+        });
+        let shown = svg(&plot).unwrap();
+        assert!(shown.contains("mean over runs") && !shown.contains("bootstrap") && !shown.contains("paper's"));
+        assert_eq!(shown.matches("missing").count(), 2, "a number that there is not is none");
+    }
+}

@@ -1,0 +1,163 @@
+use rstest::rstest;
+
+use super::*;
+use crate::fixture;
+use crate::outcomes::Recorded;
+use crate::plan::{Cell, Plan};
+use crate::report::{Figures, html};
+
+/// Two methods in two environments; the second method fails in one of them.
+fn plan(environments: &str, runs: u32) -> Plan {
+    let text = format!(
+        "# Does it help?\n# We asked.\n\nenvironments = [{environments}]\nruns = {runs}\npreset = 'paper'\n[[algorithm]]\nname = 'a2c'\n\
+         architectures = ['ff']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']"
+    );
+    Plan::parse("test", text).unwrap()
+}
+
+fn rates(cell: &Cell) -> Option<([f64; 3], f64)> {
+    let common = &cell.config.common;
+    let of_run = f64::from(cell.run * cell.run) + if common.environment == "CartPole" { 40.0 } else { 10.0 };
+    let is_missing = cell.config.settings.name() == "ppo" && common.environment == "Pendulum";
+    (!is_missing).then_some(([of_run + 10.0, of_run, of_run / 2.0], 1.0))
+}
+
+fn with_report<T>(plan: &Plan, make: impl FnOnce(&Report<'_>) -> T) -> T {
+    let results = fixture::results(plan, rates);
+    let selections = results.select();
+    make(&Report::new(&results, &selections, &Recorded::default(), &[]))
+}
+
+/// By environment, method, and metric: those columns, as they are written.
+fn written(table: &Table, columns: &[&str]) -> Vec<Vec<String>> {
+    let place = |name: &&str| table.columns.iter().position(|column| column.name == *name).unwrap();
+    let names = ["environment", "algorithm", "metric"].iter().chain(columns);
+    let places: Vec<usize> = names.map(place).collect();
+    let mut rows: Vec<Vec<String>> =
+        table.rows.iter().map(|row| places.iter().map(|&place| row[place].text.clone()).collect()).collect();
+    rows.sort();
+    rows
+}
+
+fn intervals(picture: &Picture) -> &Intervals {
+    let Drawing::Intervals(intervals) = &picture.drawing else { unreachable!("numbers with intervals") };
+    intervals
+}
+
+#[test]
+fn the_findings_numbers_are_those_of_the_tables_and_of_what_is_drawn() {
+    with_report(&plan("'CartPole', 'Pendulum'", 5), |report| {
+        let file = |name: &str| report.files().into_iter().find(|file| file.title == name).unwrap();
+        let (finding, metrics) = (file("finding.csv"), file("metrics.csv"));
+        let columns = ["runs", "mean", "paper_mean"];
+        let close = |a: &str, b: &str| match (a.parse::<f64>(), b.parse::<f64>()) {
+            (Ok(a), Ok(b)) => (a - b).abs() < 1e-9, // sums in another order
+            _ => a == b,
+        };
+        let (ours, theirs) = (written(&finding, &columns), written(&metrics, &columns));
+        assert_eq!(ours.len(), 3 * 3 * 2, "two environments and their average, three metrics, two methods");
+        for (one, other) in ours.iter().zip(&theirs) {
+            assert!(one.iter().zip(other).all(|(a, b)| close(a, b)), "{one:?} {other:?}");
+        }
+
+        let pictures = report.finding_pictures();
+        assert_eq!(pictures.len(), 1);
+        let drawn = intervals(&pictures[0]);
+        assert_eq!(
+            drawn.groups.iter().map(|group| group.name.as_str()).collect::<Vec<_>>(),
+            Metric::ALL.map(|it| it.to_string())
+        );
+        for (group, metric) in drawn.groups.iter().zip(Metric::ALL) {
+            for (row, of) in group.rows.iter().zip(&report.averages) {
+                assert_eq!(row.name, of.method.to_string());
+                assert_eq!(row.other, of.papers.get(&metric).map(|paper| paper.mean));
+                let (ours, point) = (of.ours.get(&metric).map(|ours| ours.mean), row.point);
+                assert!(ours.is_some() == point.is_some() && (ours.unwrap_or(0.0) - point.unwrap_or(0.0)).abs() < 1e-9);
+                assert!(row.point.is_none() == row.interval.is_none(), "five runs have an interval");
+                assert!(row.interval.is_none_or(|[low, high]| low < row.point.unwrap() && row.point.unwrap() < high));
+            }
+        }
+        assert!(drawn.groups.iter().all(|group| group.rows[1].point.is_none()), "PPO has nothing on Pendulum");
+        let each: Vec<_> = report.environment_pictures().into_iter().map(|picture| picture.file).collect();
+        assert_eq!(each, ["CartPole-finding", "Pendulum-finding"]);
+    });
+}
+
+#[rstest]
+#[case(1, Some("No intervals: too few seeds (1 run)."))]
+#[case(3, Some("No intervals: too few seeds (3 runs)."))]
+#[case(4, None)]
+fn too_few_seeds_have_no_interval_and_it_says_so(#[case] runs: u32, #[case] said: Option<&str>) {
+    with_report(&plan("'CartPole'", runs), |report| {
+        let pictures = report.finding_pictures();
+        let drawn = intervals(&pictures[0]);
+        assert_eq!(drawn.note, said.unwrap_or_default());
+        assert_eq!(pictures[0].caption.contains(said.unwrap_or("too few")), said.is_some());
+        assert_eq!(pictures[0].caption.contains("with 95 %"), said.is_none());
+        let rows = drawn.groups.iter().flat_map(|group| &group.rows);
+        assert!(rows.into_iter().all(|row| row.interval.is_some() == said.is_none()));
+    });
+}
+
+#[test]
+fn the_page_opens_with_title_plan_shared_settings_and_the_finding() {
+    let page = |plan: &Plan| with_report(plan, |report| html(report, &Figures::draw(report, &[], &[]).unwrap()));
+    let of_plan = plan("'CartPole'", 4);
+    let opened = page(&of_plan);
+    let order = [
+        "<nav",
+        "<h1>Generalisation of a2c ff (paper) and ppo ff (paper) on CartPole</h1>",
+        "Does it help? We asked.",
+        "<dt>plan</dt><dd><a download=\"plan.toml\" href=\"data:text/plain;charset=utf-8,%23%20Does",
+        "<dt>training</dt><dd>15000 episodes (as the paper) on D, R and E</dd>",
+        "<dt>tests</dt><dd>1000 episodes (as the paper) each, on D, R and E</dd>",
+        "<dt>seeds</dt><dd>seeds 1 to 4 (4 runs)</dd>",
+        "<dt>preset</dt><dd>paper</dd>",
+        "<dt>selection</dt><dd>none: each method has one configuration in each environment</dd>",
+        "<dt>success</dt><dd>as the paper's published code judges</dd>",
+        "<dt>program</dt><dd>perturb 0.1.0 (0123456789ab)</dd>",
+        "aria-label=\"CartPole: Default, Interpolation and Extrapolation of each method\"><svg",
+        "cells are done",
+        "<table",
+    ];
+    let mut rest = opened.as_str();
+    for part in order {
+        rest = rest.split_once(part).unwrap_or_else(|| panic!("{part} is not there, or earlier")).1;
+    }
+    assert!(!opened.contains("<dt>date</dt>"), "no clock is asked");
+    let text = format!("title = 'Wind & wires'\ndate = 2026-11-23\n{}", of_plan.text);
+    let named = page(&Plan::parse("test", text).unwrap());
+    assert!(named.contains("<h1>Wind &amp; wires</h1>") && named.contains("<dt>date</dt><dd>2026-11-23</dd>"));
+}
+
+#[test]
+fn every_figure_has_its_svg_and_its_csv_within_the_page() {
+    let page = with_report(&plan("'CartPole', 'Pendulum'", 2), |report| {
+        html(report, &Figures::draw(report, &[], &[]).unwrap())
+    });
+    let figures: Vec<&str> =
+        page.split("<figure>").skip(1).map(|rest| rest.split_once("</figure>").unwrap().0).collect();
+    assert_eq!(figures.len(), 4, "the average, two environments, profiles");
+    let decoded = |figure: &str, ending: &str| {
+        let (_, rest) = figure.split_once(&format!(".{ending}\" href=\"data:")).unwrap();
+        let (_, content) = rest.split_once(',').unwrap();
+        let content = content.split_once('"').unwrap().0.replace("&amp;", "&");
+        let mut bytes = Vec::new();
+        let mut letters = content.bytes();
+        while let Some(byte) = letters.next() {
+            let digits = |letters: &mut std::str::Bytes<'_>| [letters.next().unwrap(), letters.next().unwrap()];
+            let byte = if byte == b'%' {
+                u8::from_str_radix(std::str::from_utf8(&digits(&mut letters)).unwrap(), 16).unwrap()
+            } else {
+                byte
+            };
+            bytes.push(byte);
+        }
+        String::from_utf8(bytes).unwrap()
+    };
+    for figure in figures {
+        let shown = figure.split_once("<svg").unwrap().1.split_once("</svg>").unwrap().0;
+        assert_eq!(decoded(figure, "svg").trim_end(), format!("<svg{shown}</svg>"), "what is shown");
+        assert!(decoded(figure, "csv").lines().count() > 3);
+    }
+}

@@ -1,0 +1,75 @@
+//! How far a training is, whose episodes grow longer or shorter while it learns: the time is that of its steps.
+
+/// How much of the last stretch the length of an episode is taken from, as opposed to what was known before.
+const RECENT: f64 = 0.3;
+/// So much of all steps must be done before anything is said.
+const LEAST: f64 = 0.01;
+
+/// What was told of a training, in one process, and what follows from it.
+#[derive(Clone, Debug, Default)]
+pub struct Pace {
+    /// Episodes and steps that were done before, …
+    first: Option<(f64, f64)>,
+    /// … and episodes and steps by now.
+    last: (f64, f64),
+    /// Steps of an episode, lately.
+    length: Option<f64>,
+}
+
+impl Pace {
+    /// Takes note of the episodes that there have been, and of their steps; the first time, of those that there were before.
+    pub fn hear(&mut self, episodes: f64, steps: u64) {
+        let steps = steps as f64;
+        if self.first.is_none() {
+            self.first = Some((episodes, steps));
+        } else if episodes > self.last.0 {
+            let length = (steps - self.last.1) / (episodes - self.last.0);
+            self.length = Some(self.length.map_or(length, |known| known + RECENT * (length - known)));
+        } else {
+            return; // it counts with the next episode
+        }
+        self.last = (episodes, steps);
+    }
+
+    /// Episodes that were done before.
+    pub fn begun(&self) -> f64 {
+        self.first.map_or(0.0, |(episodes, _)| episodes)
+    }
+
+    /// What is left of `episodes`, in terms of what was done since the beginning: 1 if it is as much. `None` while that
+    /// cannot be known.
+    pub fn left(&self, episodes: f64) -> Option<f64> {
+        let done = self.last.1 - self.first?.1;
+        let left = (episodes - self.last.0).max(0.0) * self.length?;
+        (done > LEAST * (done + left)).then(|| left / done)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn episodes_that_grow_longer_take_longer() {
+        let mut pace = Pace::default();
+        assert_eq!(pace.left(100.0), None);
+        pace.hear(0.0, 0);
+        assert_eq!(pace.left(100.0), None, "nothing was done yet");
+        pace.hear(10.0, 100);
+        assert_eq!(pace.left(100.0), Some(9.0));
+        (2..=5).for_each(|i| pace.hear(10.0 * f64::from(i), 100 + 1000 * u64::from(i as u32 - 1)));
+        let left = pace.left(100.0).unwrap();
+        // 4100 steps were done; the other half of the episodes takes 5000 at the last length, which is known in part.
+        assert!((0.9..1.22).contains(&left), "{left}");
+        pace.hear(100.0, 9100);
+        assert_eq!(pace.left(100.0), Some(0.0));
+    }
+
+    #[test]
+    fn what_was_done_before_took_no_time_of_this_process() {
+        let mut pace = Pace::default();
+        pace.hear(50.0, 5000);
+        pace.hear(60.0, 6000);
+        assert_eq!((pace.left(100.0), pace.begun()), (Some(4.0), 50.0));
+    }
+}

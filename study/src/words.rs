@@ -1,0 +1,44 @@
+//! Numbers and times as people read them.
+
+/// A number with its digits in groups of three.
+pub fn grouped(number: usize) -> String {
+    let digits = number.to_string();
+    let mut text = String::new();
+    for (i, digit) in digits.chars().enumerate() {
+        if i > 0 && (digits.len() - i).is_multiple_of(3) {
+            text.push(' ');
+        }
+        text.push(digit);
+    }
+    text
+}
+
+/// A time in two of its units.
+pub fn duration(seconds: f64) -> String {
+    let seconds = seconds.round() as u64;
+    let (minutes, hours, days) = (seconds / 60, seconds / 3600, seconds / 86_400);
+    match (days, hours, minutes) {
+        (0, 0, 0) => format!("{seconds} s"),
+        (0, 0, _) => format!("{minutes} min {} s", seconds % 60),
+        (0, _, _) => format!("{hours} h {} min", minutes % 60),
+        (0..1000, _, _) => format!("{days} d {} h", hours % 24),
+        _ => format!("{} years", grouped((days as f64 / 365.25).round() as usize)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn digits_stand_in_groups_of_three() {
+        let shown = [0, 12, 183, 3294, 9882, 49_410, 1_234_567].map(grouped);
+        assert_eq!(shown, ["0", "12", "183", "3 294", "9 882", "49 410", "1 234 567"]);
+    }
+
+    #[test]
+    fn times_have_two_units() {
+        let shown = [0.4, 59.4, 61.0, 3600.0, 90_000.0, 86_400.0 * 400.0, 86_400.0 * 3652.5].map(duration);
+        assert_eq!(shown, ["0 s", "59 s", "1 min 1 s", "1 h 0 min", "1 d 1 h", "400 d 0 h", "10 years"]);
+    }
+}
