@@ -1,6 +1,6 @@
 """Pages of the site that are made from the sources.
 
-Environments, commands, settings, experiment files, protocol, Python.
+Environments, leaderboard, commands, settings, experiment files, protocol, Python.
 
 Each function gives pages by their places in the site, as markdown.
 """
@@ -118,6 +118,40 @@ def environment(entry, filmed):
 
 def channels(entries):
     return [(f"{i} `{c['name']}`", c["unit"], between(c["low"], c["high"])) for i, c in enumerate(entries)]
+
+
+# Leaderboard.
+
+
+def leaderboard():
+    """The trained policies of results/, by environment, those that keep most of their success elsewhere first."""
+    kept = [path.parents[2] / "result.json" for path in Path("results").rglob("cells/*/training/checkpoint")]
+    results = [json.loads(path.read_text()) for path in sorted(kept) if path.exists()]
+    page = (
+        "# Leaderboard\n\nTrained policies that come with the repository: success in % on D, R and E, and the mean of"
+        " the three, by which they stand. Their names are what `perturb video`, `evaluate`, `heatmap` and"
+        " `perturb.load_policy` take, in a clone or with `PERTURB_RESULTS` set to its `results`:\n\n"
+        f"```sh\nperturb video --checkpoint {results[0]['id']} --version D,E --out sheet.png\n```\n\n"
+        "Each row is one seed, tested on as many episodes of each version as it says: differences of few points between"
+        " neighbours mean nothing. What was compared with how many seeds, and the paper's numbers, are in"
+        " [results](results.md); by which rule an episode is a success stands in the files there. Policies that were"
+        " trained elsewhere stand in tables of their own:"
+        " [assess your own agent](tutorials/assess-your-agent.md).\n"
+    )
+    for name in sorted({result["training"]["environment"] for result in results}):
+        rows = [row(result) for result in results if result["training"]["environment"] == name]
+        head = ["policy", "method", "trained on", "episodes", "D", "R", "E", "mean", "test episodes"]
+        page += f"\n## {name}\n\n" + table(head, sorted(rows, key=lambda entries: (-float(entries[-2]), entries)))
+    return {"leaderboard.md": page}
+
+
+def row(result):
+    training, tests = result["training"], result["results"]
+    rates = [tests[version]["success_percent"] for version in "DRE"]
+    method = f"{training['algorithm']} {training['architecture']}"
+    episodes = training["counters"]["episodes"], tests["D"]["episodes"]
+    shown = [f"{rate:.1f}" for rate in [*rates, sum(rates) / 3]]
+    return [f"`{result['id']}`", method, training["version"], episodes[0], *shown, episodes[1]]
 
 
 # Commands.
@@ -362,6 +396,7 @@ def python():
 def pages(programs, folder):
     return {
         **environments(programs, folder),
+        **leaderboard(),
         **commands(programs),
         **settings(programs),
         **experiment_files(),

@@ -85,6 +85,17 @@ def test_an_actor_refuses_what_it_cannot_see(copied: Path) -> None:
         policy.actor(0)
 
 
+def test_a_policy_of_results_is_loaded_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    results = Path(__file__).parents[2] / "results"
+    monkeypatch.setenv("PERTURB_RESULTS", str(results))
+    policy = perturb.load_policy("CartPole-ppo-ff-R-9bd6546b-s7")
+    cell = results / "beyond/confirm-2/cells/CartPole-ppo-ff-R-9bd6546b-s7/training"
+    assert (policy.environment, policy.trained_on) == ("CartPole", "R")
+    assert policy.id == perturb.load_policy(cell).id
+    with pytest.raises(perturb.PolicyError, match=r"could be any of these policies .*-s10, CartPole-ppo-ff-R-9bd6546b-s11"):
+        perturb.load_policy("CartPole-ppo-ff-R")
+
+
 def test_what_is_no_checkpoint_is_refused_with_what_is_wrong(copied: Path, tmp_path: Path) -> None:
     with pytest.raises(perturb.PolicyError, match=r"holds no checkpoint: expected checkpoint\.json"):
         perturb.load_policy(tmp_path / "nothing")

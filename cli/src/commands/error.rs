@@ -115,7 +115,7 @@ impl CommandError {
             )
             | Self::Value(_)
             | Self::Serve(ServeError::NoFolder { .. } | ServeError::Address { .. })
-            | Self::Checkpoint(CheckpointError::Missing { .. })
+            | Self::Checkpoint(CheckpointError::Missing { .. } | CheckpointError::Several { .. })
             | Self::Records(RecordsError::Missing { .. })
             | Self::Folder(FolderError::NoPlan { .. })
             | Self::Video(VideoError::Extension { .. } | VideoError::NoFfmpeg { .. })

@@ -8,6 +8,7 @@
 mod arrays;
 mod environment;
 mod files;
+mod named;
 
 use std::path::{Path, PathBuf};
 
@@ -99,12 +100,22 @@ pub enum CheckpointError {
     /// There is no checkpoint.
     #[error(
         "{} holds no checkpoint: expected checkpoint.json there or in its folder checkpoint/; give the --out of a \
-         training",
+         training, or the name of a policy in results/",
         path.display()
     )]
     Missing {
         /// What was given.
         path: PathBuf,
+    },
+    /// A name is the beginning of several.
+    #[error("`{name}` could be any of these policies in {}, give one of them: {}", folder.display(), names.join(", "))]
+    Several {
+        /// What was given.
+        name: String,
+        /// Where it was looked for.
+        folder: PathBuf,
+        /// What begins so.
+        names: Vec<String>,
     },
     /// A file is damaged, or was written by a program that is too different.
     #[error("{} is not a usable checkpoint: {reason}", path.display())]
@@ -157,12 +168,14 @@ impl Checkpoint {
         Ok(remove_others(directory, &[WEIGHTS_PREFIX, RESUME_PREFIX], &current)?)
     }
 
-    /// Reads the checkpoint in `path`, or in its folder `checkpoint`.
+    /// Reads the checkpoint in `path`, or in its folder `checkpoint`; or that of a cell below `results/`, or where the
+    /// variable `PERTURB_RESULTS` says, whose id is `path` or alone begins with it.
     ///
     /// # Errors
     /// [`CheckpointError`], which names the file.
     pub fn load(path: &Path) -> Result<Self> {
-        let (directory, document) = Document::read(path)?;
+        let named = named::find(path)?;
+        let (directory, document) = Document::read(named.as_deref().unwrap_or(path))?;
         Self::of(&directory, document)
     }
 

@@ -16,7 +16,7 @@ use crate::video::PIXELS;
   perturb evaluate --checkpoint runs/mine --versions E --episodes 200 --json -
   perturb evaluate --checkpoint runs/mine --parameters length=0.1..2.0/20 --records long.parquet")]
 pub struct EvaluateArgs {
-    /// The --out of a training, or the checkpoint folder in it.
+    /// The --out of a training, the checkpoint folder in it, or the name of a policy in results/.
     #[arg(long, value_name = "DIR")]
     pub checkpoint: PathBuf,
     /// Versions to test on, separated by commas [default: D,R,E; none with --parameters or --contexts].
@@ -160,7 +160,7 @@ pub struct HeatmapArgs {
   perturb video --checkpoint runs/mine --version E --episodes 3 --out mine.gif
   perturb video --checkpoint runs/mine --version D,E --episodes 4 --out sheet.png")]
 pub struct VideoArgs {
-    /// The --out of a training, or the checkpoint folder in it.
+    /// The --out of a training, the checkpoint folder in it, or the name of a policy in results/.
     #[arg(long, value_name = "DIR")]
     pub checkpoint: PathBuf,
     /// Where the environment's parameters come from; of several, separated by commas, one after the other, in a contact
