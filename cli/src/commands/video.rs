@@ -11,6 +11,9 @@ use perturb_learner::checkpoint::Checkpoint;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::table::Table;
 
+/// Of a whole episode so many pictures are drawn for a contact sheet, which takes few: a robot's takes some 60 ms.
+const MOMENTS: u32 = 250;
+
 pub(super) fn run(args: &VideoArgs) -> Result<()> {
     let is_sheet = Format::of(&args.out)? == Format::Png;
     if is_sheet && args.fps.is_some() {
@@ -30,7 +33,7 @@ pub(super) fn run(args: &VideoArgs) -> Result<()> {
         seed: args.seed.unwrap_or(checkpoint.state.config.common.seed),
         size: (width, args.height.unwrap_or(width)),
         fps: args.fps,
-        every: 1,
+        every: if is_sheet { (checkpoint.state.environment_spec.step_limit / MOMENTS).max(1) } else { 1 },
     };
     let names: Vec<&str> = options.sets.iter().map(|set| &*set.name).collect();
     let total = args.episodes.saturating_mul(names.len() as u64);

@@ -12,7 +12,8 @@ const ROW: usize = 6;
 const LEAST: usize = 2;
 /// Of an episode so many frames are kept, and half of them forgotten when there are more.
 const KEPT: usize = 64;
-/// Between sets, in pixels; white.
+/// Between moments and between sets, in pixels; white.
+const SEAM: usize = 2;
 const GAP: usize = 8;
 /// The largest sheet: 256 MiB while it is made.
 const MOST_BYTES: usize = 1 << 28;
@@ -30,6 +31,11 @@ impl Grid {
     /// Pictures of an episode.
     fn moments(self) -> usize {
         (ROW / self.sets.max(1)).max(LEAST)
+    }
+
+    /// What they take in a row, in pixels, if each is so wide.
+    fn across(self, width: usize) -> usize {
+        self.moments() * (width + SEAM) - SEAM
     }
 }
 
@@ -53,8 +59,7 @@ pub(super) struct SheetEncoder {
 impl SheetEncoder {
     pub(super) fn new(path: &Path, (width, height): (u32, u32), grid: Grid) -> io::Result<Self> {
         let frame = (width as usize, height as usize);
-        let columns = grid.sets * grid.moments();
-        let across = columns.saturating_mul(frame.0).saturating_add(grid.sets.saturating_sub(1) * GAP);
+        let across = (grid.across(frame.0) + GAP).saturating_mul(grid.sets).saturating_sub(GAP);
         let sheet = (across, frame.1.saturating_mul(grid.episodes));
         let bytes = sheet.0.saturating_mul(sheet.1).saturating_mul(3);
         if bytes > MOST_BYTES {
@@ -73,7 +78,7 @@ impl SheetEncoder {
     fn place(&mut self, frame: &[u8], moment: usize) {
         let (width, height) = self.frame;
         let (set, episode) = (self.done / self.grid.episodes, self.done % self.grid.episodes);
-        let x = (set * self.grid.moments() + moment) * width + set * GAP;
+        let x = set * (self.grid.across(width) + GAP) + moment * (width + SEAM);
         for (row, from) in frame.chunks_exact(3 * width).enumerate() {
             let start = 3 * ((episode * height + row) * self.sheet.0 + x);
             self.pixels[start..start + from.len()].copy_from_slice(from);
@@ -154,13 +159,18 @@ mod tests {
         let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
         reader.next_frame(&mut pixels).unwrap();
         assert_eq!(size, (reader.info().width, reader.info().height));
+        // A seam is as wide as a frame.
         let row = |row: &[u8]| row.chunks(6).map(|frame| frame[0]).collect();
         pixels.chunks(3 * size.0 as usize).map(row).collect()
     }
 
     #[test]
     fn moments_are_evenly_spaced_from_the_first_to_the_last() {
-        let one = |length| sheet(Grid { sets: 1, episodes: 1 }, &[length]).concat();
+        let one = |length| -> Vec<u8> {
+            let row = sheet(Grid { sets: 1, episodes: 1 }, &[length]).concat();
+            assert!(row.iter().skip(1).step_by(2).all(|&seam| seam == 255), "{row:?}");
+            row.into_iter().step_by(2).collect()
+        };
         assert_eq!(one(100), [0, 20, 40, 60, 80, 99], "to a few frames: 19, 39, 59 and 79 are between those kept");
         assert_eq!(one(6), [0, 16, 33, 50, 66, 83]);
         assert_eq!(one(3), [0, 33, 66, 255, 255, 255], "no more than there are");
@@ -173,8 +183,8 @@ mod tests {
     fn sets_stand_side_by_side_and_episodes_below_each_other() {
         let rows = sheet(Grid { sets: 2, episodes: 2 }, &[3, 4, 5, 6]);
         let gap = [255; 4];
-        assert_eq!(rows[0], [&[0, 33, 66][..], &gap, &[0, 40, 80]].concat());
-        assert_eq!(rows[1], [&[0, 25, 75][..], &gap, &[0, 33, 83]].concat());
+        assert_eq!(rows[0], [&[0, 255, 33, 255, 66][..], &gap, &[0, 255, 40, 255, 80]].concat());
+        assert_eq!(rows[1], [&[0, 255, 25, 255, 75][..], &gap, &[0, 255, 33, 255, 83]].concat());
     }
 
     #[test]
