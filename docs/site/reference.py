@@ -125,7 +125,7 @@ def channels(entries):
 
 def leaderboard():
     """The trained policies of results/, by environment, those that keep most of their success elsewhere first."""
-    kept = [path.parents[2] / "result.json" for path in Path("results").rglob("cells/*/training/checkpoint")]
+    kept = [path.parents[1] / "result.json" for path in Path("results").rglob("cells/*/training/checkpoint")]
     results = [json.loads(path.read_text()) for path in sorted(kept) if path.exists()]
     page = (
         "# Leaderboard\n\nTrained policies that come with the repository: success in % on D, R and E, and the mean of"

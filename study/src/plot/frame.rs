@@ -53,11 +53,19 @@ impl Frame {
     }
 
     fn x_ticks(&self) -> Vec<(f64, String)> {
-        let fit = |ticks: &Vec<(f64, String)>| {
-            let widest = ticks.iter().map(|(_, number)| text_width(number)).fold(0.0, f64::max);
-            ticks.windows(2).all(|pair| self.x(pair[1].0) - self.x(pair[0].0) >= widest + BETWEEN)
+        let ends = |tick: &(f64, String)| {
+            let (middle, half) = (self.number(tick), text_width(&tick.1) / 2.0);
+            [middle - half, middle + half]
         };
+        let fit =
+            |ticks: &Vec<(f64, String)>| ticks.windows(2).all(|pair| ends(&pair[1])[0] - ends(&pair[0])[1] >= BETWEEN);
         (1..=MOST).rev().map(|most| round_ticks(&self.x, most)).find(fit).unwrap_or_default()
+    }
+
+    /// The middle of the number below a tick: at an end it stays beside the neighbours' frames.
+    fn number(&self, (value, number): &(f64, String)) -> f64 {
+        let half = text_width(number) / 2.0 - 5.0;
+        self.x(*value).clamp(self.left + half, (self.right() - half).max(self.left + half))
     }
 
     fn y_ticks(&self) -> Vec<(f64, String)> {
@@ -101,15 +109,10 @@ impl<DB: DrawingBackend> Canvas<'_, DB> {
             // A single number would not say how far it is to the next.
             round_ticks(&frame.x, 2).into_iter().try_for_each(|(value, _)| tick(frame.x(value)))?;
         }
-        for (value, number) in ticks {
-            let x = frame.x(value);
-            tick(x)?;
+        for written in ticks {
+            tick(frame.x(written.0))?;
             if numbers {
-                // A number at an end stays beside its neighbours' frames.
-                let half = text_width(&number) / 2.0;
-                let inside =
-                    x.clamp(frame.left + half - 5.0, (frame.right() - half + 5.0).max(frame.left + half - 5.0));
-                self.text(&number, (inside, bottom + 5.0 + LINE / 2.0), Side::Middle)?;
+                self.text(&written.1, (frame.number(&written), bottom + 5.0 + LINE / 2.0), Side::Middle)?;
             }
         }
         Ok(())

@@ -279,10 +279,17 @@ impl<DB: DrawingBackend> Canvas<'_, DB> {
 
     /// A box, in one line within another.
     fn outline(&self, [(left, top), (right, bottom)]: [Place; 2], lines: [LineStyle; 2]) -> Result<(), PlotError> {
-        // A closed path has no first corner without its other half.
-        let around =
-            [(left, top), (right, top), (right, bottom), (left, bottom), (left, top), ((left + right) / 2.0, top)];
-        lines.into_iter().try_for_each(|line| self.line(&around, line))
+        for line in lines {
+            // Each side by itself, with the corners: a path around would not be closed, in a PNG.
+            let half = f64::from(line.width) / 2.0;
+            for y in [top, bottom] {
+                self.line(&[(left - half, y), (right + half, y)], line)?;
+            }
+            for x in [left, right] {
+                self.line(&[(x, top - half), (x, bottom + half)], line)?;
+            }
+        }
+        Ok(())
     }
 
     /// The default: a ring in black within a white one.

@@ -1,4 +1,4 @@
-use super::super::svg;
+use super::super::{PNG_SCALE, svg};
 use super::*;
 use crate::fixture;
 
@@ -69,12 +69,38 @@ fn d_r_and_e_stand_side_by_side_with_one_scale_and_unbroken_boxes() {
         let lines =
             shown.lines().filter(|line| line.contains("<polyline") && line.contains(&format!("stroke=\"{name}\"")));
         let core = lines.filter(|line| line.contains("stroke-width=\"8\"")).count();
-        assert_eq!(core, 6 * boxes + 1, "{name}");
+        assert_eq!(core, 4 * (6 * boxes + 1), "{name}");
     }
     assert!(!shown.contains("dasharray"));
     assert_eq!(shown.matches("<circle").count(), 2 * (6 + 1), "the default, in two rings");
     for name in KEY {
         assert_eq!(shown.matches(name).count(), 1, "{name}");
+    }
+}
+
+/// Each pixel of a PNG along the sides of a box has the colour of its inner line.
+#[test]
+fn boxes_are_whole_in_a_png() {
+    const SIZE: (u32, u32) = (60, 50);
+    let mut pixels = vec![90; (3 * SIZE.0 * SIZE.1 * PNG_SCALE * PNG_SCALE) as usize];
+    {
+        let area =
+            BitMapBackend::with_buffer(&mut pixels, (SIZE.0 * PNG_SCALE, SIZE.1 * PNG_SCALE)).into_drawing_area();
+        Canvas::new(&area, PNG_SCALE).unwrap().outline([(10.0, 10.0), (50.0, 40.0)], RANDOM).unwrap();
+        area.present().unwrap();
+    }
+    let at = |x: u32, y: u32| {
+        let start = (3 * (y * SIZE.0 * PNG_SCALE + x)) as usize;
+        [pixels[start], pixels[start + 1], pixels[start + 2]]
+    };
+    let [left, top, right, bottom] = [10, 10, 50, 40].map(|side| side * PNG_SCALE);
+    let along = (left..=right).flat_map(|x| [(x, top), (x, bottom)]);
+    for (x, y) in along.chain((top..=bottom).flat_map(|y| [(left, y), (right, y)])) {
+        assert_eq!(at(x, y), [255; 3], "{x}, {y}");
+    }
+    let outer = (left..=right).flat_map(|x| [(x, top - 5), (x, bottom + 5)]);
+    for (x, y) in outer.chain((top..=bottom).flat_map(|y| [(left - 5, y), (right + 5, y)])) {
+        assert_eq!(at(x, y), [0; 3], "{x}, {y}");
     }
 }
 
