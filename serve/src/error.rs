@@ -12,7 +12,7 @@ use perturb_study::files::FileError;
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum ServeError {
     /// There is nothing to show.
-    #[error("there is no folder {}: give the one that your runs are in", path.display())]
+    #[error("{}", perturb_study::runs::no_folder(path))]
     NoFolder { path: PathBuf },
     /// It may not be read.
     #[error(transparent)]

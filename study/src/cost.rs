@@ -134,9 +134,7 @@ pub fn estimates(plan: &Plan, measurements: &[Measurement], step_limits: &HashMa
         let speed = *speeds.entry(pair.clone()).or_insert_with(|| speed_of(&pair, measurements));
         let limit = f64::from(step_limits.get(pair.0).copied().unwrap_or_default());
         let training_steps = generated_episodes(&cell.config, cell.config.common.episodes) * limit;
-        let times = cell.tests.sets.len() as u64 * (1 + cell.tests.marks.len() as u64);
-        let trials = cell.tests.episodes * times + cell.tests.selection.unwrap_or_default();
-        let testing_steps = (trials * u64::from(cell.config.settings.episodes_per_trial())) as f64 * limit;
+        let testing_steps = tested_episodes(cell) * limit;
         Estimate {
             training_steps,
             testing_steps,
@@ -157,6 +155,13 @@ pub fn generated_episodes(config: &TrainConfig, counted: u64) -> f64 {
     let Wrapper::Epopt(epopt) = &config.settings.wrapper else { return budget };
     let full = (epopt.full_iterations as f64 * epopt.episodes_per_iteration as f64).min(budget);
     full + (budget - full) / epopt.epsilon
+}
+
+/// How many episodes the tests of a cell have, of RL² those of whole trials.
+pub fn tested_episodes(cell: &Cell) -> f64 {
+    let times = cell.tests.sets.len() as f64 * (1.0 + cell.tests.marks.len() as f64);
+    let trials = cell.tests.episodes as f64 * times + cell.tests.selection.unwrap_or_default() as f64;
+    trials * f64::from(cell.config.settings.episodes_per_trial())
 }
 
 /// A pair's speed: measured, or the method's in another environment plus what this environment takes more.

@@ -2,12 +2,22 @@
 
 use std::fs::{self, File, TryLockError};
 use std::io::{ErrorKind, Write};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use serde::Serialize;
 
+mod plain;
+
+pub use self::plain::{Stamp, leads_out, open_plain, read_plain, read_plain_text};
+
 /// What files begin with that a write has not finished.
 pub const TEMPORARY_PREFIX: &str = ".tmp-";
+/// Whoever finds a lock taken by somebody who only looks tries so often …
+const TRIES: u32 = 100;
+/// … and waits so long in between: looking takes some microseconds.
+const LOOK: Duration = Duration::from_millis(1);
 
 /// The operating system refused a file.
 #[derive(Debug, thiserror::Error)]
@@ -55,12 +65,12 @@ pub fn read_text(path: &Path) -> Result<String> {
     fs::read_to_string(path).map_err(io("read", path))
 }
 
-/// A file's content; `None` if it is not there.
+/// A plain file's content; `None` if it is not there.
 ///
 /// # Errors
-/// The operating system's.
+/// The operating system's; a pipe or a device, and what is larger than anything that a run writes.
 pub fn read_if_there(path: &Path) -> Result<Option<Vec<u8>>> {
-    if_there(fs::read(path)).map_err(io("read", path))
+    read_plain(path, plain::MOST)
 }
 
 /// Creates a folder and those above it, unless they are there.
@@ -178,7 +188,7 @@ impl Drop for Lock {
 
 impl Lock {
     /// Takes the lock of the folder at `path`, or of a file, which is created if it is not there; `None` while somebody
-    /// else has it.
+    /// else has it. Who only asks whether [somebody has it](is_locked) does not count.
     ///
     /// # Errors
     /// The operating system's.
@@ -189,17 +199,28 @@ impl Lock {
             File::options().create(true).truncate(false).write(true).open(path)
         };
         let file = file.map_err(io("open", path))?;
-        match file.try_lock() {
-            Ok(()) => Ok(Some(Self(file))),
-            Err(TryLockError::WouldBlock) => Ok(None),
-            Err(TryLockError::Error(source)) => Err(io("lock", path)(source)),
+        for _ in 0..TRIES {
+            match file.try_lock() {
+                Ok(()) => return Ok(Some(Self(file))),
+                Err(TryLockError::WouldBlock) => {}
+                Err(TryLockError::Error(source)) => return Err(io("lock", path)(source)),
+            }
+            // Who has it shares it with nobody; who only looks shares it with anybody.
+            match file.try_lock_shared() {
+                Ok(()) => file.unlock().map_err(io("unlock", path))?,
+                Err(TryLockError::WouldBlock) => return Ok(None),
+                Err(TryLockError::Error(source)) => return Err(io("lock", path)(source)),
+            }
+            std::thread::sleep(LOOK);
         }
+        Ok(None)
     }
 }
 
-/// Whether somebody has the lock of the folder or file at `path`. Whoever takes it in this very moment is refused.
+/// Whether somebody has the lock of the folder or file at `path`. It is shared for a moment, which
+/// [keeps nobody from taking it](Lock::try_take).
 pub fn is_locked(path: &Path) -> bool {
-    let Ok(file) = File::open(path) else { return false };
+    let Ok(file) = File::options().read(true).custom_flags(plain::nonblocking()).open(path) else { return false };
     matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock))
 }
 
@@ -260,6 +281,31 @@ mod tests {
         delete(&path).unwrap();
         let error = read(&path).unwrap_err().to_string();
         assert!(error.starts_with("cannot read ") && error.contains("/nothing: No such file"), "{error}");
+    }
+
+    #[test]
+    fn a_lock_is_had_while_others_look_whether_it_is_taken() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("lock");
+        drop(Lock::try_take(&path).unwrap());
+        let end = std::sync::atomic::AtomicBool::new(false);
+        let refused = std::thread::scope(|scope| {
+            for _ in 0..2 {
+                scope.spawn(|| {
+                    while !end.load(std::sync::atomic::Ordering::Relaxed) {
+                        is_locked(&path);
+                    }
+                });
+            }
+            let refused = (0..2000).filter(|_| Lock::try_take(&path).unwrap().is_none()).count();
+            end.store(true, std::sync::atomic::Ordering::Relaxed);
+            refused
+        });
+        assert_eq!(refused, 0);
+        let _lock = Lock::try_take(&path).unwrap().unwrap();
+        let begun = std::time::Instant::now();
+        assert!(Lock::try_take(&path).unwrap().is_none());
+        assert!(begun.elapsed() < Duration::from_millis(50), "who has it is not waited for");
     }
 
     #[test]

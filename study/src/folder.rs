@@ -31,6 +31,8 @@ use crate::{Method, TestResult, Version};
 
 /// Of `result.json`; raised when older programs could misread it.
 const FORMAT_VERSION: u32 = 1;
+/// A record of a cell is shorter, bytes.
+const LONGEST: u64 = 64 << 20;
 
 /// The folder of an experiment.
 #[derive(Clone, Debug)]
@@ -377,7 +379,7 @@ impl CellResult {
 
 /// A JSON file; `None` if it is not there.
 pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
-    let Some(text) = files::read_if_there(path)? else { return Ok(None) };
+    let Some(text) = files::read_plain(path, LONGEST)? else { return Ok(None) };
     let damaged = |error: serde_json::Error| FolderError::Damaged { path: path.to_owned(), reason: error.to_string() };
     serde_json::from_slice(&text).map(Some).map_err(damaged)
 }

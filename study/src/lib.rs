@@ -47,7 +47,7 @@ mod verify;
 pub mod words;
 
 pub use assessed::{ASSESSMENT, Assessed, AssessedError, AssessedPolicy, Known, add_assessed};
-pub use cost::{Estimate, Measurement, Speed, Taken, estimates, generated_episodes, representatives};
+pub use cost::{Estimate, Measurement, Speed, Taken, estimates, generated_episodes, representatives, tested_episodes};
 pub use curves::{Curve, EnvironmentCurves, Footing, Point, curves_table, read_curves};
 pub use folder::{
     CellFolder, CellResult, CellState, Failure, FailureMark, Folder, FolderError, MarkResult, Timing, Training,

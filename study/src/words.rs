@@ -1,4 +1,4 @@
-//! Numbers and times as people read them.
+//! Numbers, times and long texts as people read them.
 
 /// A number with its digits in groups of three.
 pub fn grouped(number: usize) -> String {
@@ -26,6 +26,19 @@ pub fn duration(seconds: f64) -> String {
     }
 }
 
+/// Of a text that anybody may have written: no more than anybody reads, characters.
+const LONGEST: usize = 300;
+
+/// A text, of a long one the beginning.
+pub fn shortened(text: impl Into<String>) -> String {
+    let mut text = text.into();
+    if let Some((end, _)) = text.char_indices().nth(LONGEST) {
+        text.truncate(end);
+        text.push_str(" …");
+    }
+    text
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -34,6 +47,13 @@ mod tests {
     fn digits_stand_in_groups_of_three() {
         let shown = [0, 12, 183, 3294, 9882, 49_410, 1_234_567].map(grouped);
         assert_eq!(shown, ["0", "12", "183", "3 294", "9 882", "49 410", "1 234 567"]);
+    }
+
+    #[test]
+    fn of_a_long_text_the_beginning_is_shown() {
+        let [short, long] = [300, 301].map(|length| "ü".repeat(length));
+        assert_eq!(shortened(&*short), short);
+        assert_eq!(shortened(long), short + " …");
     }
 
     #[test]

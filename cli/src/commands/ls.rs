@@ -4,14 +4,13 @@ use std::io::Write;
 
 use super::args::LsArgs;
 use super::error::{CommandError, Result};
-use perturb_study::runs::{RunSummary, places};
+use perturb_study::runs::{RunSummary, no_folder, places};
 use perturb_study::table::Table;
 use perturb_study::words::grouped;
 
 pub(super) fn run(args: &LsArgs) -> Result<()> {
     if !args.dir.is_dir() {
-        let message = format!("there is no folder {}: give the one that your runs are in", args.dir.display());
-        return Err(CommandError::Usage(message));
+        return Err(CommandError::Usage(no_folder(&args.dir)));
     }
     let found: Vec<RunSummary> = places(&args.dir, usize::MAX)?.runs.iter().map(RunSummary::read).collect();
     let mut out = std::io::stdout();

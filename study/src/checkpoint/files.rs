@@ -36,6 +36,20 @@ impl ArraysFile {
         directory.join(Path::new(&self.file).file_name().unwrap_or_default())
     }
 
+    /// Makes sure that it is there, and as long as it was written.
+    ///
+    /// # Errors
+    /// [`CheckpointError`].
+    pub(super) fn require(&self, directory: &Path) -> Result<()> {
+        let path = self.path(directory);
+        let length = std::fs::metadata(&path).map_err(files::io("read", &path))?.len();
+        if length == self.bytes {
+            Ok(())
+        } else {
+            Err(damaged(&path, format!("it has {length} bytes, expected {}", self.bytes)))
+        }
+    }
+
     /// Its content.
     ///
     /// # Errors

@@ -194,10 +194,7 @@ impl Checkpoint {
 
     /// What `document` in `directory` describes.
     fn of(directory: &Path, document: Document) -> Result<Self> {
-        let json = directory.join(JSON);
-        let state: State = serde_json::from_value(document.rest)
-            .map_err(|error| damaged(&json, format!("it is not understood: {error}")))?;
-        state.check().map_err(|reason| damaged(&json, reason))?;
+        let state = State::of(directory, document.rest)?;
         let policy = state.policy();
         let bytes = document.weights.read(directory)?;
         let file = document.weights.path(directory);
@@ -244,6 +241,34 @@ impl Checkpoint {
 }
 
 impl State {
+    /// Reads that of the checkpoint in `path`, or in its folder `checkpoint`. Of the weights it is only looked whether they
+    /// are there.
+    ///
+    /// # Errors
+    /// [`CheckpointError`], which names the file.
+    pub fn load(path: &Path) -> Result<Self> {
+        let load = || {
+            let (directory, document) = Document::read(path)?;
+            let state = Self::of(&directory, document.rest)?;
+            document.weights.require(&directory)?;
+            Ok(state)
+        };
+        match load() {
+            // A training may have written the next one meanwhile, and deleted the weights of this one.
+            Err(CheckpointError::File(_)) => load(),
+            loaded => loaded,
+        }
+    }
+
+    /// What `checkpoint.json` in `directory` says.
+    fn of(directory: &Path, document: serde_json::Value) -> Result<Self> {
+        let json = directory.join(JSON);
+        let state: Self = serde_json::from_value(document)
+            .map_err(|error| damaged(&json, format!("it is not understood: {error}")))?;
+        state.check().map_err(|reason| damaged(&json, reason))?;
+        Ok(state)
+    }
+
     /// Whether the statistics are those that the configuration asks for; says what is wrong if they are not.
     fn check(&self) -> std::result::Result<(), String> {
         let (common, gamma) = (&self.config.common, self.config.settings.gamma());
@@ -325,7 +350,8 @@ impl Document {
             .find(|directory| directory.join(JSON).is_file())
             .ok_or_else(|| CheckpointError::Missing { path: path.to_owned() })?;
         let json = directory.join(JSON);
-        let text = crate::files::read(&json)?;
+        let text = crate::files::read_if_there(&json)?;
+        let text = text.ok_or_else(|| CheckpointError::Missing { path: path.to_owned() })?;
         let not_understood = |error: serde_json::Error| damaged(&json, format!("it is not understood: {error}"));
         let value: serde_json::Value = serde_json::from_slice(&text).map_err(not_understood)?;
         let document = Self::deserialize(&value).map_err(not_understood)?;

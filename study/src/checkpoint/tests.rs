@@ -76,6 +76,23 @@ fn what_is_saved_is_loaded_bit_for_bit_from_the_run_or_its_folder() {
 }
 
 #[test]
+fn the_state_is_read_without_the_weights_which_must_be_there() {
+    let run = tempfile::tempdir().unwrap();
+    let (saved, directory) = (checkpoint(1, 1), run.path().join("checkpoint"));
+    saved.save(&directory, None).unwrap();
+    assert_eq!(State::load(run.path()).unwrap(), saved.state);
+    let weights = files::list(&directory).unwrap().into_iter().find(|path| !path.ends_with(JSON));
+    let weights = weights.unwrap();
+    let length = std::fs::metadata(&weights).unwrap().len();
+    std::fs::write(&weights, vec![0; length as usize]).unwrap();
+    assert_eq!(State::load(run.path()).unwrap(), saved.state, "they are not looked into");
+    std::fs::write(&weights, "x").unwrap();
+    assert!(State::load(run.path()).unwrap_err().to_string().contains("it has 1 bytes, expected"));
+    std::fs::remove_file(&weights).unwrap();
+    assert!(State::load(run.path()).unwrap_err().to_string().contains("cannot read"));
+}
+
+#[test]
 fn damage_is_named() {
     let empty = tempfile::tempdir().unwrap();
     assert!(Checkpoint::load(empty.path()).unwrap_err().to_string().contains("holds no checkpoint"));

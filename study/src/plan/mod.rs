@@ -337,6 +337,11 @@ impl Cell {
         self.set.as_deref().map_or(TrainedOn::Version(self.config.common.version), TrainedOn::Set)
     }
 
+    /// What it is one of, over settings and runs: "CartPole ppo ff, trained on R".
+    pub fn described(&self) -> String {
+        format!("{} {}, trained on {}", self.config.common.environment, self.method(), self.trained_on())
+    }
+
     /// The test that selects and nothing else, if it has one.
     pub fn selection_test(&self) -> Option<(TestSet, u64)> {
         let parameters = Contexts::Drawn(self.config.common.parameters.clone());

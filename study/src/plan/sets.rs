@@ -7,6 +7,7 @@ use toml::{Table, Value};
 
 use super::file::is_plain;
 use crate::Version;
+use crate::files::read_if_there;
 use crate::sets::{Assignment, TestSet, set_of, set_of_csv};
 use crate::value_error::{ValueError, require};
 
@@ -73,5 +74,9 @@ fn content(file: &str, folder: &Path) -> Result<Vec<u8>, String> {
         return Err(format!("`{file}`, which is not the name of a file .csv"));
     }
     let path = folder.join(file);
-    std::fs::read(&path).map_err(|error| format!("`{}`, which cannot be read ({error})", path.display()))
+    let refused = |reason: &dyn std::fmt::Display| format!("`{}`, which cannot be read ({reason})", path.display());
+    match read_if_there(&path) {
+        Ok(content) => content.ok_or_else(|| refused(&std::io::Error::from(std::io::ErrorKind::NotFound))),
+        Err(error) => Err(refused(&error.source)),
+    }
 }

@@ -1,14 +1,19 @@
 //! How far an experiment is.
 
-use std::fs::Metadata;
-use std::os::unix::fs::MetadataExt;
-use std::path::Path;
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
 
-use super::RunSummary;
-use crate::files::is_locked;
+use super::{LONGEST_TEXT, RunSummary};
+use crate::files::{Stamp, is_locked, leads_out, list, read_plain_text};
 use crate::plan::{Cell, Plan};
 use crate::scheduler::{Rate, Rates};
-use crate::{AnyError, CellResult, CellState, Folder, Taken, mean};
+use crate::words::{grouped, shortened};
+use crate::{AnyError, CellResult, CellState, Folder, FolderError, Taken, mean};
+
+/// Of more cells it is not followed how far they are.
+const MOST_FOLLOWED: usize = 50_000;
+/// What stands in the place of anything that is behind a link out of the folder that may be shown.
+pub const LEADS_OUT: &str = "a link that leads out of the folder";
 
 /// An experiment, as its folder has it.
 #[derive(Clone, Debug)]
@@ -21,6 +26,10 @@ pub struct ExperimentStatus {
     pub cells: Vec<CellStatus>,
     /// Of plan.toml, as it was read.
     stamp: Option<Stamp>,
+    /// Of each cell's result and failure, as they were read.
+    records: Vec<Records>,
+    /// What links may not lead out of.
+    within: Option<PathBuf>,
 }
 
 /// How far a cell is.
@@ -41,16 +50,9 @@ pub enum CellStatus {
     },
 }
 
-/// Tells a file from what it was.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Stamp(u64, i64, i64, u64);
-
-impl Stamp {
-    fn of(path: &Path) -> Option<Self> {
-        let of = |file: Metadata| Self(file.ino(), file.mtime(), file.mtime_nsec(), file.len());
-        std::fs::metadata(path).ok().map(of)
-    }
-}
+/// Of `result.json` and `failure.json`.
+type Records = [Option<Stamp>; 2];
+const RECORDS: [&str; 2] = ["result.json", "failure.json"];
 
 impl ExperimentStatus {
     /// Of the experiment in `path`.
@@ -58,34 +60,68 @@ impl ExperimentStatus {
     /// # Errors
     /// If the plan cannot be read.
     pub fn read(path: &Path) -> Result<Self, AnyError> {
-        let folder = Folder::new(path);
-        let stamp = Stamp::of(&folder.plan_path());
-        let plan = Plan::load(&folder.require_plan()?)?.in_folder(&folder)?;
-        let cells = plan.cells.iter().map(|cell| status(&folder, cell)).collect();
-        Ok(Self { folder, plan, cells, stamp })
+        Self::with(path, None)
     }
 
-    /// Looks again, at what may have changed: cells that were not settled, and the plan. A cell that is done stays so.
+    /// The same to be followed and shown to others: nothing is read that is behind a link out of `root`, in which `path`
+    /// is, itself without links.
+    ///
+    /// # Errors
+    /// If the plan cannot be read, leads out, or has too many cells.
+    pub fn read_within(path: &Path, root: &Path) -> Result<Self, AnyError> {
+        Self::with(path, Some(root.to_owned()))
+    }
+
+    fn with(path: &Path, within: Option<PathBuf>) -> Result<Self, AnyError> {
+        let folder = Folder::new(path);
+        let stamp = Stamp::of(&folder.plan_path());
+        let plan = read_plan(&folder, within.as_deref())?;
+        let (records, cells) = plan.cells.iter().map(|cell| known(&folder, cell, within.as_deref())).unzip();
+        Ok(Self { folder, plan, cells, stamp, records, within })
+    }
+
+    /// Looks again, at what may have changed: the plan, and cells with another result or failure than before, or none.
     ///
     /// # Errors
     /// If the plan cannot be read.
     pub fn refresh(&mut self) -> Result<(), AnyError> {
-        let settled = |cells: &[CellStatus]| cells.iter().filter(|cell| cell.is_settled()).count();
-        let before = settled(&self.cells);
         if Stamp::of(&self.folder.plan_path()) != self.stamp {
-            *self = Self::read(self.folder.path())?;
+            *self = Self::with(self.folder.path(), self.within.clone())?;
             return Ok(());
         }
-        for (cell, known) in self.plan.cells.iter().zip(&mut self.cells) {
-            if !matches!(known, CellStatus::Done(_)) || !self.folder.cell(&cell.id).is_settled(false) {
-                *known = status(&self.folder, cell);
+        let before = self.count(CellStatus::is_settled);
+        for (place, cell) in self.plan.cells.iter().enumerate() {
+            let records = records(&self.folder, cell);
+            if records != self.records[place] || !self.cells[place].is_settled() {
+                self.cells[place] = status(&self.folder, cell, records, self.within.as_deref());
+                self.records[place] = records;
             }
         }
         // What is selected may have become known.
-        if !self.plan.candidates.is_empty() && settled(&self.cells) != before {
-            *self = Self::read(self.folder.path())?;
+        if !self.plan.candidates.is_empty() && self.count(CellStatus::is_settled) != before {
+            self.replan()?;
         }
         Ok(())
+    }
+
+    /// Reads the plan again; cells that it had are as they were.
+    fn replan(&mut self) -> Result<(), AnyError> {
+        let within = self.within.as_deref();
+        let plan = read_plan(&self.folder, within)?;
+        let had = self.plan.cells.iter().map(|cell| cell.id.clone());
+        let had = had.zip(self.records.drain(..).zip(self.cells.drain(..)));
+        let mut had: HashMap<String, (Records, CellStatus)> = had.collect();
+        let all =
+            plan.cells.iter().map(|cell| had.remove(&cell.id).unwrap_or_else(|| known(&self.folder, cell, within)));
+        (self.records, self.cells) = all.unzip();
+        self.plan = plan;
+        Ok(())
+    }
+
+    /// When its plan, a result or a failure last changed, s since 1970.
+    pub fn changed(&self) -> i64 {
+        let stamps = self.records.iter().flatten().chain([&self.stamp]).flatten();
+        stamps.map(Stamp::seconds).max().unwrap_or_default()
     }
 
     /// How many cells are as `is` says.
@@ -147,13 +183,73 @@ impl CellStatus {
     }
 }
 
-fn status(folder: &Folder, cell: &Cell) -> CellStatus {
+fn read_plan(folder: &Folder, within: Option<&Path>) -> Result<Plan, AnyError> {
+    let path = folder.require_plan()?;
+    if let Some(root) = within {
+        let out = |name: &Path| leads_out(root, folder.path(), name);
+        let tables =
+            list(folder.path())?.into_iter().filter(|path| path.extension().is_some_and(|ending| ending == "csv"));
+        let names =
+            tables.filter_map(|path| Some(path.file_name()?.into())).chain(["plan.toml", "cells"].map(PathBuf::from));
+        for name in names {
+            if out(&name) {
+                return Err(format!("{} is {LEADS_OUT}", name.display()).into());
+            }
+        }
+    }
+    let plan = Plan::parse(&path.display().to_string(), read_plain_text(&path, LONGEST_TEXT)?)?;
+    if within.is_some() && plan.cells.len() > MOST_FOLLOWED {
+        let (cells, most) = (grouped(plan.cells.len()), grouped(MOST_FOLLOWED));
+        return Err(
+            format!("its {cells} cells are too many to follow, expected {most} at most; ask `perturb ls`").into()
+        );
+    }
+    if let Some(root) = within.filter(|_| !plan.candidates.is_empty()) {
+        for cell in &plan.cells {
+            require_within(folder, cell, root)?; // results say which candidates become cells
+        }
+    }
+    Ok(plan.in_folder(folder)?)
+}
+
+/// Refuses a cell whose records are behind a link that leads out.
+fn require_within(folder: &Folder, cell: &Cell, root: &Path) -> Result<(), String> {
+    let place = Path::new("cells").join(&cell.id);
+    let out = RECORDS.into_iter().find(|name| leads_out(root, folder.path(), place.join(name)));
+    out.map_or(Ok(()), |name| Err(format!("{} is {LEADS_OUT}", place.join(name).display())))
+}
+
+fn records(folder: &Folder, cell: &Cell) -> Records {
     let place = folder.cell(&cell.id);
+    RECORDS.map(|name| Stamp::of(&place.path().join(name)))
+}
+
+fn known(folder: &Folder, cell: &Cell, within: Option<&Path>) -> (Records, CellStatus) {
+    let records = records(folder, cell);
+    (records, status(folder, cell, records, within))
+}
+
+/// How far a cell is that has these records.
+fn status(folder: &Folder, cell: &Cell, records: Records, within: Option<&Path>) -> CellStatus {
+    let place = folder.cell(&cell.id);
+    if records == [None; 2] {
+        let begun = place.path().is_dir();
+        return match begun && is_locked(&place.path().join("lock")) {
+            true => CellStatus::InWork,
+            false => CellStatus::Waiting { begun },
+        };
+    }
+    if let Some(Err(reason)) = within.map(|root| require_within(folder, cell, root)) {
+        return CellStatus::NotUnderstood(reason);
+    }
     match place.state() {
         Ok(CellState::Done(result)) => CellStatus::Done(result),
-        Ok(CellState::Failed(failure)) => CellStatus::Failed(failure.reason),
-        Ok(CellState::Missing) if is_locked(&place.path().join("lock")) => CellStatus::InWork,
-        Ok(CellState::Missing) => CellStatus::Waiting { begun: place.path().is_dir() },
+        Ok(CellState::Failed(failure)) => CellStatus::Failed(shortened(failure.reason)),
+        Ok(CellState::Missing) => CellStatus::Waiting { begun: true }, // deleted in this moment
+        Err(FolderError::Damaged { path, reason }) => {
+            let reason = shortened(reason);
+            CellStatus::NotUnderstood(FolderError::Damaged { path, reason }.to_string())
+        }
         Err(error) => CellStatus::NotUnderstood(error.to_string()),
     }
 }
@@ -205,8 +301,57 @@ mod tests {
         std::fs::remove_dir_all(places[0].path()).unwrap();
         status.refresh().unwrap();
         assert_eq!(status.cells[0], CellStatus::Waiting { begun: false }, "results may go, too");
+        places[1].write_result(&fixture::result(&plan.cells[1], [10.0, 20.0, 30.0], 1.0)).unwrap();
+        status.refresh().unwrap();
+        let again = |known: &CellStatus| matches!(known, CellStatus::Done(result) if result.results["D"].success_percent == 10.0);
+        assert!(again(&status.cells[1]), "results may be others, too");
         std::fs::write(folder.plan_path(), PLAN.replace("runs = 3", "runs = 2")).unwrap();
         status.refresh().unwrap();
         assert_eq!(status.cells.len(), 2, "another plan");
+    }
+
+    #[test]
+    fn what_is_shown_to_others_is_nothing_that_links_lead_out_to() {
+        let directory = tempfile::tempdir().unwrap();
+        let outside = directory.path().join("outside.json");
+        std::fs::write(&outside, "{\"secret\": 7}").unwrap();
+        let root = directory.path().canonicalize().unwrap().join("root");
+        let folder = Folder::new(&root.join("study"));
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        folder.keep_plan(&plan).unwrap();
+        let cell = folder.cell(&plan.cells[0].id);
+        std::fs::create_dir_all(cell.path()).unwrap();
+        std::os::unix::fs::symlink(&outside, cell.path().join("result.json")).unwrap();
+        let read = |within: bool| match within {
+            true => ExperimentStatus::read_within(folder.path(), &root).unwrap(),
+            false => ExperimentStatus::read(folder.path()).unwrap(),
+        };
+        let reason = |status: &ExperimentStatus| match &status.cells[0] {
+            CellStatus::NotUnderstood(reason) => reason.clone(),
+            known => panic!("{known:?}"),
+        };
+        let shown = read(true);
+        assert!(reason(&shown).ends_with("result.json is a link that leads out of the folder"));
+        assert!(reason(&read(false)).contains("secret"), "who asks for it reads it");
+        std::fs::rename(folder.plan_path(), directory.path().join("plan")).unwrap();
+        std::os::unix::fs::symlink(directory.path().join("plan"), folder.plan_path()).unwrap();
+        let error = ExperimentStatus::read_within(folder.path(), &root).unwrap_err().to_string();
+        assert_eq!(error, "plan.toml is a link that leads out of the folder");
+    }
+
+    #[test]
+    fn a_long_reason_is_shortened_and_too_many_cells_are_not_followed() {
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(directory.path());
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        folder.keep_plan(&plan).unwrap();
+        let (id, commit) = (plan.cells[0].id.clone(), "x".into());
+        let failure = Failure { id, reason: "long ".repeat(1000), commit, begins_anew: true };
+        folder.cell(&failure.id).write_failure(&failure).unwrap();
+        let status = ExperimentStatus::read(directory.path()).unwrap();
+        assert!(matches!(&status.cells[0], CellStatus::Failed(reason) if reason.len() < 400));
+        std::fs::write(folder.plan_path(), PLAN.replace("runs = 3", "runs = 50001")).unwrap();
+        let error = ExperimentStatus::read_within(directory.path(), directory.path()).unwrap_err().to_string();
+        assert!(error.contains("50 001 cells are too many to follow"), "{error}");
     }
 }

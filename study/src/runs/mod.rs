@@ -8,11 +8,14 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-pub use self::experiment::{CellStatus, ExperimentStatus};
+pub use self::experiment::{CellStatus, ExperimentStatus, LEADS_OUT};
 pub use self::progress::{LastProgress, last_progress};
 pub use self::training::TrainingStatus;
 use crate::AnyError;
 use crate::files;
+
+/// A run's `config.toml` or `plan.toml` is shorter, bytes.
+const LONGEST_TEXT: u64 = 16 << 20;
 
 /// A folder that holds a run.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -41,6 +44,11 @@ impl Kind {
             path.join("config.toml").is_file().then_some(Kind::Training)
         }
     }
+}
+
+/// Why nothing can be looked for in what is no folder, and what to do.
+pub fn no_folder(path: &Path) -> String {
+    format!("there is no folder {}: give the one that your runs are in", path.display())
 }
 
 /// What is below a folder.

@@ -1,9 +1,10 @@
 //! The last line of a training's `progress.csv`.
 
 use std::collections::HashMap;
-use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
+
+use crate::files::open_plain;
 
 /// A line and its names are shorter.
 const LONGEST: u64 = 16 * 1024;
@@ -31,8 +32,8 @@ impl LastProgress {
 
 /// The last whole line of the file at `path`, of which the beginning and the end are read; `None` if there is none.
 pub fn last_progress(path: &Path) -> Option<LastProgress> {
-    let mut file = File::open(path).ok()?;
-    let length = file.metadata().ok()?.len();
+    let (mut file, metadata) = open_plain(path).ok()?;
+    let length = metadata.len();
     let mut read = |from: u64| -> Option<String> {
         let mut bytes = Vec::new();
         file.seek(SeekFrom::Start(from)).ok()?;

@@ -2,11 +2,15 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{LastProgress, RunSummary, last_progress};
+use super::{LONGEST_TEXT, LastProgress, RunSummary, last_progress};
 use crate::AnyError;
-use crate::checkpoint::{Checkpoint, CheckpointError};
-use crate::files::is_locked;
-use crate::settings::TrainConfig;
+use crate::checkpoint::{CheckpointError, State};
+use crate::files::{is_locked, read_plain_text};
+use crate::settings::{ConfigError, TrainConfig};
+use crate::words::shortened;
+
+/// So many episodes decide whether it has had enough success.
+const RECENT: u64 = 100;
 
 /// A training, as its folder has it.
 #[derive(Clone, Debug)]
@@ -26,6 +30,9 @@ pub struct TrainingStatus {
     pub damaged: Option<String>,
     /// "in work", "finished", "broken off", "without a checkpoint".
     pub state: &'static str,
+    /// Whether it has come to its end, by its budget or by its success. It may be in work all the same: what was trained
+    /// in a cell is tested.
+    pub over: bool,
 }
 
 impl TrainingStatus {
@@ -34,14 +41,14 @@ impl TrainingStatus {
     /// # Errors
     /// If `config.toml` is not that of a training.
     pub fn read(path: &Path) -> Result<Self, AnyError> {
-        let config = TrainConfig::load(Some(&path.join("config.toml")), &[], toml::Table::new())?;
+        let config = read_config(&path.join("config.toml"))?;
         let progress = last_progress(&path.join("progress.csv"));
-        let checkpoint = Checkpoint::load(path);
+        let checkpoint = State::load(path);
         let damaged = match &checkpoint {
             Err(CheckpointError::Missing { .. }) | Ok(_) => None,
-            Err(error) => Some(error.to_string()),
+            Err(error) => Some(shortened(error.to_string())),
         };
-        let saved = checkpoint.ok().map(|checkpoint| checkpoint.state.counters.episodes);
+        let saved = checkpoint.ok().map(|state| state.counters.episodes);
         let (budget, stop) = (config.common.episodes, config.common.stop_at_success);
         let success = progress.as_ref().and_then(LastProgress::success_percent);
         let enough = stop > 0.0 && success >= Some(stop) || config.settings.is_random() && saved.is_some();
@@ -53,7 +60,9 @@ impl TrainingStatus {
         };
         let logged = progress.as_ref().and_then(LastProgress::episodes).filter(|_| state == "in work");
         let episodes = logged.unwrap_or_default().max(saved.unwrap_or_default());
-        Ok(Self { path: path.to_owned(), config, episodes, progress, saved, damaged, state })
+        let recent = progress.as_ref().and_then(LastProgress::episodes).unwrap_or_default().max(episodes) >= RECENT;
+        let over = saved >= Some(budget) || stop > 0.0 && recent && success >= Some(stop) || state == "finished";
+        Ok(Self { path: path.to_owned(), config, episodes, progress, saved, damaged, state, over })
     }
 
     /// What is trained, in a few words.
@@ -75,6 +84,15 @@ impl TrainingStatus {
     }
 }
 
+fn read_config(path: &Path) -> Result<TrainConfig, AnyError> {
+    let origin = path.display().to_string();
+    let table = read_plain_text(path, LONGEST_TEXT)?.parse().map_err(|error: toml::de::Error| ConfigError::Syntax {
+        origin: origin.clone(),
+        reason: error.to_string().trim().to_owned(),
+    })?;
+    Ok(TrainConfig::from_table(&origin, table)?)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -92,9 +110,15 @@ mod tests {
         let status = read();
         assert_eq!((status.state, status.episodes, status.saved), ("without a checkpoint", 0, None));
         let lock = Lock::try_take(&path).unwrap();
+        assert!(!read().over);
         let summary = read().summary();
         assert_eq!((summary.state, summary.done, summary.budget), ("in work", 120, 200));
         assert_eq!((summary.success_percent, summary.what.as_str()), (Some(25.0), "CartPole D a2c ff"));
+        let config = "environment = 'CartPole'\nalgorithm = 'a2c'\nepisodes = 200";
+        write("config.toml", &format!("{config}\nstop_at_success = 25"));
+        let status = read();
+        assert!(status.over && status.state == "in work", "what it has become may be tested now");
+        write("config.toml", config);
         drop(lock);
         write("checkpoint/checkpoint.json", "{");
         let status = read();

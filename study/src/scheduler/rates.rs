@@ -8,7 +8,7 @@ use crate::plan::Cell;
 /// Success of the cells of an environment, a learner and what it was trained on: means over settings and runs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Rate {
-    /// "CartPole ppo ff, trained on R".
+    /// As [`Cell::described`] has it.
     pub kind: String,
     /// How many cells.
     pub cells: usize,
@@ -23,7 +23,7 @@ pub(crate) struct Rates(BTreeMap<usize, (Rate, Vec<f64>)>);
 impl Rates {
     /// A cell that is done.
     pub(crate) fn add(&mut self, cell: &Cell, result: &CellResult) {
-        let kind = format!("{} {}, trained on {}", cell.config.common.environment, cell.method(), cell.trained_on());
+        let kind = cell.described();
         let known = self.0.iter().find(|(_, (rate, _))| rate.kind == kind).map(|(&index, _)| index);
         let names = || cell.tests.sets.iter().map(|set| (set.name.clone(), 0.0)).collect();
         let new = || (Rate { kind: kind.clone(), cells: 0, success: names() }, Vec::new());

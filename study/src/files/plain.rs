@@ -1,0 +1,181 @@
+//! Files that anybody may have put where they are: opened without waiting, read to a limit, and told from what they were.
+
+use std::fs::{File, Metadata};
+use std::io::{Error, ErrorKind, Read};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::Path;
+
+use rustix::fs::OFlags;
+
+use super::{Result, if_there, io};
+
+/// Nothing that is read whole is larger, bytes.
+pub(super) const MOST: u64 = 1 << 30;
+
+/// Tells what is at a path from what was there, without reading it: another one when its content is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub struct Stamp {
+    inode: u64,
+    length: u64,
+    changed: (i64, i64),
+}
+
+impl Stamp {
+    /// Of what is at `path`; `None` if nothing is.
+    pub fn of(path: &Path) -> Option<Self> {
+        std::fs::metadata(path).ok().as_ref().map(Self::of_metadata)
+    }
+
+    /// Of what has this metadata.
+    pub fn of_metadata(file: &Metadata) -> Self {
+        Self { inode: file.ino(), length: file.len(), changed: (file.mtime(), file.mtime_nsec()) }
+    }
+
+    /// In letters that stand for themselves in addresses.
+    pub fn tag(&self) -> String {
+        let Self { inode, length, changed: (seconds, nanoseconds) } = self;
+        format!("{inode:x}-{length:x}-{seconds:x}-{nanoseconds:x}")
+    }
+
+    /// When it was changed, s since 1970.
+    pub fn seconds(&self) -> i64 {
+        self.changed.0
+    }
+
+    /// Which file it is, whatever is in it.
+    pub fn inode(&self) -> u64 {
+        self.inode
+    }
+
+    /// How long it is, bytes.
+    pub fn length(&self) -> u64 {
+        self.length
+    }
+}
+
+/// Opens a plain file for reading. What is none is refused: a pipe would be waited for, a device might never end.
+///
+/// # Errors
+/// The operating system's; [`ErrorKind::InvalidInput`] for what is no plain file.
+pub fn open_plain(path: &Path) -> std::io::Result<(File, Metadata)> {
+    require_plain(std::fs::metadata(path)?)?; // a device may do something when it is opened
+    let file = File::options().read(true).custom_flags(nonblocking()).open(path)?;
+    let metadata = require_plain(file.metadata()?)?; // it may have become another one meanwhile
+    Ok((file, metadata))
+}
+
+/// The flag that keeps opening a pipe from waiting for its other end.
+pub(super) fn nonblocking() -> i32 {
+    OFlags::NONBLOCK.bits().cast_signed()
+}
+
+fn require_plain(metadata: Metadata) -> std::io::Result<Metadata> {
+    match metadata.is_file() {
+        true => Ok(metadata),
+        false if metadata.is_dir() => Err(Error::new(ErrorKind::IsADirectory, "it is a folder, expected a file")),
+        false => Err(Error::new(ErrorKind::InvalidInput, "it is a pipe or a device, expected a plain file; delete it")),
+    }
+}
+
+/// The content of a plain file of at most so many bytes; `None` if it is not there.
+///
+/// # Errors
+/// The operating system's; a file that is not plain, or longer.
+pub fn read_plain(path: &Path, most: u64) -> Result<Option<Vec<u8>>> {
+    let read = || {
+        let (file, metadata) = open_plain(path)?;
+        let mut content = Vec::new();
+        let mut rest = file.take(most.saturating_add(1)); // it may grow meanwhile
+        if metadata.len() <= most {
+            rest.read_to_end(&mut content)?;
+        }
+        let length = metadata.len().max(content.len() as u64);
+        if length > most {
+            let words = format!("it has {length} bytes, expected {most} at most");
+            return Err(Error::new(ErrorKind::InvalidData, words));
+        }
+        Ok(content)
+    };
+    if_there(read()).map_err(io("read", path))
+}
+
+/// The text in a plain file of at most so many bytes.
+///
+/// # Errors
+/// As those of [`read_plain`]; a file that is not there or not UTF-8.
+pub fn read_plain_text(path: &Path, most: u64) -> Result<String> {
+    let content = read_plain(path, most)?.ok_or_else(|| io("read", path)(ErrorKind::NotFound.into()))?;
+    String::from_utf8(content).map_err(|error| io("read", path)(Error::new(ErrorKind::InvalidData, error.utf8_error())))
+}
+
+/// Whether `name` in `folder`, which is in `root` and has no symbolic links, is or goes through a link that leads out of
+/// `root`, or to what is hidden there.
+pub fn leads_out(root: &Path, folder: &Path, name: impl AsRef<Path>) -> bool {
+    let mut path = folder.to_owned();
+    name.as_ref().components().any(|component| {
+        path.push(component);
+        path.is_symlink() && is_elsewhere(root, &path)
+    })
+}
+
+fn is_elsewhere(root: &Path, path: &Path) -> bool {
+    let real = match path.canonicalize() {
+        Err(error) => return error.kind() != ErrorKind::NotFound, // a link to nothing is as good as none
+        Ok(real) => real,
+    };
+    let hidden = |name: &std::ffi::OsStr| name.as_encoded_bytes().starts_with(b".");
+    real.strip_prefix(root).map_or(true, |inside| inside.iter().any(hidden))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::symlink;
+    use std::process::Command;
+
+    use super::*;
+
+    #[test]
+    fn what_is_no_plain_file_is_refused_and_not_waited_for() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| directory.path().join(name);
+        assert!(Command::new("mkfifo").arg(path("pipe")).status().unwrap().success());
+        symlink("/dev/zero", path("zeros")).unwrap();
+        std::fs::create_dir(path("folder")).unwrap();
+        for (name, words) in [("pipe", "it is a pipe"), ("zeros", "it is a pipe or a device"), ("folder", "a folder")] {
+            let error = read_plain(&path(name), MOST).unwrap_err();
+            assert!(error.to_string().contains(words) && !error.is_fault(), "{name}: {error}");
+            assert!(super::super::read_if_there(&path(name)).is_err());
+        }
+        assert!(!super::super::is_locked(&path("pipe")), "it is asked without waiting");
+    }
+
+    #[test]
+    fn no_more_is_read_than_is_allowed() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("file");
+        assert_eq!(read_plain(&path, 3).unwrap(), None);
+        std::fs::write(&path, "abc").unwrap();
+        assert_eq!(read_plain(&path, 3).unwrap().unwrap(), b"abc");
+        let error = read_plain(&path, 2).unwrap_err().to_string();
+        assert!(error.contains("it has 3 bytes, expected 2 at most"), "{error}");
+        std::fs::write(&path, b"\xff").unwrap();
+        assert!(read_plain_text(&path, 9).unwrap_err().to_string().contains("utf-8"));
+    }
+
+    #[test]
+    fn links_are_followed_no_further_than_the_folder() {
+        let directory = tempfile::tempdir().unwrap();
+        let root = directory.path().canonicalize().unwrap().join("root");
+        let run = root.join("run");
+        std::fs::create_dir_all(run.join("inner")).unwrap();
+        for name in ["../../out", "../.hidden", "file", "inner/file"] {
+            std::fs::write(run.join(name), "x").unwrap();
+        }
+        for (to, name) in [("../../out", "a"), ("../.hidden", "b"), ("file", "c"), ("nothing", "d"), ("../..", "e")] {
+            symlink(to, run.join(name)).unwrap();
+        }
+        let out =
+            ["a", "b", "c", "d", "e/out", "file", "inner/file", "missing"].map(|name| leads_out(&root, &run, name));
+        assert_eq!(out, [true, true, false, false, true, false, false, false]);
+    }
+}
