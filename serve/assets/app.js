@@ -72,9 +72,21 @@
     sizes.observe(place);
   }
 
+  // There is nothing to draw any more: the run was begun anew.
+  function clear(figure) {
+    const known = plots.get(figure), place = figure.querySelector(".plot");
+    if (!known) return;
+    known.plot.destroy();
+    plots.delete(figure);
+    place.replaceChildren();
+    place.setAttribute("aria-label", figure.querySelector("figcaption").textContent);
+    delete figure.dataset.points;
+    delete figure.dataset.reach;
+  }
+
   function drawCurve(figure, curve) {
     const name = figure.dataset.chart, { colour, range } = CURVES[name];
-    if (!curve || curve.episodes.length === 0) return;
+    if (!curve || curve.episodes.length === 0) return clear(figure);
     const by = over(), label = by === "steps" ? "environment steps" : "episodes";
     const stroke = COLOURS[colour];
     const one = {
@@ -96,7 +108,7 @@
   // The curves of the cells in work, one colour for a kind.
   function drawCells(figure, cells) {
     figure.parentElement.hidden = cells.length === 0;
-    if (cells.length === 0) return;
+    if (cells.length === 0) return clear(figure);
     const kinds = [...new Set(cells.map((cell) => cell.kind))];
     const colour = (cell) => COLOURS[kinds.indexOf(cell.kind) % COLOURS.length];
     const data = uPlot.join(cells.map((cell) => [cell.episodes, cell.success]));
@@ -158,6 +170,53 @@
     new ResizeObserver(fit).observe(report.parentElement);
   }
 
+  // What tells elements of one kind apart: where they lead, or what they show.
+  const keyOf = (node) =>
+    node.nodeType !== Node.ELEMENT_NODE ? null
+      : node.getAttribute("href") ?? node.getAttribute("src") ?? node.querySelector("[href], [src]")?.getAttribute("href")
+        ?? node.querySelector("[src]")?.getAttribute("src") ?? null;
+  const alike = (a, b) => a.nodeType === b.nodeType && a.nodeName === b.nodeName && keyOf(a) === keyOf(b);
+
+  // Makes `old` like `fresh` and touches only what differs: what has the focus, is clicked or plays stays what it is.
+  function become(old, fresh) {
+    if (old.isEqualNode(fresh)) return;
+    if (old.nodeType !== Node.ELEMENT_NODE) {
+      old.data = fresh.data;
+      return;
+    }
+    for (const { name } of [...old.attributes]) if (!fresh.hasAttribute(name)) old.removeAttribute(name);
+    for (const { name, value } of fresh.attributes) if (old.getAttribute(name) !== value) old.setAttribute(name, value);
+    fill(old, fresh);
+  }
+
+  function fill(place, fresh) {
+    const left = [...place.childNodes];
+    for (const child of [...fresh.childNodes]) {
+      const found = left.findIndex((old) => alike(old, child));
+      const [old] = found < 0 ? [] : left.splice(found, 1);
+      // What was passed over comes later or not at all.
+      if (old && found === 0) become(old, child);
+      else if (old) {
+        const gone = left.splice(0, found);
+        if (gone.some((one) => [...fresh.childNodes].some((later) => alike(one, later)))) {
+          left.unshift(...gone);
+          place.insertBefore(old, gone[0]);
+        } else gone.forEach((one) => one.remove());
+        become(old, child);
+      } else place.insertBefore(child, left[0] ?? null);
+    }
+    left.forEach((old) => old.remove());
+  }
+
+  function replace(place, part) {
+    const template = document.createElement("template");
+    template.innerHTML = part;
+    localTimes(template.content);
+    const had = document.activeElement, address = had?.getAttribute("href");
+    fill(place, template.content);
+    if (address && document.activeElement !== had) place.querySelector(`[href="${CSS.escape(address)}"]`)?.focus();
+  }
+
   function apply(update) {
     if (update.gone) return say(update.gone, "lost");
     say("live", "live");
@@ -166,8 +225,7 @@
       const place = document.getElementById(name);
       if (place && shown.get(name) !== part) {
         shown.set(name, part);
-        place.innerHTML = part;
-        localTimes(place);
+        replace(place, part);
       }
     }
     charts = update.charts;

@@ -1,8 +1,9 @@
 //! A learning curve from `monitor.csv` as it grows: some hundred points, however many episodes there are.
 
+use perturb_study::words::shortened;
 use serde::Serialize;
 
-use crate::tail::{Look, Tail};
+use crate::tail::{Look, MOST, Tail};
 
 /// When there are so many stretches, pairs of them become one.
 const MOST_STRETCHES: usize = 512;
@@ -14,6 +15,8 @@ const LEAST_EPISODES: usize = 10;
 const LEAST_SECONDS: f64 = 1.0;
 /// … and there are at most so many.
 const MOST_SPEEDS: f64 = 40.0;
+/// Episodes that come after less than this share of the time before them were written with them.
+const AT_ONCE: f64 = 0.02;
 
 /// Follows the episodes of a training.
 #[derive(Debug)]
@@ -27,6 +30,8 @@ pub(crate) struct Episodes {
     /// Lines, and what is wrong with the first that is not understood.
     lines: usize,
     wrong: Option<String>,
+    /// Why it cannot be read now.
+    unread: Option<String>,
 }
 
 /// Sums over some episodes in a row.
@@ -64,23 +69,30 @@ impl Episodes {
     /// Of the log at `path`, which need not be there yet.
     pub(crate) fn of(path: &std::path::Path) -> Self {
         let (columns, stretches) = (None, Vec::new());
-        Self { tail: Tail::of(path), columns, stretches, size: 1, lines: 0, wrong: None }
+        Self { tail: Tail::of(path), columns, stretches, size: 1, lines: 0, wrong: None, unread: None }
     }
 
     /// Reads what is new; whether anything is.
     pub(crate) fn look(&mut self) -> bool {
         let new = match self.tail.look() {
-            Ok(Look::Same) => return false,
+            Ok(Look::Same) => return self.unread.take().is_some(),
             Ok(Look::More(new)) => new,
             Ok(Look::Anew(new)) => {
                 (self.columns, self.stretches, self.size, self.lines, self.wrong) = (None, Vec::new(), 1, 0, None);
                 new
             }
+            Ok(Look::Endless) => {
+                let wrong =
+                    format!("line {} is longer than {} MiB; nothing behind it is read", self.lines + 1, MOST >> 20);
+                self.wrong = Some(wrong);
+                return true;
+            }
             Err(error) => {
-                let wrong = Some(format!("it cannot be read: {error}"));
-                return std::mem::replace(&mut self.wrong, wrong.clone()) != wrong;
+                let unread = Some(format!("it cannot be read: {error}"));
+                return std::mem::replace(&mut self.unread, unread.clone()) != unread;
             }
         };
+        self.unread = None;
         for line in new.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
             self.lines += 1;
             if let Err(reason) = self.line(&String::from_utf8_lossy(line)) {
@@ -108,7 +120,7 @@ impl Episodes {
 
     /// What is wrong with the log.
     pub(crate) fn wrong(&self) -> Option<&str> {
-        self.wrong.as_deref()
+        self.unread.as_deref().or(self.wrong.as_deref())
     }
 
     fn line(&mut self, line: &str) -> Result<(), String> {
@@ -125,7 +137,7 @@ impl Episodes {
         };
         let number = |column: usize| {
             let text = fields.get(column).copied().unwrap_or_default();
-            text.parse::<f64>().map_err(|_| format!("`{text}` is no number"))
+            text.parse::<f64>().map_err(|_| format!("`{}` is no number", shortened(text)))
         };
         let [episode_return, steps, end, successes] = columns.map(number);
         self.add(Stretch {
@@ -187,7 +199,8 @@ fn speeds(parts: &[Stretch]) -> Vec<Option<f64>> {
     for (place, part) in parts.iter().enumerate() {
         steps += part.steps;
         let time = part.end - begun;
-        if time >= LEAST_SECONDS.max(all / MOST_SPEEDS) {
+        let at_once = parts.get(place + 1).is_some_and(|next| next.end - part.end < AT_ONCE * time);
+        if time >= LEAST_SECONDS.max(all / MOST_SPEEDS) && !at_once {
             speeds.resize(place + 1, Some(steps / time));
             (begun, steps) = (part.end, 0.0);
         }
@@ -291,6 +304,8 @@ mod tests {
         let (episodes, curve) = read(&(NAMES.to_owned() + "1,2,3,1,0\nx,2,4,1,0\n\n5,2,5,1,0\n6,2"));
         assert_eq!((episodes.count(), episodes.wrong()), (2, Some("line 4: `x` is no number")));
         assert_eq!(curve.episode_return, [Some(3.0)]);
+        let long = read(&(NAMES.to_owned() + &"x".repeat(100_000) + ",2,3,1,0\n")).0;
+        assert!(long.wrong().unwrap().len() < 400, "no more is quoted than anybody reads");
         assert_eq!(read("a,b\n1,2\n").0.wrong(), Some("line 1: there is no column `r`"));
         assert_eq!(read(&(NAMES.to_owned() + "NaN,2,3,1,0\n")).1.episode_return, [None]);
     }

@@ -1,45 +1,71 @@
 //! What is known of an experiment.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use perturb_study::generated_episodes;
-use perturb_study::runs::{CellStatus, ExperimentStatus, RunSummary};
+use perturb_study::files::{self, Stamp, leads_out};
+use perturb_study::runs::{CellStatus, ExperimentStatus, LEADS_OUT, RunSummary, last_progress};
+use perturb_study::words::shortened;
+use perturb_study::{Cell, generated_episodes, records, tested_episodes};
 use serde::Serialize;
 
 use crate::curve::Curve;
 use crate::remaining::Pace;
-use crate::stamp::Stamp;
 use crate::training::{LOCK_INTERVAL, Training};
 
 /// Of at most so many cells in work the curves are followed.
-const MOST_FOLLOWED: usize = 48;
+pub(crate) const MOST_FOLLOWED: usize = 48;
 /// A test episode takes about so much of the time of a training's.
 const TEST_SHARE: f64 = 0.25;
 /// From one cell to the next it may take so long.
 const BETWEEN: Duration = Duration::from_secs(15);
+/// How often, as a share of the time that it took, a plan that is not understood is read again.
+const REREAD: u32 = 20;
 
 /// An experiment that is looked at now and then.
 #[derive(Debug)]
 pub(crate) struct Experiment {
+    /// What links may not lead out of.
+    root: PathBuf,
     path: PathBuf,
     looked: Option<Instant>,
-    /// Of `cells/`, and of the folder itself.
+    took: Duration,
+    /// Of `cells/`, and of the plan.
     stamps: [Option<Stamp>; 2],
     status: Result<ExperimentStatus, String>,
-    /// When it last changed, s since 1970.
-    changed: i64,
     /// When somebody was last seen to work on it.
     worked: Option<Instant>,
-    /// Trainings of cells in work, by the cells' ids.
-    in_work: HashMap<String, Training>,
+    /// The first cells in work, by their ids, with their curves.
+    followed: HashMap<String, Training>,
+    /// How far all cells in work are, by their ids.
+    logs: HashMap<String, Log>,
     pace: Pace,
     /// What cells take in terms of others, for so many that are done.
     weights: (usize, Vec<f64>),
-    /// Of all that its report is made from.
-    files: u64,
+    sources: Sources,
+    /// Cells that have a page of their own.
+    with_page: HashSet<String>,
+}
+
+/// The end of a cell's `progress.csv`.
+#[derive(Clone, Copy, Debug, Default)]
+struct Log {
+    stamp: Option<Stamp>,
+    episodes: u64,
+}
+
+/// Of all that the report is made from.
+#[derive(Debug, Default)]
+struct Sources {
+    at: Option<Instant>,
+    /// For so many cells that are settled, and when these last changed.
+    settled: (usize, i64),
+    /// Another number when the report would be another one.
+    state: u64,
+    /// One that must not be read.
+    out: Option<String>,
 }
 
 /// The curve of a cell in work.
@@ -48,68 +74,88 @@ pub(crate) struct CellCurve {
     pub(crate) id: String,
     /// Environment, learner and what it is trained on.
     pub(crate) kind: String,
-    #[serde(flatten)]
-    pub(crate) curve: Curve,
+    /// Episodes in the middle of a point.
+    pub(crate) episodes: Vec<f64>,
+    /// Its success rate, %.
+    pub(crate) success: Vec<f64>,
 }
 
 impl Experiment {
-    pub(crate) fn of(path: &Path) -> Self {
+    /// That in `path`, of which nothing is shown that is outside of `root`.
+    pub(crate) fn of(root: &Path, path: &Path) -> Self {
         Self {
+            root: root.to_owned(),
             path: path.to_owned(),
             looked: None,
+            took: Duration::ZERO,
             stamps: [None; 2],
             status: Err("it was not looked at".into()),
-            changed: 0,
             worked: None,
-            in_work: HashMap::new(),
+            followed: HashMap::new(),
+            logs: HashMap::new(),
             pace: Pace::default(),
             weights: Default::default(),
-            files: 0,
+            sources: Sources::default(),
+            with_page: HashSet::new(),
         }
     }
 
     /// Reads what has changed of its state.
     pub(crate) fn look(&mut self) {
         // A cell's first file makes its folder; what follows is in there.
-        let stamps = [Stamp::of(&self.path.join("cells")), Stamp::of(&self.path.join("plan.toml"))];
+        let stamps = ["cells", "plan.toml"].map(|name| Stamp::of(&self.path.join(name)));
         let idle = self.state() != "in work";
-        let rested = self.looked.is_none_or(|looked| looked.elapsed() >= LOCK_INTERVAL);
+        let rest = if self.status.is_err() { LOCK_INTERVAL.max(self.took * REREAD) } else { LOCK_INTERVAL };
+        let rested = self.looked.is_none_or(|looked| looked.elapsed() >= rest);
         if stamps == self.stamps && idle && !rested {
             return;
         }
+        let begun = Instant::now();
         self.stamps = stamps;
-        self.looked = Some(Instant::now());
         let read = match &mut self.status {
             Ok(status) => status.refresh(),
-            Err(_) => ExperimentStatus::read(&self.path).map(|status| self.status = Ok(status)),
+            Err(_) => ExperimentStatus::read_within(&self.path, &self.root).map(|status| self.status = Ok(status)),
         };
         if let Err(error) = read {
-            self.status = Err(error.to_string());
+            self.status = Err(shortened(error.to_string()));
         }
         if self.status.as_ref().is_ok_and(|status| status.state() == "in work") {
             self.worked = Some(Instant::now());
         }
-        // A cell's folder changes when its result appears there.
-        let cells = self.status.as_ref().map(|status| status.plan.cells.as_slice()).unwrap_or_default();
-        let cells = cells.iter().filter_map(|cell| Stamp::of(&self.path.join("cells").join(&cell.id)));
-        self.changed =
-            self.stamps.iter().copied().flatten().chain(cells).map(|stamp| stamp.seconds()).max().unwrap_or_default();
+        self.read_logs();
+        (self.looked, self.took) = (Some(Instant::now()), begun.elapsed());
     }
 
-    /// The same, and how far the cells in work are.
+    /// How far the cells in work are.
+    fn read_logs(&mut self) {
+        let Ok(status) = &self.status else { return self.logs.clear() };
+        let mut before = std::mem::take(&mut self.logs);
+        for id in working(status) {
+            let place = Path::new("cells").join(id).join("training/progress.csv");
+            let mut log = before.remove(id).unwrap_or_default();
+            let stamp = Stamp::of(&self.path.join(&place)).filter(|_| !leads_out(&self.root, &self.path, &place));
+            if stamp != log.stamp {
+                let last = stamp.and_then(|_| last_progress(&self.path.join(&place)));
+                log = Log { stamp, episodes: last.and_then(|last| last.episodes()).unwrap_or_default() };
+            }
+            self.logs.insert(id.to_owned(), log);
+        }
+    }
+
+    /// The same, and all that its page shows.
     pub(crate) fn follow(&mut self) {
         self.look();
-        let Ok(status) = &self.status else { return };
-        let cells = || status.plan.cells.iter().zip(&status.cells);
-        let working: Vec<&str> =
-            cells().filter(|(_, cell)| **cell == CellStatus::InWork).map(|(cell, _)| cell.id.as_str()).collect();
-        self.in_work.retain(|id, _| working.contains(&id.as_str()));
-        for id in working.iter().take(MOST_FOLLOWED) {
-            let training = || Training::of(&status.folder.cell(id).training());
-            self.in_work.entry((*id).to_owned()).or_insert_with(training).follow();
+        let Ok(status) = &self.status else { return self.followed.clear() };
+        let within = |id: &str| !leads_out(&self.root, &self.path, Path::new("cells").join(id).join("training"));
+        let first: Vec<&str> = working(status).filter(|id| within(id)).take(MOST_FOLLOWED).collect();
+        self.followed.retain(|id, _| first.contains(&id.as_str()));
+        for id in first {
+            let training = || Training::of(&self.root, &status.folder.cell(id).training());
+            self.followed.entry(id.to_owned()).or_insert_with(training).follow();
         }
-        if self.weights.0 != status.count(CellStatus::is_settled) || self.weights.1.len() != status.cells.len() {
-            self.weights = (status.count(CellStatus::is_settled), weights(status));
+        let settled = status.count(CellStatus::is_settled);
+        if self.weights.0 != settled || self.weights.1.len() != status.cells.len() {
+            self.weights = (settled, weights(status));
         }
         let shares = self.shares(status);
         if self.state() != "in work" {
@@ -117,7 +163,21 @@ impl Experiment {
         } else {
             self.pace.hear(Instant::now(), &shares);
         }
-        self.files = state_of_files(status);
+        let settled = (settled, status.changed());
+        let anew = self.sources.settled != settled || self.sources.at.is_none_or(|at| at.elapsed() >= LOCK_INTERVAL);
+        if anew {
+            self.sources = Sources::of(status, settled, &self.root);
+            self.with_page.clear();
+        }
+        for (cell, known) in status.plan.cells.iter().zip(&status.cells) {
+            let asked = *known == CellStatus::InWork && !self.with_page.contains(&cell.id);
+            if asked || anew && *known != (CellStatus::Waiting { begun: false }) {
+                let config = status.folder.cell(&cell.id).training().join("config.toml");
+                if config.is_file() && within(&cell.id) {
+                    self.with_page.insert(cell.id.clone());
+                }
+            }
+        }
     }
 
     /// How far it is, or why that is not known.
@@ -142,17 +202,31 @@ impl Experiment {
 
     /// When it last changed, s since 1970.
     pub(crate) fn changed(&self) -> i64 {
-        self.changed
+        let logs = self.logs.values().map(|log| log.stamp);
+        let stamps = self.stamps.into_iter().chain(logs).flatten().map(|stamp| stamp.seconds());
+        stamps.chain(self.status.as_ref().map(ExperimentStatus::changed)).max().unwrap_or_default()
     }
 
     /// Another number when its report would be another one.
     pub(crate) fn files(&self) -> u64 {
-        self.files
+        self.sources.state
+    }
+
+    /// Where it is, for a report; in its place why none is made.
+    pub(crate) fn reported(&self) -> Result<PathBuf, String> {
+        let out = self.sources.out.clone();
+        self.status().map_err(|reason| format!("this experiment is not understood: {reason}"))?;
+        out.map_or_else(|| Ok(self.path.clone()), |name| Err(format!("{name} is {LEADS_OUT}")))
     }
 
     /// The training of a cell in work, unless there are too many.
     pub(crate) fn training(&self, id: &str) -> Option<&Training> {
-        self.in_work.get(id)
+        self.followed.get(id)
+    }
+
+    /// Whether a cell has a page of its own.
+    pub(crate) fn has_page(&self, id: &str) -> bool {
+        self.with_page.contains(id)
     }
 
     /// How long it may still take, s.
@@ -164,23 +238,22 @@ impl Experiment {
     /// The curves of cells in work, in the order of the plan.
     pub(crate) fn curves(&self) -> Vec<CellCurve> {
         let Ok(status) = &self.status else { return Vec::new() };
-        let of = |cell: &perturb_study::Cell| {
-            let curve = self.in_work.get(&cell.id)?.curve();
+        let of = |cell: &Cell| {
+            let Curve { episodes, success, .. } = self.followed.get(&cell.id)?.curve();
             let kind = format!("{} {}, {}", cell.config.common.environment, cell.method(), cell.trained_on());
-            (curve.success.len() > 1).then(|| CellCurve { id: cell.id.clone(), kind, curve })
+            (success.len() > 1).then(|| CellCurve { id: cell.id.clone(), kind, episodes, success })
         };
         status.plan.cells.iter().filter_map(of).collect()
     }
 
     /// How much of each cell is done.
     fn shares(&self, status: &ExperimentStatus) -> Vec<f32> {
-        let share = |(cell, known): (&perturb_study::Cell, &CellStatus)| match known {
+        let share = |(cell, known): (&Cell, &CellStatus)| match known {
             CellStatus::Done(_) | CellStatus::Failed(_) => 1.0,
             CellStatus::InWork => {
-                let training = self.in_work.get(&cell.id).and_then(|training| training.status().ok());
-                let (training, testing) = (training.map_or(0.0, |status| status.episodes as f64), testing(cell));
+                let training = self.logs.get(&cell.id).map_or(0.0, |log| log.episodes as f64);
                 let budget = cell.config.common.episodes as f64;
-                (training.min(budget) / (budget + testing)) as f32
+                (training.min(budget) / (budget + testing(cell))) as f32
             }
             CellStatus::NotUnderstood(_) | CellStatus::Waiting { .. } => 0.0,
         };
@@ -188,18 +261,22 @@ impl Experiment {
     }
 }
 
+/// The cells in work, in the order of the plan.
+fn working(status: &ExperimentStatus) -> impl Iterator<Item = &str> {
+    let all = status.plan.cells.iter().zip(&status.cells);
+    all.filter(|(_, known)| **known == CellStatus::InWork).map(|(cell, _)| cell.id.as_str())
+}
+
 /// What the tests of a cell take, in episodes of its training.
-fn testing(cell: &perturb_study::Cell) -> f64 {
-    let times = cell.tests.sets.len() as u64 * (1 + cell.tests.marks.len() as u64);
-    TEST_SHARE * (cell.tests.episodes * times + cell.tests.selection.unwrap_or_default()) as f64
+fn testing(cell: &Cell) -> f64 {
+    TEST_SHARE * tested_episodes(cell)
 }
 
 /// What cells take in terms of others: what those of their kind took, or else as many episodes as they have.
 fn weights(status: &ExperimentStatus) -> Vec<f64> {
     let taken = status.taken();
     let cells = &status.plan.cells;
-    let episodes =
-        |cell: &perturb_study::Cell| generated_episodes(&cell.config, cell.config.common.episodes) + testing(cell);
+    let episodes = |cell: &Cell| generated_episodes(&cell.config, cell.config.common.episodes) + testing(cell);
     // Seconds of an episode, where cells are done.
     let known: Vec<f64> =
         cells.iter().filter_map(|cell| taken.seconds(cell).map(|seconds| seconds / episodes(cell))).collect();
@@ -207,19 +284,45 @@ fn weights(status: &ExperimentStatus) -> Vec<f64> {
     cells.iter().map(|cell| taken.seconds(cell).unwrap_or_else(|| usual * episodes(cell))).collect()
 }
 
-/// Of all that a report is made from: results, failures, heatmaps.
-fn state_of_files(status: &ExperimentStatus) -> u64 {
-    let mut hasher = DefaultHasher::new();
-    let folder = &status.folder;
-    Stamp::of(&folder.plan_path()).hash(&mut hasher);
-    Stamp::of(&folder.path().join("heatmaps")).hash(&mut hasher);
-    for (cell, known) in status.plan.cells.iter().zip(&status.cells) {
-        let name = match known {
-            CellStatus::Done(_) | CellStatus::NotUnderstood(_) => "result.json",
-            CellStatus::Failed(_) => "failure.json",
-            CellStatus::InWork | CellStatus::Waiting { .. } => continue,
+impl Sources {
+    /// Looks at the plan with its tables, heatmaps, and of each cell that is settled at what the report reads of it.
+    fn of(status: &ExperimentStatus, settled: (usize, i64), root: &Path) -> Self {
+        let (mut hasher, mut out) = (DefaultHasher::new(), None);
+        let place = status.folder.path();
+        let mut add = |path: &Path| {
+            let name = path.strip_prefix(place).unwrap_or(path);
+            if out.is_none() && leads_out(root, place, name) {
+                out = Some(name.display().to_string());
+            }
+            (name, Stamp::of(path)).hash(&mut hasher);
         };
-        (&cell.id, Stamp::of(&folder.cell(&cell.id).path().join(name))).hash(&mut hasher);
+        add(&status.folder.plan_path());
+        let listed = |folder: &Path| files::list(folder).unwrap_or_default();
+        listed(place)
+            .iter()
+            .filter(|path| path.extension().is_some_and(|ending| ending == "csv"))
+            .for_each(|path| add(path));
+        let heatmaps = place.join("heatmaps");
+        add(&heatmaps);
+        listed(&heatmaps).iter().for_each(|path| add(path));
+        for (cell, known) in status.plan.cells.iter().zip(&status.cells) {
+            let folder = status.folder.cell(&cell.id);
+            let names: &[&str] = match known {
+                CellStatus::Done(_) => &["result.json"],
+                CellStatus::Failed(_) => &["failure.json"],
+                CellStatus::NotUnderstood(_) => &["result.json", "failure.json"],
+                CellStatus::InWork | CellStatus::Waiting { .. } => &[],
+            };
+            names.iter().for_each(|name| add(&folder.path().join(name)));
+            if let CellStatus::Done(_) = known {
+                add(&folder.path().join(records::FILE));
+                add(&folder.training().join("monitor.csv"));
+                cell.tests.marks.iter().for_each(|mark| add(&folder.mark(*mark).join(records::FILE)));
+            }
+        }
+        Self { at: Some(Instant::now()), settled, state: hasher.finish(), out }
     }
-    hasher.finish()
 }
+
+#[cfg(test)]
+mod tests;

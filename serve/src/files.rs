@@ -3,15 +3,16 @@
 use std::fs::{File, Metadata};
 use std::io::SeekFrom;
 use std::ops::RangeInclusive;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use axum::body::Body;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use perturb_study::files::{Stamp, open_plain};
 use tokio::io::{AsyncReadExt, AsyncSeekExt};
 use tokio_util::io::ReaderStream;
 
-use crate::paths::media_type;
+use crate::paths::{Relative, Root, media_type};
 
 /// The end of what is asked of a file.
 #[derive(Debug, PartialEq)]
@@ -21,16 +22,24 @@ enum Asked {
     Beyond,
 }
 
-/// The file at `path`, which is below the folder; `None` if it is not sent.
-pub(crate) async fn send(path: PathBuf, headers: &HeaderMap) -> Option<Response> {
-    let kind = media_type(&path)?;
-    let opened = tokio::task::spawn_blocking(move || open(&path)).await.ok()?;
-    let (file, metadata) = opened.ok()?;
+/// The file that `relative` names; `None` if it is not sent.
+pub(crate) async fn send(root: Root, relative: Relative, headers: &HeaderMap) -> Option<Response> {
+    let opened = tokio::task::spawn_blocking(move || {
+        let path = root.resolve(&relative)?;
+        let kind = media_type(&path)?;
+        open(&path).ok().map(|opened| (kind, opened))
+    });
+    let (kind, (file, metadata)) = opened.await.ok()??;
     let (length, mut file) = (metadata.len(), tokio::fs::File::from_std(file));
-    let asked = headers
-        .get(header::RANGE)
-        .and_then(|range| range.to_str().ok())
-        .map_or(Asked::Whole, |range| part(range, length));
+    let tag = format!("\"{}\"", Stamp::of_metadata(&metadata).tag());
+    let said = |name: header::HeaderName| headers.get(name).and_then(|value| value.to_str().ok());
+    let known = |tags: &str| tags.split(',').any(|known| known.trim().trim_start_matches("W/") == tag);
+    if said(header::IF_NONE_MATCH).is_some_and(known) {
+        return Some((StatusCode::NOT_MODIFIED, [(header::ETAG, tag)]).into_response());
+    }
+    // A part of what has become another file fits no other part.
+    let range = said(header::RANGE).filter(|_| said(header::IF_RANGE).is_none_or(|of| of == tag));
+    let asked = range.map_or(Asked::Whole, |range| part(range, length));
     let (status, from, count) = match &asked {
         Asked::Whole => (StatusCode::OK, 0, length),
         Asked::Part(range) => (StatusCode::PARTIAL_CONTENT, *range.start(), range.end() - range.start() + 1),
@@ -45,6 +54,7 @@ pub(crate) async fn send(path: PathBuf, headers: &HeaderMap) -> Option<Response>
     let headers = response.headers_mut();
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(kind));
     headers.insert(header::CONTENT_LENGTH, count.into());
+    headers.insert(header::ETAG, HeaderValue::from_str(&tag).ok()?);
     headers.insert(header::ACCEPT_RANGES, HeaderValue::from_static("bytes"));
     if let Asked::Part(range) = asked {
         let range = format!("bytes {}-{}/{length}", range.start(), range.end());
@@ -53,14 +63,12 @@ pub(crate) async fn send(path: PathBuf, headers: &HeaderMap) -> Option<Response>
     Some(response)
 }
 
-/// Opens a plain file. What is none, a pipe for instance, is not waited for.
+/// Opens a plain file, and no link.
 fn open(path: &Path) -> std::io::Result<(File, Metadata)> {
-    let refused = || std::io::Error::from(std::io::ErrorKind::InvalidInput);
-    let plain = |metadata: Metadata| metadata.is_file().then_some(metadata).ok_or_else(refused);
-    plain(std::fs::symlink_metadata(path)?)?;
-    let file = File::open(path)?;
-    let metadata = plain(file.metadata()?)?;
-    Ok((file, metadata))
+    match std::fs::symlink_metadata(path)?.is_file() {
+        true => open_plain(path),
+        false => Err(std::io::ErrorKind::InvalidInput.into()),
+    }
 }
 
 /// What a Range header asks of a file: one part, from somewhere, or so much of the end. What is not understood asks for

@@ -14,7 +14,6 @@ use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
 use futures_util::{StreamExt, future};
 use perturb_protocol::Address;
-use perturb_study::runs::Kind;
 use tokio_stream::wrappers::WatchStream;
 
 use crate::load::Asked;
@@ -22,6 +21,7 @@ use crate::paths::{Relative, Root};
 use crate::report::Reports;
 use crate::watch::{Missing, Seen, Topic, Watch};
 use crate::{files, pages};
+use pages::not_there;
 
 /// How often a stream says something although there is nothing to say: so it is known whether anybody listens.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
@@ -47,16 +47,6 @@ impl Shared {
         let (reports, server) = (Arc::new(Reports::default()), server.map(|address| Arc::new(Asked::at(address))));
         let watch = Arc::new(Watch::new(root.clone(), Arc::clone(&reports), server));
         Self { root, loopback: address.ip().is_loopback(), reports, watch }
-    }
-
-    /// Reads files where waiting for them holds nobody up.
-    async fn see(&self, topic: Topic) -> Result<pages::Update, Missing> {
-        let watch = Arc::clone(&self.watch);
-        let seen = tokio::task::spawn_blocking(move || watch.see(&topic)).await;
-        seen.unwrap_or_else(|error| {
-            tracing::error!("the files were not looked at: {error}");
-            Err(Missing::NoRun)
-        })
     }
 }
 
@@ -88,6 +78,9 @@ async fn guard(State(shared): State<Arc<Shared>>, request: Request, next: Next) 
     } else if shared.loopback && !is_local(request.headers(), request.uri()) {
         let words = "This server answers to localhost, 127.0.0.1 and [::1] alone: ask for it by one of these names.";
         pages::refusal(StatusCode::MISDIRECTED_REQUEST, words)
+    } else if is_of_another_site(request.headers()) {
+        let words = "A page of another site has asked for this; open it by its address, or by a link.";
+        pages::refusal(StatusCode::FORBIDDEN, words)
     } else {
         next.run(request).await
     };
@@ -102,6 +95,14 @@ async fn guard(State(shared): State<Arc<Shared>>, request: Request, next: Next) 
     headers.extend(always.map(|(name, value)| (name, HeaderValue::from_static(value))));
     headers.entry(header::CONTENT_SECURITY_POLICY).or_insert(HeaderValue::from_static(POLICY));
     response
+}
+
+/// Whether a browser asks because a page of another site has a picture, a frame or a script from here: that page would see
+/// nothing, but have files read all the time. A link is followed, whoever has it.
+fn is_of_another_site(headers: &HeaderMap) -> bool {
+    let said = |name: &str| headers.get(name).and_then(|value| value.to_str().ok());
+    let link = said("sec-fetch-mode") == Some("navigate") && said("sec-fetch-dest") == Some("document");
+    matches!(said("sec-fetch-site"), Some("cross-site" | "same-site")) && !link
 }
 
 /// Whether a browser asked for a name of this machine. Another name may lead here, too, whoever has it: so a page of
@@ -119,17 +120,17 @@ fn is_local(headers: &HeaderMap, uri: &Uri) -> bool {
 }
 
 async fn index(State(shared): State<Arc<Shared>>) -> Response {
-    match shared.see(Topic::Index).await {
-        Ok(update) => page(pages::index::page(&shared.root, &update)),
-        Err(missing) => not_there(missing),
+    match shared.watch.see(&Topic::Index).await {
+        Ok(shown) => page(pages::index::page(&shared.root, &shown.update)),
+        Err(missing) => not_there(&missing),
     }
 }
 
 async fn run(State(shared): State<Arc<Shared>>, uri: Uri) -> Response {
-    let Some(relative) = named(&uri, "/run/") else { return not_there(Missing::NoRun) };
-    match shared.see(Topic::Run(relative.clone())).await {
-        Ok(update) => page(pages::run_page(&shared.root, &relative, &update)),
-        Err(missing) => not_there(missing),
+    let Some(relative) = named(&uri, "/run/") else { return not_there(&Missing::NoRun) };
+    match shared.watch.see(&Topic::Run(relative.clone())).await {
+        Ok(shown) => page(pages::run_page(&shared.root, &relative, &shown.update)),
+        Err(missing) => not_there(&missing),
     }
 }
 
@@ -140,7 +141,7 @@ async fn index_events(State(shared): State<Arc<Shared>>) -> Response {
 async fn run_events(State(shared): State<Arc<Shared>>, uri: Uri) -> Response {
     match named(&uri, "/events/") {
         Some(relative) => events(&shared, Topic::Run(relative)),
-        None => not_there(Missing::NoRun),
+        None => not_there(&Missing::NoRun),
     }
 }
 
@@ -155,17 +156,18 @@ fn events(shared: &Shared, topic: Topic) -> Response {
 }
 
 async fn report(State(shared): State<Arc<Shared>>, uri: Uri) -> Response {
-    let path = named(&uri, "/report/").and_then(|relative| {
-        let path = shared.root.resolve(&relative)?;
-        (Kind::of(&path)? == Kind::Experiment).then_some((relative, path))
-    });
-    let Some((relative, path)) = path else { return not_there(Missing::NoRun) };
+    let Some(relative) = named(&uri, "/report/") else { return not_there(&Missing::NoRun) };
     // What the page says about the state is what the report is of.
-    let state = match shared.see(Topic::Run(relative)).await {
-        Ok(update) => update.files,
-        Err(missing) => return not_there(missing),
+    let reported = match shared.watch.see(&Topic::Run(relative)).await {
+        Ok(shown) => shown.update.reported.clone(),
+        Err(missing) => return not_there(&missing),
     };
-    let mut response = match shared.reports.page(&path, state).await {
+    let Some(pages::Reported { folder, state }) = reported else { return not_there(&Missing::NoRun) };
+    let page = match folder {
+        Ok(folder) => shared.reports.page(&folder, state).await,
+        Err(reason) => Err(reason),
+    };
+    let mut response = match page {
         Ok(page) => Html(page.to_string()).into_response(),
         Err(reason) => Html(pages::no_report(&reason)).into_response(),
     };
@@ -174,9 +176,8 @@ async fn report(State(shared): State<Arc<Shared>>, uri: Uri) -> Response {
 }
 
 async fn file(State(shared): State<Arc<Shared>>, uri: Uri, headers: HeaderMap) -> Response {
-    let path = named(&uri, "/file/").and_then(|relative| shared.root.resolve(&relative));
-    let sent = match path {
-        Some(path) => files::send(path, &headers).await,
+    let sent = match named(&uri, "/file/") {
+        Some(relative) => files::send(shared.root.clone(), relative, &headers).await,
         None => None,
     };
     let Some(mut response) = sent else { return pages::refusal(StatusCode::NOT_FOUND, "There is no such file.") };
@@ -198,14 +199,6 @@ fn named(uri: &Uri, prefix: &str) -> Option<Relative> {
 
 fn page(text: String) -> Response {
     Html(text).into_response()
-}
-
-fn not_there(missing: Missing) -> Response {
-    let words = match missing {
-        Missing::NoRun => "There is no run here, or not any more.",
-        Missing::Gone => "The folder of the runs is gone.",
-    };
-    pages::refusal(StatusCode::NOT_FOUND, words)
 }
 
 #[cfg(test)]
@@ -230,6 +223,19 @@ mod tests {
     fn names_of_this_machine(#[case] host: &str, #[case] local: bool) {
         let headers = HeaderMap::from_iter([(header::HOST, host.parse().unwrap())]);
         assert_eq!(is_local(&headers, &Uri::from_static("/")), local);
+    }
+
+    #[rstest]
+    #[case(&[], false)]
+    #[case(&[("sec-fetch-site", "same-origin"), ("sec-fetch-mode", "no-cors"), ("sec-fetch-dest", "image")], false)]
+    #[case(&[("sec-fetch-site", "none"), ("sec-fetch-mode", "navigate"), ("sec-fetch-dest", "document")], false)]
+    #[case(&[("sec-fetch-site", "cross-site"), ("sec-fetch-mode", "navigate"), ("sec-fetch-dest", "document")], false)]
+    #[case(&[("sec-fetch-site", "cross-site"), ("sec-fetch-mode", "no-cors"), ("sec-fetch-dest", "image")], true)]
+    #[case(&[("sec-fetch-site", "cross-site"), ("sec-fetch-mode", "navigate"), ("sec-fetch-dest", "iframe")], true)]
+    #[case(&[("sec-fetch-site", "same-site"), ("sec-fetch-mode", "cors"), ("sec-fetch-dest", "empty")], true)]
+    fn pages_of_other_sites_have_links_and_nothing_else(#[case] said: &[(&'static str, &str)], #[case] refused: bool) {
+        let said = said.iter().map(|(name, value)| (HeaderName::from_static(name), value.parse().unwrap()));
+        assert_eq!(is_of_another_site(&HeaderMap::from_iter(said)), refused);
     }
 
     #[test]

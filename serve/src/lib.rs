@@ -2,7 +2,8 @@
 //!
 //! - [`Server`] listens. [`http`](self) answers: which requests there are, what keeps strangers out.
 //! - `paths` and `files`: what of the folder is sent.
-//! - `watch`: one task looks at the files for all who look at pages, and tells them by server-sent events.
+//! - `watch`: one task looks at the files for all who look at pages, and tells them by server-sent events; `paced` says how
+//!   often anything is looked at, `shelf` keeps what is known of each run under a lock of its own.
 //! - `training`, `experiment`, `index`: what is known of each, kept between looks; `tail` and `curve` follow a log that
 //!   grows, `remaining` says how long an experiment may take, `report` makes its report, `load` asks a server.
 //! - `pages`: all of it as HTML.
@@ -16,11 +17,12 @@ mod files;
 mod http;
 mod index;
 mod load;
+mod paced;
 mod pages;
 mod paths;
 mod remaining;
 mod report;
-mod stamp;
+mod shelf;
 mod tail;
 mod training;
 mod watch;

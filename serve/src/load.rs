@@ -53,8 +53,12 @@ impl Asked {
 
     /// Asks.
     pub(crate) async fn ask(self: Arc<Self>) {
-        let answer = tokio::time::timeout(LIMIT, self.answer()).await;
-        let silent = || Err(format!("it did not answer within {} s", LIMIT.as_secs()));
+        self.ask_within(LIMIT).await;
+    }
+
+    async fn ask_within(&self, limit: Duration) {
+        let answer = tokio::time::timeout(limit, self.answer()).await;
+        let silent = || Err(format!("it did not answer within {} s", limit.as_secs_f64()));
         *self.last.lock().unwrap_or_else(PoisonError::into_inner) = Some(answer.unwrap_or_else(|_| silent()));
     }
 
@@ -76,5 +80,23 @@ impl Asked {
             usual: sorted[sorted.len() / 2],
             slowest: sorted[sorted.len() - 1],
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_server_that_does_not_answer_is_told() {
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let asked = Asked::at(format!("tcp://{}", listener.local_addr().unwrap()).parse().unwrap());
+        assert_eq!(asked.last(), None, "it was not asked yet");
+        asked.ask_within(Duration::from_millis(300)).await;
+        assert_eq!(asked.last(), Some(Err("it did not answer within 0.3 s".into())));
+        drop(listener);
+        asked.ask_within(LIMIT).await;
+        let reason = asked.last().unwrap().unwrap_err();
+        assert!(!reason.is_empty() && !reason.contains("did not answer within"), "nobody is there: {reason}");
     }
 }

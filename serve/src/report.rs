@@ -8,9 +8,14 @@ use std::time::{Duration, Instant};
 
 use perturb_study::Folder;
 use perturb_study::report::{ReportError, Sources, Whole};
+use tokio::sync::Semaphore;
 
 /// So many are kept.
-const MOST: usize = 4;
+const MOST: usize = 16;
+/// So many wait for one at a time; a browser asks again.
+const MOST_WAITING: usize = 32;
+/// After one another is begun after so many times as long as it took, whatever it is of.
+const PAUSE: u32 = 2;
 /// One is made again at the earliest after so long …
 const LEAST: Duration = Duration::from_secs(5);
 /// … and after so many times as long as it took.
@@ -18,12 +23,17 @@ const REST: u32 = 10;
 /// So long somebody waits for one.
 const PATIENCE: Duration = Duration::from_secs(60);
 
+/// What makes a report.
+type Make = fn(&Path) -> Result<Arc<str>, String>;
+
 /// Reports by the folders of their experiments.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(crate) struct Reports {
     made: Mutex<HashMap<PathBuf, Made>>,
-    /// Whoever has it makes one.
-    turn: tokio::sync::Mutex<()>,
+    /// Whoever has it makes one, not before this moment.
+    turn: tokio::sync::Mutex<Instant>,
+    waiting: Arc<Semaphore>,
+    make: Make,
 }
 
 /// A report.
@@ -37,13 +47,24 @@ struct Made {
 }
 
 impl Made {
-    /// Whether it is as good as a new one, or too new to be made again.
+    /// Whether it is as good as a new one, or too new to be made again. What kept one from being made may be gone.
     fn serves(&self, state: u64) -> bool {
-        self.state == state || self.at.elapsed() < LEAST.max(self.took * REST)
+        self.page.is_ok() && self.state == state || self.at.elapsed() < LEAST.max(self.took * REST)
+    }
+}
+
+impl Default for Reports {
+    fn default() -> Self {
+        Self::by(make)
     }
 }
 
 impl Reports {
+    fn by(make: Make) -> Self {
+        let (turn, waiting) = (tokio::sync::Mutex::new(Instant::now()), Arc::new(Semaphore::new(MOST_WAITING)));
+        Self { made: Mutex::default(), turn, waiting, make }
+    }
+
     /// The state of which a report would be sent now: `state`, which the files have, or an earlier one.
     pub(crate) fn state(&self, folder: &Path, state: u64) -> u64 {
         self.known().get(folder).filter(|made| made.serves(state)).map_or(state, |made| made.state)
@@ -52,14 +73,20 @@ impl Reports {
     /// The page of the experiment in `folder`, whose files have this `state`; in its place what is wrong.
     pub(crate) async fn page(self: &Arc<Self>, folder: &Path, state: u64) -> Result<Arc<str>, String> {
         let (this, folder) = (Arc::clone(self), folder.to_owned());
+        let Ok(place) = Arc::clone(&self.waiting).try_acquire_owned() else {
+            return Err("too many wait for reports already".into());
+        };
         // It is made to its end, also if nobody waits for it any more.
         let making = tokio::spawn(async move {
-            let _turn = this.turn.lock().await;
+            let _place = place;
+            let mut turn = this.turn.lock().await;
             if let Some(made) = this.known().get(&folder).filter(|made| made.serves(state)) {
                 return made.page.clone();
             }
-            let (at, place) = (Instant::now(), folder.clone());
+            tokio::time::sleep_until((*turn).into()).await;
+            let (at, place, make) = (Instant::now(), folder.clone(), this.make);
             let made = tokio::task::spawn_blocking(move || make(&place)).await;
+            *turn = Instant::now() + PAUSE * at.elapsed();
             let page = made.unwrap_or_else(|error| Err(error.to_string()));
             let mut known = this.known();
             let oldest = known.iter().min_by_key(|(_, made)| made.at).map(|(folder, _)| folder.clone());
@@ -85,4 +112,78 @@ fn make(folder: &Path) -> Result<Arc<str>, String> {
     let sources = Sources { folder: Some(Folder::new(folder)), ..Sources::default() };
     let page = sources.read(|whole: Whole<'_>| whole.page().map_err(ReportError::from));
     page.map(Arc::from).map_err(|error| error.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use super::*;
+
+    /// How many reports there were of folders of this name.
+    static MADE: [AtomicUsize; 2] = [AtomicUsize::new(0), AtomicUsize::new(0)];
+
+    fn made(name: &str) -> usize {
+        MADE[usize::from(name == "bad")].load(Ordering::SeqCst)
+    }
+
+    fn counted(folder: &Path) -> Result<Arc<str>, String> {
+        let bad = folder.ends_with("bad");
+        let number = MADE[usize::from(bad)].fetch_add(1, Ordering::SeqCst);
+        if bad { Err(format!("reason {number}")) } else { Ok(format!("{} {number}", folder.display()).into()) }
+    }
+
+    /// Makes it as old as if it had been made so long ago.
+    fn age(reports: &Reports, folder: &Path, by: Duration) {
+        let mut known = reports.known();
+        let made = known.get_mut(folder).unwrap();
+        made.at = made.at.checked_sub(by).unwrap();
+    }
+
+    #[tokio::test]
+    async fn a_report_is_made_again_when_it_is_another_one_and_not_too_often() {
+        let (reports, good, bad) = (Arc::new(Reports::by(counted)), Path::new("good"), Path::new("bad"));
+        let first = reports.page(good, 1).await.unwrap();
+        assert_eq!(reports.page(good, 1).await.unwrap(), first);
+        assert_eq!(reports.page(good, 2).await.unwrap(), first, "too early");
+        assert_eq!((reports.state(good, 2), reports.state(bad, 2)), (1, 2));
+        age(&reports, good, LEAST);
+        assert_eq!(reports.page(good, 1).await.unwrap(), first, "nothing has changed");
+        assert_eq!(reports.state(good, 2), 2);
+        assert_ne!(reports.page(good, 2).await.unwrap(), first);
+        assert_eq!(made("good"), 2);
+
+        assert_eq!(reports.page(bad, 1).await.unwrap_err(), "reason 0");
+        assert_eq!(reports.page(bad, 1).await.unwrap_err(), "reason 0", "too early");
+        age(&reports, bad, LEAST);
+        assert_eq!(reports.page(bad, 1).await.unwrap_err(), "reason 1", "what was wrong may have been put right");
+    }
+
+    fn slow(folder: &Path) -> Result<Arc<str>, String> {
+        std::thread::sleep(Duration::from_millis(50));
+        Ok(folder.display().to_string().into())
+    }
+
+    #[tokio::test]
+    async fn however_many_experiments_there_are_some_reports_are_kept_and_between_two_is_a_rest() {
+        let (reports, begun) = (Arc::new(Reports::by(slow)), Instant::now());
+        for number in 0..=MOST {
+            reports.page(&PathBuf::from(number.to_string()), 1).await.unwrap();
+        }
+        assert!(begun.elapsed() >= Duration::from_millis(50) * (1 + (1 + PAUSE) * MOST as u32));
+        let known = reports.known();
+        assert_eq!((known.len(), known.contains_key(Path::new("0"))), (MOST, false), "the oldest has gone");
+    }
+
+    #[tokio::test]
+    async fn so_many_wait_and_no_more() {
+        let reports = Arc::new(Reports::by(slow));
+        let ask = |number: usize| {
+            let reports = Arc::clone(&reports);
+            async move { reports.page(&PathBuf::from((number % 2).to_string()), 1).await }
+        };
+        let answers = futures_util::future::join_all((0..=MOST_WAITING).map(ask)).await;
+        let refused: Vec<_> = answers.into_iter().filter_map(Result::err).collect();
+        assert_eq!(refused, ["too many wait for reports already"]);
+    }
 }

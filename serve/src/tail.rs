@@ -1,13 +1,12 @@
 //! Following a log of lines that grows: what is new of it, and nothing twice.
 
-use std::fs::File;
 use std::io::{ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use crate::stamp::Stamp;
+use perturb_study::files::{Stamp, open_plain};
 
-/// At most so much is read at a time, bytes; the rest at the next look.
-const MOST: u64 = 64 << 20;
+/// At most so much is read at a time, bytes; the rest at the next look. No line is longer.
+pub(crate) const MOST: u64 = 64 << 20;
 /// So much before the end is compared with what it was: a log that was cut back and has grown again is another one.
 const REMEMBERED: usize = 64;
 
@@ -20,6 +19,8 @@ pub(crate) struct Tail {
     offset: u64,
     /// What stands before it.
     before: Vec<u8>,
+    /// The next line has no end: there is nothing more to read of this file, told by its number.
+    endless: Option<u64>,
 }
 
 /// What came of a look.
@@ -31,25 +32,29 @@ pub(crate) enum Look {
     More(Vec<u8>),
     /// The file is another one, or was cut back; its lines from the beginning. None if it is gone.
     Anew(Vec<u8>),
+    /// The next line is longer than anything that is read.
+    Endless,
 }
 
 impl Tail {
     pub(crate) fn of(path: &Path) -> Self {
-        Self { path: path.to_owned(), stamp: None, offset: 0, before: Vec::new() }
+        Self { path: path.to_owned(), stamp: None, offset: 0, before: Vec::new(), endless: None }
     }
 
     /// Reads whole lines that were not there.
     pub(crate) fn look(&mut self) -> std::io::Result<Look> {
-        let mut file = match File::open(&self.path) {
+        let (mut file, metadata) = match open_plain(&self.path) {
             Err(error) if error.kind() == ErrorKind::NotFound => {
                 let known = self.stamp.take().is_some();
-                (self.offset, self.before) = (0, Vec::new());
+                (self.offset, self.before, self.endless) = (0, Vec::new(), None);
                 return Ok(if known { Look::Anew(Vec::new()) } else { Look::Same });
             }
             opened => opened?,
         };
-        let stamp = Some(Stamp::of_metadata(&file.metadata()?));
-        if stamp == self.stamp {
+        let now = Stamp::of_metadata(&metadata);
+        let stamp = Some(now);
+        let still_endless = self.endless == Some(now.inode()) && now.length() >= self.offset + MOST;
+        if stamp == self.stamp || still_endless {
             return Ok(Look::Same);
         }
         let begun = self.stamp.is_some();
@@ -64,6 +69,8 @@ impl Tail {
             file.by_ref().take(MOST).read_to_end(&mut bytes)?;
         }
         let full = bytes.len() as u64 == MOST; // there may be more: look again although the file is the same
+        let endless = full && !bytes[self.before.len()..].contains(&b'\n');
+        self.endless = endless.then_some(now.inode());
         let lines = bytes.iter().rposition(|&byte| byte == b'\n').map_or(0, |last| last + 1).max(self.before.len());
         bytes.truncate(lines);
         let new = bytes.split_off(self.before.len());
@@ -72,6 +79,7 @@ impl Tail {
         self.before.drain(..self.before.len().saturating_sub(REMEMBERED));
         self.stamp = if full { Some(Stamp::default()) } else { stamp };
         Ok(match () {
+            () if endless => Look::Endless,
             () if anew && begun => Look::Anew(new),
             () if new.is_empty() => Look::Same,
             () => Look::More(new),
@@ -81,6 +89,7 @@ impl Tail {
 
 #[cfg(test)]
 mod tests {
+    use std::fs::File;
     use std::io::Write;
 
     use super::*;
@@ -109,7 +118,7 @@ mod tests {
         let mut tail = Tail::of(&path);
         std::fs::write(&path, "head\none\ntwo\n").unwrap();
         tail.look().unwrap();
-        for text in ["head\n", "head\none\nother\nmore\n", "x\n"] {
+        for text in ["head\none\nother\nmore\n", "head\n", "x\n"] {
             std::fs::write(&path, text).unwrap();
             assert_eq!(tail.look().unwrap(), Look::Anew(text.into()));
         }
@@ -119,8 +128,27 @@ mod tests {
     }
 
     #[test]
+    fn a_line_without_an_end_is_told_once_and_read_once() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("log");
+        std::fs::write(&path, "head\n").unwrap();
+        let mut tail = Tail::of(&path);
+        tail.look().unwrap();
+        let file = File::options().write(true).open(&path).unwrap();
+        file.set_len(MOST + 10).unwrap();
+        assert_eq!(tail.look().unwrap(), Look::Endless);
+        file.set_len(MOST + 20).unwrap();
+        assert_eq!((tail.look().unwrap(), tail.look().unwrap()), (Look::Same, Look::Same), "however it grows");
+        std::fs::write(&path, "head\none\n").unwrap();
+        assert_eq!(tail.look().unwrap(), Look::More(b"one\n".into()), "it was cut back");
+    }
+
+    #[test]
     fn what_cannot_be_read_is_an_error() {
         let directory = tempfile::tempdir().unwrap();
         assert!(Tail::of(directory.path()).look().is_err(), "a folder");
+        let pipe = directory.path().join("pipe");
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        assert!(Tail::of(&pipe).look().is_err(), "it is not waited for");
     }
 }

@@ -2,29 +2,28 @@
 //! latest alone, waits for each of them: who is slow misses what was in between.
 
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use perturb_study::runs::Kind;
-use tokio::sync::{Notify, watch};
+use tokio::sync::{Notify, Semaphore, watch};
 
 use crate::experiment::Experiment;
 use crate::index::Index;
 use crate::load::{self, Asked};
+use crate::paced::{Paced, Trouble, rest};
 use crate::pages::{self, Update};
 use crate::paths::{Relative, Root};
 use crate::report::Reports;
+use crate::shelf::{FORGET, Shelf};
 use crate::training::Training;
 
-/// How often files are looked at …
-const INTERVAL: Duration = Duration::from_secs(1);
-/// … but no more than this share of the time, as one in so many.
-const REST: u32 = 5;
 /// So many look on at a time.
 pub(crate) const MOST_CLIENTS: usize = 64;
-/// What nobody has looked at for so long is forgotten.
-const FORGET: Duration = Duration::from_secs(600);
+/// So many things are looked at at a time: more would only take the processors from trainings.
+const MOST_LOOKS: usize = 4;
+/// Who has just come waits so long for others who come with him.
+const GATHER: Duration = Duration::from_millis(50);
 
 /// What one can look at.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
@@ -36,22 +35,37 @@ pub(crate) enum Topic {
 }
 
 /// Why one cannot look at something.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Missing {
     /// There is no run.
     NoRun,
-    /// The folder of all runs is gone.
-    Gone,
+    /// The folder of all runs cannot be listed, for this reason.
+    Gone(String),
+    /// Looking has failed.
+    Not(Trouble),
 }
 
 /// What is seen, as it is sent.
 pub(crate) type Seen = Arc<str>;
 
+/// What is seen, for pages and as it is sent.
+#[derive(Debug)]
+pub(crate) struct Shown {
+    pub(crate) update: Update,
+    json: Seen,
+}
+
+/// A look at something, and when somebody last wanted it.
+type Look = (Paced<Result<Arc<Shown>, Missing>>, Instant);
+
 /// Looks at files.
 #[derive(Debug)]
 pub(crate) struct Watch {
     root: Root,
-    views: Mutex<Views>,
+    views: Views,
+    /// The last looks.
+    looks: Mutex<HashMap<Topic, Look>>,
+    room: Arc<Semaphore>,
     topics: Mutex<HashMap<Topic, watch::Sender<Seen>>>,
     /// Somebody has begun to look on.
     begun: Notify,
@@ -62,66 +76,75 @@ pub(crate) struct Watch {
 /// What is known of what was looked at.
 #[derive(Debug, Default)]
 pub(crate) struct Views {
-    pub(crate) trainings: HashMap<PathBuf, Used<Training>>,
-    pub(crate) experiments: HashMap<PathBuf, Used<Experiment>>,
-}
-
-/// Something, and when it was last looked at.
-#[derive(Debug)]
-pub(crate) struct Used<T>(T, Instant);
-
-impl Views {
-    pub(crate) fn training(&mut self, path: &Path) -> &mut Training {
-        let used = self.trainings.entry(path.to_owned()).or_insert_with(|| Used(Training::of(path), Instant::now()));
-        used.1 = Instant::now();
-        &mut used.0
-    }
-
-    pub(crate) fn experiment(&mut self, path: &Path) -> &mut Experiment {
-        let new = || Used(Experiment::of(path), Instant::now());
-        let used = self.experiments.entry(path.to_owned()).or_insert_with(new);
-        used.1 = Instant::now();
-        &mut used.0
-    }
-
-    fn forget(&mut self) {
-        self.trainings.retain(|_, used| used.1.elapsed() < FORGET);
-        self.experiments.retain(|_, used| used.1.elapsed() < FORGET);
-    }
+    pub(crate) trainings: Shelf<Training>,
+    pub(crate) experiments: Shelf<Experiment>,
 }
 
 impl Watch {
     pub(crate) fn new(root: Root, reports: Arc<Reports>, server: Option<Arc<Asked>>) -> Self {
-        let (views, topics, begun) = (Mutex::default(), Mutex::default(), Notify::new());
-        Self { root, views, topics, begun, reports, server }
+        let (views, looks, room) = (Views::default(), Mutex::default(), Arc::new(Semaphore::new(MOST_LOOKS)));
+        Self { root, views, looks, room, topics: Mutex::default(), begun: Notify::new(), reports, server }
     }
 
-    /// What there is to see now. Reads files.
-    pub(crate) fn see(&self, topic: &Topic) -> Result<Update, Missing> {
-        let server = self.server.as_ref().map(|server| (server.address(), server.last()));
-        let mut views = self.views.lock().unwrap_or_else(PoisonError::into_inner);
-        match topic {
-            Topic::Index => {
-                let index = Index::look(&self.root, &mut views).map_err(|_| Missing::Gone)?;
-                Ok(pages::index::update(&self.root, &index, server.as_ref()))
-            }
-            Topic::Run(relative) => {
-                let path = self.root.resolve(relative).ok_or(Missing::NoRun)?;
-                match Kind::of(&path).ok_or(Missing::NoRun)? {
-                    Kind::Training => {
-                        let training = views.training(&path);
-                        training.follow();
-                        Ok(pages::training::update(&self.root, relative, &path, training))
-                    }
-                    Kind::Experiment => {
-                        let experiment = views.experiment(&path);
-                        experiment.follow();
-                        let report = self.reports.state(&path, experiment.files());
-                        Ok(pages::experiment::update(&self.root, relative, &path, experiment, report))
-                    }
-                }
-            }
+    /// What there is to see, now or a moment ago.
+    pub(crate) async fn see(self: &Arc<Self>, topic: &Topic) -> Result<Arc<Shown>, Missing> {
+        let paced = self.paced(topic);
+        let (this, asked) = (Arc::clone(self), topic.clone());
+        let seen = paced.see(&self.room, move || this.look(&asked)).await;
+        let seen = seen.unwrap_or_else(|trouble| Err(Missing::Not(trouble)));
+        if matches!(seen, Err(Missing::NoRun)) {
+            self.looks().remove(topic); // names are many
         }
+        seen
+    }
+
+    fn paced(&self, topic: &Topic) -> Paced<Result<Arc<Shown>, Missing>> {
+        let mut looks = self.looks();
+        let (paced, used) = looks.entry(topic.clone()).or_insert_with(|| (Paced::default(), Instant::now()));
+        *used = Instant::now();
+        paced.clone()
+    }
+
+    /// Reads files.
+    fn look(&self, topic: &Topic) -> Result<Arc<Shown>, Missing> {
+        self.views.trainings.forget();
+        self.views.experiments.forget();
+        self.looks().retain(|_, (_, used)| used.elapsed() < FORGET);
+        let update = self.update(topic)?;
+        let json = update.to_json().into();
+        Ok(Arc::new(Shown { update, json }))
+    }
+
+    fn update(&self, topic: &Topic) -> Result<Update, Missing> {
+        let root = &self.root;
+        let relative = match topic {
+            Topic::Index => {
+                let index = Index::look(root, &self.views).map_err(|error| Missing::Gone(error.to_string()))?;
+                let server = self.server.as_ref().map(|server| (server.address(), server.last()));
+                return Ok(pages::index::update(root, &index, server.as_ref()));
+            }
+            Topic::Run(relative) => relative,
+        };
+        let path = root.resolve(relative).ok_or(Missing::NoRun)?;
+        Ok(match Kind::of(&path).ok_or(Missing::NoRun)? {
+            Kind::Training => self.views.trainings.with(
+                &path,
+                || Training::of(root.path(), &path),
+                |training| {
+                    training.follow();
+                    pages::training::update(root, relative, &path, training)
+                },
+            ),
+            Kind::Experiment => self.views.experiments.with(
+                &path,
+                || Experiment::of(root.path(), &path),
+                |experiment| {
+                    experiment.follow();
+                    let report = self.reports.state(&path, experiment.files());
+                    pages::experiment::update(root, relative, &path, experiment, report)
+                },
+            ),
+        })
     }
 
     /// Has `topic` looked at for one more; `None` if too many look on already. The first value may be empty.
@@ -141,9 +164,10 @@ impl Watch {
     pub(crate) async fn run(self: Arc<Self>) {
         let mut asked: Option<Instant> = None;
         loop {
-            let topics = self.watched();
+            let topics = self.watched(|_| true);
             if topics.is_empty() {
                 self.begun.notified().await;
+                tokio::time::sleep(GATHER).await;
                 continue;
             }
             if let Some(server) = self.server.as_ref().filter(|_| asked.is_none_or(|at| at.elapsed() >= load::INTERVAL))
@@ -151,47 +175,53 @@ impl Watch {
                 asked = Some(Instant::now());
                 tokio::spawn(Arc::clone(server).ask());
             }
-            let (begun, this) = (Instant::now(), Arc::clone(&self));
-            let look = move || {
-                topics.iter().for_each(|topic| this.look(topic));
-                this.views.lock().unwrap_or_else(PoisonError::into_inner).forget();
-            };
-            if let Err(error) = tokio::task::spawn_blocking(look).await {
-                tracing::error!("the files were not looked at: {error}");
-            }
-            let rest = INTERVAL.max(begun.elapsed() * REST);
-            // Who has just come is not kept waiting, but does not hurry anybody either.
-            tokio::select! {
-                () = tokio::time::sleep(rest) => {}
-                () = self.begun.notified() => tokio::time::sleep(Duration::from_millis(100)).await,
+            let begun = Instant::now();
+            self.tell(topics).await;
+            let next = tokio::time::Instant::now() + rest(begun.elapsed());
+            // Who has just come is not kept waiting, and does not hurry anybody else either.
+            while tokio::time::timeout_at(next, self.begun.notified()).await.is_ok() {
+                tokio::time::sleep(GATHER).await;
+                self.tell(self.watched(|seen| seen.is_empty())).await;
             }
         }
     }
 
-    /// What somebody looks at.
-    fn watched(&self) -> Vec<Topic> {
+    /// What somebody looks at, where the last that was seen is as `is` says.
+    fn watched(&self, is: impl Fn(&Seen) -> bool) -> Vec<Topic> {
         let mut topics = self.topics();
         topics.retain(|_, sender| sender.receiver_count() > 0);
-        topics.keys().cloned().collect()
+        topics.iter().filter(|(_, sender)| is(&sender.borrow())).map(|(topic, _)| topic.clone()).collect()
     }
 
-    fn look(&self, topic: &Topic) {
-        let seen = match self.see(topic) {
-            Ok(update) => update.to_json(),
-            Err(missing) => pages::gone(missing).to_json(),
-        };
-        if let Some(sender) = self.topics().get(topic) {
-            sender.send_if_modified(|last| {
-                let new = **last != *seen;
-                if new {
-                    *last = seen.into();
-                }
-                new
-            });
+    /// Looks at these, and tells who looks on.
+    async fn tell(self: &Arc<Self>, topics: Vec<Topic>) {
+        for topic in topics {
+            // One that does not end keeps the others waiting once; whoever has just come is told something.
+            let told = self.topics().get(&topic).is_some_and(|sender| !sender.borrow().is_empty());
+            if told && self.paced(&topic).is_busy() {
+                continue;
+            }
+            let seen = match self.see(&topic).await {
+                Ok(shown) => Arc::clone(&shown.json),
+                Err(missing) => pages::gone(&missing).into(),
+            };
+            if let Some(sender) = self.topics().get(&topic) {
+                sender.send_if_modified(|last| {
+                    let new = **last != *seen;
+                    if new {
+                        *last = seen;
+                    }
+                    new
+                });
+            }
         }
     }
 
     fn topics(&self) -> MutexGuard<'_, HashMap<Topic, watch::Sender<Seen>>> {
         self.topics.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn looks(&self) -> MutexGuard<'_, HashMap<Topic, Look>> {
+        self.looks.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -16,7 +16,8 @@ pub(super) fn run(args: &ServeArgs) -> Result<()> {
         let address = server.address();
         if !address.ip().is_loopback() {
             let warning = "anybody who reaches this address can see everything in the folder: there is neither \
-                           authentication nor encryption";
+                           authentication nor encryption; and so can any site that somebody who reaches it opens in a \
+                           browser, as names are not checked: prefer 127.0.0.1 and `ssh -L`";
             eprintln!("perturb: {warning}");
         }
         let mut out = std::io::stdout();

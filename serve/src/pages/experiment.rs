@@ -9,14 +9,12 @@ use perturb_study::runs::{CellStatus, ExperimentStatus, Kind};
 use perturb_study::words::{duration, grouped};
 use serde_json::json;
 
-use super::{Update, badge, bar, chart, crumbs, name_of, pictures, run_link, time, troubles};
-use crate::experiment::Experiment;
+use super::{Reported, Update, badge, bar, chart, crumbs, name_of, pictures, run_link, time, troubles};
+use crate::experiment::{Experiment, MOST_FOLLOWED as MOST_LISTED};
 use crate::paths::{Relative, Root};
 
 /// Of more cells no map is drawn.
 const MOST_MAPPED: usize = 1000;
-/// So many cells in work, and so many failures, are listed.
-const MOST_LISTED: usize = 48;
 
 pub(crate) fn update(root: &Root, relative: &Relative, path: &Path, experiment: &Experiment, report: u64) -> Update {
     let name = name_of(root, relative);
@@ -27,15 +25,16 @@ pub(crate) fn update(root: &Root, relative: &Relative, path: &Path, experiment: 
                 ("head", head(status, experiment)),
                 ("kinds", kinds(status)),
                 ("working", working(status, experiment, relative)),
-                ("map", map(status, relative)),
-                ("failures", failures(status, relative)),
+                ("map", map(status, experiment, relative)),
+                ("failures", failures(status, experiment, relative)),
                 ("pictures", pictures::of_run(relative, path)),
             ];
             (title(&name, status, experiment), parts)
         }
     };
     let charts = json!({ "cells": experiment.curves() });
-    Update { title, kind: Some(Kind::Experiment), parts, charts, report, files: experiment.files() }
+    let reported = Some(Reported { folder: experiment.reported(), state: experiment.files() });
+    Update { title, kind: Some(Kind::Experiment), parts, charts, report, reported, crumbs: crumbs(root, relative) }
 }
 
 pub(crate) fn page(root: &Root, relative: &Relative, update: &Update) -> String {
@@ -56,7 +55,7 @@ pub(crate) fn page(root: &Root, relative: &Relative, update: &Update) -> String 
             "Files: " a href={ "/file/" (relative.join("plan.toml").encode()) } { "plan.toml" }
         }
     };
-    super::document(&update.title, &format!("/events/{}", relative.encode()), &crumbs(root, relative), &main)
+    super::document(&update.title, &format!("/events/{}", relative.encode()), &update.crumbs, &main)
 }
 
 fn title(name: &str, status: &ExperimentStatus, experiment: &Experiment) -> String {
@@ -100,7 +99,7 @@ fn kinds(status: &ExperimentStatus) -> Markup {
     let rates = status.rates();
     let mut kinds: Vec<(String, usize, usize)> = Vec::new();
     for (cell, known) in status.plan.cells.iter().zip(&status.cells) {
-        let kind = kind(cell);
+        let kind = cell.described();
         let place = kinds.iter().position(|(name, ..)| *name == kind).unwrap_or_else(|| {
             kinds.push((kind, 0, 0));
             kinds.len() - 1
@@ -146,11 +145,6 @@ fn kinds(status: &ExperimentStatus) -> Markup {
     }
 }
 
-/// As [`perturb_study::scheduler::Rate`] has it.
-fn kind(cell: &Cell) -> String {
-    format!("{} {}, trained on {}", cell.config.common.environment, cell.method(), cell.trained_on())
-}
-
 fn working(status: &ExperimentStatus, experiment: &Experiment, relative: &Relative) -> Markup {
     let cells = || {
         let all = status.plan.cells.iter().zip(&status.cells);
@@ -177,12 +171,12 @@ fn one(cell: &Cell, experiment: &Experiment, relative: &Relative) -> Markup {
     let success = training.and_then(|status| status.progress.as_ref()?.success_percent());
     let doing = match () {
         () if training.is_none() => "beginning",
-        () if episodes >= budget => "tests",
+        () if episodes >= budget || training.is_some_and(|status| status.over) => "tests",
         () => "training",
     };
     html! {
         tr {
-            th scope="row" { a href=(cell_link(relative, cell)) { (cell.id) } }
+            th scope="row" { (cell_link(experiment, relative, cell, &html! { (cell.id) })) }
             td.amount {
                 (bar(episodes, budget, &format!("{}: episodes", cell.id)))
                 span { (grouped(episodes as usize)) " of " (grouped(budget as usize)) }
@@ -194,7 +188,7 @@ fn one(cell: &Cell, experiment: &Experiment, relative: &Relative) -> Markup {
 }
 
 /// Every cell as a square.
-fn map(status: &ExperimentStatus, relative: &Relative) -> Markup {
+fn map(status: &ExperimentStatus, experiment: &Experiment, relative: &Relative) -> Markup {
     if status.cells.len() > MOST_MAPPED {
         return html! { p { (grouped(status.cells.len())) " cells are too many to draw one by one." } };
     }
@@ -212,12 +206,7 @@ fn map(status: &ExperimentStatus, relative: &Relative) -> Markup {
                 @let word = word(known);
                 @let label = format!("{}: {word}", cell.id);
                 li class={ "state " (word.replace(' ', "-")) } title=(label) {
-                    // Who was not begun has no page.
-                    @if *known == (CellStatus::Waiting { begun: false }) {
-                        span.hidden { (label) }
-                    } @else {
-                        a href=(cell_link(relative, cell)) { span.hidden { (label) } }
-                    }
+                    (cell_link(experiment, relative, cell, &html! { span.hidden { (label) } }))
                 }
             }
         }
@@ -229,7 +218,7 @@ fn map(status: &ExperimentStatus, relative: &Relative) -> Markup {
     }
 }
 
-fn failures(status: &ExperimentStatus, relative: &Relative) -> Markup {
+fn failures(status: &ExperimentStatus, experiment: &Experiment, relative: &Relative) -> Markup {
     let failed: Vec<(&Cell, &str)> = status
         .plan
         .cells
@@ -244,7 +233,7 @@ fn failures(status: &ExperimentStatus, relative: &Relative) -> Markup {
         @if !failed.is_empty() {
             ul.trouble {
                 @for (cell, reason) in failed.iter().take(MOST_LISTED) {
-                    li { a href=(cell_link(relative, cell)) { (cell.id) } " failed: " (reason) }
+                    li { (cell_link(experiment, relative, cell, &html! { (cell.id) })) " failed: " (reason) }
                 }
                 @if failed.len() > MOST_LISTED { li { "and " (failed.len() - MOST_LISTED) " more" } }
             }
@@ -252,6 +241,8 @@ fn failures(status: &ExperimentStatus, relative: &Relative) -> Markup {
     }
 }
 
-fn cell_link(relative: &Relative, cell: &Cell) -> String {
-    run_link(&relative.join("cells").join(&cell.id).join("training"))
+/// Leads to a cell's training, if that was begun.
+fn cell_link(experiment: &Experiment, relative: &Relative, cell: &Cell, words: &Markup) -> Markup {
+    let address = || run_link(&relative.join("cells").join(&cell.id).join("training"));
+    html! { @if experiment.has_page(&cell.id) { a href=(address()) { (words) } } @else { (words) } }
 }

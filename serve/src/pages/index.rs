@@ -6,7 +6,6 @@ use maud::{Markup, html};
 use perturb_protocol::Address;
 use perturb_study::runs::Kind;
 use perturb_study::words::{duration, grouped};
-use serde_json::Value;
 
 use super::{Update, badge, bar, facts, name_of, pictures, run_link, time};
 use crate::index::{Index, MOST_FOLDERS, Row};
@@ -26,9 +25,7 @@ pub(crate) fn update(root: &Root, index: &Index, server: Option<&Server<'_>>) ->
             ("server", server.map_or_else(Markup::default, of_server)),
             ("pictures", pictures::shown(&index.pictures)),
         ],
-        charts: Value::Null,
-        report: 0,
-        files: 0,
+        ..Update::default()
     }
 }
 
@@ -58,6 +55,9 @@ fn runs(root: &Root, index: &Index) -> Markup {
                 }
                 tbody role="rowgroup" { @for row in &index.runs { (run(root, row)) } }
             }
+        }
+        @if index.more_runs > 0 {
+            p { "And " (grouped(index.more_runs)) " more, which changed before these." }
         }
         @if index.more {
             p { "There are more than " (grouped(MOST_FOLDERS)) " folders; the others were not looked at." }

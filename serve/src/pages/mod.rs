@@ -8,20 +8,22 @@ pub(crate) mod index;
 pub(crate) mod pictures;
 pub(crate) mod training;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use axum::http::StatusCode;
 use axum::response::{Html, IntoResponse, Response};
 use chrono::DateTime;
 use maud::{DOCTYPE, Markup, html};
 use perturb_study::runs::Kind;
+use perturb_study::words::shortened;
 use serde_json::{Map, Value, json};
 
+use crate::paced::Trouble;
 use crate::paths::{Relative, Root};
 use crate::watch::Missing;
 
 /// What there is to see of something.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(crate) struct Update {
     /// Of the window.
     pub(crate) title: String,
@@ -31,9 +33,21 @@ pub(crate) struct Update {
     pub(crate) parts: Vec<(&'static str, Markup)>,
     /// What is drawn.
     pub(crate) charts: Value,
-    /// The state of which a report would be sent, and that of the files.
+    /// The state of which a report would be sent.
     pub(crate) report: u64,
-    pub(crate) files: u64,
+    /// Of an experiment: what a report is made from now.
+    pub(crate) reported: Option<Reported>,
+    /// The way to it.
+    crumbs: Markup,
+}
+
+/// What a report is made from.
+#[derive(Clone, Debug)]
+pub(crate) struct Reported {
+    /// The folder; in its place why there is no report.
+    pub(crate) folder: Result<PathBuf, String>,
+    /// Of its files.
+    pub(crate) state: u64,
 }
 
 impl Update {
@@ -53,20 +67,33 @@ impl Update {
     }
 }
 
-/// What is sent when there is nothing to see any more.
-pub(crate) fn gone(missing: Missing) -> Gone {
-    Gone(match missing {
-        Missing::NoRun => "There is no run here any more.",
-        Missing::Gone => "The folder of the runs is gone.",
-    })
+/// What is sent when there is nothing to see.
+pub(crate) fn gone(missing: &Missing) -> String {
+    let words = match missing {
+        Missing::NoRun => "There is no run here any more.".into(),
+        missing => words_of(missing).1,
+    };
+    json!({ "gone": words }).to_string()
 }
 
-/// Nothing to see.
-pub(crate) struct Gone(&'static str);
+/// What is answered when there is nothing to see.
+pub(crate) fn not_there(missing: &Missing) -> Response {
+    let (status, words) = words_of(missing);
+    refusal(status, &words)
+}
 
-impl Gone {
-    pub(crate) fn to_json(&self) -> String {
-        json!({ "gone": self.0 }).to_string()
+fn words_of(missing: &Missing) -> (StatusCode, String) {
+    match missing {
+        Missing::NoRun => (StatusCode::NOT_FOUND, "There is no run here, or not any more.".into()),
+        Missing::Gone(reason) => (StatusCode::NOT_FOUND, format!("The runs cannot be listed: {reason}.")),
+        Missing::Not(Trouble::Panicked) => {
+            let words = "The server cannot show this: a mistake of its own, which it has said on its console.";
+            (StatusCode::INTERNAL_SERVER_ERROR, words.into())
+        }
+        Missing::Not(Trouble::Slow) => {
+            let words = "Looking at these files takes too long; perhaps their disk or network does not answer.";
+            (StatusCode::SERVICE_UNAVAILABLE, words.into())
+        }
     }
 }
 
@@ -204,6 +231,9 @@ pub(crate) fn refusal(status: StatusCode, words: &str) -> Response {
     (status, Html(page.into_string())).into_response()
 }
 
+/// After so many seconds a report is asked for again that could not be made.
+const AGAIN: u32 = 15;
+
 /// What stands in the place of a report.
 pub(crate) fn no_report(reason: &str) -> String {
     html! {
@@ -212,9 +242,10 @@ pub(crate) fn no_report(reason: &str) -> String {
             head {
                 meta charset="utf-8";
                 meta name="color-scheme" content="light dark";
+                meta http-equiv="refresh" content=(AGAIN); // what was wrong may have been put right
                 title { "perturb: no report" }
             }
-            body { p { "There is no report now: " (reason) } }
+            body { p { "There is no report now: " (shortened(reason)) } }
         }
     }
     .into_string()

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use maud::{Markup, html};
 use perturb_study::runs::{Kind, TrainingStatus};
-use perturb_study::words::{duration, grouped};
+use perturb_study::words::{duration, grouped, shortened};
 use perturb_study::{CellResult, TestResult};
 use serde_json::json;
 
@@ -26,7 +26,7 @@ pub(crate) fn update(root: &Root, relative: &Relative, path: &Path, training: &T
     };
     let (result, failure) = match training.result() {
         Some(Ok(result)) => (Some(result), None),
-        Some(Err(reason)) => (None, Some(format!("The cell failed: {reason}"))),
+        Some(Err(reason)) => (None, Some(reason)),
         None => (None, None),
     };
     let wrong: Vec<String> = failure.into_iter().chain(training.troubles()).collect();
@@ -39,9 +39,10 @@ pub(crate) fn update(root: &Root, relative: &Relative, path: &Path, training: &T
         ("tests", result.map_or_else(Markup::default, |result| tests(&result))),
         ("pictures", pictures::of_run(relative, path)),
         ("settings", settings(training)),
+        ("files", files(training, relative)),
     ];
     let charts = json!({ "curve": curve });
-    Update { title, kind: Some(Kind::Training), parts, charts, report: 0, files: 0 }
+    Update { title, kind: Some(Kind::Training), parts, charts, crumbs: crumbs(root, relative), ..Update::default() }
 }
 
 pub(crate) fn page(root: &Root, relative: &Relative, update: &Update) -> String {
@@ -67,13 +68,14 @@ pub(crate) fn page(root: &Root, relative: &Relative, update: &Update) -> String 
         (update.part("tests"))
         (update.part("pictures"))
         (update.part("settings"))
-        (files(relative))
+        (update.part("files"))
     };
-    super::document(&update.title, &format!("/events/{}", relative.encode()), &crumbs(root, relative), &main)
+    super::document(&update.title, &format!("/events/{}", relative.encode()), &update.crumbs, &main)
 }
 
 fn title(name: &str, status: &TrainingStatus) -> String {
-    let percent = 100 * status.episodes.min(status.config.common.episodes) / status.config.common.episodes.max(1);
+    let (done, budget) = (status.episodes as f64, status.config.common.episodes.max(1) as f64);
+    let percent = (100.0 * done / budget).min(100.0).floor();
     if status.state == "in work" { format!("{percent} % · {name}") } else { format!("{name} · perturb") }
 }
 
@@ -203,15 +205,14 @@ fn settings(training: &Training) -> Markup {
 }
 
 fn shown(value: &toml::Value) -> String {
-    value.as_str().map_or_else(|| value.to_string(), str::to_owned)
+    shortened(value.as_str().map_or_else(|| value.to_string(), str::to_owned))
 }
 
-fn files(relative: &Relative) -> Markup {
+fn files(training: &Training, relative: &Relative) -> Markup {
     html! {
         p.note {
-            "Files: "
-            @for (place, name) in ["config.toml", "monitor.csv", "progress.csv"].into_iter().enumerate() {
-                @if place > 0 { ", " }
+            @for (place, name) in training.files().enumerate() {
+                @if place > 0 { ", " } @else { "Files: " }
                 a href={ "/file/" (relative.join(name).encode()) } { (name) }
             }
         }

@@ -55,6 +55,20 @@ impl Place {
         self.ask("GET", path, "localhost")
     }
 
+    /// The page as soon as it is as `wanted` says: it may be that of a second ago.
+    #[track_caller]
+    pub fn until(&self, path: &str, wanted: impl Fn(&Answer) -> bool) -> Answer {
+        let start = Instant::now();
+        loop {
+            let answer = self.get(path);
+            if wanted(&answer) {
+                return answer;
+            }
+            assert!(start.elapsed() < LIMIT, "{path} is still {} {}", answer.status, answer.body);
+            std::thread::sleep(Duration::from_millis(100));
+        }
+    }
+
     pub fn ask(&self, method: &str, path: &str, host: &str) -> Answer {
         self.send(&format!("{method} {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n"))
     }

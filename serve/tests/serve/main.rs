@@ -1,4 +1,5 @@
 //! The pages over HTTP, without a browser.
+#![allow(clippy::unwrap_used)]
 
 mod client;
 mod pages;

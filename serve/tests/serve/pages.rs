@@ -155,8 +155,7 @@ fn what_is_broken_is_told_and_ends_nothing() {
     write(&place.path("one/monitor.csv"), "r,l,t,success\n1,2,3,1\nx,2,4,1\n\u{0}\u{1}\n5,2,5,1\n");
     write(&place.path("one/checkpoint/checkpoint.json"), "{");
     write(&place.path("one/progress.csv"), "\u{fffd}\n\n,,,");
-    let page = place.get("/run/one");
-    assert!(page.body.contains("monitor.csv: line 3: `x` is no number"), "{}", page.body);
+    let page = place.until("/run/one", |page| page.body.contains("monitor.csv: line 3: `x` is no number"));
     assert!(page.body.contains("checkpoint.json is not a usable checkpoint"), "{}", page.body);
 }
 
@@ -169,14 +168,107 @@ fn a_folder_that_vanishes_is_told_and_one_that_comes_back_is_shown() {
     std::fs::rename(place.path("one"), place.path(".hidden")).unwrap();
     events.until("the end", |event| event["gone"].is_string());
     assert_eq!(place.get("/run/one").status, 404);
+    assert_eq!(place.get("/file/one/config.toml").status, 404);
     std::fs::rename(place.path(".hidden"), place.path("one")).unwrap();
     events.until("the run again", |event| curve(event).is_object());
     std::fs::rename(place.path(""), place.path("").with_file_name("elsewhere")).unwrap();
-    all.until("the end of all", |event| event["gone"].is_string());
+    let event = all.until("the end of all", |event| event["gone"].is_string());
+    assert!(event["gone"].as_str().unwrap().contains("cannot list "), "{event}");
     assert_eq!(place.get("/").status, 404);
     std::fs::rename(place.path("").with_file_name("elsewhere"), place.path("")).unwrap();
     all.until("all again", |event| event["parts"].is_object());
     assert_eq!(place.get("/").status, 200);
+}
+
+#[test]
+fn pipes_and_devices_in_the_place_of_files_hold_nobody_up() {
+    let place = Place::new();
+    let pipe = |name: &str| {
+        let path = place.path(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        let _ = std::fs::remove_file(&path);
+        assert!(std::process::Command::new("mkfifo").arg(path).status().unwrap().success());
+    };
+    let plan = Plan::load(&place.path("study/plan.toml")).unwrap();
+    let cell = |cell: usize, name: &str| format!("study/cells/{}/{name}", plan.cells[cell].id);
+    pipe("one/monitor.csv");
+    pipe("one/progress.csv");
+    pipe("one/checkpoint/checkpoint.json");
+    pipe(&cell(1, "result.json"));
+    pipe(&cell(0, "training/monitor.csv"));
+    pipe("study/heatmaps/a.json");
+    write_training(&place.path("zeros"), 3);
+    std::fs::remove_file(place.path("zeros/monitor.csv")).unwrap();
+    std::os::unix::fs::symlink("/dev/zero", place.path("zeros/monitor.csv")).unwrap();
+    for path in ["/", "/run/one", "/run/study", "/run/zeros", "/report/study"] {
+        assert_eq!(place.get(path).status, 200, "{path}");
+    }
+    assert!(place.get("/run/one").body.contains("monitor.csv: it cannot be read: it is a pipe"));
+    assert!(place.get("/run/study").body.contains("it is a pipe or a device"));
+    assert_eq!(place.get("/file/one/monitor.csv").status, 404);
+}
+
+#[test]
+fn what_is_behind_a_link_out_of_the_folder_is_neither_shown_nor_quoted() {
+    let place = Place::new();
+    write(&place.folder.path().join("credentials.toml"), "[registry]\ntoken = \"secret-token");
+    let link = |name: &str| {
+        let _ = std::fs::remove_file(place.path(name));
+        write(&place.path(name), "");
+        std::fs::remove_file(place.path(name)).unwrap();
+        std::os::unix::fs::symlink(place.folder.path().join("credentials.toml"), place.path(name)).unwrap();
+    };
+    let plan = Plan::load(&place.path("study/plan.toml")).unwrap();
+    link("x/config.toml");
+    link("y/plan.toml");
+    link(&format!("study/cells/{}/result.json", plan.cells[1].id));
+    for (path, words) in [
+        ("/run/x", "config.toml is a link that leads out of the folder"),
+        ("/run/y", "plan.toml is a link that leads out of the folder"),
+        ("/run/study", "result.json is a link that leads out of the folder"),
+        ("/report/y", "plan.toml is a link that leads out of the folder"),
+        ("/report/study", "result.json is a link that leads out of the folder"),
+        ("/", "not understood"),
+    ] {
+        let page = place.get(path);
+        assert!(page.status == 200 && page.body.contains(words), "{path}: {}", page.body);
+        assert!(!page.body.contains("token") && !page.body.contains("registry"), "{path}: {}", page.body);
+    }
+}
+
+#[test]
+fn links_lead_to_what_is_there() {
+    let place = Place::new();
+    let plan = Plan::load(&place.path("study/plan.toml")).unwrap();
+    let page = place.get("/run/study");
+    assert!(
+        page.body.contains(&format!("{}: done", plan.cells[0].id)) && !page.body.contains("href=\"/run/study/cells")
+    );
+    write_training(&place.path("study/cells").join(&plan.cells[0].id).join("training"), 20);
+    let address = format!("href=\"/run/study/cells/{}/training\"", plan.cells[0].id);
+    place.until("/run/study", |page| page.body.contains(&address));
+    let sent = |page: &str| {
+        ["config.toml", "monitor.csv", "progress.csv"].map(|name| page.contains(&format!("/one/{name}\"")))
+    };
+    assert_eq!(sent(&place.get("/run/one").body), [true; 3]);
+    std::fs::remove_file(place.path("one/progress.csv")).unwrap();
+    let page = place.until("/run/one", |page| !page.body.contains("/one/progress.csv\""));
+    assert_eq!(sent(&page.body), [true, true, false]);
+}
+
+#[test]
+fn many_who_ask_have_files_looked_at_no_more_often() {
+    let place = Place::new();
+    place.get("/run/one");
+    let begun = std::time::Instant::now();
+    write(&place.path("one/config.toml"), "no = TOML =");
+    place.until("/run/one", |page| page.body.contains("not understood"));
+    assert!(begun.elapsed() >= std::time::Duration::from_millis(900), "{:?}", begun.elapsed());
+    // Who comes to look at one run has no other looked at.
+    let mut events = place.events("/events/study");
+    events.until("an event", |_| true);
+    write_training(&place.path("one"), 30);
+    place.events("/events/one").until("the run", |event| curve(event).is_object());
 }
 
 #[test]

@@ -82,6 +82,20 @@ fn another_name_for_this_machine_is_refused() {
 }
 
 #[test]
+fn another_site_has_nothing_looked_at() {
+    let place = Place::new();
+    let ask = |site: &str, mode: &str, dest: &str, path: &str| {
+        let said = format!("Sec-Fetch-Site: {site}\r\nSec-Fetch-Mode: {mode}\r\nSec-Fetch-Dest: {dest}");
+        place.send(&format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n{said}\r\nConnection: close\r\n\r\n")).status
+    };
+    for path in ["/", "/run/one", "/report/study", "/file/one/monitor.csv", "/events"] {
+        assert_eq!(ask("cross-site", "no-cors", "image", path), 403, "{path}");
+    }
+    assert_eq!(ask("cross-site", "navigate", "document", "/run/one"), 200, "a link");
+    assert_eq!(ask("same-origin", "no-cors", "image", "/file/one/monitor.csv"), 200);
+}
+
+#[test]
 fn answers_say_what_browsers_may_do_with_them() {
     let place = Place::new();
     for path in ["/", "/run/one", "/run/study", "/report/study", "/file/pictures/over%20%3Cb%3E.svg", "/nothing"] {
@@ -117,8 +131,22 @@ fn files_are_sent_whole_in_part_and_by_their_kind() {
     assert_eq!((answer.status, answer.body.as_str()), (206, "234"));
     assert!(answer.head.contains("content-range: bytes 2-4/10") && answer.head.contains("content-length: 3"));
     assert_eq!((part("-2").body.as_str(), part("8-").body.as_str(), part("10-").status), ("89", "89", 416));
+    let tag = answer_tag(&place.get("/file/film.mp4").head);
+    let with = |said: &str| {
+        place
+            .send(&format!("GET /file/film.mp4?v=1 HTTP/1.1\r\nHost: localhost\r\n{said}\r\nConnection: close\r\n\r\n"))
+    };
+    assert_eq!(with(&format!("If-None-Match: \"x\", {tag}")).status, 304);
+    assert_eq!(with(&format!("Range: bytes=2-4\r\nIf-Range: {tag}")).body, "234");
+    write(&place.path("film.mp4"), "another film");
+    assert_eq!(with(&format!("If-None-Match: {tag}")).body, "another film");
+    assert_eq!(with(&format!("Range: bytes=2-4\r\nIf-Range: {tag}")).status, 200, "a part of another file");
     let head = place.ask("HEAD", "/file/film.mp4", "localhost");
     assert_eq!((head.status, head.body.as_str()), (200, ""));
+}
+
+fn answer_tag(head: &str) -> String {
+    head.lines().find_map(|line| line.strip_prefix("etag: ")).expect("a tag").to_owned()
 }
 
 #[test]
