@@ -11,6 +11,7 @@ a list of what is wrong.
 
 import base64
 import contextlib
+import json
 import shutil
 import signal
 import subprocess
@@ -32,13 +33,26 @@ LIVE = "document.getElementById('live').dataset.state === 'live'"
 REACH = "Number(document.querySelector('[data-chart=return]').dataset.reach ?? 0)"
 DONE = "document.querySelectorAll('.map li.done').length"
 REPORTED = "document.querySelector('iframe.report').contentDocument?.body.innerText.includes('WORDS') ?? false"
-PAINTED = """
-[...document.querySelectorAll('figure.chart canvas')].map(canvas => {
-  const blank = document.createElement('canvas');
-  [blank.width, blank.height] = [canvas.width, canvas.height];
-  return canvas.toDataURL() !== blank.toDataURL();
-})
-"""
+# The colours of the lines, by the names of the plots; that of cells may have any of its kinds'.
+LINES = {"return": ["#0072b2"], "success": ["#009e73"], "length": ["#cc79a7"], "speed": ["#d55e00"]}
+LINES["cells"] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d00", "#7f7f7f"]
+# Of each plot that has a canvas: its name, and how many pixels have a colour of its lines.
+PAINTED = """[...document.querySelectorAll('figure.chart canvas')].map(canvas => {
+  const name = canvas.closest('figure').dataset.chart;
+  const lines = LINES[name].map(colour => [1, 3, 5].map(place => parseInt(colour.slice(place, place + 2), 16)));
+  const copy = document.createElement('canvas');
+  [copy.width, copy.height] = [canvas.width, canvas.height];
+  const context = copy.getContext('2d', {willReadFrequently: true});
+  context.drawImage(canvas, 0, 0);
+  const {data} = context.getImageData(0, 0, copy.width, copy.height);
+  let count = 0;
+  for (let place = 0; place < data.length; place += 4)
+    count += data[place + 3] > 200 && lines.some(line => line.every((value, i) => Math.abs(value - data[place + i]) < 12));
+  return [name, count];
+})""".replace("LINES", json.dumps(LINES))
+CURVES = list(LINES)[:4]
+# A line is at least so long, pixels.
+LEAST_LINE = 100
 UNNAMED = """
 [...document.querySelectorAll('img:not([alt]), [role=img]:not([aria-label]), iframe:not([title]), progress:not([aria-label])')]
   .length
@@ -80,8 +94,9 @@ class Pages:
     def stayed(self, what):
         self.check(f"{what}: the page was not loaded again", self.evaluate("window.since"), "the beginning")
 
-    def draw(self, name, schemes=("light", "dark")):
-        """Takes pictures, and looks at what must hold at any size."""
+    def draw(self, name, plots=(), schemes=("light", "dark")):
+        """Takes pictures, and looks at what must hold at any size: these plots are there, if that is
+        known, and each has its line."""
         for scheme in schemes:
             self.browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
             for width, height in WIDTHS.items():
@@ -93,7 +108,11 @@ class Pages:
                 shot = self.browser.call("Page.captureScreenshot", clip=clip, captureBeyondViewport=True)
                 (self.pictures / f"{name}-{width}-{scheme}.png").write_bytes(base64.b64decode(shot["data"]))
                 self.check(f"{name}: pixels wider than {width}", max(0, self.evaluate(WIDER)), 0)
-                self.check(f"{name}: plots without a line at {width}", self.evaluate(PAINTED).count(False), 0)
+                painted = self.evaluate(PAINTED)
+                if plots is not None:
+                    self.check(f"{name}: plots at {width}", [plot for plot, _ in painted], list(plots))
+                bare = [(plot, count) for plot, count in painted if count < LEAST_LINE]
+                self.check(f"{name}: plots without a line at {width}, with the pixels that have its colour", bare, [])
         self.check(f"{name}: without a name", self.evaluate(UNNAMED), 0)
         self.check(f"{name}: pictures that do not load", self.evaluate(BROKEN), [])
         first, last = schemes[0], next(iter(WIDTHS))
@@ -159,7 +178,7 @@ def main():
         pages.evaluate("document.images[0].scrollIntoView()")
         pages.until("pictures of a run", loaded)
         pages.evaluate("scrollTo(0, 0)")
-        pages.draw("finished", schemes=("light",))
+        pages.draw("finished", CURVES, schemes=("light",))
 
         wrong = pages.wrong + list(pages.complaints())
         pages.open("run/cart-pole-on-R")
@@ -184,7 +203,7 @@ def watch_training(pages):
     reach = pages.evaluate(REACH)
     pages.until("a curve that grows", f"{REACH} > {reach}")
     pages.until("a title that says how far it is", "document.title.includes('%')")
-    pages.draw("training")
+    pages.draw("training", CURVES)
     pages.evaluate("document.querySelector('input[value=steps]').click()")
     pages.check("over steps it reaches further", pages.evaluate(f"{REACH} > {reach}"), True)
     pages.stayed("a curve that grows")
@@ -196,10 +215,15 @@ def watch_experiment(pages, experiment):
     pages.open("run/study")
     pages.until("a cell in work", "document.querySelectorAll('.working tbody tr').length > 0")
     pages.until("its curve", "document.querySelector('[data-chart=cells]').dataset.points > 1")
-    pages.draw("experiment", schemes=("light",))
+    # From one cell to the next there may be none for a moment.
+    pages.until("its line", f"{PAINTED}.some(([plot, count]) => plot === 'cells' && count >= {LEAST_LINE})")
+    pages.draw("experiment", None, schemes=("light",))
+    pages.until("a link to its training", "document.querySelector('.map li.in-work a') !== null")
+    pages.evaluate("window.kept = document.querySelector('.map a'); window.kept.focus()")
     done = pages.evaluate(DONE)
     pages.until("a cell that is done", f"{DONE} > {done}")
-    pages.draw("experiment-later")
+    pages.check("what has the focus keeps it", pages.evaluate("document.activeElement === window.kept"), True)
+    pages.draw("experiment-later", None)
     if status := experiment.wait(timeout=LIMIT):
         pages.wrong.append(f"perturb run ended with {status}")
     pages.until("all cells", f"{DONE} === 16")
