@@ -124,9 +124,10 @@ def channels(entries):
 
 
 def leaderboard():
-    """The trained policies of results/, by environment, those that keep most of their success elsewhere first."""
+    """The trained policies of results/, by environment, those with the highest mean over D, R and E first."""
     kept = [path.parents[1] / "result.json" for path in Path("results").rglob("cells/*/training/checkpoint")]
     results = [json.loads(path.read_text()) for path in sorted(kept) if path.exists()]
+    results = [result for result in results if set("DRE") <= set(result["results"])]
     page = (
         "# Leaderboard\n\nTrained policies that come with the repository: success in % on D, R and E, and the mean of"
         " the three, by which they stand. Their names are what `perturb video`, `evaluate`, `heatmap` and"

@@ -150,7 +150,7 @@ mod tests {
 
     use super::*;
 
-    const SHORT: Limits = Limits { most: 1, patience: Duration::from_millis(400), head: Duration::from_millis(150) };
+    const SHORT: Limits = Limits { most: 1, patience: Duration::from_secs(5), head: Duration::from_millis(150) };
     const TICK: Duration = Duration::from_millis(20);
 
     async fn connected() -> (Connections, Connection, TcpStream) {

@@ -1,6 +1,7 @@
 //! Looking at something no more often than a part of the time, by one at a time, for all who want to know.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use tokio::sync::{Mutex, Semaphore};
@@ -14,7 +15,11 @@ const PATIENCE: Duration = Duration::from_secs(20);
 
 /// Something that is looked at now and then.
 #[derive(Debug)]
-pub(crate) struct Paced<T>(Arc<Mutex<Option<Last<T>>>>);
+pub(crate) struct Paced<T> {
+    last: Arc<Mutex<Option<Last<T>>>>,
+    /// Whether a look goes on for longer than anybody waits.
+    stuck: Arc<AtomicBool>,
+}
 
 /// What was seen of it, when, and how long looking took.
 #[derive(Debug)]
@@ -40,24 +45,24 @@ pub(crate) fn rest(took: Duration) -> Duration {
 
 impl<T> Default for Paced<T> {
     fn default() -> Self {
-        Self(Arc::new(Mutex::new(None)))
+        Self { last: Arc::new(Mutex::new(None)), stuck: Arc::default() }
     }
 }
 
 impl<T> Clone for Paced<T> {
     fn clone(&self) -> Self {
-        Self(Arc::clone(&self.0))
+        Self { last: Arc::clone(&self.last), stuck: Arc::clone(&self.stuck) }
     }
 }
 
 impl<T: Clone + Send + 'static> Paced<T> {
     /// Whether somebody looks just now.
     pub(crate) fn is_busy(&self) -> bool {
-        self.0.try_lock().is_err()
+        self.last.try_lock().is_err()
     }
 
     /// What is seen: by a look, as soon as there is `room` for one, or by the last one if it was lately. A look goes on to
-    /// its end, also if nobody waits for it any more.
+    /// its end, also if nobody waits for it any more, but then takes no room from others.
     pub(crate) async fn see(
         &self,
         room: &Arc<Semaphore>,
@@ -72,15 +77,29 @@ impl<T: Clone + Send + 'static> Paced<T> {
         room: &Arc<Semaphore>,
         look: impl FnOnce() -> T + Send + 'static,
     ) -> Result<T, Trouble> {
-        let (last, room) = (Arc::clone(&self.0), Arc::clone(room));
+        if self.stuck.load(Ordering::Relaxed) {
+            return Err(Trouble::Slow);
+        }
+        let (last, stuck, room) = (Arc::clone(&self.last), Arc::clone(&self.stuck), Arc::clone(room));
         let looking = tokio::spawn(async move {
             let mut last = last.lock_owned().await;
             if let Some(known) = last.as_ref().filter(|known| known.at.elapsed() < rest(known.took)) {
                 return known.seen.clone();
             }
-            let _room = room.acquire_owned().await; // nobody closes it
+            let room = room.acquire_owned().await; // nobody closes it
             let begun = Instant::now();
-            let seen = tokio::task::spawn_blocking(look).await.map_err(|error| {
+            let mut look = tokio::task::spawn_blocking(look);
+            let looked = match tokio::time::timeout(patience, &mut look).await {
+                Ok(looked) => looked,
+                Err(_) => {
+                    drop(room);
+                    stuck.store(true, Ordering::Relaxed);
+                    let looked = look.await;
+                    stuck.store(false, Ordering::Relaxed);
+                    looked
+                }
+            };
+            let seen = looked.map_err(|error| {
                 tracing::error!("the files were not looked at: {error}");
                 Trouble::Panicked
             });
@@ -117,11 +136,10 @@ mod tests {
         let begun = Instant::now();
         let (one, other) = tokio::join!(see(), see());
         assert_eq!((one, other), (Ok(0), Ok(0)));
-        while begun.elapsed() < Duration::from_millis(1500) {
-            assert_eq!(see().await, Ok(0), "a rest of five times as long as it took");
+        while see().await == Ok(0) {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
-        tokio::time::sleep(Duration::from_millis(600)).await;
+        assert!(begun.elapsed() >= Duration::from_millis(1800), "a rest of five times as long as it took");
         assert_eq!(see().await, Ok(1));
     }
 
@@ -139,7 +157,7 @@ mod tests {
 
     #[tokio::test]
     async fn who_waits_for_a_look_that_does_not_end_is_told() {
-        let (stuck, other, room) = (Paced::<u8>::default(), Paced::default(), room());
+        let (stuck, other, room) = (Paced::<u8>::default(), Paced::default(), Arc::new(Semaphore::new(1)));
         let (end, ended) = std::sync::mpsc::channel::<()>();
         let seen = stuck.see_within(Duration::from_millis(100), &room, move || {
             let _ = ended.recv();
@@ -147,7 +165,12 @@ mod tests {
         });
         assert_eq!(seen.await, Err(Trouble::Slow));
         assert!(stuck.is_busy() && !other.is_busy());
-        assert_eq!(other.see(&room, || 2).await, Ok(2));
+        assert_eq!(other.see(&room, || 2).await, Ok(2), "there was room for one");
+        assert_eq!(stuck.see(&room, || 3).await, Err(Trouble::Slow), "nobody else waits");
         drop(end);
+        while stuck.see(&room, || 3).await == Err(Trouble::Slow) {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        assert_eq!(stuck.see(&room, || 3).await, Ok(1), "what it saw in the end");
     }
 }

@@ -22,6 +22,8 @@ use crate::training::Training;
 pub(crate) const MOST_CLIENTS: usize = 64;
 /// So many things are looked at at a time: more would only take the processors from trainings.
 const MOST_LOOKS: usize = 4;
+/// So long those who look on wait for what is looked at at once; what takes longer is told when it is seen.
+const TOGETHER: Duration = Duration::from_secs(2);
 /// Who has just come waits so long for others who come with him.
 const GATHER: Duration = Duration::from_millis(50);
 
@@ -109,7 +111,7 @@ impl Watch {
     fn look(&self, topic: &Topic) -> Result<Arc<Shown>, Missing> {
         self.views.trainings.forget();
         self.views.experiments.forget();
-        self.looks().retain(|_, (_, used)| used.elapsed() < FORGET);
+        self.looks().retain(|_, (look, used)| used.elapsed() < FORGET || look.is_busy());
         let update = self.update(topic)?;
         let json = update.to_json().into();
         Ok(Arc::new(Shown { update, json }))
@@ -195,25 +197,36 @@ impl Watch {
 
     /// Looks at these, and tells who looks on.
     async fn tell(self: &Arc<Self>, topics: Vec<Topic>) {
-        for topic in topics {
-            // One that does not end keeps the others waiting once; whoever has just come is told something.
-            let told = self.topics().get(&topic).is_some_and(|sender| !sender.borrow().is_empty());
-            if told && self.paced(&topic).is_busy() {
-                continue;
-            }
-            let seen = match self.see(&topic).await {
-                Ok(shown) => Arc::clone(&shown.json),
-                Err(missing) => pages::gone(&missing).into(),
-            };
-            if let Some(sender) = self.topics().get(&topic) {
-                sender.send_if_modified(|last| {
-                    let new = **last != *seen;
-                    if new {
-                        *last = seen;
-                    }
-                    new
-                });
-            }
+        // One that does not end keeps no other waiting; whoever has just come is told something.
+        let is_due = |topic: &Topic| {
+            let told = self.topics().get(topic).is_some_and(|sender| !sender.borrow().is_empty());
+            !(told && self.paced(topic).is_busy())
+        };
+        let looks: Vec<_> = topics
+            .into_iter()
+            .filter(is_due)
+            .map(|topic| {
+                let this = Arc::clone(self);
+                tokio::spawn(async move { this.tell_of(&topic).await })
+            })
+            .collect();
+        // A look that panics is told as such, and a late one goes on.
+        let _ = tokio::time::timeout(TOGETHER, futures_util::future::join_all(looks)).await;
+    }
+
+    async fn tell_of(self: &Arc<Self>, topic: &Topic) {
+        let seen = match self.see(topic).await {
+            Ok(shown) => Arc::clone(&shown.json),
+            Err(missing) => pages::gone(&missing).into(),
+        };
+        if let Some(sender) = self.topics().get(topic) {
+            sender.send_if_modified(|last| {
+                let new = **last != *seen;
+                if new {
+                    *last = seen;
+                }
+                new
+            });
         }
     }
 

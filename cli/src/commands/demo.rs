@@ -39,7 +39,7 @@ const POINT_EPISODES: u64 = 5;
 const TRIES: u64 = 20;
 /// Width and height of the films' pictures, and steps from one to the next: a robot's takes some 60 ms to draw.
 const PIXELS: (u32, u32) = (240, 240);
-const EVERY: u32 = 6;
+const EVERY: u32 = 8;
 
 /// A policy that was trained, and its success by what it was tested on, %.
 struct Trained {

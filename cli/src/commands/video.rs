@@ -12,7 +12,7 @@ use perturb_study::interrupt::StopFlag;
 use perturb_study::table::Table;
 
 /// Of a whole episode so many pictures are drawn for a contact sheet, which takes few: a robot's takes some 60 ms.
-const MOMENTS: u32 = 250;
+const MOMENTS: u32 = 500;
 
 pub(super) fn run(args: &VideoArgs) -> Result<()> {
     let is_sheet = Format::of(&args.out)? == Format::Png;

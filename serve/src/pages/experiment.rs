@@ -49,7 +49,7 @@ pub(crate) fn page(root: &Root, relative: &Relative, update: &Update) -> String 
         details open { summary { "All cells" } (update.part("map")) }
         (update.part("pictures"))
         h2 { "Report as it stands" }
-        p.note { a href=(report) { "The report alone" } ", as `perturb report --html` writes it when all is done." }
+        p.note { a href=(report) { "The report alone" } ", as " code { "perturb report --html" } " writes it when all is done." }
         iframe.report src=(report) title="Report as it stands" loading="lazy" data-report=(format!("{:016x}", update.report)) {}
         p.note {
             "Files: " a href={ "/file/" (relative.join("plan.toml").encode()) } { "plan.toml" }

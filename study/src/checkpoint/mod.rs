@@ -108,7 +108,7 @@ pub enum CheckpointError {
         path: PathBuf,
     },
     /// A name is the beginning of several.
-    #[error("`{name}` could be any of these policies in {}, give one of them: {}", folder.display(), names.join(", "))]
+    #[error("`{name}` could be any of these policies in {}, give the name or the path of one: {}", folder.display(), names.join(", "))]
     Several {
         /// What was given.
         name: String,

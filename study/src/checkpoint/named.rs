@@ -23,34 +23,43 @@ fn find_below(folder: &Path, path: &Path) -> Result<Option<PathBuf>> {
     let (Some(std::path::Component::Normal(name)), None) = (parts.next(), parts.next()) else { return Ok(None) };
     let Some(name) = name.to_str().filter(|_| !path.exists()) else { return Ok(None) };
     let mut found = Vec::new();
-    collect(folder, name, DEPTH, &mut found)?;
+    collect(folder, name, DEPTH, &mut found);
     let id = |checkpoint: &PathBuf| checkpoint.ancestors().nth(2).and_then(Path::file_name).map(ToOwned::to_owned);
-    if let Some(whole) = found.iter().find(|checkpoint| id(checkpoint).is_some_and(|id| id == name)) {
+    let is_whole = |checkpoint: &&PathBuf| id(checkpoint).is_some_and(|id| id == name);
+    if let [whole] = found.iter().filter(is_whole).collect::<Vec<_>>()[..] {
         return Ok(Some(whole.clone()));
     }
     match &found[..] {
         [] => Ok(None),
         [one] => Ok(Some(one.clone())),
         several => {
-            let names = several.iter().filter_map(id).map(|id| id.to_string_lossy().into_owned()).collect();
+            let shown = |checkpoint: &PathBuf| match checkpoint
+                .ancestors()
+                .nth(2)
+                .and_then(|cell| cell.strip_prefix(folder).ok())
+            {
+                Some(cell) => cell.display().to_string(),
+                None => checkpoint.display().to_string(),
+            };
+            let names = several.iter().map(shown).collect();
             Err(CheckpointError::Several { name: name.to_owned(), folder: folder.to_owned(), names })
         }
     }
 }
 
-/// Adds the checkpoints of cells whose ids begin with `name`, in the order of their paths.
-fn collect(folder: &Path, name: &str, depth: usize, found: &mut Vec<PathBuf>) -> Result<()> {
-    for path in list(folder)? {
+/// Adds the checkpoints of cells whose ids begin with `name`, in the order of their paths. What cannot be listed has none.
+fn collect(folder: &Path, name: &str, depth: usize, found: &mut Vec<PathBuf>) {
+    for path in list(folder).unwrap_or_default() {
         let Some(file) = path.file_name().and_then(|file| file.to_str()) else { continue };
         if file == "cells" {
             let begins = |cell: &PathBuf| cell.file_name().is_some_and(|id| id.to_string_lossy().starts_with(name));
-            let checkpoints = list(&path)?.into_iter().filter(begins).map(|cell| cell.join("training/checkpoint"));
+            let checkpoints =
+                list(&path).unwrap_or_default().into_iter().filter(begins).map(|cell| cell.join("training/checkpoint"));
             found.extend(checkpoints.filter(|checkpoint| checkpoint.join(JSON).is_file()));
         } else if depth > 0 && path.is_dir() {
-            collect(&path, name, depth - 1, found)?;
+            collect(&path, name, depth - 1, found);
         }
     }
-    Ok(())
 }
 
 #[cfg(test)]
@@ -74,7 +83,13 @@ mod tests {
             assert_eq!(find(none).unwrap(), None, "{none}");
         }
         let several = find("Hopper").unwrap_err().to_string();
-        assert!(several.contains("Hopper-R-1, Hopper-R-10, Hopper-D-2"), "{several}");
+        assert!(several.contains("a/cells/Hopper-R-1, a/cells/Hopper-R-10, b/c/cells/Hopper-D-2"), "{several}");
+        std::fs::create_dir_all(folder.path().join("d/cells/Hopper-D-2/training/checkpoint")).unwrap();
+        std::fs::write(folder.path().join("d/cells/Hopper-D-2/training/checkpoint").join(JSON), "{}").unwrap();
+        let twice = find("Hopper-D-2").unwrap_err().to_string();
+        assert!(twice.contains("b/c/cells/Hopper-D-2, d/cells/Hopper-D-2"), "{twice}");
+        std::fs::write(folder.path().join("cells/Acrobot-D-2"), "").unwrap();
+        assert_eq!(find_below(&folder.path().join("cells/Acrobot-D-2"), Path::new("Acro")).unwrap(), None, "a file");
         assert_eq!(find_below(&folder.path().join("nowhere"), Path::new("Hopper-D")).unwrap(), None);
     }
 }

@@ -11,6 +11,8 @@ use super::ticks::round_ticks;
 
 /// Between two numbers along an axis, at least.
 const BETWEEN: f64 = 6.0;
+/// A number goes so far beyond its frame, which may have a neighbour.
+const BEYOND: f64 = 2.0;
 /// The most ticks at an axis.
 const MOST: usize = 6;
 /// Lines at ticks.
@@ -62,9 +64,9 @@ impl Frame {
         (1..=MOST).rev().map(|most| round_ticks(&self.x, most)).find(fit).unwrap_or_default()
     }
 
-    /// The middle of the number below a tick: at an end it stays beside the neighbours' frames.
+    /// The middle of the number below a tick.
     fn number(&self, (value, number): &(f64, String)) -> f64 {
-        let half = text_width(number) / 2.0 - 5.0;
+        let half = text_width(number) / 2.0 - BEYOND;
         self.x(*value).clamp(self.left + half, (self.right() - half).max(self.left + half))
     }
 

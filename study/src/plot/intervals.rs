@@ -140,6 +140,10 @@ impl Intervals {
         }
         match row.point {
             Some(point) => canvas.circle((frame.x(point), y - apart), RADIUS, style.colour.filled())?,
+            // Where the paper's mark is not.
+            None if row.other.is_some_and(|other| frame.x(other) < frame.middle().0) => {
+                canvas.text("missing", (frame.right() - 6.0, y), Side::Right)?;
+            }
             None => canvas.text("missing", (frame.left + 6.0, y), Side::Left)?,
         }
         row.other.map_or(Ok(()), |other| draw_other(canvas, (frame.x(other), y + apart)))

@@ -172,8 +172,9 @@ fn overview(
             "{incomplete} of {} rows lack cells{}; the column `cells` says which.",
             selections.iter().filter(|row| !row.method.elsewhere).count(),
             match results.plan.selection {
-                Selection::Paper => ", so that their configurations were selected among fewer than the plan has",
-                Selection::Clean => "",
+                Selection::Paper if results.plan.selects() =>
+                    ", so that their configurations were selected among fewer than the plan has",
+                Selection::Paper | Selection::Clean => "",
             }
         ));
     }

@@ -71,7 +71,7 @@ pub struct AuditArgs {
     /// The --out of `perturb run`, the folder of one of its cells, the --records of `perturb evaluate`, or a folder of
     /// `Assessment.save` in Python.
     pub dir: PathBuf,
-    /// The checkpoint that was tested, for a file of records: the --out of its training, or the checkpoint folder in it; for
+    /// The checkpoint that was tested, for a file of records: the --out of its training, the checkpoint folder in it, or a name in results/; for
     /// the folder of an assessment those of all its policies that are perturb's.
     #[arg(long, value_name = "DIR", num_args = 1..)]
     pub checkpoint: Vec<PathBuf>,
@@ -108,7 +108,7 @@ pub struct HeatmapArgs {
         conflicts_with_all = ["checkpoint", "parameters", "records", "out"]
     )]
     pub dir: Option<PathBuf>,
-    /// Policies instead, of one environment: the --out of each training, or the checkpoint folder in it. The picture shows
+    /// Policies instead, of one environment: the --out of each training, the checkpoint folder in it, or a name in results/. The picture shows
     /// the mean over those of a method that were trained on the same, side by side with others.
     #[arg(long, value_name = "DIR", num_args = 1..)]
     pub checkpoint: Vec<PathBuf>,
