@@ -130,29 +130,29 @@ def leaderboard():
     results = [result for result in results if set("DRE") <= set(result["results"])]
     page = (
         "# Leaderboard\n\nTrained policies that come with the repository: success in % on D, R and E, and the mean of"
-        " the three, by which they stand. Their names are what `perturb video`, `evaluate`, `heatmap` and"
-        " `perturb.load_policy` take, in a clone or with `PERTURB_RESULTS` set to its `results`:\n\n"
+        " the three, by which they stand. Their names, which say learner, network, training version and seed, are what"
+        " `perturb video`, `evaluate`, `heatmap` and `perturb.load_policy` take, in a clone or with `PERTURB_RESULTS`"
+        " set to its `results`:\n\n"
         f"```sh\nperturb video --checkpoint {results[0]['id']} --version D,E --out sheet.png\n```\n\n"
-        "Each row is one seed, tested on as many episodes of each version as it says: differences of few points between"
-        " neighbours mean nothing. What was compared with how many seeds, and the paper's numbers, are in"
-        " [results](results.md); by which rule an episode is a success stands in the files there. Policies that were"
+        "Each row is one seed, trained for so many episodes and tested on so many of each version: differences of few"
+        " points between neighbours mean nothing. What was compared with how many seeds, and the paper's numbers, are"
+        " in [results](results.md); by which rule an episode is a success stands in the files there. Policies that were"
         " trained elsewhere stand in tables of their own:"
         " [assess your own agent](tutorials/assess-your-agent.md).\n"
     )
     for name in sorted({result["training"]["environment"] for result in results}):
         rows = [row(result) for result in results if result["training"]["environment"] == name]
-        head = ["policy", "method", "trained on", "episodes", "D", "R", "E", "mean", "test episodes"]
-        page += f"\n## {name}\n\n" + table(head, sorted(rows, key=lambda entries: (-float(entries[-2]), entries)))
+        head = ["policy", "D", "R", "E", "mean", "episodes", "tests"]
+        page += f"\n## {name}\n\n" + table(head, sorted(rows, key=lambda entries: (-float(entries[4]), entries)))
     return {"leaderboard.md": page}
 
 
 def row(result):
     training, tests = result["training"], result["results"]
     rates = [tests[version]["success_percent"] for version in "DRE"]
-    method = f"{training['algorithm']} {training['architecture']}"
     episodes = training["counters"]["episodes"], tests["D"]["episodes"]
     shown = [f"{rate:.1f}" for rate in [*rates, sum(rates) / 3]]
-    return [f"`{result['id']}`", method, training["version"], episodes[0], *shown, episodes[1]]
+    return [f"`{result['id']}`", *shown, *episodes]
 
 
 # Commands.
