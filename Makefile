@@ -69,8 +69,9 @@ missing=; \
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help deps opengl toolchain build install demo all-pairs report-check serve-test test slurm-test qemu-test slurm-acceptance lint bench \
-	bench-peers audit cargo-deny python-test wheel wheel-test python-acceptance bench-python \
+.PHONY: help deps opengl toolchain build install demo all-pairs report-check serve-test test slurm-test kill-test \
+	qemu-test slurm-acceptance lint bench fuzz bench-peers audit cargo-deny python-test wheel wheel-test \
+	python-acceptance bench-python \
 	python-venv docs docs-test docker docker-base docker-test
 
 help: ## this list
@@ -93,9 +94,13 @@ install: build ## copy the programs, manual pages and completions to PREFIX, by 
 	mkdir -p $(PREFIX)/share/man/man1 $(PREFIX)/share/bash-completion/completions $(PREFIX)/share/zsh/site-functions \
 		$(PREFIX)/share/fish/vendor_completions.d
 	$(PROGRAMS)/perturb --quiet man $(PREFIX)/share/man/man1
+	$(PROGRAMS)/perturb-server --man > $(PREFIX)/share/man/man1/perturb-server.1
 	$(PROGRAMS)/perturb completions bash > $(PREFIX)/share/bash-completion/completions/perturb
+	$(PROGRAMS)/perturb-server --completions bash > $(PREFIX)/share/bash-completion/completions/perturb-server
 	$(PROGRAMS)/perturb completions zsh > $(PREFIX)/share/zsh/site-functions/_perturb
+	$(PROGRAMS)/perturb-server --completions zsh > $(PREFIX)/share/zsh/site-functions/_perturb-server
 	$(PROGRAMS)/perturb completions fish > $(PREFIX)/share/fish/vendor_completions.d/perturb.fish
+	$(PROGRAMS)/perturb-server --completions fish > $(PREFIX)/share/fish/vendor_completions.d/perturb-server.fish
 	@echo "installed in $(PREFIX)/bin; if it is not on your PATH: export PATH=$(PREFIX)/bin:\$$PATH"
 
 demo: build opengl ## train Hopper on default and on random physics, and see what still works; some three minutes
@@ -121,6 +126,9 @@ test: deps opengl $(DM_ENV_RPC)/installed ## run all tests, then those of the se
 slurm-test: build ## do a plan on a real Slurm of two nodes, started for it, one of which dies
 	@$(call install,$(SLURM_PACKAGES))
 	PERTURB_SLURM_REQUIRED=1 cargo test $(ALL) --test cli slurm::
+
+kill-test: build ## kill servers a hundred times while policies are trained, and compare their weights; minutes
+	cargo test $(ALL) --test cli -- --ignored --nocapture a_hundred_kills
 
 qemu-test: build ## train on emulated processors, to the same weights as on this one
 	@$(call install,$(QEMU))
@@ -160,13 +168,13 @@ python-test: $(VENV)/installed opengl ## lint, type-check and test the Python pa
 	cd python && $(abspath $(VENV))/bin/mypy
 	cd python && $(abspath $(VENV))/bin/pytest -q
 
-wheel: $(VENV)/installed ## build the Python package's wheel, with perturb-server and MuJoCo inside, in python/dist
+wheel: build $(VENV)/installed ## build the Python package's wheel, with both programs and MuJoCo inside, in python/dist
 	rm -rf python/dist $(TARGET)/wheel
 	$(VENV)/bin/pip wheel -q --disable-pip-version-check --no-deps --wheel-dir $(TARGET)/wheel ./python
-	PATH="$(abspath $(VENV))/bin:$$PATH" $(VENV)/bin/python python/bundle.py $(TARGET)/wheel/*.whl $(PROGRAMS)/perturb-server python/dist
+	PATH="$(abspath $(VENV))/bin:$$PATH" $(VENV)/bin/python python/bundle.py $(TARGET)/wheel/*.whl $(PROGRAMS) python/dist
 
 # Where there is no Docker, or no base image, in a new environment on this machine. The container has Python 3.11, and no network.
-wheel-test: wheel ## install the wheel in a bare container, and run the program and the README's loop there
+wheel-test: wheel ## install the wheel in a bare container, and run the programs and the README's loop there
 	rm -rf $(TARGET)/wheel-dependencies
 	download="$(VENV)/bin/pip download -q --disable-pip-version-check --dest $(TARGET)/wheel-dependencies"; \
 	if docker info >/dev/null 2>&1 && $(MAKE) docker-base; then \
@@ -201,8 +209,7 @@ docs-test: docs $(VENV)/installed ## run the tutorials' blocks, follow all links
 	python3 docs/site/links.py $(DOCS)/site
 	python3 docs/site/look.py chromium $(DOCS)/site $(DOCS)/pictures
 
-$(PROGRAMS)/perturb-server: deps
-	cargo build --package perturb --release --locked
+$(PROGRAMS)/perturb-server: build ;
 
 # The native module is compiled when the package is installed, and the server is asked for its catalogue.
 $(VENV)/installed: python/requirements-dev.txt python/pyproject.toml python/build_backend.py proto/perturb/v1/perturb.proto \
@@ -251,6 +258,20 @@ docker-base:
 		docker image inspect $$image >/dev/null 2>&1 || docker pull --quiet $$image || { \
 			echo "The base image $$image is missing and cannot be pulled; docker/README.md says how else to come by it" >&2; exit 1; \
 		}; \
+	done
+
+# Seconds for each of seven targets, and what is mutated from one time to the next.
+FUZZ_SECONDS ?= 43
+FUZZ = $(TARGET)/fuzz-corpus
+FUZZ_TARGETS = requests snapshots worlds connections checkpoints records plans
+fuzz: deps ## attack the server and the readers of files with mutated bytes, under AddressSanitizer; five minutes, nightly Rust
+	@cargo +nightly --version >/dev/null || { echo "a nightly toolchain is missing: rustup toolchain install nightly" >&2; exit 1; }
+	@cargo +nightly fuzz --version >/dev/null 2>&1 || cargo +nightly install cargo-fuzz --locked
+	cargo run --release --locked --manifest-path fuzz/Cargo.toml --target-dir $(TARGET)/fuzz --bin seeds -- $(FUZZ)
+	@set -e; for target in $(FUZZ_TARGETS); do \
+		mkdir -p fuzz/corpus/$$target; \
+		cargo +nightly fuzz run --fuzz-dir fuzz --target-dir $(TARGET)/fuzz --features libfuzzer $$target $(FUZZ)/$$target fuzz/corpus/$$target -- \
+			-max_total_time=$(FUZZ_SECONDS) -timeout=60 -rss_limit_mb=4096 -max_len=65536 -print_final_stats=1; \
 	done
 
 docker-test: docker ## run an experiment on servers and learners in containers, and stop a server in mid-run

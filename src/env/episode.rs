@@ -266,6 +266,14 @@ impl Episodes {
         Receipt { requested: self.values.clone(), applied, model_hash: self.environment.model_hash().into() }
     }
 
+    /// Adds what the receipt has: the requested values, then the applied ones.
+    pub fn push_receipt(&self, values: &mut Vec<f64>) {
+        values.extend_from_slice(&self.values);
+        let requested = values.len();
+        values.resize(requested + self.spec().applied.len(), 0.0);
+        self.environment.applied(&mut values[requested..]);
+    }
+
     /// The current episode as one that began.
     pub fn started(&self, receipt: bool) -> EpisodeStart {
         EpisodeStart { id: self.id(), receipt: receipt.then(|| self.receipt()) }

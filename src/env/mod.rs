@@ -19,5 +19,6 @@ pub(crate) use error::shorten;
 pub use parameter::Parameter;
 pub use perturb_protocol::{Distribution, DistributionError, Interval, Version};
 pub use seeding::{Purpose, Stream};
+pub(crate) use snapshot::MOST_SNAPSHOT_BYTES;
 pub use spaces::{Action, ActionSpace, Channel, Quantity, RewardTerm};
 pub use success::{Achievement, Comparison, Success};

@@ -3,13 +3,20 @@
 use super::{
     Distribution, EnvironmentSpec, Episodes, Error, Interval, Settings, check_bounds,
     episode::{Progress, boxes},
+    shorten,
 };
 use serde::{Deserialize, Serialize};
 
 /// Raised by every change of the layout below.
-const FORMAT: u32 = 2;
-/// The layout without [`Progress::held_longest`], which follows [`Saved`] since.
-const FORMAT_BEFORE: u32 = 1;
+const FORMAT: u32 = 3;
+/// The layout without a checksum, which ends snapshots since: CRC-32C, little-endian, of everything before it.
+const UNSEALED: u32 = 2;
+/// Nor with [`Progress::held_longest`], which follows [`Saved`] since.
+const FIRST: u32 = 1;
+
+/// The most bytes of a snapshot. The largest has a distribution of 64 intervals for each parameter, of R and of E; its
+/// numbers are a hundred or so.
+pub const MOST_SNAPSHOT_BYTES: usize = 64 << 10;
 
 /// More episodes than any environment runs: a snapshot that claims more would let the counts overflow.
 const MAX_EPISODE: u64 = 1 << 63;
@@ -52,8 +59,10 @@ impl Episodes {
             progress: self.progress,
             state,
         };
-        postcard::to_stdvec(&(saved, self.progress.held_longest))
-            .expect("plain numbers and strings always encode into a growing buffer")
+        let mut snapshot = postcard::to_stdvec(&(saved, self.progress.held_longest))
+            .expect("plain numbers and strings always encode into a growing buffer");
+        snapshot.extend(crc32c::crc32c(&snapshot).to_le_bytes());
+        snapshot
     }
 
     /// Brings a saved environment back: what follows is what followed the snapshot, byte for byte.
@@ -91,20 +100,34 @@ impl Episodes {
     fn check(&self, snapshot: &[u8]) -> Result<(Saved, Vec<Distribution>), Error> {
         let refuse = |reason: String| Err(Error::Snapshot { reason });
         let unreadable = || refuse(format!("its {} bytes are not a snapshot", snapshot.len()));
+        // A byte of it may claim a list, which takes more than twenty.
+        if snapshot.len() > MOST_SNAPSHOT_BYTES {
+            return unreadable();
+        }
         let Ok((mut saved, rest)) = postcard::take_from_bytes::<Saved>(snapshot) else { return unreadable() };
+        let rest = match (saved.format, rest.split_last_chunk()) {
+            (FIRST | UNSEALED, _) => rest,
+            (FORMAT, Some((rest, sum)))
+                if crc32c::crc32c(&snapshot[..snapshot.len() - sum.len()]).to_le_bytes() == *sum =>
+            {
+                rest
+            }
+            (FORMAT, _) => return refuse("it is not what was taken: its checksum is another".into()),
+            (format, _) => return refuse(format!("its format is {format}, this server reads 1 to {FORMAT}")),
+        };
         saved.progress.held_longest = match (saved.format, rest) {
             // That run is the longest that it knows of; a longer one before it is lost.
-            (FORMAT_BEFORE, []) => saved.progress.held_for,
-            (FORMAT, rest) => match postcard::take_from_bytes(rest) {
+            (FIRST, []) => saved.progress.held_for,
+            (FIRST, _) => return unreadable(),
+            (_, rest) => match postcard::take_from_bytes(rest) {
                 Ok((held_longest, [])) => held_longest,
                 _ => return unreadable(),
             },
-            (FORMAT_BEFORE, _) => return unreadable(),
-            (format, _) => return refuse(format!("its format is {format}, this server reads 1 to {FORMAT}")),
         };
         let spec = self.spec();
         if (saved.environment.as_str(), saved.revision) != (spec.name, spec.revision) {
             let Saved { environment, revision, .. } = saved;
+            let environment = shorten(&environment).escape_debug().to_string();
             return refuse(format!("it is of {environment}-v{revision}, this is {}-v{}", spec.name, spec.revision));
         }
         if saved.model_hash != self.environment.model_hash() {

@@ -2,9 +2,10 @@
 
 use super::{
     Autoreset, Error, Play, Played, Pool, Turn,
-    bytes::{put, put_actions},
+    bytes::{put, put_actions, put_wide},
     round::Round,
     shard::{Command, Shard, SlotReset},
+    told::Told,
     workers::{Job, Permit, Shared, lock},
 };
 use crate::{
@@ -23,6 +24,8 @@ const SHARD_COST: RangeInclusive<f64> = 20.0..=200.0;
 const SHARDS_A_WORKER: f64 = 32.0;
 /// What each worker's share should at least cost, in µs, for more than one to be set to work.
 const LEAST_SHARE: f64 = 10.0;
+/// So many environments are freed in less time than the transport notices, and no other thread is asked to.
+const FEW: usize = 64;
 
 /// What a batch is opened with.
 #[derive(Debug, Clone)]
@@ -35,6 +38,8 @@ pub struct BatchSettings {
     pub autoreset: Autoreset,
     /// Whether episodes carry receipts.
     pub receipts: bool,
+    /// Whether those of steps are arrays.
+    pub receipt_arrays: bool,
     /// Whether steps report the reward's terms.
     pub reward_terms: bool,
     /// Whether observations have the parameters at their end.
@@ -102,6 +107,11 @@ pub struct Stepped {
     pub ended: Vec<(u32, EpisodeEnd)>,
     /// Slot and episode; only with receipts.
     pub started: Vec<(u32, EpisodeStart)>,
+    /// u64 `[M, 5]`, of what ended, then of what began; only with receipts as arrays: slot, indices of environment, trial
+    /// and episode, number in the trial.
+    pub receipt_episodes: Bytes,
+    /// f64 `[M, P + Q]`: requested and applied values.
+    pub receipt_values: Bytes,
 }
 
 /// A batch of environments. Dropping it frees them at once, or as soon as the shards under way have finished.
@@ -214,7 +224,8 @@ impl Batch {
         slots.iter().for_each(|&slot| leaves[slot] = true);
         let mut all = self.job.shards.iter().flat_map(|shard| lock(shard).take_slots()).collect::<Vec<Episodes>>();
         let mut slot = 0..;
-        all.retain(|_| slot.next().is_some_and(|slot: usize| !leaves[slot]));
+        let gone: Vec<Episodes> = all.extract_if(.., |_| slot.next().is_some_and(|slot: usize| leaves[slot])).collect();
+        self.workers.free(Box::new(gone));
         self.size = all.len();
         self.shard_size = shard_size(self.settings.spec, self.size, self.n_workers);
         let spec = self.settings.spec;
@@ -394,12 +405,25 @@ impl Batch {
             final_observations: self.gather_f32(|shard| &shard.final_observations),
             ended: self.collect(|shard| &mut shard.ended),
             started: self.collect(|shard| &mut shard.started),
+            receipt_episodes: self.gather_told(|told| &told.episodes, u64::to_le_bytes),
+            receipt_values: self.gather_told(|told| &told.values, f64::to_le_bytes),
         }
     }
 
     fn gather_f32(&mut self, field: impl Fn(&Shard) -> &Vec<f32>) -> Bytes {
         for shard in &self.job.shards {
             put(&mut self.buffer, field(&lock(shard)));
+        }
+        self.buffer.split().freeze()
+    }
+
+    /// Of what ended in all shards, then of what began.
+    fn gather_told<T: Copy>(&mut self, column: fn(&Told) -> &Vec<T>, encode: fn(T) -> [u8; 8]) -> Bytes {
+        let parts: [fn(&Shard) -> &Told; 2] = [|shard| &shard.ended_told, |shard| &shard.started_told];
+        for told in parts {
+            for shard in &self.job.shards {
+                put_wide(&mut self.buffer, column(told(&lock(shard))), encode);
+            }
         }
         self.buffer.split().freeze()
     }
@@ -415,6 +439,10 @@ impl Batch {
 impl Drop for Batch {
     fn drop(&mut self) {
         self.job.abandoned.store(true, Ordering::Relaxed);
+        if self.size() <= FEW {
+            return; // freed here, so that there is room at once
+        }
+        self.workers.free(Box::new((Arc::clone(&self.job), self.play.take())));
     }
 }
 

@@ -12,6 +12,14 @@ pub(super) fn put(buffer: &mut BytesMut, values: &[f32]) {
     words.iter_mut().zip(values).for_each(|(to, from)| *to = from.to_le_bytes());
 }
 
+/// Appends numbers of 64 bits.
+pub(super) fn put_wide<T: Copy>(buffer: &mut BytesMut, values: &[T], encode: impl Fn(T) -> [u8; 8]) {
+    let start = buffer.len();
+    buffer.resize(start + 8 * values.len(), 0);
+    let words = buffer[start..].as_chunks_mut::<8>().0;
+    words.iter_mut().zip(values).for_each(|(to, from)| *to = encode(*from));
+}
+
 /// Appends u8, 0 or 1.
 pub(super) fn put_flags(buffer: &mut BytesMut, flags: &[bool]) {
     let start = buffer.len();

@@ -13,6 +13,7 @@ mod bytes;
 mod play;
 mod round;
 mod shard;
+mod told;
 mod workers;
 
 pub use batch::{Batch, BatchSettings, ResetEntry, SlotGroup, Stepped};

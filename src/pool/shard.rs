@@ -1,6 +1,7 @@
 //! A part of a batch: what one worker runs at a time.
 
 use super::batch::{BatchSettings, SlotGroup};
+use super::told::Told;
 use crate::{
     env::{self, Action, ActionSpace, Distribution, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings},
     scene::Scene,
@@ -57,6 +58,7 @@ pub(super) struct Shard {
     groups: Vec<SlotGroup>,
     autoreset: Autoreset,
     receipts: bool,
+    receipt_arrays: bool,
     observe_parameters: bool,
     /// O.
     observation_size: usize,
@@ -83,6 +85,10 @@ pub(super) struct Shard {
     pub(super) ended: Vec<(u32, EpisodeEnd)>,
     /// Slot of the batch and what began there.
     pub(super) started: Vec<(u32, EpisodeStart)>,
+    /// With receipts as arrays: those of `ended` …
+    pub(super) ended_told: Told,
+    /// … and of what began in a step.
+    pub(super) started_told: Told,
     pub(super) snapshots: Vec<Vec<u8>>,
     pub(super) failure: Option<env::Error>,
     terms: Vec<f64>,
@@ -98,7 +104,7 @@ impl Shard {
     /// A shard of `size` slots from `first_slot` on with these environments; its outputs are unknown yet but for the
     /// observations.
     pub(super) fn of(settings: &BatchSettings, slots: Vec<Episodes>, (first_slot, size): (usize, usize)) -> Self {
-        let BatchSettings { spec, autoreset, receipts, observe_parameters, .. } = *settings;
+        let BatchSettings { spec, autoreset, receipts, receipt_arrays, observe_parameters, .. } = *settings;
         let observation_size = settings.observation_size();
         let (choices, vectors) = match spec.action {
             ActionSpace::Discrete(_) => (size, 0),
@@ -111,6 +117,7 @@ impl Shard {
             groups: Vec::new(),
             autoreset,
             receipts,
+            receipt_arrays,
             observe_parameters,
             observation_size,
             command: Command::Step,
@@ -126,6 +133,8 @@ impl Shard {
             final_observations: Vec::new(),
             ended: Vec::new(),
             started: Vec::new(),
+            ended_told: Told::default(),
+            started_told: Told::default(),
             snapshots: Vec::new(),
             failure: None,
             terms: vec![0.0; spec.reward_terms.len()],
@@ -164,6 +173,8 @@ impl Shard {
     pub(super) fn run(&mut self) {
         self.ended.clear();
         self.started.clear();
+        self.ended_told.clear();
+        self.started_told.clear();
         self.final_observations.clear();
         self.snapshots.clear();
         self.failure = None;
@@ -213,7 +224,7 @@ impl Shard {
                 self.terminated[slot] = 0;
                 self.truncated[slot] = 0;
                 self.reward_terms[slot * n_terms..][..n_terms].fill(0.0);
-                self.note_start(slot);
+                self.note_start_in_step(slot);
                 self.observe(slot);
                 continue;
             }
@@ -238,10 +249,14 @@ impl Shard {
     fn finish(&mut self, slot: usize) {
         let n = self.observation_size;
         self.final_observations.extend_from_slice(&self.observations[slot * n..][..n]);
-        self.ended.push(((self.first_slot + slot) as u32, self.slots[slot].finished(self.receipts)));
+        let as_message = self.receipts && !self.receipt_arrays;
+        self.ended.push(((self.first_slot + slot) as u32, self.slots[slot].finished(as_message)));
+        if self.receipts && self.receipt_arrays {
+            self.ended_told.push(self.first_slot + slot, &self.slots[slot]);
+        }
         if self.autoreset == Autoreset::SameStep {
             self.slots[slot].begin(None);
-            self.note_start(slot);
+            self.note_start_in_step(slot);
             self.observe(slot);
         }
     }
@@ -277,6 +292,14 @@ impl Shard {
         for (slot, snapshot) in std::mem::take(&mut self.backups) {
             self.failure = self.slots[slot].restore(&snapshot).err();
             self.observe(slot);
+        }
+    }
+
+    fn note_start_in_step(&mut self, slot: usize) {
+        if self.receipts && self.receipt_arrays {
+            self.started_told.push(self.first_slot + slot, &self.slots[slot]);
+        } else {
+            self.note_start(slot);
         }
     }
 

@@ -1,6 +1,7 @@
 //! The worker threads and their queue.
 
 use super::{Error, round::Round, shard::Shard};
+use crate::priority::lower;
 use std::{
     collections::VecDeque,
     io,
@@ -9,6 +10,7 @@ use std::{
     sync::{
         Arc, Condvar, Mutex, MutexGuard, PoisonError,
         atomic::{AtomicBool, AtomicUsize, Ordering},
+        mpsc,
     },
     thread::{self, JoinHandle},
 };
@@ -26,11 +28,19 @@ const SHORT: f64 = 50.0;
 /// … and looked after so often before its session sleeps, about twice that time.
 const POLLS: usize = 50;
 
+/// The workers' niceness: the transport, which has little to do at a time, comes before them.
+const NICENESS: i32 = 1;
+/// That of the thread that frees what sessions leave behind, for which nobody waits.
+const NICENESS_OF_FREEING: i32 = 3;
+
 /// Worker threads that step batches, and the count of environments they may hold.
 pub struct Pool {
     shared: Arc<Shared>,
     threads: Vec<JoinHandle<()>>,
 }
+
+/// What sessions leave behind: freeing thousands of environments takes longer than the transport may be kept.
+pub(super) type Rest = Box<dyn Send>;
 
 impl Pool {
     /// Starts `workers` threads (at least 1) for at most `max_environments` environments at a time.
@@ -38,7 +48,9 @@ impl Pool {
     /// # Errors
     /// If the operating system starts no thread.
     pub fn new(workers: usize, max_environments: usize) -> io::Result<Self> {
+        let (rests, received) = mpsc::channel::<Rest>();
         let shared = Arc::new(Shared {
+            rests: Mutex::new(Some(rests)),
             queue: Mutex::new(Queue { jobs: VecDeque::with_capacity(1024), sleeping: 0, closed: false }),
             waiting: AtomicUsize::new(0),
             ready: Condvar::new(),
@@ -52,12 +64,17 @@ impl Pool {
             let thread = thread::Builder::new().name(format!("physics-{i}")).spawn(move || shared.work(i))?;
             pool.threads.push(thread);
         }
+        let free = move || {
+            lower(NICENESS_OF_FREEING);
+            received.into_iter().for_each(drop);
+        };
+        pool.threads.push(thread::Builder::new().name("free".into()).spawn(free)?);
         Ok(pool)
     }
 
     /// The number of worker threads.
     pub fn workers(&self) -> usize {
-        self.threads.len()
+        self.threads.len() - 1
     }
 
     /// Environments in use.
@@ -74,6 +91,7 @@ impl Drop for Pool {
     fn drop(&mut self) {
         self.shared.closing.store(true, Ordering::Relaxed);
         lock(&self.shared.queue).closed = true;
+        *lock(&self.shared.rests) = None;
         self.shared.ready.notify_all();
         for thread in self.threads.drain(..) {
             // A worker never panics: shards run inside catch_unwind.
@@ -84,6 +102,8 @@ impl Drop for Pool {
 
 /// What the workers and the batches share.
 pub(super) struct Shared {
+    /// The way to the thread that frees, until the pool ends.
+    rests: Mutex<Option<mpsc::Sender<Rest>>>,
     queue: Mutex<Queue>,
     /// Jobs in the queue, to be looked at without its lock.
     waiting: AtomicUsize,
@@ -194,7 +214,15 @@ impl Shared {
         }
     }
 
+    /// Frees what a session leaves behind, elsewhere.
+    pub(super) fn free(&self, rest: Rest) {
+        if let Some(rests) = &*lock(&self.rests) {
+            let _ = rests.send(rest); // its thread ends only with the pool
+        }
+    }
+
     fn work(&self, worker: usize) {
+        lower(NICENESS);
         while let Some(job) = self.pop() {
             if job.run_part(worker) {
                 self.conduct(&job);

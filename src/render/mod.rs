@@ -3,26 +3,27 @@
 //! One thread for a server draws them all, so that neither the physics' workers nor the transport's thread ever draws
 //! or waits for OpenGL: a session hands over a [`Scene`] and gets pixels back.
 //!
+//! - `turns` puts those that wait in order.
 //! - `canvas` draws shapes in a plane: paths in metres, anti-aliased, by a library in Rust.
 //! - `model` draws MuJoCo's models, each on one of its own with colours, floor, light and sky.
 
 mod canvas;
 #[cfg(feature = "mujoco")]
 mod model;
+mod turns;
 
-use crate::scene::Scene;
+use crate::{priority::lower, scene::Scene};
 use bytes::Bytes;
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
-    sync::{Mutex, PoisonError},
+    sync::{Arc, Mutex, PoisonError},
     thread::{self, JoinHandle},
     time::Duration,
 };
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::oneshot;
+use turns::Turns;
 
-/// Requests that wait for the thread. More wait in their sessions.
-const QUEUE: usize = 64;
-/// What the thread's niceness is raised by. Its driver's threads inherit it: physics comes first.
+/// The thread's niceness. Its driver's threads inherit it: physics comes first.
 const NICENESS: i32 = 5;
 /// How long the end of a server waits for the picture under way.
 const FAREWELL: Duration = Duration::from_secs(1);
@@ -74,9 +75,9 @@ pub struct Renderer {
     thread: Mutex<Option<DrawingThread>>,
 }
 
-/// The thread, and the way to it.
+/// The thread, and what waits for it.
 struct DrawingThread {
-    jobs: mpsc::Sender<Job>,
+    jobs: Arc<Turns<Job>>,
     handle: JoinHandle<()>,
 }
 
@@ -93,30 +94,30 @@ impl Renderer {
     }
 
     /// A picture, `[height, width, 3]`: red, green, blue, the uppermost row first. Pictures are drawn one after the
-    /// other, in the order of their requests; where too many wait, this one waits for its place. The same scene and size
-    /// give the same bytes.
+    /// other, in an order that lets nobody wait for more pixels than are fair. The same scene and size give the same bytes.
     ///
     /// # Errors
     /// [`Error`].
     pub async fn draw(&self, scene: Scene, size: Size) -> Result<Bytes, Error> {
         let (reply, picture) = oneshot::channel();
-        let jobs = self.jobs()?;
+        let pixels = u64::from(size.width) * u64::from(size.height);
+        self.jobs()?.push(pixels, Job { scene, size, reply }, |job| !job.reply.is_closed());
         // The thread ends only when this is dropped.
-        jobs.send(Job { scene, size, reply }).await.map_err(|_| Error::Defect)?;
         picture.await.map_err(|_| Error::Defect)?.map(Bytes::from)
     }
 
-    fn jobs(&self) -> Result<mpsc::Sender<Job>, Error> {
+    fn jobs(&self) -> Result<Arc<Turns<Job>>, Error> {
         let mut running = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(thread) = &*running {
-            return Ok(thread.jobs.clone());
+            return Ok(Arc::clone(&thread.jobs));
         }
-        let (jobs, receiver) = mpsc::channel(QUEUE);
+        let jobs = Arc::new(Turns::new());
+        let own = Arc::clone(&jobs);
         let handle = thread::Builder::new()
             .name("render".into())
-            .spawn(move || work(receiver))
+            .spawn(move || work(&own))
             .map_err(|error| Error::NoThread { reason: error.to_string() })?;
-        *running = Some(DrawingThread { jobs: jobs.clone(), handle });
+        *running = Some(DrawingThread { jobs: Arc::clone(&jobs), handle });
         Ok(jobs)
     }
 }
@@ -125,7 +126,7 @@ impl Drop for Renderer {
     fn drop(&mut self) {
         let running = self.thread.get_mut().unwrap_or_else(PoisonError::into_inner);
         if let Some(DrawingThread { jobs, handle }) = running.take() {
-            drop(jobs);
+            jobs.close();
             // A driver should not be drawing while the process ends; one that hangs must not keep it from ending.
             for _ in 0..FAREWELL.as_millis() {
                 if handle.is_finished() {
@@ -138,12 +139,10 @@ impl Drop for Renderer {
 }
 
 /// The thread: draws what is asked for until nobody can ask any more.
-fn work(mut jobs: mpsc::Receiver<Job>) {
-    if let Err(error) = rustix::process::nice(NICENESS) {
-        tracing::debug!(%error, "pictures are drawn at the priority of physics");
-    }
+fn work(jobs: &Turns<Job>) {
+    lower(NICENESS);
     let mut cache = Cache::default();
-    while let Some(Job { scene, size, reply }) = jobs.blocking_recv() {
+    while let Some(Job { scene, size, reply }) = jobs.pop() {
         if reply.is_closed() {
             continue; // its session is gone
         }

@@ -17,7 +17,8 @@ const FREE_RISE: f64 = 0.6;
 #[derive(Default)]
 pub(super) struct Models {
     drawn: Vec<ShownModel>,
-    /// That there is no OpenGL, once that is known: it does not come while the server runs.
+    /// That there is no library of OpenGL, once that is known: it does not come while the server runs. Anything else that
+    /// it lacks, as descriptors, may.
     missing: Option<String>,
 }
 
@@ -37,8 +38,9 @@ impl Models {
             return Err(Error::Missing { environment, reason: reason.clone() });
         }
         self.try_draw(model, size).map_err(|error| match error {
-            mujoco::Error::NoOpenGl { .. } => {
-                let reason = self.missing.insert(error.to_string()).clone();
+            mujoco::Error::NoOpenGl { is_installed, .. } => {
+                let reason = error.to_string();
+                self.missing = (!is_installed).then(|| reason.clone());
                 Error::Missing { environment, reason }
             }
             _ => Error::Failed { environment, reason: error.to_string() },

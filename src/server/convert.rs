@@ -26,7 +26,7 @@ pub fn open(catalogue: &Catalogue, most: usize, request: proto::Open) -> Result<
             return Err(Refusal::value("open.autoreset_mode", request.autoreset_mode, expected));
         }
     };
-    let proto::Open { receipts, reward_terms, observe_parameters, .. } = request;
+    let proto::Open { receipts, receipt_arrays, reward_terms, observe_parameters, .. } = request;
     let groups = if request.groups.is_empty() {
         vec![group(spec, "open", "open.batch_size", single(request))?]
     } else {
@@ -40,7 +40,7 @@ pub fn open(catalogue: &Catalogue, most: usize, request: proto::Open) -> Result<
         let named = |i, slots| group(spec, &format!("open.groups[{i}]"), &format!("open.groups[{i}].size"), slots);
         numbered.map(|(i, slots)| named(i, slots)).collect::<Result<_, _>>()?
     };
-    Ok(BatchSettings { spec, groups, autoreset, receipts, reward_terms, observe_parameters })
+    Ok(BatchSettings { spec, groups, autoreset, receipts, receipt_arrays, reward_terms, observe_parameters })
 }
 
 /// An `open` without groups as one group.
@@ -346,6 +346,8 @@ pub fn stepped(stepped: Stepped) -> proto::Stepped {
         ended: stepped.ended.into_iter().map(ended).collect(),
         started: started(stepped.started),
         reward_terms: stepped.reward_terms,
+        receipt_episodes: stepped.receipt_episodes,
+        receipt_values: stepped.receipt_values,
     }
 }
 

@@ -1,12 +1,13 @@
 //! Binding addresses: TCP ports and Unix sockets.
 
+use super::peers::{Guarded, Peer, Places};
 use crate::config::ListenAddress;
 use futures_util::{Stream, stream};
 use std::time::Duration;
 use std::{
     io::{self, ErrorKind},
-    os::unix::{fs::FileTypeExt, net::UnixStream as StdUnixStream},
-    path::PathBuf,
+    os::unix::fs::{FileTypeExt, MetadataExt},
+    path::{Path, PathBuf},
 };
 use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
 
@@ -21,29 +22,69 @@ pub enum Listener {
     Unix(UnixListener, SocketFile),
 }
 
+/// What connections are subject to.
+#[derive(Clone)]
+pub struct Admission {
+    /// Places for them.
+    pub places: Places,
+    /// How long a client may take to begin.
+    pub handshake: Duration,
+}
+
+impl Admission {
+    /// The connection, if there is a place for it.
+    fn admit<S>(&self, stream: S, peer: Peer) -> Option<Guarded<S>> {
+        match self.places.take(Some(peer)) {
+            Ok(place) => Some(Guarded::new(stream, peer, place, self.handshake)),
+            Err(full) => {
+                tracing::debug!(?peer, ?full, "closed a connection for which there is no place");
+                None
+            }
+        }
+    }
+}
+
 /// Connections as they come, without Nagle's delay: a step is one small message each way.
-pub fn tcp_connections(listener: TcpListener) -> impl Stream<Item = io::Result<TcpStream>> {
-    stream::unfold(listener, |listener| async {
+pub fn tcp_connections(
+    listener: TcpListener,
+    admission: Admission,
+) -> impl Stream<Item = io::Result<Guarded<TcpStream>>> {
+    stream::unfold((listener, admission), |(listener, admission)| async {
         let connection = loop {
             match listener.accept().await {
-                Ok((connection, _)) => break connection,
+                Ok((connection, address)) => {
+                    // It fails for connections that are gone already.
+                    let _ = connection.set_nodelay(true);
+                    if let Some(connection) = admission.admit(connection, Peer::Machine(address.ip())) {
+                        break connection;
+                    }
+                }
                 Err(error) => pause(&error).await,
             }
         };
-        Some((connection.set_nodelay(true).map(|()| connection), listener))
+        Some((Ok(connection), (listener, admission)))
     })
 }
 
 /// Connections as they come. The socket's file is removed when the stream is dropped.
-pub fn unix_connections(listener: UnixListener, file: SocketFile) -> impl Stream<Item = io::Result<UnixStream>> {
-    stream::unfold((listener, file), |(listener, file)| async {
+pub fn unix_connections(
+    listener: UnixListener,
+    file: SocketFile,
+    admission: Admission,
+) -> impl Stream<Item = io::Result<Guarded<UnixStream>>> {
+    stream::unfold((listener, file, admission), |(listener, file, admission)| async {
         let connection = loop {
             match listener.accept().await {
-                Ok((connection, _)) => break connection,
+                Ok((connection, _)) => {
+                    let user = connection.peer_cred().ok().map(|credentials| credentials.uid());
+                    if let Some(connection) = admission.admit(connection, Peer::User(user)) {
+                        break connection;
+                    }
+                }
                 Err(error) => pause(&error).await,
             }
         };
-        Some((Ok(connection), (listener, file)))
+        Some((Ok(connection), (listener, file, admission)))
     })
 }
 
@@ -76,13 +117,24 @@ async fn pause(error: &io::Error) {
     tokio::time::sleep(PAUSE).await;
 }
 
-/// Removes a socket's file when it is dropped.
-pub struct SocketFile(PathBuf);
+/// Removes a socket's file when it is dropped, unless another server's has taken its place.
+pub struct SocketFile {
+    path: PathBuf,
+    /// Device and number of the file.
+    identity: Option<(u64, u64)>,
+}
+
+/// Which file is at a path.
+fn identity(path: &Path) -> Option<(u64, u64)> {
+    std::fs::symlink_metadata(path).ok().map(|file| (file.dev(), file.ino()))
+}
 
 impl Drop for SocketFile {
     fn drop(&mut self) {
-        // Gone already is as good.
-        let _ = std::fs::remove_file(&self.0);
+        if identity(&self.path) == self.identity {
+            // Gone already is as good.
+            let _ = std::fs::remove_file(&self.path);
+        }
     }
 }
 
@@ -98,11 +150,12 @@ impl Listener {
             ListenAddress::Unix(path) => {
                 let is_socket = std::fs::symlink_metadata(path).is_ok_and(|m| m.file_type().is_socket());
                 let refused = |e: io::Error| e.kind() == ErrorKind::ConnectionRefused;
-                if is_socket && StdUnixStream::connect(path).is_err_and(refused) {
+                // Without waiting: a server that accepts nobody is one all the same.
+                if is_socket && UnixStream::connect(path).await.is_err_and(refused) {
                     std::fs::remove_file(path).map_err(explain)?;
                 }
                 let listener = UnixListener::bind(path).map_err(explain)?;
-                Ok(Self::Unix(listener, SocketFile(path.clone())))
+                Ok(Self::Unix(listener, SocketFile { path: path.clone(), identity: identity(path) }))
             }
         }
     }
@@ -114,7 +167,7 @@ impl Listener {
     pub fn address(&self) -> io::Result<ListenAddress> {
         match self {
             Self::Tcp(listener) => listener.local_addr().map(ListenAddress::Tcp),
-            Self::Unix(_, file) => Ok(ListenAddress::Unix(file.0.clone())),
+            Self::Unix(_, file) => Ok(ListenAddress::Unix(file.path.clone())),
         }
     }
 }

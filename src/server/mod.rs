@@ -2,6 +2,9 @@
 //!
 //! - [`service`]: one short method for each call.
 //! - [`conversation`]: the transport of a session.
+//! - [`frames`] and [`fields`]: how requests come off the wire, with bounds for all that they are made of.
+//! - [`replies`]: how replies go onto it; [`budget`]: the bytes of both; [`sizes`]: how many they are.
+//! - [`peers`]: whom connections are from, and what each may have.
 //! - [`requests`]: spans and counts of requests, a layer between the two.
 //! - [`session`]: the legal order of a session's requests.
 //! - [`convert`]: the protocol to the domain and back, with all validation; [`acting`]: that of policies.
@@ -11,15 +14,21 @@
 //! - [`probe`]: asking another process's server for its health.
 
 pub mod acting;
+pub mod budget;
 pub mod conversation;
 pub mod convert;
 pub mod dm_env_rpc;
 pub mod drain;
+pub mod fields;
+pub mod frames;
 pub mod listen;
+pub mod peers;
 pub mod probe;
+pub mod replies;
 pub mod requests;
 pub mod service;
 pub mod session;
+pub mod sizes;
 pub mod status;
 
 use crate::{
@@ -29,19 +38,28 @@ use crate::{
     proto::{self, dm_env_rpc::v1::environment_server::EnvironmentServer, perturb_server::PerturbServer},
     render::Renderer,
 };
-use conversation::Sessions;
+use budget::Budget;
+use conversation::{Limits, Sessions};
 use drain::{Controller, Phase};
-use listen::Listener;
+use frames::{Keeping, Transit};
+use listen::{Admission, Listener};
+use peers::Places;
 use service::Service;
 use session::Shared;
 use std::{future::Future, io, sync::Arc, time::Duration};
 use tonic::transport::Server;
 use tonic_health::ServingStatus;
 
-/// A session's request for a large batch should not wait for the window: 4 MiB.
-const STREAM_WINDOW: u32 = 4 << 20;
+/// What a stream's client may send before it is read: the actions of ten thousand robots.
+const STREAM_WINDOW: u32 = 1 << 20;
 /// One session whose requests pile up should not stall the others of its connection: room for 16 such.
 const CONNECTION_WINDOW: u32 = 16 * STREAM_WINDOW;
+/// Streams of a connection beside sessions: health, the catalogue, reflection.
+const OTHER_STREAMS: usize = 16;
+/// How long a call may take that is no stream.
+const UNARY_LIMIT: Duration = Duration::from_secs(10);
+/// The most bytes of a request outside streams of sessions: it is a name or nothing.
+const UNARY_BYTES: usize = 1 << 10;
 /// How long connections may take to notice the end.
 const FAREWELL: Duration = Duration::from_secs(1);
 
@@ -79,16 +97,22 @@ pub async fn run(
     let pool = Arc::new(Pool::new(config.workers, config.max_envs)?);
     let (controller, drain) = Controller::new();
     let idle = (config.idle_seconds > 0).then(|| Duration::from_secs(config.idle_seconds));
-    let sessions = Sessions::new(config.max_sessions, idle, drain.clone());
+    let handshake = Duration::from_secs(config.handshake_seconds);
+    let limits = Limits { bytes: config.max_message_bytes, handshake, idle };
+    let of_a_peer = if config.max_peer_sessions > 0 { config.max_peer_sessions } else { usize::MAX };
+    let sessions = Sessions::new(Places::new(config.max_sessions, of_a_peer), limits, drain.clone());
+    let admission = Admission { places: Places::new(usize::MAX, of_a_peer.saturating_add(OTHER_STREAMS)), handshake };
+    let stall = (config.stall_seconds > 0).then(|| Duration::from_secs(config.stall_seconds));
+    let transit = Transit { budget: Budget::new(config.max_memory), limit: stall };
     let worlds = dm_env_rpc::service::Service::new(Arc::clone(&pool), Arc::clone(&catalogue), sessions.clone());
     let service = Service::new(Shared { pool, catalogue, listing, renderer: Renderer::new() }, sessions);
     let counts = [("perturb.v1", service.counts()), ("dm_env_rpc.v1", worlds.counts())];
-    let worlds = EnvironmentServer::new(worlds)
-        .max_decoding_message_size(config.max_message_bytes)
-        .max_encoding_message_size(usize::MAX);
+    let worlds = EnvironmentServer::new(worlds).max_encoding_message_size(usize::MAX);
+    let worlds = Keeping::new(worlds, "/dm_env_rpc.v1.Environment/Process", transit.clone());
     let service = PerturbServer::new(service)
-        .max_decoding_message_size(config.max_message_bytes)
+        .max_decoding_message_size(UNARY_BYTES) // of all but sessions
         .max_encoding_message_size(usize::MAX);
+    let service = Keeping::new(service, "/perturb.v1.Perturb/Session", transit);
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<PerturbServer<Service>>().await;
     health.set_serving::<EnvironmentServer<dm_env_rpc::service::Service>>().await;
@@ -103,23 +127,25 @@ pub async fn run(
         .http2_keepalive_timeout(Some(keepalive))
         .initial_stream_window_size(STREAM_WINDOW)
         .initial_connection_window_size(CONNECTION_WINDOW)
+        .max_concurrent_streams(u32::try_from(config.max_sessions.saturating_add(OTHER_STREAMS)).unwrap_or(u32::MAX))
+        .timeout(UNARY_LIMIT) // until an answer begins, which that of a stream does at once
         .add_service(service)
         .add_service(worlds)
-        .add_service(health_service)
-        .add_service(reflection().build_v1()?)
-        .add_service(reflection().build_v1alpha()?);
+        .add_service(health_service.max_decoding_message_size(UNARY_BYTES))
+        .add_service(reflection().build_v1()?.max_decoding_message_size(UNARY_BYTES))
+        .add_service(reflection().build_v1alpha()?.max_decoding_message_size(UNARY_BYTES));
 
     let mut servers = tokio::task::JoinSet::new();
     for listener in listeners {
-        let (router, mut closed) = (router.clone(), drain.clone());
+        let (router, mut closed, admission) = (router.clone(), drain.clone(), admission.clone());
         servers.spawn(async move {
             let end = async move { closed.closed().await };
             match listener {
                 Listener::Tcp(listener) => {
-                    router.serve_with_incoming_shutdown(listen::tcp_connections(listener), end).await
+                    router.serve_with_incoming_shutdown(listen::tcp_connections(listener, admission), end).await
                 }
                 Listener::Unix(listener, file) => {
-                    router.serve_with_incoming_shutdown(listen::unix_connections(listener, file), end).await
+                    router.serve_with_incoming_shutdown(listen::unix_connections(listener, file, admission), end).await
                 }
             }
         });

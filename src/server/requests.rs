@@ -1,6 +1,6 @@
 //! Spans and counts of requests: a layer around the dialogues of both protocols.
 
-use super::conversation::Dialogue;
+use super::{conversation::Dialogue, fields::Field, frames::Allowance, status::Refusal};
 use std::{
     fmt,
     sync::{
@@ -69,9 +69,26 @@ impl<D: Observed> Counted<D> {
     }
 }
 
+impl<D: Observed> Counted<D> {
+    fn count(&self, kind: &str, refusal: Option<&str>) {
+        if let Some(refusal) = refusal {
+            tracing::debug!(refusal, "refused");
+        }
+        if let Some((_, count)) = self.counts.iter().find(|(known, _)| *known == kind) {
+            count.answered.fetch_add(1, Ordering::Relaxed);
+            count.refused.fetch_add(refusal.is_some().into(), Ordering::Relaxed);
+        }
+    }
+}
+
 impl<D: Observed> Dialogue for Counted<D> {
     type Request = D::Request;
     type Response = D::Response;
+    const FIELDS: &'static [Field] = D::FIELDS;
+
+    fn allowance(&self) -> Allowance {
+        self.dialogue.allowance()
+    }
 
     fn is_open(&self) -> bool {
         self.dialogue.is_open()
@@ -81,14 +98,12 @@ impl<D: Observed> Dialogue for Counted<D> {
         let kind = D::kind(&request);
         let span = tracing::debug_span!("request", kind);
         let response = self.dialogue.answer(request).instrument(span.clone()).await;
-        let refusal = D::refusal(&response);
-        if let Some(refusal) = refusal {
-            span.in_scope(|| tracing::debug!(refusal, "refused"));
-        }
-        if let Some((_, count)) = self.counts.iter().find(|(known, _)| *known == kind) {
-            count.answered.fetch_add(1, Ordering::Relaxed);
-            count.refused.fetch_add(refusal.is_some().into(), Ordering::Relaxed);
-        }
+        span.in_scope(|| self.count(kind, D::refusal(&response)));
         response
+    }
+
+    fn refuse(&self, refusal: Refusal) -> Self::Response {
+        self.count("unknown", Some(&refusal.to_string()));
+        self.dialogue.refuse(refusal)
     }
 }

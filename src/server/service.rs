@@ -2,6 +2,7 @@
 
 use super::{
     conversation::{Responses, Sessions},
+    frames::Frames,
     requests::{Counted, Counts},
     session::{Session, Shared},
 };
@@ -42,9 +43,10 @@ impl Perturb for Service {
 
     async fn session(
         &self,
-        requests: Request<Streaming<proto::SessionRequest>>,
+        mut request: Request<Streaming<proto::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        let session = Session::new(Arc::clone(&self.shared));
-        Ok(Response::new(self.sessions.begin(requests.into_inner(), Counted::new(session, &self.counts))?))
+        let frames = Frames::of(&mut request)?;
+        let session = Session::new(Arc::clone(&self.shared), frames.budget().clone(), frames.outbox.clone());
+        Ok(Response::new(self.sessions.begin(frames, Counted::new(session, &self.counts))?))
     }
 }

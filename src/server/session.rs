@@ -1,6 +1,16 @@
 //! One session: the legal order of its requests, each answered once.
 
-use super::{acting, conversation::Dialogue, convert, requests::Observed, status::Refusal};
+use super::{
+    acting,
+    budget::{Budget, Outbox, Share},
+    conversation::{Dialogue, MOST_BYTES_BEFORE_OPEN},
+    convert,
+    fields::{self, Field},
+    frames::Allowance,
+    requests::Observed,
+    sizes,
+    status::Refusal,
+};
 use crate::{
     env::Catalogue,
     pool::{Batch, Pool},
@@ -8,6 +18,9 @@ use crate::{
     render::Renderer,
 };
 use std::sync::Arc;
+
+/// A step's bytes beside its actions.
+const LITTLE: usize = 32;
 
 /// What all sessions of a server share.
 pub struct Shared {
@@ -25,12 +38,19 @@ pub struct Shared {
 pub struct Session {
     shared: Arc<Shared>,
     batch: Option<Batch>,
+    budget: Budget,
+    /// What replies take beyond `kept`.
+    outbox: Outbox,
+    /// What steps need.
+    kept: Option<Share>,
+    /// What the policy needs that plays.
+    playing: Option<Share>,
 }
 
 impl Session {
-    /// A session that is not open yet.
-    pub fn new(shared: Arc<Shared>) -> Self {
-        Self { shared, batch: None }
+    /// A session that is not open yet, whose replies' bytes are taken from the budget until they leave the outbox.
+    pub fn new(shared: Arc<Shared>, budget: Budget, outbox: Outbox) -> Self {
+        Self { shared, batch: None, budget, outbox, kept: None, playing: None }
     }
 
     async fn open(&mut self, request: proto::Open) -> Result<proto::Opened, Refusal> {
@@ -40,45 +60,69 @@ impl Session {
         let autoreset_mode = request.autoreset_mode;
         let most = self.shared.listing.max_batch_size as usize;
         let settings = convert::open(&self.shared.catalogue, most, request)?;
-        let observes_parameters = settings.observe_parameters;
+        let (observes_parameters, receipt_arrays) = (settings.observe_parameters, settings.receipt_arrays);
         let environment = self.shared.listing.environments.iter().find(|entry| entry.name == settings.spec.name);
         let environment = environment.map(|entry| entry.observed(observes_parameters));
+        let envs = settings.size();
+        // More than there can be is for the pool to refuse.
+        let kept = (envs <= most).then(|| self.budget.take(sizes::session(&settings, envs))).transpose()?;
         let (batch, observations, started) = Batch::open(&self.shared.pool, settings).await?;
-        self.batch = Some(batch);
+        (self.batch, self.kept) = (Some(batch), kept);
         let started = convert::started(started);
-        Ok(proto::Opened { environment, observations, started, autoreset_mode, acts: true, observes_parameters })
+        let acts = true;
+        Ok(proto::Opened {
+            environment,
+            observations,
+            started,
+            autoreset_mode,
+            acts,
+            observes_parameters,
+            receipt_arrays,
+        })
     }
 
     async fn step(&mut self, request: proto::Step) -> Result<proto::Stepped, Refusal> {
         let batch = self.opened("step")?;
         convert::actions(batch.settings().spec, batch.size(), &request.actions)?;
-        Ok(convert::stepped(batch.step(&request.actions).await?))
+        let stepped = batch.step(&request.actions).await?;
+        self.playing = None;
+        Ok(convert::stepped(stepped))
     }
 
     async fn reset(&mut self, request: proto::Reset) -> Result<proto::ResetDone, Refusal> {
         let batch = self.opened("reset")?;
         let entries = convert::reset(batch, request)?;
         let (observations, started) = batch.reset(entries).await?;
+        self.playing = None;
         Ok(proto::ResetDone { observations, started: convert::started(started) })
     }
 
     async fn snapshot(&mut self, request: proto::Snapshot) -> Result<proto::Snapshotted, Refusal> {
         let batch = self.opened("snapshot")?;
         let slots = convert::mask("snapshot.mask", batch.size(), &request.mask)?;
-        Ok(proto::Snapshotted { snapshots: batch.snapshot(slots).await? })
+        let mut share = self.budget.take(sizes::snapshots(slots.len()))?;
+        let batch = self.opened("snapshot")?;
+        let snapshots = batch.snapshot(slots).await?;
+        share.set(sizes::taken(&snapshots));
+        self.outbox.put(share);
+        Ok(proto::Snapshotted { snapshots })
     }
 
     async fn restore(&mut self, request: proto::Restore) -> Result<proto::Restored, Refusal> {
         let batch = self.opened("restore")?;
         let entries = convert::restore(batch.size(), request)?;
-        Ok(proto::Restored { observations: batch.restore(entries).await? })
+        let observations = batch.restore(entries).await?;
+        self.playing = None;
+        Ok(proto::Restored { observations })
     }
 
     async fn render(&mut self, request: proto::Render) -> Result<proto::Rendered, Refusal> {
         let batch = self.opened("render")?;
         let (slot, size) = convert::render(batch.size(), request)?;
         let scene = batch.scene(slot)?.ok_or(Refusal::NothingToDraw { slot })?;
+        let share = self.budget.take(sizes::picture(size))?;
         let pixels = self.shared.renderer.draw(scene, size).await?;
+        self.outbox.put(share);
         Ok(proto::Rendered { pixels, width: size.width.into(), height: size.height.into() })
     }
 
@@ -89,9 +133,15 @@ impl Session {
     }
 
     async fn act(&mut self, request: proto::Act) -> Result<proto::Acted, Refusal> {
-        let batch = self.opened("act")?;
+        let batch = self.batch.as_mut().ok_or(Refusal::NotOpen { request: "act" })?;
+        let policy = sizes::policy(&request, batch.size());
+        let policy = (policy > 0).then(|| self.budget.take(policy)).transpose()?;
         let turn = acting::turn(batch, request)?;
-        Ok(acting::acted(batch.act(turn).await?))
+        let share = self.budget.take(sizes::reply_to(&turn, batch))?;
+        self.playing = policy.or(self.playing.take());
+        let acted = acting::acted(batch.act(turn).await?);
+        self.outbox.put(share);
+        Ok(acted)
     }
 
     fn save_player(&mut self) -> Result<proto::PlayerSaved, Refusal> {
@@ -106,6 +156,21 @@ impl Session {
 impl Dialogue for Session {
     type Request = proto::SessionRequest;
     type Response = proto::SessionResponse;
+    const FIELDS: &'static [Field] = fields::SESSION_REQUEST;
+
+    fn allowance(&self) -> Allowance {
+        match &self.batch {
+            None => {
+                let entries = self.shared.listing.max_batch_size as usize;
+                Allowance { bytes: MOST_BYTES_BEFORE_OPEN, entries, covered: 0 }
+            }
+            Some(batch) => Allowance {
+                bytes: sizes::most_of_a_request(batch),
+                entries: batch.size(),
+                covered: sizes::step_request(batch.settings(), batch.size()) + LITTLE,
+            },
+        }
+    }
 
     fn is_open(&self) -> bool {
         self.batch.is_some()
@@ -124,7 +189,12 @@ impl Dialogue for Session {
             Some(Request::SavePlayer(_)) => self.save_player().map(Response::SavePlayer),
             None => Err(Refusal::value("request", "empty or of a kind this server does not know", "open, step, …")),
         };
-        proto::SessionResponse { response: Some(response.unwrap_or_else(|refusal| Response::Error(refusal.into()))) }
+        response
+            .map_or_else(|refusal| self.refuse(refusal), |response| proto::SessionResponse { response: Some(response) })
+    }
+
+    fn refuse(&self, refusal: Refusal) -> Self::Response {
+        proto::SessionResponse { response: Some(Response::Error(refusal.into())) }
     }
 }
 

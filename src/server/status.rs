@@ -58,6 +58,39 @@ pub enum Refusal {
         /// The most there may be.
         limit: usize,
     },
+    /// One peer has all the sessions that it may have.
+    #[error("all of the {limit} sessions that one machine or user may have here are in use; close one")]
+    TooManyOfAPeer {
+        /// The most there may be.
+        limit: usize,
+    },
+    /// The budget of bytes in flight is used up.
+    #[error(
+        "this needs {wanted} bytes, but {used} of the server's {limit} for what is in flight are in use; ask for less at \
+         a time, read the replies that wait, or try again later"
+    )]
+    NoMemory {
+        /// What was asked for.
+        wanted: usize,
+        /// In use.
+        used: usize,
+        /// The most there may be.
+        limit: usize,
+    },
+    /// A message began and does not end.
+    #[error("a message began, and nothing more of it came for {seconds} s; send messages whole")]
+    Unfinished {
+        /// The limit.
+        seconds: u64,
+    },
+    /// A message is larger than its stream may send now.
+    #[error("a message of {got} bytes came; at most {limit} are read here now")]
+    TooLarge {
+        /// Its length in bytes.
+        got: usize,
+        /// The most there may be.
+        limit: usize,
+    },
     /// The session sent nothing for too long.
     #[error("the session was idle for {seconds} s, the most this server allows; start a new one")]
     Idle {
@@ -131,6 +164,8 @@ impl Refusal {
             },
             Self::Pool(pool::Error::Full { .. })
             | Self::TooManySessions { .. }
+            | Self::TooManyOfAPeer { .. }
+            | Self::NoMemory { .. }
             | Self::Render(render::Error::NoThread { .. }) => Code::ResourceExhausted,
             Self::Pool(pool::Error::Ended { .. })
             | Self::NotOpen { .. }
@@ -144,7 +179,8 @@ impl Refusal {
             }
             Self::NotJoined { .. } | Self::AlreadyJoined { .. } | Self::Occupied { .. } => Code::FailedPrecondition,
             Self::Value { .. } => Code::InvalidArgument,
-            Self::Idle { .. } => Code::DeadlineExceeded,
+            Self::TooLarge { .. } => Code::OutOfRange,
+            Self::Idle { .. } | Self::Unfinished { .. } => Code::DeadlineExceeded,
             Self::Draining => Code::Unavailable,
             Self::Unknown { .. } => Code::NotFound,
             Self::Forbidden { .. } => Code::PermissionDenied,

@@ -25,11 +25,12 @@ fn observable(state: &[f64]) -> bool {
     state.iter().all(|&x| (x as f32).is_finite())
 }
 
-/// Takes back a saved state of exactly `N` finite numbers.
-pub(super) fn load<const N: usize>(state: &[f64]) -> Result<[f64; N], Error> {
+/// Takes back a saved state of exactly `N` finite numbers, each between the ends that the dynamics keep it within.
+pub(super) fn load<const N: usize>(state: &[f64], most: [f64; N]) -> Result<[f64; N], Error> {
     match <[f64; N]>::try_from(state) {
-        Ok(state) if observable(&state) => Ok(state),
-        Ok(_) => Err(Error::Snapshot { reason: "its state is not finite".into() }),
+        Ok(state) if !observable(&state) => Err(Error::Snapshot { reason: "its state is not finite".into() }),
+        Ok(state) if state.iter().zip(most).all(|(x, most)| x.abs() <= most) => Ok(state),
+        Ok(_) => Err(Error::Snapshot { reason: format!("its state is not within ±{most:?}") }),
         Err(_) => Err(Error::Snapshot { reason: format!("its state has {} numbers, expected {N}", state.len()) }),
     }
 }

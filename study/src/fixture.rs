@@ -122,7 +122,7 @@ pub fn assessed(agent: &str, environment: &str, trained_on: &[Option<Version>], 
         for (version, steps) in Version::ALL.into_iter().zip(steps) {
             let set = version.to_string();
             let one = |index: u32| episode(&set, index, f64::from(index), steps + index, steps + index >= 195);
-            records.add(RecordedTest { set: version.into(), seed: 7 }, (0..10).map(one).collect());
+            records.add(RecordedTest { set: version.into(), seed: 7, axes: None }, (0..10).map(one).collect());
         }
         let (timesteps, observe, deterministic) = (Some(100_000), Observe::State, Some(false));
         AssessedPolicy::new(Known { trained_on, timesteps, seed: 1, episodes: 10, observe, deterministic }, records)

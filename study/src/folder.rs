@@ -22,11 +22,13 @@ use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use super::plan::{Cell, Plan};
 use crate::files::{self, FileError, Lock, write_atomically};
 use crate::records::Agreement;
 use crate::results::Counters;
+use crate::seal::{self, Sealed};
 use crate::{Method, TestResult, Version};
 
 /// Of `result.json`; raised when older programs could misread it.
@@ -315,7 +317,7 @@ impl CellFolder {
     /// # Errors
     /// [`FileError`].
     pub fn write_result(&self, result: &CellResult) -> files::Result<()> {
-        files::write_json(&self.path.join("result.json"), result)
+        write(&self.path.join("result.json"), result)
     }
 
     /// Records a failure.
@@ -323,7 +325,7 @@ impl CellFolder {
     /// # Errors
     /// [`FileError`].
     pub fn write_failure(&self, failure: &Failure) -> files::Result<()> {
-        files::write_json(&self.path.join("failure.json"), failure)
+        write(&self.path.join("failure.json"), failure)
     }
 
     /// Forgets a failure, and the training that led to it if another attempt [must begin anew](Failure::begins_anew).
@@ -377,11 +379,20 @@ impl CellResult {
     }
 }
 
-/// A JSON file; `None` if it is not there.
+/// A JSON file, whose checksum is the right one, if it has any; `None` if it is not there.
 pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
     let Some(text) = files::read_plain(path, LONGEST)? else { return Ok(None) };
-    let damaged = |error: serde_json::Error| FolderError::Damaged { path: path.to_owned(), reason: error.to_string() };
-    serde_json::from_slice(&text).map(Some).map_err(damaged)
+    let damaged = |reason: String| FolderError::Damaged { path: path.to_owned(), reason };
+    let not_understood = |error: serde_json::Error| damaged(error.to_string());
+    let mut value: Value = serde_json::from_slice(&text).map_err(not_understood)?;
+    seal::open(&mut value).map_err(|broken| damaged(broken.into()))?;
+    serde_json::from_value(value).map(Some).map_err(not_understood)
+}
+
+/// Writes a record with its checksum.
+fn write(path: &Path, record: &impl Serialize) -> files::Result<()> {
+    let sealed = Sealed::new(record).map_err(|error| files::io("write", path)(error.into()))?;
+    files::write_json(path, &sealed)
 }
 
 #[cfg(test)]
@@ -497,6 +508,21 @@ mod tests {
         }
         cell.write_result(&CellResult { format_version: 9, ..result() }).unwrap();
         assert!(cell.state().unwrap_err().to_string().contains("it has format 9, this program reads 1"));
+    }
+
+    #[test]
+    fn a_changed_digit_of_a_result_is_refused_and_one_of_an_earlier_program_read() {
+        let directory = tempfile::tempdir().unwrap();
+        let cell = Folder::new(directory.path()).cell("a");
+        cell.write_result(&result()).unwrap();
+        let path = cell.path().join("result.json");
+        let text = fs::read_to_string(&path).unwrap();
+        fs::write(&path, text.replace("33.3", "93.3")).unwrap();
+        let message = cell.state().unwrap_err().to_string();
+        assert!(message.contains("result.json is not understood: it is not what was written"), "{message}");
+        assert!(message.ends_with("delete it to have the cell done again"), "{message}");
+        files::write_json(&path, &result()).unwrap();
+        assert_eq!(cell.state().unwrap(), CellState::Done(Box::new(result())));
     }
 
     #[test]

@@ -5,9 +5,10 @@ use serde::{Deserialize, Serialize};
 use perturb_protocol::proto::{self, Interval};
 
 use crate::Version;
+use crate::heatmaps::HeatmapKind;
 use crate::means::mean;
 use crate::records::{EpisodeRecord, Records};
-use crate::sets::Context;
+use crate::sets::{Context, TestSet};
 use crate::table::Table;
 
 /// The most points along an axis: all environments run together.
@@ -112,6 +113,45 @@ impl Axis {
 impl Heatmap {
     /// What the set of a heatmap's recorded test is called.
     pub const SET: &str = "heatmap";
+
+    /// The axes of a heatmap's set: the two parameters that vary, the faster one along x. `None` of another set.
+    pub(crate) fn axes_of(set: &TestSet, environment: &proto::Environment) -> Option<[Axis; 2]> {
+        let contexts = set.listed();
+        let [first, second, ..] = contexts.as_slice() else { return None };
+        let (mut varying, mut faster) = (Vec::new(), None);
+        for parameter in environment.parameters.iter().filter(|_| set.name == Self::SET) {
+            let value = |context: &Context| context.get(&parameter.name).copied();
+            if contexts.iter().any(|context| value(context) != value(first)) {
+                if value(first) != value(second) {
+                    faster = Some(varying.len());
+                }
+                varying.push(Axis::of(parameter));
+            }
+        }
+        let [one, other]: [Axis; 2] = varying.try_into().ok()?;
+        Some(if faster? == 0 { [one, other] } else { [other, one] })
+    }
+
+    /// That of recorded episodes, if they have the test of one.
+    pub fn recorded(records: &Records) -> Option<Self> {
+        let axes = records.about.tests.iter().find_map(|test| test.axes.clone())?;
+        Self::of(records, axes)
+    }
+
+    /// The contexts of its set over `axes`, of `grid` points along each, where others have the values of `fixed`.
+    pub fn contexts(axes: &[Axis; 2], grid: usize, fixed: &Context) -> Vec<Context> {
+        let context = |point: usize| {
+            let places = [point % grid, point / grid];
+            let value = |i: usize| (axes[i].name.clone(), axes[i].value(places[i], grid));
+            fixed.clone().into_iter().chain([value(0), value(1)]).collect()
+        };
+        (0..grid * grid).map(context).collect()
+    }
+
+    /// Over what it is.
+    pub fn kind(&self) -> HeatmapKind {
+        HeatmapKind { parameters: self.axes.clone().map(|axis| axis.name), base: self.base }
+    }
 
     /// Where other parameters came from in a recorded test; `None` if it is not that of a heatmap.
     pub fn base_of(records: &Records) -> Option<Version> {
@@ -255,6 +295,44 @@ mod tests {
         for grid in [0, usize::MAX] {
             assert_eq!(Heatmap { grid, ..empty() }.with_points(head.as_bytes()), None, "{grid}");
         }
+    }
+
+    #[test]
+    fn the_axes_of_a_recorded_heatmap_are_the_parameters_that_vary_the_faster_one_along_x() {
+        let heatmap = fixture::heatmap(2, |_, _| (0.0, 0.0));
+        let parameter = |axis: &Axis| {
+            let distribution = |pairs: &[(f64, f64)]| proto::Distribution {
+                intervals: pairs.iter().map(|&(low, high)| Interval { low, high }).collect(),
+            };
+            proto::Parameter {
+                name: axis.name.clone(),
+                unit: axis.unit.clone(),
+                default_value: axis.default,
+                random: Some(distribution(&axis.random)),
+                extreme: Some(distribution(&axis.extreme)),
+                ..proto::Parameter::default()
+            }
+        };
+        let [mass, length] = &heatmap.axes;
+        let gravity = Axis { name: "gravity".into(), ..mass.clone() };
+        let parameters = [length, &gravity, mass].map(parameter).into();
+        let environment = proto::Environment { parameters, ..proto::Environment::default() };
+        let fixed: Context = [("gravity".to_owned(), 1.0)].into();
+        let set = |name: &str, contexts| TestSet {
+            name: name.into(),
+            version: Version::D,
+            contexts: crate::sets::Contexts::Listed(contexts),
+        };
+        let over = |axes: &[Axis; 2]| set(Heatmap::SET, Heatmap::contexts(axes, 2, &fixed));
+        assert_eq!(Heatmap::axes_of(&over(&heatmap.axes), &environment), Some(heatmap.axes.clone()));
+        let turned = [length.clone(), mass.clone()];
+        assert_eq!(Heatmap::axes_of(&over(&turned), &environment), Some(turned.clone()));
+        let others = set("others", Heatmap::contexts(&heatmap.axes, 2, &fixed));
+        assert_eq!(Heatmap::axes_of(&others, &environment), None, "a set of another name");
+        let one = set(Heatmap::SET, vec![fixed.clone(), [("gravity".to_owned(), 2.0)].into()]);
+        assert_eq!(Heatmap::axes_of(&one, &environment), None, "of one parameter");
+        let single = set(Heatmap::SET, vec![fixed.clone()]);
+        assert_eq!(Heatmap::axes_of(&single, &environment), None, "of one point");
     }
 
     #[test]

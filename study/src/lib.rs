@@ -34,6 +34,7 @@ mod results;
 pub mod runs;
 mod scenarios;
 pub mod scheduler;
+mod seal;
 mod selection;
 pub mod sets;
 pub mod settings;

@@ -4,6 +4,7 @@ use perturb_policy::random::{Purpose, stream};
 use perturb_protocol::{Distribution, EndedEpisode, Version, proto};
 use rand::Rng;
 
+use crate::heatmap::Heatmap;
 use crate::records::{Difference, EpisodeRecord, RecordedTest, Records};
 use crate::sets::{Context, TestSet};
 
@@ -62,7 +63,7 @@ impl Counting {
     pub fn new(set: TestSet, purpose: Purpose, seed: u64, episodes: u64, episodes_per_trial: u32) -> Self {
         let quotas = quotas(episodes, set.listed().len());
         let seed = environment_seed(purpose, seed, set.version);
-        Self { test: RecordedTest { set, seed }, quotas, episodes_per_trial, counted: Vec::new() }
+        Self { test: RecordedTest { set, seed, axes: None }, quotas, episodes_per_trial, counted: Vec::new() }
     }
 
     /// The test, with the seed of its environments.
@@ -95,7 +96,8 @@ impl Counting {
     /// # Errors
     /// [`NotRecorded`], if the server played something else; nothing was added then.
     pub fn finish(self, environment: &proto::Environment, records: &mut Records) -> Result<(), NotRecorded> {
-        let Self { test, mut counted, .. } = self;
+        let Self { mut test, mut counted, .. } = self;
+        test.axes = Heatmap::axes_of(&test.set, environment);
         counted.sort_by_key(|end| (end.environment_index, end.episode_index));
         let contexts = test.set.listed();
         let parts = test.set.version.parts();

@@ -130,7 +130,7 @@ mod tests {
             tests: Vec::new(),
         };
         let mut records = Records::new(about);
-        records.add(RecordedTest { set: Version::D.into(), seed: 7 }, (0..3).map(episode).collect());
+        records.add(RecordedTest { set: Version::D.into(), seed: 7, axes: None }, (0..3).map(episode).collect());
         records
     }
 

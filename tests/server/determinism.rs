@@ -115,5 +115,6 @@ fn joined(a: &Stepped, b: &Stepped, second: u32) -> Stepped {
         reward_terms: both(|s| &s.reward_terms),
         ended: a.ended.iter().cloned().chain(ended).collect(),
         started: a.started.iter().cloned().chain(started).collect(),
+        ..Stepped::default()
     }
 }

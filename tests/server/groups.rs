@@ -49,6 +49,7 @@ fn part(stepped: &Stepped, first: u32, size: u32) -> Stepped {
         final_observations: finals,
         ended: ended.map(|(_, end)| end.clone()).collect(),
         started: stepped.started.clone(),
+        ..Stepped::default()
     };
     here.started.retain(|start| (first..first + size).contains(&start.slot));
     here.ended.iter_mut().for_each(|end| end.slot -= first);

@@ -243,6 +243,22 @@ async fn the_catalogue_is_printed_as_a_server_would_tell_it() {
     assert!(String::from_utf8(printed.stdout).unwrap() == told);
 }
 
+#[test]
+fn shells_and_man_know_every_flag() {
+    let printed = |arguments: &[&str]| {
+        let Output { status, stdout, .. } = command().args(arguments).output().unwrap();
+        assert!(status.success());
+        String::from_utf8(stdout).unwrap()
+    };
+    for shell in ["bash", "zsh", "fish"] {
+        let script = printed(&["--completions", shell]);
+        assert!(["max-envs", "keepalive-seconds", "catalogue"].iter().all(|flag| script.contains(flag)), "{script}");
+    }
+    let page = printed(&["--man"]);
+    assert!(page.starts_with(".ie") && page.contains("\\-\\-max\\-envs"), "{page}");
+    assert_eq!(command().args(["--man", "--catalogue"]).output().unwrap().status.code(), Some(2));
+}
+
 #[tokio::test]
 async fn a_stale_socket_is_replaced_a_live_one_and_a_file_are_not() {
     let directory = tempfile::tempdir().unwrap();
@@ -275,6 +291,63 @@ async fn a_stale_socket_is_replaced_a_live_one_and_a_file_are_not() {
     assert_eq!(std::fs::read_to_string(&socket).unwrap(), "precious");
 }
 
+#[tokio::test]
+async fn a_successors_socket_stays_when_an_old_server_ends() {
+    let directory = tempfile::tempdir().unwrap();
+    let address = format!("unix:{}", directory.path().join("perturb.sock").display());
+    let listen = || {
+        let mut command = command();
+        command.args(["--listen", &address]);
+        Server::spawn(command, tempfile::tempdir().unwrap(), 1)
+    };
+    let mut old = listen();
+    std::fs::remove_file(old.socket()).unwrap();
+    let new = listen();
+    old.signal("TERM");
+    old.ended().await;
+    assert_eq!(health(new.unix(), SERVICE).await.unwrap(), ServingStatus::Serving);
+}
+
+#[tokio::test]
+async fn a_socket_whose_server_accepts_nobody_is_in_use_and_nobody_waits_for_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let socket = directory.path().join("perturb.sock");
+    let _deaf = UnixListener::bind(&socket).unwrap();
+    let mut waiting = Vec::new();
+    while let Ok(connection) = tokio::net::UnixStream::connect(&socket).await {
+        waiting.push(connection);
+    }
+    let address = format!("unix:{}", socket.display());
+    let message = refused({
+        let mut command = command();
+        command.args(["--listen", &address]);
+        command
+    });
+    assert!(message.contains("another program does"), "{message}");
+}
+
+#[tokio::test]
+async fn the_transport_comes_before_physics() {
+    let server = Server::start(&["--workers", "2"]);
+    let niceness = |task: &Path| {
+        let stat = std::fs::read_to_string(task.join("stat")).unwrap();
+        // After the name in brackets: the state and fifteen numbers stand before it.
+        let rest = stat.rsplit_once(") ").unwrap().1.to_owned();
+        rest.split(' ').nth(16).unwrap().parse::<i32>().unwrap()
+    };
+    let tasks = Path::new("/proc").join(server.child.id().to_string()).join("task");
+    let mut found = Vec::new();
+    until("the workers have started", async || {
+        found = std::fs::read_dir(&tasks).unwrap().map(|task| task.unwrap().path()).collect::<Vec<_>>();
+        let physics = |task: &&std::path::PathBuf| {
+            std::fs::read_to_string(task.join("comm")).is_ok_and(|name| name.starts_with("physics"))
+        };
+        let transport = niceness(&tasks.join(server.child.id().to_string()));
+        found.iter().filter(physics).filter(|task| niceness(task) > transport).count() == 2
+    })
+    .await;
+}
+
 #[test]
 fn a_port_in_use_is_an_error_that_names_it() {
     let taken = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -298,6 +371,9 @@ fn a_bad_flag_is_refused_before_any_port_is_bound() {
         &["--max-sessions", "0"],
         &["--max-message-bytes", "1023"],
         &["--keepalive-seconds", "0"],
+        &["--handshake-seconds", "0"],
+        &["--stall-seconds", "86401"],
+        &["--max-memory", "1000"],
         &["--keepalive-seconds", "18446744073709551615"],
         &["--grace-seconds", "-1"],
         &["--log", "perturb=loud"],

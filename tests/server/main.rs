@@ -4,6 +4,7 @@
 mod common;
 
 mod acting;
+mod bounds;
 mod catalogue;
 mod conformance;
 mod determinism;
@@ -18,6 +19,7 @@ mod locomotion;
 mod observing;
 mod old_snapshots;
 mod pool;
+mod receipt_arrays;
 mod reference;
 mod rendering;
 mod restoring;

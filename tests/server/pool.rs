@@ -21,7 +21,15 @@ const MODES: [Autoreset; 3] = [Autoreset::NextStep, Autoreset::SameStep, Autores
 fn batch_settings(spec: &'static EnvironmentSpec, size: usize, autoreset: Autoreset) -> BatchSettings {
     let episodes = common::settings(spec, Version::R, 17, 100, 2);
     let groups = vec![SlotGroup { size, episodes }];
-    BatchSettings { spec, groups, autoreset, receipts: true, reward_terms: true, observe_parameters: false }
+    BatchSettings {
+        spec,
+        groups,
+        autoreset,
+        receipts: true,
+        receipt_arrays: false,
+        reward_terms: true,
+        observe_parameters: false,
+    }
 }
 
 /// Random actions for slots whose environments have the indices from `first` on.
@@ -104,6 +112,7 @@ impl Model {
             final_observations: last.into(),
             ended,
             started,
+            ..Stepped::default()
         }
     }
 

@@ -42,11 +42,19 @@ struct Progress {
 }
 
 fn decode(snapshot: &[u8]) -> Saved {
-    postcard::from_bytes(snapshot).unwrap()
+    postcard::from_bytes(&snapshot[..snapshot.len() - CHECKSUM]).unwrap()
 }
 
 fn encode(saved: &Saved) -> Vec<u8> {
-    postcard::to_stdvec(saved).unwrap()
+    sealed(postcard::to_stdvec(saved).unwrap())
+}
+
+/// Bytes of the checksum at a snapshot's end.
+const CHECKSUM: usize = 4;
+
+fn sealed(content: Vec<u8>) -> Vec<u8> {
+    let sum = crc32c::crc32c(&content).to_le_bytes();
+    [content, sum.to_vec()].concat()
 }
 
 /// An environment in the middle of its first trial's second episode, at most 4 steps in: some fall soon.
@@ -326,6 +334,21 @@ fn every_truncated_snapshot_is_refused() {
 }
 
 #[test]
+fn every_changed_byte_of_a_snapshot_is_refused() {
+    for spec in tasks::catalogue().specs() {
+        let snapshot = used(spec).snapshot();
+        let mut e = other(spec);
+        let before = e.snapshot();
+        for place in 0..snapshot.len() {
+            let mut changed = snapshot.clone();
+            changed[place] ^= 1 << (place % 8);
+            refused(e.restore(&changed));
+        }
+        assert_eq!(e.snapshot(), before);
+    }
+}
+
+#[test]
 fn a_snapshot_with_something_behind_it_is_refused() {
     for spec in tasks::catalogue().specs() {
         refused(other(spec).restore(&[used(spec).snapshot(), vec![0]].concat()));
@@ -367,11 +390,12 @@ proptest! {
     fn flipped_bits_do_no_harm(flips in prop::collection::vec((any::<prop::sample::Index>(), 0..8_u32), 1..4)) {
         for spec in tasks::catalogue().specs() {
             let mut snapshot = used(spec).snapshot();
+            snapshot.truncate(snapshot.len() - CHECKSUM);
             for (index, bit) in &flips {
                 let index = index.index(snapshot.len());
                 snapshot[index] ^= 1 << bit;
             }
-            try_restore(spec, &snapshot)?;
+            try_restore(spec, &sealed(snapshot))?; // somebody meant it
         }
     }
 }
@@ -381,7 +405,15 @@ proptest! {
 fn batch_settings(spec: &'static EnvironmentSpec, seed: u64, size: usize, autoreset: Autoreset) -> BatchSettings {
     let episodes = common::settings(spec, Version::R, seed, 0, 2);
     let groups = vec![SlotGroup { size, episodes }];
-    BatchSettings { spec, groups, autoreset, receipts: true, reward_terms: true, observe_parameters: false }
+    BatchSettings {
+        spec,
+        groups,
+        autoreset,
+        receipts: true,
+        receipt_arrays: false,
+        reward_terms: true,
+        observe_parameters: false,
+    }
 }
 
 fn actions(spec: &EnvironmentSpec, size: usize, t: u64) -> Vec<u8> {
@@ -505,4 +537,23 @@ async fn after_a_refused_restore_observations_are_those_of_before() {
         let width = 4 * spec.observation.len();
         assert_eq!(observed[..], last.observations[..width], "{}", spec.name);
     }
+}
+
+#[rstest::rstest]
+#[case("Pendulum", 1, 8.5)]
+#[case("Pendulum", 1, -1e30)]
+#[case("Pendulum", 0, 11_000.0)]
+#[case("MountainCar", 0, 1.3)]
+#[case("MountainCar", 1, -0.08)]
+#[case("Acrobot", 0, 3.2)]
+#[case("Acrobot", 3, 29.0)]
+fn a_state_that_the_dynamics_never_reach_is_refused(#[case] name: &str, #[case] entry: usize, #[case] value: f64) {
+    let spec = tasks::catalogue().find(name).unwrap();
+    let mut environment = episodes(spec, Version::D, 1, 0, 1);
+    let before = environment.snapshot();
+    let mut saved: Saved = postcard::from_bytes(&before).unwrap();
+    saved.state[entry] = value;
+    let refused = environment.restore(&sealed(postcard::to_stdvec(&saved).unwrap()));
+    assert!(matches!(&refused, Err(Error::Snapshot { reason }) if reason.contains("within")), "{refused:?}");
+    assert_eq!(environment.snapshot(), before);
 }

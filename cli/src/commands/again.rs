@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::args::PlayArgs;
+use super::args::{PlayArgs, WaitArgs};
 use super::error::CommandError;
 use perturb_learner::training::{LastCheckpoint, TrainError};
 
@@ -26,6 +26,9 @@ pub(super) fn resume_command(path: &Path, play: &PlayArgs) -> String {
     }
     if play.act == "client" {
         command += " --act client";
+    }
+    if play.wait.server_wait != WaitArgs::USUAL {
+        command += &format!(" --server-wait {}", play.wait.server_wait);
     }
     command
 }
@@ -52,6 +55,7 @@ mod tests {
         let play = |servers: &[&str], act: &str| PlayArgs {
             server: ServerArgs { server: servers.iter().map(|text| text.parse().unwrap()).collect(), workers: None },
             act: act.into(),
+            wait: WaitArgs { server_wait: WaitArgs::USUAL },
         };
         assert_eq!(resume_command(Path::new("runs/a"), &play(&[], "server")), "perturb train --resume runs/a");
         assert_eq!(

@@ -4,6 +4,8 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+use serde_json::{Value, json};
+
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::Servers;
 use perturb_learner::evaluation::{Audit, audit};
@@ -15,7 +17,7 @@ use super::args::AuditArgs;
 use super::display::Display;
 use super::error::{CommandError, Result, system};
 use super::rates::file_in;
-use super::{plan_in, servers};
+use super::{lasting_servers, plan_in};
 
 /// So many differences are told of each policy.
 const SHOWN: usize = 3;
@@ -31,30 +33,51 @@ struct Tested {
 pub(super) fn run(args: &AuditArgs) -> Result<ExitCode> {
     let tested = tested(args)?;
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let servers = servers(&args.server)?;
-    let mut out = std::io::stdout();
-    let (mut played, mut different) = (0, 0);
+    let servers = lasting_servers(&args.server, args.wait)?;
     let most = if args.all { usize::MAX } else { args.episodes };
-    let mut unusable = 0;
+    let mut audits = Vec::new();
     for one in &tested {
-        let Audit { episodes, different: of_policy } = match one.audit(&servers, most, &stop) {
-            Ok(audit) => audit,
-            Err(error) if tested.len() > 1 && stop.signal().is_none() => {
-                writeln!(out, "{}: {error}", one.name)?;
-                unusable += 1;
-                continue;
-            }
-            Err(error) => return Err(error),
-        };
-        for line in of_policy.iter().take(SHOWN) {
-            writeln!(out, "{}: {line}", one.name)?;
+        match one.audit(&servers, most, &stop) {
+            // Of one policy, and of one that was stopped, it is the command's error.
+            Err(error) if tested.len() == 1 || stop.signal().is_some() => return Err(error),
+            audit => audits.push((one.name.as_str(), audit.map_err(|error| error.to_string()))),
         }
-        played += episodes;
-        different += of_policy.len() as u64;
+        if !args.json {
+            audits.last().map_or(Ok(()), |(name, audit)| print(name, audit))?;
+        }
     }
-    let recorded = if tested.len() == 1 { "1 policy".to_owned() } else { format!("{} policies", tested.len()) };
-    writeln!(out, "{} of {played} episodes of {recorded} have the same bytes", played - different)?;
-    Ok(if different + unusable == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+    let done = || audits.iter().filter_map(|(_, audit)| audit.as_ref().ok());
+    let played: u64 = done().map(|audit| audit.episodes).sum();
+    let different: usize = done().map(|audit| audit.different.len()).sum();
+    let mut out = std::io::stdout();
+    if args.json {
+        let policies: Vec<_> = audits.iter().map(|(name, audit)| document(name, audit)).collect();
+        let same = played - different as u64;
+        writeln!(out, "{:#}", json!({ "episodes": played, "same": same, "policies": policies }))?;
+    } else {
+        let recorded = if tested.len() == 1 { "1 policy".to_owned() } else { format!("{} policies", tested.len()) };
+        writeln!(out, "{} of {played} episodes of {recorded} have the same bytes", played - different as u64)?;
+    }
+    Ok(if different == 0 && done().count() == tested.len() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// What came of a policy, or why it could not be played again.
+type Outcome = Result<Audit, String>;
+
+/// Says what is not as it was recorded.
+fn print(name: &str, audit: &Outcome) -> std::io::Result<()> {
+    let lines = match audit {
+        Ok(audit) => &audit.different[..audit.different.len().min(SHOWN)],
+        Err(error) => std::slice::from_ref(error),
+    };
+    lines.iter().try_for_each(|line| writeln!(std::io::stdout(), "{name}: {line}"))
+}
+
+fn document(name: &str, audit: &Outcome) -> Value {
+    match audit {
+        Ok(audit) => json!({ "policy": name, "episodes": audit.episodes, "different": audit.different }),
+        Err(error) => json!({ "policy": name, "error": error }),
+    }
 }
 
 impl Tested {

@@ -67,11 +67,11 @@ impl<'a> Doing<'a> {
                 display.cells(status);
                 rates.clone_from(&status.rates);
             }
-            Announcement::Note(sentence) => display.say(sentence),
+            Announcement::Note(sentence) => note(sentence),
             Announcement::Line(line) if self.args.json => write_line(&mut std::io::stdout(), line),
             Announcement::Line(_) => {}
         };
-        let end = run_plan(plan, self.folder, backend, &self.forgiven, self.stop, &mut report);
+        let end = run_plan(plan, self.folder, backend, &self.forgiven, self.args.wait.time(), self.stop, &mut report);
         drop(display);
         self.rates = rates;
         self.end = Some(end.map_err(|error| match error {

@@ -10,7 +10,7 @@ use std::time::Instant;
 use super::args::DemoArgs;
 use super::display::{Display, note};
 use super::error::{CommandError, Result, system};
-use super::{servers, signal_code, threads};
+use super::{lasting_servers, signal_code, threads};
 use crate::video::{VideoError, VideoFile, VideoOptions, film};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{ClientError, Servers};
@@ -64,7 +64,7 @@ pub(super) fn run(args: &DemoArgs) -> Result<ExitCode> {
         let message = format!("{} is not empty: give the demo another --out, or delete that", out.display());
         return Err(CommandError::Usage(message));
     }
-    let demo = Demo { args, servers: servers(&args.server)?, stop, out };
+    let demo = Demo { args, servers: lasting_servers(&args.server, args.wait)?, stop, out };
     match demo.run(start) {
         Ok(()) => Ok(ExitCode::SUCCESS),
         Err(error) => {

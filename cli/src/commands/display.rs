@@ -2,6 +2,7 @@
 
 use std::io::IsTerminal;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
@@ -21,6 +22,8 @@ const LEAST_ELAPSED: Duration = Duration::from_secs(1);
 
 /// Whether nothing is said but errors.
 static QUIET: AtomicBool = AtomicBool::new(false);
+/// The bar that is on the terminal.
+static SHOWN: Mutex<Option<MultiProgress>> = Mutex::new(None);
 
 /// Has [`note`] and displays say nothing from now on.
 pub(super) fn be_quiet() {
@@ -31,11 +34,19 @@ pub(super) fn is_quiet() -> bool {
     QUIET.load(Ordering::Relaxed)
 }
 
-/// A sentence on standard error, unless nobody wants to hear it.
+/// A sentence on standard error, beside the bar that is shown there, unless nobody wants to hear it.
 pub(super) fn note(sentence: impl std::fmt::Display) {
-    if !is_quiet() {
-        eprintln!("{sentence}");
+    if is_quiet() {
+        return;
     }
+    match &*shown() {
+        Some(bar) => bar.suspend(|| eprintln!("{sentence}")),
+        None => eprintln!("{sentence}"),
+    }
+}
+
+fn shown() -> MutexGuard<'static, Option<MultiProgress>> {
+    SHOWN.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// The episodes of a training or a test, or the cells of a run.
@@ -144,14 +155,6 @@ impl Display {
             eprintln!("{}{words}", self.what);
         }
     }
-
-    /// A sentence beside it.
-    pub(super) fn say(&self, sentence: &str) {
-        match &self.bar {
-            Some(bar) => bar.all.suspend(|| note(sentence)),
-            None => note(sentence),
-        }
-    }
 }
 
 /// As many lines as are shown, and how many more there are.
@@ -168,6 +171,7 @@ impl Bar {
         let bar = ProgressBar::new(total).with_style(style("{prefix}{wide_bar} {percent:>3} %"));
         bar.set_prefix(what.to_owned());
         let bar = all.add(bar);
+        *shown() = Some(all.clone());
         Self { all, bar, lines: Vec::new() }
     }
 
@@ -195,6 +199,7 @@ impl Drop for Display {
             lines.iter().for_each(ProgressBar::finish_and_clear);
             bar.finish_and_clear();
             let _ = all.clear(); // the terminal is gone
+            *shown() = None;
         }
     }
 }

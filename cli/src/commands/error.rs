@@ -95,7 +95,9 @@ impl CommandError {
             | Self::Measure(MeasureError::Test(error))
             | Self::Heatmap(HeatmapError::Test(error))
             | Self::Video(VideoError::Test(error)) => error.signal(),
-            Self::Measure(MeasureError::Stopped { signal }) => Some(*signal),
+            Self::Measure(MeasureError::Stopped { signal }) | Self::Train(TrainError::Stopped { signal, .. }) => {
+                Some(*signal)
+            }
             _ => None,
         }
     }

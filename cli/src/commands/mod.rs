@@ -31,9 +31,10 @@ mod video;
 use std::io::IsTerminal;
 use std::process::ExitCode;
 
-use args::{Cli, Command, PlayArgs, ServerArgs};
+use args::{Cli, Command, PlayArgs, ServerArgs, WaitArgs};
+use display::note;
 use error::{CommandError, Result};
-use perturb_learner::client::{ActAt, Servers};
+use perturb_learner::client::{ActAt, ServerWait, Servers};
 use perturb_study::interrupt::end_on_signals;
 use perturb_study::{Folder, Plan};
 
@@ -102,10 +103,15 @@ fn servers(args: &ServerArgs) -> Result<Servers> {
     Ok(Servers::connect(&args.server)?)
 }
 
+/// The same, for what goes on when they are lost and come back.
+fn lasting_servers(args: &ServerArgs, wait: WaitArgs) -> Result<Servers> {
+    Ok(servers(args)?.with_wait(ServerWait { limit: wait.time(), tell: |sentence| note(sentence) }))
+}
+
 /// The same, for those that play.
 fn playing_servers(args: &PlayArgs) -> Result<Servers> {
     let act = if args.act == "client" { ActAt::Client } else { ActAt::Server };
-    Ok(servers(&args.server)?.with_act(act))
+    Ok(lasting_servers(&args.server, args.wait)?.with_act(act))
 }
 
 /// The plan of an experiment, with all cells that are known.

@@ -3,6 +3,8 @@
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+use serde_json::json;
+
 use perturb_study::TestResult;
 use perturb_study::records::{FILE, Records};
 use perturb_study::success::Criterion;
@@ -26,6 +28,13 @@ pub(super) fn run(args: &RatesArgs) -> Result<()> {
     for test in &about.tests {
         let name = test.set.name.as_str();
         rows.extend(criteria.iter().map(|criterion| (name, criterion, records.result(name, Some(criterion)))));
+    }
+    if args.json {
+        let rows =
+            rows.iter().map(|(set, success, result)| json!({ "set": set, "success": success, "result": result }));
+        let rates: Vec<_> = rows.collect();
+        let document = json!({ "environment": about.environment, "policy": about.policy, "rates": rates });
+        return Ok(writeln!(std::io::stdout(), "{document:#}")?);
     }
     let table = Table::of("", &rows)
         .text("tested on", |(set, ..)| set)

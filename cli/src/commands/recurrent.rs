@@ -53,8 +53,9 @@ pub(super) fn prepare(architecture: Architecture, one_thread: bool) -> Result<()
     let source = command.exec();
     let shown = program.display();
     Err(CommandError::Usage(format!(
-        "recurrent policies are trained by the program {PROGRAM}, which cannot be started: {shown}: {source}; install \
-         it beside perturb (`make install`), or train with --architecture ff"
+        "recurrent policies are trained by the program {PROGRAM}, which cannot be started: {shown}: {source}; it \
+         needs libtorch, so the Python wheel is without it: `make install` in a clone of perturb installs both, or \
+         train with --architecture ff"
     )))
 }
 

@@ -19,7 +19,7 @@ use perturb_learner::client::{Address, PrivateServer, Servers};
 use perturb_learner::measure::{MeasureError, measure};
 use perturb_study::files::require_writable;
 use perturb_study::interrupt::StopFlag;
-use perturb_study::scheduler::{CellEvent, Local, Order, OrderedCell, Teller, count};
+use perturb_study::scheduler::{CellEvent, Local, News, Order, OrderedCell, Teller, count};
 use perturb_study::{Cell, Folder, Grouping, Plan, Taken, estimates, representatives};
 
 /// How long each group of trainings is measured.
@@ -88,8 +88,9 @@ fn work(args: &RunArgs, folder: &Folder, stop: &StopFlag) -> Result<ExitCode> {
     match Servers::connect_to_one(&args.server.server, order.turn) {
         Ok(servers) => {
             for order in &orders {
-                let addresses = servers.addresses().map(ToString::to_string);
-                addresses.for_each(|address| tell(order.cell, CellEvent::Server { address }));
+                for address in servers.addresses() {
+                    tell(order.cell, CellEvent::Server { address: address.to_string() });
+                }
             }
             run_cells(&servers, &orders, stop, &mut tell);
         }
@@ -124,14 +125,21 @@ fn all_cells(args: &RunArgs, plan: Plan, folder: &Folder, stop: &StopFlag) -> Re
     step_limits(&servers, &plan)?; // refuses environments that there are not
     let addresses: Vec<String> = addresses.iter().map(Address::to_string).collect();
     let command = || worker(args, folder, &addresses);
-    let server_ended = || {
-        let status = local.as_ref()?.lock().ok()?.exit_status()?;
-        Some(format!("the private server ended with {status}"))
+    let server = || {
+        let mut server = local.as_ref()?.lock().ok()?;
+        let ended = format!("the private server ended with {}", server.exit_status()?);
+        if args.wait.time().is_zero() {
+            return Some(News::NoServer(ended));
+        }
+        Some(match server.restart() {
+            Ok(()) => News::Note(format!("{ended}; it is started again")),
+            Err(error) => News::NoServer(format!("{ended}; {error}")),
+        })
     };
     let mut doing = Doing::begin(args, plan, folder, stop)?;
     while let Some(plan) = doing.next()? {
         let most = if is_quiet() { Vec::new() } else { most(&servers, &plan, folder, grouping, stop)? };
-        doing.run(&plan, &mut Local::new(&plan, folder, grouping, &command, &server_ended).with_most(most))?;
+        doing.run(&plan, &mut Local::new(&plan, folder, grouping, &command, &server).with_most(most))?;
     }
     doing.end()
 }

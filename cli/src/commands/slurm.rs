@@ -53,6 +53,7 @@ fn options(args: &RunArgs) -> Result<SlurmOptions> {
         group: args.group,
         workers: args.server.workers.unwrap_or(jobs),
         servers: named.iter().map(Address::to_string).collect(),
+        server_wait: args.wait.server_wait,
     };
     let engine = &args.engine;
     Ok(SlurmOptions {

@@ -13,7 +13,7 @@ use super::error::{CommandError, Result, system};
 use super::{playing_servers, recurrent, sets, signal_code, threads};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::logging::{EpisodeFigures, Progress, TimeShares};
-use perturb_learner::training::{Outcome, RunDirectory, is_over, resume, train};
+use perturb_learner::training::{Outcome, RunDirectory, TrainError, is_over, resume, train};
 use perturb_study::Version;
 use perturb_study::files::{create_folder, io, write_atomically};
 use perturb_study::interrupt::StopFlag;
@@ -51,7 +51,7 @@ fn begin(args: &TrainArgs) -> Result<ExitCode> {
     let report = |progress: &Progress| display.training(progress);
     let outcome = train(&servers, &config, &directory, threads(args.threads), &stop, report);
     drop(display);
-    end(args, &config, &directory, &outcome.map_err(|error| explain(error, &args.play))?)
+    end(args, &config, &directory, outcome)
 }
 
 /// The run in `path`, from its last checkpoint.
@@ -90,11 +90,25 @@ fn go_on(args: &TrainArgs, path: &Path) -> Result<ExitCode> {
     if saved.is_some_and(|saved| saved.state.config == config) {
         write_atomically(&path.join("config.toml"), config.to_toml().as_bytes())?;
     }
-    end(args, &config, &directory, &outcome.map_err(|error| explain(error, &args.play))?)
+    end(args, &config, &directory, outcome)
 }
 
 /// Says what a training came to.
-fn end(args: &TrainArgs, config: &TrainConfig, directory: &RunDirectory, outcome: &Outcome) -> Result<ExitCode> {
+fn end(
+    args: &TrainArgs,
+    config: &TrainConfig,
+    directory: &RunDirectory,
+    outcome: Result<Outcome, TrainError>,
+) -> Result<ExitCode> {
+    let outcome = match outcome {
+        Ok(outcome) => outcome,
+        Err(TrainError::Stopped { signal, source }) => {
+            let lost = explain(*source, &args.play);
+            note(format_args!("stopped by signal {signal}, waiting for a server: {lost}"));
+            return Ok(signal_code(signal));
+        }
+        Err(error) => return Err(explain(error, &args.play)),
+    };
     if !config.settings.is_random() {
         summarise(&outcome.progress);
     }

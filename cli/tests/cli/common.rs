@@ -1,7 +1,8 @@
 //! What several tests need to run the programs.
 
 use std::path::Path;
-use std::process::{Command, Output, Stdio};
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
 use perturb_learner::client::{Address, PrivateServer, Servers};
@@ -68,6 +69,24 @@ pub fn wait_within(limit: Duration, what: &str, mut condition: impl FnMut() -> b
         assert!(start.elapsed() < limit, "{what} did not happen within {limit:?}");
         std::thread::sleep(Duration::from_millis(20));
     }
+}
+
+/// How `child` ends, which is to end by itself; where it does not, it is killed, so that a test fails rather than hangs.
+#[track_caller]
+pub fn ended(child: Child) -> Output {
+    let id = child.id();
+    let (done, watched) = channel::<()>();
+    let watch = std::thread::spawn(move || {
+        let is_late = watched.recv_timeout(LIMIT) == Err(RecvTimeoutError::Timeout);
+        if is_late {
+            kill("-KILL", id);
+        }
+        is_late
+    });
+    let output = child.wait_with_output().expect("its output");
+    drop(done);
+    assert!(!watch.join().expect("a watch"), "it did not end within {LIMIT:?}: {}", stderr(&output));
+    output
 }
 
 /// The process that `parent` started and that is called perturb-server.

@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::common::{addresses, child_server, config, is_running, kill, perturb, read, run, server, stderr, wait_for};
+use crate::common::{
+    addresses, child_server, config, ended, is_running, kill, perturb, read, run, server, stderr, wait_for,
+};
 use perturb_learner::algorithm::Experience;
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers, Session, StepReply};
@@ -271,7 +273,7 @@ fn a_refused_request_is_told_in_the_servers_words_and_the_session_lives_on() {
 fn a_server_that_is_killed_ends_the_training_soon_and_leaves_a_checkpoint() {
     let out = tempfile::tempdir().expect("a directory");
     let path = out.path().to_str().expect("a path");
-    let arguments = ["train", "--env", "CartPole", "--episodes", "1000000", "--out", path];
+    let arguments = ["train", "--env", "CartPole", "--episodes", "1000000", "--out", path, "--server-wait", "0"];
     let child = perturb(&arguments).spawn().expect("perturb");
     wait_for("a few iterations", || {
         out.path().join("progress.csv").exists() && read(out.path(), "progress.csv").lines().count() > 4
@@ -279,7 +281,7 @@ fn a_server_that_is_killed_ends_the_training_soon_and_leaves_a_checkpoint() {
     let server = child_server(child.id()).expect("a private server");
     let killed = Instant::now();
     kill("-KILL", server);
-    let output = child.wait_with_output().expect("perturb ends");
+    let output = ended(child);
     assert!(killed.elapsed() < SOON, "{:?}", killed.elapsed());
     assert_eq!(output.status.code(), Some(1));
     let message = stderr(&output);
@@ -314,7 +316,7 @@ fn a_signal_ends_a_training_after_the_iteration_with_its_checkpoint(#[case] sign
     wait_for("a checkpoint", || out.path().join("checkpoint/checkpoint.json").exists());
     let server = child_server(child.id()).expect("a private server");
     kill(signal, child.id());
-    let output = child.wait_with_output().expect("perturb ends");
+    let output = ended(child);
     assert_eq!(output.status.code(), Some(status), "{}", stderr(&output));
     assert!(stderr(&output).contains("stopped by signal"), "{}", stderr(&output));
     assert!(stderr(&output).contains(&format!("perturb train --resume {path}")), "{}", stderr(&output));
@@ -392,7 +394,7 @@ fn a_reader_that_has_read_enough_ends_the_program_quietly() {
     ] {
         let mut child = perturb(arguments).spawn().expect("perturb");
         drop(child.stdout.take());
-        let output = child.wait_with_output().expect("perturb ends");
+        let output = ended(child);
         assert!(output.status.success(), "{arguments:?}: {}", stderr(&output));
         assert!(!stderr(&output).contains("panicked"), "{}", stderr(&output));
     }

@@ -10,7 +10,7 @@ use insta::assert_snapshot;
 use rstest::rstest;
 use tempfile::TempDir;
 
-use crate::common::{child_server, kill, stderr, wait_for};
+use crate::common::{child_server, ended, kill, stderr, wait_for};
 
 /// Two cells of a few seconds.
 const PLAN: &str = "environments = ['CartPole']\nversions = ['D']\nruns = 2\ntest_episodes = 12
@@ -213,7 +213,7 @@ fn ctrl_c_ends_soon_and_leaves_nothing_temporary(#[case] words: &str, #[case] be
     wait_for("a beginning", has_begun);
     std::thread::sleep(std::time::Duration::from_millis(300));
     kill("-INT", child.id());
-    let output = child.wait_with_output().expect("ended");
+    let output = ended(child);
     assert_eq!(output.status.code(), Some(130), "{}", stderr(&output));
     let words = stderr(&output);
     let last = words.lines().last().unwrap_or_default();
@@ -236,7 +236,7 @@ fn a_second_ctrl_c_and_even_kill_9_leave_no_temporary_folder() {
         wait_for("a training", || place.path("run/progress.csv").exists());
         assert_eq!(temporary(&place).len(), 2, "a folder with a socket");
         signals.iter().for_each(|signal| kill(signal, child.id()));
-        child.wait_with_output().expect("ended");
+        ended(child);
         wait_for("the end of the server", || temporary(&place).is_empty());
         std::fs::remove_dir_all(place.path("run")).expect("removed");
     }
@@ -249,18 +249,18 @@ fn a_lost_server_is_a_sentence_with_the_command_that_goes_on() {
     let mut server = place.command(&["perturb-server", "--listen", &address, "--log", "error"]);
     let mut server = server.stdout(Stdio::null()).spawn().expect("a server");
     wait_for("the server", || place.path("socket").exists());
-    let words =
-        ["perturb", "train", "--env", "CartPole", "--episodes", "1000000", "--out", "my run", "--server", &address];
+    let train = ["perturb", "train", "--env", "CartPole", "--episodes", "1000000", "--out", "my run"];
+    let words = [&train[..], &["--server", &address, "--server-wait", "0"]].concat();
     let child = place.start(&words);
     wait_for("a checkpoint", || place.path("my run/checkpoint/checkpoint.json").exists());
     server.kill().and_then(|()| server.wait()).expect("killed");
-    let output = child.wait_with_output().expect("ended");
+    let output = ended(child);
     assert_eq!(output.status.code(), Some(1));
     let said = stderr(&output);
     assert!(said.starts_with(&format!("perturb: lost the server at {address} ")), "{said}");
     assert!(said.contains("; the checkpoint after ") && !said.contains("h2") && !said.contains("transport"), "{said}");
-    let command =
-        format!("episodes is kept in my run; go on from there: perturb train --resume 'my run' --server {address}\n");
+    let again = format!("perturb train --resume 'my run' --server {address} --server-wait 0");
+    let command = format!("episodes is kept in my run; go on from there: {again}\n");
     assert!(said.ends_with(&command), "{said}");
 }
 

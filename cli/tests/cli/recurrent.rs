@@ -46,8 +46,8 @@ fn a_program_without_the_other_one_trains_what_needs_no_libtorch_and_says_what_t
     assert_eq!(refused.status.code(), Some(2));
     let said = stderr(&refused).replace(&folder.path().display().to_string(), "DIR");
     let expected = "perturb: recurrent policies are trained by the program perturb-recurrent, which cannot be started: \
-                    DIR/perturb-recurrent: No such file or directory (os error 2); install it beside perturb (`make \
-                    install`), or train with --architecture ff\n";
+                    DIR/perturb-recurrent: No such file or directory (os error 2); it needs libtorch, so the \
+                    Python wheel is without it: `make install` in a clone of perturb installs both, or train with --architecture ff\n";
     assert_eq!(said, expected);
     assert!(!out.exists());
 

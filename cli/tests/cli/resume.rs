@@ -5,7 +5,9 @@ use std::path::{Path, PathBuf};
 use std::process::Child;
 use std::time::Duration;
 
-use crate::common::{addresses, child_server, config, kill, perturb, read, refusal, run, server, stderr, wait_for};
+use crate::common::{
+    addresses, child_server, config, ended, kill, perturb, read, refusal, run, server, stderr, wait_for,
+};
 use insta::assert_snapshot;
 use perturb_learner::checkpoint::{Checkpoint, ResumeState};
 use perturb_learner::client::{ClientError, OpenOptions, Servers, Session, StepReply};
@@ -285,7 +287,7 @@ fn kill_after(mut child: Child, run: &Path, at_least: u64, delay: Duration) {
     wait_for("a checkpoint", || episodes(run) >= at_least);
     std::thread::sleep(delay);
     child.kill().expect("kill -9");
-    let output = child.wait_with_output().expect("it ends");
+    let output = ended(child);
     assert_eq!(output.status.code(), None, "it ended before it was killed: {}", stderr(&output));
 }
 
@@ -326,16 +328,18 @@ fn a_learner_that_is_killed_again_and_again_comes_to_the_same_bytes() {
 fn a_training_that_lost_its_server_says_how_to_go_on() {
     let out = tempfile::tempdir().expect("a directory");
     let path = out.path().to_str().expect("a path");
-    let settings = ["--set", "checkpoint_interval=20", "--set", "episodes=400", "--set", "n_epochs=2"];
+    let settings =
+        ["--set", "checkpoint_interval=20", "--set", "episodes=400", "--set", "n_epochs=2", "--server-wait", "0"];
     let child =
         perturb(&[&["train", "--env", "CartPole", "--out", path][..], &settings].concat()).spawn().expect("perturb");
     wait_for("a checkpoint", || episodes(out.path()) >= 40);
     kill("-KILL", child_server(child.id()).expect("a private server"));
-    let output = child.wait_with_output().expect("perturb ends");
+    let output = ended(child);
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
     let kept = episodes(out.path());
     let expected = format!(
-        "the checkpoint after {kept} episodes is kept in {path}; go on from there: perturb train --resume {path}"
+        "the checkpoint after {kept} episodes is kept in {path}; go on from there: perturb train --resume {path} \
+         --server-wait 0"
     );
     assert!(stderr(&output).contains(&expected), "{}", stderr(&output));
 

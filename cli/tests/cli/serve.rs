@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
 use std::net::TcpStream;
 use std::process::Child;
 
-use crate::common::{LIMIT, kill, perturb};
+use crate::common::{LIMIT, ended, kill, perturb};
 
 /// Shows an empty folder; the address that is printed.
 fn start(folder: &std::path::Path, more: &[&str]) -> (Child, String) {
@@ -26,7 +26,7 @@ fn ctrl_c_ends_it_at_once_also_while_somebody_looks_on() {
     let mut lines = BufReader::new(stream).lines();
     assert!(lines.any(|line| line.is_ok_and(|line| line.starts_with("data: "))), "an event");
     kill("-INT", child.id());
-    let output = child.wait_with_output().expect("ended");
+    let output = ended(child);
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(130), "{said}");
     assert!(said.ends_with("stopped by signal 2\n"), "{said}");
@@ -52,7 +52,7 @@ fn an_address_that_others_reach_is_warned_about() {
     stream.read_to_string(&mut answer).expect("an answer");
     assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("There is nothing yet"), "{answer}");
     child.kill().expect("killed");
-    let output = child.wait_with_output().expect("ended");
+    let output = ended(child);
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(said.contains("anybody who reaches this address can see everything in the folder"), "{said}");
     assert!(said.contains("so can any site that somebody who reaches it opens in a browser"), "{said}");

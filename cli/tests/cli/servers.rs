@@ -5,7 +5,7 @@ use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::Child;
 
-use crate::common::{addresses, kill, perturb, server, stderr, wait_for};
+use crate::common::{addresses, ended, kill, perturb, server, stderr, wait_for};
 use perturb_learner::client::{Address, OpenOptions, Servers, Session};
 use perturb_study::Version;
 use perturb_study::{Folder, Plan};
@@ -57,7 +57,7 @@ impl Runs {
 
 #[track_caller]
 fn succeeded(run: Child) {
-    let output = run.wait_with_output().expect("ended");
+    let output = ended(run);
     assert!(output.status.success(), "{}: {}", output.status, stderr(&output));
 }
 
@@ -73,8 +73,8 @@ fn options() -> OpenOptions {
     }
 }
 
-fn first(servers: &Servers) -> &Address {
-    servers.addresses().next().expect("a connection")
+fn first(servers: &Servers) -> Address {
+    servers.addresses().into_iter().next().expect("a connection")
 }
 
 /// A machine that accepts connections and never answers.
@@ -127,7 +127,7 @@ fn a_run_spreads_its_cells_and_survives_the_death_of_a_server() {
     succeeded(run);
     assert_eq!(runs.files("broken", "result.json"), whole);
 
-    let again = runs.start("broken", &both).wait_with_output().expect("ended");
+    let again = ended(runs.start("broken", &both));
     let words = stderr(&again);
     assert!(again.status.success(), "{words}");
     assert!(words.contains(&format!("no server answers at {}", both[0])), "the other server is enough: {words}");
@@ -140,7 +140,7 @@ fn turns_go_around_the_servers_and_pass_over_those_that_take_no_sessions() {
     let both = addresses(&servers);
     for turn in 0..4 {
         let one = Servers::connect_to_one(&both, turn).expect("a connection");
-        assert_eq!(one.addresses().collect::<Vec<_>>(), [&both[turn % 2]]);
+        assert_eq!(one.addresses(), [both[turn % 2].clone()]);
     }
     let (_listener, silent) = silent();
     let gone: Address = "unix:/nowhere/perturb.sock".parse().expect("an address");
@@ -148,13 +148,13 @@ fn turns_go_around_the_servers_and_pass_over_those_that_take_no_sessions() {
         let ending = ending.clone();
         let three = [ending.clone(), silent.clone(), both[0].clone()];
         let (some, troubles) = Servers::connect_to_some(&three).expect("a connection");
-        assert_eq!(some.addresses().collect::<Vec<_>>(), [&both[0]]);
+        assert_eq!(some.addresses(), [both[0].clone()]);
         let words: Vec<String> = troubles.iter().map(ToString::to_string).collect();
         assert!(words[0].contains(&format!("{ending}: it is shutting down")), "{words:?}");
         assert!(words[1].contains(&format!("{silent}: it accepted the connection, but did not answer")), "{words:?}");
         for turn in 0..3 {
             let three = [ending.clone(), gone.clone(), both[0].clone()];
-            assert_eq!(first(&Servers::connect_to_one(&three, turn).expect("a connection")), &both[0]);
+            assert_eq!(first(&Servers::connect_to_one(&three, turn).expect("a connection")), both[0]);
         }
         let error = Servers::connect_to_one(&[ending.clone(), gone.clone()], 0).expect_err("none").to_string();
         assert!(error.contains("it is shutting down; unix:/nowhere/perturb.sock: "), "{error}");
@@ -183,7 +183,7 @@ fn a_name_is_one_server_however_many_addresses_it_has() {
         let one = Servers::connect_to_one(std::slice::from_ref(&name), turn).expect("a connection");
         Session::open(&one, &options(), &mut Vec::new()).expect("a session");
     }
-    assert_eq!(Servers::connect(&[name.clone(), name]).expect("connections").addresses().count(), 2);
+    assert_eq!(Servers::connect(&[name.clone(), name]).expect("connections").addresses().len(), 2);
     drop(child.stdin.take());
     child.wait().expect("it ends");
 }

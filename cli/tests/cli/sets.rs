@@ -151,6 +151,12 @@ fn an_episode_that_comes_out_otherwise_is_told_and_is_a_failure() {
         said.contains("return was") && said.ends_with("47 of 48 episodes of 1 policy have the same bytes\n"),
         "{said}"
     );
+    let output = audit(&cell, &["--all", "--json"]);
+    assert_eq!(output.status.code(), Some(1));
+    let told: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON and nothing else");
+    assert_eq!((&told["episodes"], &told["same"]), (&48.into(), &47.into()));
+    let different = told["policies"][0]["different"].as_array().expect("sentences");
+    assert!(different.len() == 1 && said.contains(different[0].as_str().expect("a sentence")), "{told}");
 }
 
 #[test]
@@ -173,6 +179,12 @@ fn sets_are_typed_judged_by_other_thresholds_and_played_again() {
     for line in ["steps at most 80", "steps at most 90", "steps at most 500"] {
         assert!(text.contains(line), "{text}");
     }
+    let rates = perturb(&["rates", &records, "--success", "text", "code", "--json"]).output().unwrap();
+    let told: serde_json::Value = serde_json::from_slice(&rates.stdout).expect("JSON and nothing else");
+    let rates = told["rates"].as_array().expect("a rate for each set and rule");
+    let rules: Vec<_> = rates.iter().map(|rate| rate["success"]["threshold"].as_f64().expect("a number")).collect();
+    assert_eq!(rules, [80.0, 90.0]);
+    assert!(rates.iter().all(|rate| rate["set"].is_string() && rate["result"]["episodes"] == 12), "{told}");
     let same = stdout(&audit(records.as_ref(), &["--all", "--checkpoint", &training]));
     assert_eq!(same, "12 of 12 episodes of 1 policy have the same bytes\n");
 }

@@ -5,7 +5,7 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use crate::common::{addresses, child_server, kill, perturb, refusal, run, server, stderr, wait_for};
+use crate::common::{addresses, child_server, ended, kill, perturb, refusal, run, server, stderr, wait_for};
 use gif::{ColorOutput, DecodeOptions};
 use insta::assert_snapshot;
 use perturb_cli::video::{Footage, VideoFile, VideoOptions, film};
@@ -354,7 +354,7 @@ fn broken_off(ending: &str, server: Option<&str>, end: impl FnOnce(u32)) -> (Out
     let written = || names(&folder).iter().any(|path| path.metadata().is_ok_and(|file| file.len() > 0));
     wait_for("the first frames", written);
     end(child.id());
-    (child.wait_with_output().expect("perturb"), names(&folder))
+    (ended(child), names(&folder))
 }
 
 #[test]

@@ -42,6 +42,8 @@ pub enum Error {
     NoOpenGl {
         /// What failed.
         reason: String,
+        /// Whether its library is there, so that it may succeed another time.
+        is_installed: bool,
     },
     /// The state cannot be trusted any more. MuJoCo may have put the initial state in its place.
     #[error("the simulation diverged: {warning}; reset it")]

@@ -50,7 +50,12 @@ fn library() -> Result<&'static Egl, Error> {
 fn open(name: &str) -> Result<Egl, Error> {
     // SAFETY: the initialisers that run are those of the system's EGL library, which any program may load, and its
     // functions have the types of the EGL registry.
-    unsafe { Egl::load_required_from_filename(name) }.map_err(|error| Error::NoOpenGl { reason: error.to_string() })
+    unsafe { Egl::load_required_from_filename(name) }.map_err(|error| {
+        let reason = error.to_string();
+        // As the dynamic loader puts it; where it has no room or no descriptors, it has other words.
+        let is_installed = !reason.contains("No such file or directory");
+        Error::NoOpenGl { reason, is_installed }
+    })
 }
 
 /// Displays that need no screen, the likeliest first: each graphics card and the software renderer, then whatever the
@@ -106,7 +111,7 @@ impl Gl {
                 Err(failed) => reason = failed,
             }
         }
-        Err(Error::NoOpenGl { reason })
+        Err(Error::NoOpenGl { reason, is_installed: true })
     }
 
     fn on(egl: &'static Egl, display: egl::Display) -> Result<Self, String> {
@@ -147,6 +152,7 @@ mod tests {
     #[test]
     fn a_missing_library_is_named_with_the_packages_that_bring_one() {
         let Err(error) = open("libEGL-that-is-not-there.so.1") else { panic!("it was opened") };
+        assert!(matches!(error, Error::NoOpenGl { is_installed: false, .. }), "{error:?}");
         let message = error.to_string();
         assert!(message.contains("libEGL-that-is-not-there.so.1"), "{message}");
         assert!(message.contains("libegl1 and libgl1-mesa-dri"), "{message}");
@@ -156,5 +162,6 @@ mod tests {
     fn a_library_that_is_not_egl_is_refused() {
         let Err(error) = open("libm.so.6") else { panic!("it was taken for EGL") };
         assert!(error.to_string().contains("eglChooseConfig"), "{error}");
+        assert!(matches!(error, Error::NoOpenGl { is_installed: true, .. }), "{error:?}");
     }
 }

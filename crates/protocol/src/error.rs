@@ -120,6 +120,24 @@ impl ClientError {
             | Self::System { .. } => true,
         }
     }
+
+    /// Whether the server or the way to it is gone, or silent: what it had is lost, and the same may go well when it is back.
+    pub fn is_absence(&self) -> bool {
+        match self {
+            Self::Lost { code, .. } => matches!(
+                code,
+                Code::Aborted
+                    | Code::Cancelled
+                    | Code::DataLoss
+                    | Code::DeadlineExceeded
+                    | Code::Internal
+                    | Code::Unavailable
+                    | Code::Unknown
+            ),
+            Self::Connect { .. } | Self::NoneConnects { .. } | Self::TimedOut { .. } | Self::Start { .. } => true,
+            _ => false,
+        }
+    }
 }
 
 /// "during a step", "when it was to save a player".

@@ -1,8 +1,8 @@
 //! A server of a program's own, on a private Unix socket.
 
-use std::fs::Permissions;
-use std::io::{BufRead, BufReader};
-use std::os::unix::fs::PermissionsExt;
+use std::fs::{DirBuilder, Permissions};
+use std::io::{BufRead, BufReader, ErrorKind};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
@@ -31,8 +31,9 @@ const END_LIMIT: Duration = Duration::from_secs(5);
 pub struct PrivateServer {
     child: Child,
     address: Address,
+    workers: Option<usize>,
     /// Holds the socket; only its owner may enter.
-    _directory: TempDir,
+    directory: TempDir,
 }
 
 impl PrivateServer {
@@ -54,20 +55,20 @@ impl PrivateServer {
             .parse()
             .map_err(|error| ClientError::Start { program: program.clone(), reason: format!("{error}; set TMPDIR") })?;
 
-        let mut command = Command::new(&program);
-        command.arg("--listen").arg(address.to_string()).args(["--private", "--log", "warn"]);
-        if let Some(workers) = workers {
-            command.args(["--workers", &workers.to_string()]);
-        }
-        let mut child = command
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .process_group(0)
-            .spawn()
-            .map_err(|error| ClientError::Start { program: program.clone(), reason: error.to_string() })?;
-        let lines = child.stdout.take().map(read_lines);
-        let server = Self { child, address, _directory: directory };
-        server.wait_until_ready(&program, lines)
+        let child = spawn(&program, &address, workers)?;
+        Ok(Self { child, address, workers, directory })
+    }
+
+    /// Ends it, if it still runs, and starts it again at the same address.
+    ///
+    /// # Errors
+    /// Those of [`PrivateServer::start`].
+    pub fn restart(&mut self) -> Result<(), ClientError> {
+        self.end();
+        let again = |source| ClientError::System { action: "create the server's private directory again", source };
+        own_directory(self.directory.path()).map_err(again)?;
+        self.child = spawn(&find_program()?, &self.address, self.workers)?;
+        Ok(())
     }
 
     /// Where it listens.
@@ -85,28 +86,8 @@ impl PrivateServer {
         self.child.try_wait().ok().flatten()
     }
 
-    fn wait_until_ready(mut self, program: &Path, lines: Option<Receiver<String>>) -> Result<Self, ClientError> {
-        let fail = |reason| Err(ClientError::Start { program: program.to_owned(), reason });
-        let Some(lines) = lines else { return fail("its output cannot be read".into()) };
-        let deadline = Instant::now() + START_LIMIT;
-        loop {
-            match lines.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
-                Ok(line) if line.starts_with("listening on ") => return Ok(self),
-                Ok(_) => {}
-                Err(RecvTimeoutError::Timeout) => {
-                    return fail(format!("it did not listen within {} s", START_LIMIT.as_secs()));
-                }
-                Err(RecvTimeoutError::Disconnected) => {
-                    let status = self.child.wait().map_or_else(|error| error.to_string(), |status| status.to_string());
-                    return fail(format!("it ended with {status} before it listened"));
-                }
-            }
-        }
-    }
-}
-
-impl Drop for PrivateServer {
-    fn drop(&mut self) {
+    /// Closes its standard input, and waits until it has ended.
+    fn end(&mut self) {
         drop(self.child.stdin.take());
         let deadline = Instant::now() + END_LIMIT;
         while Instant::now() < deadline {
@@ -118,6 +99,67 @@ impl Drop for PrivateServer {
         // It had its time; an error means that it ended in this very moment.
         let _ = self.child.kill();
         let _ = self.child.wait();
+    }
+}
+
+impl Drop for PrivateServer {
+    fn drop(&mut self) {
+        self.end();
+    }
+}
+
+/// Makes the directory again, which a server that ended in order has deleted. One that is there must be this user's alone.
+fn own_directory(path: &Path) -> std::io::Result<()> {
+    match DirBuilder::new().mode(0o700).create(path) {
+        Err(error) if error.kind() == ErrorKind::AlreadyExists => {
+            let (there, own) = (path.symlink_metadata()?, Path::new("/proc/self").metadata()?.uid());
+            let is_own = there.is_dir() && there.uid() == own && there.mode().trailing_zeros() >= 6;
+            if is_own { Ok(()) } else { Err(ErrorKind::PermissionDenied.into()) }
+        }
+        made => made,
+    }
+}
+
+/// Starts `program`, and waits until it listens.
+fn spawn(program: &Path, address: &Address, workers: Option<usize>) -> Result<Child, ClientError> {
+    let mut command = Command::new(program);
+    command.arg("--listen").arg(address.to_string()).args(["--private", "--log", "warn"]);
+    if let Some(workers) = workers {
+        command.args(["--workers", &workers.to_string()]);
+    }
+    let fail = |reason| ClientError::Start { program: program.to_owned(), reason };
+    let mut child = command
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .process_group(0)
+        .spawn()
+        .map_err(|error| fail(error.to_string()))?;
+    match wait_until_ready(&mut child) {
+        Ok(()) => Ok(child),
+        Err(reason) => {
+            let _ = child.kill(); // an error means that it has ended
+            let _ = child.wait();
+            Err(fail(reason))
+        }
+    }
+}
+
+/// Waits until `child` says that it listens.
+fn wait_until_ready(child: &mut Child) -> Result<(), String> {
+    let lines = child.stdout.take().map(read_lines).ok_or("its output cannot be read")?;
+    let deadline = Instant::now() + START_LIMIT;
+    loop {
+        match lines.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
+            Ok(line) if line.starts_with("listening on ") => return Ok(()),
+            Ok(_) => {}
+            Err(RecvTimeoutError::Timeout) => {
+                return Err(format!("it did not listen within {} s", START_LIMIT.as_secs()));
+            }
+            Err(RecvTimeoutError::Disconnected) => {
+                let status = child.wait().map_or_else(|error| error.to_string(), |status| status.to_string());
+                return Err(format!("it ended with {status} before it listened"));
+            }
+        }
     }
 }
 

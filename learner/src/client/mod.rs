@@ -12,6 +12,7 @@ mod reply;
 mod servers;
 mod session;
 mod single;
+mod waiting;
 
 pub use acting::{ActAt, Played};
 pub use options::OpenOptions;
@@ -20,3 +21,4 @@ pub use reply::{StepReply, StepSlice};
 pub use servers::Servers;
 pub use session::Session;
 pub use single::{BegunEpisode, Picture, Single};
+pub use waiting::{After, ServerWait, Waiting};

@@ -2,7 +2,7 @@
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::io::ErrorKind;
-use std::sync::Mutex;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tokio::runtime::{Builder, Runtime};
@@ -12,6 +12,7 @@ use perturb_protocol::names::EnvironmentName;
 use perturb_protocol::{Address, ClientError, Connection, Machines, PrivateServer, first_of, machines};
 
 use super::acting::ActAt;
+use super::waiting::ServerWait;
 use crate::proto;
 use perturb_study::settings::Common;
 
@@ -19,16 +20,29 @@ use perturb_study::settings::Common;
 #[derive(Debug)]
 pub struct Servers {
     // Dropped in this order: connections, the runtime that drives them, the server.
-    connections: Vec<Connection>,
+    connections: Mutex<Vec<Connection>>,
     runtime: Runtime,
     local: Option<Mutex<PrivateServer>>,
+    /// Where servers are looked for when they were lost.
+    named: Vec<Address>,
     act: ActAt,
+    wait: ServerWait,
 }
 
 impl Servers {
     /// The same, with actions chosen there.
     pub fn with_act(self, act: ActAt) -> Self {
         Self { act, ..self }
+    }
+
+    /// The same, which are waited for when they are lost.
+    pub fn with_wait(self, wait: ServerWait) -> Self {
+        Self { wait, ..self }
+    }
+
+    /// How long they are waited for when they are lost.
+    pub(super) fn wait(&self) -> ServerWait {
+        self.wait
     }
 
     /// Where actions are chosen.
@@ -54,9 +68,37 @@ impl Servers {
     /// [`ClientError::Connect`] if one does not answer within some seconds, or is shutting down.
     pub fn connect(addresses: &[Address]) -> Result<Self, ClientError> {
         let runtime = runtime()?;
-        let one = |address| async move { any_of(address, machines(address).await?.into_order(own_turn())).await };
         let connections = addresses.iter().map(|address| runtime.block_on(one(address))).collect::<Result<_, _>>()?;
-        Ok(Self { connections, runtime, local: None, act: ActAt::default() })
+        Ok(Self { named: addresses.to_vec(), ..Self::of(connections, runtime) })
+    }
+
+    fn of(connections: Vec<Connection>, runtime: Runtime) -> Self {
+        let named = connections.iter().map(|connection| connection.address().clone()).collect();
+        let (act, wait) = (ActAt::default(), ServerWait::default());
+        Self { connections: Mutex::new(connections), runtime, local: None, named, act, wait }
+    }
+
+    /// Connects again to those of the servers that are there, of which there must be at least one, and says what is wrong
+    /// with the others. A private one is started again.
+    ///
+    /// # Errors
+    /// What is wrong with all of them.
+    pub(super) async fn reconnect(&self) -> Result<Vec<ClientError>, ClientError> {
+        if let Some(local) = &self.local {
+            local.lock().unwrap_or_else(PoisonError::into_inner).restart()?;
+        }
+        let (mut there, mut errors) = (Vec::new(), Vec::new());
+        for address in &self.named {
+            match one(address).await {
+                Ok(connection) => there.push(connection),
+                Err(error) => errors.push(error),
+            }
+        }
+        if there.is_empty() {
+            return Err(ClientError::of_all(errors));
+        }
+        *self.locked() = there;
+        Ok(errors)
     }
 
     /// Connects to one server of `addresses`, where every machine that a name stands for counts: to number `turn`, counted
@@ -77,7 +119,7 @@ impl Servers {
                 }
             }
         })?;
-        Ok(Self { connections: vec![connection], runtime, local: None, act: ActAt::default() })
+        Ok(Self::of(vec![connection], runtime))
     }
 
     /// Connects to all servers of `addresses` that take sessions, where every machine that a name stands for counts, and
@@ -107,17 +149,21 @@ impl Servers {
         if connections.is_empty() {
             return Err(ClientError::of_all(errors));
         }
-        Ok((Self { connections, runtime, local: None, act: ActAt::default() }, errors))
+        Ok((Self::of(connections, runtime), errors))
     }
 
     /// Where the servers are, one address for each connection.
-    pub fn addresses(&self) -> impl Iterator<Item = &Address> {
-        self.connections.iter().map(Connection::address)
+    pub fn addresses(&self) -> Vec<Address> {
+        self.locked().iter().map(|connection| connection.address().clone()).collect()
     }
 
     /// The connections, in the order of their addresses.
-    pub(super) fn connections(&self) -> &[Connection] {
-        &self.connections
+    pub(super) fn connections(&self) -> Vec<Connection> {
+        self.locked().clone()
+    }
+
+    fn locked(&self) -> MutexGuard<'_, Vec<Connection>> {
+        self.connections.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Waits for `future`, which may wait for servers.
@@ -150,7 +196,7 @@ impl Servers {
     /// # Errors
     /// [`ClientError::Lost`] or [`ClientError::TimedOut`].
     pub fn catalogue(&self) -> Result<proto::ListEnvironmentsResponse, ClientError> {
-        self.connections
+        self.connections()
             .first()
             .map_or_else(|| Ok(proto::ListEnvironmentsResponse::default()), |first| self.catalogue_of(first))
     }
@@ -166,7 +212,8 @@ impl Servers {
     /// [`ClientError::NoEnvironment`] with the names that there are, [`ClientError::Disagreement`], and those of
     /// [`Servers::catalogue`].
     pub fn environment(&self, name: &str) -> Result<proto::Environment, ClientError> {
-        let Some((first, others)) = self.connections.split_first() else {
+        let connections = self.connections();
+        let Some((first, others)) = connections.split_first() else {
             return Err(ClientError::System {
                 action: "ask for an environment",
                 source: ErrorKind::NotConnected.into(),
@@ -190,7 +237,7 @@ impl Servers {
     pub fn environment_seen(&self, common: &Common) -> Result<proto::Environment, ClientError> {
         let environment = self.environment(&common.environment)?;
         let sees = common.observe.sees_parameters();
-        match self.connections.first() {
+        match self.connections().first() {
             Some(first) if sees && environment.parameter_observations.is_empty() => {
                 Err(ClientError::NoParameters { address: first.address().clone() })
             }
@@ -235,6 +282,11 @@ async fn all_machines(addresses: &[Address]) -> (Machines, Vec<ClientError>) {
         }
     }
     (all, errors)
+}
+
+/// Connects to the server at `address`.
+async fn one(address: &Address) -> Result<Connection, ClientError> {
+    any_of(address, machines(address).await?.into_order(own_turn())).await
 }
 
 /// Connects to one of the machines that `address` stands for.

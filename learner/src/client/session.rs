@@ -49,12 +49,13 @@ impl<'a> Session<'a> {
         observations: &mut Vec<f32>,
     ) -> Result<Self, ClientError> {
         let num_envs = options.iter().map(|options| options.num_envs).sum();
-        let ranges = split(num_envs, servers.connections().len());
+        let connections = servers.connections();
+        let ranges = split(num_envs, connections.len());
         let mut acts = servers.act() == ActAt::Server;
         let mut parts: Vec<Part> = Vec::new();
         let mut environment: Option<proto::Environment> = None;
         observations.clear();
-        for (connection, range) in servers.connections().iter().zip(ranges) {
+        for (connection, range) in connections.iter().zip(ranges) {
             if range.is_empty() {
                 continue; // more servers than environments
             }

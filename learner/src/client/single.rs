@@ -57,7 +57,8 @@ impl<'a> Single<'a> {
         options: &OpenOptions,
         observation: &mut Vec<f32>,
     ) -> Result<(Self, BegunEpisode), ClientError> {
-        let Some(connection) = servers.connections().first() else {
+        let connections = servers.connections();
+        let Some(connection) = connections.first() else {
             let source = std::io::ErrorKind::NotConnected.into();
             return Err(ClientError::System { action: "open an environment", source });
         };

@@ -6,7 +6,7 @@ use perturb_protocol::Version;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::{About, EpisodeRecord, Records};
 
-use super::test::TestError;
+use super::test::{TestError, outlasting};
 use super::trials::Trials;
 use crate::checkpoint::Checkpoint;
 use crate::client::{EndedEpisode, OpenOptions, Servers, Session};
@@ -56,6 +56,17 @@ pub fn audit(
     if got != records.about.policy {
         return Err(AuditError::Policy { recorded: records.about.policy.clone(), got });
     }
+    Ok(outlasting(servers, stop, || play_again(servers, checkpoint, records, most, stop, report))?)
+}
+
+fn play_again(
+    servers: &Servers,
+    checkpoint: &Checkpoint,
+    records: &Records,
+    most: usize,
+    stop: &StopFlag,
+    report: &mut dyn FnMut(u64),
+) -> Result<Audit, TestError> {
     let mut queues: BTreeMap<usize, VecDeque<&EpisodeRecord>> = BTreeMap::new();
     let chosen = spread(&records.episodes, most);
     for episode in chosen {
@@ -77,7 +88,7 @@ pub fn audit(
             return Ok(audit);
         }
         if let Some(signal) = stop.signal() {
-            return Err(TestError::Stopped { signal }.into());
+            return Err(TestError::Stopped { signal });
         }
         for end in replay.trials.step()? {
             let Some(recorded) = running.remove(&end.slot) else { continue };

@@ -3,7 +3,7 @@
 use perturb_protocol::proto;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::Records;
-use perturb_study::sets::{Context, Contexts, TestSet};
+use perturb_study::sets::{Contexts, TestSet};
 use perturb_study::{Axis, Heatmap, HeatmapOptions, MOST_POINTS};
 
 use super::test::{TestError, TestOptions, Tester};
@@ -70,12 +70,7 @@ pub fn heatmap(
     if let Some(axis) = axes.iter().find(|axis| options.fixed.contains_key(&axis.name)) {
         return Err(HeatmapError::Fixed { name: axis.name.clone() });
     }
-    let context = |point: usize| {
-        let places = [point % grid, point / grid];
-        let value = |i: usize| (axes[i].name.clone(), axes[i].value(places[i], grid));
-        options.fixed.clone().into_iter().chain([value(0), value(1)]).collect::<Context>()
-    };
-    let contexts = Contexts::Listed((0..grid * grid).map(context).collect());
+    let contexts = Contexts::Listed(Heatmap::contexts(&axes, grid, &options.fixed));
     let set = TestSet { name: Heatmap::SET.into(), version: options.base, contexts };
     let records = tester.test(&[set], stop, &mut |_, done| report(done))?;
     let heatmap = Heatmap::of(&records, axes).ok_or(HeatmapError::NotOfAxes)?;

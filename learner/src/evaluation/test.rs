@@ -12,7 +12,7 @@ use perturb_study::{TestResult, ValueError};
 
 use super::trials::{RemoteTrials, Trials};
 use crate::checkpoint::{Changed, Checkpoint};
-use crate::client::{ClientError, EndedEpisode, OpenOptions, Servers, Session};
+use crate::client::{After, ClientError, EndedEpisode, OpenOptions, Servers, Session, Waiting};
 
 /// Why a checkpoint could not be tested.
 #[derive(Debug, thiserror::Error)]
@@ -124,8 +124,12 @@ impl<'a> Tester<'a> {
         for set in sets {
             let episodes_per_trial = self.about.episodes_per_trial;
             let TestOptions { episodes, seed, .. } = self.options;
-            let mut counting = Counting::new(set.clone(), self.options.purpose(), seed, episodes, episodes_per_trial);
-            self.play(&mut counting, stop, &mut |done| report(set, done))?;
+            let purpose = self.options.purpose();
+            let counting = outlasting(self.servers, stop, || {
+                let mut counting = Counting::new(set.clone(), purpose, seed, episodes, episodes_per_trial);
+                self.play(&mut counting, stop, &mut |done| report(set, done))?;
+                Ok(counting)
+            })?;
             counting.finish(&self.environment, &mut records)?;
         }
         Ok(records)
@@ -177,6 +181,26 @@ impl<'a> Tester<'a> {
             }
             // Environments that are done go on, unseen: they cost less than a smaller batch would save.
             counting.take(trials()?);
+        }
+    }
+}
+
+/// Does `work`, from its beginning again when servers were lost and have come back: what it gives depends on neither.
+pub(super) fn outlasting<T>(
+    servers: &Servers,
+    stop: &StopFlag,
+    mut work: impl FnMut() -> Result<T, TestError>,
+) -> Result<T, TestError> {
+    let mut waiting = Waiting::default();
+    loop {
+        let error = match work() {
+            Err(TestError::Client(error)) => error,
+            done => return done,
+        };
+        match waiting.wait(servers, &error, stop) {
+            After::Again => {}
+            After::GivenUp => return Err(error.into()),
+            After::Stopped { signal } => return Err(TestError::Stopped { signal }),
         }
     }
 }

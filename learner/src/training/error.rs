@@ -80,6 +80,14 @@ pub enum TrainError {
         /// Why it cannot.
         source: Box<TrainError>,
     },
+    /// The program was asked to end while a lost server was waited for.
+    #[error("stopped by signal {signal}, waiting for a server: {source}")]
+    Stopped {
+        /// The signal.
+        signal: i32,
+        /// What was lost.
+        source: Box<TrainError>,
+    },
     /// A training that had begun ended.
     #[error("{source}; {}", what_is_left(last.as_ref(), source))]
     Failed {
@@ -100,13 +108,21 @@ pub struct LastCheckpoint {
 }
 
 impl TrainError {
+    /// What a server failed with, if that is what failed.
+    pub fn of_server(&self) -> Option<&ClientError> {
+        match self {
+            Self::Client(error) => Some(error),
+            Self::Restore { source, .. } | Self::Failed { source, .. } | Self::Stopped { source, .. } => {
+                source.of_server()
+            }
+            _ => None,
+        }
+    }
+
     /// Whether a server had no room for the environments.
     pub fn is_for_want_of_room(&self) -> bool {
-        match self {
-            Self::Client(ClientError::Refused { code, .. }) => *code == tonic::Code::ResourceExhausted,
-            Self::Restore { source, .. } | Self::Failed { source, .. } => source.is_for_want_of_room(),
-            _ => false,
-        }
+        let full = tonic::Code::ResourceExhausted;
+        matches!(self.of_server(), Some(ClientError::Refused { code, .. }) if *code == full)
     }
 
     /// Whether the machine is at fault that has the files, see [`FileError::is_fault`].
@@ -134,11 +150,7 @@ impl TrainError {
 
     /// Whether the same may go well later or with another server, see [`ClientError::can_be_retried`].
     pub fn can_be_retried(&self) -> bool {
-        match self {
-            Self::Client(error) => error.can_be_retried(),
-            Self::Restore { source, .. } | Self::Failed { source, .. } => source.can_be_retried(),
-            _ => false,
-        }
+        self.of_server().is_some_and(ClientError::can_be_retried)
     }
 }
 

@@ -16,7 +16,7 @@ mod run_directory;
 use std::ops::Range;
 
 use crate::checkpoint::{Checkpoint, ResumeState};
-use crate::client::{OpenOptions, Servers, Session};
+use crate::client::{After, OpenOptions, Servers, Session, Waiting};
 use crate::logging::Progress;
 use crate::rollout::{Collector, RemoteCollector};
 pub use ending::is_over;
@@ -73,14 +73,34 @@ impl Start {
             Self::Checkpoint(saved) => &saved.0.state.config,
         }
     }
+
+    /// Steps that are behind it.
+    fn timesteps(&self) -> u64 {
+        match self {
+            Self::Fresh(_) => 0,
+            Self::Checkpoint(saved) => saved.0.state.counters.timesteps,
+        }
+    }
+
+    /// Where the training of `config` in `directory` goes on that was broken off.
+    fn again(directory: &RunDirectory, config: &TrainConfig) -> Result<Self> {
+        Ok(match directory.last_checkpoint()? {
+            Some((mut checkpoint, state)) => {
+                checkpoint.state.config = config.clone(); // a larger budget may not have been saved yet
+                Self::Checkpoint(Box::new((checkpoint, state)))
+            }
+            None => Self::Fresh(Box::new(config.clone())),
+        })
+    }
 }
 
 /// Trains as `config` says, with `threads` threads in updates, which change no byte, and writes everything to `directory`;
 /// calls `report` after every iteration. When `stop` is
-/// raised, the iteration is finished and the checkpoint written.
+/// raised, the iteration is finished and the checkpoint written. Servers that are lost are [waited
+/// for](crate::client::ServerWait), and the training goes on from its last checkpoint, to the same bytes.
 ///
 /// # Errors
-/// A server that is lost, numbers that are not finite, a full disk. The last checkpoint in the directory stays as it is.
+/// A server that is lost for good, numbers that are not finite, a full disk. The last checkpoint in the directory stays as it is.
 pub fn train(
     servers: &Servers,
     config: &TrainConfig,
@@ -115,12 +135,45 @@ pub fn resume(
     alone(servers, Entry { directory, start, marks: &[] }, threads, stop, report)
 }
 
+/// Trains one policy, from its last checkpoint on when servers were lost and have come back.
 fn alone(
     servers: &Servers,
     entry: Entry<'_>,
     threads: usize,
     stop: &StopFlag,
     mut report: impl FnMut(&Progress),
+) -> Result<Outcome> {
+    let Entry { directory, mut start, marks } = entry;
+    let config = start.config().clone();
+    let (mut waiting, mut saved) = (Waiting::default(), start.timesteps());
+    loop {
+        let mut hear = |progress: &Progress| {
+            if progress.saved_timesteps > saved {
+                saved = progress.saved_timesteps;
+                waiting.progressed();
+            }
+            report(progress);
+        };
+        let error = match once(servers, Entry { directory, start, marks }, threads, stop, &mut hear) {
+            Ok(outcome) => return Ok(outcome),
+            Err(error) => error,
+        };
+        let Some(lost) = error.of_server() else { return Err(error) };
+        match waiting.wait(servers, lost, stop) {
+            After::Again => start = Start::again(directory, &config)?,
+            After::GivenUp => return Err(error),
+            After::Stopped { signal } => return Err(TrainError::Stopped { signal, source: Box::new(error) }),
+        }
+    }
+}
+
+/// Trains one policy while its servers are there.
+fn once(
+    servers: &Servers,
+    entry: Entry<'_>,
+    threads: usize,
+    stop: &StopFlag,
+    report: &mut dyn FnMut(&Progress),
 ) -> Result<Outcome> {
     let mut outcome = None;
     let mut ended = |_, end| outcome = Some(end);

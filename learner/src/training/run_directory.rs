@@ -1,6 +1,6 @@
 //! The directory of a run: for one process at a time.
 
-use std::cell::OnceCell;
+use std::cell::{Cell, OnceCell};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -15,6 +15,8 @@ pub struct RunDirectory {
     overwrite: bool,
     /// Taken as soon as the directory exists.
     lock: OnceCell<Lock>,
+    /// What is in it is of the run that this value is for.
+    is_own: Cell<bool>,
 }
 
 /// Why a directory cannot be trained in.
@@ -112,7 +114,7 @@ impl RunDirectory {
         if path.exists() && !path.is_dir() {
             return Err(RunDirectoryError::IsFile { path: path.to_owned() });
         }
-        let directory = Self { path: path.to_owned(), overwrite, lock: OnceCell::new() };
+        let directory = Self::of(path, overwrite, false);
         if path.exists() {
             directory.lock()?;
         }
@@ -129,11 +131,29 @@ impl RunDirectory {
         if !path.is_dir() {
             return Err(RunDirectoryError::Missing { path: path.to_owned() });
         }
-        let directory = Self { path: path.to_owned(), overwrite: false, lock: OnceCell::new() };
+        let directory = Self::of(path, false, true);
         directory.lock()?;
         match ResumeState::load(&directory.checkpoint()) {
             Err(CheckpointError::Missing { .. }) => Err(directory.nothing_to_resume()?),
             loaded => loaded.map(|(checkpoint, state)| (directory, checkpoint, state)).map_err(Into::into),
+        }
+    }
+
+    fn of(path: &Path, overwrite: bool, is_own: bool) -> Self {
+        Self { path: path.to_owned(), overwrite, lock: OnceCell::new(), is_own: Cell::new(is_own) }
+    }
+
+    /// The last checkpoint of the run that this value is for; `None` if there is none yet.
+    ///
+    /// # Errors
+    /// One that cannot be read.
+    pub(crate) fn last_checkpoint(&self) -> Result<Option<(Checkpoint, ResumeState)>> {
+        if !self.is_own.get() {
+            return Ok(None);
+        }
+        match ResumeState::load(&self.checkpoint()) {
+            Err(CheckpointError::Missing { .. }) => Ok(None),
+            loaded => Ok(Some(loaded?)),
         }
     }
 
@@ -168,7 +188,7 @@ impl RunDirectory {
     fn earlier_run(&self) -> Result<Vec<PathBuf>> {
         let files = files_of_a_run(&self.path)?;
         match files.first() {
-            Some(file) if !self.overwrite => Err(RunDirectoryError::HoldsRun {
+            Some(file) if !self.overwrite && !self.is_own.get() => Err(RunDirectoryError::HoldsRun {
                 path: self.path.clone(),
                 file: file.file_name().unwrap_or_default().to_string_lossy().into_owned(),
             }),
@@ -182,7 +202,9 @@ impl RunDirectory {
         if self.lock.get().is_none() {
             self.lock()?;
         }
-        Ok(self.earlier_run()?.iter().try_for_each(|file| files::delete(file))?)
+        self.earlier_run()?.iter().try_for_each(|file| files::delete(file))?;
+        self.is_own.set(true);
+        Ok(())
     }
 
     /// Where it is.

@@ -13,18 +13,20 @@
 //! Nothing in them depends on the clock.
 //!
 //! Of a batch, each key holds an array `[N]`, and the key with an underscore before it a mask of the environments that have
-//! it, as `VectorEnv._add_info` of Gymnasium makes them.
+//! it, as `VectorEnv._add_info` of Gymnasium makes them. `parameters` and `receipt`, two dozen arrays, are made when
+//! somebody looks at them.
 
 use std::sync::Arc;
 
 use bytes::Bytes;
 use numpy::{Element, PyArray1, PyArrayMethods, PyReadonlyArray1};
 use perturb_protocol::proto;
+use pyo3::intern;
 use pyo3::prelude::*;
-use pyo3::types::{PyDict, PyString};
+use pyo3::types::{PyDict, PyString, PyType};
 
 use crate::arrays;
-use crate::failure::{MALFORMED, failure};
+use crate::told::{Told, misfit};
 
 /// A key, and that of the mask of the environments that have it.
 struct Label {
@@ -46,6 +48,10 @@ pub struct Labels {
     applied: Vec<Label>,
     reward_terms: Vec<Label>,
     known: Known,
+    /// SHA-256 of the model.
+    model_hash: String,
+    /// `perturb.infos.Later`, a dictionary that is filled when somebody looks.
+    later: Py<PyType>,
 }
 
 macro_rules! known {
@@ -68,14 +74,24 @@ known! {
 
 impl Labels {
     /// Those of an environment of which there are N.
-    pub fn new(py: Python<'_>, environment: &proto::Environment, num_envs: usize) -> Self {
-        Self {
+    ///
+    /// # Errors
+    /// Python's, if the package is not whole.
+    pub fn new(py: Python<'_>, environment: &proto::Environment, num_envs: usize) -> PyResult<Self> {
+        Ok(Self {
             num_envs,
             parameters: environment.parameters.iter().map(|it| Label::new(py, &it.name)).collect(),
             applied: environment.applied.iter().map(|it| Label::new(py, &it.name)).collect(),
             reward_terms: environment.reward_terms.iter().map(|it| Label::new(py, &it.name)).collect(),
             known: Known::new(py),
-        }
+            model_hash: environment.model_hash.clone(),
+            later: py.import("perturb.infos")?.getattr("Later")?.cast_into()?.unbind(),
+        })
+    }
+
+    /// No episodes yet.
+    fn told(&self) -> Told {
+        Told::new(self.parameters.len(), self.applied.len())
     }
 }
 
@@ -84,15 +100,14 @@ impl Labels {
 pub struct Events {
     labels: Arc<Labels>,
     ended: Vec<proto::EpisodeEnd>,
-    started: Vec<proto::EpisodeStart>,
+    /// Their receipts, and those of the episodes that began; none if they were not asked for.
+    ended_told: Arc<Told>,
+    started_told: Arc<Told>,
     final_observations: Vec<f32>,
     /// O.
     observation_size: usize,
     reward_terms: Vec<f32>,
 }
-
-/// An episode with its receipt.
-type Told<'a> = (usize, &'a proto::Episode, &'a proto::Receipt);
 
 impl Events {
     /// Episodes that began.
@@ -100,10 +115,12 @@ impl Events {
     /// # Errors
     /// If they do not fit.
     pub fn begun(labels: &Arc<Labels>, started: Vec<proto::EpisodeStart>) -> PyResult<Self> {
+        let started = started.iter().map(|start| (start.slot, start.episode.as_ref(), start.receipt.as_ref()));
         Self {
             labels: Arc::clone(labels),
             ended: Vec::new(),
-            started,
+            ended_told: Arc::default(),
+            started_told: Arc::new(labels.told().with_messages(started)?),
             final_observations: Vec::new(),
             observation_size: 0,
             reward_terms: Vec::new(),
@@ -116,10 +133,17 @@ impl Events {
     /// # Errors
     /// If they do not fit.
     pub fn stepped(labels: &Arc<Labels>, stepped: proto::Stepped, observation_size: usize) -> PyResult<Option<Self>> {
-        let proto::Stepped { ended, started, final_observations, reward_terms, .. } = stepped;
-        if ended.is_empty() && started.is_empty() && reward_terms.is_empty() {
+        let proto::Stepped { ended, started, final_observations, reward_terms, receipt_episodes, .. } = stepped;
+        if ended.is_empty() && started.is_empty() && reward_terms.is_empty() && receipt_episodes.is_empty() {
             return Ok(None);
         }
+        let [ended_told, started_told] = if receipt_episodes.is_empty() {
+            let started = started.iter().map(|start| (start.slot, start.episode.as_ref(), start.receipt.as_ref()));
+            let ended = ended.iter().map(|end| (end.slot, end.episode.as_ref(), end.receipt.as_ref()));
+            [labels.told().with_messages(ended)?, labels.told().with_messages(started)?]
+        } else {
+            labels.told().split(&receipt_episodes, &stepped.receipt_values, ended.len())?
+        };
         let terms = |bytes: &Bytes| match bytes.is_empty() {
             true => Ok(Vec::new()),
             false => arrays::numbers(bytes, &[labels.num_envs, labels.reward_terms.len()]),
@@ -129,29 +153,29 @@ impl Events {
             final_observations: arrays::numbers(&final_observations, &[ended.len(), observation_size])?,
             reward_terms: terms(&reward_terms)?,
             ended,
-            started,
+            ended_told: Arc::new(ended_told),
+            started_told: Arc::new(started_told),
             observation_size,
         }
         .checked()
         .map(Some)
     }
 
-    /// The episodes that ended.
-    pub fn ended(&self) -> &[proto::EpisodeEnd] {
-        &self.ended
+    /// The episodes that ended, with their receipts.
+    pub fn ended(&self) -> impl Iterator<Item = proto::EpisodeEnd> {
+        let receipt = |index| self.ended_told.receipt(index, &self.labels.model_hash);
+        let whole = move |(index, end): (usize, &proto::EpisodeEnd)| proto::EpisodeEnd {
+            receipt: end.receipt.clone().or_else(|| receipt(index)),
+            ..end.clone()
+        };
+        self.ended.iter().enumerate().map(whole)
     }
 
     fn checked(self) -> PyResult<Self> {
-        let slots = self.ended.iter().map(|end| end.slot).chain(self.started.iter().map(|start| start.slot));
-        let receipts = self.ended.iter().map(|end| &end.receipt).chain(self.started.iter().map(|start| &start.receipt));
-        let (n, labels) = (self.labels.num_envs, &self.labels);
-        let fits = |receipt: &proto::Receipt| {
-            receipt.requested.len() == labels.parameters.len() && receipt.applied.len() == labels.applied.len()
-        };
-        if slots.max().is_some_and(|most| most as usize >= n) || !receipts.flatten().all(fits) {
-            let words =
-                format!("the server sent episodes that do not fit a batch of {n}, or receipts of other lengths");
-            return Err(failure(MALFORMED, 0, words));
+        let told = || self.ended_told.episodes.iter().chain(&self.started_told.episodes);
+        let slots = self.ended.iter().map(|end| end.slot.into()).chain(told().map(|row| row[0]));
+        if slots.max().is_some_and(|most| most >= self.labels.num_envs as u64) {
+            return Err(misfit());
         }
         Ok(self)
     }
@@ -176,20 +200,21 @@ impl Events {
                 info.set_item(&known.achieved.key, achieved)?;
             }
         }
-        for (_, episode, receipt) in started(&self.started).chain(ended(&self.ended)) {
-            let values = |labels: &[Label], values: &[f64]| {
-                let named = PyDict::new(py);
-                labels.iter().zip(values).try_for_each(|(label, value)| named.set_item(&label.key, value))?;
-                PyResult::Ok(named)
-            };
+        let values = |labels: &[Label], values: &[f64]| {
+            let named = PyDict::new(py);
+            labels.iter().zip(values).try_for_each(|(label, value)| named.set_item(&label.key, value))?;
+            PyResult::Ok(named)
+        };
+        for ([_, environment, trial, episode, _], row) in self.started_told.rows().chain(self.ended_told.rows()) {
+            let (requested, applied) = row.split_at(self.labels.parameters.len());
             let told = PyDict::new(py);
-            told.set_item(&known.environment_index.key, episode.environment_index)?;
-            told.set_item(&known.trial_index.key, episode.trial_index)?;
-            told.set_item(&known.episode_index.key, episode.episode_index)?;
-            told.set_item(&known.applied.key, values(&self.labels.applied, &receipt.applied)?)?;
-            told.set_item(&known.model_hash.key, &receipt.model_hash)?;
-            info.set_item(&known.context_id.key, episode.trial_index)?;
-            info.set_item(&known.parameters.key, values(&self.labels.parameters, &receipt.requested)?)?;
+            told.set_item(&known.environment_index.key, environment)?;
+            told.set_item(&known.trial_index.key, trial)?;
+            told.set_item(&known.episode_index.key, episode)?;
+            told.set_item(&known.applied.key, values(&self.labels.applied, applied)?)?;
+            told.set_item(&known.model_hash.key, &self.labels.model_hash)?;
+            info.set_item(&known.context_id.key, trial)?;
+            info.set_item(&known.parameters.key, values(&self.labels.parameters, requested)?)?;
             info.set_item(&known.receipt.key, told)?;
         }
         Ok(info)
@@ -212,7 +237,7 @@ impl Events {
         moved.resize(n, false);
         if !same_step || self.ended.is_empty() {
             self.outcomes(&infos)?;
-            self.receipts(&infos, started(&self.started).chain(ended(&self.ended)).collect())?;
+            self.receipts(&infos, [&self.started_told, &self.ended_told])?;
             self.terms(&infos, &moved)?;
             return Ok(infos);
         }
@@ -226,9 +251,9 @@ impl Events {
         set(&infos, &known.final_obs, PyArray1::from_vec(py, observations), &mask)?;
         set(&infos, &known.final_info, &finals, &mask)?;
         self.outcomes(&finals)?;
-        self.receipts(&finals, ended(&self.ended).collect())?;
+        self.receipts(&finals, [&self.ended_told])?;
         self.terms(&finals, &over)?;
-        self.receipts(&infos, started(&self.started).collect())?;
+        self.receipts(&infos, [&self.started_told])?;
         self.terms(&infos, &moved)?;
         Ok(infos)
     }
@@ -257,53 +282,25 @@ impl Events {
         Ok(())
     }
 
-    fn receipts(&self, infos: &Bound<'_, PyDict>, told: Vec<Told<'_>>) -> PyResult<()> {
-        if told.is_empty() {
+    fn receipts<const P: usize>(&self, infos: &Bound<'_, PyDict>, parts: [&Arc<Told>; P]) -> PyResult<()> {
+        let rows = || parts.iter().flat_map(|part| &part.episodes);
+        if rows().next().is_none() {
             return Ok(());
         }
-        let (py, known, labels) = (infos.py(), &self.labels.known, &*self.labels);
-        let (_, mask) = self.mask(py, told.iter().map(|(slot, ..)| *slot));
-        // All columns in two pieces of memory: a piece for each would take longer than to fill it.
-        let (n, applied) = (labels.num_envs, labels.parameters.len());
-        let mut values = vec![0.0_f64; (applied + labels.applied.len()) * n];
-        let mut counts = vec![0_i64; 4 * n];
-        for (slot, episode, receipt) in &told {
-            for (i, value) in receipt.requested.iter().chain(&receipt.applied).enumerate() {
-                values[i * n + slot] = *value;
-            }
-            let trial = episode.trial_index as i64;
-            let row = [trial, i64::from(episode.environment_index), trial, episode.episode_index as i64];
-            row.into_iter().enumerate().for_each(|(i, count)| counts[i * n + slot] = count);
-        }
-        let values = PyArray1::from_vec(py, values).reshape([applied + labels.applied.len(), n])?;
-        let counts = PyArray1::from_vec(py, counts).reshape([4, n])?;
-        let named = |labels: &[Label], first: usize| {
-            let named = PyDict::new(py);
-            for (i, label) in labels.iter().enumerate() {
-                set(&named, label, values.get_item(first + i)?, &mask)?;
-            }
-            PyResult::Ok(named)
+        let (py, known) = (infos.py(), &self.labels.known);
+        let slots = || rows().map(|row| row[0] as usize);
+        let (_, mask) = self.mask(py, slots());
+        let trials = slots().zip(rows().map(|row| row[2] as i64));
+        set(infos, &known.context_id, self.column(py, trials), &mask)?;
+        let receipts = Receipts {
+            labels: Arc::clone(&self.labels),
+            parts: parts.map(Arc::clone).into(),
+            mask: mask.clone().unbind(),
         };
-        set(infos, &known.context_id, counts.get_item(0)?, &mask)?;
-        set(infos, &known.parameters, named(&labels.parameters, 0)?, &mask)?;
-        let receipt = PyDict::new(py);
-        set(&receipt, &known.environment_index, counts.get_item(1)?, &mask)?;
-        set(&receipt, &known.trial_index, counts.get_item(2)?, &mask)?;
-        set(&receipt, &known.episode_index, counts.get_item(3)?, &mask)?;
-        set(&receipt, &known.applied, named(&labels.applied, applied)?, &mask)?;
-        let mut hashes: Vec<Py<PyAny>> = (0..labels.num_envs).map(|_| py.None()).collect();
-        // All are of one model, mostly: one text for all of them.
-        let mut last: Option<(&str, Py<PyAny>)> = None;
-        for (slot, _, receipt) in &told {
-            let text = match last.take() {
-                Some((known, text)) if same(known, &receipt.model_hash) => text,
-                _ => PyString::new(py, &receipt.model_hash).into_any().unbind(),
-            };
-            hashes[*slot] = text.clone_ref(py);
-            last = Some((&receipt.model_hash, text));
-        }
-        set(&receipt, &known.model_hash, PyArray1::from_vec(py, hashes), &mask)?;
-        set(infos, &known.receipt, receipt, &mask)
+        let receipts = Bound::new(py, receipts)?;
+        let later = |filled_by| self.labels.later.bind(py).call1((receipts.getattr(filled_by)?,));
+        set(infos, &known.parameters, later(intern!(py, "parameters"))?, &mask)?;
+        set(infos, &known.receipt, later(intern!(py, "receipt"))?, &mask)
     }
 
     fn terms(&self, infos: &Bound<'_, PyDict>, moved: &[bool]) -> PyResult<()> {
@@ -351,15 +348,53 @@ fn set<'py>(
     infos.set_item(&label.mask, mask)
 }
 
-/// Whether two texts are equal. To compare empty ones, which lie nowhere, takes some processors 100 ns.
-fn same(one: &str, other: &str) -> bool {
-    one.len() == other.len() && (one.is_empty() || one == other)
+/// What fills the dictionaries `parameters` and `receipt` of a batch.
+#[pyclass(frozen, module = "perturb._native")]
+struct Receipts {
+    labels: Arc<Labels>,
+    /// Of an environment that is in two of them the last counts.
+    parts: Vec<Arc<Told>>,
+    mask: Py<PyArray1<bool>>,
 }
 
-fn started(started: &[proto::EpisodeStart]) -> impl Iterator<Item = Told<'_>> {
-    started.iter().filter_map(|start| Some((start.slot as usize, start.episode.as_ref()?, start.receipt.as_ref()?)))
+#[pymethods]
+impl Receipts {
+    /// Values that were drawn or given.
+    fn parameters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        self.values(py, &self.labels.parameters, 0)
+    }
+
+    /// Which episode it is, and the values that were read back.
+    fn receipt<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let (labels, mask) = (&*self.labels, self.mask.bind(py));
+        let (known, n, receipt) = (&labels.known, labels.num_envs, PyDict::new(py));
+        for (i, label) in [(1, &known.environment_index), (2, &known.trial_index), (3, &known.episode_index)] {
+            let mut column = vec![0_i64; n];
+            self.rows().for_each(|(row, _)| column[row[0] as usize] = row[i] as i64);
+            set(&receipt, label, PyArray1::from_vec(py, column), mask)?;
+        }
+        set(&receipt, &known.applied, self.values(py, &labels.applied, labels.parameters.len())?, mask)?;
+        let hash = PyString::new(py, &labels.model_hash).into_any().unbind();
+        let mut hashes: Vec<Py<PyAny>> = (0..n).map(|_| py.None()).collect();
+        self.rows().for_each(|(row, _)| hashes[row[0] as usize] = hash.clone_ref(py));
+        set(&receipt, &known.model_hash, PyArray1::from_vec(py, hashes), mask)?;
+        Ok(receipt)
+    }
 }
 
-fn ended(ended: &[proto::EpisodeEnd]) -> impl Iterator<Item = Told<'_>> {
-    ended.iter().filter_map(|end| Some((end.slot as usize, end.episode.as_ref()?, end.receipt.as_ref()?)))
+impl Receipts {
+    fn rows(&self) -> impl Iterator<Item = ([u64; 5], &[f64])> {
+        self.parts.iter().flat_map(|part| part.rows())
+    }
+
+    /// Columns of values from the `first` on.
+    fn values<'py>(&self, py: Python<'py>, labels: &[Label], first: usize) -> PyResult<Bound<'py, PyDict>> {
+        let named = PyDict::new(py);
+        for (i, label) in labels.iter().enumerate() {
+            let mut column = vec![0.0_f64; self.labels.num_envs];
+            self.rows().for_each(|(row, values)| column[row[0] as usize] = values[first + i]);
+            set(&named, label, PyArray1::from_vec(py, column), self.mask.bind(py))?;
+        }
+        Ok(named)
+    }
 }

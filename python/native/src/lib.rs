@@ -3,7 +3,7 @@
 //! - [`session`]: a session that waits for its replies without Python's lock, hears of signals, and survives forks.
 //! - [`line`]: the connection under it, which is driven by the thread that waits.
 //! - [`requests`]: requests, made of what Python gives.
-//! - [`arrays`], [`infos`]: replies, as arrays and dictionaries.
+//! - [`arrays`], [`infos`]: replies, as arrays and dictionaries; [`told`]: the episodes that these are made of.
 //! - [`policy`]: trained policies that act here, by the learner's arithmetic.
 //! - [`sets`], [`testing`], [`records`]: tests of whatever acts in Python, recorded as the program `perturb` records its own.
 //! - [`assessed`]: such tests as folders, and in reports.
@@ -25,6 +25,7 @@ mod requests;
 mod session;
 mod sets;
 mod testing;
+mod told;
 
 /// What the Python package stands on; `perturb/_native.pyi` has the types.
 #[pymodule]
@@ -42,7 +43,13 @@ mod _native {
     #[pymodule_export]
     use super::session::{Session, catalogue};
     #[pymodule_export]
-    use super::sets::{make_set, read_csv_set, read_sets};
+    use super::sets::{heatmap_contexts, make_set, read_csv_set, read_sets};
     #[pymodule_export]
     use super::testing::Tests;
+    /// What the set of a heatmap is called.
+    #[pymodule_export]
+    const HEATMAP_SET: &str = perturb_study::Heatmap::SET;
+    /// The most points along a heatmap's axis.
+    #[pymodule_export]
+    const MOST_POINTS: usize = perturb_study::MOST_POINTS;
 }

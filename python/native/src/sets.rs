@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use perturb_protocol::{Distribution, Interval, Version};
 use perturb_study::sets::{Assignment, Contexts, TestSet, set_of, set_of_csv};
-use perturb_study::{Plan, files};
+use perturb_study::{Axis, Heatmap, MOST_POINTS, Plan, files};
 use pyo3::exceptions::PyOSError;
 use pyo3::prelude::*;
 
@@ -35,6 +35,25 @@ pub fn read_csv_set(name: &str, version: &str, path: PathBuf) -> PyResult<Set> {
 pub fn read_sets(path: PathBuf) -> PyResult<Vec<Set>> {
     let sets = Plan::own_sets(&path).map_err(|error| invalid(&error))?;
     Ok(sets.iter().map(to_python).collect())
+}
+
+/// The contexts of a heatmap over two parameters, each with its range, of so many points along each.
+#[pyfunction]
+pub fn heatmap_contexts(
+    axes: [(String, f64, f64); 2],
+    points: usize,
+    fixed: BTreeMap<String, f64>,
+) -> Vec<BTreeMap<String, f64>> {
+    let axis = |(name, low, high)| Axis {
+        name,
+        low,
+        high,
+        unit: String::new(),
+        default: low,
+        random: Vec::new(),
+        extreme: Vec::new(),
+    };
+    Heatmap::contexts(&axes.map(axis), points.min(MOST_POINTS), &fixed)
 }
 
 /// As Python has it.

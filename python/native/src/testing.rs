@@ -85,11 +85,11 @@ impl Tests {
         let Some(counting) = &mut self.counting else { return Err(failure(UNUSABLE, 0, "no test has begun")) };
         if let Some(events) = events {
             let terminated = terminated.as_array();
-            let ended = |end: &proto::EpisodeEnd| {
+            let ended = |end: proto::EpisodeEnd| {
                 let slot = end.slot as usize;
-                EndedEpisode::of(end.clone(), slot, terminated.get(slot).copied().unwrap_or_default())
+                EndedEpisode::of(end, slot, terminated.get(slot).copied().unwrap_or_default())
             };
-            let ended: Option<Vec<EndedEpisode>> = events.ended().iter().map(ended).collect();
+            let ended: Option<Vec<EndedEpisode>> = events.ended().map(ended).collect();
             let unnamed = "the server sent the end of an episode without its address or its receipt: mend the server";
             counting.take(ended.ok_or_else(|| failure(MALFORMED, 0, unnamed))?);
         }

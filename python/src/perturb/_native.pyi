@@ -152,6 +152,14 @@ def read_csv_set(name: str, version: str, path: str) -> Set:
 def read_sets(path: str) -> list[Set]:
     """The sets of an experiment file."""
 
+HEATMAP_SET: str
+MOST_POINTS: int
+
+def heatmap_contexts(
+    axes: Sequence[tuple[str, float, float]], points: int, fixed: dict[str, float]
+) -> list[dict[str, float]]:
+    """The contexts of a heatmap over two parameters, each with its range."""
+
 class Tests:
     """The tests of a policy, one set after the other."""
 

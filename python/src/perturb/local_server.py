@@ -26,7 +26,7 @@ PROGRAM = "perturb-server"
 # Overrides where the program is looked for.
 VARIABLE = "PERTURB_SERVER"
 # Where wheels have it, if they do.
-BUNDLED = Path(__file__).with_name("_server") / PROGRAM
+BUNDLED = Path(__file__).with_name("_programs") / PROGRAM
 # How long a start may take, s.
 START_LIMIT = 20.0
 # How long a server may take to end before it is killed, s.

@@ -18,11 +18,12 @@ from typing import Any
 import numpy as np
 
 from . import _native, catalogue, requests
+from .catalogue import CATALOGUE_ENTRIES
 from .environments import environments
-from .errors import InvalidArgumentError
+from .errors import InvalidArgumentError, UnknownNameError
 from .policy import native
 
-__all__ = ["Set", "drawn", "grid", "listed", "read", "read_csv", "sampled"]
+__all__ = ["Set", "drawn", "grid", "heatmap", "listed", "read", "read_csv", "sampled"]
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,52 @@ def sampled(name: str, environment: str, count: int, *, version: requests.Versio
             context[parameter.name] = min(low + place, high)
         contexts.append(context)
     return listed(name, contexts)
+
+
+def heatmap(
+    environment: str,
+    x: str | None = None,
+    y: str | None = None,
+    *,
+    points: int = 10,
+    base: requests.Version = "D",
+    fixed: Mapping[str, float] | None = None,
+) -> Set:
+    """Make the set of a heatmap over two parameters, which reports draw of whoever was tested on it.
+
+    Its name is `heatmap`, and its tests are those of `perturb heatmap`. Points stand in the middle of equal parts of
+    the range that R and E have together.
+
+    Args:
+        environment: its name.
+        x: the parameter along x; at first that of the environment's usual heatmap.
+        y: along y.
+        points: along each axis, 2 … 100. Each point has equally many of a test's episodes, at least 1.
+        base: where other parameters come from.
+        fixed: values of others.
+
+    Raises:
+        UnknownNameError: for an environment or a parameter that there is not.
+        InvalidArgumentError: for other numbers of points, one parameter twice, or where it is not known what to show.
+    """
+    known = environments()[catalogue.find(environment).name]
+    usual = next(entry["heatmap_axes"] for entry in CATALOGUE_ENTRIES if entry["name"] == known.name) or (None, None)
+    axes = (usual[0] if x is None else x, usual[1] if y is None else y)
+    ranges = []
+    for name in axes:
+        if name is None:
+            raise InvalidArgumentError(f"give x= and y=: it is not known which of {known.name}'s parameters to show")
+        if name not in known.parameters:
+            raise UnknownNameError(f"{known.name} has no parameter {name!r}, only {', '.join(known.parameters)}")
+        intervals = known.parameters[name].random + known.parameters[name].extreme
+        ranges.append((name, min(low for low, _ in intervals), max(high for _, high in intervals)))
+    wrong = [name for name in axes if name in (fixed or {})]
+    if axes[0] == axes[1] or wrong:
+        raise InvalidArgumentError(f"{wrong[0] if wrong else axes[0]} is an axis, and cannot be something else, too")
+    if requests.count(points, "points", 2) > _native.MOST_POINTS:
+        raise InvalidArgumentError(f"points is {points}; expected 2 … {_native.MOST_POINTS}")
+    contexts = native(_native.heatmap_contexts, ranges, points, dict(fixed or {}))
+    return listed(_native.HEATMAP_SET, contexts, base=base)
 
 
 def read_csv(name: str, path: str | os.PathLike[str], *, base: requests.Version = "D") -> Set:

@@ -12,13 +12,18 @@ use crate::{
         self as rpc, environment_request::Payload as Request, environment_response::Payload as Response,
     },
     server::{
-        conversation::{Dialogue, Sessions},
+        conversation::{Dialogue, MOST_BYTES_BEFORE_OPEN, Sessions},
         drain::Phase,
+        fields::{self, Field},
+        frames::Allowance,
         requests::Observed,
         status::Refusal,
     },
 };
 use std::sync::Arc;
+
+/// The most bytes of a request: a world is one environment, and mistakes deserve an answer.
+const MOST_BYTES: usize = 1 << 20;
 
 /// A client's stream. When it is dropped it leaves its world, and the worlds that it made go unless an agent is in them.
 pub(super) struct Agent {
@@ -112,6 +117,11 @@ impl Drop for Agent {
 impl Dialogue for Agent {
     type Request = rpc::EnvironmentRequest;
     type Response = rpc::EnvironmentResponse;
+    const FIELDS: &'static [Field] = fields::ENVIRONMENT_REQUEST;
+
+    fn allowance(&self) -> Allowance {
+        Allowance { bytes: if self.is_open() { MOST_BYTES } else { MOST_BYTES_BEFORE_OPEN }, entries: 1, covered: 0 }
+    }
 
     /// Whether it keeps a world alive.
     fn is_open(&self) -> bool {
@@ -138,8 +148,12 @@ impl Dialogue for Agent {
                 Err(Refusal::value("request", "empty or of a kind this server does not know", expected))
             }
         };
-        let payload = response.unwrap_or_else(|refusal| Response::Error(refusal.into()));
-        rpc::EnvironmentResponse { payload: Some(payload) }
+        response
+            .map_or_else(|refusal| self.refuse(refusal), |payload| rpc::EnvironmentResponse { payload: Some(payload) })
+    }
+
+    fn refuse(&self, refusal: Refusal) -> Self::Response {
+        rpc::EnvironmentResponse { payload: Some(Response::Error(refusal.into())) }
     }
 }
 

@@ -7,6 +7,7 @@ use crate::{
     proto::dm_env_rpc::v1::{EnvironmentRequest, EnvironmentResponse, environment_server::Environment},
     server::{
         conversation::{Responses, Sessions},
+        frames::Frames,
         requests::{Counted, Counts},
     },
 };
@@ -39,9 +40,9 @@ impl Environment for Service {
 
     async fn process(
         &self,
-        requests: Request<Streaming<EnvironmentRequest>>,
+        mut request: Request<Streaming<EnvironmentRequest>>,
     ) -> Result<Response<Self::ProcessStream>, Status> {
         let agent = Agent::new(Arc::clone(&self.worlds), self.sessions.clone());
-        Ok(Response::new(self.sessions.begin(requests.into_inner(), Counted::new(agent, &self.counts))?))
+        Ok(Response::new(self.sessions.begin(Frames::of(&mut request)?, Counted::new(agent, &self.counts))?))
     }
 }

@@ -62,6 +62,7 @@ pub(super) fn create(catalogue: &Catalogue, settings: &Settings) -> Result<(Batc
         groups: vec![SlotGroup { size: 1, episodes }],
         autoreset,
         receipts: true,
+        receipt_arrays: false,
         reward_terms: false,
         observe_parameters: false,
     };

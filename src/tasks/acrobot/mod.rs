@@ -199,7 +199,7 @@ impl Environment for Acrobot {
     }
 
     fn load(&mut self, state: &[f64]) -> Result<(), Error> {
-        self.state = analytic::load(state)?;
+        self.state = analytic::load(state, [PI, PI, MAX_VELOCITY_1, MAX_VELOCITY_2])?;
         Ok(())
     }
 }

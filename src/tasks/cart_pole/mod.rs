@@ -168,7 +168,7 @@ impl Environment for CartPole {
     }
 
     fn load(&mut self, state: &[f64]) -> Result<(), Error> {
-        self.state = analytic::load(state)?;
+        self.state = analytic::load(state, [f64::MAX; 4])?;
         Ok(())
     }
 }

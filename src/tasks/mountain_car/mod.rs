@@ -135,7 +135,7 @@ impl Environment for MountainCar {
     }
 
     fn load(&mut self, state: &[f64]) -> Result<(), Error> {
-        self.state = analytic::load(state)?;
+        self.state = analytic::load(state, [-MIN_POSITION, MAX_SPEED])?;
         Ok(())
     }
 }

@@ -32,7 +32,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     ],
     action: ActionSpace::Continuous(&[Channel::new("torque", "N m", -MAX_TORQUE, MAX_TORQUE)]),
     state: &[
-        Channel::new("theta", "rad", -10_000.0, 10_000.0),
+        Channel::new("theta", "rad", -MOST_INITIAL_ANGLE, MOST_INITIAL_ANGLE),
         Channel::new("theta_velocity", "rad/s", -MAX_SPEED, MAX_SPEED),
     ],
     reward_terms: &[
@@ -41,7 +41,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
         RewardTerm { name: "torque", description: "-0.001 u², u clipped to ±2" },
     ],
     applied: &[Quantity { name: "length", unit: "m" }, Quantity { name: "mass", unit: "kg" }],
-    step_limit: 200,
+    step_limit: STEP_LIMIT,
     control_timestep: DT,
     step_cost: 0.05,
     success: Success {
@@ -63,6 +63,10 @@ const DT: f64 = 0.05;
 const GRAVITY: f64 = 10.0;
 const MAX_SPEED: f64 = 8.0;
 const MAX_TORQUE: f64 = 2.0;
+const STEP_LIMIT: u32 = 200;
+const MOST_INITIAL_ANGLE: f64 = 10_000.0;
+/// The angle is not wrapped: that of an episode that turned all the time; rounded up.
+const MOST_ANGLE: f64 = MOST_INITIAL_ANGLE + (STEP_LIMIT + 1) as f64 * MAX_SPEED * DT;
 const UPRIGHT: f64 = PI / 3.0;
 
 /// The rod.
@@ -157,7 +161,7 @@ impl Environment for Pendulum {
     }
 
     fn load(&mut self, state: &[f64]) -> Result<(), Error> {
-        self.state = analytic::load(state)?;
+        self.state = analytic::load(state, [MOST_ANGLE, MAX_SPEED])?;
         self.torque = None;
         Ok(())
     }

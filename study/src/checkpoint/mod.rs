@@ -23,6 +23,7 @@ use self::files::remove_others;
 pub use self::files::{ArraysFile, damaged};
 use crate::Counters;
 use crate::files::{FileError, write_atomically};
+use crate::seal::{self, Sealed};
 use crate::settings::{Architecture, TrainConfig};
 
 /// Of the JSON's layout; raised when older programs could misread it. Format 1 says beside the configuration what follows
@@ -79,9 +80,6 @@ pub struct Resume {
 #[derive(Serialize, Deserialize)]
 struct Document {
     format_version: u32,
-    /// Of everything else here, see [`checksum`].
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    crc32c: Option<u32>,
     weights: ArraysFile,
     /// Not looked into for testing.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -153,16 +151,15 @@ impl Checkpoint {
         let weights = ArraysFile::write(directory, WEIGHTS_PREFIX, iterations, &weights)?;
         let weights_file = weights.file.clone();
 
-        let mut document = Document {
+        let document = Document {
             format_version: FORMAT_VERSION,
-            crc32c: None,
             weights,
             resume,
             rest: serde_json::to_value(&self.state).map_err(|error| damaged(directory, error.to_string()))?,
         };
         let not_written = |error: serde_json::Error| damaged(directory, error.to_string());
-        document.crc32c = Some(checksum(serde_json::to_value(&document).map_err(not_written)?));
-        let json = serde_json::to_vec_pretty(&document).map_err(not_written)?;
+        let sealed = Sealed::new(&document).map_err(not_written)?;
+        let json = serde_json::to_vec_pretty(&sealed).map_err(not_written)?;
         write_atomically(&directory.join(JSON), &json)?;
         let current = [weights_file.as_str(), resume_file.as_deref().unwrap_or_default()];
         Ok(remove_others(directory, &[WEIGHTS_PREFIX, RESUME_PREFIX], &current)?)
@@ -353,27 +350,18 @@ impl Document {
         let text = crate::files::read_if_there(&json)?;
         let text = text.ok_or_else(|| CheckpointError::Missing { path: path.to_owned() })?;
         let not_understood = |error: serde_json::Error| damaged(&json, format!("it is not understood: {error}"));
-        let value: serde_json::Value = serde_json::from_slice(&text).map_err(not_understood)?;
-        let document = Self::deserialize(&value).map_err(not_understood)?;
+        let mut value: serde_json::Value = serde_json::from_slice(&text).map_err(not_understood)?;
+        let sealed = seal::open(&mut value);
+        let document: Self = serde_json::from_value(value).map_err(not_understood)?;
         if !(1..=FORMAT_VERSION).contains(&document.format_version) {
             let reason = format!("it has format {}, this program reads 1 to {FORMAT_VERSION}", document.format_version);
             return Err(damaged(&json, reason));
         }
-        let sealed = document.format_version >= SEALED || document.crc32c.is_some();
-        if sealed && document.crc32c != Some(checksum(value)) {
-            let reason = "it is not what was written: its checksum is another; give a copy that is whole";
-            return Err(damaged(&json, reason.into()));
+        if sealed.is_err() || (document.format_version >= SEALED && sealed == Ok(false)) {
+            return Err(damaged(&json, format!("{}; give a copy that is whole", seal::BROKEN)));
         }
         Ok((directory, document))
     }
-}
-
-/// CRC-32C of a document without its own entry, as compact JSON with sorted names: spaces and order do not matter.
-fn checksum(mut document: serde_json::Value) -> u32 {
-    if let Some(entries) = document.as_object_mut() {
-        entries.remove("crc32c");
-    }
-    crc32c::crc32c(document.to_string().as_bytes())
 }
 
 #[cfg(test)]

@@ -173,8 +173,8 @@ fn statistics_that_cannot_be_are_refused() {
         let path = directory.path().join(JSON);
         let mut document: serde_json::Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
         *document.pointer_mut(pointer).unwrap() = value;
-        document["crc32c"] = checksum(document.clone()).into();
-        fs::write(&path, document.to_string()).unwrap();
+        seal::open(&mut document).unwrap_err();
+        fs::write(&path, serde_json::to_vec(&Sealed::new(&document).unwrap()).unwrap()).unwrap();
         let error = Checkpoint::load(directory.path()).unwrap_err();
         assert!(matches!(error, CheckpointError::Damaged { .. }), "{error}");
         error.to_string()

@@ -1,11 +1,11 @@
 //! What pictures are drawn on: texts, lines and areas in units.
 
 use plotters::coord::Shift;
-use plotters::element::{DashedPathElement, DynElement};
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::colours::{FRAME, INK, LINES, PAPER};
+use super::dashes::dashes;
 use super::{FAMILY, PlotError, WIDTH, drawing, load_font};
 
 /// The size of all texts, as the library counts it: its SVG divides it by 1.24, which is 13.7 units, and in a column of 85 mm
@@ -38,17 +38,6 @@ impl LineStyle {
     /// Of the `index`th of several lines.
     pub(super) fn nth(index: usize) -> Self {
         Self { colour: LINES[index % LINES.len()], width: 2, dashes: DASHES[index % DASHES.len()] }
-    }
-
-    fn along<'a, DB>(self, points: Vec<(i32, i32)>, scale: u32) -> DynElement<'a, DB, (i32, i32)>
-    where
-        DB: DrawingBackend + 'a,
-    {
-        let style = self.colour.stroke_width(self.width * scale);
-        match self.dashes {
-            None => PathElement::new(points, style).into_dyn(),
-            Some((dash, gap)) => DashedPathElement::new(points, dash * scale, gap * scale, style).into_dyn(),
-        }
     }
 }
 
@@ -136,8 +125,18 @@ impl<'a, DB: DrawingBackend> Canvas<'a, DB> {
     }
 
     pub(super) fn line(&self, points: &[Place], style: LineStyle) -> Result<(), PlotError> {
+        match style.dashes {
+            None => self.whole_line(points, style),
+            Some((dash, gap)) => {
+                let dashes = dashes(points, dash.into(), gap.into());
+                dashes.iter().try_for_each(|dash| self.whole_line(dash, style))
+            }
+        }
+    }
+
+    fn whole_line(&self, points: &[Place], style: LineStyle) -> Result<(), PlotError> {
         let points: Vec<_> = points.iter().map(|point| self.at(*point)).collect();
-        self.area.draw(&style.along(points, self.scale)).map_err(drawing)
+        self.area.draw(&PathElement::new(points, self.stroke(style.colour, style.width))).map_err(drawing)
     }
 
     pub(super) fn circle(&self, at: Place, radius: f64, style: ShapeStyle) -> Result<(), PlotError> {

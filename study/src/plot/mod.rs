@@ -7,6 +7,7 @@
 mod canvas;
 mod colours;
 mod curves;
+mod dashes;
 mod frame;
 mod heatmap;
 pub(crate) mod intervals;

@@ -12,6 +12,7 @@ pub use parquet::{FILE, RecordsError};
 use perturb_protocol::{EndedEpisode, proto};
 use serde::{Deserialize, Serialize};
 
+use crate::heatmap::Axis;
 use crate::means::{mean, wilson};
 use crate::results::TestResult;
 use crate::sets::TestSet;
@@ -78,6 +79,9 @@ pub struct RecordedTest {
     pub set: TestSet,
     /// Of its environments and actions.
     pub seed: u64,
+    /// Of the test of a heatmap: x and y. `None` of any other, and in records of programs that did not write it yet.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub axes: Option<[Axis; 2]>,
 }
 
 /// How an episode ended.

@@ -22,6 +22,7 @@ use parquet::schema::types::Type;
 use super::{About, ColumnValues, Ending, EpisodeRecord, Records};
 use crate::AnyError;
 use crate::files::{FileError, read_if_there, write_atomically};
+use crate::seal;
 
 /// What the file is called beside a result.
 pub const FILE: &str = "episodes.parquet";
@@ -124,7 +125,12 @@ impl Records {
             }
         }
         rows.close()?;
-        Ok(file.into_inner()?)
+        let mut file = file.into_inner()?;
+        // Before the footer, whose length stands before the last four bytes: readers find everything by its offset.
+        let footer = file.last_chunk::<8>().map_or(0, |end| 8 + u32::from_le_bytes([end[0], end[1], end[2], end[3]]));
+        let place = file.len() - footer as usize;
+        seal::insert(&mut file, place);
+        Ok(file)
     }
 
     /// Reads the file.
@@ -138,6 +144,8 @@ impl Records {
     }
 
     fn decode(content: Vec<u8>) -> Result<Self, AnyError> {
+        // First of all: the decoder takes what has changed for what it says, and may panic.
+        seal::check(&content).map_err(|broken| format!("{broken}; give a copy that is whole, or test again"))?;
         let reader = SerializedFileReader::new(Bytes::from(content))?;
         let metadata = reader.metadata().file_metadata();
         let about = metadata.key_value_metadata().and_then(|pairs| pairs.iter().find(|pair| pair.key == KEY));

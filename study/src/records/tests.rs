@@ -24,7 +24,7 @@ fn records() -> Records {
     let mut records = Records::new(about);
     for version in [Version::D, Version::E] {
         let episodes = (0..5).map(|index| episode(version, index)).collect();
-        records.add(RecordedTest { set: version.into(), seed: u64::MAX }, episodes);
+        records.add(RecordedTest { set: version.into(), seed: u64::MAX, axes: None }, episodes);
     }
     records
 }
@@ -91,7 +91,7 @@ fn episodes_can_be_judged_by_the_texts_rule_and_by_the_codes_whichever_they_were
             EpisodeRecord { requested, applied, achieved, also_achieved, ..episode(Version::D, index) }
         };
         let episodes = vec![at(0, 150.0, 150.0), at(1, 20.0, 120.0), at(2, 0.0, 110.0), at(3, 0.0, 99.0)];
-        records.add(RecordedTest { set: Version::D.into(), seed: 1 }, episodes);
+        records.add(RecordedTest { set: Version::D.into(), seed: 1, axes: None }, episodes);
 
         let directory = tempfile::tempdir().unwrap();
         records.write(&directory.path().join(FILE)).unwrap();
@@ -124,6 +124,28 @@ fn a_file_of_something_else_is_refused() {
         let error = Records::read(&path).unwrap_err().to_string();
         assert!(error.contains("does not hold recorded episodes"), "{error}");
     }
+}
+
+#[test]
+fn a_changed_bit_is_refused_wherever_it_is_unless_it_changes_nothing() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join(FILE);
+    records().write(&path).unwrap();
+    let whole = std::fs::read(&path).unwrap();
+    let mut refused = 0;
+    for place in 0..whole.len() {
+        let mut damaged = whole.clone();
+        damaged[place] ^= 1 << (place % 8);
+        std::fs::write(&path, damaged).unwrap();
+        match Records::read(&path) {
+            Ok(read) => assert_eq!(read, records(), "byte {place}"),
+            Err(error) => {
+                assert!(error.to_string().contains("its checksum is another"), "byte {place}: {error}");
+                refused += 1;
+            }
+        }
+    }
+    assert_eq!(refused, whole.len() - "perturb.crc32c=".len(), "only what says that there is a checksum may change");
 }
 
 #[test]

@@ -1,6 +1,7 @@
-//! Pictures of the heatmaps that an experiment has: one for each environment, pair of parameters, and method.
+//! Pictures of heatmaps, of an experiment and of agents that were trained elsewhere: one for each environment, pair of
+//! parameters, and method.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::path::Path;
 
@@ -11,10 +12,10 @@ use crate::files::{delete, list, write_atomically};
 use crate::folder::{Folder, FolderError};
 use crate::heatmap::{Heatmap, HeatmapPoint};
 use crate::heatmaps::{HeatmapKind, HeatmapPlace, HeatmapRecord, NoHeatmap, heatmap_kinds, heatmap_places};
-use crate::plan::distinct;
+use crate::plan::{TrainedOn, distinct};
 use crate::plot::{HeatmapColumn, HeatmapPanels, PlotError, common_returns, save, svg};
 use crate::scheduler::count;
-use crate::selection::MethodResults;
+use crate::selection::{MethodResults, Reported};
 use crate::table::Table;
 
 /// What a method's policies do over two parameters: a column for each thing that they were trained on, the mean over runs.
@@ -48,74 +49,128 @@ struct Draft<'a> {
 
 /// The policies that were trained on the same.
 struct Column<'a> {
-    places: &'a [HeatmapPlace<'a>],
-    records: Vec<HeatmapRecord>,
+    trained_on: TrainedOn<'a>,
+    /// Policies that there are, with a heatmap or without.
+    policies: usize,
+    origins: Vec<Origin>,
     missing: Vec<(u32, NoHeatmap)>,
     mean: Option<Heatmap>,
 }
 
-/// Those of everything in `folder` that belongs to `selections`; without pictures where nothing does.
+/// A policy's heatmap, or why there is none.
+#[derive(Clone)]
+struct Shown<'a> {
+    trained_on: TrainedOn<'a>,
+    run: u32,
+    content: Result<(Heatmap, Origin), NoHeatmap>,
+}
+
+/// How a heatmap was made.
+#[derive(Clone)]
+struct Origin {
+    seed: u64,
+    /// Of the program; `None` if that is not known.
+    commit: Option<String>,
+}
+
+/// Those of the cells that belong to `selections`, which are in `folder`, and of the agents among them that were trained
+/// elsewhere; without pictures where cells have none.
 ///
 /// # Errors
 /// [`FolderError`] if a file is there that cannot be read.
-pub fn heatmap_pictures(selections: &[MethodResults<'_>], folder: &Folder) -> Result<Vec<HeatmapPicture>, FolderError> {
+pub fn heatmap_pictures(
+    selections: &[MethodResults<'_>],
+    folder: Option<&Folder>,
+) -> Result<Vec<HeatmapPicture>, FolderError> {
     let places = heatmap_places(selections);
-    let kinds = heatmap_kinds(folder, &places)?;
+    let of_cells = folder.map_or_else(|| Ok(BTreeMap::new()), |folder| heatmap_kinds(folder, &places))?;
     let mut pictures = Vec::new();
-    for places in places.chunk_by(|a, b| a.environment == b.environment) {
-        let mut of_environment: Vec<Option<&HeatmapKind>> =
-            kinds.get(places[0].environment).into_iter().flatten().map(Some).collect();
-        if of_environment.is_empty() {
-            of_environment.push(None);
+    for rows in selections.chunk_by(|a, b| a.environment == b.environment) {
+        let environment = rows[0].environment;
+        let places: Vec<_> = places.iter().filter(|place| place.environment == environment).collect();
+        let elsewhere: Vec<_> = rows.iter().map(|row| (&row.method, shown_elsewhere(row))).collect();
+        let kinds_elsewhere = elsewhere.iter().flat_map(|(_, shown)| shown.iter().map(|(kind, _)| kind));
+        let kinds: BTreeSet<&HeatmapKind> =
+            of_cells.get(environment).into_iter().flatten().chain(kinds_elsewhere).collect();
+        let mut kinds: Vec<Option<&HeatmapKind>> = kinds.into_iter().map(Some).collect();
+        if kinds.is_empty() {
+            kinds.push(None);
         }
         let mut drafts = Vec::new();
-        for kind in of_environment {
+        for kind in kinds {
             for places in places.chunk_by(|a, b| a.method == b.method) {
-                drafts.push(Draft::read(folder, kind, places)?);
+                let shown = places.iter().map(|place| shown(place, folder, kind)).collect::<Result<Vec<_>, _>>()?;
+                drafts.push(Draft::of((environment, places[0].method), kind, shown));
+            }
+            for (method, shown) in &elsewhere {
+                let shown = shown.iter().filter(|(of, _)| Some(of) == kind).map(|(_, shown)| shown.clone());
+                drafts.push(Draft::of((environment, method), kind, shown.collect()));
             }
         }
-        let shown = drafts.iter().flat_map(|draft| &draft.columns).filter_map(|column| column.mean.as_ref());
-        let returns = common_returns(places[0].environment, shown);
+        drafts.retain(|draft| !draft.columns.is_empty());
+        let means = drafts.iter().flat_map(|draft| &draft.columns).filter_map(|column| column.mean.as_ref());
+        let returns = common_returns(environment, means);
         pictures.extend(drafts.iter().map(|draft| draft.picture(&returns)));
     }
     Ok(pictures)
 }
 
+/// The heatmap of a cell.
+fn shown<'a>(
+    place: &HeatmapPlace<'a>,
+    folder: Option<&Folder>,
+    kind: Option<&HeatmapKind>,
+) -> Result<Shown<'a>, FolderError> {
+    let read = match folder.zip(kind) {
+        Some((folder, kind)) => place.read(folder, kind)?,
+        None => Err(if place.selected.is_some() { NoHeatmap::NotMade } else { NoHeatmap::NoResult }),
+    };
+    let origin = |record: HeatmapRecord| Origin { seed: record.options.seed, commit: Some(record.commit) };
+    let content = read.map(|stored| (stored.heatmap, origin(stored.record)));
+    Ok(Shown { trained_on: place.trained_on, run: place.run, content })
+}
+
+/// The heatmaps of an agent that was trained elsewhere, in the order of cells' ones; of a row of cells none.
+fn shown_elsewhere<'a>(row: &MethodResults<'a>) -> Vec<(HeatmapKind, Shown<'a>)> {
+    let mut all = Vec::new();
+    for (&run, of_run) in &row.runs {
+        for (&trained_on, reported) in &of_run.0 {
+            let Some(Reported::Elsewhere(_, policy)) = reported else { continue };
+            let Some(heatmap) = Heatmap::recorded(&policy.records) else { continue };
+            let origin = Origin { seed: policy.known.seed, commit: None };
+            all.push((heatmap.kind(), Shown { trained_on, run, content: Ok((heatmap, origin)) }));
+        }
+    }
+    all.sort_by_key(|(_, shown)| (shown.trained_on, shown.run));
+    all
+}
+
 impl<'a> Draft<'a> {
-    fn read(
-        folder: &Folder,
-        kind: Option<&'a HeatmapKind>,
-        places: &'a [HeatmapPlace<'a>],
-    ) -> Result<Self, FolderError> {
+    /// Of policies in the order of what they were trained on.
+    fn of((environment, method): (&'a str, &'a Method), kind: Option<&'a HeatmapKind>, shown: Vec<Shown<'a>>) -> Self {
         let mut columns: Vec<Column<'a>> = Vec::new();
         // All of a picture have the points of its first.
         let mut first: Option<Heatmap> = None;
-        for places in places.chunk_by(|a, b| a.trained_on == b.trained_on) {
-            let mut column = Column { places, records: Vec::new(), missing: Vec::new(), mean: None };
-            let mut heatmaps = Vec::new();
-            for place in places {
-                let read = match kind {
-                    Some(kind) => place.read(folder, kind)?,
-                    None => Err(if place.selected.is_some() { NoHeatmap::NotMade } else { NoHeatmap::NoResult }),
-                };
-                match read {
-                    Ok(stored) => {
-                        let alike =
-                            [first.get_or_insert_with(|| stored.heatmap.clone()).clone(), stored.heatmap.clone()];
+        for shown in shown.chunk_by(|a, b| a.trained_on == b.trained_on) {
+            let (trained_on, policies) = (shown[0].trained_on, shown.len());
+            let (mut origins, mut missing, mut heatmaps) = (Vec::new(), Vec::new(), Vec::new());
+            for Shown { run, content, .. } in shown.iter().cloned() {
+                match content {
+                    Ok((heatmap, origin)) => {
+                        let alike = [first.get_or_insert_with(|| heatmap.clone()).clone(), heatmap.clone()];
                         if Heatmap::mean(&alike).is_some() {
-                            column.records.push(stored.record);
-                            heatmaps.push(stored.heatmap);
+                            origins.push(origin);
+                            heatmaps.push(heatmap);
                         } else {
-                            column.missing.push((place.run, NoHeatmap::NotAlike));
+                            missing.push((run, NoHeatmap::NotAlike));
                         }
                     }
-                    Err(why) => column.missing.push((place.run, why)),
+                    Err(why) => missing.push((run, why)),
                 }
             }
-            column.mean = Heatmap::mean(&heatmaps);
-            columns.push(column);
+            columns.push(Column { trained_on, policies, origins, missing, mean: Heatmap::mean(&heatmaps) });
         }
-        Ok(Self { environment: places[0].environment, method: places[0].method, kind, columns })
+        Self { environment, method, kind, columns }
     }
 
     fn picture(&self, returns: &Range<f64>) -> HeatmapPicture {
@@ -144,7 +199,7 @@ impl<'a> Draft<'a> {
             name: of,
             panels,
             figures: self.figures(),
-            wanted: columns.iter().map(|column| column.places.len()).sum(),
+            wanted: columns.iter().map(|column| column.policies).sum(),
             missing: columns.iter().flat_map(|column| column.missing.iter().map(|(_, why)| *why)).collect(),
         }
     }
@@ -155,23 +210,23 @@ impl<'a> Draft<'a> {
     }
 
     fn caption(&self, of: &str, tested: &str) -> String {
-        let records = || self.columns.iter().flat_map(|column| &column.records);
-        let seeds: BTreeSet<u64> = records().map(|record| record.options.seed).collect();
-        let commits: BTreeSet<&str> = records().map(|record| record.commit.as_str()).collect();
+        let origins = || self.columns.iter().flat_map(|column| &column.origins);
+        let seeds: BTreeSet<u64> = origins().map(|origin| origin.seed).collect();
+        let commits: BTreeSet<&str> = origins().filter_map(|origin| origin.commit.as_deref()).collect();
         let columns: Vec<String> = self.columns.iter().map(Column::told).collect();
         format!(
-            "{of}. Means over runs: {}. {tested} of each policy, test {} {}. perturb {}.",
+            "{of}. Means over runs: {}. {tested} of each policy, test {} {}.{}",
             columns.join("; "),
             if seeds.len() == 1 { "seed" } else { "seeds" },
             listed(seeds),
-            listed(commits)
+            if commits.is_empty() { String::new() } else { format!(" perturb {}.", listed(commits)) }
         )
     }
 
     /// A line for each column and point.
     fn figures(&self) -> Table {
         let of_column = |column: &'_ Column<'a>| {
-            let (trained_on, runs) = (column.places[0].trained_on.to_string(), column.records.len());
+            let (trained_on, runs) = (column.trained_on.to_string(), column.origins.len());
             let points = column.mean.iter().flat_map(|mean| mean.points.clone());
             points.map(move |point| (trained_on.clone(), runs, point)).collect::<Vec<_>>()
         };
@@ -191,19 +246,19 @@ impl<'a> Draft<'a> {
 impl Column<'_> {
     fn panel(&self) -> HeatmapColumn {
         let content = self.mean.clone().ok_or_else(|| said(self.missing.iter()));
-        HeatmapColumn { caption: format!("trained on {}, {}", self.places[0].trained_on, self.runs()), content }
+        HeatmapColumn { caption: format!("trained on {}, {}", self.trained_on, self.runs()), content }
     }
 
     /// How many runs are there.
     fn runs(&self) -> String {
-        match (self.records.len(), self.places.len()) {
+        match (self.origins.len(), self.policies) {
             (there, all) if there == all => count(all, "run"),
             (there, all) => format!("{there} of {}", count(all, "run")),
         }
     }
 
     fn told(&self) -> String {
-        let told = format!("{} trained on {}", self.runs(), self.places[0].trained_on);
+        let told = format!("{} trained on {}", self.runs(), self.trained_on);
         let why = |(run, why): &(u32, NoHeatmap)| format!("run {run}: {why}");
         match self.missing.iter().map(why).collect::<Vec<_>>() {
             missing if missing.is_empty() => told,

@@ -1,7 +1,10 @@
 use super::*;
+use crate::assessed::{Assessed, AssessedPolicy, add_assessed};
 use crate::fixture;
 use crate::heatmaps::store_heatmap;
 use crate::plan::{Cell, Plan};
+use crate::records::RecordedTest;
+use crate::sets::{Context, Contexts, TestSet};
 use crate::{HeatmapOptions, Version};
 
 const PLAN: &str = "environments = ['Pendulum', 'Elsewhere']\nruns = 2
@@ -29,7 +32,7 @@ fn store(folder: &Folder, cell: &Cell, heatmap: &Heatmap) {
 
 fn pictures(plan: &Plan, folder: &Folder) -> Vec<HeatmapPicture> {
     let results = fixture::results(plan, |_| Some(([0.0; 3], 0.0)));
-    heatmap_pictures(&results.select(), folder).unwrap()
+    heatmap_pictures(&results.select(), Some(folder)).unwrap()
 }
 
 fn is_of(cell: &Cell, environment: &str, algorithm: &str) -> bool {
@@ -155,7 +158,7 @@ fn of_an_experiment_without_heatmaps_it_is_said_why() {
     let directory = tempfile::tempdir().unwrap();
     let folder = Folder::new(directory.path());
     let results = fixture::results(&plan, |cell| is_of(cell, "Pendulum", "a2c").then_some(([0.0; 3], 0.0)));
-    let pictures = heatmap_pictures(&results.select(), &folder).unwrap();
+    let pictures = heatmap_pictures(&results.select(), Some(&folder)).unwrap();
     let captions: Vec<&str> = pictures.iter().map(|picture| picture.caption.as_str()).collect();
     assert_eq!(captions.len(), 4);
     assert_eq!(captions[0], "Pendulum, a2c ff: mean return and success: the heatmap has not been made.");
@@ -165,4 +168,56 @@ fn of_an_experiment_without_heatmaps_it_is_said_why() {
     assert!(
         pictures.iter().all(|picture| picture.panels.is_none() && picture.wanted == 6 && picture.missing.len() == 6)
     );
+}
+
+/// An agent whose policies were tested over mass and length, four episodes a point: of each what it was trained on, and how
+/// many of the four were successes.
+fn agent(policies: &[(Version, u32)]) -> Assessed {
+    let trained_on: Vec<_> = policies.iter().map(|(version, _)| Some(*version)).collect();
+    let tested = fixture::assessed("pushes", "Pendulum", &trained_on, [1; 3]);
+    let with_heatmap = |(policy, (_, successes)): (&AssessedPolicy, &(Version, u32))| {
+        let axes = fixture::heatmap(2, |_, _| (0.0, 0.0)).axes;
+        let contexts = Contexts::Listed(Heatmap::contexts(&axes, 2, &Context::new()));
+        let set = TestSet { name: Heatmap::SET.into(), version: Version::D, contexts };
+        let mut records = policy.records.clone();
+        let episode = |index| fixture::episode(Heatmap::SET, index, 0.0, 1, index / 4 < *successes);
+        records.add(RecordedTest { set, seed: 9, axes: Some(axes) }, (0..16).map(episode).collect());
+        AssessedPolicy::new(policy.known.clone(), records)
+    };
+    let policies = tested.policies().iter().zip(policies).map(with_heatmap).collect();
+    Assessed::new(tested.name.clone(), tested.agent.clone(), policies).unwrap()
+}
+
+#[test]
+fn agents_that_were_trained_elsewhere_have_pictures_beside_cells_ones() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let directory = folder(&plan, |cell| is_of(cell, "Pendulum", "a2c").then(|| trained(cell)));
+    let results = fixture::results(&plan, |_| Some(([0.0; 3], 0.0)));
+    let assessed = [agent(&[(Version::D, 2), (Version::E, 3)]), agent(&[(Version::D, 4)])];
+    let mut selections = results.select();
+    let alone = heatmap_pictures(&selections, Some(&Folder::new(directory.path()))).unwrap();
+    add_assessed(&mut selections, &assessed);
+    let pictures = heatmap_pictures(&selections, Some(&Folder::new(directory.path()))).unwrap();
+    let (here, elsewhere): (Vec<_>, Vec<_>) = pictures.into_iter().partition(|it| !it.name.contains("pushes"));
+    assert_eq!(here, alone, "those of cells are the same");
+    assert_eq!(elsewhere.len(), 1);
+    let panels = elsewhere[0].panels.as_ref().unwrap();
+    let captions: Vec<&str> = panels.columns.iter().map(|column| column.caption.as_str()).collect();
+    assert_eq!(captions, ["trained on D, 2 runs", "trained on E, 1 run"]);
+    let success = |column: usize| panels.columns[column].content.as_ref().unwrap().points[0].success_percent;
+    assert_eq!((success(0), success(1)), (75.0, 75.0), "the mean over runs, and of one");
+    assert!(elsewhere[0].caption.contains("2 × 2 points of 4 episodes of each policy, test seed 1."));
+    assert!(!elsewhere[0].caption.contains("perturb"), "whose program it was is not known");
+
+    // By itself, without an experiment.
+    let mut selections = Vec::new();
+    add_assessed(&mut selections, &assessed);
+    assert_eq!(heatmap_pictures(&selections, None).unwrap(), elsewhere);
+    // What was tested on other sets has none.
+    let mut others = assessed[1].policies()[0].clone();
+    others.records.about.tests.iter_mut().for_each(|test| test.axes = None);
+    let others = [Assessed::new(String::new(), "other".into(), vec![others]).unwrap()];
+    let mut selections = Vec::new();
+    add_assessed(&mut selections, &others);
+    assert_eq!(heatmap_pictures(&selections, None).unwrap(), []);
 }

@@ -68,7 +68,7 @@ fn records(cell: &Cell) -> Records {
     let mut records = Records::new(About::new(&environment, String::new(), 1));
     for version in Version::ALL {
         let episodes = (0..EPISODES).map(|index| episode(cell, version, index)).collect();
-        records.add(RecordedTest { set: version.into(), seed: 7 }, episodes);
+        records.add(RecordedTest { set: version.into(), seed: 7, axes: None }, episodes);
     }
     records
 }

@@ -108,13 +108,13 @@ impl Sources {
         };
         let mut selections = results.select();
         let mut recorded = Recorded::of(&selections);
-        let (mut curves, mut heatmaps) = (Vec::new(), Vec::new());
+        let mut curves = Vec::new();
         if let Some(folder) = &folder {
             verify(&results, folder, |result, records| recorded.add(result, records)).map_err(ReportError::from)?;
             curves = read_curves(&selections, folder).map_err(ReportError::from)?;
-            heatmaps = heatmap_pictures(&selections, folder).map_err(ReportError::from)?;
         }
         add_assessed(&mut selections, &assessed);
+        let heatmaps = heatmap_pictures(&selections, folder.as_ref()).map_err(ReportError::from)?;
         let report = Report::new(&results, &selections, &recorded, &curves);
         make(Whole { report, curves: &curves, heatmaps: &heatmaps })
     }

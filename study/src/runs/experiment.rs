@@ -166,7 +166,10 @@ impl ExperimentStatus {
             self.done().flat_map(|(_, result)| result.results.values().map(|test| test.success_percent)).collect();
         RunSummary {
             path: self.folder.path().to_owned(),
-            what: self.plan.environments().join(", "),
+            what: match &self.plan.environments()[..] {
+                few @ ([_] | [_, _]) => few.join(", "),
+                many => format!("{} environments", many.len()), // a line must fit
+            },
             done: self.done().count() as u64,
             budget: self.cells.len() as u64,
             unit: "cells",

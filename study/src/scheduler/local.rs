@@ -19,7 +19,7 @@ pub struct Local<'a> {
     folder: &'a Folder,
     grouping: Grouping,
     command: &'a dyn Fn() -> Command,
-    server_ended: &'a dyn Fn() -> Option<String>,
+    server: &'a dyn Fn() -> Option<News>,
     workers: Vec<Worker>,
     /// What each cell may take at most, s of a process, as far as it was measured.
     most: Vec<Option<f64>>,
@@ -41,15 +41,15 @@ struct Worker {
 
 impl<'a> Local<'a> {
     /// `grouping.at_a_time` workers, started by `command`; each reads an [`Order`] and writes
-    /// [`Line`](super::Line)s. `server_ended` says how the server that they share ended, if it has.
+    /// [`Line`](super::Line)s. `server` says what has become of the server that they share, if anything.
     pub fn new(
         plan: &'a Plan,
         folder: &'a Folder,
         grouping: Grouping,
         command: &'a dyn Fn() -> Command,
-        server_ended: &'a dyn Fn() -> Option<String>,
+        server: &'a dyn Fn() -> Option<News>,
     ) -> Self {
-        Self { plan, folder, grouping, command, server_ended, workers: Vec::new(), most: Vec::new() }
+        Self { plan, folder, grouping, command, server, workers: Vec::new(), most: Vec::new() }
     }
 
     /// The same, which knows what cells may take at most, by their places in the plan, s of a process.
@@ -160,7 +160,7 @@ impl Backend for Local<'_> {
                 self.workers.push(worker);
             }
         }
-        news.extend((self.server_ended)().map(News::NoServer));
+        news.extend((self.server)());
         Ok(news)
     }
 
@@ -221,8 +221,8 @@ mod tests {
     }
 
     /// Runs with a shell script as a worker of one cell.
-    fn run_script(folder: &Folder, script: &str, stop: &StopFlag, server_ended: &dyn Fn() -> Option<String>) -> Ran {
-        run_grouped(Grouping { most: 1, at_a_time: 2 }, folder, script, stop, server_ended)
+    fn run_script(folder: &Folder, script: &str, stop: &StopFlag, server: &dyn Fn() -> Option<News>) -> Ran {
+        run_grouped(Grouping { most: 1, at_a_time: 2 }, folder, script, stop, server)
     }
 
     fn run_grouped(
@@ -230,7 +230,7 @@ mod tests {
         folder: &Folder,
         script: &str,
         stop: &StopFlag,
-        server_ended: &dyn Fn() -> Option<String>,
+        server: &dyn Fn() -> Option<News>,
     ) -> Ran {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let command = || {
@@ -238,14 +238,14 @@ mod tests {
             command.arg("-c").arg(format!("{BEGIN} {script}")).current_dir(folder.path());
             command
         };
-        let mut local = Local::new(&plan, folder, grouping, &command, server_ended);
+        let mut local = Local::new(&plan, folder, grouping, &command, server);
         let mut lines = Vec::new();
         let mut report = |report: Announcement<'_>| {
             if let Announcement::Line(line) = report {
                 lines.push(line.clone());
             }
         };
-        let end = run(&plan, folder, &mut local, &HashMap::new(), stop, &mut report);
+        let end = run(&plan, folder, &mut local, &HashMap::new(), Duration::ZERO, stop, &mut report);
         Ran { end, lines }
     }
 
@@ -352,7 +352,8 @@ mod tests {
     fn the_end_of_the_shared_server_is_that_of_the_run() {
         let (_directory, folder, _) = place();
         let stop = StopFlag::default();
-        let ran = run_script(&folder, "cat >/dev/null", &stop, &|| Some("the private server ended".into()));
+        let ran =
+            run_script(&folder, "cat >/dev/null", &stop, &|| Some(News::NoServer("the private server ended".into())));
         let message = ran.end.unwrap_err().to_string();
         assert!(message.starts_with("the run cannot go on without a server: the private server ended;"), "{message}");
     }

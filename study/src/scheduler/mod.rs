@@ -21,6 +21,7 @@ use crate::files::FileError;
 use crate::folder::{CellState, Failure, FailureMark, Folder};
 use crate::interrupt::StopFlag;
 use crate::plan::{Cell, Grouping, Plan, SELECTION_TEST, Tests};
+use crate::words::duration;
 pub use event::{CellEvent, Line, Order, OrderedCell, Teller, write_line};
 pub use local::Local;
 pub use pace::Pace;
@@ -35,13 +36,16 @@ pub(crate) use times::Times;
 
 /// How often in a row a cell may be broken off without getting any further.
 pub const MOST_ATTEMPTS: u32 = 3;
-/// How often in a row a cell may be without a server, or a disk, before the run ends: after some fifteen seconds, in which
-/// a server may have been started again.
-const MOST_LOST: u32 = 5;
+/// How often in a row a cell may be without a disk before the run ends, after some fifteen seconds.
+const MOST_FAULTS: u32 = 5;
+/// How long a cell is kept without a server at least before the run ends: one may be started again meanwhile.
+const LEAST_WAIT: Duration = Duration::from_secs(15);
 /// A cell that had a server for so long made some progress: what is lost then is not lost in a row.
 const HAD_A_SERVER: Duration = Duration::from_secs(60);
-/// How long nothing is begun after a cell had no server or no disk; doubled at each time in a row.
+/// How long nothing is begun after a cell had no server or no disk; doubled at each time in a row, …
 const PAUSE: Duration = Duration::from_secs(1);
+/// … up to this.
+const LONGEST_PAUSE: Duration = Duration::from_secs(30);
 /// How often the folder is looked at, and it is said how far the run is.
 const LOOK_INTERVAL: Duration = Duration::from_secs(1);
 /// A test episode takes about so much of the time of a training's: there are no updates, and many at a time.
@@ -193,7 +197,8 @@ pub enum RunError {
 type Result<T, E = RunError> = std::result::Result<T, E>;
 
 /// Does every cell of `plan` that has no result in `folder`, also those that had failed as is `forgiven` them, by their ids.
-/// Returns when no cell is left, also none that another run works on.
+/// Returns when no cell is left, also none that another run works on. A cell that has lost its server goes on from its last
+/// checkpoint, if need be for `server_wait`, or fifteen seconds, until there is one.
 ///
 /// # Errors
 /// [`RunError`]; the backend has then been stopped.
@@ -202,10 +207,11 @@ pub fn run(
     folder: &Folder,
     backend: &mut dyn Backend,
     forgiven: &HashMap<String, FailureMark>,
+    server_wait: Duration,
     stop: &StopFlag,
     report: &mut dyn FnMut(Announcement<'_>),
 ) -> Result<RunEnd> {
-    let mut scheduler = Scheduler::new(plan, folder, backend, forgiven, report);
+    let mut scheduler = Scheduler { server_wait, ..Scheduler::new(plan, folder, backend, forgiven, report) };
     let end = loop {
         match (scheduler.step(Instant::now()), stop.signal()) {
             (Ok(None), None) => std::thread::sleep(TICK),
@@ -237,7 +243,9 @@ struct Tracked {
     /// How far this attempt is.
     pace: Pace,
     lost_servers: usize,
+    /// How often in a row it had no server or no disk, and how long nothing was begun for that.
     lost_in_a_row: u32,
+    waited: Duration,
     /// When something first happened to it in this attempt: before its turn in a job, a cell takes no time; …
     begun: Option<Instant>,
     /// … had a server (looking for one, of which many may be silent, is not having one) …
@@ -271,6 +279,7 @@ struct Scheduler<'a> {
     times: Times<'a>,
     rates: Rates,
     paused_until: Option<Instant>,
+    server_wait: Duration,
     look_at: Option<Instant>,
 }
 
@@ -294,6 +303,7 @@ impl<'a> Scheduler<'a> {
             times: Times::default(),
             rates: Rates::default(),
             paused_until: None,
+            server_wait: Duration::ZERO,
             look_at: None,
         };
         let left: Vec<usize> = (0..plan.cells.len()).filter(|&cell| !scheduler.settled(cell)).collect();
@@ -364,13 +374,24 @@ impl<'a> Scheduler<'a> {
                 } else {
                     tracked.saved_before.is_some_and(|before| tracked.saved > before)
                 };
-                tracked.lost_in_a_row = if progressed { 1 } else { tracked.lost_in_a_row + 1 };
-                tracked.lost_servers += usize::from(lost_server);
-                if tracked.lost_in_a_row >= MOST_LOST {
-                    let words = format!("{}: {end}", self.id(cell));
-                    return Err(if lost_server { RunError::NoServer(words) } else { RunError::FileFault(words) });
+                if progressed {
+                    (tracked.lost_in_a_row, tracked.waited) = (0, Duration::ZERO);
                 }
-                let pause = PAUSE * (1 << (tracked.lost_in_a_row - 1));
+                tracked.lost_in_a_row += 1;
+                tracked.lost_servers += usize::from(lost_server);
+                let pause = LONGEST_PAUSE.min(PAUSE * (1 << (tracked.lost_in_a_row - 1).min(16)));
+                tracked.waited += pause;
+                let most = self.server_wait.max(LEAST_WAIT);
+                if lost_server && tracked.waited > most {
+                    return Err(RunError::NoServer(format!("{}: {end}", self.id(cell))));
+                } else if !lost_server && tracked.lost_in_a_row >= MOST_FAULTS {
+                    return Err(RunError::FileFault(format!("{}: {end}", self.id(cell))));
+                } else if lost_server && self.paused_until.is_none_or(|until| until < now) {
+                    let wait = duration((most + pause - tracked.waited).as_secs_f64());
+                    let words = format!("{}: {end}; waiting for it, at most {wait}", self.id(cell));
+                    (self.report)(Announcement::Note(&words));
+                }
+                let tracked = &mut self.cells[cell];
                 self.paused_until = self.paused_until.max(Some(now + pause));
                 // At the front: if the servers are gone, the run ends soon, however many cells it has.
                 tracked.phase = Phase::Waiting;

@@ -26,8 +26,15 @@ async fn mountain_cars(pool: &Pool, size: usize) -> Batch {
     let spec = tasks::catalogue().find("MountainCar").unwrap();
     let groups = vec![SlotGroup { size, episodes: common::settings(spec, Version::R, 1, 0, 1) }];
     let autoreset = Autoreset::SameStep;
-    let settings =
-        BatchSettings { spec, groups, autoreset, receipts: false, reward_terms: false, observe_parameters: false };
+    let settings = BatchSettings {
+        spec,
+        groups,
+        autoreset,
+        receipts: false,
+        receipt_arrays: false,
+        reward_terms: false,
+        observe_parameters: false,
+    };
     Batch::open(pool, settings).await.unwrap().0
 }
 

@@ -7,6 +7,7 @@ use perturb::{
     },
     scene::{Drawing, Scene, colour},
 };
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "Ball",
@@ -102,5 +103,14 @@ impl Environment for Ball {
         let &[x, velocity, distance] = state else { return Err(Error::Snapshot { reason: "three numbers".into() }) };
         (self.state, self.distance) = ([x, velocity], distance);
         Ok(())
+    }
+}
+
+/// Balls that the thread has freed that frees what sessions leave behind.
+pub static FREED: AtomicUsize = AtomicUsize::new(0);
+
+impl Drop for Ball {
+    fn drop(&mut self) {
+        FREED.fetch_add(usize::from(std::thread::current().name() == Some("free")), Ordering::Relaxed);
     }
 }

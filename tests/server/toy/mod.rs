@@ -8,11 +8,14 @@ use crate::{
 };
 use perturb::{
     config::{Arguments, Config},
-    proto::{Comparison, Open, Reset, Version},
+    proto::{Comparison, Open, Release, Reset, Version},
     server::{listen::Listener, run},
     tasks,
 };
-use std::thread::{self, JoinHandle};
+use std::{
+    sync::atomic::Ordering,
+    thread::{self, JoinHandle},
+};
 use tokio::sync::oneshot;
 
 /// A server in a thread of this process, with the catalogue that no program has.
@@ -113,4 +116,18 @@ async fn another_environment_is_a_world_of_dm_env_rpc() {
     agent.reset([].into()).await;
     agent.step(vector(&[0.0])).await;
     assert_eq!(agent.read("applied.mass").await, double(3.0));
+}
+
+#[tokio::test]
+async fn environments_are_freed_by_a_thread_that_nobody_waits_for() {
+    const N: u32 = 1000;
+    let server = InThread::start().await;
+    let freed = |before: usize| ball::FREED.load(Ordering::Relaxed) - before;
+    let before = freed(0);
+    let (mut session, _) = Session::open(&server.address, open("Ball", N, 1)).await;
+    let mask = [vec![1; 400], vec![0; 600]].concat().into();
+    session.ask(Release { mask }).await;
+    server::until("those that were released are freed", async || freed(before) >= 400).await;
+    drop(session);
+    server::until("all are freed", async || freed(before) >= N as usize).await;
 }

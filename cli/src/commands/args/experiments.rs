@@ -6,7 +6,7 @@ use clap::Args;
 use perturb_study::scheduler::slurm::TimeLimit;
 use perturb_study::{Grouping, Selection};
 
-use super::{ServerArgs, at_least_one, natural};
+use super::{ServerArgs, WaitArgs, at_least_one, natural};
 
 #[derive(Args, Debug)]
 pub struct PlanArgs {
@@ -76,6 +76,8 @@ pub struct RunArgs {
     pub engine: EngineArgs,
     #[command(flatten)]
     pub server: ServerArgs,
+    #[command(flatten)]
+    pub wait: WaitArgs,
 }
 
 /// Who schedules a run past one machine.

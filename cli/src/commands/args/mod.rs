@@ -7,6 +7,7 @@ mod training;
 use std::fmt::Display;
 use std::ops::RangeInclusive;
 use std::str::FromStr;
+use std::time::Duration;
 
 use clap::{Arg, ArgAction, Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 
@@ -105,11 +106,32 @@ pub struct ServerArgs {
     pub workers: Option<usize>,
 }
 
+/// How long servers are waited for.
+#[derive(Args, Clone, Copy, Debug)]
+pub struct WaitArgs {
+    /// How long to wait for servers that were lost, before giving up; what was begun then goes on, to the same bytes. The
+    /// server that perturb started itself it starts again; of several, those that are back will do. 0 does not wait.
+    #[arg(long, value_name = "SECONDS", default_value_t = Self::USUAL, value_parser = natural::<u32>)]
+    pub server_wait: u32,
+}
+
+impl WaitArgs {
+    /// Unless told otherwise, s.
+    pub const USUAL: u32 = 900;
+
+    /// As a time.
+    pub fn time(self) -> Duration {
+        Duration::from_secs(self.server_wait.into())
+    }
+}
+
 /// Where trained and tested policies play.
 #[derive(Args, Clone, Debug)]
 pub struct PlayArgs {
     #[command(flatten)]
     pub server: ServerArgs,
+    #[command(flatten)]
+    pub wait: WaitArgs,
     /// Where actions are chosen, which changes no byte: at the server, if it can, for a whole rollout at a time; or here, at
     /// every step.
     #[arg(long, value_name = "WHERE", default_value = "server", value_parser = ["server", "client"])]
@@ -158,7 +180,8 @@ mod tests {
         let refused: Vec<&str> =
             train.get_arg_conflicts_with(of("resume")).iter().map(|argument| argument.get_id().as_str()).collect();
         for argument in train.get_arguments().map(|argument| argument.get_id().as_str()) {
-            let accepted = ["resume", "extend", "server", "workers", "act", "threads", "help"].contains(&argument);
+            let accepted =
+                ["resume", "extend", "server", "server_wait", "workers", "act", "threads", "help"].contains(&argument);
             assert_ne!(refused.contains(&argument), accepted, "--{argument}");
         }
     }

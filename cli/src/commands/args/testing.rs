@@ -7,7 +7,7 @@ use perturb_study::sets::Assignment;
 use perturb_study::success::Rule;
 use perturb_study::{MOST_POINTS, Version};
 
-use super::{PlayArgs, ServerArgs, at_least_one, natural, within};
+use super::{PlayArgs, ServerArgs, WaitArgs, at_least_one, natural, within};
 use crate::video::PIXELS;
 
 #[derive(Args, Debug)]
@@ -81,8 +81,13 @@ pub struct AuditArgs {
     /// Play all recorded episodes again.
     #[arg(long, conflicts_with = "episodes")]
     pub all: bool,
+    /// Print JSON.
+    #[arg(long)]
+    pub json: bool,
     #[command(flatten)]
     pub server: ServerArgs,
+    #[command(flatten)]
+    pub wait: WaitArgs,
 }
 
 #[derive(Args, Debug)]
@@ -93,6 +98,9 @@ pub struct RatesArgs {
     /// tested with].
     #[arg(long, value_name = "text|code|QUANTITY=NUMBER", num_args = 1..)]
     pub success: Vec<Rule>,
+    /// Print JSON.
+    #[arg(long)]
+    pub json: bool,
 }
 
 #[derive(Args, Debug)]

@@ -9,7 +9,7 @@ use perturb_study::Version;
 use perturb_study::sets::Assignment;
 use perturb_study::settings::{Architecture, Observe, Preset, Settings};
 
-use super::{PlayArgs, ServerArgs, at_least_one, natural, within};
+use super::{PlayArgs, ServerArgs, WaitArgs, at_least_one, natural, within};
 
 #[derive(Args, Debug)]
 pub struct EnvsArgs {
@@ -119,6 +119,8 @@ pub struct DemoArgs {
     pub out: Option<PathBuf>,
     #[command(flatten)]
     pub server: ServerArgs,
+    #[command(flatten)]
+    pub wait: WaitArgs,
 }
 
 #[derive(Args, Debug)]

@@ -71,7 +71,7 @@ pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
         }
     }
     let report = folder.path().join("report");
-    for file in save_heatmaps(&heatmap_pictures(&selections, &folder)?, &report)? {
+    for file in save_heatmaps(&heatmap_pictures(&selections, Some(&folder))?, &report)? {
         writeln!(std::io::stdout(), "{}.png, .svg and .csv", report.join(file).display())?;
     }
     match count {

@@ -6,8 +6,8 @@ use std::process::Output;
 
 use super::{Experiment, PLAN, kill_all, succeeded};
 use crate::common::{perturb, stderr, wait_for};
-use perturb_study::Folder;
 use perturb_study::records::Records;
+use perturb_study::{CellState, Folder};
 
 #[test]
 fn a_report_is_the_same_however_often_the_run_was_broken_off() {
@@ -282,9 +282,10 @@ fn heatmaps_of_an_experiment_are_made_once_and_are_in_its_report() {
     assert_eq!(heatmap_files(&out), first, "the same bytes again");
     let name = damaged.file_stem().expect("a name").to_string_lossy().into_owned();
     let id = experiment.plan.cells.iter().map(|cell| &cell.id).find(|id| name.starts_with(*id)).expect("a cell");
-    let result = Folder::new(&out).cell(id).path().join("result.json");
-    let written = text(&result).replace("\"command\": \"perturb", "\"command\": \"/bin/perturb");
-    std::fs::write(&result, written).expect("written");
+    let place = Folder::new(&out).cell(id);
+    let Ok(CellState::Done(mut result)) = place.state() else { panic!("{id} has no result") };
+    result.command = format!("/bin/{}", result.command);
+    place.write_result(&result).expect("written");
     let outdated = experiment.page("out");
     assert!(embedded(&outdated).len() == 2 && outdated.contains("1: the heatmap is of an earlier result"));
     assert_eq!(made(&experiment, &["--seed", "3"]), (8, 0), "other settings, other heatmaps");

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command};
 
 use super::{Experiment, PLAN, children, kill_all, succeeded};
-use crate::common::{child_server, is_running, kill, perturb, stderr, wait_for};
+use crate::common::{child_server, ended, is_running, kill, perturb, stderr, wait_for};
 use perturb_learner::client::PrivateServer;
 use perturb_study::{CellResult, CellState, Counts, Folder, Plan};
 
@@ -46,7 +46,7 @@ fn a_group_whose_process_is_killed_is_done_all_the_same() {
     let worker = || children(run.id()).into_iter().find(|&id| Some(id) != child_server(run.id()));
     wait_for("a training", || experiment.attempts("out").iter().sum::<usize>() > 0);
     kill("-KILL", worker().expect("a worker"));
-    succeeded(&run.wait_with_output().expect("ended"));
+    succeeded(&ended(run));
     assert_eq!(experiment.results("out"), experiment.results("whole"));
 
     let told = std::fs::read_to_string(told).expect("lines");
@@ -93,7 +93,7 @@ fn two_runs_on_one_folder_share_the_cells() {
     let runs: Vec<Child> =
         (0..2).map(|_| experiment.command("out", &["--jobs", "2"]).spawn().expect("started")).collect();
     for run in runs {
-        succeeded(&run.wait_with_output().expect("ended"));
+        succeeded(&ended(run));
     }
     let cells = experiment.plan.cells.len();
     assert_eq!(experiment.results("out").len(), cells);
@@ -145,7 +145,7 @@ fn two_runs_that_try_again_at_once_try_each_cell_once() {
     wait_for("two runs", || told.iter().all(busy));
     drop(held);
     for run in runs {
-        let output = run.wait_with_output().expect("ended");
+        let output = ended(run);
         assert!(output.status.code() == Some(1) && stderr(&output).contains("8 of 8 cells failed"), "{output:?}");
     }
     assert_eq!(experiment.attempts("out"), vec![2; cells]);
@@ -193,7 +193,7 @@ fn a_signal_stops_the_workers_and_the_same_command_goes_on() {
         wait_for("trainings", || experiment.attempts("out").iter().sum::<usize>() > begun);
         let started = children(id);
         kill(name, id);
-        let output = child.wait_with_output().expect("ended");
+        let output = ended(child);
         assert_eq!(output.status.code(), Some(code), "{}", stderr(&output));
         assert!(stderr(&output).contains("the same command goes on"));
         wait_for("the end of what the run started", || !started.iter().any(|&id| is_running(id)));
@@ -207,11 +207,12 @@ fn a_lost_server_is_no_cells_failure() {
     let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 100000"));
     let server = PrivateServer::start(Some(1)).unwrap_or_else(|error| panic!("{error}"));
     let address = server.address().to_string();
-    let child = experiment.command("out", &["--jobs", "2", "--server", &address]).spawn().expect("started");
+    let mut command = experiment.command("out", &["--jobs", "2", "--server", &address, "--server-wait", "0"]);
+    let child = command.spawn().expect("started");
     let progress = experiment.out("out/cells").join(&experiment.plan.cells[0].id).join("training/progress.csv");
     wait_for("a training", || progress.exists());
     kill("-KILL", server.process_id());
-    let output = child.wait_with_output().expect("ended");
+    let output = ended(child);
     assert_eq!(output.status.code(), Some(1));
     assert!(stderr(&output).contains("cannot go on without a server"), "{}", stderr(&output));
     let folder = Folder::new(&experiment.out("out"));
@@ -219,6 +220,30 @@ fn a_lost_server_is_no_cells_failure() {
 
     let one = experiment.run("out", &["--cell", "0", "--server", &address]);
     assert!(one.status.code() == Some(2) && stderr(&one).contains("no server answers at"), "{}", stderr(&one));
+}
+
+#[test]
+fn a_run_starts_its_private_server_again_and_comes_to_the_same_results() {
+    let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 300, checkpoint_interval = 20"));
+    succeeded(&experiment.run("undisturbed", &["--jobs", "2"]));
+    let child = experiment.command("out", &["--jobs", "2"]).spawn().expect("started");
+    let mut killed = None;
+    for cell in [0, 3] {
+        let cell = experiment.out("out/cells").join(&experiment.plan.cells[cell].id);
+        wait_for("a checkpoint", || cell.join("training/checkpoint/checkpoint.json").exists());
+        let mut server = None;
+        wait_for("a private server", || {
+            server = child_server(child.id()).filter(|&id| is_running(id) && Some(id) != killed);
+            server.is_some()
+        });
+        kill("-KILL", server.expect("a private server"));
+        killed = server;
+    }
+    let output = ended(child);
+    succeeded(&output);
+    let said = stderr(&output);
+    assert_eq!(said.matches("the private server ended with signal: 9 (SIGKILL); it is started again").count(), 2);
+    assert_eq!(experiment.results("out"), experiment.results("undisturbed"));
 }
 
 #[test]
@@ -232,7 +257,7 @@ fn a_cell_that_somebody_works_on_is_left_alone_until_they_have_given_it_up() {
     let told = || std::fs::read_to_string(&told).expect("lines");
     wait_for("a worker", || told().contains(r#""event":"busy""#));
     drop(lock);
-    succeeded(&run.wait_with_output().expect("ended"));
+    succeeded(&ended(run));
     assert_eq!((experiment.results("out").len(), told().matches(r#""event":"done""#).count()), (1, 1));
 }
 

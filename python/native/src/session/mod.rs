@@ -137,6 +137,8 @@ impl Session {
             receipts,
             reward_terms,
             observe_parameters,
+            // Of one environment by itself a message is as good.
+            receipt_arrays: receipts && !self.actions.single,
             groups: Vec::new(),
         };
         {
@@ -157,7 +159,7 @@ impl Session {
         let come: Result<_, ClientError> = line.wait(py, opening, self.deadline(), &self.closing).map_err(explain)?;
         let (connection, stream, opened) = come.map_err(|error| failure::of(&error))?;
         let served = opened.environment.unwrap_or_default();
-        let labels = Arc::new(Labels::new(py, &served, n));
+        let labels = Arc::new(Labels::new(py, &served, n)?);
         let events = Events::begun(&labels, opened.started)?;
         std::mem::forget(unopened);
         self.put_back(py, Box::new(Open { stream, connection, line, labels, under_way: 0 }));

@@ -36,6 +36,8 @@ pub struct Task {
     pub workers: usize,
     /// Addresses of servers that all jobs share; empty for a private one in each job.
     pub servers: Vec<String>,
+    /// How long each job waits for servers that were lost, s.
+    pub server_wait: u32,
 }
 
 impl Task {
@@ -184,7 +186,7 @@ mod tests {
 
     #[test]
     fn a_job_asks_for_the_cores_that_it_uses() {
-        let task = Task { program: "/x".into(), jobs: 2, group: 36, workers: 3, servers: Vec::new() };
+        let task = Task { program: "/x".into(), jobs: 2, group: 36, workers: 3, servers: Vec::new(), server_wait: 0 };
         assert_eq!(task.cores(), 3);
         assert_eq!(Task { servers: vec!["a:1".into()], ..task }.cores(), 2);
     }

@@ -16,7 +16,7 @@ pub(super) fn script(task: &Task, folder: &Path, submission: &Path) -> Result<St
     } else {
         format!("--server {}", quoted(&task.servers.join(",")))
     };
-    let (jobs, group) = (task.jobs, task.group);
+    let (jobs, group, wait) = (task.jobs, task.group, task.server_wait);
     Ok(format!(
         r#"#!/bin/sh
 # One job of an array that `perturb run --engine slurm` submitted: it does the cells of its line in cells.txt.
@@ -32,7 +32,7 @@ if [ ! -x "$program" ]; then
     echo "perturb: $SLURMD_NODENAME finds no program $program: put it in a folder that all nodes see" >&2
     exit 1
 fi
-exec "$program" run {plan} --json --out {folder} --cell "$cells" --jobs {jobs} --group {group} {servers}
+exec "$program" run {plan} --json --out {folder} --cell "$cells" --jobs {jobs} --group {group} --server-wait {wait} {servers}
 "#
     ))
 }
@@ -64,7 +64,8 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         std::fs::write(directory.path().join("cells.txt"), "a,b\nc\n").unwrap();
         let program = directory.path().join("a program");
-        let mut task = Task { program: program.clone(), jobs: 2, group: 9, workers: 3, servers: Vec::new() };
+        let mut task =
+            Task { program: program.clone(), jobs: 2, group: 9, workers: 3, servers: Vec::new(), server_wait: 60 };
         let (succeeded, said) = run(&task, directory.path(), "0");
         assert!(!succeeded && said.contains("n1 finds no program") && said.contains("a program"), "{said}");
 
@@ -72,14 +73,17 @@ mod tests {
         let (succeeded, said) = run(&task, directory.path(), "0");
         let shown = directory.path().display();
         let expected = format!(
-            "[run][{shown}/plan.toml][--json][--out][{shown}/it's $HOME][--cell][a,b][--jobs][2][--group][9][--workers][3]"
+            "[run][{shown}/plan.toml][--json][--out][{shown}/it's $HOME][--cell][a,b][--jobs][2][--group][9][--server-wait][60][--workers][3]"
         );
         assert!(succeeded && said.starts_with(&expected), "{said}");
         assert!(said.contains("job 7_0 on n1, restarted 0 times"), "{said}");
 
         task.servers = vec!["one:1".into(), "two:2".into()];
         let (_, said) = run(&task, directory.path(), "1");
-        assert!(said.contains("[--cell][c][--jobs][2][--group][9][--server][one:1,two:2]"), "{said}");
+        assert!(
+            said.contains("[--cell][c][--jobs][2][--group][9][--server-wait][60][--server][one:1,two:2]"),
+            "{said}"
+        );
         let (succeeded, said) = run(&task, directory.path(), "2");
         assert!(!succeeded && said.contains("n1 finds no cells in"), "{said}");
     }

@@ -52,7 +52,7 @@ pub(super) fn options() -> SlurmOptions {
         time: None,
         array_limit: None,
         cells_per_job: Some(1),
-        task: Task { program: "/bin/true".into(), jobs: 1, group: 36, workers: 1, servers: Vec::new() },
+        task: Task { program: "/bin/true".into(), jobs: 1, group: 36, workers: 1, servers: Vec::new(), server_wait: 0 },
         queue_interval: Duration::from_secs(15),
     }
 }

@@ -1,0 +1,254 @@
+//! Servers are killed at random moments, and what goes on comes to the bytes that it comes to undisturbed.
+
+use std::fs::File;
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, SystemTime};
+
+use rstest::rstest;
+use tempfile::TempDir;
+
+use crate::common::{child_server, ended, kill, perturb, run, server, stderr, wait_for};
+use perturb_learner::checkpoint::Checkpoint;
+use perturb_learner::client::Servers;
+
+const PPO_CART_POLE: &str = "environment = 'CartPole'\nversion = 'R'\nalgorithm = 'ppo'\narchitecture = 'ff'\n\
+                             episodes = 800\nnum_envs = 8\nn_steps = 64\ncheckpoint_interval = 20";
+const A2C_PENDULUM: &str = "environment = 'Pendulum'\nversion = 'R'\nalgorithm = 'a2c'\narchitecture = 'ff'\n\
+                            episodes = 400\nnum_envs = 8\ncheckpoint_interval = 8";
+
+/// Whose servers are killed.
+#[derive(Clone, Copy, Debug, Hash)]
+enum Victim {
+    /// The only one, which the learner started itself.
+    Private,
+    /// The only one, which somebody starts again.
+    Named,
+    /// One of two, which somebody starts again.
+    OneOfTwo,
+}
+
+/// Numbers that follow from a seed.
+struct Dice(u64, u64);
+
+impl Dice {
+    /// Of the moment, and printed: a failure can be tried again with `PERTURB_SEED`.
+    fn new() -> Self {
+        let now = || SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).expect("a time").subsec_nanos();
+        let given = std::env::var("PERTURB_SEED").ok().map(|text| text.parse().expect("PERTURB_SEED is a number"));
+        let seed = given.unwrap_or_else(|| now().into());
+        println!("PERTURB_SEED={seed}");
+        Self(seed, 0)
+    }
+
+    fn below(&mut self, end: u64) -> u64 {
+        let mut hasher = DefaultHasher::new();
+        self.1 += 1;
+        (self.0, self.1).hash(&mut hasher);
+        hasher.finish() % end
+    }
+
+    fn wait(&mut self, from: u64, to: u64) {
+        std::thread::sleep(Duration::from_millis(from + self.below(to - from)));
+    }
+}
+
+/// A server at a socket, which can be killed and started again.
+struct Named {
+    socket: PathBuf,
+    child: Child,
+}
+
+impl Named {
+    fn new(folder: &Path, name: &str) -> Self {
+        let socket = folder.join(name);
+        let child = Self::start(&socket);
+        Self { socket, child }
+    }
+
+    fn start(socket: &Path) -> Child {
+        let program = Path::new(env!("CARGO_BIN_EXE_perturb")).with_file_name("perturb-server");
+        let mut command = Command::new(program);
+        command.arg("--listen").arg(format!("unix:{}", socket.display()));
+        command.args(["--log", "error", "--workers", "1", "--exit-with-stdin"]);
+        let child = command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn().expect("perturb-server");
+        wait_for("a server", || std::os::unix::net::UnixStream::connect(socket).is_ok());
+        child
+    }
+
+    fn address(&self) -> String {
+        format!("unix:{}", self.socket.display())
+    }
+
+    fn kill(&mut self) {
+        self.child.kill().and_then(|()| self.child.wait()).expect("killed");
+    }
+
+    fn restart(&mut self) {
+        self.child = Self::start(&self.socket);
+    }
+}
+
+impl Drop for Named {
+    fn drop(&mut self) {
+        let _ = self.child.kill(); // it may be killed already
+        let _ = self.child.wait();
+    }
+}
+
+/// The name of the policy's weights, and what the training counted.
+fn result(run: &Path) -> (String, u64, u64) {
+    let checkpoint = Checkpoint::load(run).expect("a checkpoint");
+    let counters = checkpoint.state.counters;
+    (checkpoint.id().expect("a name"), counters.episodes, counters.timesteps)
+}
+
+fn undisturbed(text: &str) -> (String, u64, u64) {
+    let local = server(1);
+    let servers = Servers::connect(std::slice::from_ref(local.address())).expect("a connection");
+    let (out, _) = run(&servers, text);
+    result(out.path())
+}
+
+/// Starts a training, whose words go to a file.
+fn train(folder: &TempDir, text: &str, arguments: &[&str]) -> (Child, PathBuf, PathBuf) {
+    let (settings, out, said) =
+        (folder.path().join("settings.toml"), folder.path().join("run"), folder.path().join("said"));
+    std::fs::write(&settings, text).expect("written");
+    let _ = std::fs::remove_dir_all(&out); // of the training before
+    let mut command = perturb(&["train", "--threads", "1"]);
+    command.arg("--config").arg(settings).arg("--out").arg(&out).args(arguments);
+    let child = command.stderr(File::create(&said).expect("a file")).spawn().expect("started");
+    (child, out, said)
+}
+
+/// Trains while servers are killed, so many times at most; gives how often, and what it came to.
+fn harassed(text: &str, victim: Victim, most: usize, dice: &mut Dice) -> (usize, (String, u64, u64)) {
+    let folder = tempfile::tempdir().expect("a directory");
+    let names: &[&str] = match victim {
+        Victim::Private => &[],
+        Victim::Named => &["a"],
+        Victim::OneOfTwo => &["a", "b"],
+    };
+    let mut named: Vec<Named> = names.iter().map(|name| Named::new(folder.path(), name)).collect();
+    let list = named.iter().map(Named::address).collect::<Vec<_>>().join(",");
+    let (mut child, out, said) = match victim {
+        Victim::Private => train(&folder, text, &["--workers", "1"]),
+        Victim::Named | Victim::OneOfTwo => train(&folder, text, &["--server", &list]),
+    };
+    // Before that, nothing is begun yet: a server that does not answer is a wrong one.
+    wait_for("a training", || out.join("progress.csv").exists());
+    let mut kills = 0;
+    while kills < most {
+        if child.try_wait().expect("a child").is_some() {
+            break;
+        }
+        if named.is_empty() {
+            let Some(id) = child_server(child.id()) else {
+                dice.wait(0, 50);
+                continue;
+            };
+            let _ = Command::new("kill").args(["-KILL", &id.to_string()]).status(); // it may have ended
+        } else {
+            let place = dice.below(named.len() as u64) as usize;
+            named[place].kill();
+            dice.wait(0, 300);
+            named[place].restart();
+        }
+        kills += 1;
+        dice.wait(0, 500);
+    }
+    let status = child.wait().expect("ended");
+    let said = std::fs::read_to_string(said).expect("words");
+    assert!(status.success(), "{status}: {said}");
+    (kills, result(&out))
+}
+
+#[rstest]
+#[case(PPO_CART_POLE, Victim::Private)]
+#[case(PPO_CART_POLE, Victim::OneOfTwo)]
+#[case(A2C_PENDULUM, Victim::Named)]
+#[case(A2C_PENDULUM, Victim::OneOfTwo)]
+fn a_training_outlives_its_servers_and_comes_to_the_same_weights(#[case] text: &str, #[case] victim: Victim) {
+    let (kills, got) = harassed(text, victim, 3, &mut Dice::new());
+    assert!(kills > 0, "it ended before anything was killed");
+    assert_eq!(got, undisturbed(text), "after {kills} kills");
+}
+
+/// `make kill-test`: some minutes.
+#[test]
+#[ignore = "takes minutes"]
+fn a_hundred_kills_change_no_weight() {
+    let mut dice = Dice::new();
+    for text in [PPO_CART_POLE, A2C_PENDULUM] {
+        let expected = undisturbed(text);
+        for victim in [Victim::Private, Victim::Named, Victim::OneOfTwo] {
+            let (mut kills, mut trainings) = (0, 0);
+            while kills < 17 {
+                let (more, got) = harassed(text, victim, 17 - kills, &mut dice);
+                (kills, trainings) = (kills + more, trainings + 1);
+                assert_eq!(got, expected, "{victim:?}, training {trainings}");
+            }
+            println!("{victim:?}: {kills} kills in {trainings} trainings, all {}", expected.0);
+        }
+    }
+}
+
+#[test]
+fn a_server_that_stays_away_is_done_without() {
+    let folder = tempfile::tempdir().expect("a directory");
+    let mut two = ["a", "b"].map(|name| Named::new(folder.path(), name));
+    let list = two.iter().map(Named::address).collect::<Vec<_>>().join(",");
+    let (mut child, out, said) = train(&folder, A2C_PENDULUM, &["--server", &list]);
+    wait_for("a training", || out.join("checkpoint/checkpoint.json").exists());
+    two[0].kill();
+    let status = child.wait().expect("ended");
+    let said = std::fs::read_to_string(said).expect("words");
+    assert!(status.success(), "{said}");
+    assert!(said.contains(&format!("lost the server at {} ", two[0].address())), "{said}");
+    assert!(said.contains(&format!("going on with {} alone", two[1].address())), "{said}");
+    assert_eq!(result(&out), undisturbed(A2C_PENDULUM));
+}
+
+#[test]
+fn a_signal_ends_a_training_that_waits_and_it_says_how_to_go_on() {
+    let folder = tempfile::tempdir().expect("a directory");
+    let mut one = Named::new(folder.path(), "a");
+    let (mut child, out, said) = train(&folder, A2C_PENDULUM, &["--server", &one.address()]);
+    wait_for("a checkpoint", || out.join("checkpoint/checkpoint.json").exists());
+    one.kill();
+    let words = || std::fs::read_to_string(&said).expect("words");
+    wait_for("it waits", || words().contains("; waiting for it, at most 15 min"));
+    assert!(child.try_wait().expect("a child").is_none(), "{}", words());
+    kill("-INT", child.id());
+    assert_eq!(child.wait().expect("ended").code(), Some(130), "{}", words());
+    let command = format!("perturb train --resume {} --server {}", out.display(), one.address());
+    assert!(words().contains("stopped by signal 2, waiting for a server: lost the server"), "{}", words());
+    assert!(words().trim_end().ends_with(&command), "{}", words());
+}
+
+#[test]
+fn a_test_outlives_its_server() {
+    let folder = tempfile::tempdir().expect("a directory");
+    let (mut child, out, said) = train(&folder, &A2C_PENDULUM.replace("= 400", "= 16"), &[]);
+    assert!(child.wait().expect("ended").success(), "{}", std::fs::read_to_string(said).expect("words"));
+    let mut command =
+        perturb(&["evaluate", "--versions", "D,E", "--episodes", "12000", "--json", "-", "--workers", "1"]);
+    command.arg("--checkpoint").arg(out);
+    let whole = command.output().expect("ended");
+    assert!(whole.status.success(), "{}", stderr(&whole));
+    let child = command.spawn().expect("started");
+    let mut victim = None;
+    wait_for("a server", || {
+        victim = child_server(child.id());
+        victim.is_some()
+    });
+    // Connected, and in the middle of it.
+    std::thread::sleep(Duration::from_millis(1500));
+    kill("-KILL", victim.expect("a server"));
+    let broken = ended(child);
+    assert!(broken.status.success(), "{}", stderr(&broken));
+    assert!(stderr(&broken).contains("the private server ended with signal: 9 (SIGKILL)"), "{}", stderr(&broken));
+    assert_eq!(broken.stdout, whole.stdout);
+}

@@ -1,0 +1,151 @@
+//! What is mutated: bytes that are taken as they are.
+
+use std::path::Path;
+
+use perturb::env::ActionSpace;
+use perturb::proto::act::Task;
+use perturb::proto::dm_env_rpc::v1 as rpc;
+use perturb::proto::dm_env_rpc::v1::environment_request::Payload;
+use perturb::proto::policy::Role;
+use perturb::proto::session_request::Request;
+use perturb::proto::session_response::Response;
+use perturb::proto::{
+    Act, AutoresetMode, Distribution, Interval, Open, Policy, RandomStream, Release, Render, Reset, SavePlayer,
+    SessionResponse, SlotGroup, Snapshot, Version,
+};
+use perturb::tasks;
+use perturb_policy::{ActionKind, PolicySpec};
+use prost::Message;
+
+use crate::server::{answers, frame, framed, head, open, steps};
+
+/// A policy that is kept, with a recorded test.
+const POLICY: &str = "results/beyond/confirm-2/cells/CartPole-ppo-ff-R-9bd6546b-s7";
+
+/// Those of the target of this name.
+pub fn seeds(name: &str) -> Vec<Vec<u8>> {
+    let environments = tasks::catalogue();
+    let names = || environments.names();
+    match name {
+        "requests" => names().flat_map(sessions).collect(),
+        "snapshots" => names().enumerate().flat_map(|(choice, name)| saved(choice, name)).collect(),
+        "worlds" => names().map(world).collect(),
+        "connections" => vec![
+            head(&[open("CartPole", 2), steps("CartPole", 2, 2)].concat()),
+            head(&[]),
+            b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n".to_vec(),
+        ],
+        "checkpoints" => {
+            let folder = kept(POLICY).join("training/checkpoint");
+            let document = std::fs::read(folder.join("checkpoint.json")).expect("a checkpoint");
+            let weights = std::fs::read_dir(folder).expect("its folder").flatten();
+            let weights = weights.map(|file| file.path()).find(|path| path.extension().is_some_and(|it| it != "json"));
+            let weights = std::fs::read(weights.expect("weights")).expect("weights");
+            let document: serde_json::Value = serde_json::from_slice(&document).expect("JSON");
+            let document = document.to_string();
+            let length = u16::try_from(document.len()).expect("a short document");
+            vec![[&length.to_le_bytes(), document.as_bytes(), &weights].concat()]
+        }
+        "records" => vec![std::fs::read(kept(POLICY).join("episodes.parquet")).expect("recorded")],
+        "plans" => ["quick", "classic-ff", "classic-rc", "paper", "beyond/confirm-2", "questions/pendulum"]
+            .map(|name| std::fs::read(kept("experiments").join(name).with_extension("toml")).expect("a file"))
+            .to_vec(),
+        _ => Vec::new(),
+    }
+}
+
+fn kept(path: &str) -> std::path::PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
+}
+
+/// Sessions with a request of each kind.
+fn sessions(environment: &str) -> [Vec<u8>; 3] {
+    let environments = tasks::catalogue();
+    let spec = environments.find(environment).expect("it has one");
+    let parameter = spec.parameters[0].name.to_owned();
+    let distribution = Distribution { intervals: vec![Interval { low: 1.0, high: 1.0 }] };
+    let parameters = || [(parameter.clone(), distribution.clone())].into();
+    let reset = Reset { mask: vec![1, 0].into(), seeds: vec![3], parameters: parameters(), ..Reset::default() };
+    let usual = [
+        open(environment, 2),
+        steps(environment, 2, 2),
+        framed(Request::Reset(reset)),
+        framed(Request::Snapshot(Snapshot::default())),
+        framed(Request::Render(Render { slot: 1, width: 16, height: 16 })),
+        framed(Request::Release(Release { mask: vec![0, 1].into() })),
+        steps(environment, 1, 1),
+    ];
+    let group =
+        SlotGroup { size: 2, version: Version::Extreme.into(), parameters: parameters(), ..SlotGroup::default() };
+    let groups = framed(Request::Open(Open {
+        environment: environment.into(),
+        autoreset_mode: AutoresetMode::NextStep.into(),
+        groups: vec![group.clone(), group],
+        receipts: true,
+        reward_terms: true,
+        observe_parameters: true,
+        ..Open::default()
+    }));
+    let action = match spec.action {
+        ActionSpace::Discrete(names) => ActionKind::Discrete { n: names.len() },
+        ActionSpace::Continuous(channels) => ActionKind::Continuous { size: channels.len() },
+    };
+    let shape = PolicySpec { observation_size: spec.observation.len(), action, hidden: vec![4], lstm: Some(2) };
+    let stream = RandomStream { key: vec![1; 32].into(), ..RandomStream::default() };
+    let policy = Policy { hidden: vec![4], lstm: 2, role: Some(Role::Training(stream)), ..Policy::default() };
+    let weights = vec![0; 4 * shape.n_weights()].into();
+    let act = Act { policy: Some(policy), weights, task: Some(Task::Steps(3)), ..Act::default() };
+    let acting =
+        [open(environment, 2), framed(Request::Act(act)), framed(Request::SavePlayer(SavePlayer::default()))].concat();
+    [usual.concat(), [groups, steps(environment, 4, 2)].concat(), acting]
+}
+
+/// Snapshots at the beginning, and some steps later.
+fn saved(choice: usize, environment: &str) -> Vec<Vec<u8>> {
+    let snapshot = || framed(Request::Snapshot(Snapshot::default()));
+    let body = [open(environment, 1), snapshot(), steps(environment, 1, 5), snapshot()].concat();
+    let replies = answers(body).into_iter().map(|reply| SessionResponse::decode(&reply[..]).expect("a reply"));
+    let choice = u8::try_from(choice).expect("few environments");
+    let snapshots = replies.filter_map(|reply| match reply.response {
+        Some(Response::Snapshot(taken)) => {
+            let (saved, _checksum) = taken.snapshots[0].split_last_chunk::<4>()?;
+            Some([&[choice][..], saved].concat())
+        }
+        _ => None,
+    });
+    let found: Vec<_> = snapshots.collect();
+    assert_eq!(found.len(), 2, "both are answered");
+    found
+}
+
+/// A world that is made, joined, stepped, reset, left and destroyed.
+fn world(environment: &str) -> Vec<u8> {
+    let text = |text: &str| rpc::Tensor {
+        payload: Some(rpc::tensor::Payload::Strings(rpc::tensor::StringArray { array: vec![text.into()] })),
+        ..rpc::Tensor::default()
+    };
+    let settings = [("env_id".to_owned(), text(environment)), ("version".to_owned(), text("R"))];
+    // The first world of a server has this name; what names another is refused.
+    let world_name = "world-1".to_owned();
+    let payloads = [
+        Payload::CreateWorld(rpc::CreateWorldRequest { settings: settings.into() }),
+        Payload::JoinWorld(rpc::JoinWorldRequest { world_name: world_name.clone(), ..Default::default() }),
+        Payload::Step(rpc::StepRequest { requested_observations: vec![1, 2], ..Default::default() }),
+        Payload::Reset(rpc::ResetRequest::default()),
+        Payload::ResetWorld(rpc::ResetWorldRequest { world_name: world_name.clone(), ..Default::default() }),
+        Payload::LeaveWorld(rpc::LeaveWorldRequest::default()),
+        Payload::DestroyWorld(rpc::DestroyWorldRequest { world_name }),
+    ];
+    let messages = payloads.map(|payload| rpc::EnvironmentRequest { payload: Some(payload) }.encode_to_vec());
+    messages.iter().flat_map(|message| frame(message)).collect()
+}
+
+/// How many replies a session's seed gets, and those that refuse something.
+pub fn replies(seed: &[u8]) -> (usize, Vec<String>) {
+    let replies = answers(seed.to_vec());
+    let refusal = |reply: &Vec<u8>| match SessionResponse::decode(&reply[..]).expect("a reply").response {
+        Some(Response::Error(error)) => Some(error.message),
+        _ => None,
+    };
+    (replies.len(), replies.iter().filter_map(refusal).collect())
+}

@@ -1,0 +1,230 @@
+//! The server, in this process, attacked over its socket. After each attack a bystander asks what it asked before, of
+//! both robots and a classic task, and must get the same bytes.
+
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+use std::time::Duration;
+
+use bytes::Bytes;
+use perturb::config::{Config, ListenAddress};
+use perturb::proto::session_request::Request;
+use perturb::proto::{AutoresetMode, Open, Restore, SessionRequest, Step, Version};
+use perturb::server::{self, listen::Listener};
+use perturb::tasks;
+use prost::Message;
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::net::UnixStream;
+use tokio::runtime::{Builder, Runtime};
+
+/// Longer than any answer takes on a busy machine, under a sanitizer.
+const PATIENCE: Duration = Duration::from_secs(60);
+/// Longer than a client thinks about what it sends.
+const PAUSE: Duration = Duration::from_millis(300);
+/// Calls' paths.
+const SESSION: &str = "/perturb.v1.Perturb/Session";
+const PROCESS: &str = "/dm_env_rpc.v1.Environment/Process";
+/// gRPC's code of a server's own mistake.
+const INTERNAL: &str = "13";
+
+/// The body of a session's stream: frames with requests.
+pub fn requests(data: &[u8]) {
+    attack(|socket| exchange(socket, SESSION, data.to_vec()));
+}
+
+/// A byte that chooses an environment, and a snapshot for it without its checksum, which is made good. What is taken is
+/// stepped.
+pub fn snapshots(data: &[u8]) {
+    let Some((&choice, snapshot)) = data.split_first() else { return };
+    let environments = tasks::catalogue();
+    let specs: Vec<_> = environments.specs().collect();
+    let environment = specs[usize::from(choice) % specs.len()].name;
+    let sealed = [snapshot, &crc32c::crc32c(snapshot).to_le_bytes()].concat();
+    let restore = Restore { mask: Bytes::new(), snapshots: vec![sealed.into()] };
+    let body = [open(environment, 1), framed(Request::Restore(restore)), steps(environment, 1, 3)].concat();
+    attack(|socket| exchange(socket, SESSION, body));
+}
+
+/// The body of a dm_env_rpc stream.
+pub fn worlds(data: &[u8]) {
+    attack(|socket| exchange(socket, PROCESS, data.to_vec()));
+}
+
+/// All that a client ever sends.
+pub fn connections(data: &[u8]) {
+    attack(async |socket| {
+        let mut connection = UnixStream::connect(socket).await.expect("the server listens");
+        // It may hang up at any time.
+        let _ = connection.write_all(data).await;
+        let _ = connection.shutdown().await;
+        let mut answer = Vec::new();
+        let _ = connection.read_to_end(&mut answer).await;
+        answer
+    });
+}
+
+/// A request in its frame.
+pub(crate) fn framed(request: Request) -> Vec<u8> {
+    frame(&SessionRequest { request: Some(request) }.encode_to_vec())
+}
+
+/// A message in its frame.
+pub(crate) fn frame(message: &[u8]) -> Vec<u8> {
+    let length = u32::try_from(message.len()).expect("a short message");
+    [&[0][..], &length.to_be_bytes(), message].concat()
+}
+
+/// Opens a session of `n` environments.
+pub(crate) fn open(environment: &str, n: u32) -> Vec<u8> {
+    framed(Request::Open(Open {
+        environment: environment.into(),
+        version: Version::Random.into(),
+        batch_size: n,
+        seed: 7,
+        autoreset_mode: AutoresetMode::SameStep.into(),
+        ..Open::default()
+    }))
+}
+
+/// Steps a session of `n` environments so many times.
+pub(crate) fn steps(environment: &str, n: usize, times: usize) -> Vec<u8> {
+    let width = match environment {
+        "Hopper" => 3,
+        "HalfCheetah" => 6,
+        _ => 1,
+    };
+    framed(Request::Step(Step { actions: vec![0; 4 * width * n].into() })).repeat(times)
+}
+
+/// Runs an attack, and looks whether the server is as before.
+fn attack<F: AsyncFnOnce(&'static Path) -> Vec<u8>>(attack: F) {
+    thread_local! {
+        static CLIENT: Runtime = Builder::new_current_thread().enable_all().build().expect("a runtime");
+    }
+    let socket = socket();
+    CLIENT.with(|client| {
+        client.block_on(async {
+            tokio::time::timeout(PATIENCE, attack(socket)).await.expect("an answer, or the connection's end");
+            let seen = tokio::time::timeout(PATIENCE, bystander(socket)).await.expect("an answer to a bystander");
+            assert!(seen == *expected(), "a bystander got other bytes");
+        });
+    });
+}
+
+/// Where the server listens, which is started first.
+fn socket() -> &'static Path {
+    static SOCKET: OnceLock<PathBuf> = OnceLock::new();
+    SOCKET.get_or_init(|| {
+        let folder = tempfile::tempdir().expect("a folder").keep();
+        let path = folder.join("server.sock");
+        let address = ListenAddress::Unix(path.clone());
+        let config =
+            Config { listen: vec![address.clone()], workers: 1, max_envs: 256, max_sessions: 64, ..Config::default() };
+        let (listening, listens) = std::sync::mpsc::channel();
+        std::thread::spawn(move || {
+            let runtime = Builder::new_current_thread().enable_all().build().expect("a runtime");
+            runtime.block_on(async {
+                let listener = Listener::bind(&address).await.expect("an address");
+                listening.send(()).expect("somebody waits");
+                let served = server::run(vec![listener], &config, tasks::catalogue(), std::future::pending()).await;
+                panic!("the server ended: {served:?}");
+            });
+        });
+        listens.recv().expect("a server");
+        path
+    })
+}
+
+/// What a bystander gets of a server that nobody attacked.
+fn expected() -> &'static Vec<u8> {
+    static EXPECTED: OnceLock<Vec<u8>> = OnceLock::new();
+    EXPECTED.get_or_init(|| {
+        let asked = std::thread::spawn(|| {
+            let runtime = Builder::new_current_thread().enable_all().build().expect("a runtime");
+            runtime.block_on(bystander(socket()))
+        });
+        asked.join().expect("an answer")
+    })
+}
+
+async fn bystander(socket: &Path) -> Vec<u8> {
+    let mut seen = Vec::new();
+    for environment in ["Hopper", "HalfCheetah", "Pendulum"] {
+        let body = [open(environment, 2), steps(environment, 2, 2)].concat();
+        seen.extend(exchange(socket, SESSION, body).await);
+    }
+    seen
+}
+
+/// The replies to a session's stream with this body.
+pub(crate) fn answers(body: Vec<u8>) -> Vec<Vec<u8>> {
+    let runtime = Builder::new_current_thread().enable_all().build().expect("a runtime");
+    let bytes = runtime.block_on(exchange(socket(), SESSION, body));
+    let mut rest = &bytes[..];
+    let mut replies = Vec::new();
+    while let Some((header, behind)) = rest.split_first_chunk::<5>() {
+        let length = u32::from_be_bytes([header[1], header[2], header[3], header[4]]) as usize;
+        let (reply, behind) = behind.split_at(length);
+        replies.push(reply.to_vec());
+        rest = behind;
+    }
+    replies
+}
+
+/// All that a client sends for a session's stream with this body, before it has heard anything.
+pub(crate) fn head(body: &[u8]) -> Vec<u8> {
+    let runtime = Builder::new_current_thread().enable_all().build().expect("a runtime");
+    runtime.block_on(async {
+        let (ours, mut theirs) = tokio::io::duplex(1 << 16);
+        let body = body.to_vec();
+        tokio::spawn(async move { call(ours, SESSION, body).await });
+        let mut sent = vec![0; 1 << 16];
+        let mut length = 0;
+        // It has said all once it waits.
+        while let Ok(Ok(more)) = tokio::time::timeout(PAUSE, theirs.read(&mut sent[length..])).await {
+            length += more;
+        }
+        sent.truncate(length);
+        sent
+    })
+}
+
+/// The bytes of the replies to a call with this body.
+async fn exchange(socket: &Path, path: &str, body: Vec<u8>) -> Vec<u8> {
+    let connection = loop {
+        match UnixStream::connect(socket).await {
+            Ok(connection) => break connection,
+            Err(error) if error.kind() == ErrorKind::WouldBlock => tokio::task::yield_now().await,
+            Err(error) => panic!("the server does not listen: {error}"),
+        }
+    };
+    call(connection, path, body).await
+}
+
+async fn call<T: AsyncRead + AsyncWrite + Unpin + Send + 'static>(connection: T, path: &str, body: Vec<u8>) -> Vec<u8> {
+    let (client, connection) = h2::client::handshake(connection).await.expect("HTTP/2");
+    let connection = tokio::spawn(connection);
+    let mut client = client.ready().await.expect("a connection");
+    let request = http::Request::post(format!("http://perturb{path}"))
+        .header("content-type", "application/grpc")
+        .header("te", "trailers");
+    let (response, mut upwards) = client.send_request(request.body(()).expect("a request"), false).expect("a stream");
+    let mut replies = Vec::new();
+    // The server may have had enough before it has all.
+    let _ = upwards.send_data(body.into(), true);
+    if let Ok(response) = response.await {
+        let mut downwards = response.into_body();
+        while let Some(Ok(data)) = downwards.data().await {
+            let _ = downwards.flow_control().release_capacity(data.len());
+            replies.extend_from_slice(&data);
+        }
+        if let Ok(Some(trailers)) = downwards.trailers().await {
+            let told = |name| trailers.get(name).map(|value| String::from_utf8_lossy(value.as_bytes()).into_owned());
+            let message = told("grpc-message").unwrap_or_default();
+            assert!(told("grpc-status").as_deref() != Some(INTERNAL) || !message.contains("defect"), "{message}");
+        }
+    }
+    drop(client);
+    connection.abort();
+    replies
+}

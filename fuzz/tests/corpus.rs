@@ -1,0 +1,114 @@
+//! Every attack for some seconds: seeds and the corpus as they are, and mutated at random, from a printed seed.
+
+use std::collections::BTreeMap;
+use std::io::Write;
+use std::path::Path;
+use std::sync::{Mutex, Once, PoisonError};
+
+use perturb_fuzz::{TARGETS, Target, replies, seeds};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
+
+/// Mutated inputs of each target, unless `PERTURB_FUZZ_INPUTS` says how many.
+const INPUTS: u64 = 200;
+
+/// What each target is attacked with at present.
+static SEEDS: Mutex<BTreeMap<String, u64>> = Mutex::new(BTreeMap::new());
+
+fn attack(name: &str) {
+    static HOOK: Once = Once::new();
+    HOOK.call_once(|| {
+        // A panic on one of the server's threads would only end that, and what tests print goes with the process.
+        std::panic::set_hook(Box::new(|panic| {
+            let seeds = SEEDS.lock().unwrap_or_else(PoisonError::into_inner);
+            let again = "each is repeated by PERTURB_FUZZ_SEED=SEED PERTURB_FUZZ_INPUTS=1";
+            let _ = writeln!(std::io::stderr(), "{panic}\nseeds under way: {seeds:?}; {again}");
+            std::process::abort();
+        }));
+    });
+    let Target { run, .. } = TARGETS.iter().find(|target| target.name == name).expect("a target");
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus").join(name);
+    let mut found: Vec<_> = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|file| file.path()).collect();
+    found.sort();
+    let found = found.iter().map(|path| std::fs::read(path).expect("a file"));
+    let inputs: Vec<Vec<u8>> = seeds(name).into_iter().chain(found).collect();
+    assert!(!inputs.is_empty());
+    inputs.iter().for_each(|input| run(input));
+    let number = |name: &str, usual| std::env::var(name).map_or(usual, |text| text.parse().expect("a number"));
+    let (count, first) = (number("PERTURB_FUZZ_INPUTS", INPUTS), number("PERTURB_FUZZ_SEED", 1));
+    for seed in first..first + count {
+        SEEDS.lock().unwrap_or_else(PoisonError::into_inner).insert(name.to_owned(), seed);
+        run(&mutated(&inputs, &mut ChaCha8Rng::seed_from_u64(seed)));
+    }
+}
+
+/// One of these, changed in a few places.
+fn mutated(inputs: &[Vec<u8>], random: &mut ChaCha8Rng) -> Vec<u8> {
+    let below = |random: &mut ChaCha8Rng, most: usize| random.next_u64() as usize % most.max(1);
+    let mut input = inputs[below(random, inputs.len())].clone();
+    for _ in 0..=below(random, 4) {
+        let (at, length) = (below(random, input.len()), below(random, 16));
+        let end = (at + length).min(input.len());
+        match below(random, 6) {
+            0 => input.truncate(at),
+            1 => drop(input.drain(at..end)),
+            2 => {
+                let part = input[at..end].to_vec();
+                input.splice(at..at, part.repeat(below(random, 8)));
+            }
+            3 => {
+                let other = &inputs[below(random, inputs.len())];
+                input.splice(at.., other[below(random, other.len())..].to_vec());
+            }
+            4 => input[at..end].fill([0, 0x7F, 0x80, 0xFF][below(random, 4)]),
+            _ if at < input.len() => input[at] ^= 1 << below(random, 8),
+            _ => {}
+        }
+    }
+    input
+}
+
+/// Mutations of what is refused at once reach little.
+#[test]
+fn seeds_of_sessions_are_answered_without_a_refusal() {
+    for seed in seeds("requests") {
+        let (number, mut refused) = replies(&seed);
+        refused.retain(|refusal| !refusal.contains("OpenGL")); // not every machine has it
+        assert!(number > 2 && refused.is_empty(), "{number} replies, {refused:?}");
+    }
+}
+
+#[test]
+fn requests() {
+    attack("requests");
+}
+
+#[test]
+fn snapshots() {
+    attack("snapshots");
+}
+
+#[test]
+fn worlds() {
+    attack("worlds");
+}
+
+#[test]
+fn connections() {
+    attack("connections");
+}
+
+#[test]
+fn checkpoints() {
+    attack("checkpoints");
+}
+
+#[test]
+fn records() {
+    attack("records");
+}
+
+#[test]
+fn plans() {
+    attack("plans");
+}

@@ -1,0 +1,82 @@
+//! Episodes with their receipts, as numbers in a row: what infos are made of, when somebody looks.
+
+use perturb_protocol::proto;
+use pyo3::prelude::*;
+
+use crate::failure::{MALFORMED, failure};
+
+/// Episodes with their receipts.
+#[derive(Default)]
+pub struct Told {
+    /// Where in the batch, which environment, trial and episode, and the episode's number in its trial.
+    pub episodes: Vec<[u64; 5]>,
+    /// `[m, P + Q]`: what was requested, then what was applied.
+    values: Vec<f64>,
+    /// P.
+    requested: usize,
+    /// P + Q.
+    width: usize,
+}
+
+impl Told {
+    /// None yet, of receipts with so many requested and applied values.
+    pub fn new(requested: usize, applied: usize) -> Self {
+        Self { requested, width: requested + applied, ..Self::default() }
+    }
+
+    /// Adds messages; those without a receipt are left out.
+    ///
+    /// # Errors
+    /// If receipts have other lengths.
+    pub fn with_messages<'a>(mut self, messages: impl Iterator<Item = Message<'a>>) -> PyResult<Self> {
+        for (slot, episode, receipt) in messages {
+            let (Some(episode), Some(receipt)) = (episode, receipt) else { continue };
+            if receipt.requested.len() != self.requested || receipt.applied.len() + self.requested != self.width {
+                return Err(misfit());
+            }
+            let proto::Episode { environment_index, trial_index, episode_index, episode_in_trial } = *episode;
+            let numbers = [slot.into(), environment_index.into(), trial_index, episode_index, episode_in_trial.into()];
+            self.episodes.push(numbers);
+            self.values.extend(receipt.requested.iter().chain(&receipt.applied));
+        }
+        Ok(self)
+    }
+
+    /// The same of arrays, cut in two behind the first `ended`.
+    ///
+    /// # Errors
+    /// If they do not fit each other.
+    pub fn split(&self, episodes: &[u8], values: &[u8], ended: usize) -> PyResult<[Self; 2]> {
+        let (words, numbers) = (episodes.as_chunks::<8>().0, values.as_chunks::<8>().0);
+        let m = words.len() / 5;
+        if episodes.len() != m * 40 || values.len() != m * self.width * 8 || m < ended {
+            return Err(misfit());
+        }
+        let part = |from: usize, to: usize| Self {
+            episodes: words.as_chunks::<5>().0[from..to].iter().map(|row| row.map(u64::from_le_bytes)).collect(),
+            values: numbers[from * self.width..to * self.width].iter().map(|word| f64::from_le_bytes(*word)).collect(),
+            ..*self
+        };
+        Ok([part(0, ended), part(ended, m)])
+    }
+
+    /// Which episodes there are, and of each its requested and applied values.
+    pub fn rows(&self) -> impl Iterator<Item = ([u64; 5], &[f64])> {
+        self.episodes.iter().copied().zip(self.values.chunks(self.width.max(1)))
+    }
+
+    /// The receipt of the `index`th; the model's hash is known elsewhere.
+    pub fn receipt(&self, index: usize, model_hash: &str) -> Option<proto::Receipt> {
+        let (_, values) = self.rows().nth(index)?;
+        let (requested, applied) = values.split_at(self.requested);
+        Some(proto::Receipt { requested: requested.into(), applied: applied.into(), model_hash: model_hash.into() })
+    }
+}
+
+/// A message: its slot, and what it says.
+pub type Message<'a> = (u32, Option<&'a proto::Episode>, Option<&'a proto::Receipt>);
+
+/// What is wrong with a server's episodes.
+pub fn misfit() -> PyErr {
+    failure(MALFORMED, 0, "the server sent episodes that do not fit the batch, or receipts of other lengths")
+}

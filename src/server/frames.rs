@@ -1,0 +1,261 @@
+//! Messages off the wire: gRPC's frames, each bounded by what its stream may send now, before anything of it is kept.
+//!
+//! tonic has one limit for all messages of a service, and decodes them on the transport's thread. So the streams of both
+//! protocols keep their bodies from it (`Kept`) and read them here.
+
+use super::{
+    budget::{Budget, Outbox, Share},
+    conversation::MOST_BYTES_BEFORE_OPEN,
+    peers::Connection,
+    replies::Replies,
+    status::Refusal,
+};
+use bytes::{Buf, Bytes, BytesMut};
+use http_body_util::BodyExt;
+use std::{
+    convert::Infallible,
+    future::Future,
+    pin::Pin,
+    sync::{Arc, Mutex, PoisonError},
+    task::{Context, Poll},
+    time::Duration,
+};
+use tonic::{Code, Status, body::Body, codegen::Service, codegen::http, server::NamedService};
+
+/// A frame's flag and its length.
+const HEADER: usize = 5;
+/// What a message may have before the budget is asked: as much as a session may send that is not open.
+const SMALL: usize = MOST_BYTES_BEFORE_OPEN;
+/// A message of so many bytes is worth an allocation of its own.
+const LARGE: usize = 1 << 20;
+
+/// What a stream may send now.
+#[derive(Debug, Clone, Copy)]
+pub struct Allowance {
+    /// The most bytes of a message.
+    pub bytes: usize,
+    /// The most entries of fields that have one for each environment.
+    pub entries: usize,
+    /// The bytes of a message for which the budget was asked already.
+    pub covered: usize,
+}
+
+/// A service one of whose methods, that at `path`, reads its requests from `Kept` and not from tonic.
+#[derive(Clone)]
+pub struct Keeping<S> {
+    service: S,
+    path: &'static str,
+    transit: Transit,
+}
+
+/// What requests and replies are subject to on their way.
+#[derive(Clone)]
+pub struct Transit {
+    /// What they take their bytes from.
+    pub budget: Budget,
+    /// How long a client may leave a message unfinished, or a reply unread.
+    pub limit: Option<Duration>,
+}
+
+impl<S> Keeping<S> {
+    /// Keeps the bodies of calls of this path.
+    pub fn new(service: S, path: &'static str, transit: Transit) -> Self {
+        Self { service, path, transit }
+    }
+}
+
+impl<S: NamedService> NamedService for Keeping<S> {
+    const NAME: &'static str = S::NAME;
+}
+
+impl<S> Service<http::Request<Body>> for Keeping<S>
+where
+    S: Service<http::Request<Body>, Response = http::Response<Body>, Error = Infallible>,
+    S::Future: Send + 'static,
+{
+    type Response = http::Response<Body>;
+    type Error = Infallible;
+    type Future = Pin<Box<dyn Future<Output = Result<Self::Response, Infallible>> + Send>>;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Infallible>> {
+        self.service.poll_ready(context)
+    }
+
+    fn call(&mut self, mut request: http::Request<Body>) -> Self::Future {
+        let (outbox, transit) = (Outbox::default(), self.transit.clone());
+        let connection = request.extensions().get::<Connection>().cloned();
+        let is_stream = request.uri().path() == self.path;
+        if is_stream {
+            let body = std::mem::take(request.body_mut());
+            let frames = Frames {
+                body,
+                buffer: BytesMut::new(),
+                message: None,
+                share: transit.budget.nothing(),
+                transit: transit.clone(),
+                connection: connection.clone(),
+                outbox: outbox.clone(),
+            };
+            request.extensions_mut().insert(Kept(Arc::new(Mutex::new(Some(frames)))));
+        }
+        // What is no stream is one small reply.
+        let limit = transit.limit.filter(|_| is_stream);
+        let response = self.service.call(request);
+        Box::pin(
+            async move { Ok(response.await?.map(|body| Body::new(Replies::new(body, outbox, connection, limit)))) },
+        )
+    }
+}
+
+/// A request's frames, as an extension of the request, which must be one that could be cloned.
+#[derive(Clone)]
+struct Kept(Arc<Mutex<Option<Frames>>>);
+
+/// The messages of a request's body, as they come.
+pub struct Frames {
+    body: Body,
+    /// What has come and not been taken.
+    buffer: BytesMut,
+    message: Option<Begun>,
+    /// Of the message that has begun.
+    share: Share,
+    transit: Transit,
+    /// Whom they are from.
+    pub connection: Option<Connection>,
+    /// Where the shares of their replies go.
+    pub outbox: Outbox,
+}
+
+/// A message that has begun.
+enum Begun {
+    /// It has so many bytes.
+    Wanted(usize),
+    /// There was no room for it. So many of its bytes have not come yet, and are thrown away.
+    Refused(usize, Refusal),
+}
+
+/// A message.
+pub enum Message {
+    /// Its bytes, with their share of the budget.
+    Whole(Bytes, Share),
+    /// The budget has no room for it.
+    Refused(Refusal),
+}
+
+impl Frames {
+    /// Those of a request whose body was kept.
+    ///
+    /// # Errors
+    /// Where it was not: a defect.
+    pub fn of<T>(request: &mut tonic::Request<T>) -> Result<Self, Status> {
+        let kept = request.extensions_mut().remove::<Kept>();
+        let frames = kept.and_then(|kept| kept.0.lock().unwrap_or_else(PoisonError::into_inner).take());
+        frames.ok_or_else(|| Status::internal("the request's body is not there: a defect of the server"))
+    }
+
+    /// What they take their bytes from.
+    pub fn budget(&self) -> &Budget {
+        &self.transit.budget
+    }
+
+    /// The next message; none at the client's end, whatever that looks like. To be called again if its future was dropped:
+    /// nothing is lost.
+    ///
+    /// # Errors
+    /// A status that ends the stream: the message is too large, or never ends, or what came is not gRPC.
+    pub async fn next(&mut self, allowance: Allowance) -> Result<Option<Message>, Status> {
+        loop {
+            if self.message.is_none() && self.buffer.len() >= HEADER {
+                self.message = Some(self.begin(allowance)?);
+            }
+            if let Some(whole) = self.taken() {
+                return Ok(Some(whole));
+            }
+            match self.frame().await? {
+                Some(Ok(frame)) => {
+                    if let Ok(data) = frame.into_data() {
+                        self.take(&data, allowance);
+                    }
+                }
+                Some(Err(status)) if status.code() == Code::Cancelled => return Ok(None),
+                Some(Err(status)) => return Err(status),
+                None if self.buffer.is_empty() && self.message.is_none() => return Ok(None),
+                None => return Err(Status::internal("the stream ended within a message")),
+            }
+        }
+    }
+
+    /// The next frame of HTTP's; within a message it must come in time.
+    async fn frame(&mut self) -> Result<Option<Result<http_body::Frame<Bytes>, Status>>, Status> {
+        let next = self.body.frame();
+        match self.transit.limit.filter(|_| self.message.is_some()) {
+            None => Ok(next.await),
+            Some(limit) => tokio::time::timeout(limit, next)
+                .await
+                .map_err(|_| Refusal::Unfinished { seconds: limit.as_secs() }.into()),
+        }
+    }
+
+    /// Reads a frame's header.
+    fn begin(&mut self, allowance: Allowance) -> Result<Begun, Status> {
+        match self.buffer.get_u8() {
+            0 => {}
+            1 => return Err(Status::internal("a message came compressed; send it as it is")),
+            flag => return Err(Status::internal(format!("a frame began with {flag}; expected 0: is it gRPC?"))),
+        }
+        let length = self.buffer.get_u32() as usize;
+        if length > allowance.bytes {
+            return Err(Refusal::TooLarge { got: length, limit: allowance.bytes }.into());
+        }
+        Ok(Begun::Wanted(length))
+    }
+
+    /// The message that has begun, if it is there.
+    fn taken(&mut self) -> Option<Message> {
+        match &mut self.message {
+            Some(Begun::Wanted(length)) if self.buffer.len() >= *length => {
+                let bytes = if *length < LARGE {
+                    self.buffer.split_to(*length).freeze()
+                } else {
+                    // Its memory goes with it; a part would keep the whole.
+                    let rest = BytesMut::from(&self.buffer[*length..]);
+                    let mut whole = std::mem::replace(&mut self.buffer, rest);
+                    whole.truncate(*length);
+                    whole.freeze()
+                };
+                self.message = None;
+                Some(Message::Whole(bytes, std::mem::replace(&mut self.share, self.transit.budget.nothing())))
+            }
+            Some(Begun::Refused(left, refusal)) => {
+                let come = (*left).min(self.buffer.len());
+                self.buffer.advance(come);
+                *left -= come;
+                let refused = (*left == 0).then(|| Message::Refused(refusal.clone()))?;
+                self.message = None;
+                Some(refused)
+            }
+            _ => None,
+        }
+    }
+
+    /// Takes bytes that came, with their share of the budget.
+    fn take(&mut self, data: &[u8], allowance: Allowance) {
+        if let Some(Begun::Wanted(length)) = self.message {
+            let free = allowance.covered.max(SMALL);
+            let beyond = |bytes: usize| bytes.min(length).saturating_sub(free);
+            let (before, after) = (beyond(self.buffer.len()), beyond(self.buffer.len() + data.len()));
+            if let Err(refusal) = self.share.grow(after - before) {
+                self.share = self.transit.budget.nothing();
+                // What has come of it goes with its memory.
+                let come = std::mem::take(&mut self.buffer).len();
+                self.message = Some(Begun::Refused(length - come, refusal));
+            }
+            if self.buffer.capacity() - self.buffer.len() < data.len() {
+                // By doubling, and not all that was announced: a client that announces much need not send it.
+                let rest = length.saturating_sub(self.buffer.len());
+                self.buffer.reserve(rest.min(self.buffer.len()).max(data.len()));
+            }
+        }
+        self.buffer.extend_from_slice(data);
+    }
+}

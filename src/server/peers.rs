@@ -1,0 +1,226 @@
+//! Who is at the other end: places by peer, the time that a connection has to begin, and how one is ended.
+
+use futures_util::task::AtomicWaker;
+use std::{
+    collections::BTreeMap,
+    future::Future,
+    io::{self, ErrorKind, IoSlice},
+    net::IpAddr,
+    pin::Pin,
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
+    task::{Context, Poll},
+    time::Duration,
+};
+use tokio::{
+    io::{AsyncRead, AsyncWrite, ReadBuf},
+    time::{Sleep, sleep},
+};
+use tonic::transport::server::Connected;
+
+/// What a client of HTTP/2 sends first, in bytes.
+const PREFACE: usize = 24;
+
+/// Whom a connection is from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Peer {
+    /// A machine.
+    Machine(IpAddr),
+    /// A user of this machine, by a Unix socket; none where the system does not tell.
+    User(Option<u32>),
+}
+
+/// Places, of which there are so many in all and for each peer.
+#[derive(Clone)]
+pub struct Places(Arc<State>);
+
+struct State {
+    all: usize,
+    each: usize,
+    taken: Mutex<(usize, BTreeMap<Peer, usize>)>,
+}
+
+/// Why there is no place.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Full {
+    /// All are taken.
+    All(usize),
+    /// The peer has as many as it may.
+    Peer(usize),
+}
+
+/// A place, until it is dropped.
+pub struct Place {
+    places: Places,
+    peer: Option<Peer>,
+}
+
+impl Places {
+    /// So many in all, and for each peer.
+    pub fn new(all: usize, each: usize) -> Self {
+        Self(Arc::new(State { all, each, taken: Mutex::default() }))
+    }
+
+    /// A place for a peer. One that is not known has no quota of its own.
+    ///
+    /// # Errors
+    /// [`Full`].
+    pub fn take(&self, peer: Option<Peer>) -> Result<Place, Full> {
+        let mut taken = self.lock();
+        let (all, by_peer) = &mut *taken;
+        if *all >= self.0.all {
+            return Err(Full::All(self.0.all));
+        }
+        if let Some(peer) = peer {
+            let its = by_peer.entry(peer).or_default();
+            if *its >= self.0.each {
+                return Err(Full::Peer(self.0.each));
+            }
+            *its += 1;
+        }
+        *all += 1;
+        Ok(Place { places: self.clone(), peer })
+    }
+
+    fn lock(&self) -> MutexGuard<'_, (usize, BTreeMap<Peer, usize>)> {
+        self.0.taken.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        let mut taken = self.places.lock();
+        let (all, by_peer) = &mut *taken;
+        *all -= 1;
+        if let Some(peer) = self.peer
+            && let Some(its) = by_peer.get_mut(&peer)
+        {
+            *its -= 1;
+            if *its == 0 {
+                by_peer.remove(&peer);
+            }
+        }
+    }
+}
+
+/// A connection, as its calls see it.
+#[derive(Clone)]
+pub struct Connection {
+    /// Whom it is from.
+    pub peer: Peer,
+    end: Arc<End>,
+}
+
+#[derive(Default)]
+struct End {
+    came: AtomicBool,
+    waker: AtomicWaker,
+}
+
+impl Connection {
+    /// Ends it, with all its calls.
+    pub fn end(&self) {
+        self.end.came.store(true, Ordering::Release);
+        self.end.waker.wake();
+    }
+}
+
+/// A connection's bytes. It fails if its client's first do not come in time, and once it is ended.
+pub struct Guarded<S> {
+    stream: S,
+    connection: Connection,
+    /// The bytes of the preface that have not come, and until when they may.
+    preface: Option<(usize, Pin<Box<Sleep>>)>,
+    _place: Place,
+}
+
+impl<S> Guarded<S> {
+    /// Gives the client so long to begin.
+    pub fn new(stream: S, peer: Peer, place: Place, limit: Duration) -> Self {
+        let preface = Some((PREFACE, Box::pin(sleep(limit))));
+        Self { stream, connection: Connection { peer, end: Arc::default() }, preface, _place: place }
+    }
+
+    fn check(&self, context: &Context<'_>) -> io::Result<()> {
+        self.connection.end.waker.register(context.waker());
+        let ended = self.connection.end.came.load(Ordering::Acquire);
+        if ended { Err(ErrorKind::ConnectionAborted.into()) } else { Ok(()) }
+    }
+}
+
+impl<S> Connected for Guarded<S> {
+    type ConnectInfo = Connection;
+
+    fn connect_info(&self) -> Connection {
+        self.connection.clone()
+    }
+}
+
+impl<S: AsyncRead + Unpin> AsyncRead for Guarded<S> {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        self.check(context)?;
+        let before = buffer.filled().len();
+        let polled = Pin::new(&mut self.stream).poll_read(context, buffer);
+        if let Some((left, limit)) = &mut self.preface {
+            *left = left.saturating_sub(buffer.filled().len() - before);
+            if *left == 0 {
+                self.preface = None;
+            } else if limit.as_mut().poll(context).is_ready() {
+                return Poll::Ready(Err(ErrorKind::TimedOut.into()));
+            }
+        }
+        polled
+    }
+}
+
+impl<S: AsyncWrite + Unpin> AsyncWrite for Guarded<S> {
+    fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        self.check(context)?;
+        Pin::new(&mut self.stream).poll_write(context, bytes)
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        parts: &[IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        self.check(context)?;
+        Pin::new(&mut self.stream).poll_write_vectored(context, parts)
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        self.stream.is_write_vectored()
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_flush(context)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_shutdown(context)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_peer_takes_its_own_places_and_no_more() {
+        let [one, other] = [1, 2].map(|user| Some(Peer::User(Some(user))));
+        let places = Places::new(4, 2);
+        let [first, _second] = [places.take(one), places.take(one)].map(Result::unwrap);
+        assert_eq!(places.take(one).err(), Some(Full::Peer(2)));
+        let _others = [places.take(other), places.take(None)].map(Result::unwrap);
+        assert_eq!(places.take(other).err(), Some(Full::All(4)));
+        drop(first);
+        assert!(places.take(one).is_ok());
+        assert!(places.take(one).is_ok(), "that place was given back");
+    }
+}

@@ -1,0 +1,107 @@
+//! Replies on their way to the wire: their shares of the budget go with their bytes, and a client that holds shares and
+//! does not read loses its connection.
+
+use super::{budget::Outbox, peers::Connection};
+use bytes::Bytes;
+use http_body::{Body as HttpBody, Frame, SizeHint};
+use std::{
+    pin::Pin,
+    sync::{Arc, Mutex, PoisonError, Weak},
+    task::{Context, Poll},
+    time::Duration,
+};
+use tokio::time::{Instant, sleep};
+use tonic::{Status, body::Body};
+
+/// How often a stalled stream is looked after within its time.
+const LOOKS: u32 = 4;
+
+/// A response's body.
+pub struct Replies {
+    body: Body,
+    outbox: Outbox,
+    waiting: Arc<Waiting>,
+}
+
+/// How many replies with shares wait for the client to read, and since when it has read none of them to its end.
+struct Waiting(Mutex<(usize, Instant)>);
+
+impl Waiting {
+    /// One more, or one less.
+    fn change(&self, change: impl FnOnce(usize) -> usize) {
+        let mut waiting = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let (before, after) = (waiting.0, change(waiting.0));
+        waiting.0 = after;
+        if before == 0 || after < before {
+            waiting.1 = Instant::now();
+        }
+    }
+
+    fn elapsed(&self) -> Duration {
+        let (replies, since) = *self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if replies == 0 { Duration::ZERO } else { since.elapsed() }
+    }
+}
+
+/// A reply that waits, until it is dropped.
+struct Unread(Arc<Waiting>);
+
+impl Unread {
+    fn new(waiting: &Arc<Waiting>) -> Self {
+        waiting.change(|replies| replies + 1);
+        Self(Arc::clone(waiting))
+    }
+}
+
+impl Drop for Unread {
+    fn drop(&mut self) {
+        self.0.change(|replies| replies - 1);
+    }
+}
+
+impl Replies {
+    /// A body whose replies' shares are in the outbox. If its client does not read such a reply within `limit`, its
+    /// connection ends.
+    pub fn new(body: Body, outbox: Outbox, connection: Option<Connection>, limit: Option<Duration>) -> Self {
+        let waiting = Arc::new(Waiting(Mutex::new((0, Instant::now()))));
+        if let (Some(connection), Some(limit)) = (connection, limit) {
+            tokio::spawn(watch(Arc::downgrade(&waiting), connection, limit));
+        }
+        Self { body, outbox, waiting }
+    }
+}
+
+/// Ends the connection when its client has read nothing for that long.
+async fn watch(waiting: Weak<Waiting>, connection: Connection, limit: Duration) {
+    loop {
+        sleep(limit / LOOKS).await;
+        match waiting.upgrade() {
+            None => return,
+            Some(waiting) if waiting.elapsed() > limit => {
+                let seconds = limit.as_secs();
+                tracing::warn!(peer = ?connection.peer, seconds, "ended a connection that did not read its replies");
+                return connection.end();
+            }
+            Some(_) => {}
+        }
+    }
+}
+
+impl HttpBody for Replies {
+    type Data = Bytes;
+    type Error = Status;
+
+    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        let Self { body, outbox, waiting } = &mut *self;
+        let polled = Pin::new(body).poll_frame(context);
+        polled.map_ok(|frame| frame.map_data(|bytes| outbox.send(bytes, || Unread::new(waiting))))
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}

@@ -1,0 +1,88 @@
+//! How many bytes requests and replies have, before they are made: what a batch can need, and what the budget is asked for.
+
+use crate::{
+    env::{self, ActionSpace},
+    pool::{Autoreset, Batch, BatchSettings, Turn},
+    proto,
+    render::Size,
+};
+
+/// A request's bytes beside what it has for each environment: parameters, and mistakes that deserve an answer.
+const REST_OF_A_REQUEST: usize = 1 << 20;
+/// The most bytes of a number, tag included.
+const LONGEST_NUMBER: usize = 11;
+/// What an episode's end takes, and with a receipt, roughly: as it is computed and as it is sent.
+const END: usize = 300;
+const RECEIPT: usize = 500;
+/// A snapshot, roughly.
+const SNAPSHOT: usize = 2 << 10;
+
+/// Entries of an action.
+fn action_width(settings: &BatchSettings) -> usize {
+    match settings.spec.action {
+        ActionSpace::Discrete(_) => 1,
+        ActionSpace::Continuous(channels) => channels.len(),
+    }
+}
+
+/// The most bytes of a request that a batch can need. Weights are as many as a policy has, which any session may send
+/// that the server can act for.
+pub fn most_of_a_request(batch: &Batch) -> usize {
+    let settings = batch.settings();
+    if settings.autoreset == Autoreset::SameStep {
+        return usize::MAX;
+    }
+    let reset = 1 + LONGEST_NUMBER + 8 * settings.spec.state.len();
+    let restore = 1 + 2 * LONGEST_NUMBER + env::MOST_SNAPSHOT_BYTES;
+    REST_OF_A_REQUEST.saturating_add(batch.size().saturating_mul(reset.max(restore)))
+}
+
+/// A step's request.
+pub fn step_request(settings: &BatchSettings, envs: usize) -> usize {
+    envs.saturating_mul(4 * action_width(settings))
+}
+
+/// What a session holds as long as it is open, so that no step is refused for what others hold: a step's request and two
+/// replies, one being computed and one being sent.
+pub fn session(settings: &BatchSettings, envs: usize) -> usize {
+    let numbers = 2 * settings.observation_size() + 1 + settings.spec.reward_terms.len();
+    let ends = if settings.receipts { 2 * RECEIPT } else { END };
+    let reply = envs.saturating_mul(4 * numbers + 2 + ends);
+    step_request(settings, envs).saturating_add(reply.saturating_mul(2))
+}
+
+/// The snapshots of so many environments.
+pub fn snapshots(envs: usize) -> usize {
+    envs.saturating_mul(SNAPSHOT)
+}
+
+/// Snapshots that were taken.
+pub fn taken(snapshots: &[bytes::Bytes]) -> usize {
+    snapshots.iter().map(|snapshot| snapshot.len() + size_of::<bytes::Bytes>()).sum()
+}
+
+/// A picture.
+pub fn picture(size: Size) -> usize {
+    3 * usize::from(size.width) * usize::from(size.height)
+}
+
+/// What the server keeps of a policy that plays: its weights as they came and as they are computed with, and what it
+/// computes in each environment.
+pub fn policy(request: &proto::Act, envs: usize) -> usize {
+    let widths = request.policy.as_ref().map_or(0, |policy| {
+        policy.hidden.iter().chain([&policy.lstm]).map(|&width| width as usize).fold(0, usize::saturating_add)
+    });
+    (2 * request.weights.len()).saturating_add(envs.saturating_mul(widths).saturating_mul(16))
+}
+
+/// The most of a turn's reply.
+pub fn reply_to(turn: &Turn, batch: &Batch) -> usize {
+    let settings = batch.settings();
+    // Flags, values and the like beside observations and two times the action: as sampled, and as an input.
+    let numbers = settings.observation_size() + 2 * action_width(settings) + 10;
+    let step = batch.size().saturating_mul(4 * numbers + RECEIPT);
+    step.saturating_mul(turn.most_steps).min(REPLY.saturating_add(step))
+}
+
+/// Where a turn's reply is cut, roughly.
+const REPLY: usize = 4_000_000;

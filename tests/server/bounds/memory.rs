@@ -1,0 +1,204 @@
+//! How much memory clients may take, and for how long.
+
+use super::{
+    Neighbour,
+    client::{Connection, LIST, SESSION, framed},
+};
+use crate::common::server::{Server, Session, open, until, within};
+use bytes::Bytes;
+use perturb::proto::{
+    Act, AutoresetMode, Open, Render, SessionRequest, session_request::Request, session_response::Response,
+};
+use prost::Message;
+use std::time::{Duration, Instant};
+use tonic::Code;
+
+/// What a server takes beside what it counts: its allocator's, HTTP/2's, and what tests cannot see.
+const REST: usize = 150 << 20;
+
+fn message(request: impl Into<Request>) -> Vec<u8> {
+    SessionRequest { request: Some(request.into()) }.encode_to_vec()
+}
+
+fn same_step(environment: &str, n: u32) -> Open {
+    Open { autoreset_mode: AutoresetMode::SameStep.into(), ..open(environment, n, 1) }
+}
+
+#[tokio::test]
+async fn unfinished_messages_take_no_more_than_the_budget() {
+    const LENGTH: usize = 30 << 20;
+    let server = Server::start(&["--max-memory", "100000000"]);
+    let neighbour = Neighbour::start(server.unix());
+    let before = server.memory();
+    let half = Bytes::from(vec![0; LENGTH - 1]);
+    let mut connections = Vec::new();
+    let mut calls = Vec::new();
+    // 600 MB.
+    for _ in 0..20 {
+        let mut connection = Connection::new(server.port(), 1 << 20).await;
+        let mut call = connection.call(SESSION).await.unwrap();
+        assert!(call.send_message(&message(same_step("CartPole", 1))).await);
+        assert!(call.receive().await.is_some());
+        call.send(framed(LENGTH, &[])).await;
+        assert!(call.send(half.clone()).await, "what has no room is read and thrown away");
+        connections.push(connection);
+        calls.push(call);
+    }
+    let grown = server.peak_memory() - before;
+    println!("the server took {} MB more", grown >> 20);
+    assert!(grown < 100_000_000 + REST, "the server took {grown} bytes more");
+    neighbour.was_not_held_up();
+    // The last is refused in its place, and its session goes on.
+    let mut last = calls.pop().unwrap();
+    assert!(last.send(Bytes::from_static(&[0])).await);
+    let reply = last.receive().await.unwrap();
+    let refusal = String::from_utf8_lossy(&reply);
+    assert!(refusal.contains("of the server's 100000000"), "{refusal}");
+    assert!(last.send_message(&message(perturb::proto::Step { actions: vec![0; 4].into() })).await);
+    assert!(last.receive().await.is_some());
+    // What the others held is free when they are gone.
+    drop((last, calls, connections));
+    let (mut session, _) = Session::open(server.tcp(), same_step("CartPole", 1)).await;
+    until("there is room for a large request", async || {
+        session.refused(Act { weights: vec![0; LENGTH].into(), ..Act::default() }).await.0 != Code::ResourceExhausted
+    })
+    .await;
+}
+
+#[tokio::test]
+async fn pictures_that_nobody_reads_take_no_more_than_the_budget() {
+    let server = Server::start(&["--max-memory", "100000000"]);
+    let neighbour = Neighbour::start(server.unix());
+    let before = server.memory();
+    let (mut connections, mut calls) = (Vec::new(), Vec::new());
+    // 1.2 GB.
+    for _ in 0..100 {
+        let mut connection = Connection::new(server.port(), 1 << 16).await;
+        let mut call = connection.call(SESSION).await.unwrap();
+        assert!(call.send_message(&message(open("MountainCar", 1, 1))).await);
+        assert!(call.receive().await.is_some());
+        assert!(call.send_message(&message(Render { slot: 0, width: 2048, height: 2048 })).await);
+        connections.push(connection);
+        calls.push(call);
+    }
+    // Another asks until it is refused: there is no room for more.
+    let (mut other, _) = Session::open(server.tcp(), open("MountainCar", 1, 1)).await;
+    let start = Instant::now();
+    loop {
+        match other.answer(Render { slot: 0, width: 2048, height: 2048 }).await {
+            Response::Error(error) => {
+                assert_eq!(error.code, Code::ResourceExhausted as i32, "{error:?}");
+                break;
+            }
+            _ => assert!(start.elapsed() < Duration::from_secs(60), "it is never refused"),
+        }
+    }
+    // Time to draw those that wait for their turn.
+    tokio::time::sleep(Duration::from_secs(2)).await;
+    let grown = server.peak_memory() - before;
+    println!("the server took {} MB more", grown >> 20);
+    assert!(grown < 100_000_000 + REST, "the server took {grown} bytes more");
+    neighbour.was_not_held_up();
+    // Those who leave make room.
+    drop((calls, connections));
+    until("there is room for a picture", async || {
+        matches!(other.answer(Render { slot: 0, width: 2048, height: 2048 }).await, Response::Render(_))
+    })
+    .await;
+}
+
+#[tokio::test]
+async fn a_session_for_which_there_is_no_room_is_refused_and_those_that_are_open_step_on() {
+    let server = Server::start(&["--max-memory", "6000000"]);
+    let (mut first, _) = Session::open(server.tcp(), open("CartPole", 2_000, 1)).await;
+    let mut second = Session::connect(server.tcp()).await;
+    let (code, message) = second.refused(open("CartPole", 2_000, 1)).await;
+    assert_eq!(code, Code::ResourceExhausted, "{message}");
+    assert!(message.contains("of the server's 6000000"), "{message}");
+    for _ in 0..10 {
+        first.step(vec![0; 8_000].into()).await;
+    }
+    drop(first);
+    until("there is room", async || matches!(second.answer(open("CartPole", 2_000, 1)).await, Response::Opened(_)))
+        .await;
+}
+
+#[tokio::test]
+async fn a_snapshot_of_empty_lists_takes_no_memory() {
+    let server = Server::start(&[]);
+    let (mut session, _) = Session::open(server.tcp(), same_step("CartPole", 1)).await;
+    let good = session.snapshot(&[]).await.remove(0);
+    let before = server.memory();
+    // As many parameters as there are bytes, each with an empty list of intervals.
+    let name = good.windows(8).position(|window| window == b"CartPole").unwrap();
+    for at in name + 8..good.len().min(name + 100) {
+        let mut bad = good[..at].to_vec();
+        bad.extend_from_slice(&[0x80, 0x80, 0x80, 0x08]);
+        bad.resize(16 << 20, 0);
+        let restore = perturb::proto::Restore { mask: Bytes::new(), snapshots: vec![bad.into()] };
+        let (code, message) = session.refused(restore).await;
+        assert_eq!(code, Code::InvalidArgument, "{message}");
+    }
+    let grown = server.peak_memory().saturating_sub(before);
+    println!("the server took {} MB more", grown >> 20);
+    assert!(grown < REST, "the server took {grown} bytes more");
+    session.restore(&[], vec![good]).await;
+}
+
+#[tokio::test]
+async fn a_client_that_reads_nothing_and_one_that_never_ends_a_message_are_gone_in_time() {
+    let server = Server::start(&["--stall-seconds", "1", "--max-envs", "2"]);
+    let mut unread = Connection::new(server.port(), 1 << 16).await;
+    let mut call = unread.call(SESSION).await.unwrap();
+    assert!(call.send_message(&message(open("MountainCar", 1, 1))).await);
+    assert!(call.receive().await.is_some());
+    assert!(call.send_message(&message(Render { slot: 0, width: 2048, height: 2048 })).await);
+    let mut unfinished = Connection::new(server.port(), 1 << 16).await;
+    let mut half = unfinished.call(SESSION).await.unwrap();
+    assert!(half.send_message(&message(open("MountainCar", 1, 1))).await);
+    assert!(half.receive().await.is_some());
+    half.send(framed(1000, &[0; 10])).await;
+    let (code, message) = half.status().await.unwrap();
+    assert_eq!(code, Code::DeadlineExceeded as i32, "{message}");
+    until("the connection is closed", async || unread.is_closed()).await;
+    // Both environments are free. One that waits without a word, and has read everything, stays.
+    let mut session = Session::connect(server.tcp()).await;
+    until("there is room", async || matches!(session.answer(open("MountainCar", 2, 1)).await, Response::Opened(_)))
+        .await;
+    tokio::time::sleep(Duration::from_secs(3)).await;
+    session.step(vec![0; 8].into()).await;
+}
+
+#[tokio::test]
+async fn a_call_that_never_ends_its_request_is_ended() {
+    let server = Server::start(&[]);
+    let mut connection = Connection::new(server.port(), 1 << 16).await;
+    let mut call = connection.call(LIST).await.unwrap();
+    call.send(framed(10, &[0; 5])).await;
+    let start = Instant::now();
+    let (code, message) = within(call.status()).await.unwrap();
+    assert!(code != Code::Ok as i32, "{message}");
+    assert!(start.elapsed() < Duration::from_secs(40));
+}
+
+#[cfg(feature = "mujoco")]
+#[tokio::test]
+async fn environments_opened_and_dropped_again_and_again_take_little_more_than_once() {
+    const N: u32 = 16_384;
+    let server = Server::start(&[]);
+    let mut once = 0;
+    for round in 0..10 {
+        let mut session = Session::connect(server.tcp()).await;
+        let open = Open { receipts: false, ..open("Hopper", N, round) };
+        until("there is room", async || matches!(session.answer(open.clone()).await, Response::Opened(_))).await;
+        if round == 0 {
+            once = server.memory();
+        }
+        drop(session);
+    }
+    // Without a thread that frees them all it was 1.5: each worker's heap grew by what the others had. Now it is 1.2 to 1.3,
+    // by what falls to which worker, once the last ones are freed.
+    until("memory is given back", async || server.memory() as f64 <= 1.4 * once as f64).await;
+    let (now, peak) = (server.memory(), server.peak_memory());
+    println!("once {} MB, ten times {} MB, at most {} MB", once >> 20, now >> 20, peak >> 20);
+}

@@ -1,0 +1,61 @@
+//! What one client may take of the server: each attack is tried beside a neighbour, who must not notice.
+
+mod client;
+mod memory;
+mod messages;
+mod pictures;
+mod places;
+
+use crate::common::server::{Session, environment, open, step, within};
+use std::{
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    thread::{self, JoinHandle},
+    time::{Duration, Instant},
+};
+
+/// The longest step of a neighbour, whose machine may be busy with much else. What it comes to is printed.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// A session that steps all the time, on a thread of its own, and measures how long each step takes.
+struct Neighbour {
+    stop: Arc<AtomicBool>,
+    thread: JoinHandle<Vec<Duration>>,
+}
+
+impl Neighbour {
+    fn start(address: &str) -> Self {
+        let (address, stop) = (address.to_owned(), Arc::new(AtomicBool::new(false)));
+        let stopped = Arc::clone(&stop);
+        let thread = thread::spawn(move || {
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+            runtime.block_on(async {
+                let environment = environment(&address, "CartPole").await;
+                let (mut session, _) = Session::open(&address, open(&environment.name, 4, 1)).await;
+                let mut times = Vec::new();
+                while !stopped.load(Ordering::Relaxed) || times.len() < 20 {
+                    let start = Instant::now();
+                    session.send(step(vec![0; 16])).await;
+                    within(session.receive()).await.unwrap().expect("the stream ended");
+                    times.push(start.elapsed());
+                    tokio::time::sleep(Duration::from_millis(1)).await;
+                }
+                times
+            })
+        });
+        Self { stop, thread }
+    }
+
+    /// Ends it; no step took long.
+    fn was_not_held_up(self) {
+        self.stop.store(true, Ordering::Relaxed);
+        let mut times = self.thread.join().expect("the neighbour's session failed");
+        times.sort_unstable();
+        let at = |percent: usize| times[(times.len() - 1) * percent / 100];
+        let (median, p99, longest) = (at(50), at(99), at(100));
+        println!("{} steps of a neighbour: median {median:?}, p99 {p99:?}, longest {longest:?}", times.len());
+        assert!(longest < PATIENCE, "a neighbour's step took {longest:?}");
+    }
+}

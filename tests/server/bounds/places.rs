@@ -1,0 +1,129 @@
+//! Who may have how many places, and how long a place is kept for somebody who does not come.
+
+use super::client::{Connection, SESSION};
+use crate::common::server::{Server, Session, client, command, open, until, within};
+use std::{
+    io::{Read, Write},
+    net::TcpStream,
+    os::unix::process::CommandExt,
+    time::Duration,
+};
+use tonic::Code;
+
+#[tokio::test]
+async fn half_a_preface_is_closed_in_time() {
+    let server = Server::start(&["--handshake-seconds", "5"]);
+    for part in [&b""[..], b"PRI * HTTP/2.0\r\n"] {
+        let mut half = TcpStream::connect(server.port()).unwrap();
+        half.write_all(part).unwrap();
+        half.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
+        let closed = tokio::task::spawn_blocking(move || half.read_to_end(&mut Vec::new())).await.unwrap();
+        // An end, or a reset: no time-out.
+        let waited = closed.as_ref().is_err_and(|error| error.kind() == std::io::ErrorKind::WouldBlock);
+        assert!(!waited, "{closed:?}");
+    }
+    // A connection without calls has begun, and stays.
+    let mut idle = client(server.tcp()).await;
+    tokio::time::sleep(Duration::from_secs(7)).await;
+    let mut session = Session::start(&mut idle).await.unwrap();
+    session.ask(open("CartPole", 1, 1)).await;
+}
+
+#[tokio::test]
+async fn sessions_that_are_never_opened_give_their_places_back() {
+    let server = Server::start(&["--handshake-seconds", "5", "--max-sessions", "100"]);
+    let (mut opened, _) = Session::open(server.tcp(), open("CartPole", 1, 1)).await;
+    let mut connection = Connection::new(server.port(), 1 << 16).await;
+    let mut calls = Vec::new();
+    for _ in 0..99 {
+        calls.push(connection.call(SESSION).await.unwrap());
+    }
+    let mut other = client(server.unix()).await;
+    until("there is a place again", async || Session::start(&mut other).await.is_ok()).await;
+    let (code, message) = calls[0].status().await.unwrap();
+    assert_eq!(code, Code::DeadlineExceeded as i32, "{message}");
+    assert!(message.contains("5 s"), "{message}");
+    opened.step(vec![0; 4].into()).await;
+}
+
+#[tokio::test]
+async fn a_peer_has_no_more_sessions_and_connections_than_its_quota() {
+    let server = Server::start(&["--max-peer-sessions", "2"]);
+    let mut one = client(server.tcp()).await;
+    let (mut first, _second) = (Session::start(&mut one).await.unwrap(), Session::connect(server.tcp()).await);
+    first.ask(open("CartPole", 1, 1)).await;
+    let status = Session::start(&mut one).await.err().expect("a third session is refused");
+    assert_eq!(status.code(), Code::ResourceExhausted, "{status:?}");
+    assert!(status.message().contains("all of the 2 sessions"), "{status:?}");
+    // By another way it is another peer.
+    let (mut other, _) = Session::open(server.unix(), open("CartPole", 1, 1)).await;
+    // Connections are closed beyond some more than its sessions.
+    let mut connections: Vec<TcpStream> = (0..40).map(|_| TcpStream::connect(server.port()).unwrap()).collect();
+    let mut last = connections.pop().unwrap();
+    last.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
+    let closed = tokio::task::spawn_blocking(move || last.read(&mut [0])).await.unwrap();
+    assert!(
+        matches!(closed, Ok(0)) || closed.as_ref().is_err_and(|e| e.kind() != std::io::ErrorKind::WouldBlock),
+        "{closed:?}"
+    );
+    first.step(vec![0; 4].into()).await;
+    other.step(vec![0; 4].into()).await;
+}
+
+#[tokio::test]
+async fn more_connections_are_served_than_the_soft_limit_of_descriptors_allows() {
+    let mut limited = std::process::Command::new("sh");
+    limited.arg("-c").arg("ulimit -S -n 64; exec \"$@\"").arg("sh").arg(command().get_program());
+    limited.args(["--listen", "tcp://127.0.0.1:0"]).arg0("sh");
+    let server = Server::spawn(limited, tempfile::tempdir().unwrap(), 1);
+    let mut sessions = Vec::new();
+    for seed in 0..100 {
+        sessions.push(within(Session::open(server.tcp(), open("CartPole", 1, seed))).await);
+    }
+}
+
+/// For so many seconds the test below steps, where the variable says so.
+#[cfg(feature = "mujoco")]
+const SECONDS: &str = "PERTURB_TEST_FULL_SERVER_SECONDS";
+
+#[cfg(feature = "mujoco")]
+#[tokio::test]
+async fn every_place_can_be_taken_by_hoppers_and_one_more_is_refused_at_once() {
+    use crate::common::server::{step, stepped};
+    use std::time::Instant;
+
+    const SESSIONS: usize = 1024;
+    let server = Server::start(&[]);
+    let mut sessions = Vec::new();
+    let mut connection = client(server.tcp()).await;
+    for seed in 0..SESSIONS {
+        if seed % 64 == 0 {
+            connection = client(server.tcp()).await;
+        }
+        let mut session = Session::start(&mut connection).await.unwrap();
+        session.ask(open("Hopper", 16, seed as u64)).await;
+        sessions.push(session);
+    }
+    let mut one_more = client(server.unix()).await;
+    let asked = Instant::now();
+    let status = Session::start(&mut one_more).await.err().expect("one more is refused");
+    assert_eq!(status.code(), Code::ResourceExhausted, "{status:?}");
+    println!("refused after {:?}, {} MB", asked.elapsed(), server.memory() >> 20);
+    let seconds = std::env::var(SECONDS).map_or(0, |seconds| seconds.parse().unwrap());
+    let (start, mut rounds, mut times) = (Instant::now(), 0, Vec::new());
+    while rounds < 3 || start.elapsed() < Duration::from_secs(seconds) {
+        // All at once: what one waits is what the server takes for all.
+        let sent = Instant::now();
+        for session in &sessions {
+            session.send(step(vec![0; 4 * 3 * 16])).await;
+        }
+        for session in &mut sessions {
+            stepped(&session.receive().await.unwrap().unwrap());
+            times.push(sent.elapsed());
+        }
+        rounds += 1;
+    }
+    times.sort_unstable();
+    let at = |percent: usize| times[(times.len() - 1) * percent / 100];
+    println!("{rounds} steps of all: median {:?}, p99 {:?}, {} MB", at(50), at(99), server.peak_memory() >> 20);
+}
