@@ -4,7 +4,12 @@ use clap::Parser;
 use config::{Environment, File, FileFormat};
 use perturb_protocol::limits::{DEFAULT_MAX_ENVS, DEFAULT_MAX_MESSAGE_BYTES, DEFAULT_PORT};
 use serde::{Deserialize, Serialize};
-use std::{fmt, net::SocketAddr, path::PathBuf, time::Duration};
+use std::{
+    fmt,
+    net::SocketAddr,
+    path::{Path, PathBuf},
+    time::Duration,
+};
 
 const ENV_PREFIX: &str = "PERTURB_SERVER";
 /// A day. The transport adds the interval to the present, which must not overflow.
@@ -179,12 +184,20 @@ impl Default for Config {
     }
 }
 
-/// A quarter of the machine's memory, or of what this process's container may have.
+/// A quarter of the machine's memory, or of what this process's container or service may have.
 fn usual_memory() -> usize {
     let rustix::system::Sysinfo { totalram, mem_unit, .. } = rustix::system::sysinfo();
     let machine = (totalram as usize).saturating_mul(mem_unit as usize);
-    let container = std::fs::read_to_string("/sys/fs/cgroup/memory.max").ok().and_then(|text| text.trim().parse().ok());
-    (container.unwrap_or(machine).min(machine) / 4).max(LEAST_MEMORY)
+    let groups = std::fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
+    let group = group_memory(Path::new("/sys/fs/cgroup"), &groups);
+    (group.unwrap_or(machine).min(machine) / 4).max(LEAST_MEMORY)
+}
+
+/// The least that this process's control group, or one around it, may have, in bytes; `groups` is `/proc/self/cgroup`.
+fn group_memory(root: &Path, groups: &str) -> Option<usize> {
+    let own = groups.lines().find_map(|line| line.strip_prefix("0::/")).unwrap_or_default();
+    let around = Path::new(own).ancestors().map(|group| root.join(group).join("memory.max"));
+    around.filter_map(|file| std::fs::read_to_string(file).ok()?.trim().parse().ok()).min()
 }
 
 /// The environment variables that are settings.
@@ -336,6 +349,22 @@ impl Config {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_service_has_what_the_narrowest_group_around_it_may_have() {
+        let root = tempfile::tempdir().unwrap();
+        let service = root.path().join("system.slice/perturb.service");
+        std::fs::create_dir_all(&service).unwrap();
+        let memory = || group_memory(root.path(), "1:name=systemd:/x\n0::/system.slice/perturb.service\n");
+        assert_eq!(memory(), None);
+        std::fs::write(service.join("memory.max"), "max\n").unwrap();
+        assert_eq!(memory(), None);
+        std::fs::write(service.parent().unwrap().join("memory.max"), "4096\n").unwrap();
+        assert_eq!(memory(), Some(4096));
+        std::fs::write(root.path().join("memory.max"), "8192\n").unwrap();
+        assert_eq!(memory(), Some(4096));
+        assert_eq!(group_memory(root.path(), ""), Some(8192), "a container sees its own group as the root");
+    }
 
     #[test]
     fn a_level_is_that_of_our_own_lines_and_a_filter_stays_as_it_is() {

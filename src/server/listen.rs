@@ -55,7 +55,7 @@ pub fn tcp_connections(
                 Ok((connection, address)) => {
                     // It fails for connections that are gone already.
                     let _ = connection.set_nodelay(true);
-                    if let Some(connection) = admission.admit(connection, Peer::Machine(address.ip())) {
+                    if let Some(connection) = admission.admit(connection, Peer::at(address.ip())) {
                         break connection;
                     }
                 }

@@ -5,7 +5,7 @@ use std::{
     collections::BTreeMap,
     future::Future,
     io::{self, ErrorKind, IoSlice},
-    net::IpAddr,
+    net::{IpAddr, Ipv6Addr},
     pin::Pin,
     sync::{
         Arc, Mutex, MutexGuard, PoisonError,
@@ -26,10 +26,20 @@ const PREFACE: usize = 24;
 /// Whom a connection is from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Peer {
-    /// A machine.
+    /// A machine, or a network of them that one may have for itself.
     Machine(IpAddr),
     /// A user of this machine, by a Unix socket; none where the system does not tell.
     User(Option<u32>),
+}
+
+impl Peer {
+    /// Whoever has this address: of IPv6 its network of 64 bits, which is the least that a machine is given.
+    pub fn at(address: IpAddr) -> Self {
+        Self::Machine(match address.to_canonical() {
+            IpAddr::V6(address) => Ipv6Addr::from_bits(address.to_bits() & !u128::from(u64::MAX)).into(),
+            address => address,
+        })
+    }
 }
 
 /// Places, of which there are so many in all and for each peer.
@@ -210,6 +220,16 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Guarded<S> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn addresses_of_one_machine_are_one_peer() {
+        let [same, other] = ["2001:db8::1", "2001:db8:0:1::1"].map(|text| Peer::at(text.parse().unwrap()));
+        assert_eq!(Peer::at("2001:db8::ffff:0:0:2".parse().unwrap()), same);
+        assert_ne!(same, other);
+        let [old, mapped] = ["192.0.2.1", "::ffff:192.0.2.1"].map(|text| Peer::at(text.parse().unwrap()));
+        assert_eq!(old, mapped);
+        assert_ne!(old, Peer::at("192.0.2.2".parse().unwrap()));
+    }
 
     #[test]
     fn a_peer_takes_its_own_places_and_no_more() {

@@ -38,6 +38,8 @@ impl Default for ServerWait {
 pub struct Waiting {
     waited: Duration,
     looks: u32,
+    /// Whether anything was gained: then there was room once.
+    has_begun: bool,
 }
 
 /// How a loss ends.
@@ -57,15 +59,14 @@ pub enum After {
 impl Waiting {
     /// Something was gained: what is lost from now on is not lost in a row.
     pub fn progressed(&mut self) {
-        *self = Self::default();
+        *self = Self { has_begun: true, ..Self::default() };
     }
 
     /// Waits for the servers that `error` speaks of, as long as [`ServerWait`] says: for all of them for some seconds, then
-    /// for any. A server that comes back full, for what was lost with another one, is waited for, too.
+    /// for any. One that has no room for what is under way, on another server before for instance, is waited for, too.
     pub fn wait(&mut self, servers: &Servers, error: &ClientError, stop: &StopFlag) -> After {
         let ServerWait { limit, tell } = servers.wait();
-        let is_lost = error.is_absence() || (self.looks > 0 && is_full(error));
-        if !is_lost || self.waited >= limit {
+        if !self.is_passing(error) || self.waited >= limit {
             return After::GivenUp;
         }
         tell(&format!("{error}; waiting for it, at most {}", duration((limit - self.waited).as_secs_f64())));
@@ -76,6 +77,11 @@ impl Waiting {
                 after = self.look(servers) => after,
             }
         })
+    }
+
+    /// Whether the same may go well later: not what is refused, unless it is for want of room where there was some.
+    fn is_passing(&self, error: &ClientError) -> bool {
+        error.is_absence() || ((self.looks > 0 || self.has_begun) && is_full(error))
     }
 
     async fn look(&mut self, servers: &Servers) -> After {
@@ -137,7 +143,11 @@ mod tests {
         assert!([Internal, Unavailable, Unknown].map(lost).iter().all(ClientError::is_absence));
         assert!(![InvalidArgument, PermissionDenied, ResourceExhausted].map(lost).iter().any(ClientError::is_absence));
         assert!(![InvalidArgument, NotFound, Unavailable].map(refused).iter().any(ClientError::is_absence));
-        assert!(is_full(&refused(ResourceExhausted)) && !is_full(&refused(InvalidArgument)));
+        let [new, mut begun] = [Waiting::default(), Waiting::default()];
+        begun.progressed();
+        let looked = Waiting { looks: 1, ..Waiting::default() };
+        assert_eq!([&new, &begun, &looked].map(|one| one.is_passing(&refused(ResourceExhausted))), [false, true, true]);
+        assert!(![new, begun, looked].iter().any(|one| one.is_passing(&refused(InvalidArgument))));
     }
 
     #[test]

@@ -243,9 +243,11 @@ struct Tracked {
     /// How far this attempt is.
     pace: Pace,
     lost_servers: usize,
-    /// How often in a row it had no server or no disk, and how long nothing was begun for that.
+    /// How often in a row it had no server, and how long nothing was begun for that.
     lost_in_a_row: u32,
     waited: Duration,
+    /// How often in a row it had no disk.
+    faults_in_a_row: u32,
     /// When something first happened to it in this attempt: before its turn in a job, a cell takes no time; …
     begun: Option<Instant>,
     /// … had a server (looking for one, of which many may be silent, is not having one) …
@@ -367,35 +369,34 @@ impl<'a> Scheduler<'a> {
             CellEvent::Busy => tracked.phase = Phase::Elsewhere,
             CellEvent::Refused { reason } => return Err(RunError::Refused(reason)),
             CellEvent::Failed { reason } => self.record_failure(cell, reason)?,
-            CellEvent::LostServer { .. } | CellEvent::FileFault { .. } => {
-                let lost_server = matches!(end, CellEvent::LostServer { .. });
-                let progressed = if lost_server {
-                    tracked.served.is_some_and(|since| now - since >= HAD_A_SERVER)
-                } else {
-                    tracked.saved_before.is_some_and(|before| tracked.saved > before)
-                };
-                if progressed {
+            CellEvent::LostServer { .. } => {
+                if tracked.served.is_some_and(|since| now - since >= HAD_A_SERVER) {
                     (tracked.lost_in_a_row, tracked.waited) = (0, Duration::ZERO);
                 }
                 tracked.lost_in_a_row += 1;
-                tracked.lost_servers += usize::from(lost_server);
-                let pause = LONGEST_PAUSE.min(PAUSE * (1 << (tracked.lost_in_a_row - 1).min(16)));
+                tracked.lost_servers += 1;
+                let pause = pause(tracked.lost_in_a_row);
                 tracked.waited += pause;
-                let most = self.server_wait.max(LEAST_WAIT);
-                if lost_server && tracked.waited > most {
+                let (waited, most) = (tracked.waited, self.server_wait.max(LEAST_WAIT));
+                if waited > most {
                     return Err(RunError::NoServer(format!("{}: {end}", self.id(cell))));
-                } else if !lost_server && tracked.lost_in_a_row >= MOST_FAULTS {
-                    return Err(RunError::FileFault(format!("{}: {end}", self.id(cell))));
-                } else if lost_server && self.paused_until.is_none_or(|until| until < now) {
-                    let wait = duration((most + pause - tracked.waited).as_secs_f64());
+                } else if self.paused_until.is_none_or(|until| until < now) {
+                    let wait = duration((most + pause - waited).as_secs_f64());
                     let words = format!("{}: {end}; waiting for it, at most {wait}", self.id(cell));
                     (self.report)(Announcement::Note(&words));
                 }
-                let tracked = &mut self.cells[cell];
-                self.paused_until = self.paused_until.max(Some(now + pause));
-                // At the front: if the servers are gone, the run ends soon, however many cells it has.
-                tracked.phase = Phase::Waiting;
-                self.queue.push_front(cell);
+                self.pause(cell, now + pause);
+            }
+            CellEvent::FileFault { .. } => {
+                if tracked.saved_before.is_some_and(|before| tracked.saved > before) {
+                    tracked.faults_in_a_row = 0;
+                }
+                tracked.faults_in_a_row += 1;
+                let pause = pause(tracked.faults_in_a_row);
+                if tracked.faults_in_a_row >= MOST_FAULTS {
+                    return Err(RunError::FileFault(format!("{}: {end}", self.id(cell))));
+                }
+                self.pause(cell, now + pause);
             }
             end => {
                 tracked.attempts += 1;
@@ -414,6 +415,13 @@ impl<'a> Scheduler<'a> {
             }
         }
         Ok(())
+    }
+
+    /// Begins nothing until then, and this cell first: if it cannot go on, the run ends soon, however many cells it has.
+    fn pause(&mut self, cell: usize, until: Instant) {
+        self.paused_until = self.paused_until.max(Some(until));
+        self.cells[cell].phase = Phase::Waiting;
+        self.queue.push_front(cell);
     }
 
     /// Records the failure of a worker that could not do so itself.
@@ -564,6 +572,11 @@ impl<'a> Scheduler<'a> {
     fn id(&self, cell: usize) -> &'a str {
         &self.plan.cells[cell].id
     }
+}
+
+/// How long nothing is begun after so many losses in a row.
+fn pause(in_a_row: u32) -> Duration {
+    LONGEST_PAUSE.min(PAUSE * (1 << (in_a_row - 1).min(16)))
 }
 
 /// What is left of a cell under way, in terms of what was done of it.

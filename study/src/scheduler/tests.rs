@@ -313,6 +313,14 @@ fn a_full_disk_is_waited_for_ends_the_run_and_is_no_cells_failure() {
     let message = format!("the run cannot go on: {}: no space left; when that is mended", place.id(0));
     assert!(ran.end.as_ref().is_err_and(|error| error.starts_with(&message)), "{:?}", ran.end);
     assert!((0..4).all(|cell| !place.folder.cell(place.id(cell)).is_settled(true)), "no cell is blamed");
+    // A fault after servers were lost is the first one.
+    let place = Place::new();
+    let ran = place.run(&|cell, attempt| match (cell, attempt) {
+        (0, 1..=4) => vec![lost()],
+        (0, 5..=6) => vec![full()],
+        _ => done(),
+    });
+    assert_eq!(ran.end, place.finished(&[]));
     // One that gets further each time may go on.
     let place = Place::new();
     let ran = place.run(&|cell, attempt| match (cell, attempt) {
