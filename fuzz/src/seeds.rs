@@ -124,9 +124,9 @@ fn world(environment: &str) -> Vec<u8> {
         payload: Some(rpc::tensor::Payload::Strings(rpc::tensor::StringArray { array: vec![text.into()] })),
         ..rpc::Tensor::default()
     };
-    let settings = [("env_id".to_owned(), text(environment)), ("version".to_owned(), text("R"))];
-    // The first world of a server has this name; what names another is refused.
-    let world_name = "world-1".to_owned();
+    let world_name = "w".to_owned();
+    let settings = [("env_id", environment), ("version", "R"), ("world_name", &world_name)];
+    let settings = settings.map(|(name, value)| (name.to_owned(), text(value)));
     let payloads = [
         Payload::CreateWorld(rpc::CreateWorldRequest { settings: settings.into() }),
         Payload::JoinWorld(rpc::JoinWorldRequest { world_name: world_name.clone(), ..Default::default() }),

@@ -39,8 +39,8 @@ pub struct Pool {
     threads: Vec<JoinHandle<()>>,
 }
 
-/// What sessions leave behind: freeing thousands of environments takes longer than the transport may be kept.
-pub(super) type Rest = Box<dyn Send>;
+/// Frees what a session leaves behind: thousands of environments take longer than the transport may be kept.
+pub(super) type Rest = Box<dyn FnOnce() + Send>;
 
 impl Pool {
     /// Starts `workers` threads (at least 1) for at most `max_environments` environments at a time.
@@ -66,7 +66,7 @@ impl Pool {
         }
         let free = move || {
             lower(NICENESS_OF_FREEING);
-            received.into_iter().for_each(drop);
+            received.into_iter().for_each(|free: Rest| free());
         };
         pool.threads.push(thread::Builder::new().name("free".into()).spawn(free)?);
         Ok(pool)
@@ -214,6 +214,11 @@ impl Shared {
         }
     }
 
+    /// Whether the pool ends: what is left in the queue is not done any more.
+    pub(super) fn is_closing(&self) -> bool {
+        self.closing.load(Ordering::Relaxed)
+    }
+
     /// Frees what a session leaves behind, elsewhere.
     pub(super) fn free(&self, rest: Rest) {
         if let Some(rests) = &*lock(&self.rests) {
@@ -232,7 +237,7 @@ impl Shared {
 
     /// A job's last part has ended: its session is told, unless a round wants another step.
     fn conduct(&self, job: &Arc<Job>) {
-        while job.conduct(self.closing.load(Ordering::Relaxed)) {
+        while job.conduct(self.is_closing()) {
             job.prepare();
             let shards = job.shards.len();
             if shards > 1 || self.waiting.load(Ordering::Acquire) > 0 {

@@ -130,6 +130,26 @@ pub enum Refusal {
         /// What was asked for.
         request: &'static str,
     },
+    /// dm_env_rpc: a world of others.
+    #[error(
+        "{request} came from a stream that has neither made world {world:?} nor is its agent; join it first, or have it \
+         made with the setting shared"
+    )]
+    NotYours {
+        /// The world.
+        world: String,
+        /// What was asked for.
+        request: &'static str,
+    },
+    /// dm_env_rpc: the name that was asked for is another world's.
+    #[error("a world {world:?} is there already; ask for another name, or for none")]
+    Taken {
+        /// The name.
+        world: String,
+    },
+    /// dm_env_rpc: a world cannot have a name of its own.
+    #[error("the system gives no random numbers for a world's name; ask for a name by the setting world_name")]
+    NoRandomness,
     /// dm_env_rpc: a property does not allow this.
     #[error("property {key:?} cannot be {access}; list_property tells what each property allows")]
     Forbidden {
@@ -183,7 +203,9 @@ impl Refusal {
             Self::Idle { .. } | Self::Unfinished { .. } => Code::DeadlineExceeded,
             Self::Draining => Code::Unavailable,
             Self::Unknown { .. } => Code::NotFound,
-            Self::Forbidden { .. } => Code::PermissionDenied,
+            Self::Forbidden { .. } | Self::NotYours { .. } => Code::PermissionDenied,
+            Self::Taken { .. } => Code::AlreadyExists,
+            Self::NoRandomness => Code::Unavailable,
             Self::UnknownExtension { .. } => Code::Unimplemented,
         }
     }

@@ -44,9 +44,9 @@ impl Agent {
         if self.sessions.phase() != Phase::Running {
             return Err(Refusal::Draining);
         }
-        let (settings, version) = settings::create(self.worlds.catalogue(), &request.settings)?;
+        let (settings, version, own) = settings::create(self.worlds.catalogue(), &request.settings)?;
         let runner = Runner::open(self.worlds.pool(), settings, version).await?;
-        Ok(rpc::CreateWorldResponse { world_name: self.worlds.add(self.id, runner) })
+        Ok(rpc::CreateWorldResponse { world_name: self.worlds.add(self.id, runner, own)? })
     }
 
     async fn join_world(&mut self, request: rpc::JoinWorldRequest) -> Result<rpc::JoinWorldResponse, Refusal> {
@@ -54,7 +54,7 @@ impl Agent {
             return Err(Refusal::AlreadyJoined { world: joined.world.name().into() });
         }
         settings::none("join_world", &request.settings)?;
-        let (world, runner) = self.worlds.join(&request.world_name)?;
+        let (world, runner) = self.worlds.join(self.id, &request.world_name)?;
         // Before anything is awaited: if the client goes now, the world is left and not lost.
         let joined = self.joined.insert(Joined { world, runner });
         joined.runner.settle().await;
@@ -81,7 +81,7 @@ impl Agent {
     }
 
     fn reset_world(&mut self, request: rpc::ResetWorldRequest) -> Result<rpc::ResetWorldResponse, Refusal> {
-        let world = self.worlds.find(&request.world_name)?;
+        let world = self.worlds.of(self.id, &request.world_name, "reset_world")?;
         world.change(settings::change(world.spec(), "reset_world", &request.settings)?)?;
         match &mut self.joined {
             Some(joined) if joined.world.name() == world.name() => joined.runner.stop(),
@@ -91,7 +91,7 @@ impl Agent {
     }
 
     fn destroy_world(&mut self, request: &rpc::DestroyWorldRequest) -> Result<rpc::DestroyWorldResponse, Refusal> {
-        self.worlds.destroy(&request.world_name)?;
+        self.worlds.destroy(self.id, &request.world_name)?;
         Ok(rpc::DestroyWorldResponse {})
     }
 

@@ -14,8 +14,21 @@ const VERSION: &str = "version";
 const SEED: &str = "seed";
 const ENVIRONMENT_INDEX: &str = "environment_index";
 const EPISODES_PER_TRIAL: &str = "episodes_per_trial";
+const WORLD_NAME: &str = "world_name";
+const SHARED: &str = "shared";
+
+/// The longest name that may be asked for, in bytes.
+const LONGEST_NAME: usize = 64;
 
 type Settings = BTreeMap<String, Tensor>;
+
+/// Whose a world is.
+pub(super) struct Ownership {
+    /// The name that was asked for.
+    pub(super) name: Option<String>,
+    /// Whether every stream may reset and destroy it.
+    pub(super) shared: bool,
+}
 
 /// What a reset, or a written property, changes from the next episode on.
 #[derive(Default)]
@@ -28,17 +41,21 @@ pub(super) struct Change {
     pub(super) parameters: Vec<(&'static str, Distribution)>,
 }
 
-/// Checks the settings of `create_world`. Returns the version beside what the batch needs to know.
+/// Checks the settings of `create_world`. Returns the version, and whose the world is to be, beside what the batch needs
+/// to know.
 ///
 /// # Errors
 /// For settings that are missing, unknown, of a wrong type or out of range.
-pub(super) fn create(catalogue: &Catalogue, settings: &Settings) -> Result<(BatchSettings, Version), Refusal> {
+pub(super) fn create(
+    catalogue: &Catalogue,
+    settings: &Settings,
+) -> Result<(BatchSettings, Version, Ownership), Refusal> {
     let id = settings.get(ENV_ID).ok_or_else(|| {
         let expected = format!("a STRING scalar, one of {}", catalogue.names().collect::<Vec<_>>().join(", "));
         Refusal::value(field(ENV_ID), "missing", expected)
     })?;
     let spec = catalogue.find(tensors::text(&field(ENV_ID), id)?)?;
-    let own = [ENV_ID, VERSION, SEED, ENVIRONMENT_INDEX, EPISODES_PER_TRIAL];
+    let own = [ENV_ID, VERSION, SEED, ENVIRONMENT_INDEX, EPISODES_PER_TRIAL, WORLD_NAME, SHARED];
     check_names(spec, "create_world", &own, settings)?;
     let integer = |name, default, low, high| match settings.get(name) {
         Some(tensor) => tensors::integer(&field(name), tensor, low, high),
@@ -66,7 +83,19 @@ pub(super) fn create(catalogue: &Catalogue, settings: &Settings) -> Result<(Batc
         reward_terms: false,
         observe_parameters: false,
     };
-    Ok((batch, version))
+    Ok((batch, version, ownership(settings)?))
+}
+
+fn ownership(settings: &Settings) -> Result<Ownership, Refusal> {
+    let name = settings.get(WORLD_NAME).map(|tensor| tensors::text(&field(WORLD_NAME), tensor)).transpose()?;
+    let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte);
+    if let Some(name) = name.filter(|name| name.is_empty() || name.len() > LONGEST_NAME || !name.bytes().all(is_plain))
+    {
+        let expected = format!("1 to {LONGEST_NAME} letters, digits, -, _ or .");
+        return Err(Refusal::value(field(WORLD_NAME), format!("{:?}", shorten(name)), expected));
+    }
+    let shared = settings.get(SHARED).map(|tensor| tensors::boolean(&field(SHARED), tensor)).transpose()?;
+    Ok(Ownership { name: name.map(String::from), shared: shared.unwrap_or(false) })
 }
 
 /// Checks the settings of a reset.

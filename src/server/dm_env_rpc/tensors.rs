@@ -20,6 +20,17 @@ pub(super) fn text<'a>(field: &str, tensor: &'a Tensor) -> Result<&'a str, Refus
     }
 }
 
+/// A BOOL scalar.
+///
+/// # Errors
+/// If it is something else.
+pub(super) fn boolean(field: &str, tensor: &Tensor) -> Result<bool, Refusal> {
+    match (&tensor.payload, tensor.shape.as_slice()) {
+        (Some(Payload::Bools(bools)), []) if bools.array.len() == 1 => Ok(bools.array[0]),
+        _ => Err(refuse(field, tensor, "a scalar: BOOL, shape [], elements: 1")),
+    }
+}
+
 /// A DOUBLE scalar.
 ///
 /// # Errors

@@ -1,6 +1,7 @@
-//! All worlds of the server, by name. A world lives as long as the stream that made it or an agent that is in it.
+//! All worlds of the server, by name. A world lives as long as the stream that made it or an agent that is in it. Names
+//! cannot be guessed, unless they were asked for: whoever is told one may join.
 
-use super::{runner::Runner, world::World};
+use super::{runner::Runner, settings::Ownership, world::World};
 use crate::{
     env::{Catalogue, shorten},
     pool::Pool,
@@ -24,8 +25,6 @@ pub(super) struct Worlds {
 #[derive(Default)]
 struct Registry {
     worlds: BTreeMap<String, Entry>,
-    /// So many were made; numbers are not used twice.
-    made: u64,
     streams: StreamId,
 }
 
@@ -33,6 +32,10 @@ struct Entry {
     world: Arc<World>,
     /// The stream that made it, until it ends.
     maker: Option<StreamId>,
+    /// The stream whose agent is in it.
+    agent: Option<StreamId>,
+    /// Whether every stream may reset and destroy it.
+    shared: bool,
     /// None while an agent has it.
     runner: Option<Runner>,
 }
@@ -61,32 +64,42 @@ impl Worlds {
     }
 
     /// Takes a world that a stream has made. Returns its name.
-    pub(super) fn add(&self, maker: StreamId, runner: Runner) -> String {
-        let mut registry = self.lock();
-        registry.made += 1;
-        let name = format!("{}-{}", runner.spec().name, registry.made);
-        let world = Arc::new(World::new(name.clone(), &runner));
-        registry.worlds.insert(name.clone(), Entry { world, maker: Some(maker), runner: Some(runner) });
-        name
-    }
-
-    /// The world of that name.
     ///
     /// # Errors
-    /// [`Refusal::Unknown`].
-    pub(super) fn find(&self, name: &str) -> Result<Arc<World>, Refusal> {
-        self.lock().worlds.get(name).map(|entry| Arc::clone(&entry.world)).ok_or_else(|| unknown(name))
+    /// [`Refusal::Taken`] if another has the name that was asked for, [`Refusal::NoRandomness`].
+    pub(super) fn add(&self, maker: StreamId, runner: Runner, own: Ownership) -> Result<String, Refusal> {
+        let name = match own.name {
+            Some(name) => name,
+            None => random_name(runner.spec().name)?,
+        };
+        let mut registry = self.lock();
+        if registry.worlds.contains_key(&name) {
+            return Err(Refusal::Taken { world: name });
+        }
+        let world = Arc::new(World::new(name.clone(), &runner));
+        let entry = Entry { world, maker: Some(maker), agent: None, shared: own.shared, runner: Some(runner) };
+        registry.worlds.insert(name.clone(), entry);
+        Ok(name)
     }
 
-    /// Gives a world to an agent.
+    /// The world of that name, for a stream that wants to change it.
+    ///
+    /// # Errors
+    /// [`Refusal::Unknown`], [`Refusal::NotYours`].
+    pub(super) fn of(&self, stream: StreamId, name: &str, request: &'static str) -> Result<Arc<World>, Refusal> {
+        Ok(Arc::clone(&self.lock().of(stream, name, request)?.world))
+    }
+
+    /// Gives a world to a stream's agent.
     ///
     /// # Errors
     /// [`Refusal::Unknown`], [`Refusal::Occupied`].
-    pub(super) fn join(&self, name: &str) -> Result<(Arc<World>, Runner), Refusal> {
+    pub(super) fn join(&self, stream: StreamId, name: &str) -> Result<(Arc<World>, Runner), Refusal> {
         let mut registry = self.lock();
         let entry = registry.worlds.get_mut(name).ok_or_else(|| unknown(name))?;
         let occupied = || Refusal::Occupied { world: name.into(), request: "join_world" };
         let runner = entry.runner.take().ok_or_else(occupied)?;
+        entry.agent = Some(stream);
         Ok((Arc::clone(&entry.world), runner))
     }
 
@@ -94,7 +107,7 @@ impl Worlds {
     pub(super) fn leave(&self, world: &World, runner: Runner) {
         let mut registry = self.lock();
         if let Some(entry) = registry.worlds.get_mut(world.name()) {
-            entry.runner = Some(runner);
+            (entry.agent, entry.runner) = (None, Some(runner));
         }
         registry.reap();
     }
@@ -102,11 +115,10 @@ impl Worlds {
     /// Frees a world.
     ///
     /// # Errors
-    /// [`Refusal::Unknown`], [`Refusal::Occupied`].
-    pub(super) fn destroy(&self, name: &str) -> Result<(), Refusal> {
+    /// [`Refusal::Unknown`], [`Refusal::NotYours`], [`Refusal::Occupied`].
+    pub(super) fn destroy(&self, stream: StreamId, name: &str) -> Result<(), Refusal> {
         let mut registry = self.lock();
-        let entry = registry.worlds.get(name).ok_or_else(|| unknown(name))?;
-        if entry.runner.is_none() {
+        if registry.of(stream, name, "destroy_world")?.runner.is_none() {
             return Err(Refusal::Occupied { world: name.into(), request: "destroy_world" });
         }
         registry.worlds.remove(name);
@@ -133,10 +145,27 @@ impl Worlds {
 }
 
 impl Registry {
+    /// The world of that name, if the stream has made it, is its agent's, or may do as if.
+    fn of(&self, stream: StreamId, name: &str, request: &'static str) -> Result<&Entry, Refusal> {
+        let entry = self.worlds.get(name).ok_or_else(|| unknown(name))?;
+        let is_its = entry.shared || [entry.maker, entry.agent].contains(&Some(stream));
+        if is_its { Ok(entry) } else { Err(Refusal::NotYours { world: name.into(), request }) }
+    }
+
     /// Frees the worlds that have neither maker nor agent.
     fn reap(&mut self) {
         self.worlds.retain(|_, entry| entry.maker.is_some() || entry.runner.is_none());
     }
+}
+
+/// One that nobody guesses.
+fn random_name(environment: &str) -> Result<String, Refusal> {
+    let mut bytes = [0; 16];
+    let got = rustix::rand::getrandom(&mut bytes, rustix::rand::GetRandomFlags::empty());
+    if !got.is_ok_and(|n| n == bytes.len()) {
+        return Err(Refusal::NoRandomness);
+    }
+    Ok(format!("{environment}-{:032x}", u128::from_ne_bytes(bytes)))
 }
 
 fn unknown(name: &str) -> Refusal {

@@ -257,6 +257,10 @@ pub fn uint64(n: u64) -> Tensor {
     scalar(tensor::Payload::Uint64s(tensor::Uint64Array { array: vec![n] }))
 }
 
+pub fn boolean(x: bool) -> Tensor {
+    scalar(tensor::Payload::Bools(tensor::BoolArray { array: vec![x] }))
+}
+
 pub fn double(x: f64) -> Tensor {
     scalar(tensor::Payload::Doubles(tensor::DoubleArray { array: vec![x] }))
 }

@@ -1,5 +1,6 @@
 //! The server's other protocol.
 
 pub mod client;
+mod ownership;
 mod protocol;
 mod worlds;

@@ -351,7 +351,7 @@ async fn wrong_settings_of_a_join_or_a_reset_are_refused_by_name_and_change_noth
 async fn every_request_is_answered_once_in_order_by_its_variant_or_an_error() {
     let server = Server::start(&[]);
     let mut agent = Agent::connect(server.tcp()).await;
-    let world = "CartPole-1"; // the server's first
+    let world = "pole";
     let reset = || Some(Request::Reset(rpc::ResetRequest::default()));
     let step = || Some(step(choice(1)));
     let wrong_type = Any { type_url: "type.googleapis.com/google.protobuf.Empty".into(), value: vec![] };
@@ -366,7 +366,7 @@ async fn every_request_is_answered_once_in_order_by_its_variant_or_an_error() {
         (Some(join(world)), Err(Code::NotFound)),
         (Some(destroy(world)), Err(Code::NotFound)),
         (Some(client::reset_world(world, client::Settings::new())), Err(Code::NotFound)),
-        (Some(create(settings("CartPole", []))), Ok("CreateWorld")),
+        (Some(create(settings("CartPole", [("world_name", text(world))]))), Ok("CreateWorld")),
         (Some(client::reset_world(world, client::Settings::new())), Ok("ResetWorld")),
         (Some(join(world)), Ok("JoinWorld")),
         (Some(join(world)), Err(Code::FailedPrecondition)),

@@ -2,8 +2,8 @@
 //! neighbours.
 
 use super::client::{
-    Agent, Seen, Settings, choice, create, destroy, double, floats, int64, join, list, property, read, settings, step,
-    text, uint64, vector, write,
+    Agent, Seen, Settings, boolean, choice, create, destroy, double, floats, int64, join, list, property, read,
+    settings, step, text, uint64, vector, write,
 };
 use crate::common::server::{self, Actor, Server, Session, environment, open, refusal, until};
 use insta::assert_snapshot;
@@ -85,7 +85,7 @@ async fn a_world_has_one_agent_at_a_time_and_is_open_to_every_stream() {
     assert_eq!(agent.join(&second).await, specs);
     maker.leave().await;
     agent.leave().await;
-    agent.destroy(&first).await;
+    maker.destroy(&first).await;
     let (code, message) = maker.refused(destroy(&first)).await;
     assert!(code == Code::NotFound && message.contains(&format!("world {first:?} is unknown")), "{message}");
     maker.destroy(&second).await;
@@ -209,7 +209,8 @@ async fn a_reset_begins_the_next_episode_and_consumes_none_where_none_runs() {
 #[tokio::test]
 async fn a_reset_may_change_seed_version_and_parameters() {
     let server = Server::start(&[]);
-    let (mut agent, world) = Agent::in_world(server.tcp(), settings("CartPole", [("force", double(7.0))])).await;
+    let given = settings("CartPole", [("force", double(7.0)), ("shared", boolean(true))]);
+    let (mut agent, world) = Agent::in_world(server.tcp(), given).await;
     let change = [("version".into(), text("E")), ("mass".into(), double(0.3)), ("seed".into(), int64(6))];
     agent.reset(Settings::from(change.clone())).await;
     assert_eq!(agent.read("version").await, text("D"), "not before the next episode");
@@ -234,7 +235,8 @@ async fn a_reset_may_change_seed_version_and_parameters() {
 async fn a_reset_of_the_world_interrupts_its_agent_once() {
     let server = Server::start(&[]);
     let seeded = |seed| settings("CartPole", [("seed", int64(seed))]);
-    let (mut agent, world) = Agent::in_world(server.tcp(), seeded(1)).await;
+    let shared = settings("CartPole", [("seed", int64(1)), ("shared", boolean(true))]);
+    let (mut agent, world) = Agent::in_world(server.tcp(), shared).await;
     let mut other = Agent::connect(server.tcp()).await;
     let undisturbed = reference(server.tcp(), seeded(1), 1, 4).await;
     let seen = play(&mut agent, 1, 3).await;
