@@ -1,5 +1,6 @@
 //! The server's configuration: defaults, then a TOML file, then environment variables, then flags.
 
+use crate::server::tls::Files;
 use clap::Parser;
 use config::{Environment, File, FileFormat};
 use perturb_protocol::limits::{DEFAULT_MAX_ENVS, DEFAULT_MAX_MESSAGE_BYTES, DEFAULT_PORT};
@@ -93,6 +94,33 @@ pub struct Arguments {
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub keepalive_seconds: Option<u64>,
+    /// A TOML file of tokens, one of which every call by TCP must show: [[token]] with name, sha256 (or token), and if
+    /// need be max_sessions and max_envs. It is read again when it changes.
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tokens: Option<PathBuf>,
+    /// The server's certificate for TLS on its TCP addresses, in PEM, with those between it and its authority's. The files
+    /// of TLS are read again when they change.
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tls_cert: Option<PathBuf>,
+    /// The private key of --tls-cert, in PEM.
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tls_key: Option<PathBuf>,
+    /// The authorities, as certificates in PEM, one of which must have signed a client's certificate. Without it clients
+    /// need none.
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tls_client_ca: Option<PathBuf>,
+    /// Let other machines use this server without asking who they are, or without encryption.
+    #[arg(long)]
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub insecure: bool,
+    /// Who may connect to Unix sockets: their files' mode, octal, such as 0660 for the group. [default: 0600]
+    #[arg(long, value_name = "MODE")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub socket_mode: Option<String>,
     /// What to log on standard error: error, warn, info, debug, trace, or a filter such as perturb=debug.
     /// [default: info]
     #[arg(long, value_name = "FILTER")]
@@ -119,6 +147,11 @@ pub struct Arguments {
     #[arg(long, group = "instead")]
     #[serde(skip)]
     pub catalogue: bool,
+    /// Start no server, but print a new token on standard output, and on standard error its entry for the file of
+    /// --tokens.
+    #[arg(long, value_name = "NAME", group = "instead")]
+    #[serde(skip)]
+    pub new_token: Option<String>,
     /// Start no server, but print what lets a shell complete these flags.
     #[arg(long, value_name = "SHELL", group = "instead")]
     #[serde(skip)]
@@ -157,6 +190,18 @@ pub struct Config {
     pub idle_seconds: u64,
     /// How often a silent connection is asked whether it lives, s, 1 … 86400.
     pub keepalive_seconds: u64,
+    /// The file of tokens that callers must show.
+    pub tokens: Option<PathBuf>,
+    /// The server's certificate for TLS.
+    pub tls_cert: Option<PathBuf>,
+    /// Its private key.
+    pub tls_key: Option<PathBuf>,
+    /// Whose certificates clients must show.
+    pub tls_client_ca: Option<PathBuf>,
+    /// Whether other machines may use this server unasked or unencrypted.
+    pub insecure: bool,
+    /// The mode of Unix sockets' files.
+    pub socket_mode: SocketMode,
     /// The log filter.
     pub log: String,
     /// Whether to shut down when standard input closes.
@@ -178,6 +223,12 @@ impl Default for Config {
             grace_seconds: 30,
             idle_seconds: 0,
             keepalive_seconds: 60,
+            tokens: None,
+            tls_cert: None,
+            tls_key: None,
+            tls_client_ca: None,
+            insecure: false,
+            socket_mode: SocketMode::default(),
             log: "info".into(),
             exit_with_stdin: false,
         }
@@ -259,6 +310,34 @@ impl fmt::Display for ListenAddress {
     }
 }
 
+/// The mode of a Unix socket's file: who may connect are those who may write.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(try_from = "String")]
+pub struct SocketMode(u32);
+
+impl SocketMode {
+    /// As the system takes it.
+    pub fn bits(self) -> u32 {
+        self.0
+    }
+}
+
+impl Default for SocketMode {
+    fn default() -> Self {
+        Self(0o600)
+    }
+}
+
+impl TryFrom<String> for SocketMode {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        // The owner may read and write, nobody execute; a number that was not octal is none of these.
+        let bits = u32::from_str_radix(&text, 8).ok().filter(|bits| bits & !0o066 == 0o600);
+        bits.map(Self).ok_or_else(|| format!("{text:?} is no mode of a socket; expected 0600, 0660, 0666, or so"))
+    }
+}
+
 /// Why a configuration was refused.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -266,6 +345,17 @@ pub enum Error {
     /// A source cannot be read, or has an unknown key or a value of a wrong type.
     #[error("the configuration cannot be read: {0}; --help lists the settings")]
     Source(#[from] config::ConfigError),
+    /// Other machines could use the server, or read along.
+    #[error(
+        "{address} can be reached by other machines, and {lacks}: give --tls-cert, --tls-key and --tokens (or \
+         --tls-client-ca); or give --insecure, where everybody who reaches that address may use the server and read along"
+    )]
+    Insecure {
+        /// Where it would listen.
+        address: String,
+        /// What is missing.
+        lacks: &'static str,
+    },
     /// A value is out of its range.
     #[error("{key} is {got}; expected {expected}")]
     Value {
@@ -325,6 +415,26 @@ impl Config {
         if self.stall_seconds > MOST_SECONDS {
             return refuse("stall_seconds", &self.stall_seconds, "at most 86400");
         }
+        match (&self.tls_cert, &self.tls_key, &self.tls_client_ca) {
+            (Some(_), None, _) => return refuse("tls_key", &"not given", "the private key of tls_cert"),
+            (None, Some(_), _) => return refuse("tls_cert", &"not given", "the certificate of tls_key"),
+            (None, None, Some(_)) => {
+                return refuse("tls_cert", &"not given", "a certificate, as tls_client_ca needs TLS");
+            }
+            _ => {}
+        }
+        let asks = self.tokens.is_some() || self.tls_client_ca.is_some();
+        let lacks = match (self.tls_cert.is_some(), asks) {
+            _ if self.insecure => None,
+            (true, true) => None,
+            (true, false) => Some("this server would not ask who they are"),
+            (false, true) => Some("tokens would go there unencrypted"),
+            (false, false) => Some("this server would neither encrypt nor ask who they are"),
+        };
+        let others = |address: &&ListenAddress| matches!(address, ListenAddress::Tcp(tcp) if !tcp.ip().to_canonical().is_loopback());
+        if let (Some(lacks), Some(address)) = (lacks, self.listen.iter().find(others)) {
+            return Err(Error::Insecure { address: address.written(), lacks });
+        }
         if tracing_subscriber::EnvFilter::try_new(&self.log).is_err() {
             return refuse("log", &self.log, "error, warn, info, debug, trace, or a filter such as perturb=debug");
         }
@@ -338,6 +448,12 @@ impl Config {
             Ok(level) => format!("{},perturb={level}", level.min(tracing::level_filters::LevelFilter::ERROR)),
             Err(_) => self.log.clone(),
         }
+    }
+
+    /// The files of TLS, if it is asked for.
+    pub fn tls(&self) -> Option<Files> {
+        let (cert, key) = self.tls_cert.clone().zip(self.tls_key.clone())?;
+        Some(Files { cert, key, client_ca: self.tls_client_ca.clone() })
     }
 
     /// The grace period.

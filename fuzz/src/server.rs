@@ -10,7 +10,7 @@ use bytes::Bytes;
 use perturb::config::{Config, ListenAddress};
 use perturb::proto::session_request::Request;
 use perturb::proto::{AutoresetMode, Open, Restore, SessionRequest, Step, Version};
-use perturb::server::{self, listen::Listener};
+use perturb::server::{self, guards::Guards, listen::Listener};
 use perturb::tasks;
 use prost::Message;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
@@ -124,9 +124,10 @@ fn socket() -> &'static Path {
         std::thread::spawn(move || {
             let runtime = Builder::new_current_thread().enable_all().build().expect("a runtime");
             runtime.block_on(async {
-                let listener = Listener::bind(&address).await.expect("an address");
+                let listener = Listener::bind(&address, config.socket_mode).await.expect("an address");
                 listening.send(()).expect("somebody waits");
-                let served = server::run(vec![listener], &config, tasks::catalogue(), std::future::pending()).await;
+                let (guards, forever) = (Guards::default(), std::future::pending());
+                let served = server::run(vec![listener], &config, &guards, tasks::catalogue(), forever).await;
                 panic!("the server ended: {served:?}");
             });
         });

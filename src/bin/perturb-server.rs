@@ -4,7 +4,7 @@
 use clap::{CommandFactory, Parser};
 use perturb::{
     config::{Arguments, Config, ListenAddress},
-    server::{self, listen::Listener, probe::probe},
+    server::{self, guards::Guards, listen::Listener, probe::probe, tokens::new_token},
     tasks,
 };
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
@@ -24,6 +24,19 @@ fn main() -> ExitCode {
         // Whoever reads it may have read enough.
         let _ = io::stdout().write_all(&page);
         return ExitCode::SUCCESS;
+    }
+    if let Some(name) = &arguments.new_token {
+        return match new_token(name) {
+            Ok((token, entry)) => {
+                eprint!("{entry}");
+                println!("{token}");
+                ExitCode::SUCCESS
+            }
+            Err(error) => {
+                eprintln!("perturb-server: --new-token {name:?}: {error}");
+                ExitCode::from(2)
+            }
+        };
     }
     let config = match Config::load(&arguments) {
         Ok(config) => config,
@@ -76,7 +89,7 @@ fn about(arguments: &Arguments) -> Option<Vec<u8>> {
 
 /// Why the program fails.
 enum Failure {
-    /// An address cannot be had.
+    /// An address cannot be had, or a file that the settings name.
     Address(io::Error),
     Other(Box<dyn Error>),
 }
@@ -101,22 +114,31 @@ fn run(config: &Config) -> Result<(), Failure> {
     raise_descriptors();
     // One thread for I/O: physics has threads of its own, and a hand-over between runtime threads doubles latency.
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let guards = Guards::load(config).map_err(Failure::Address)?;
     let result = runtime.block_on(async {
         // Before the addresses are told: who reads them may send a signal at once.
         let shutdown = shutdown(config.exit_with_stdin)?;
         let mut listeners = Vec::new();
         for address in &config.listen {
-            let listener = Listener::bind(address).await.map_err(Failure::Address)?;
+            let listener = Listener::bind(address, config.socket_mode).await.map_err(Failure::Address)?;
             // Whoever started the server need not read on.
-            let _ = writeln!(io::stdout(), "listening on {}", listener.address()?);
+            let _ = writeln!(io::stdout(), "listening on {}", told(&listener.address()?, config));
             listeners.push(listener);
         }
-        server::run(listeners, config, tasks::catalogue(), shutdown).await?;
+        server::run(listeners, config, &guards, tasks::catalogue(), shutdown).await?;
         Ok(())
     });
     // Connections that did not close by themselves must not keep the program.
     runtime.shutdown_background();
     result
+}
+
+/// How clients write the address.
+fn told(address: &ListenAddress, config: &Config) -> String {
+    match address {
+        ListenAddress::Tcp(tcp) if config.tls_cert.is_some() => format!("https://{tcp}"),
+        other => other.to_string(),
+    }
 }
 
 /// Takes all the file descriptors that the system lets the process have: each connection needs one.
@@ -138,7 +160,7 @@ fn catalogue(config: &Config) -> Result<(), Failure> {
 fn health(config: &Config) -> Result<(), Failure> {
     let listen = config.listen.first().ok_or("no address is given")?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    Ok(runtime.block_on(probe(listen))?)
+    Ok(runtime.block_on(probe(listen, config.tls_cert.as_deref()))?)
 }
 
 /// Resolves at SIGTERM, SIGINT, or, if asked for, when standard input closes. A second signal exits at once.

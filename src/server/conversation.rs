@@ -7,6 +7,7 @@ use super::{
     frames::{Allowance, Frames, Message},
     peers::{Full, Place, Places},
     status::Refusal,
+    tokens::{Held, Token},
 };
 use futures_util::{Stream, stream};
 use std::{future::Future, pin::Pin, time::Duration};
@@ -75,7 +76,7 @@ impl Sessions {
     /// Begins a session: the dialogue answers what the requests' frames bring.
     ///
     /// # Errors
-    /// If the server is shutting down or has no room for another session.
+    /// If the server is shutting down or has no room for another session, or its token may have no more.
     pub fn begin<D: Dialogue>(&self, requests: Frames, dialogue: D) -> Result<Responses<D::Response>, Status> {
         if self.phase() != Phase::Running {
             return Err(Refusal::Draining.into());
@@ -85,8 +86,9 @@ impl Sessions {
             Full::All(limit) => Refusal::TooManySessions { limit },
             Full::Peer(limit) => Refusal::TooManyOfAPeer { limit },
         })?;
+        let held = requests.bearer.as_ref().map(Token::session).transpose()?;
         let sessions = Self { drain: self.drain.enter(), ..self.clone() };
-        let conversation = Conversation { requests, dialogue, sessions, _place: place };
+        let conversation = Conversation { requests, dialogue, sessions, _place: place, _held: held };
         // Polled by the connection: when the client is gone the stream is dropped, and what the dialogue holds with it.
         let responses = stream::unfold(Some(conversation), |conversation| async {
             let mut conversation = conversation?;
@@ -106,6 +108,7 @@ struct Conversation<D: Dialogue> {
     /// What this one is subject to; it counts as running as long as it holds this.
     sessions: Sessions,
     _place: Place,
+    _held: Option<Held>,
 }
 
 impl<D: Dialogue> Conversation<D> {
@@ -130,6 +133,9 @@ impl<D: Dialogue> Conversation<D> {
         };
         if self.sessions.phase() != Phase::Running && !self.dialogue.is_open() {
             return Some(Err(Refusal::Draining.into()));
+        }
+        if let Some(bearer) = self.requests.bearer.as_ref().filter(|bearer| bearer.is_revoked()) {
+            return Some(Err(bearer.revoked().into()));
         }
         // Until it is answered its bytes are kept.
         let (request, _share) = match request {

@@ -9,6 +9,7 @@ use super::{
     peers::Connection,
     replies::Replies,
     status::Refusal,
+    tokens::Bearer,
 };
 use bytes::{Buf, Bytes, BytesMut};
 use http_body_util::BodyExt;
@@ -94,6 +95,7 @@ where
                 share: transit.budget.nothing(),
                 transit: transit.clone(),
                 connection: connection.clone(),
+                bearer: request.extensions_mut().remove::<Bearer>(),
                 outbox: outbox.clone(),
             };
             request.extensions_mut().insert(Kept(Arc::new(Mutex::new(Some(frames)))));
@@ -122,6 +124,8 @@ pub struct Frames {
     transit: Transit,
     /// Whom they are from.
     pub connection: Option<Connection>,
+    /// The token that came with them.
+    pub bearer: Option<Bearer>,
     /// Where the shares of their replies go.
     pub outbox: Outbox,
 }

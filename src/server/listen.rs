@@ -1,18 +1,29 @@
 //! Binding addresses: TCP ports and Unix sockets.
 
-use super::peers::{Guarded, Peer, Places};
-use crate::config::ListenAddress;
+use super::{
+    peers::{Guarded, Peer, Place, Places},
+    tls::Tls,
+};
+use crate::config::{ListenAddress, SocketMode};
 use futures_util::{Stream, stream};
 use std::time::Duration;
 use std::{
+    fs::Permissions,
     io::{self, ErrorKind},
-    os::unix::fs::{FileTypeExt, MetadataExt},
+    os::unix::fs::{FileTypeExt, MetadataExt, PermissionsExt},
     path::{Path, PathBuf},
 };
-use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
+use tokio::{
+    net::{TcpListener, TcpStream, UnixListener, UnixSocket, UnixStream},
+    task::JoinSet,
+    time::timeout,
+};
+use tokio_rustls::server::TlsStream;
 
 /// How long to wait where the system has no room for another connection.
 const PAUSE: Duration = Duration::from_millis(200);
+/// The most connections that wait to be accepted.
+const BACKLOG: u32 = 1024;
 
 /// A bound address.
 pub enum Listener {
@@ -34,13 +45,31 @@ pub struct Admission {
 impl Admission {
     /// The connection, if there is a place for it.
     fn admit<S>(&self, stream: S, peer: Peer) -> Option<Guarded<S>> {
-        match self.places.take(Some(peer)) {
-            Ok(place) => Some(Guarded::new(stream, peer, place, self.handshake)),
-            Err(full) => {
-                tracing::debug!(?peer, ?full, "closed a connection for which there is no place");
-                None
-            }
+        self.place(peer).map(|place| Guarded::new(stream, peer, place, self.handshake))
+    }
+
+    fn place(&self, peer: Peer) -> Option<Place> {
+        let full = |full| tracing::debug!(?peer, ?full, "closed a connection for which there is no place");
+        self.places.take(Some(peer)).map_err(full).ok()
+    }
+
+    /// The connection, if its client shakes hands in time.
+    async fn shake(
+        self,
+        stream: TcpStream,
+        peer: Peer,
+        place: Place,
+        tls: Tls,
+    ) -> Option<Guarded<TlsStream<TcpStream>>> {
+        let refused = |reason: &dyn ToString| {
+            tracing::debug!(?peer, reason = reason.to_string(), "closed a connection in its handshake");
+        };
+        match timeout(self.handshake, tls.accept(stream)).await {
+            Ok(Ok(stream)) => return Some(Guarded::new(stream, peer, place, self.handshake)),
+            Ok(Err(error)) => refused(&error),
+            Err(late) => refused(&late),
         }
+        None
     }
 }
 
@@ -63,6 +92,32 @@ pub fn tcp_connections(
             }
         };
         Some((Ok(connection), (listener, admission)))
+    })
+}
+
+/// Connections whose clients have shaken hands, in whatever order they are done with it: none waits for another.
+pub fn tls_connections(
+    listener: TcpListener,
+    admission: Admission,
+    tls: Tls,
+) -> impl Stream<Item = io::Result<Guarded<TlsStream<TcpStream>>>> {
+    stream::unfold((listener, admission, tls, JoinSet::new()), |(listener, admission, tls, mut shaking)| async {
+        let connection = loop {
+            tokio::select! {
+                accepted = listener.accept() => match accepted {
+                    Ok((connection, address)) => {
+                        let _ = connection.set_nodelay(true);
+                        let peer = Peer::at(address.ip());
+                        if let Some(place) = admission.place(peer) {
+                            shaking.spawn(admission.clone().shake(connection, peer, place, tls.clone()));
+                        }
+                    }
+                    Err(error) => pause(&error).await,
+                },
+                Some(done) = shaking.join_next() => if let Ok(Some(connection)) = done { break connection },
+            }
+        };
+        Some((Ok(connection), (listener, admission, tls, shaking)))
     })
 }
 
@@ -139,11 +194,12 @@ impl Drop for SocketFile {
 }
 
 impl Listener {
-    /// Binds an address. A Unix socket that a dead server left behind is replaced.
+    /// Binds an address; a Unix socket's file gets this mode before anybody can connect. One that a dead server left behind
+    /// is replaced.
     ///
     /// # Errors
     /// If the address is in use or may not be bound; the message names it.
-    pub async fn bind(address: &ListenAddress) -> io::Result<Self> {
+    pub async fn bind(address: &ListenAddress, mode: SocketMode) -> io::Result<Self> {
         let explain = |error: io::Error| io::Error::new(error.kind(), explain(address, &error));
         match address {
             ListenAddress::Tcp(tcp) => Ok(Self::Tcp(TcpListener::bind(tcp).await.map_err(explain)?)),
@@ -154,8 +210,11 @@ impl Listener {
                 if is_socket && UnixStream::connect(path).await.is_err_and(refused) {
                     std::fs::remove_file(path).map_err(explain)?;
                 }
-                let listener = UnixListener::bind(path).map_err(explain)?;
-                Ok(Self::Unix(listener, SocketFile { path: path.clone(), identity: identity(path) }))
+                let socket = UnixSocket::new_stream().and_then(|socket| socket.bind(path).map(|()| socket));
+                let socket = socket.map_err(explain)?;
+                let file = SocketFile { path: path.clone(), identity: identity(path) };
+                std::fs::set_permissions(path, Permissions::from_mode(mode.bits())).map_err(explain)?;
+                Ok(Self::Unix(socket.listen(BACKLOG).map_err(explain)?, file))
             }
         }
     }

@@ -5,6 +5,7 @@
 //! - [`frames`] and [`fields`]: how requests come off the wire, with bounds for all that they are made of.
 //! - [`replies`]: how replies go onto it; [`budget`]: the bytes of both; [`sizes`]: how many they are.
 //! - [`peers`]: whom connections are from, and what each may have.
+//! - [`guards`]: what keeps strangers out: [`tokens`], [`tls`], of files that a [`watch`] reads again.
 //! - [`requests`]: spans and counts of requests, a layer between the two.
 //! - [`session`]: the legal order of a session's requests.
 //! - [`convert`]: the protocol to the domain and back, with all validation; [`acting`]: that of policies.
@@ -21,6 +22,7 @@ pub mod dm_env_rpc;
 pub mod drain;
 pub mod fields;
 pub mod frames;
+pub mod guards;
 pub mod listen;
 pub mod peers;
 pub mod probe;
@@ -30,6 +32,9 @@ pub mod service;
 pub mod session;
 pub mod sizes;
 pub mod status;
+pub mod tls;
+pub mod tokens;
+pub mod watch;
 
 use crate::{
     config::Config,
@@ -42,11 +47,13 @@ use budget::Budget;
 use conversation::{Limits, Sessions};
 use drain::{Controller, Phase};
 use frames::{Keeping, Transit};
+use guards::Guards;
 use listen::{Admission, Listener};
 use peers::Places;
 use service::Service;
 use session::Shared;
 use std::{future::Future, io, sync::Arc, time::Duration};
+use tokens::Gated;
 use tonic::transport::Server;
 use tonic_health::ServingStatus;
 
@@ -81,14 +88,16 @@ pub enum Error {
     Reflection(#[from] tonic_reflection::server::Error),
 }
 
-/// Serves these environments on the listeners until `shutdown` resolves; then drains: new sessions are refused, running ones may go on for
-/// the grace period, and connections are closed. Must run on a tokio runtime; a current-thread one is fastest.
+/// Serves these environments on the listeners, to whom the guards let in, until `shutdown` resolves; then drains: new
+/// sessions are refused, running ones may go on for the grace period, and connections are closed. Must run on a tokio
+/// runtime; a current-thread one is fastest.
 ///
 /// # Errors
 /// [`Error`], before anything is served, or when a listener fails.
 pub async fn run(
     listeners: Vec<Listener>,
     config: &Config,
+    guards: &Guards,
     catalogue: Catalogue,
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Error> {
@@ -122,6 +131,7 @@ pub async fn run(
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
     let keepalive = Duration::from_secs(config.keepalive_seconds);
+    let tokens = || guards.tokens.clone();
     let router = Server::builder()
         .http2_keepalive_interval(Some(keepalive))
         .http2_keepalive_timeout(Some(keepalive))
@@ -129,22 +139,27 @@ pub async fn run(
         .initial_connection_window_size(CONNECTION_WINDOW)
         .max_concurrent_streams(u32::try_from(config.max_sessions.saturating_add(OTHER_STREAMS)).unwrap_or(u32::MAX))
         .timeout(UNARY_LIMIT) // until an answer begins, which that of a stream does at once
-        .add_service(service)
-        .add_service(worlds)
+        .add_service(Gated::new(service, tokens()))
+        .add_service(Gated::new(worlds, tokens()))
+        // Health is for everybody: whoever watches over servers need not be able to use them.
         .add_service(health_service.max_decoding_message_size(UNARY_BYTES))
-        .add_service(reflection().build_v1()?.max_decoding_message_size(UNARY_BYTES))
-        .add_service(reflection().build_v1alpha()?.max_decoding_message_size(UNARY_BYTES));
+        .add_service(Gated::new(reflection().build_v1()?.max_decoding_message_size(UNARY_BYTES), tokens()))
+        .add_service(Gated::new(reflection().build_v1alpha()?.max_decoding_message_size(UNARY_BYTES), tokens()));
 
     let mut servers = tokio::task::JoinSet::new();
     for listener in listeners {
-        let (router, mut closed, admission) = (router.clone(), drain.clone(), admission.clone());
+        let (router, mut closed, admission, tls) =
+            (router.clone(), drain.clone(), admission.clone(), guards.tls.clone());
         servers.spawn(async move {
             let end = async move { closed.closed().await };
-            match listener {
-                Listener::Tcp(listener) => {
+            match (listener, tls) {
+                (Listener::Tcp(listener), Some(tls)) => {
+                    router.serve_with_incoming_shutdown(listen::tls_connections(listener, admission, tls), end).await
+                }
+                (Listener::Tcp(listener), None) => {
                     router.serve_with_incoming_shutdown(listen::tcp_connections(listener, admission), end).await
                 }
-                Listener::Unix(listener, file) => {
+                (Listener::Unix(listener, file), _) => {
                     router.serve_with_incoming_shutdown(listen::unix_connections(listener, file, admission), end).await
                 }
             }

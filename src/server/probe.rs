@@ -1,11 +1,11 @@
 //! Asking a running server for its health, as container engines do by starting the server's own program.
 
 use crate::config::ListenAddress;
-use perturb_protocol::{Address, AddressError, ClientError, Connection};
+use perturb_protocol::{Address, AddressError, ClientError, Connection, Patience, credentials::Credentials};
 use std::{
     io,
     net::{Ipv4Addr, Ipv6Addr},
-    path,
+    path::{self, Path},
     time::Duration,
 };
 
@@ -33,15 +33,24 @@ pub enum Error {
 }
 
 /// Asks the server that listens at `listen` whether it takes sessions. One that listens everywhere is asked through the
-/// loopback interface.
+/// loopback interface; one with TLS must show this certificate, whatever names are in it.
 ///
 /// # Errors
 /// [`Error`], after at most 3 s.
-pub async fn probe(listen: &ListenAddress) -> Result<(), Error> {
-    let address = reachable(listen)?;
-    let reason = match tokio::time::timeout(LIMIT, Connection::open(&address)).await {
+pub async fn probe(listen: &ListenAddress, certificate: Option<&Path>) -> Result<(), Error> {
+    let mut address = reachable(listen)?;
+    let mut credentials = Credentials::default();
+    if let (Address::Tcp { host, tls, .. }, Some(certificate)) = (&mut address, certificate) {
+        *tls = Some(host.clone());
+        credentials = match Credentials::knowing(certificate) {
+            Ok(credentials) => credentials,
+            Err(reason) => return Err(Error::NoAnswer { address, reason }),
+        };
+    }
+    let connecting = Connection::open_as(&address, Patience::default(), credentials);
+    let reason = match tokio::time::timeout(LIMIT, connecting).await {
         Ok(Ok(_)) => return Ok(()),
-        Ok(Err(ClientError::Connect { reason, .. })) => reason,
+        Ok(Err(ClientError::Connect { reason, .. } | ClientError::Unsafe { reason, .. })) => reason,
         Ok(Err(error)) => error.to_string(),
         Err(_) => format!("it took more than {} s", LIMIT.as_secs()),
     };

@@ -46,7 +46,8 @@ impl Perturb for Service {
         mut request: Request<Streaming<proto::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
         let frames = Frames::of(&mut request)?;
-        let session = Session::new(Arc::clone(&self.shared), frames.budget().clone(), frames.outbox.clone());
+        let (budget, outbox) = (frames.budget().clone(), frames.outbox.clone());
+        let session = Session::new(Arc::clone(&self.shared), frames.bearer.clone(), budget, outbox);
         Ok(Response::new(self.sessions.begin(frames, Counted::new(session, &self.counts))?))
     }
 }

@@ -10,6 +10,7 @@ use super::{
     requests::Observed,
     sizes,
     status::Refusal,
+    tokens::{Bearer, Held},
 };
 use crate::{
     env::Catalogue,
@@ -38,6 +39,9 @@ pub struct Shared {
 pub struct Session {
     shared: Arc<Shared>,
     batch: Option<Batch>,
+    bearer: Option<Bearer>,
+    /// Its environments, of those that its token may have.
+    held: Option<Held>,
     budget: Budget,
     /// What replies take beyond `kept`.
     outbox: Outbox,
@@ -49,8 +53,8 @@ pub struct Session {
 
 impl Session {
     /// A session that is not open yet, whose replies' bytes are taken from the budget until they leave the outbox.
-    pub fn new(shared: Arc<Shared>, budget: Budget, outbox: Outbox) -> Self {
-        Self { shared, batch: None, budget, outbox, kept: None, playing: None }
+    pub fn new(shared: Arc<Shared>, bearer: Option<Bearer>, budget: Budget, outbox: Outbox) -> Self {
+        Self { shared, batch: None, bearer, held: None, budget, outbox, kept: None, playing: None }
     }
 
     async fn open(&mut self, request: proto::Open) -> Result<proto::Opened, Refusal> {
@@ -66,8 +70,9 @@ impl Session {
         let envs = settings.size();
         // More than there can be is for the pool to refuse.
         let kept = (envs <= most).then(|| self.budget.take(sizes::session(&settings, envs))).transpose()?;
+        let held = self.bearer.as_ref().map(|bearer| bearer.envs(envs)).transpose()?;
         let (batch, observations, started) = Batch::open(&self.shared.pool, settings).await?;
-        (self.batch, self.kept) = (Some(batch), kept);
+        (self.batch, self.kept, self.held) = (Some(batch), kept, held);
         let started = convert::started(started);
         let acts = true;
         Ok(proto::Opened {
@@ -128,7 +133,11 @@ impl Session {
 
     fn release(&mut self, request: &proto::Release) -> Result<proto::Released, Refusal> {
         let batch = self.opened("release")?;
-        batch.release(&convert::release(batch.size(), request)?)?;
+        let slots = convert::release(batch.size(), request)?;
+        batch.release(&slots)?;
+        if let Some(held) = &mut self.held {
+            held.give_back(slots.len());
+        }
         Ok(proto::Released {})
     }
 

@@ -64,6 +64,33 @@ pub enum Refusal {
         /// The most there may be.
         limit: usize,
     },
+    /// A call without a token.
+    #[error(
+        "this server asks for a token, and none came; ask who runs it for one, and name the file that has it in \
+         PERTURB_TOKEN_FILE, or send it as the metadata `authorization: Bearer TOKEN`"
+    )]
+    NoToken,
+    /// A call with a token that is none here.
+    #[error("this server does not know the token that came; ask who runs it for one that is good")]
+    WrongToken,
+    /// The session's token was taken out of the file of tokens.
+    #[error("the token {name:?} was revoked; ask who runs this server for another one")]
+    RevokedToken {
+        /// What it is called.
+        name: String,
+    },
+    /// A token has all that it may have.
+    #[error("the token {name:?} may have {limit} {what} here, and {wanted} more would be too many; close a session")]
+    TooManyOfAToken {
+        /// What it is called.
+        name: String,
+        /// What was asked for.
+        wanted: usize,
+        /// The most there may be.
+        limit: usize,
+        /// Sessions or environments.
+        what: &'static str,
+    },
     /// The budget of bytes in flight is used up.
     #[error(
         "this needs {wanted} bytes, but {used} of the server's {limit} for what is in flight are in use; ask for less at \
@@ -185,6 +212,7 @@ impl Refusal {
             Self::Pool(pool::Error::Full { .. })
             | Self::TooManySessions { .. }
             | Self::TooManyOfAPeer { .. }
+            | Self::TooManyOfAToken { .. }
             | Self::NoMemory { .. }
             | Self::Render(render::Error::NoThread { .. }) => Code::ResourceExhausted,
             Self::Pool(pool::Error::Ended { .. })
@@ -201,6 +229,7 @@ impl Refusal {
             Self::Value { .. } => Code::InvalidArgument,
             Self::TooLarge { .. } => Code::OutOfRange,
             Self::Idle { .. } | Self::Unfinished { .. } => Code::DeadlineExceeded,
+            Self::NoToken | Self::WrongToken | Self::RevokedToken { .. } => Code::Unauthenticated,
             Self::Draining => Code::Unavailable,
             Self::Unknown { .. } => Code::NotFound,
             Self::Forbidden { .. } | Self::NotYours { .. } => Code::PermissionDenied,

@@ -13,6 +13,7 @@ mod dm_env_rpc;
 mod drawing;
 mod faults;
 mod groups;
+mod guarded;
 mod lifecycle;
 #[cfg(feature = "mujoco")]
 mod locomotion;

@@ -154,6 +154,7 @@ fn is_wrong_server(error: &ClientError) -> bool {
         error,
         ClientError::Connect { .. }
             | ClientError::NotPerturb { .. }
+            | ClientError::Unsafe { .. }
             | ClientError::NoneConnects { .. }
             | ClientError::NoServerProgram { .. }
             | ClientError::NoEnvironment(_)

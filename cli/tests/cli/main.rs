@@ -5,6 +5,7 @@ mod common;
 
 mod end_to_end;
 mod experiments;
+mod guarded;
 mod misuse;
 mod patience;
 mod processors;

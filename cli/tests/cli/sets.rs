@@ -8,7 +8,7 @@ use std::thread::{self, JoinHandle};
 use perturb::config::{Arguments, Config};
 use perturb::env::{Action, Catalogue, Environment, EnvironmentSpec, Error, Stream, Transition};
 use perturb::scene::Scene;
-use perturb::server::listen::Listener;
+use perturb::server::{guards::Guards, listen::Listener};
 use perturb::tasks::cart_pole;
 use perturb_study::records::{FILE, Records};
 use perturb_study::{CellResult, CellState, Folder, Plan};
@@ -303,10 +303,11 @@ impl InThread {
             let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
             runtime.block_on(async {
                 let any = "tcp://127.0.0.1:0".to_owned().try_into().expect("an address");
-                let listener = Listener::bind(&any).await.expect("a free port");
+                let listener = Listener::bind(&any, config.socket_mode).await.expect("a free port");
                 tell.send(listener.address().expect("bound").to_string()).expect("heard");
                 let stop = async { drop(end.await) };
-                perturb::server::run(vec![listener], &config, catalogue, stop).await.expect("served");
+                let guards = Guards::default();
+                perturb::server::run(vec![listener], &config, &guards, catalogue, stop).await.expect("served");
             });
         });
         let address = address.blocking_recv().expect("it listens");

@@ -1,7 +1,7 @@
 //! Addresses of servers.
 
 use std::fmt;
-use std::net::Ipv4Addr;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::str::FromStr;
 
@@ -12,19 +12,23 @@ use crate::limits::LONGEST_SOCKET_PATH;
 pub enum Address {
     /// A Unix socket, written `unix:/path`.
     Unix(PathBuf),
-    /// A TCP port, written `host:port`, `http://host:port` or `tcp://host:port`. An IPv6 host is written in brackets.
+    /// A TCP port, written `host:port`, `http://host:port` or `tcp://host:port`, with TLS `https://host:port`. An IPv6 host
+    /// is written in brackets.
     Tcp {
         /// A host name or an IP address, without brackets.
         host: String,
         /// The port, at least 1.
         port: u16,
+        /// With TLS the name that the server's certificate must have: the host, or that from which it was resolved.
+        tls: Option<String>,
     },
 }
 
 /// Why a text is not an address.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "`{text}` is not a server's address: {reason}; write `unix:/path`, `host:port`, `http://host:port` or `tcp://host:port`"
+    "`{text}` is not a server's address: {reason}; write `unix:/path`, `host:port`, `http://host:port` or \
+     `tcp://host:port`, with TLS `https://host:port`"
 )]
 pub struct AddressError {
     /// What was given.
@@ -44,27 +48,32 @@ impl FromStr for Address {
 impl Address {
     /// What starts a server there, where it can be said.
     pub fn start_command(&self) -> String {
-        match self {
-            Self::Unix(path) => format!("perturb-server --listen unix:{}", path.display()),
-            Self::Tcp { host, port } if host.contains(':') => format!("perturb-server --listen tcp://[{host}]:{port}"),
-            Self::Tcp { host, port } if host.parse::<Ipv4Addr>().is_ok() => {
-                format!("perturb-server --listen tcp://{host}:{port}")
-            }
-            Self::Tcp { host, port } if host == "localhost" => {
-                format!("perturb-server --listen tcp://127.0.0.1:{port}")
-            }
-            Self::Tcp { port, .. } => format!("perturb-server --listen tcp://0.0.0.0:{port}"),
-        }
+        let (host, port, tls) = match self {
+            Self::Unix(path) => return format!("perturb-server --listen unix:{}", path.display()),
+            Self::Tcp { host, port, tls } => (host, port, tls.is_some()),
+        };
+        let ip = match host.as_str() {
+            "localhost" => IpAddr::from(Ipv4Addr::LOCALHOST),
+            name => name.parse().unwrap_or(Ipv4Addr::UNSPECIFIED.into()),
+        };
+        let guards = match (tls, ip.is_loopback()) {
+            (true, true) => " --tls-cert FILE --tls-key FILE",
+            (true, false) => " --tls-cert FILE --tls-key FILE --tokens FILE",
+            (false, true) => "",
+            (false, false) => " --insecure",
+        };
+        format!("perturb-server --listen tcp://{}{guards}", SocketAddr::new(ip, *port))
     }
 }
 
 impl fmt::Display for Address {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Unix(path) => write!(f, "unix:{}", path.display()),
-            Self::Tcp { host, port } if host.contains(':') => write!(f, "http://[{host}]:{port}"),
-            Self::Tcp { host, port } => write!(f, "http://{host}:{port}"),
-        }
+        let (host, port, tls) = match self {
+            Self::Unix(path) => return write!(f, "unix:{}", path.display()),
+            Self::Tcp { host, port, tls } => (host, port, tls),
+        };
+        let scheme = if tls.is_some() { "https" } else { "http" };
+        if host.contains(':') { write!(f, "{scheme}://[{host}]:{port}") } else { write!(f, "{scheme}://{host}:{port}") }
     }
 }
 
@@ -75,14 +84,14 @@ fn parse(text: &str) -> Result<Address, String> {
     if let Some(path) = text.strip_prefix("unix:") {
         return parse_unix(path);
     }
-    if text.starts_with("https://") {
-        return Err("encrypted connections are not supported, tunnel them instead".into());
-    }
-    let rest = text.strip_prefix("http://").or_else(|| text.strip_prefix("tcp://")).unwrap_or(text);
+    let (rest, tls) = match text.strip_prefix("https://") {
+        Some(rest) => (rest, true),
+        None => (text.strip_prefix("http://").or_else(|| text.strip_prefix("tcp://")).unwrap_or(text), false),
+    };
     if let Some((scheme, _)) = rest.split_once("://") {
         return Err(format!("the scheme `{scheme}` is unknown"));
     }
-    parse_tcp(rest.strip_suffix('/').unwrap_or(rest))
+    parse_tcp(rest.strip_suffix('/').unwrap_or(rest), tls)
 }
 
 fn parse_unix(path: &str) -> Result<Address, String> {
@@ -99,7 +108,7 @@ fn parse_unix(path: &str) -> Result<Address, String> {
     Ok(Address::Unix(path.into()))
 }
 
-fn parse_tcp(text: &str) -> Result<Address, String> {
+fn parse_tcp(text: &str, tls: bool) -> Result<Address, String> {
     let Some((host, port)) = text.rsplit_once(':') else {
         return Err("the port is missing".into());
     };
@@ -121,7 +130,7 @@ fn parse_tcp(text: &str) -> Result<Address, String> {
     if !host.chars().all(plausible) {
         return Err(format!("`{host}` is not a host name"));
     }
-    Ok(Address::Tcp { host: host.to_owned(), port })
+    Ok(Address::Tcp { host: host.to_owned(), port, tls: tls.then(|| host.to_owned()) })
 }
 
 #[cfg(test)]
@@ -145,7 +154,7 @@ mod tests {
 
     #[test]
     fn an_address_reads_back_from_its_text() {
-        for text in ["unix:/a/b", "127.0.0.1:1", "[::1]:80", "tcp://host:65535"] {
+        for text in ["unix:/a/b", "127.0.0.1:1", "[::1]:80", "tcp://host:65535", "https://[::1]:80"] {
             let address: Address = text.parse().unwrap();
             assert_eq!(address.to_string().parse(), Ok(address));
         }
@@ -155,10 +164,12 @@ mod tests {
     fn a_server_is_started_at_an_address_that_it_understands() {
         for (text, expected) in [
             ("unix:/a/b", "unix:/a/b"),
-            ("10.0.0.2:7", "tcp://10.0.0.2:7"),
+            ("10.0.0.2:7", "tcp://10.0.0.2:7 --insecure"),
             ("http://localhost:7", "tcp://127.0.0.1:7"),
             ("[::1]:7", "tcp://[::1]:7"),
-            ("node-3:7", "tcp://0.0.0.0:7"),
+            ("node-3:7", "tcp://0.0.0.0:7 --insecure"),
+            ("https://localhost:7", "tcp://127.0.0.1:7 --tls-cert FILE --tls-key FILE"),
+            ("https://node-3:7", "tcp://0.0.0.0:7 --tls-cert FILE --tls-key FILE --tokens FILE"),
         ] {
             let command = text.parse::<Address>().unwrap().start_command();
             assert_eq!(command, format!("perturb-server --listen {expected}"));
@@ -171,7 +182,7 @@ mod tests {
             ("", "empty"),
             ("unix:relative", "absolute"),
             ("unix:", "absolute"),
-            ("https://host:1", "encrypted"),
+            ("https://host", "port is missing"),
             ("ftp://host:1", "scheme `ftp`"),
             ("localhost", "port is missing"),
             ("host:99999", "`99999` is not a port"),

@@ -5,12 +5,15 @@ use std::time::Duration;
 
 use tokio::time::timeout;
 use tonic::Code;
+use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Channel, Endpoint};
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
 
 use crate::address::Address;
+use crate::credentials::{Credentials, WithToken};
+use crate::encryption::{Connector, speaks_tls};
 use crate::error::{ClientError, REPLY_LIMIT, describe, lost, system_words, timed_out};
 use crate::limits::SERVICE;
 use crate::proto::{self, perturb_client::PerturbClient};
@@ -43,11 +46,14 @@ impl Default for Patience {
     }
 }
 
+/// What calls are made with.
+pub type Client = PerturbClient<InterceptedService<Channel, WithToken>>;
+
 /// A connection to a server that takes sessions.
 #[derive(Clone, Debug)]
 pub struct Connection {
     address: Address,
-    client: PerturbClient<Channel>,
+    client: Client,
     patience: Patience,
 }
 
@@ -55,7 +61,7 @@ impl Connection {
     /// Connects to `address`, whose server must take sessions: one that is shutting down still answers.
     ///
     /// # Errors
-    /// [`ClientError::Connect`].
+    /// [`ClientError::Connect`], [`ClientError::Unsafe`].
     pub async fn open(address: &Address) -> Result<Self, ClientError> {
         Self::open_with(address, Patience::default()).await
     }
@@ -63,8 +69,73 @@ impl Connection {
     /// The same, with another patience.
     ///
     /// # Errors
-    /// [`ClientError::Connect`].
+    /// [`ClientError::Connect`], [`ClientError::Unsafe`].
     pub async fn open_with(address: &Address, patience: Patience) -> Result<Self, ClientError> {
+        let wrong = |reason| ClientError::Unsafe { address: address.clone(), reason };
+        Self::open_as(address, patience, Credentials::of_environment(address).map_err(wrong)?).await
+    }
+
+    /// The same, with other credentials than the environment's.
+    ///
+    /// # Errors
+    /// [`ClientError::Connect`], [`ClientError::Unsafe`].
+    pub async fn open_as(
+        address: &Address,
+        patience: Patience,
+        mut credentials: Credentials,
+    ) -> Result<Self, ClientError> {
+        let token = WithToken(credentials.token.take());
+        let (host, port, name) = match address {
+            Address::Tcp { host, port, tls: Some(name) } => (host, *port, name),
+            _ => {
+                let channel = Self::endpoint(address, patience)?.connect().await;
+                let opened = Self::opened(address, patience, token, channel).await;
+                return match (address, opened) {
+                    (
+                        Address::Tcp { host, port, .. },
+                        Err(ClientError::NotPerturb { .. } | ClientError::Connect { .. }),
+                    ) if speaks_tls(host, *port).await => {
+                        let reason = format!("it speaks TLS; write https://{host}:{port}");
+                        Err(ClientError::Unsafe { address: address.clone(), reason })
+                    }
+                    (_, opened) => opened,
+                };
+            }
+        };
+        let refuse = |reason| ClientError::Unsafe { address: address.clone(), reason };
+        let connector = Connector::new(host, port, name, credentials).map_err(refuse)?;
+        let channel = Self::endpoint(address, patience)?.connect_with_connector(connector.clone()).await;
+        let has_shaken = channel.is_ok();
+        Self::opened(address, patience, token, channel).await.map_err(|error| {
+            let reason = connector.failure().or_else(|| connector.refusal().filter(|_| has_shaken));
+            match (error, reason) {
+                (ClientError::NotPerturb { .. } | ClientError::Connect { .. }, Some(reason)) => refuse(reason),
+                (error, _) => error,
+            }
+        })
+    }
+
+    fn endpoint(address: &Address, patience: Patience) -> Result<Endpoint, ClientError> {
+        let wrong = |error: tonic::transport::Error| ClientError::Connect {
+            address: address.clone(),
+            reason: error.to_string(),
+        };
+        Ok(Endpoint::from_shared(address.to_string())
+            .map_err(wrong)?
+            .connect_timeout(CONNECT_LIMIT)
+            .tcp_nodelay(true)
+            .http2_keep_alive_interval(patience.keepalive_interval)
+            .keep_alive_timeout(patience.keepalive_limit)
+            .initial_stream_window_size(WINDOW)
+            .initial_connection_window_size(WINDOW))
+    }
+
+    async fn opened(
+        address: &Address,
+        patience: Patience,
+        token: WithToken,
+        channel: Result<Channel, tonic::transport::Error>,
+    ) -> Result<Self, ClientError> {
         let fail = |reason: String| ClientError::Connect { address: address.clone(), reason };
         let transport = |error: tonic::transport::Error| {
             fail(
@@ -72,19 +143,9 @@ impl Connection {
                     .unwrap_or_else(|| format!("it did not answer within {} s", CONNECT_LIMIT.as_secs())),
             )
         };
-        let channel = Endpoint::from_shared(address.to_string())
-            .map_err(transport)?
-            .connect_timeout(CONNECT_LIMIT)
-            .tcp_nodelay(true)
-            .http2_keep_alive_interval(patience.keepalive_interval)
-            .keep_alive_timeout(patience.keepalive_limit)
-            .initial_stream_window_size(WINDOW)
-            .initial_connection_window_size(WINDOW)
-            .connect()
-            .await
-            .map_err(transport)?;
+        let channel = channel.map_err(transport)?;
         takes_sessions(address, &channel).await?;
-        let client = PerturbClient::new(channel)
+        let client = PerturbClient::with_interceptor(channel, token)
             .max_decoding_message_size(LARGEST_MESSAGE)
             .max_encoding_message_size(LARGEST_MESSAGE);
         Ok(Self { address: address.clone(), client, patience })
@@ -101,7 +162,7 @@ impl Connection {
     }
 
     /// What calls are made with.
-    pub fn client(&self) -> PerturbClient<Channel> {
+    pub fn client(&self) -> Client {
         self.client.clone()
     }
 
@@ -157,7 +218,7 @@ impl Machines {
 /// [`ClientError::Connect`] for a name that stands for none.
 pub async fn machines(address: &Address) -> Result<Machines, ClientError> {
     let one = || Machines { equal: vec![address.clone()], spare: Vec::new() };
-    let Address::Tcp { host, port } = address else { return Ok(one()) };
+    let Address::Tcp { host, port, tls } = address else { return Ok(one()) };
     if host.parse::<IpAddr>().is_ok() {
         return Ok(one());
     }
@@ -168,15 +229,19 @@ pub async fn machines(address: &Address) -> Result<Machines, ClientError> {
         .map_err(|error| fail(format!("its name cannot be resolved: {error}")))?
         .collect();
     // The name says more than a number, as long as it is clear whom it means.
-    Ok(if found.len() > 1 { sorted(found) } else { one() })
+    Ok(if found.len() > 1 { sorted(found, tls.as_deref()) } else { one() })
 }
 
-fn sorted(mut found: Vec<SocketAddr>) -> Machines {
+fn sorted(mut found: Vec<SocketAddr>, tls: Option<&str>) -> Machines {
     let liked = found.first().is_some_and(SocketAddr::is_ipv4); // a resolver puts what can be reached first
     found.sort_unstable();
     found.dedup();
     let (equal, spare): (Vec<_>, Vec<_>) = found.into_iter().partition(|found| found.is_ipv4() == liked);
-    let address = |found: SocketAddr| Address::Tcp { host: found.ip().to_string(), port: found.port() };
+    let address = |found: SocketAddr| Address::Tcp {
+        host: found.ip().to_string(),
+        port: found.port(),
+        tls: tls.map(str::to_owned),
+    };
     Machines { equal: equal.into_iter().map(address).collect(), spare: spare.into_iter().map(address).collect() }
 }
 
@@ -238,7 +303,7 @@ mod tests {
     fn replicas_have_an_order_of_their_own_and_turns_go_around() {
         let answers = [["10.0.0.9:7", "10.0.0.10:7", "10.0.0.2:7"], ["10.0.0.2:7", "10.0.0.9:7", "10.0.0.10:7"]];
         for answer in answers {
-            let turn = |turn| sorted(found(&answer)).into_order(turn);
+            let turn = |turn| sorted(found(&answer), None).into_order(turn);
             assert_eq!(turn(0), addresses(&["10.0.0.2:7", "10.0.0.9:7", "10.0.0.10:7"]));
             assert_eq!(turn(1), addresses(&["10.0.0.9:7", "10.0.0.10:7", "10.0.0.2:7"]));
             assert_eq!(turn(5), addresses(&["10.0.0.10:7", "10.0.0.2:7", "10.0.0.9:7"]));
@@ -247,15 +312,15 @@ mod tests {
 
     #[test]
     fn a_machine_with_two_protocols_is_one_machine() {
-        let machines = sorted(found(&["127.0.0.1:7", "[::1]:7", "127.0.0.1:7"]));
+        let machines = sorted(found(&["127.0.0.1:7", "[::1]:7", "127.0.0.1:7"]), None);
         assert_eq!(machines.equal, addresses(&["127.0.0.1:7"]));
         for turn in 0..3 {
             assert_eq!(
-                sorted(found(&["127.0.0.1:7", "[::1]:7"])).into_order(turn),
+                sorted(found(&["127.0.0.1:7", "[::1]:7"]), None).into_order(turn),
                 addresses(&["127.0.0.1:7", "[::1]:7"])
             );
         }
-        assert_eq!(sorted(found(&["[::1]:7", "127.0.0.1:7"])).equal, addresses(&["[::1]:7"]));
+        assert_eq!(sorted(found(&["[::1]:7", "127.0.0.1:7"]), None).equal, addresses(&["[::1]:7"]));
     }
 
     #[test]

@@ -26,6 +26,9 @@ pub enum ClientError {
          `perturb-server --listen tcp://127.0.0.1:0`"
     )]
     NotPerturb { address: Address },
+    /// The server is not trusted, or does not trust this client.
+    #[error("no safe connection to the server at {address}: {reason}")]
+    Unsafe { address: Address, reason: String },
     /// None of several servers takes sessions.
     #[error(
         "no server answers ({reasons}); start one of them with `perturb-server --listen ADDRESS`, or correct --server"
@@ -89,6 +92,7 @@ impl ClientError {
     pub(crate) fn in_short(&self) -> String {
         match self {
             Self::Connect { address, reason } => format!("{address}: {reason}"),
+            Self::Unsafe { address, reason } => format!("{address}: {reason}"),
             Self::NotPerturb { address } => format!("{address}: what answers there is no perturb-server"),
             other => other.to_string(),
         }
@@ -96,7 +100,7 @@ impl ClientError {
 
     /// The errors of all addresses that were tried as one.
     pub fn of_all(mut errors: Vec<Self>) -> Self {
-        if errors.len() == 1 {
+        if errors.len() == 1 || errors.iter().all(|error| matches!(error, Self::Unsafe { .. })) && !errors.is_empty() {
             return errors.remove(0);
         }
         Self::NoneConnects { reasons: errors.iter().map(Self::in_short).collect::<Vec<_>>().join("; ") }
@@ -106,7 +110,7 @@ impl ClientError {
     pub fn can_be_retried(&self) -> bool {
         match self {
             Self::Refused { code, .. } => *code == Code::ResourceExhausted, // full; others' sessions will end
-            Self::Snapshots { .. } | Self::NoEnvironment(_) => false,
+            Self::Snapshots { .. } | Self::NoEnvironment(_) | Self::Unsafe { .. } => false,
             Self::Connect { .. }
             | Self::NotPerturb { .. } // a name that stands for another machine tomorrow
             | Self::NoneConnects { .. }
@@ -174,6 +178,10 @@ pub(crate) fn system_words(error: &(dyn std::error::Error + 'static)) -> Option<
 }
 
 pub(crate) fn lost(address: &Address, request: &'static str, status: &Status) -> ClientError {
+    if status.code() == Code::Unauthenticated {
+        let (address, code, message) = (address.clone(), status.code(), describe(status));
+        return ClientError::Refused { address, request, code, message };
+    }
     ClientError::Lost { address: address.clone(), request, code: status.code(), reason: describe(status) }
 }
 

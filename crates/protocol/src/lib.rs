@@ -5,6 +5,7 @@
 //! - [`names`]: how people may spell names.
 //! - [`catalogue`]: the environments and limits as JSON.
 //! - [`Connection`] and [`Stream`]: a client's side of a session, one typed reply for each request.
+//! - [`credentials`]: what a client shows, and whom it trusts.
 //! - [`EndedEpisode`]: what came of an episode.
 //! - [`PrivateServer`]: a server of a program's own.
 #![forbid(unsafe_code)]
@@ -12,7 +13,9 @@
 mod address;
 pub mod catalogue;
 mod connection;
+pub mod credentials;
 mod distribution;
+mod encryption;
 mod ended;
 mod error;
 pub mod limits;

@@ -99,6 +99,10 @@ impl Waiting {
                     tell(&format!("going on with {} alone", there.join(" and ")));
                     return After::Again;
                 }
+                Err(error @ ClientError::Unsafe { .. }) => {
+                    tell(&error.to_string());
+                    return After::GivenUp;
+                }
                 _ if self.waited >= limit => return After::GivenUp,
                 _ => {}
             }

@@ -32,6 +32,9 @@ pub const UNUSABLE: &str = "unusable";
 /// A policy that cannot be loaded, does not fit, or cannot act.
 pub const POLICY: &str = "policy";
 
+/// gRPC's code of a server that is not trusted, or does not trust.
+const UNAUTHENTICATED: i32 = 16;
+
 /// A failure for Python.
 pub fn failure(kind: &'static str, code: i32, words: impl Into<String>) -> PyErr {
     Failure::new_err((kind, code, words.into()))
@@ -45,6 +48,7 @@ pub fn of(error: &ClientError) -> PyErr {
         ClientError::TimedOut { .. } => failure(TIMED_OUT, 0, ""),
         ClientError::Protocol { got, .. } => failure(MISMATCH, 0, got),
         ClientError::Connect { reason, .. } => failure(UNREACHABLE, 0, reason),
+        ClientError::Unsafe { reason, .. } => failure(UNREACHABLE, UNAUTHENTICATED, reason),
         ClientError::NotPerturb { .. } => failure(UNREACHABLE, 0, "what answers there is no perturb-server"),
         other => failure(UNREACHABLE, 0, other.to_string()),
     }

@@ -12,7 +12,7 @@ from .errors import InvalidArgumentError
 
 @dataclass(frozen=True)
 class Address:
-    """Where a server listens: `unix:/path` or `host:port`."""
+    """Where a server listens: `unix:/path`, `host:port`, or with TLS `https://host:port`."""
 
     target: str
 
@@ -21,14 +21,14 @@ class Address:
 
 
 def parse_address(text: str) -> Address:
-    """Understand `unix:/path`, `host:port`, `http://host:port` and `tcp://host:port`, as the learner does.
+    """Understand `unix:/path`, `host:port`, `http://host:port`, `tcp://host:port` and `https://host:port`, as the learner does.
 
     Raises:
         InvalidArgumentError: with what is wrong with it.
     """
 
     def refuse(reason: str) -> InvalidArgumentError:
-        forms = "write unix:/path, host:port, http://host:port or tcp://host:port"
+        forms = "write unix:/path, host:port, http://host:port or tcp://host:port, with TLS https://host:port"
         return InvalidArgumentError(f"server={text!r} is not a server's address: {reason}; {forms}")
 
     if not isinstance(text, str):
@@ -41,9 +41,8 @@ def parse_address(text: str) -> Address:
         if len(path.encode()) > LONGEST_SOCKET_PATH:
             raise refuse(f"the path of the socket is longer than the {LONGEST_SOCKET_PATH} bytes that Linux allows")
         return Address(f"unix:{path}")
-    if text.startswith("https://"):
-        raise refuse("encrypted connections are not supported, tunnel them instead")
-    rest = text.removeprefix("http://") if text.startswith("http://") else text.removeprefix("tcp://")
+    scheme = next((scheme for scheme in ("https://", "http://", "tcp://") if text.startswith(scheme)), "")
+    rest = text.removeprefix(scheme)
     rest = rest.removesuffix("/")
     host, separator, port = rest.rpartition(":")
     if not separator:
@@ -55,7 +54,7 @@ def parse_address(text: str) -> Address:
             raise refuse(f"{host[1:-1]!r} is not an IPv6 address")
     elif not re.fullmatch(r"[A-Za-z0-9._-]+", host):
         raise refuse(f"{host!r} is not a host name; an IPv6 address must stand in brackets")
-    return Address(f"{host}:{port}")
+    return Address(f"{scheme if scheme == 'https://' else ''}{host}:{port}")
 
 
 def _is_ipv6(host: str) -> bool:

@@ -48,7 +48,7 @@ KEEPALIVE_INTERVAL, KEEPALIVE_LIMIT = 10.0, 20.0
 # How often a session that nobody waits in answers the server's question whether it lives, s.
 TEND_INTERVAL = 0.25
 # gRPC's codes of streams that a server ended.
-RESOURCE_EXHAUSTED, OUT_OF_RANGE, UNIMPLEMENTED = 8, 11, 12
+RESOURCE_EXHAUSTED, OUT_OF_RANGE, UNIMPLEMENTED, UNAUTHENTICATED = 8, 11, 12, 16
 
 
 class Session:
@@ -183,6 +183,8 @@ class Session:
             return error
         what, code, words = error.args
         if what == "refused":
+            if code == UNAUTHENTICATED:  # a token that is missing, wrong or revoked ends the stream
+                return self._fail(self._explain(kind, what, code, words))
             refused = refusal(kind, code, words)
             # A refusal changes nothing; a defect of the server costs the environments.
             return self._fail(refused) if isinstance(refused, ServerDefectError) else refused
@@ -220,6 +222,8 @@ class Session:
                 f"the server at {self.address} refused {kind}, which is too large for it: {words}; "
                 "start it with a larger --max-message-bytes, or use fewer environments"
             )
+        if code == UNAUTHENTICATED:
+            return ServerConnectionError(f"the server at {self.address} does not let this process in: {words}")
         if code == UNIMPLEMENTED:
             return ProtocolError(f"what answers at {self.address} is no perturb-server: {words}")
         if self._local is not None:

@@ -5,7 +5,7 @@ use super::{
     runner::Runner,
     settings, specs,
     world::Joined,
-    worlds::{StreamId, Worlds},
+    worlds::{Caller, Worlds},
 };
 use crate::{
     proto::dm_env_rpc::v1::{
@@ -18,6 +18,7 @@ use crate::{
         frames::Allowance,
         requests::Observed,
         status::Refusal,
+        tokens::Bearer,
     },
 };
 use std::sync::Arc;
@@ -28,16 +29,16 @@ const MOST_BYTES: usize = 1 << 20;
 /// A client's stream. When it is dropped it leaves its world, and the worlds that it made go unless an agent is in them.
 pub(super) struct Agent {
     worlds: Arc<Worlds>,
+    caller: Caller,
     sessions: Sessions,
-    id: StreamId,
     joined: Option<Joined>,
 }
 
 impl Agent {
     /// A stream that has joined no world.
-    pub(super) fn new(worlds: Arc<Worlds>, sessions: Sessions) -> Self {
-        let id = worlds.stream();
-        Self { worlds, sessions, id, joined: None }
+    pub(super) fn new(worlds: Arc<Worlds>, bearer: Option<Bearer>, sessions: Sessions) -> Self {
+        let caller = worlds.caller(bearer);
+        Self { worlds, caller, sessions, joined: None }
     }
 
     async fn create_world(&mut self, request: rpc::CreateWorldRequest) -> Result<rpc::CreateWorldResponse, Refusal> {
@@ -45,8 +46,9 @@ impl Agent {
             return Err(Refusal::Draining);
         }
         let (settings, version, own) = settings::create(self.worlds.catalogue(), &request.settings)?;
+        let held = self.caller.envs(1)?;
         let runner = Runner::open(self.worlds.pool(), settings, version).await?;
-        Ok(rpc::CreateWorldResponse { world_name: self.worlds.add(self.id, runner, own)? })
+        Ok(rpc::CreateWorldResponse { world_name: self.worlds.add(&self.caller, runner, own, held)? })
     }
 
     async fn join_world(&mut self, request: rpc::JoinWorldRequest) -> Result<rpc::JoinWorldResponse, Refusal> {
@@ -54,7 +56,7 @@ impl Agent {
             return Err(Refusal::AlreadyJoined { world: joined.world.name().into() });
         }
         settings::none("join_world", &request.settings)?;
-        let (world, runner) = self.worlds.join(self.id, &request.world_name)?;
+        let (world, runner) = self.worlds.join(&self.caller, &request.world_name)?;
         // Before anything is awaited: if the client goes now, the world is left and not lost.
         let joined = self.joined.insert(Joined { world, runner });
         joined.runner.settle().await;
@@ -81,7 +83,7 @@ impl Agent {
     }
 
     fn reset_world(&mut self, request: rpc::ResetWorldRequest) -> Result<rpc::ResetWorldResponse, Refusal> {
-        let world = self.worlds.of(self.id, &request.world_name, "reset_world")?;
+        let world = self.worlds.of(&self.caller, &request.world_name, "reset_world")?;
         world.change(settings::change(world.spec(), "reset_world", &request.settings)?)?;
         match &mut self.joined {
             Some(joined) if joined.world.name() == world.name() => joined.runner.stop(),
@@ -91,7 +93,7 @@ impl Agent {
     }
 
     fn destroy_world(&mut self, request: &rpc::DestroyWorldRequest) -> Result<rpc::DestroyWorldResponse, Refusal> {
-        self.worlds.destroy(self.id, &request.world_name)?;
+        self.worlds.destroy(&self.caller, &request.world_name)?;
         Ok(rpc::DestroyWorldResponse {})
     }
 
@@ -110,7 +112,7 @@ impl Agent {
 impl Drop for Agent {
     fn drop(&mut self) {
         self.leave();
-        self.worlds.stream_ended(self.id);
+        self.worlds.stream_ended(&self.caller);
     }
 }
 
@@ -125,7 +127,7 @@ impl Dialogue for Agent {
 
     /// Whether it keeps a world alive.
     fn is_open(&self) -> bool {
-        self.joined.is_some() || self.worlds.are_made_by(self.id)
+        self.joined.is_some() || self.worlds.are_made_by(&self.caller)
     }
 
     async fn answer(&mut self, request: Self::Request) -> Self::Response {

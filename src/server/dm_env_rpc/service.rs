@@ -42,7 +42,8 @@ impl Environment for Service {
         &self,
         mut request: Request<Streaming<EnvironmentRequest>>,
     ) -> Result<Response<Self::ProcessStream>, Status> {
-        let agent = Agent::new(Arc::clone(&self.worlds), self.sessions.clone());
-        Ok(Response::new(self.sessions.begin(Frames::of(&mut request)?, Counted::new(agent, &self.counts))?))
+        let frames = Frames::of(&mut request)?;
+        let agent = Agent::new(Arc::clone(&self.worlds), frames.bearer.clone(), self.sessions.clone());
+        Ok(Response::new(self.sessions.begin(frames, Counted::new(agent, &self.counts))?))
     }
 }

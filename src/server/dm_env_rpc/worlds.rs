@@ -1,11 +1,15 @@
 //! All worlds of the server, by name. A world lives as long as the stream that made it or an agent that is in it. Names
-//! cannot be guessed, unless they were asked for: whoever is told one may join.
+//! cannot be guessed, unless they were asked for: whoever is told one may join, with the token that the world was made
+//! with.
 
 use super::{runner::Runner, settings::Ownership, world::World};
 use crate::{
     env::{Catalogue, shorten},
     pool::Pool,
-    server::status::Refusal,
+    server::{
+        status::Refusal,
+        tokens::{Bearer, Held},
+    },
 };
 use std::{
     collections::BTreeMap,
@@ -13,7 +17,28 @@ use std::{
 };
 
 /// Tells streams apart.
-pub(super) type StreamId = u64;
+type StreamId = u64;
+
+/// A stream.
+pub(super) struct Caller {
+    stream: StreamId,
+    bearer: Option<Bearer>,
+}
+
+impl Caller {
+    /// So many environments of its token.
+    ///
+    /// # Errors
+    /// [`Refusal::TooManyOfAToken`].
+    pub(super) fn envs(&self, count: usize) -> Result<Option<Held>, Refusal> {
+        self.bearer.as_ref().map(|bearer| bearer.envs(count)).transpose()
+    }
+
+    /// Whose it is.
+    fn owner(&self) -> Option<&str> {
+        self.bearer.as_ref().map(|bearer| bearer.name())
+    }
+}
 
 /// The registry that all streams share.
 pub(super) struct Worlds {
@@ -32,12 +57,16 @@ struct Entry {
     world: Arc<World>,
     /// The stream that made it, until it ends.
     maker: Option<StreamId>,
+    /// Of which token's streams it is.
+    owner: Option<String>,
     /// The stream whose agent is in it.
     agent: Option<StreamId>,
     /// Whether every stream may reset and destroy it.
     shared: bool,
     /// None while an agent has it.
     runner: Option<Runner>,
+    /// Of the environments that its maker's token may have.
+    _held: Option<Held>,
 }
 
 impl Worlds {
@@ -56,18 +85,24 @@ impl Worlds {
         &self.catalogue
     }
 
-    /// A new stream's id.
-    pub(super) fn stream(&self) -> StreamId {
+    /// A new stream.
+    pub(super) fn caller(&self, bearer: Option<Bearer>) -> Caller {
         let mut registry = self.lock();
         registry.streams += 1;
-        registry.streams
+        Caller { stream: registry.streams, bearer }
     }
 
-    /// Takes a world that a stream has made. Returns its name.
+    /// Takes a world that a stream has made, and what it holds of its token's. Returns its name.
     ///
     /// # Errors
     /// [`Refusal::Taken`] if another has the name that was asked for, [`Refusal::NoRandomness`].
-    pub(super) fn add(&self, maker: StreamId, runner: Runner, own: Ownership) -> Result<String, Refusal> {
+    pub(super) fn add(
+        &self,
+        maker: &Caller,
+        runner: Runner,
+        own: Ownership,
+        held: Option<Held>,
+    ) -> Result<String, Refusal> {
         let name = match own.name {
             Some(name) => name,
             None => random_name(runner.spec().name)?,
@@ -77,7 +112,15 @@ impl Worlds {
             return Err(Refusal::Taken { world: name });
         }
         let world = Arc::new(World::new(name.clone(), &runner));
-        let entry = Entry { world, maker: Some(maker), agent: None, shared: own.shared, runner: Some(runner) };
+        let entry = Entry {
+            world,
+            maker: Some(maker.stream),
+            owner: maker.owner().map(String::from),
+            agent: None,
+            shared: own.shared,
+            runner: Some(runner),
+            _held: held,
+        };
         registry.worlds.insert(name.clone(), entry);
         Ok(name)
     }
@@ -86,20 +129,20 @@ impl Worlds {
     ///
     /// # Errors
     /// [`Refusal::Unknown`], [`Refusal::NotYours`].
-    pub(super) fn of(&self, stream: StreamId, name: &str, request: &'static str) -> Result<Arc<World>, Refusal> {
-        Ok(Arc::clone(&self.lock().of(stream, name, request)?.world))
+    pub(super) fn of(&self, caller: &Caller, name: &str, request: &'static str) -> Result<Arc<World>, Refusal> {
+        Ok(Arc::clone(&self.lock().of(caller, name, request)?.world))
     }
 
     /// Gives a world to a stream's agent.
     ///
     /// # Errors
     /// [`Refusal::Unknown`], [`Refusal::Occupied`].
-    pub(super) fn join(&self, stream: StreamId, name: &str) -> Result<(Arc<World>, Runner), Refusal> {
+    pub(super) fn join(&self, caller: &Caller, name: &str) -> Result<(Arc<World>, Runner), Refusal> {
         let mut registry = self.lock();
-        let entry = registry.worlds.get_mut(name).ok_or_else(|| unknown(name))?;
+        let entry = registry.find(caller, name)?;
         let occupied = || Refusal::Occupied { world: name.into(), request: "join_world" };
         let runner = entry.runner.take().ok_or_else(occupied)?;
-        entry.agent = Some(stream);
+        entry.agent = Some(caller.stream);
         Ok((Arc::clone(&entry.world), runner))
     }
 
@@ -116,9 +159,9 @@ impl Worlds {
     ///
     /// # Errors
     /// [`Refusal::Unknown`], [`Refusal::NotYours`], [`Refusal::Occupied`].
-    pub(super) fn destroy(&self, stream: StreamId, name: &str) -> Result<(), Refusal> {
+    pub(super) fn destroy(&self, caller: &Caller, name: &str) -> Result<(), Refusal> {
         let mut registry = self.lock();
-        if registry.of(stream, name, "destroy_world")?.runner.is_none() {
+        if registry.of(caller, name, "destroy_world")?.runner.is_none() {
             return Err(Refusal::Occupied { world: name.into(), request: "destroy_world" });
         }
         registry.worlds.remove(name);
@@ -126,14 +169,14 @@ impl Worlds {
     }
 
     /// Whether there are worlds that this stream has made.
-    pub(super) fn are_made_by(&self, stream: StreamId) -> bool {
-        self.lock().worlds.values().any(|entry| entry.maker == Some(stream))
+    pub(super) fn are_made_by(&self, caller: &Caller) -> bool {
+        self.lock().worlds.values().any(|entry| entry.maker == Some(caller.stream))
     }
 
     /// A stream is gone, and with it those of its worlds that have no agent.
-    pub(super) fn stream_ended(&self, stream: StreamId) {
+    pub(super) fn stream_ended(&self, caller: &Caller) {
         let mut registry = self.lock();
-        for entry in registry.worlds.values_mut().filter(|entry| entry.maker == Some(stream)) {
+        for entry in registry.worlds.values_mut().filter(|entry| entry.maker == Some(caller.stream)) {
             entry.maker = None;
         }
         registry.reap();
@@ -146,10 +189,16 @@ impl Worlds {
 
 impl Registry {
     /// The world of that name, if the stream has made it, is its agent's, or may do as if.
-    fn of(&self, stream: StreamId, name: &str, request: &'static str) -> Result<&Entry, Refusal> {
-        let entry = self.worlds.get(name).ok_or_else(|| unknown(name))?;
-        let is_its = entry.shared || [entry.maker, entry.agent].contains(&Some(stream));
+    fn of(&mut self, caller: &Caller, name: &str, request: &'static str) -> Result<&Entry, Refusal> {
+        let entry = self.find(caller, name)?;
+        let is_its = entry.shared || [entry.maker, entry.agent].contains(&Some(caller.stream));
         if is_its { Ok(entry) } else { Err(Refusal::NotYours { world: name.into(), request }) }
+    }
+
+    /// The world of that name, if there is one for streams with this token.
+    fn find(&mut self, caller: &Caller, name: &str) -> Result<&mut Entry, Refusal> {
+        let found = self.worlds.get_mut(name).filter(|entry| entry.owner.as_deref() == caller.owner());
+        found.ok_or_else(|| unknown(name))
     }
 
     /// Frees the worlds that have neither maker nor agent.

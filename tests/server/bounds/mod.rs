@@ -1,6 +1,6 @@
 //! What one client may take of the server: each attack is tried beside a neighbour, who must not notice.
 
-mod client;
+pub mod client;
 mod memory;
 mod messages;
 mod pictures;

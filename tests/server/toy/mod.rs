@@ -9,7 +9,7 @@ use crate::{
 use perturb::{
     config::{Arguments, Config},
     proto::{Comparison, Open, Release, Reset, Version},
-    server::{listen::Listener, run},
+    server::{guards::Guards, listen::Listener, run},
     tasks,
 };
 use std::{
@@ -33,10 +33,12 @@ impl InThread {
             let config = Config { workers: 2, ..Config::load(&Arguments::default()).unwrap() };
             let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
             runtime.block_on(async {
-                let listener = Listener::bind(&"tcp://127.0.0.1:0".to_owned().try_into().unwrap()).await.unwrap();
+                let any = "tcp://127.0.0.1:0".to_owned().try_into().unwrap();
+                let listener = Listener::bind(&any, config.socket_mode).await.unwrap();
                 tell.send(listener.address().unwrap().to_string()).unwrap();
                 let catalogue = tasks::catalogue().with(&ball::SPEC);
-                run(vec![listener], &config, catalogue, async { drop(end.await) }).await.unwrap();
+                let end = async { drop(end.await) };
+                run(vec![listener], &config, &Guards::default(), catalogue, end).await.unwrap();
             });
         });
         Self { address: address.await.unwrap(), shutdown: Some(shutdown), thread: Some(thread) }

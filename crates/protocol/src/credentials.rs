@@ -1,0 +1,165 @@
+//! What a client shows to servers, and whose certificates it trusts.
+
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+
+use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer, pem::PemObject};
+use tonic::metadata::{Ascii, MetadataValue};
+use tonic::service::Interceptor;
+use tonic::{Request, Status};
+
+use crate::address::Address;
+
+/// The file with a client's token.
+pub const TOKEN_FILE: &str = "PERTURB_TOKEN_FILE";
+/// Whose certificates are trusted.
+pub const CA: &str = "PERTURB_CA";
+/// A client's certificate.
+pub const CERT: &str = "PERTURB_CERT";
+/// Its private key.
+pub const KEY: &str = "PERTURB_KEY";
+/// 1: a token may go unencrypted to other machines.
+pub const INSECURE: &str = "PERTURB_INSECURE";
+/// Where systems keep the authorities that they trust: Debian, Red Hat, Alpine and SUSE.
+const SYSTEM_CA: [&str; 3] =
+    ["/etc/ssl/certs/ca-certificates.crt", "/etc/pki/tls/certs/ca-bundle.crt", "/etc/ssl/ca-bundle.pem"];
+
+/// What a variable is set to.
+type Variable<'a> = &'a dyn Fn(&str) -> Option<OsString>;
+
+/// What a client shows, and whom it trusts. Read for each connection, so that files may be replaced.
+#[derive(Default)]
+pub struct Credentials {
+    /// Sent with every call.
+    pub(crate) token: Option<Bearer>,
+    /// Shown to servers that ask for it.
+    pub(crate) identity: Option<Identity>,
+    pub(crate) trust: Trust,
+}
+
+/// A client's certificate, those between it and its authority's, and its key.
+type Identity = (Vec<CertificateDer<'static>>, PrivateKeyDer<'static>);
+
+/// Whose certificates are trusted.
+pub(crate) enum Trust {
+    /// Those that one of these authorities has signed.
+    Authorities(Vec<CertificateDer<'static>>),
+    /// The one that is the first of these.
+    Exactly(Vec<CertificateDer<'static>>),
+}
+
+impl Default for Trust {
+    fn default() -> Self {
+        Self::Authorities(Vec::new())
+    }
+}
+
+impl Credentials {
+    /// As the environment says, for a server at this address.
+    ///
+    /// # Errors
+    /// Those of [`Credentials::of`].
+    pub fn of_environment(address: &Address) -> Result<Self, String> {
+        Self::of(address, &environment)
+    }
+
+    /// As variables say, for a server at this address. A Unix socket needs none.
+    ///
+    /// # Errors
+    /// A sentence that names the variable, the file and what is wrong.
+    pub fn of(address: &Address, variable: Variable<'_>) -> Result<Self, String> {
+        let Address::Tcp { host, port, tls } = address else { return Ok(Self::default()) };
+        let file = |name| file(name, variable);
+        let token = file(TOKEN_FILE).map(|path| token(&path)).transpose()?;
+        if tls.is_none() {
+            if token.is_some() && !is_here(host) && variable(INSECURE).is_none_or(|value| value != "1") {
+                return Err(format!(
+                    "the token of {TOKEN_FILE} would go there unencrypted; write https://{host}:{port} if it speaks TLS, \
+                     or set {INSECURE}=1"
+                ));
+            }
+            return Ok(Self { token, ..Self::default() });
+        }
+        let trust = Trust::Authorities(match file(CA) {
+            Some(path) => certificates(CA, &path)?,
+            None => match SYSTEM_CA.iter().map(Path::new).find(|path| path.exists()) {
+                Some(path) => certificates("the system's authorities", path)?,
+                None => return Err(format!("this system names no authorities; set {CA} to the file of the server's")),
+            },
+        });
+        Ok(Self { token, identity: identity(variable)?, trust })
+    }
+
+    /// The same for a server whose certificate is known, the first of a file of PEM.
+    ///
+    /// # Errors
+    /// Those of the file, and of the variables for a client's certificate.
+    pub fn knowing(certificate: &Path) -> Result<Self, String> {
+        let trust = Trust::Exactly(certificates("the server's certificate", certificate)?);
+        Ok(Self { token: None, identity: identity(&environment)?, trust })
+    }
+}
+
+fn environment(name: &str) -> Option<OsString> {
+    std::env::var_os(name)
+}
+
+/// The file that a variable names, if it does.
+fn file(name: &str, variable: Variable<'_>) -> Option<PathBuf> {
+    variable(name).filter(|value| !value.is_empty()).map(PathBuf::from)
+}
+
+fn is_here(host: &str) -> bool {
+    host == "localhost" || host.parse::<std::net::IpAddr>().is_ok_and(|ip| ip.to_canonical().is_loopback())
+}
+
+fn identity(variable: Variable<'_>) -> Result<Option<Identity>, String> {
+    match (file(CERT, variable), file(KEY, variable)) {
+        (None, None) => Ok(None),
+        (Some(cert), Some(key)) => {
+            let wrong = |error| format!("{KEY}={}: {error}; expected a private key in PEM", key.display());
+            Ok(Some((certificates(CERT, &cert)?, PrivateKeyDer::from_pem_file(&key).map_err(wrong)?)))
+        }
+        (Some(_), None) => Err(format!("{CERT} is set and {KEY} is not; both are expected, or none")),
+        (None, Some(_)) => Err(format!("{KEY} is set and {CERT} is not; both are expected, or none")),
+    }
+}
+
+fn certificates(what: &str, path: &Path) -> Result<Vec<CertificateDer<'static>>, String> {
+    let wrong =
+        |reason: &dyn std::fmt::Display| format!("{what}={}: {reason}; expected certificates in PEM", path.display());
+    let all = CertificateDer::pem_file_iter(path).and_then(Iterator::collect::<Result<Vec<_>, _>>);
+    let all = all.map_err(|error| wrong(&error))?;
+    if all.is_empty() { Err(wrong(&"there is no certificate")) } else { Ok(all) }
+}
+
+fn token(path: &Path) -> Result<Bearer, String> {
+    let wrong = |reason: &dyn std::fmt::Display| {
+        format!("{TOKEN_FILE}={}: {reason}; expected one line with a token", path.display())
+    };
+    let text = std::fs::read_to_string(path).map_err(|error| wrong(&error))?;
+    let text = text.trim();
+    if text.is_empty() || !text.bytes().all(|byte| byte.is_ascii_graphic()) {
+        return Err(wrong(&"there is none"));
+    }
+    let mut value: MetadataValue<Ascii> = format!("Bearer {text}").parse().map_err(|_| wrong(&"there is none"))?;
+    value.set_sensitive(true);
+    Ok(Bearer(value))
+}
+
+/// A token, which is never shown.
+#[derive(Clone, Debug)]
+pub(crate) struct Bearer(MetadataValue<Ascii>);
+
+/// Sends a token with each call, if there is one.
+#[derive(Clone, Debug, Default)]
+pub struct WithToken(pub(crate) Option<Bearer>);
+
+impl Interceptor for WithToken {
+    fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {
+        if let Some(Bearer(value)) = &self.0 {
+            request.metadata_mut().insert("authorization", value.clone());
+        }
+        Ok(request)
+    }
+}

@@ -1,0 +1,223 @@
+//! Encrypted connections.
+
+use std::future::Future;
+use std::io;
+use std::pin::Pin;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use hyper_util::rt::TokioIo;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+use tokio::time::timeout;
+use tokio_rustls::TlsConnector;
+use tokio_rustls::client::TlsStream;
+use tokio_rustls::rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
+use tokio_rustls::rustls::client::{ResolvesClientCert, WebPkiServerVerifier};
+use tokio_rustls::rustls::crypto::{CryptoProvider, ring, verify_tls13_signature};
+use tokio_rustls::rustls::pki_types::{CertificateDer, ServerName, UnixTime};
+use tokio_rustls::rustls::sign::CertifiedKey;
+use tokio_rustls::rustls::version::TLS13;
+use tokio_rustls::rustls::{
+    CertificateError, ClientConfig, DigitallySignedStruct, Error, PeerMisbehaved, RootCertStore, SignatureScheme,
+};
+use tonic::codegen::{Service, http::Uri};
+
+use crate::credentials::{CA, CERT, Credentials, KEY, Trust};
+
+/// How long a server may take to show that it speaks TLS.
+const PROBE_LIMIT: Duration = Duration::from_secs(1);
+/// What a client of HTTP/2 sends first.
+const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
+/// The first byte of an alert of TLS.
+const ALERT: u8 = 0x15;
+
+/// Makes encrypted connections to one server.
+#[derive(Clone)]
+pub(crate) struct Connector {
+    host: String,
+    port: u16,
+    name: ServerName<'static>,
+    config: Arc<ClientConfig>,
+    shown: Arc<Shown>,
+    /// Why the last handshake failed.
+    failure: Arc<Mutex<Option<String>>>,
+}
+
+impl Connector {
+    /// To the server at host and port, whose certificate must be for that name.
+    ///
+    /// # Errors
+    /// What is wrong with the credentials.
+    pub(crate) fn new(host: &str, port: u16, name: &str, credentials: Credentials) -> Result<Self, String> {
+        let provider = Arc::new(ring::default_provider());
+        let words = |error: &dyn ToString| error.to_string();
+        let verifier: Arc<dyn ServerCertVerifier> = match credentials.trust {
+            Trust::Exactly(known) => Arc::new(Known { known, provider: Arc::clone(&provider) }),
+            Trust::Authorities(authorities) => {
+                let mut roots = RootCertStore::empty();
+                roots.add_parsable_certificates(authorities);
+                let verifier = WebPkiServerVerifier::builder_with_provider(Arc::new(roots), Arc::clone(&provider));
+                verifier.build().map_err(|error| format!("{CA}: {error}"))?
+            }
+        };
+        let key = credentials.identity.map(|(chain, key)| CertifiedKey::from_der(chain, key, &provider).map(Arc::new));
+        let key = key.transpose().map_err(|error| format!("{CERT} and {KEY} do not go together: {error}"))?;
+        let shown = Arc::new(Shown { key, asked: AtomicBool::new(false) });
+        let mut config = ClientConfig::builder_with_provider(provider)
+            .with_protocol_versions(&[&TLS13])
+            .map_err(|error| words(&error))?
+            .dangerous() // for a server whose certificate is known as it is
+            .with_custom_certificate_verifier(verifier)
+            .with_client_cert_resolver(Arc::clone(&shown) as Arc<dyn ResolvesClientCert>);
+        config.alpn_protocols = vec![b"h2".to_vec()];
+        let name =
+            ServerName::try_from(name.to_owned()).map_err(|_| format!("`{name}` can be no certificate's name"))?;
+        let (host, failure) = (host.to_owned(), Arc::default());
+        Ok(Self { host, port, name, config: Arc::new(config), shown, failure })
+    }
+
+    /// Why there is no encrypted connection, where that is the reason: after a failure to connect.
+    pub(crate) fn failure(&self) -> Option<String> {
+        self.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Why the server ended a connection, where it was encrypted: servers see a client's certificate last.
+    pub(crate) fn refusal(&self) -> Option<String> {
+        let asked = self.shown.asked.load(Ordering::Relaxed);
+        asked.then(|| match self.shown.key {
+            Some(_) => format!("it accepts no client with the certificate of {CERT}: another authority must sign it"),
+            None => format!("it asks for a client's certificate; set {CERT} and {KEY} to the files of yours"),
+        })
+    }
+}
+
+impl Service<Uri> for Connector {
+    type Response = TokioIo<TlsStream<TcpStream>>;
+    type Error = io::Error;
+    type Future = Pin<Box<dyn Future<Output = io::Result<Self::Response>> + Send>>;
+
+    fn poll_ready(&mut self, _: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Poll::Ready(Ok(()))
+    }
+
+    fn call(&mut self, _: Uri) -> Self::Future {
+        let Self { host, port, name, config, failure, .. } = self.clone();
+        Box::pin(async move {
+            let tcp = TcpStream::connect((host.as_str(), port)).await?;
+            tcp.set_nodelay(true)?;
+            let stream = TlsConnector::from(config).connect(name, tcp).await;
+            let reason = stream.as_ref().err().and_then(|error| words(error, &host));
+            *failure.lock().unwrap_or_else(PoisonError::into_inner) = reason;
+            stream.map(TokioIo::new).map_err(|error| match error.kind() {
+                io::ErrorKind::UnexpectedEof | io::ErrorKind::ConnectionReset => io::Error::other(
+                    "it ended the connection in TLS's handshake; if it speaks no TLS, write tcp:// for https://",
+                ),
+                _ => error,
+            })
+        })
+    }
+}
+
+/// What is wrong with a handshake; none if only the connection is.
+fn words(error: &io::Error, host: &str) -> Option<String> {
+    use CertificateError as Bad;
+    let error = error.get_ref()?.downcast_ref::<Error>()?;
+    Some(match error {
+        Error::InvalidCertificate(Bad::Expired | Bad::ExpiredContext { .. }) => {
+            "its certificate has expired; whoever runs it must renew it".into()
+        }
+        Error::InvalidCertificate(Bad::NotValidYet | Bad::NotValidYetContext { .. }) => {
+            "its certificate is not valid yet: are the clocks right?".into()
+        }
+        Error::InvalidCertificate(Bad::UnknownIssuer | Bad::BadSignature) => {
+            format!("nobody who is trusted here has signed its certificate; set {CA} to the file of its authority's")
+        }
+        Error::InvalidCertificate(Bad::NotValidForName | Bad::NotValidForNameContext { .. }) => {
+            format!("its certificate is not for this name: {error}")
+        }
+        Error::InvalidCertificate(Bad::ApplicationVerificationFailure) => "its certificate is another one".into(),
+        Error::InvalidMessage(_) => {
+            format!("it speaks no TLS; write tcp:// for https://, or see who listens at {host}")
+        }
+        Error::PeerMisbehaved(PeerMisbehaved::IllegalMiddleboxChangeCipherSpec) | Error::DecryptError => {
+            format!("what came was changed on its way: {error}")
+        }
+        other => format!("TLS failed: {other}"),
+    })
+}
+
+/// Whether who listens there speaks TLS, and answers what is none as TLS does.
+pub(crate) async fn speaks_tls(host: &str, port: u16) -> bool {
+    let ask = async {
+        let mut tcp = TcpStream::connect((host, port)).await?;
+        tcp.write_all(PREFACE).await?;
+        tcp.read_u8().await
+    };
+    matches!(timeout(PROBE_LIMIT, ask).await, Ok(Ok(ALERT)))
+}
+
+/// A client's certificate, and whether the server asked for it.
+#[derive(Debug)]
+struct Shown {
+    key: Option<Arc<CertifiedKey>>,
+    asked: AtomicBool,
+}
+
+impl ResolvesClientCert for Shown {
+    fn resolve(&self, _: &[&[u8]], _: &[SignatureScheme]) -> Option<Arc<CertifiedKey>> {
+        self.asked.store(true, Ordering::Relaxed);
+        self.key.clone()
+    }
+
+    fn has_certs(&self) -> bool {
+        true // so that one is asked for
+    }
+}
+
+/// Trusts one certificate, whatever is in it.
+#[derive(Debug)]
+struct Known {
+    known: Vec<CertificateDer<'static>>,
+    provider: Arc<CryptoProvider>,
+}
+
+impl ServerCertVerifier for Known {
+    fn verify_server_cert(
+        &self,
+        certificate: &CertificateDer<'_>,
+        _: &[CertificateDer<'_>],
+        _: &ServerName<'_>,
+        _: &[u8],
+        _: UnixTime,
+    ) -> Result<ServerCertVerified, Error> {
+        if self.known.first().is_some_and(|known| known == certificate) {
+            return Ok(ServerCertVerified::assertion());
+        }
+        Err(Error::InvalidCertificate(CertificateError::ApplicationVerificationFailure))
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        _: &[u8],
+        _: &CertificateDer<'_>,
+        _: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        Err(Error::General("only TLS 1.3 is spoken here".into()))
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signature: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        verify_tls13_signature(message, certificate, signature, &self.provider.signature_verification_algorithms)
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        self.provider.signature_verification_algorithms.supported_schemes()
+    }
+}

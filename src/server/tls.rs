@@ -1,0 +1,114 @@
+//! TLS 1.3: the server's certificate, and whose certificates clients must show.
+
+use std::{
+    io,
+    path::PathBuf,
+    sync::{Arc, PoisonError, RwLock},
+};
+use tokio::net::TcpStream;
+use tokio_rustls::{
+    TlsAcceptor,
+    rustls::{
+        RootCertStore, ServerConfig,
+        crypto::ring,
+        pki_types::{CertificateDer, PrivateKeyDer, pem::PemObject},
+        server::WebPkiClientVerifier,
+        version::TLS13,
+    },
+    server::TlsStream,
+};
+
+/// The files of TLS, in PEM.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Files {
+    /// The server's certificate, and those between it and its authority's.
+    pub cert: PathBuf,
+    /// Its private key.
+    pub key: PathBuf,
+    /// The authorities one of which must have signed a client's certificate; none: clients need none.
+    pub client_ca: Option<PathBuf>,
+}
+
+impl Files {
+    /// In the order in which [`Tls::renew`] takes what is in them.
+    pub fn paths(&self) -> Vec<PathBuf> {
+        [Some(&self.cert), Some(&self.key), self.client_ca.as_ref()].into_iter().flatten().cloned().collect()
+    }
+
+    fn configured(&self, contents: &[Vec<u8>]) -> Result<ServerConfig, String> {
+        let [cert, key, rest @ ..] = contents else { return Err("a certificate and a key are expected".into()) };
+        let chain = certificates(&self.cert, cert)?;
+        let key = PrivateKeyDer::from_pem_slice(key).map_err(|error| {
+            format!("{}: {error}; expected a private key in PEM, without a passphrase", self.key.display())
+        })?;
+        let clients = match (&self.client_ca, rest) {
+            (Some(path), [authorities, ..]) => {
+                let wrong = |error: &dyn ToString| format!("{}: {}", path.display(), error.to_string());
+                let mut roots = RootCertStore::empty();
+                for certificate in certificates(path, authorities)? {
+                    roots.add(certificate).map_err(|error| wrong(&error))?;
+                }
+                let provider = Arc::new(ring::default_provider());
+                let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider).build();
+                verifier.map_err(|error| wrong(&error))?
+            }
+            _ => WebPkiClientVerifier::no_client_auth(),
+        };
+        let (cert, key_file) = (self.cert.display(), self.key.display());
+        let mut config = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()))
+            .with_protocol_versions(&[&TLS13])
+            .map_err(|error| error.to_string())?
+            .with_client_cert_verifier(clients)
+            .with_single_cert(chain, key)
+            .map_err(|error| format!("{cert} and {key_file} do not go together: {error}"))?;
+        config.alpn_protocols = vec![b"h2".to_vec()];
+        Ok(config)
+    }
+}
+
+/// The certificates of a file, at least one.
+fn certificates(path: &std::path::Path, pem: &[u8]) -> Result<Vec<CertificateDer<'static>>, String> {
+    let all: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(pem).collect();
+    let all = all.map_err(|error| format!("{}: {error}; expected certificates in PEM", path.display()))?;
+    if all.is_empty() {
+        return Err(format!("{}: there is no certificate; expected some in PEM", path.display()));
+    }
+    Ok(all)
+}
+
+/// How connections are encrypted from now on.
+#[derive(Clone)]
+pub struct Tls {
+    files: Arc<Files>,
+    config: Arc<RwLock<Arc<ServerConfig>>>,
+}
+
+impl Tls {
+    /// With what is in the files.
+    ///
+    /// # Errors
+    /// What is wrong with which of them.
+    pub fn new(files: Files, contents: &[Vec<u8>]) -> Result<Self, String> {
+        let config = Arc::new(files.configured(contents)?);
+        Ok(Self { files: Arc::new(files), config: Arc::new(RwLock::new(config)) })
+    }
+
+    /// Takes what is in the files now, for the connections to come.
+    ///
+    /// # Errors
+    /// What is wrong with which of them; then all stays as it is.
+    pub fn renew(&self, contents: &[Vec<u8>]) -> Result<(), String> {
+        let config = Arc::new(self.files.configured(contents)?);
+        *self.config.write().unwrap_or_else(PoisonError::into_inner) = config;
+        Ok(())
+    }
+
+    /// Shakes hands with a client.
+    ///
+    /// # Errors
+    /// If they do not agree.
+    pub async fn accept(&self, connection: TcpStream) -> io::Result<TlsStream<TcpStream>> {
+        let config = Arc::clone(&self.config.read().unwrap_or_else(PoisonError::into_inner));
+        TlsAcceptor::from(config).accept(connection).await
+    }
+}

@@ -1,0 +1,47 @@
+//! Certificates, made for the test.
+
+use rcgen::{BasicConstraints, CertificateParams, DistinguishedName, DnType, IsCa, Issuer, KeyPair, date_time_ymd};
+use std::path::{Path, PathBuf};
+
+/// An authority.
+pub struct Authority {
+    issuer: Issuer<'static, KeyPair>,
+    pem: String,
+}
+
+/// A certificate's and a key's file.
+pub struct Pair {
+    pub cert: PathBuf,
+    pub key: PathBuf,
+}
+
+impl Authority {
+    pub fn new(name: &str) -> Self {
+        let mut params = CertificateParams::new(Vec::new()).unwrap();
+        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        params.distinguished_name = DistinguishedName::new();
+        params.distinguished_name.push(DnType::CommonName, name);
+        let key = KeyPair::generate().unwrap();
+        let pem = params.self_signed(&key).unwrap().pem();
+        Self { issuer: Issuer::new(params, key), pem }
+    }
+
+    /// The file of its own certificate.
+    pub fn file(&self, directory: &Path, name: &str) -> PathBuf {
+        let path = directory.join(name);
+        std::fs::write(&path, &self.pem).unwrap();
+        path
+    }
+
+    /// Files of a certificate for these names, written over what was there.
+    pub fn issue(&self, directory: &Path, file: &str, names: &[&str], until_year: i32) -> Pair {
+        let mut params =
+            CertificateParams::new(names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>()).unwrap();
+        (params.not_before, params.not_after) = (date_time_ymd(2020, 1, 1), date_time_ymd(until_year, 1, 1));
+        let own = KeyPair::generate().unwrap();
+        let pair = Pair { cert: directory.join(format!("{file}.pem")), key: directory.join(format!("{file}.key")) };
+        std::fs::write(&pair.cert, params.signed_by(&own, &self.issuer).unwrap().pem()).unwrap();
+        std::fs::write(&pair.key, own.serialize_pem()).unwrap();
+        pair
+    }
+}

@@ -1,0 +1,132 @@
+//! Tokens.
+
+use super::{begin, connect, logged, steps, unauthenticated};
+use crate::{
+    bounds::client,
+    common::server::{Server, within},
+};
+use perturb_protocol::{
+    ClientError, Connection,
+    credentials::{INSECURE, TOKEN_FILE},
+};
+use std::path::{Path, PathBuf};
+use tempfile::TempDir;
+use tonic::Code;
+
+const ANN: &str = "correct-horse-battery";
+const BOB: &str = "staple-correct-horse";
+
+struct Guarded {
+    server: Server,
+    directory: TempDir,
+    file: PathBuf,
+}
+
+fn entry(name: &str, token: &str, more: &str) -> String {
+    format!("[[token]]\nname = \"{name}\"\ntoken = \"{token}\"\n{more}\n")
+}
+
+impl Guarded {
+    fn start(tokens: &str) -> Self {
+        let directory = tempfile::tempdir().unwrap();
+        let file = directory.path().join("tokens.toml");
+        std::fs::write(&file, tokens).unwrap();
+        let server = Server::start(&["--tokens", file.to_str().unwrap(), "--log", "debug"]);
+        Self { server, directory, file }
+    }
+
+    async fn connect(&self, token: &str) -> Connection {
+        let file = self.directory.path().join(token);
+        std::fs::write(&file, format!("{token}\n")).unwrap();
+        connect(self.server.tcp(), &[(TOKEN_FILE, &file)]).await.unwrap()
+    }
+}
+
+#[tokio::test]
+async fn who_has_a_token_comes_in_and_others_do_not() {
+    let guarded = Guarded::start(&entry("ann", ANN, ""));
+    let ann = guarded.connect(ANN).await;
+    assert!(!within(ann.catalogue()).await.unwrap().environments.is_empty());
+    let mut session = begin(&ann, 4).await.unwrap();
+    steps(&mut session, 4).await.unwrap();
+
+    let stranger = connect(guarded.server.tcp(), &[]).await.unwrap();
+    let words = unauthenticated(begin(&stranger, 1).await);
+    assert!(words.contains("asks for a token") && words.contains(TOKEN_FILE), "{words}");
+    unauthenticated(within(stranger.catalogue()).await);
+    let words = unauthenticated(begin(&guarded.connect(&ANN.to_uppercase()).await, 1).await);
+    assert!(words.contains("does not know the token"), "{words}");
+
+    let neighbour = connect(guarded.server.unix(), &[]).await.unwrap();
+    begin(&neighbour, 1).await.expect("a Unix socket has its own guard");
+    let log = guarded.server.log();
+    assert!(log.contains("ann") && !log.to_lowercase().contains(ANN), "names are logged, tokens are not:\n{log}");
+}
+
+#[tokio::test]
+async fn every_service_but_health_asks_for_a_token() {
+    let guarded = Guarded::start(&entry("ann", ANN, ""));
+    let mut connection = client::Connection::new(guarded.server.port(), 1 << 16).await;
+    for path in [
+        client::SESSION,
+        client::LIST,
+        "/dm_env_rpc.v1.Environment/Process",
+        "/grpc.reflection.v1.ServerReflection/ServerReflectionInfo",
+        "/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo",
+    ] {
+        let (code, message) = connection.call(path).await.unwrap().status().await.unwrap();
+        assert_eq!(code, Code::Unauthenticated as i32, "{path}: {message}");
+    }
+    connect(guarded.server.tcp(), &[]).await.expect("its health is told");
+}
+
+#[tokio::test]
+async fn a_token_that_is_taken_out_of_the_file_is_good_no_more() {
+    let guarded = Guarded::start(&entry("ann", ANN, ""));
+    let ann = guarded.connect(ANN).await;
+    let mut session = begin(&ann, 1).await.unwrap();
+    std::fs::write(&guarded.file, "[[token]]\nname = \"bob\"").unwrap();
+    logged(&guarded.server, "those of before stay in force").await;
+    steps(&mut session, 1).await.expect("a broken file changes nothing");
+    begin(&ann, 1).await.unwrap();
+
+    std::fs::write(&guarded.file, entry("bob", BOB, "")).unwrap();
+    logged(&guarded.server, "read tokens again").await;
+    let words = unauthenticated(steps(&mut session, 1).await);
+    assert!(words.contains("\"ann\" was revoked"), "{words}");
+    unauthenticated(begin(&ann, 1).await);
+    begin(&guarded.connect(BOB).await, 1).await.unwrap();
+}
+
+#[tokio::test]
+async fn a_token_has_its_quotas() {
+    let guarded = Guarded::start(&(entry("ann", ANN, "max_sessions = 2\nmax_envs = 8") + &entry("bob", BOB, "")));
+    let ann = guarded.connect(ANN).await;
+    let refused = |result: Result<_, ClientError>| match result.err().expect("it is refused") {
+        ClientError::Refused { code: Code::ResourceExhausted, message: words, .. }
+        | ClientError::Lost { code: Code::ResourceExhausted, reason: words, .. } => words,
+        other => panic!("{other:?}"),
+    };
+    let six = begin(&ann, 6).await.unwrap();
+    let words = refused(begin(&guarded.connect(ANN).await, 3).await.map(drop));
+    assert!(words.contains("\"ann\" may have 8 environments"), "{words}");
+    let _two = begin(&ann, 2).await.unwrap();
+    let words = refused(begin(&ann, 1).await.map(drop));
+    assert!(words.contains("\"ann\" may have 2 sessions"), "{words}");
+    begin(&guarded.connect(BOB).await, 100).await.expect("another's token has its own");
+    drop(six);
+    crate::common::server::until("what was given back can be had", async || begin(&ann, 6).await.is_ok()).await;
+}
+
+#[tokio::test]
+async fn a_clients_own_mistakes_are_told() {
+    let directory = tempfile::tempdir().unwrap();
+    let nothing = directory.path().join("nothing");
+    let words = super::unsafe_words(connect("127.0.0.1:9", &[(TOKEN_FILE, &nothing)]).await);
+    assert!(words.contains("PERTURB_TOKEN_FILE=") && words.contains("one line with a token"), "{words}");
+    std::fs::write(&nothing, ANN).unwrap();
+    let words = super::unsafe_words(connect("192.0.2.1:9", &[(TOKEN_FILE, &nothing)]).await);
+    assert!(words.contains("unencrypted") && words.contains("https://192.0.2.1:9"), "{words}");
+    let variables: [(&str, &Path); 2] = [(TOKEN_FILE, &nothing), (INSECURE, Path::new("1"))];
+    assert!(connect("127.0.0.1:9", &variables).await.unwrap_err().is_absence());
+}
