@@ -28,7 +28,10 @@ pub(crate) struct Client {
 
 impl Client {
     pub(crate) async fn open(socket: &Path, name: &str, batch: usize) -> Result<Self, Failure> {
-        let connection = Connection::open(&Address::Unix(socket.into())).await?;
+        Self::on(&Connection::open(&Address::Unix(socket.into())).await?, name, batch).await
+    }
+
+    pub(crate) async fn on(connection: &Connection, name: &str, batch: usize) -> Result<Self, Failure> {
         let open = proto::Open {
             environment: name.into(),
             version: proto::Version::Default.into(),
@@ -37,7 +40,7 @@ impl Client {
             autoreset_mode: proto::AutoresetMode::SameStep.into(),
             ..Default::default()
         };
-        let (session, _) = Session::open(&connection, open).await?;
+        let (session, _) = Session::open(connection, open).await?;
         Ok(Self { spec: tasks::catalogue().find(name)?, batch, session, noise: Noise(7) })
     }
 
@@ -121,6 +124,8 @@ impl Noise {
 pub(crate) struct Process {
     child: Child,
     pub(crate) socket: PathBuf,
+    /// Where it said that it listens.
+    pub(crate) address: String,
     _directory: tempfile::TempDir,
 }
 
@@ -129,6 +134,16 @@ impl Process {
         let mut command = Command::new(env!("CARGO_BIN_EXE_perturb-server"));
         command.args(["--log", "warn", "--workers", &workers.to_string()]);
         Self::start(command, |socket| vec!["--listen".into(), format!("unix:{}", socket.display())])
+    }
+
+    /// One with a TCP port in place of a socket.
+    pub(crate) fn tcp(flags: &[(&str, &Path)]) -> Result<Self, Failure> {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_perturb-server"));
+        command.args(["--log", "warn", "--workers", "1"]);
+        for (flag, value) in flags {
+            command.arg(flag).arg(value);
+        }
+        Self::start(command, |_| vec!["--listen".into(), "tcp://127.0.0.1:0".into()])
     }
 
     pub(crate) fn echo() -> Result<Self, Failure> {
@@ -140,8 +155,10 @@ impl Process {
         let socket = directory.path().join("socket");
         let mut child = command.args(arguments(&socket)).stdout(Stdio::piped()).spawn()?;
         let stdout = child.stdout.take().ok_or("no standard output")?;
-        BufReader::new(stdout).read_line(&mut String::new())?;
-        Ok(Self { child, socket, _directory: directory })
+        let mut line = String::new();
+        BufReader::new(stdout).read_line(&mut line)?;
+        let address = line.trim().trim_start_matches("listening on ").to_owned();
+        Ok(Self { child, socket, address, _directory: directory })
     }
 
     /// Where the system tells of it.

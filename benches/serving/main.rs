@@ -2,6 +2,7 @@
 //!
 //! - CartPole, batch 256, over a Unix socket, against a bare tonic echo of the same payload;
 //! - Hopper and HalfCheetah, batches of 64, 256 and 1024, two workers, against MuJoCo's timesteps alone ([`robots`]);
+//! - CartPole over TCP with TLS, against without ([`encrypted`]);
 //! - the round trip of one environment, and the memory of one Hopper;
 //! - CartPole, 8 environments that the server plays with a policy, against computing its actions alone ([`acting`]);
 //! - pictures of each environment, 480 × 480 pixels, and what the server's memory grows by with them.
@@ -11,6 +12,7 @@
 mod acting;
 mod client;
 mod echo;
+mod encrypted;
 #[cfg(feature = "mujoco")]
 mod robots;
 
@@ -51,6 +53,11 @@ fn main() -> Result<(), Failure> {
         }
         if wanted("round_trip/CartPole/1") {
             round_trip().await?;
+        }
+        for batch in [1, 256] {
+            if wanted(&format!("tls/CartPole/{batch}")) {
+                encrypted::stepped(batch).await?;
+            }
         }
         for lstm in [None, Some(256)] {
             if wanted(acting::id(lstm)) {

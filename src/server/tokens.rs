@@ -209,8 +209,8 @@ impl Tokens {
     fn find(&self, shown: &[u8]) -> Option<Bearer> {
         let digest: [u8; 32] = Sha256::digest(shown).into();
         let tokens = self.0.read().unwrap_or_else(PoisonError::into_inner);
-        let fits = |token: &&Bearer| bool::from(token.digest.ct_eq(&digest));
-        tokens.iter().filter(fits).last().cloned()
+        let fits = |token: &Bearer| bool::from(token.digest.ct_eq(&digest));
+        tokens.iter().fold(None, |found, token| if fits(token) { Some(token) } else { found }).cloned()
     }
 
     /// Whose call it is; none for one by a Unix socket, which needs no token.

@@ -16,11 +16,11 @@ pub enum Address {
     /// is written in brackets.
     Tcp {
         /// A host name or an IP address, without brackets.
-        host: String,
+        host: Box<str>,
         /// The port, at least 1.
         port: u16,
         /// With TLS the name that the server's certificate must have: the host, or that from which it was resolved.
-        tls: Option<String>,
+        tls: Option<Box<str>>,
     },
 }
 
@@ -52,7 +52,7 @@ impl Address {
             Self::Unix(path) => return format!("perturb-server --listen unix:{}", path.display()),
             Self::Tcp { host, port, tls } => (host, port, tls.is_some()),
         };
-        let ip = match host.as_str() {
+        let ip = match &**host {
             "localhost" => IpAddr::from(Ipv4Addr::LOCALHOST),
             name => name.parse().unwrap_or(Ipv4Addr::UNSPECIFIED.into()),
         };
@@ -130,7 +130,7 @@ fn parse_tcp(text: &str, tls: bool) -> Result<Address, String> {
     if !host.chars().all(plausible) {
         return Err(format!("`{host}` is not a host name"));
     }
-    Ok(Address::Tcp { host: host.to_owned(), port, tls: tls.then(|| host.to_owned()) })
+    Ok(Address::Tcp { host: host.into(), port, tls: tls.then(|| host.into()) })
 }
 
 #[cfg(test)]

@@ -223,7 +223,7 @@ pub async fn machines(address: &Address) -> Result<Machines, ClientError> {
         return Ok(one());
     }
     let fail = |reason| ClientError::Connect { address: address.clone(), reason };
-    let found: Vec<SocketAddr> = timeout(CONNECT_LIMIT, tokio::net::lookup_host((host.as_str(), *port)))
+    let found: Vec<SocketAddr> = timeout(CONNECT_LIMIT, tokio::net::lookup_host((&**host, *port)))
         .await
         .map_err(|_| fail(format!("its name was not resolved within {} s", CONNECT_LIMIT.as_secs())))?
         .map_err(|error| fail(format!("its name cannot be resolved: {error}")))?
@@ -238,9 +238,9 @@ fn sorted(mut found: Vec<SocketAddr>, tls: Option<&str>) -> Machines {
     found.dedup();
     let (equal, spare): (Vec<_>, Vec<_>) = found.into_iter().partition(|found| found.is_ipv4() == liked);
     let address = |found: SocketAddr| Address::Tcp {
-        host: found.ip().to_string(),
+        host: found.ip().to_string().into(),
         port: found.port(),
-        tls: tls.map(str::to_owned),
+        tls: tls.map(Box::from),
     };
     Machines { equal: equal.into_iter().map(address).collect(), spare: spare.into_iter().map(address).collect() }
 }

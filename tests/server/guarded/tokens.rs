@@ -102,7 +102,7 @@ async fn a_token_that_is_taken_out_of_the_file_is_good_no_more() {
 async fn a_token_has_its_quotas() {
     let guarded = Guarded::start(&(entry("ann", ANN, "max_sessions = 2\nmax_envs = 8") + &entry("bob", BOB, "")));
     let ann = guarded.connect(ANN).await;
-    let refused = |result: Result<_, ClientError>| match result.err().expect("it is refused") {
+    let refused = |result: Result<_, ClientError>| match result.unwrap_err() {
         ClientError::Refused { code: Code::ResourceExhausted, message: words, .. }
         | ClientError::Lost { code: Code::ResourceExhausted, reason: words, .. } => words,
         other => panic!("{other:?}"),
