@@ -36,8 +36,17 @@ impl Agent {
 
     /// A stream on this connection.
     pub async fn start(client: &mut EnvironmentClient<Channel>) -> Result<Self, Status> {
+        Self::show(client, None).await
+    }
+
+    /// The same, which shows a token.
+    pub async fn show(client: &mut EnvironmentClient<Channel>, token: Option<&str>) -> Result<Self, Status> {
         let (requests, receiver) = tokio::sync::mpsc::channel(1024);
-        let responses = within(client.process(ReceiverStream::new(receiver))).await?.into_inner();
+        let mut call = tonic::Request::new(ReceiverStream::new(receiver));
+        if let Some(token) = token {
+            call.metadata_mut().insert("authorization", format!("Bearer {token}").parse().unwrap());
+        }
+        let responses = within(client.process(call)).await?.into_inner();
         Ok(Self { requests: Some(requests), responses })
     }
 

@@ -1,8 +1,9 @@
 //! Whose worlds of dm_env_rpc are: names, and who may reset and destroy.
 
 use super::client::{Agent, Settings, boolean, choice, create, destroy, double, join, reset_world, settings, text};
-use crate::common::server::{Server, refusal};
+use crate::common::server::{Server, channel, refusal};
 use insta::assert_snapshot;
+use perturb::proto::dm_env_rpc::v1::environment_client::EnvironmentClient;
 use tonic::Code;
 
 #[tokio::test]
@@ -76,4 +77,30 @@ async fn a_shared_world_is_everybodys() {
     other.reset_world(&world, Settings::new()).await;
     other.destroy(&world).await;
     assert_eq!(maker.refused(join(&world)).await.0, Code::NotFound);
+}
+
+#[tokio::test]
+async fn a_token_does_not_see_anothers_worlds() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("tokens.toml");
+    let [ann, bob] = ["correct-horse-battery", "staple-correct-horse"];
+    let entry = |name, token| format!("[[token]]\nname = \"{name}\"\ntoken = \"{token}\"\nmax_envs = 1\n");
+    std::fs::write(&file, entry("ann", ann) + &entry("bob", bob)).unwrap();
+    let server = Server::start(&["--tokens", file.to_str().unwrap()]);
+    let mut client = EnvironmentClient::new(channel(server.tcp()).await);
+    let mut maker = Agent::show(&mut client, Some(ann)).await.unwrap();
+    let mut same = Agent::show(&mut client, Some(ann)).await.unwrap();
+    let mut other = Agent::show(&mut client, Some(bob)).await.unwrap();
+    let mut neighbour = Agent::connect(server.unix()).await;
+    let shared = || settings("CartPole", [("world_name", text("pole")), ("shared", boolean(true))]);
+    let world = maker.create(shared()).await;
+    for request in [join(&world), reset_world(&world, Settings::new()), destroy(&world)] {
+        assert_eq!(other.refused(request.clone()).await.0, Code::NotFound);
+        assert_eq!(neighbour.refused(request).await.0, Code::NotFound);
+    }
+    same.reset_world(&world, Settings::new()).await;
+    same.join(&world).await;
+    let (code, message) = same.refused(create(settings("CartPole", []))).await;
+    assert!(code == Code::ResourceExhausted && message.contains("ann"), "its only environment is in use: {message}");
+    other.create(settings("CartPole", [])).await;
 }
