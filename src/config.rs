@@ -94,7 +94,7 @@ pub struct Arguments {
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub keepalive_seconds: Option<u64>,
-    /// A TOML file of tokens, one of which every call by TCP must show: [[token]] with name, sha256 (or token), and if
+    /// A TOML file of tokens, one of which every call by TCP must show: for each a name, sha256 (or token), and if
     /// need be max_sessions and max_envs. It is read again when it changes.
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -431,7 +431,10 @@ impl Config {
             (false, true) => Some("tokens would go there unencrypted"),
             (false, false) => Some("this server would neither encrypt nor ask who they are"),
         };
-        let others = |address: &&ListenAddress| matches!(address, ListenAddress::Tcp(tcp) if !tcp.ip().to_canonical().is_loopback());
+        let others = |address: &&ListenAddress| match address {
+            ListenAddress::Tcp(tcp) => !tcp.ip().to_canonical().is_loopback(),
+            ListenAddress::Unix(_) => false,
+        };
         if let (Some(lacks), Some(address)) = (lacks, self.listen.iter().find(others)) {
             return Err(Error::Insecure { address: address.written(), lacks });
         }

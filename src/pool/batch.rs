@@ -16,8 +16,6 @@ use bytes::{Bytes, BytesMut};
 use std::{
     ops::RangeInclusive,
     sync::{Arc, Mutex, atomic::Ordering},
-    thread::sleep,
-    time::Duration,
 };
 
 /// What one shard should cost, in µs: long enough to hide the queue, short enough that sessions take turns …
@@ -26,8 +24,6 @@ const SHARD_COST: RangeInclusive<f64> = 20.0..=200.0;
 const SHARDS_A_WORKER: f64 = 32.0;
 /// What each worker's share should at least cost, in µs, for more than one to be set to work.
 const LEAST_SHARE: f64 = 10.0;
-/// How often it is looked whether a batch that was left is in nobody's hands.
-const UNTIL_ALONE: Duration = Duration::from_millis(1);
 /// So many environments are freed in less time than the transport notices, and no other thread is asked to.
 const FEW: usize = 64;
 
@@ -229,7 +225,11 @@ impl Batch {
         let mut all = self.job.shards.iter().flat_map(|shard| lock(shard).take_slots()).collect::<Vec<Episodes>>();
         let mut slot = 0..;
         let gone: Vec<Episodes> = all.extract_if(.., |_| slot.next().is_some_and(|slot: usize| leaves[slot])).collect();
-        self.workers.free(Box::new(|| drop(gone)));
+        let mut gone = Some(gone);
+        self.workers.free(Box::new(move || {
+            drop(gone.take());
+            true
+        }));
         self.size = all.len();
         self.shard_size = shard_size(self.settings.spec, self.size, self.n_workers);
         let spec = self.settings.spec;
@@ -446,13 +446,12 @@ impl Drop for Batch {
         if self.size() <= FEW {
             return; // freed here, so that there is room at once
         }
-        let (job, play, workers) = (Arc::clone(&self.job), self.play.take(), Arc::clone(&self.workers));
         // Who holds the job last frees the environments: neither this thread, which lets it go now, nor a worker.
+        let mut rest = Some((Arc::clone(&self.job), self.play.take()));
         self.workers.free(Box::new(move || {
-            while Arc::strong_count(&job) > 1 && !workers.is_closing() {
-                sleep(UNTIL_ALONE);
-            }
-            drop((job, play));
+            let is_alone = rest.as_ref().is_none_or(|(job, _)| Arc::strong_count(job) == 1);
+            drop(rest.take_if(|_| is_alone));
+            is_alone
         }));
     }
 }

@@ -10,9 +10,10 @@ use std::{
     sync::{
         Arc, Condvar, Mutex, MutexGuard, PoisonError,
         atomic::{AtomicBool, AtomicUsize, Ordering},
-        mpsc,
+        mpsc::{self, RecvTimeoutError},
     },
     thread::{self, JoinHandle},
+    time::Duration,
 };
 use tokio::sync::Notify;
 
@@ -39,8 +40,11 @@ pub struct Pool {
     threads: Vec<JoinHandle<()>>,
 }
 
-/// Frees what a session leaves behind: thousands of environments take longer than the transport may be kept.
-pub(super) type Rest = Box<dyn FnOnce() + Send>;
+/// Frees what a session leaves behind, and says whether it could: thousands of environments take longer than the transport
+/// may be kept.
+pub(super) type Rest = Box<dyn FnMut() -> bool + Send>;
+/// How often it is looked whether what could not be freed can be.
+const AGAIN: Duration = Duration::from_millis(1);
 
 impl Pool {
     /// Starts `workers` threads (at least 1) for at most `max_environments` environments at a time.
@@ -64,11 +68,11 @@ impl Pool {
             let thread = thread::Builder::new().name(format!("physics-{i}")).spawn(move || shared.work(i))?;
             pool.threads.push(thread);
         }
-        let free = move || {
+        let freeing = move || {
             lower(NICENESS_OF_FREEING);
-            received.into_iter().for_each(|free: Rest| free());
+            free(&received);
         };
-        pool.threads.push(thread::Builder::new().name("free".into()).spawn(free)?);
+        pool.threads.push(thread::Builder::new().name("free".into()).spawn(freeing)?);
         Ok(pool)
     }
 
@@ -84,6 +88,23 @@ impl Pool {
 
     pub(super) fn queue(&self) -> Arc<Shared> {
         Arc::clone(&self.shared)
+    }
+}
+
+/// Frees what comes, as soon as it can be, until the pool ends.
+fn free(received: &mpsc::Receiver<Rest>) {
+    let mut left: Vec<Rest> = Vec::new();
+    loop {
+        let come = match left.is_empty() {
+            true => received.recv().map_err(|_| RecvTimeoutError::Disconnected),
+            false => received.recv_timeout(AGAIN),
+        };
+        match come {
+            Ok(rest) => left.push(rest),
+            Err(RecvTimeoutError::Timeout) => {}
+            Err(RecvTimeoutError::Disconnected) => return,
+        }
+        left.retain_mut(|rest| !rest());
     }
 }
 
@@ -214,11 +235,6 @@ impl Shared {
         }
     }
 
-    /// Whether the pool ends: what is left in the queue is not done any more.
-    pub(super) fn is_closing(&self) -> bool {
-        self.closing.load(Ordering::Relaxed)
-    }
-
     /// Frees what a session leaves behind, elsewhere.
     pub(super) fn free(&self, rest: Rest) {
         if let Some(rests) = &*lock(&self.rests) {
@@ -237,7 +253,7 @@ impl Shared {
 
     /// A job's last part has ended: its session is told, unless a round wants another step.
     fn conduct(&self, job: &Arc<Job>) {
-        while job.conduct(self.is_closing()) {
+        while job.conduct(self.closing.load(Ordering::Relaxed)) {
             job.prepare();
             let shards = job.shards.len();
             if shards > 1 || self.waiting.load(Ordering::Acquire) > 0 {

@@ -7,7 +7,7 @@ use super::{
     frames::{Allowance, Frames, Message},
     peers::{Full, Place, Places},
     status::Refusal,
-    tokens::{Held, Token},
+    tokens::{Bearer, Held, Token},
 };
 use futures_util::{Stream, stream};
 use std::{future::Future, pin::Pin, time::Duration};
@@ -119,9 +119,11 @@ impl<D: Dialogue> Conversation<D> {
         allowance.bytes = allowance.bytes.min(bytes);
         let limit =
             if self.dialogue.is_open() { idle } else { Some(idle.map_or(handshake, |idle| idle.min(handshake))) };
+        let bearer = self.requests.bearer.clone();
         let request = tokio::select! {
             biased; // the end comes first: a client that never pauses must not outlast it
             () = self.sessions.drain.closed() => return Some(Err(Refusal::Draining.into())),
+            refusal = revoked(bearer.as_ref()) => return Some(Err(refusal.into())),
             request = self.requests.next(allowance) => match request {
                 Ok(request) => request?,
                 Err(status) => return Some(Err(status)),
@@ -134,19 +136,28 @@ impl<D: Dialogue> Conversation<D> {
         if self.sessions.phase() != Phase::Running && !self.dialogue.is_open() {
             return Some(Err(Refusal::Draining.into()));
         }
-        if let Some(bearer) = self.requests.bearer.as_ref().filter(|bearer| bearer.is_revoked()) {
-            return Some(Err(bearer.revoked().into()));
-        }
         // Until it is answered its bytes are kept.
         let (request, _share) = match request {
             Message::Whole(bytes, share) => (bytes, share),
             Message::Refused(refusal) => return Some(Ok(self.dialogue.refuse(refusal))),
         };
         match self.sessions.decoder.decode(request, D::FIELDS, allowance).await {
-            Ok(Ok(request)) => Some(Ok(self.dialogue.answer(request).await)),
+            Ok(Ok(request)) => Some(tokio::select! {
+                biased; // it mostly is there at once
+                response = self.dialogue.answer(request) => Ok(response),
+                refusal = revoked(bearer.as_ref()) => Err(refusal.into()),
+            }),
             Ok(Err(refusal)) => Some(Ok(self.dialogue.refuse(refusal))),
             Err(status) => Some(Err(status)),
         }
+    }
+}
+
+/// Resolves when the token is revoked, if there is one.
+async fn revoked(bearer: Option<&Bearer>) -> Refusal {
+    match bearer {
+        Some(bearer) => bearer.revoked().await,
+        None => std::future::pending().await,
     }
 }
 

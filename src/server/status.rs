@@ -80,7 +80,9 @@ pub enum Refusal {
         name: String,
     },
     /// A token has all that it may have.
-    #[error("the token {name:?} may have {limit} {what} here, and {wanted} more would be too many; close a session")]
+    #[error(
+        "the token {name:?} may have {limit} {what} here, and {wanted} more would be too many; ask for less, or close"
+    )]
     TooManyOfAToken {
         /// What it is called.
         name: String,
@@ -212,9 +214,11 @@ impl Refusal {
             Self::Pool(pool::Error::Full { .. })
             | Self::TooManySessions { .. }
             | Self::TooManyOfAPeer { .. }
-            | Self::TooManyOfAToken { .. }
             | Self::NoMemory { .. }
             | Self::Render(render::Error::NoThread { .. }) => Code::ResourceExhausted,
+            // What is more than it may ever have is not to be tried again.
+            Self::TooManyOfAToken { wanted, limit, .. } if wanted > limit => Code::InvalidArgument,
+            Self::TooManyOfAToken { .. } => Code::ResourceExhausted,
             Self::Pool(pool::Error::Ended { .. })
             | Self::NotOpen { .. }
             | Self::AlreadyOpen

@@ -5,7 +5,10 @@ use std::{
     path::PathBuf,
     sync::{Arc, PoisonError, RwLock},
 };
-use tokio::net::TcpStream;
+use tokio::{
+    io::{AsyncReadExt, AsyncWriteExt},
+    net::TcpStream,
+};
 use tokio_rustls::{
     TlsAcceptor,
     rustls::{
@@ -103,12 +106,21 @@ impl Tls {
         Ok(())
     }
 
-    /// Shakes hands with a client.
+    /// Shakes hands with a client. One with whom there is no agreement is told why, and hears it: a connection that is
+    /// closed while there is something to read is reset, and what was written last may be lost.
     ///
     /// # Errors
     /// If they do not agree.
     pub async fn accept(&self, connection: TcpStream) -> io::Result<TlsStream<TcpStream>> {
         let config = Arc::clone(&self.config.read().unwrap_or_else(PoisonError::into_inner));
-        TlsAcceptor::from(config).accept(connection).await
+        match TlsAcceptor::from(config).accept(connection).into_fallible().await {
+            Ok(stream) => Ok(stream),
+            Err((error, mut connection)) => {
+                let _ = connection.shutdown().await; // an error means that the client has gone
+                let mut rest = [0; 1024];
+                while connection.read(&mut rest).await.is_ok_and(|count| count > 0) {}
+                Err(error)
+            }
+        }
     }
 }

@@ -19,6 +19,7 @@ use std::{
     task::{Context, Poll},
 };
 use subtle::ConstantTimeEq;
+use tokio::sync::Notify;
 use toml::Spanned;
 use tonic::{
     Status,
@@ -59,14 +60,15 @@ struct Entry {
 }
 
 /// So many of something, of which a token may have no more than a limit.
+#[derive(Default)]
 struct Quota {
     taken: AtomicUsize,
     limit: AtomicUsize,
 }
 
 impl Quota {
-    fn new(limit: Option<usize>) -> Self {
-        Self { taken: AtomicUsize::new(0), limit: AtomicUsize::new(limit.unwrap_or(usize::MAX)) }
+    fn bound(&self, limit: Option<usize>) {
+        self.limit.store(limit.unwrap_or(usize::MAX), Ordering::Relaxed);
     }
 
     /// Takes so many, or says how many there may be.
@@ -87,8 +89,10 @@ pub struct Token {
     /// SHA-256 of the token.
     digest: [u8; 32],
     revoked: AtomicBool,
-    sessions: Quota,
-    envs: Quota,
+    /// Wakes who waits for that.
+    told: Notify,
+    sessions: Arc<Quota>,
+    envs: Arc<Quota>,
 }
 
 /// The token of a call.
@@ -101,13 +105,24 @@ impl Token {
     }
 
     /// Whether it is in the file no more.
-    pub fn is_revoked(&self) -> bool {
-        self.revoked.load(Ordering::Relaxed)
+    fn is_revoked(&self) -> bool {
+        self.revoked.load(Ordering::Acquire)
     }
 
-    /// The refusal of what comes after it was revoked.
-    pub fn revoked(&self) -> Refusal {
-        Refusal::RevokedToken { name: self.name.clone() }
+    /// Waits until it is in the file no more, and gives the refusal of what comes then.
+    pub async fn revoked(&self) -> Refusal {
+        loop {
+            let told = self.told.notified();
+            if self.is_revoked() {
+                return Refusal::RevokedToken { name: self.name.clone() };
+            }
+            told.await;
+        }
+    }
+
+    fn revoke(&self) {
+        self.revoked.store(true, Ordering::Release);
+        self.told.notify_waiters();
     }
 
     /// A session of it.
@@ -184,23 +199,26 @@ impl Tokens {
         let mut tokens = self.0.write().unwrap_or_else(PoisonError::into_inner);
         let mut renewed = Vec::with_capacity(listed.len());
         for (digest, Entry { name, max_sessions, max_envs, .. }) in listed {
-            match tokens.iter().find(|token| token.name == name && token.digest == digest) {
-                Some(token) => {
-                    token.sessions.limit.store(max_sessions.unwrap_or(usize::MAX), Ordering::Relaxed);
-                    token.envs.limit.store(max_envs.unwrap_or(usize::MAX), Ordering::Relaxed);
-                    renewed.push(Arc::clone(token));
-                }
-                None => renewed.push(Arc::new(Token {
+            // Another token of the same name has what was taken with the one before, too.
+            let before = tokens.iter().find(|token| token.name == name);
+            let (sessions, envs) =
+                before.map_or_else(Default::default, |token| (Arc::clone(&token.sessions), Arc::clone(&token.envs)));
+            sessions.bound(max_sessions);
+            envs.bound(max_envs);
+            renewed.push(match before.filter(|token| token.digest == digest) {
+                Some(token) => Arc::clone(token),
+                None => Arc::new(Token {
                     name,
                     digest,
                     revoked: AtomicBool::new(false),
-                    sessions: Quota::new(max_sessions),
-                    envs: Quota::new(max_envs),
-                })),
-            }
+                    told: Notify::new(),
+                    sessions,
+                    envs,
+                }),
+            });
         }
         let gone = |token: &&Bearer| !renewed.iter().any(|kept| Arc::ptr_eq(kept, token));
-        tokens.iter().filter(gone).for_each(|token| token.revoked.store(true, Ordering::Relaxed));
+        tokens.iter().filter(gone).for_each(|token| token.revoke());
         *tokens = renewed;
         Ok(())
     }
@@ -423,8 +441,12 @@ mod tests {
         assert!(!ann.is_revoked() && ann.envs(6).is_err() && ann.envs(5).is_ok(), "what it has is remembered");
         let first = ann.session().unwrap();
         assert!(ann.session().is_ok(), "that quota is gone");
+        let renewed = file("another-horse-battery", "max_envs = 10");
+        tokens.renew(&renewed).unwrap();
+        let new = tokens.find(b"another-horse-battery").unwrap();
+        assert!(ann.is_revoked() && new.envs(6).is_err() && new.envs(5).is_ok(), "the quota is the name's");
         tokens.renew("").unwrap();
-        assert!(ann.is_revoked() && tokens.find(SECRET.as_bytes()).is_none());
+        assert!(new.is_revoked() && tokens.find(SECRET.as_bytes()).is_none());
         drop((first, held));
         assert_eq!(ann.envs.taken.load(Ordering::Relaxed) + ann.sessions.taken.load(Ordering::Relaxed), 0);
     }

@@ -46,6 +46,12 @@ impl FromStr for Address {
 }
 
 impl Address {
+    /// The same with TLS, as it is written.
+    pub(crate) fn with_tls(&self) -> String {
+        let text = self.to_string();
+        text.strip_prefix("http://").map_or_else(|| text.clone(), |rest| format!("https://{rest}"))
+    }
+
     /// What starts a server there, where it can be said.
     pub fn start_command(&self) -> String {
         let (host, port, tls) = match self {

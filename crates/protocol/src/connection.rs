@@ -92,10 +92,10 @@ impl Connection {
                 let opened = Self::opened(address, patience, token, channel).await;
                 return match (address, opened) {
                     (
-                        Address::Tcp { host, port, .. },
+                        Address::Tcp { host, port, tls: None },
                         Err(ClientError::NotPerturb { .. } | ClientError::Connect { .. }),
                     ) if speaks_tls(host, *port).await => {
-                        let reason = format!("it speaks TLS; write https://{host}:{port}");
+                        let reason = format!("it speaks TLS; write {}", address.with_tls());
                         Err(ClientError::Unsafe { address: address.clone(), reason })
                     }
                     (_, opened) => opened,
@@ -105,13 +105,9 @@ impl Connection {
         let refuse = |reason| ClientError::Unsafe { address: address.clone(), reason };
         let connector = Connector::new(host, port, name, credentials).map_err(refuse)?;
         let channel = Self::endpoint(address, patience)?.connect_with_connector(connector.clone()).await;
-        let has_shaken = channel.is_ok();
-        Self::opened(address, patience, token, channel).await.map_err(|error| {
-            let reason = connector.failure().or_else(|| connector.refusal().filter(|_| has_shaken));
-            match (error, reason) {
-                (ClientError::NotPerturb { .. } | ClientError::Connect { .. }, Some(reason)) => refuse(reason),
-                (error, _) => error,
-            }
+        Self::opened(address, patience, token, channel).await.map_err(|error| match (error, connector.failure()) {
+            (ClientError::NotPerturb { .. } | ClientError::Connect { .. }, Some(reason)) => refuse(reason),
+            (error, _) => error,
         })
     }
 

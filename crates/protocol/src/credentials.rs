@@ -68,14 +68,14 @@ impl Credentials {
     /// # Errors
     /// A sentence that names the variable, the file and what is wrong.
     pub fn of(address: &Address, variable: Variable<'_>) -> Result<Self, String> {
-        let Address::Tcp { host, port, tls } = address else { return Ok(Self::default()) };
+        let Address::Tcp { host, tls, .. } = address else { return Ok(Self::default()) };
         let file = |name| file(name, variable);
         let token = file(TOKEN_FILE).map(|path| token(&path)).transpose()?;
         if tls.is_none() {
             if token.is_some() && !is_here(host) && variable(INSECURE).is_none_or(|value| value != "1") {
                 return Err(format!(
-                    "the token of {TOKEN_FILE} would go there unencrypted; write https://{host}:{port} if it speaks TLS, \
-                     or set {INSECURE}=1"
+                    "the token of {TOKEN_FILE} would go there unencrypted; write {} if it speaks TLS, or set {INSECURE}=1",
+                    address.with_tls()
                 ));
             }
             return Ok(Self { token, ..Self::default() });

@@ -3,25 +3,24 @@
 use std::future::Future;
 use std::io;
 use std::pin::Pin;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
 use hyper_util::rt::TokioIo;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, ReadBuf};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
+use tokio_rustls::rustls::client::WebPkiServerVerifier;
 use tokio_rustls::rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
-use tokio_rustls::rustls::client::{ResolvesClientCert, WebPkiServerVerifier};
 use tokio_rustls::rustls::crypto::{CryptoProvider, ring, verify_tls13_signature};
 use tokio_rustls::rustls::pki_types::{CertificateDer, ServerName, UnixTime};
-use tokio_rustls::rustls::sign::CertifiedKey;
 use tokio_rustls::rustls::version::TLS13;
 use tokio_rustls::rustls::{
-    CertificateError, ClientConfig, DigitallySignedStruct, Error, PeerMisbehaved, RootCertStore, SignatureScheme,
+    AlertDescription, CertificateError, ClientConfig, DigitallySignedStruct, Error, InvalidMessage, RootCertStore,
+    SignatureScheme,
 };
 use tonic::codegen::{Service, http::Uri};
 
@@ -41,10 +40,12 @@ pub(crate) struct Connector {
     port: u16,
     name: ServerName<'static>,
     config: Arc<ClientConfig>,
-    shown: Arc<Shown>,
-    /// Why the last handshake failed.
-    failure: Arc<Mutex<Option<String>>>,
+    shows_certificate: bool,
+    failure: Failure,
 }
+
+/// Why there is no connection that can be trusted, once that is known.
+type Failure = Arc<Mutex<Option<String>>>;
 
 impl Connector {
     /// To the server at host and port, whose certificate must be for that name.
@@ -63,39 +64,33 @@ impl Connector {
                 verifier.build().map_err(|error| format!("{CA}: {error}"))?
             }
         };
-        let key = credentials.identity.map(|(chain, key)| CertifiedKey::from_der(chain, key, &provider).map(Arc::new));
-        let key = key.transpose().map_err(|error| format!("{CERT} and {KEY} do not go together: {error}"))?;
-        let shown = Arc::new(Shown { key, asked: AtomicBool::new(false) });
-        let mut config = ClientConfig::builder_with_provider(provider)
+        let shows_certificate = credentials.identity.is_some();
+        let builder = ClientConfig::builder_with_provider(provider)
             .with_protocol_versions(&[&TLS13])
             .map_err(|error| words(&error))?
             .dangerous() // for a server whose certificate is known as it is
-            .with_custom_certificate_verifier(verifier)
-            .with_client_cert_resolver(Arc::clone(&shown) as Arc<dyn ResolvesClientCert>);
+            .with_custom_certificate_verifier(verifier);
+        let mut config = match credentials.identity {
+            Some((chain, key)) => builder
+                .with_client_auth_cert(chain, key)
+                .map_err(|error| format!("{CERT} and {KEY} do not go together: {error}"))?,
+            None => builder.with_no_client_auth(),
+        };
         config.alpn_protocols = vec![b"h2".to_vec()];
         let name =
             ServerName::try_from(name.to_owned()).map_err(|_| format!("`{name}` can be no certificate's name"))?;
         let (host, failure) = (host.to_owned(), Arc::default());
-        Ok(Self { host, port, name, config: Arc::new(config), shown, failure })
+        Ok(Self { host, port, name, config: Arc::new(config), shows_certificate, failure })
     }
 
-    /// Why there is no encrypted connection, where that is the reason: after a failure to connect.
+    /// Why who is there is not trusted, or does not trust, where that is why there is no connection.
     pub(crate) fn failure(&self) -> Option<String> {
         self.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
-    }
-
-    /// Why the server ended a connection, where it was encrypted: servers see a client's certificate last.
-    pub(crate) fn refusal(&self) -> Option<String> {
-        let asked = self.shown.asked.load(Ordering::Relaxed);
-        asked.then(|| match self.shown.key {
-            Some(_) => format!("it accepts no client with the certificate of {CERT}: another authority must sign it"),
-            None => format!("it asks for a client's certificate; set {CERT} and {KEY} to the files of yours"),
-        })
     }
 }
 
 impl Service<Uri> for Connector {
-    type Response = TokioIo<TlsStream<TcpStream>>;
+    type Response = TokioIo<Watched>;
     type Error = io::Error;
     type Future = Pin<Box<dyn Future<Output = io::Result<Self::Response>> + Send>>;
 
@@ -104,24 +99,27 @@ impl Service<Uri> for Connector {
     }
 
     fn call(&mut self, _: Uri) -> Self::Future {
-        let Self { host, port, name, config, failure, .. } = self.clone();
+        let Self { host, port, name, config, shows_certificate, failure } = self.clone();
         Box::pin(async move {
             let tcp = TcpStream::connect((host.as_str(), port)).await?;
             tcp.set_nodelay(true)?;
             let stream = TlsConnector::from(config).connect(name, tcp).await;
             let reason = stream.as_ref().err().and_then(|error| words(error, &host));
             *failure.lock().unwrap_or_else(PoisonError::into_inner) = reason;
-            stream.map(TokioIo::new).map_err(|error| match error.kind() {
-                io::ErrorKind::UnexpectedEof | io::ErrorKind::ConnectionReset => io::Error::other(
-                    "it ended the connection in TLS's handshake; if it speaks no TLS, write tcp:// for https://",
-                ),
-                _ => error,
+            stream.map(|stream| TokioIo::new(Watched { stream, shows_certificate, failure })).map_err(|error| {
+                match error.kind() {
+                    io::ErrorKind::UnexpectedEof | io::ErrorKind::ConnectionReset => io::Error::other(
+                        "it ended the connection in TLS's handshake; if it speaks no TLS, write tcp:// for https://",
+                    ),
+                    _ => error,
+                }
             })
         })
     }
 }
 
-/// What is wrong with a handshake; none if only the connection is.
+/// What is wrong with who answers; none if it may only be the line: what was changed on its way, for instance, is not
+/// believed, but may come whole the next time.
 fn words(error: &io::Error, host: &str) -> Option<String> {
     use CertificateError as Bad;
     let error = error.get_ref()?.downcast_ref::<Error>()?;
@@ -139,14 +137,77 @@ fn words(error: &io::Error, host: &str) -> Option<String> {
             format!("its certificate is not for this name: {error}")
         }
         Error::InvalidCertificate(Bad::ApplicationVerificationFailure) => "its certificate is another one".into(),
-        Error::InvalidMessage(_) => {
+        Error::InvalidCertificate(other) => format!("its certificate is not good: {other}"),
+        Error::InvalidMessage(InvalidMessage::InvalidContentType) => {
             format!("it speaks no TLS; write tcp:// for https://, or see who listens at {host}")
         }
-        Error::PeerMisbehaved(PeerMisbehaved::IllegalMiddleboxChangeCipherSpec) | Error::DecryptError => {
-            format!("what came was changed on its way: {error}")
-        }
-        other => format!("TLS failed: {other}"),
+        Error::AlertReceived(
+            AlertDescription::ProtocolVersion
+            | AlertDescription::HandshakeFailure
+            | AlertDescription::NoApplicationProtocol,
+        ) => format!("it does not speak TLS 1.3 for HTTP/2: {error}"),
+        _ => return None,
     })
+}
+
+/// An encrypted connection, whose end may be the server's word on the client's certificate, which servers see last.
+pub(crate) struct Watched {
+    stream: TlsStream<TcpStream>,
+    shows_certificate: bool,
+    failure: Failure,
+}
+
+impl Watched {
+    fn hear(&self, error: &io::Error) {
+        use AlertDescription as Alert;
+        let Some(Error::AlertReceived(
+            Alert::CertificateRequired
+            | Alert::BadCertificate
+            | Alert::UnsupportedCertificate
+            | Alert::CertificateRevoked
+            | Alert::CertificateExpired
+            | Alert::CertificateUnknown
+            | Alert::UnknownCA
+            | Alert::AccessDenied
+            | Alert::DecryptError, // a signature that is not its issuer's
+        )) = error.get_ref().and_then(|error| error.downcast_ref())
+        else {
+            return;
+        };
+        let reason = match self.shows_certificate {
+            true => format!("it accepts no client with the certificate of {CERT}: another authority must sign it"),
+            false => format!("it asks for a client's certificate; set {CERT} and {KEY} to the files of yours"),
+        };
+        *self.failure.lock().unwrap_or_else(PoisonError::into_inner) = Some(reason);
+    }
+}
+
+impl AsyncRead for Watched {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        let polled = Pin::new(&mut self.stream).poll_read(context, buffer);
+        if let Poll::Ready(Err(error)) = &polled {
+            self.hear(error);
+        }
+        polled
+    }
+}
+
+impl AsyncWrite for Watched {
+    fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.stream).poll_write(context, bytes)
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_flush(context)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_shutdown(context)
+    }
 }
 
 /// Whether who listens there speaks TLS, and answers what is none as TLS does.
@@ -157,24 +218,6 @@ pub(crate) async fn speaks_tls(host: &str, port: u16) -> bool {
         tcp.read_u8().await
     };
     matches!(timeout(PROBE_LIMIT, ask).await, Ok(Ok(ALERT)))
-}
-
-/// A client's certificate, and whether the server asked for it.
-#[derive(Debug)]
-struct Shown {
-    key: Option<Arc<CertifiedKey>>,
-    asked: AtomicBool,
-}
-
-impl ResolvesClientCert for Shown {
-    fn resolve(&self, _: &[&[u8]], _: &[SignatureScheme]) -> Option<Arc<CertifiedKey>> {
-        self.asked.store(true, Ordering::Relaxed);
-        self.key.clone()
-    }
-
-    fn has_certs(&self) -> bool {
-        true // so that one is asked for
-    }
 }
 
 /// Trusts one certificate, whatever is in it.

@@ -177,7 +177,8 @@ impl Stream {
     /// # Errors
     /// Those of [`Stream::receive`].
     pub async fn ask<A: Ask>(&mut self, request: A) -> Result<A::Reply, ClientError> {
-        self.send(request).await?;
+        // If the stream has ended already, its status says why.
+        let _ = self.send(request).await;
         self.receive::<A>().await
     }
 

@@ -21,7 +21,7 @@ class Address:
 
 
 def parse_address(text: str) -> Address:
-    """Understand `unix:/path`, `host:port`, `http://host:port`, `tcp://host:port` and `https://host:port`, as the learner does.
+    """Understand `unix:/path`, `host:port` (`http://` or `tcp://` before it), `https://host:port`, as the learner does.
 
     Raises:
         InvalidArgumentError: with what is wrong with it.

@@ -241,7 +241,13 @@ class Session:
 
 
 def _listen(address: Address) -> str:
-    return str(address) if str(address).startswith("unix:") else f"tcp://{address}"
+    """What starts a server there, as flags; whom it lets in is its owner's to say."""
+    text = str(address)
+    if text.startswith("unix:"):
+        return text
+    rest = text.removeprefix("https://")
+    guards = " --tls-cert FILE --tls-key FILE" if rest != text else ""
+    return f"tcp://{rest}{guards}"
 
 
 # What of a session has to be closed: the stream, the private server, the process that opened it.

@@ -46,6 +46,7 @@ impl Agent {
             return Err(Refusal::Draining);
         }
         let (settings, version, own) = settings::create(self.worlds.catalogue(), &request.settings)?;
+        self.worlds.is_free(&self.caller, &own)?;
         let held = self.caller.envs(1)?;
         let runner = Runner::open(self.worlds.pool(), settings, version).await?;
         Ok(rpc::CreateWorldResponse { world_name: self.worlds.add(&self.caller, runner, own, held)? })
@@ -100,7 +101,7 @@ impl Agent {
     fn leave(&mut self) {
         if let Some(Joined { world, mut runner }) = self.joined.take() {
             runner.stop();
-            self.worlds.leave(&world, runner);
+            self.worlds.leave(&self.caller, &world, runner);
         }
     }
 

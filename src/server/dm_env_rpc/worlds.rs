@@ -34,11 +34,14 @@ impl Caller {
         self.bearer.as_ref().map(|bearer| bearer.envs(count)).transpose()
     }
 
-    /// Whose it is.
-    fn owner(&self) -> Option<&str> {
-        self.bearer.as_ref().map(|bearer| bearer.name())
+    /// What it calls so.
+    fn key(&self, name: &str) -> Key {
+        (self.bearer.as_ref().map(|bearer| bearer.name().to_owned()), name.to_owned())
     }
 }
+
+/// A world's name, with that of the token which it was made with: others do not see it, and may use the name too.
+type Key = (Option<String>, String);
 
 /// The registry that all streams share.
 pub(super) struct Worlds {
@@ -49,7 +52,7 @@ pub(super) struct Worlds {
 
 #[derive(Default)]
 struct Registry {
-    worlds: BTreeMap<String, Entry>,
+    worlds: BTreeMap<Key, Entry>,
     streams: StreamId,
 }
 
@@ -57,8 +60,6 @@ struct Entry {
     world: Arc<World>,
     /// The stream that made it, until it ends.
     maker: Option<StreamId>,
-    /// Of which token's streams it is.
-    owner: Option<String>,
     /// The stream whose agent is in it.
     agent: Option<StreamId>,
     /// Whether every stream may reset and destroy it.
@@ -92,6 +93,17 @@ impl Worlds {
         Caller { stream: registry.streams, bearer }
     }
 
+    /// Whether there is no world of the name that is asked for.
+    ///
+    /// # Errors
+    /// [`Refusal::Taken`].
+    pub(super) fn is_free(&self, maker: &Caller, own: &Ownership) -> Result<(), Refusal> {
+        match own.name.as_ref().filter(|name| self.lock().worlds.contains_key(&maker.key(name))) {
+            Some(name) => Err(Refusal::Taken { world: name.clone() }),
+            None => Ok(()),
+        }
+    }
+
     /// Takes a world that a stream has made, and what it holds of its token's. Returns its name.
     ///
     /// # Errors
@@ -107,21 +119,20 @@ impl Worlds {
             Some(name) => name,
             None => random_name(runner.spec().name)?,
         };
-        let mut registry = self.lock();
-        if registry.worlds.contains_key(&name) {
+        let (key, mut registry) = (maker.key(&name), self.lock());
+        if registry.worlds.contains_key(&key) {
             return Err(Refusal::Taken { world: name });
         }
         let world = Arc::new(World::new(name.clone(), &runner));
         let entry = Entry {
             world,
             maker: Some(maker.stream),
-            owner: maker.owner().map(String::from),
             agent: None,
             shared: own.shared,
             runner: Some(runner),
             _held: held,
         };
-        registry.worlds.insert(name.clone(), entry);
+        registry.worlds.insert(key, entry);
         Ok(name)
     }
 
@@ -147,9 +158,9 @@ impl Worlds {
     }
 
     /// Takes a world back from its agent.
-    pub(super) fn leave(&self, world: &World, runner: Runner) {
+    pub(super) fn leave(&self, agent: &Caller, world: &World, runner: Runner) {
         let mut registry = self.lock();
-        if let Some(entry) = registry.worlds.get_mut(world.name()) {
+        if let Some(entry) = registry.worlds.get_mut(&agent.key(world.name())) {
             (entry.agent, entry.runner) = (None, Some(runner));
         }
         registry.reap();
@@ -164,7 +175,7 @@ impl Worlds {
         if registry.of(caller, name, "destroy_world")?.runner.is_none() {
             return Err(Refusal::Occupied { world: name.into(), request: "destroy_world" });
         }
-        registry.worlds.remove(name);
+        registry.worlds.remove(&caller.key(name));
         Ok(())
     }
 
@@ -197,8 +208,7 @@ impl Registry {
 
     /// The world of that name, if there is one for streams with this token.
     fn find(&mut self, caller: &Caller, name: &str) -> Result<&mut Entry, Refusal> {
-        let found = self.worlds.get_mut(name).filter(|entry| entry.owner.as_deref() == caller.owner());
-        found.ok_or_else(|| unknown(name))
+        self.worlds.get_mut(&caller.key(name)).ok_or_else(|| unknown(name))
     }
 
     /// Frees the worlds that have neither maker nor agent.

@@ -31,8 +31,8 @@ impl Encrypted {
         let authority = Authority::new("authority");
         let Pair { cert, key } = authority.issue(directory.path(), "server", names, until_year);
         let ca = authority.file(directory.path(), "ca.pem");
-        let mut flags = vec!["--log", "debug", "--handshake-seconds", "2", "--tls-cert"];
-        flags.extend([cert.to_str().unwrap(), "--tls-key", key.to_str().unwrap()]);
+        let mut flags = vec!["--log", "debug", "--tls-cert", cert.to_str().unwrap()];
+        flags.extend(["--tls-key", key.to_str().unwrap()]);
         for (flag, path) in more {
             flags.extend([*flag, path.to_str().unwrap()]);
         }
@@ -104,7 +104,8 @@ async fn a_server_may_ask_for_certificates_of_clients() {
     let with = async |pair: &Pair| {
         connect(encrypted.address(), &[(CA, &encrypted.ca), (CERT, &pair.cert), (KEY, &pair.key)]).await
     };
-    begin(&with(&good).await.unwrap(), 1).await.unwrap();
+    let connection = with(&good).await.unwrap();
+    let _session = begin(&connection, 1).await.unwrap();
     for pair in [old, bad] {
         let words = unsafe_words(with(&pair).await);
         assert!(words.contains("accepts no client with the certificate"), "{words}");
@@ -113,6 +114,10 @@ async fn a_server_may_ask_for_certificates_of_clients() {
     assert!(words.contains("asks for a client's certificate; set PERTURB_CERT"), "{words}");
     let half = unsafe_words(connect(encrypted.address(), &[(CA, &encrypted.ca), (CERT, &good.cert)]).await);
     assert!(half.contains("PERTURB_KEY is not"), "{half}");
+    // Its end is no question of trust: it is waited for.
+    encrypted.server.signal("TERM");
+    let error = with(&good).await.unwrap_err();
+    assert!(error.is_absence() && error.to_string().contains("shutting down"), "{error}");
 }
 
 #[tokio::test]
@@ -148,7 +153,7 @@ async fn tokens_go_through_tls() {
 
 #[tokio::test]
 async fn handshakes_that_do_not_end_hold_up_nobody() {
-    let encrypted = Encrypted::usual();
+    let encrypted = Encrypted::start(&["127.0.0.1"], 2040, &[("--handshake-seconds", Path::new("2"))]);
     let port = encrypted.address().strip_prefix("https://").unwrap();
     let mut silent = Vec::new();
     for _ in 0..50 {

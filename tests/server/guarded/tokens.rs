@@ -60,7 +60,10 @@ async fn who_has_a_token_comes_in_and_others_do_not() {
     let neighbour = connect(guarded.server.unix(), &[]).await.unwrap();
     begin(&neighbour, 1).await.expect("a Unix socket has its own guard");
     let log = guarded.server.log();
-    assert!(log.contains("ann") && !log.to_lowercase().contains(ANN), "names are logged, tokens are not:\n{log}");
+    assert!(
+        log.contains("token=\"ann\"") && !log.to_lowercase().contains(ANN),
+        "names are logged, tokens are not:\n{log}"
+    );
 }
 
 #[tokio::test]

@@ -97,8 +97,8 @@ pub enum Command {
 /// Where environments run.
 #[derive(Args, Clone, Debug)]
 pub struct ServerArgs {
-    /// Running servers, separated by commas: unix:/path, host:port, http://host:port or tcp://host:port. Without this,
-    /// perturb starts a server of its own and ends it afterwards.
+    /// Running servers, separated by commas: unix:/path, host:port, http://host:port or tcp://host:port, with TLS
+    /// https://host:port. Without this, perturb starts a server of its own and ends it afterwards.
     #[arg(long, value_name = "ADDRESS", value_delimiter = ',')]
     pub server: Vec<Address>,
     /// Physics threads of the server that perturb starts itself [default: one a core].

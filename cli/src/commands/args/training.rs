@@ -148,7 +148,7 @@ pub struct ServeArgs {
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8420", value_parser = listening)]
     pub address: SocketAddr,
     /// A running server of environments, of which the page shows what it says of itself: unix:/path, host:port,
-    /// http://host:port or tcp://host:port.
+    /// http://host:port or tcp://host:port, with TLS https://host:port.
     #[arg(long, value_name = "ADDRESS")]
     pub server: Option<Address>,
 }
