@@ -95,10 +95,15 @@ pub struct Arguments {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub keepalive_seconds: Option<u64>,
     /// A TOML file of tokens, one of which every call by TCP must show: for each a name, sha256 (or token), and if
-    /// need be max_sessions and max_envs. It is read again when it changes.
+    /// need be max_sessions, max_envs and a role, which says what may be drawn from. It is read again when it changes.
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tokens: Option<PathBuf>,
+    /// Write into this file what every token draws from (distribution, seed, indices, episodes), before it does, in lines
+    /// that are chained to each other; `perturb audit --ledger` reads it. An old one is gone on with.
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ledger: Option<PathBuf>,
     /// The server's certificate for TLS on its TCP addresses, in PEM, with those between it and its authority's. The files
     /// of TLS are read again when they change.
     #[arg(long, value_name = "FILE")]
@@ -192,6 +197,8 @@ pub struct Config {
     pub keepalive_seconds: u64,
     /// The file of tokens that callers must show.
     pub tokens: Option<PathBuf>,
+    /// The file of what is drawn.
+    pub ledger: Option<PathBuf>,
     /// The server's certificate for TLS.
     pub tls_cert: Option<PathBuf>,
     /// Its private key.
@@ -224,6 +231,7 @@ impl Default for Config {
             idle_seconds: 0,
             keepalive_seconds: 60,
             tokens: None,
+            ledger: None,
             tls_cert: None,
             tls_key: None,
             tls_client_ca: None,

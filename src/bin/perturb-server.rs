@@ -114,7 +114,7 @@ fn run(config: &Config) -> Result<(), Failure> {
     raise_descriptors();
     // One thread for I/O: physics has threads of its own, and a hand-over between runtime threads doubles latency.
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    let guards = Guards::load(config).map_err(Failure::Address)?;
+    let guards = Guards::load(config, &tasks::catalogue()).map_err(Failure::Address)?;
     let result = runtime.block_on(async {
         // Before the addresses are told: who reads them may send a signal at once.
         let shutdown = shutdown(config.exit_with_stdin)?;

@@ -5,6 +5,7 @@ use super::{
     shorten,
 };
 use crate::scene::Scene;
+use perturb_protocol::region::Region;
 
 /// Everything that is fixed about an environment.
 #[derive(Debug, Clone, Copy)]
@@ -49,6 +50,13 @@ impl EnvironmentSpec {
     pub fn distributions(&self, version: Version) -> Vec<Distribution> {
         let of = |&part: &Version| self.parameters.iter().map(move |parameter| parameter.distribution(part));
         version.parts().iter().flat_map(of).collect()
+    }
+
+    /// The values that distributions, one for each parameter in each box, may have.
+    pub fn region(&self, distributions: &[Distribution]) -> Region {
+        let names = || self.parameters.iter().map(|parameter| parameter.name.to_owned());
+        let boxes = distributions.chunks(self.parameters.len().max(1));
+        Region::new(boxes.map(|each| names().zip(each.iter().cloned()).collect()).collect())
     }
 }
 

@@ -33,6 +33,17 @@ pub struct EpisodeId {
     pub episode_in_trial: u32,
 }
 
+/// What an environment's random numbers follow from, beside its distributions.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Draw {
+    /// The seed.
+    pub seed: u64,
+    /// The environment's index.
+    pub environment_index: u32,
+    /// The current episode.
+    pub episode_index: u64,
+}
+
 /// What physics an episode ran with.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Receipt {
@@ -257,6 +268,12 @@ impl Episodes {
             episode_index: self.progress.episode,
             episode_in_trial: self.progress.episode_in_trial,
         }
+    }
+
+    /// Where the environment draws from, and how far it is.
+    pub fn draw(&self) -> Draw {
+        let Settings { seed, environment_index, .. } = self.settings;
+        Draw { seed, environment_index, episode_index: self.progress.episode }
     }
 
     /// The physics of the current episode.

@@ -13,12 +13,13 @@ mod success;
 
 pub use catalogue::Catalogue;
 pub use environment::{Environment, EnvironmentSpec, Transition, check_bounds, resolve};
-pub use episode::{EpisodeEnd, EpisodeId, EpisodeStart, Episodes, Outcome, Receipt, Settings};
+pub use episode::{Draw, EpisodeEnd, EpisodeId, EpisodeStart, Episodes, Outcome, Receipt, Settings};
 pub use error::Error;
 pub(crate) use error::shorten;
 pub use parameter::Parameter;
 pub use perturb_protocol::{Distribution, DistributionError, Interval, Version};
 pub use seeding::{Purpose, Stream};
 pub(crate) use snapshot::MOST_SNAPSHOT_BYTES;
+pub use snapshot::{SavedDraw, saved_draw};
 pub use spaces::{Action, ActionSpace, Channel, Quantity, RewardTerm};
 pub use success::{Achievement, Comparison, Success};

@@ -1,7 +1,7 @@
 //! Saving an environment whole, and bringing it back in another session, process or server.
 
 use super::{
-    Distribution, EnvironmentSpec, Episodes, Error, Interval, Settings, check_bounds,
+    Distribution, Draw, EnvironmentSpec, Episodes, Error, Interval, Settings, check_bounds,
     episode::{Progress, boxes},
     shorten,
 };
@@ -98,6 +98,38 @@ impl Episodes {
 
     /// Decodes a snapshot and checks all that can be wrong with it, short of the physics' own state.
     fn check(&self, snapshot: &[u8]) -> Result<(Saved, Vec<Distribution>), Error> {
+        let (saved, distributions) = Saved::read(self.spec(), snapshot)?;
+        if saved.model_hash != self.environment.model_hash() {
+            return Err(Error::Snapshot { reason: "it was taken with another model".into() });
+        }
+        Ok((saved, distributions))
+    }
+}
+
+/// What a saved environment draws from.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SavedDraw {
+    /// Where its random numbers come from.
+    pub draw: Draw,
+    /// What parameters are drawn from: [`Settings::distributions`].
+    pub distributions: Vec<Distribution>,
+    /// The parameters in force, `[P]`, which a client may have made up.
+    pub values: Vec<f64>,
+}
+
+/// What a snapshot brings back, before it does.
+///
+/// # Errors
+/// [`Error::Snapshot`].
+pub fn saved_draw(spec: &'static EnvironmentSpec, snapshot: &[u8]) -> Result<SavedDraw, Error> {
+    let (Saved { seed, environment_index, values, progress, .. }, distributions) = Saved::read(spec, snapshot)?;
+    let draw = Draw { seed, environment_index, episode_index: progress.episode };
+    Ok(SavedDraw { draw, distributions, values })
+}
+
+impl Saved {
+    /// All of a snapshot but its model is checked.
+    fn read(spec: &'static EnvironmentSpec, snapshot: &[u8]) -> Result<(Self, Vec<Distribution>), Error> {
         let refuse = |reason: String| Err(Error::Snapshot { reason });
         let unreadable = || refuse(format!("its {} bytes are not a snapshot", snapshot.len()));
         // A byte of it may claim a list, which takes more than twenty.
@@ -124,14 +156,10 @@ impl Episodes {
                 _ => return unreadable(),
             },
         };
-        let spec = self.spec();
         if (saved.environment.as_str(), saved.revision) != (spec.name, spec.revision) {
             let Saved { environment, revision, .. } = saved;
             let environment = shorten(&environment).escape_debug().to_string();
             return refuse(format!("it is of {environment}-v{revision}, this is {}-v{}", spec.name, spec.revision));
-        }
-        if saved.model_hash != self.environment.model_hash() {
-            return refuse("it was taken with another model".into());
         }
         let n = spec.parameters.len();
         if boxes(saved.distributions.len(), n).is_none() || saved.values.len() != n {

@@ -9,7 +9,7 @@ use super::{
     workers::{Job, Permit, Shared, lock},
 };
 use crate::{
-    env::{Distribution, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings},
+    env::{Distribution, Draw, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings},
     scene::Scene,
 };
 use bytes::{Bytes, BytesMut};
@@ -128,7 +128,12 @@ pub struct Batch {
     under_way: bool,
     /// The policy that plays, until somebody else changes the environments.
     play: Option<Box<Play>>,
+    /// Who is told when it is freed.
+    farewell: Option<Farewell>,
 }
+
+/// Who is told where environments drew from, when they are freed.
+pub type Farewell = Box<dyn FnOnce(Vec<Draw>) + Send + Sync>;
 
 impl Batch {
     /// Makes the environments, on the pool's workers, and begins their first episodes. Returns the batch with its first
@@ -154,6 +159,7 @@ impl Batch {
             buffer: BytesMut::new(),
             under_way: false,
             play: None,
+            farewell: None,
         };
         batch.run().await?;
         batch.check_failures()?;
@@ -305,6 +311,16 @@ impl Batch {
         lock(&self.job.shards[slot / self.shard_size]).distributions(slot).to_vec()
     }
 
+    /// Where a slot draws from, and how far it is.
+    pub fn draw(&self, slot: usize) -> Draw {
+        lock(&self.job.shards[slot / self.shard_size]).draws().nth(slot % self.shard_size).expect("a slot of the batch")
+    }
+
+    /// Tells where its environments drew from, and how far they came, in order of slots, when they are freed.
+    pub fn when_freed(&mut self, tell: Farewell) {
+        self.farewell = Some(tell);
+    }
+
     /// Waits for the end of a request whose future was dropped before it was ready. To be called before the next one,
     /// then; the workers still run it, and another would mix with it. A policy that plays ends with its present step.
     pub async fn settle(&mut self) {
@@ -443,17 +459,30 @@ impl Batch {
 impl Drop for Batch {
     fn drop(&mut self) {
         self.job.abandoned.store(true, Ordering::Relaxed);
-        if self.size() <= FEW {
+        let is_idle = Arc::strong_count(&self.job) == 1;
+        if self.size() <= FEW && (is_idle || self.farewell.is_none()) {
+            if let Some(tell) = self.farewell.take() {
+                tell(draws(&self.job));
+            }
             return; // freed here, so that there is room at once
         }
         // Who holds the job last frees the environments: neither this thread, which lets it go now, nor a worker.
-        let mut rest = Some((Arc::clone(&self.job), self.play.take()));
+        let mut rest = Some((Arc::clone(&self.job), self.play.take(), self.farewell.take()));
         self.workers.free(Box::new(move || {
-            let is_alone = rest.as_ref().is_none_or(|(job, _)| Arc::strong_count(job) == 1);
-            drop(rest.take_if(|_| is_alone));
+            let is_alone = rest.as_ref().is_none_or(|(job, ..)| Arc::strong_count(job) == 1);
+            if let Some((job, _, farewell)) = rest.take_if(|_| is_alone)
+                && let Some(tell) = farewell
+            {
+                tell(draws(&job));
+            }
             is_alone
         }));
     }
+}
+
+/// Where all environments of a job draw from.
+fn draws(job: &Job) -> Vec<Draw> {
+    job.shards.iter().flat_map(|shard| lock(shard).draws().collect::<Vec<_>>()).collect()
 }
 
 /// The job of a batch of `size` environments.

@@ -16,7 +16,7 @@ mod shard;
 mod told;
 mod workers;
 
-pub use batch::{Batch, BatchSettings, ResetEntry, SlotGroup, Stepped};
+pub use batch::{Batch, BatchSettings, Farewell, ResetEntry, SlotGroup, Stepped};
 pub use play::{Play, Policy, PolicyRole};
 pub use round::{EndedAt, Played, Turn};
 pub use shard::Autoreset;

@@ -3,7 +3,9 @@
 use super::batch::{BatchSettings, SlotGroup};
 use super::told::Told;
 use crate::{
-    env::{self, Action, ActionSpace, Distribution, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings},
+    env::{
+        self, Action, ActionSpace, Distribution, Draw, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings,
+    },
     scene::Scene,
 };
 use bytes::Bytes;
@@ -162,6 +164,11 @@ impl Shard {
     /// The distributions in force in a slot of the batch.
     pub(super) fn distributions(&self, slot: usize) -> &[Distribution] {
         &self.slots[slot - self.first_slot].settings().distributions
+    }
+
+    /// Where each environment draws from.
+    pub(super) fn draws(&self) -> impl Iterator<Item = Draw> {
+        self.slots.iter().map(Episodes::draw)
     }
 
     /// What a picture of a slot of the batch shows.

@@ -1,44 +1,51 @@
-//! What keeps strangers out, of the files that the settings name.
+//! What keeps strangers out, and what is written down of those who came in, of the files that the settings name.
 
 use super::{
+    ledger::Ledger,
     tls::{Files, Tls},
     tokens::Tokens,
     watch::{self, Watch},
 };
-use crate::config::Config;
+use crate::{config::Config, env::Catalogue};
 use std::{io, path::PathBuf};
 
-/// What keeps strangers out; by default nothing does.
+/// What keeps strangers out and writes down what others do; by default nothing does.
 #[derive(Default)]
 pub struct Guards {
     /// What callers must show.
     pub tokens: Option<Tokens>,
     /// How TCP connections are encrypted.
     pub tls: Option<Tls>,
+    /// Has what is drawn.
+    pub ledger: Option<Ledger>,
     /// Has the files read again when they change.
     watches: Vec<Watch>,
 }
 
 impl Guards {
-    /// Those of the settings, whose files are read, and again when they change.
+    /// Those of the settings of a server of these environments: its files are read, and again when they change.
     ///
     /// # Errors
     /// If a file is wrong: it is named, with what was expected.
-    pub fn load(config: &Config) -> io::Result<Self> {
+    pub fn load(config: &Config, catalogue: &Catalogue) -> io::Result<Self> {
         let mut guards = Self::default();
         if let Some(path) = &config.tokens {
-            guards.tokens = Some(guards.load_tokens(path.clone())?);
+            guards.tokens = Some(guards.load_tokens(path.clone(), catalogue)?);
         }
         if let Some(files) = config.tls() {
             guards.tls = Some(guards.load_tls(files)?);
         }
+        if let Some(path) = &config.ledger {
+            let wrong = |error| io::Error::other(format!("the ledger {}: {error}; correct --ledger", path.display()));
+            guards.ledger = Some(Ledger::open(path).map_err(wrong)?);
+        }
         Ok(guards)
     }
 
-    fn load_tokens(&mut self, path: PathBuf) -> io::Result<Tokens> {
+    fn load_tokens(&mut self, path: PathBuf, catalogue: &Catalogue) -> io::Result<Tokens> {
         let wrong = |reason: String| io::Error::other(format!("{reason}; correct --tokens"));
         let before = watch::read(std::slice::from_ref(&path)).map_err(wrong)?;
-        let tokens = Tokens::default();
+        let tokens = Tokens::new(catalogue.clone());
         let renewed = tokens.clone();
         let name = path.display().to_string();
         let renew = move |contents: &[Vec<u8>]| {

@@ -6,6 +6,7 @@
 //! - [`replies`]: how replies go onto it; [`budget`]: the bytes of both; [`sizes`]: how many they are.
 //! - [`peers`]: whom connections are from, and what each may have.
 //! - [`guards`]: what keeps strangers out: [`tokens`], [`tls`], of files that a [`watch`] reads again.
+//! - [`draws`]: what a session draws from, by its token's role, and the [`ledger`] that has it.
 //! - [`requests`]: spans and counts of requests, a layer between the two.
 //! - [`session`]: the legal order of a session's requests.
 //! - [`convert`]: the protocol to the domain and back, with all validation; [`acting`]: that of policies.
@@ -20,9 +21,11 @@ pub mod conversation;
 pub mod convert;
 pub mod dm_env_rpc;
 pub mod drain;
+pub mod draws;
 pub mod fields;
 pub mod frames;
 pub mod guards;
+pub mod ledger;
 pub mod listen;
 pub mod peers;
 pub mod probe;
@@ -113,8 +116,14 @@ pub async fn run(
     let admission = Admission { places: Places::new(usize::MAX, of_a_peer.saturating_add(OTHER_STREAMS)), handshake };
     let stall = (config.stall_seconds > 0).then(|| Duration::from_secs(config.stall_seconds));
     let transit = Transit { budget: Budget::new(config.max_memory), limit: stall };
-    let worlds = dm_env_rpc::service::Service::new(Arc::clone(&pool), Arc::clone(&catalogue), sessions.clone());
-    let service = Service::new(Shared { pool, catalogue, listing, renderer: Renderer::new() }, sessions);
+    let worlds = dm_env_rpc::service::Service::new(
+        Arc::clone(&pool),
+        Arc::clone(&catalogue),
+        sessions.clone(),
+        guards.ledger.clone(),
+    );
+    let ledger = guards.ledger.clone();
+    let service = Service::new(Shared { pool, catalogue, listing, renderer: Renderer::new(), ledger }, sessions);
     let counts = [("perturb.v1", service.counts()), ("dm_env_rpc.v1", worlds.counts())];
     let worlds = EnvironmentServer::new(worlds).max_encoding_message_size(usize::MAX);
     let worlds = Keeping::new(worlds, "/dm_env_rpc.v1.Environment/Process", transit.clone());
@@ -186,6 +195,9 @@ pub async fn run(
     let farewell = async { while servers.join_next().await.is_some() {} };
     if tokio::time::timeout(FAREWELL, farewell).await.is_err() {
         tracing::debug!("some connections did not close by themselves");
+    }
+    if let Some(ledger) = &guards.ledger {
+        ledger.close().await;
     }
     Ok(())
 }

@@ -5,8 +5,10 @@ use super::{
     budget::{Budget, Outbox, Share},
     conversation::{Dialogue, MOST_BYTES_BEFORE_OPEN},
     convert,
+    draws::Draws,
     fields::{self, Field},
     frames::Allowance,
+    ledger::Ledger,
     requests::Observed,
     sizes,
     status::Refusal,
@@ -33,6 +35,8 @@ pub struct Shared {
     pub listing: proto::ListEnvironmentsResponse,
     /// What draws them.
     pub renderer: Renderer,
+    /// Has what is drawn.
+    pub ledger: Option<Ledger>,
 }
 
 /// A client's session. Dropping it frees its environments.
@@ -42,6 +46,7 @@ pub struct Session {
     bearer: Option<Bearer>,
     /// Its environments, of those that its token may have.
     held: Option<Held>,
+    draws: Draws,
     budget: Budget,
     /// What replies take beyond `kept`.
     outbox: Outbox,
@@ -54,7 +59,8 @@ pub struct Session {
 impl Session {
     /// A session that is not open yet, whose replies' bytes are taken from the budget until they leave the outbox.
     pub fn new(shared: Arc<Shared>, bearer: Option<Bearer>, budget: Budget, outbox: Outbox) -> Self {
-        Self { shared, batch: None, bearer, held: None, budget, outbox, kept: None, playing: None }
+        let draws = Draws::new(bearer.clone(), shared.ledger.clone());
+        Self { shared, batch: None, bearer, held: None, draws, budget, outbox, kept: None, playing: None }
     }
 
     async fn open(&mut self, request: proto::Open) -> Result<proto::Opened, Refusal> {
@@ -71,7 +77,9 @@ impl Session {
         // More than there can be is for the pool to refuse.
         let kept = (envs <= most).then(|| self.budget.take(sizes::session(&settings, envs))).transpose()?;
         let held = self.bearer.as_ref().map(|bearer| bearer.envs(envs)).transpose()?;
-        let (batch, observations, started) = Batch::open(&self.shared.pool, settings).await?;
+        self.draws.open(&settings).await?;
+        let (mut batch, observations, started) = Batch::open(&self.shared.pool, settings).await?;
+        self.draws.follow(&mut batch);
         (self.batch, self.kept, self.held) = (Some(batch), kept, held);
         let started = convert::started(started);
         let acts = true;
@@ -95,8 +103,9 @@ impl Session {
     }
 
     async fn reset(&mut self, request: proto::Reset) -> Result<proto::ResetDone, Refusal> {
-        let batch = self.opened("reset")?;
+        let batch = self.batch.as_mut().ok_or(Refusal::NotOpen { request: "reset" })?;
         let entries = convert::reset(batch, request)?;
+        self.draws.reset(batch, &entries).await?;
         let (observations, started) = batch.reset(entries).await?;
         self.playing = None;
         Ok(proto::ResetDone { observations, started: convert::started(started) })
@@ -114,8 +123,9 @@ impl Session {
     }
 
     async fn restore(&mut self, request: proto::Restore) -> Result<proto::Restored, Refusal> {
-        let batch = self.opened("restore")?;
+        let batch = self.batch.as_mut().ok_or(Refusal::NotOpen { request: "restore" })?;
         let entries = convert::restore(batch.size(), request)?;
+        self.draws.restore(batch, &entries).await?;
         let observations = batch.restore(entries).await?;
         self.playing = None;
         Ok(proto::Restored { observations })
@@ -132,8 +142,9 @@ impl Session {
     }
 
     fn release(&mut self, request: &proto::Release) -> Result<proto::Released, Refusal> {
-        let batch = self.opened("release")?;
+        let batch = self.batch.as_mut().ok_or(Refusal::NotOpen { request: "release" })?;
         let slots = convert::release(batch.size(), request)?;
+        self.draws.release(batch, &slots);
         batch.release(&slots)?;
         if let Some(held) = &mut self.held {
             held.give_back(slots.len());

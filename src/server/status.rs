@@ -74,7 +74,7 @@ pub enum Refusal {
     #[error("this server does not know the token that came; ask who runs it for one that is good")]
     WrongToken,
     /// The session's token was taken out of the file of tokens.
-    #[error("the token {name:?} was revoked; ask who runs this server for another one")]
+    #[error("the token {name:?} was revoked, or has another role now; ask who runs this server")]
     RevokedToken {
         /// What it is called.
         name: String,
@@ -92,6 +92,27 @@ pub enum Refusal {
         limit: usize,
         /// Sessions or environments.
         what: &'static str,
+    },
+    /// The token's role does not allow it.
+    #[error(
+        "a token of the role {role:?} may not draw from {region} of {environment}: {reason}; ask for what it may draw \
+         from, or who runs this server for another token"
+    )]
+    NotAllowed {
+        /// The role.
+        role: String,
+        /// The environment.
+        environment: &'static str,
+        /// What was to be drawn from.
+        region: String,
+        /// Why not.
+        reason: String,
+    },
+    /// What would be drawn cannot be written down.
+    #[error("this server writes down what is drawn, and cannot: {reason}; try again later, or tell who runs it")]
+    NoLedger {
+        /// Why not.
+        reason: String,
     },
     /// The budget of bytes in flight is used up.
     #[error(
@@ -236,9 +257,9 @@ impl Refusal {
             Self::NoToken | Self::WrongToken | Self::RevokedToken { .. } => Code::Unauthenticated,
             Self::Draining => Code::Unavailable,
             Self::Unknown { .. } => Code::NotFound,
-            Self::Forbidden { .. } | Self::NotYours { .. } => Code::PermissionDenied,
+            Self::Forbidden { .. } | Self::NotYours { .. } | Self::NotAllowed { .. } => Code::PermissionDenied,
             Self::Taken { .. } => Code::AlreadyExists,
-            Self::NoRandomness => Code::Unavailable,
+            Self::NoRandomness | Self::NoLedger { .. } => Code::Unavailable,
             Self::UnknownExtension { .. } => Code::Unimplemented,
         }
     }

@@ -22,6 +22,7 @@ mod heatmap;
 mod heatmap_policies;
 mod heatmaps;
 pub mod interrupt;
+pub mod ledger;
 mod means;
 pub mod outcomes;
 pub mod paper;

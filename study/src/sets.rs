@@ -61,6 +61,13 @@ impl TestSet {
         }
     }
 
+    /// The values that replace the version's in one of its contexts.
+    pub fn parameters(&self, context: &Context) -> Parameters {
+        let mut parameters = self.drawn();
+        parameters.extend(context.iter().map(|(name, value)| (name.clone(), Distribution::fixed(*value))));
+        parameters
+    }
+
     /// The set's contexts; one empty one if its parameters are drawn.
     pub fn listed(&self) -> Vec<Context> {
         match &self.contexts {

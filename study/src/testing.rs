@@ -1,6 +1,7 @@
 //! Which episodes a test plays, and how they are recorded, whoever plays them: equal policies have equal records.
 
 use perturb_policy::random::{Purpose, stream};
+use perturb_protocol::region::{self, Region};
 use perturb_protocol::{Distribution, EndedEpisode, Version, proto};
 use rand::Rng;
 
@@ -100,9 +101,7 @@ impl Counting {
         test.axes = Heatmap::axes_of(&test.set, environment);
         counted.sort_by_key(|end| (end.environment_index, end.episode_index));
         let contexts = test.set.listed();
-        let parts = test.set.version.parts();
-        let asked_in = |context| parts.iter().map(|&part| asked(environment, &test.set, part, context)).collect();
-        let asked: Vec<Vec<Vec<Distribution>>> = contexts.iter().map(asked_in).collect();
+        let asked: Vec<_> = contexts.iter().map(|context| asked(environment, &test.set, context)).collect();
         for end in &counted {
             check_requested(environment, &test.set, &asked[end.slot % contexts.len()], &end.receipt.requested)?;
         }
@@ -118,21 +117,13 @@ impl Counting {
     }
 }
 
-/// What each parameter may be in a context of a set, in a trial of `version`.
-fn asked(environment: &proto::Environment, set: &TestSet, version: Version, context: &Context) -> Vec<Distribution> {
-    let drawn = set.drawn();
-    let of = |parameter: &proto::Parameter| {
-        let own = context.get(&parameter.name).map(|value| Distribution::fixed(*value));
-        let own = own.or_else(|| drawn.get(&parameter.name).cloned());
-        let of_version = match version {
-            Version::D | Version::RE => None, // a trial of R+E is one of R or of E
-            Version::R => parameter.random.as_ref(),
-            Version::E => parameter.extreme.as_ref(),
-        };
-        let versions = || of_version.and_then(|values| values.try_into().ok());
-        own.or_else(versions).unwrap_or_else(|| Distribution::fixed(parameter.default_value))
+/// What each parameter may be in a context of a set, in a trial of each part of its version.
+fn asked(environment: &proto::Environment, set: &TestSet, context: &Context) -> Vec<Vec<Distribution>> {
+    let region = Region::of(environment, set.version, &set.parameters(context));
+    let in_order = |values: &region::Box| {
+        environment.parameters.iter().filter_map(|parameter| values.get(&parameter.name).cloned()).collect()
     };
-    environment.parameters.iter().map(of).collect()
+    region.boxes().iter().map(in_order).collect()
 }
 
 /// Whether the server requested of its physics what it was asked for: all parameters of one part of the version.

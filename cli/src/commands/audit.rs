@@ -1,4 +1,6 @@
-//! `perturb audit`.
+//! `perturb audit`: episodes played again, or ledgers read.
+
+mod ledgers;
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -32,6 +34,9 @@ struct Tested {
 
 pub(super) fn run(args: &AuditArgs) -> Result<ExitCode> {
     let tested = tested(args)?;
+    if !args.ledger.is_empty() {
+        return ledgers::prove(args, &tested);
+    }
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = lasting_servers(&args.server, args.wait)?;
     let most = if args.all { usize::MAX } else { args.episodes };

@@ -6,6 +6,7 @@ mod common;
 mod end_to_end;
 mod experiments;
 mod guarded;
+mod ledgers;
 mod misuse;
 mod patience;
 mod processors;

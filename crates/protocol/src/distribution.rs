@@ -115,6 +115,37 @@ impl Distribution {
         self.0.iter().any(|interval| interval.low - margin <= value && value <= interval.high + margin)
     }
 
+    /// Whether all its values are `other`'s, too, whose intervals may touch.
+    pub fn is_within(&self, other: &Self) -> bool {
+        let mut wider: Vec<Interval> = Vec::with_capacity(other.0.len());
+        for &interval in &other.0 {
+            match wider.last_mut() {
+                Some(last) if last.high >= interval.low => last.high = interval.high,
+                _ => wider.push(interval),
+            }
+        }
+        self.0.iter().all(|own| wider.iter().any(|other| other.low <= own.low && own.high <= other.high))
+    }
+
+    /// Whether values of it are `other`'s, too. Of two intervals the ends are none, since both are never drawn: R and E, which
+    /// touch, do not overlap; a fixed value is in an interval whose end it is.
+    pub fn overlaps(&self, other: &Self) -> bool {
+        let meet = |one: &Interval, other: &Interval| {
+            let (low, high) = (one.low.max(other.low), one.high.min(other.high));
+            let is_fixed = one.low == one.high || other.low == other.high;
+            low < high || (is_fixed && low == high)
+        };
+        self.0.iter().any(|one| other.0.iter().any(|other| meet(one, other)))
+    }
+
+    /// As [`FromStr`] reads it.
+    pub fn written(&self) -> String {
+        let interval = |&Interval { low, high }: &Interval| {
+            if low == high { low.to_string() } else { format!("{low}..{high}") }
+        };
+        self.0.iter().map(interval).collect::<Vec<_>>().join(",")
+    }
+
     /// Least and greatest value.
     pub fn range(&self) -> (f64, f64) {
         (self.0[0].low, self.0[self.0.len() - 1].high)
@@ -172,10 +203,7 @@ impl From<Distribution> for Written {
     fn from(distribution: Distribution) -> Self {
         match distribution.0[..] {
             [Interval { low, high }] if low == high => Self::Number(low),
-            _ => {
-                let interval = |&Interval { low, high }: &Interval| format!("{low}..{high}");
-                Self::Text(distribution.0.iter().map(interval).collect::<Vec<_>>().join(","))
-            }
+            _ => Self::Text(distribution.written()),
         }
     }
 }
@@ -205,6 +233,29 @@ mod tests {
             assert_eq!(Distribution::try_from(&proto::Distribution::from(&distribution)), Ok(distribution));
         }
         assert_eq!(" 1 .. 2 ".parse::<Distribution>().unwrap().range(), (1.0, 2.0));
+    }
+
+    #[test]
+    fn sets_are_within_and_overlap_as_their_values_do() {
+        let of = |text: &str| text.parse::<Distribution>().unwrap();
+        for (one, other, within, overlaps) in [
+            ("1", "1", true, true),
+            ("1", "2", false, false),
+            ("1", "0..2", true, true),
+            ("0..2", "1", false, true),
+            ("1", "1..2", true, true),
+            ("1", "1.1..2", false, false),
+            ("1..2", "2..3", false, false),
+            ("1..2", "1..2", true, true),
+            ("1..3", "1..2,2..3", true, true),
+            ("1..3", "1..2,2.5..3", false, true),
+            ("0..1,2..3", "0..3", true, true),
+            ("0..1,2..3", "1..2", false, false),
+        ] {
+            let (a, b) = (of(one), of(other));
+            assert_eq!((a.is_within(&b), a.overlaps(&b)), (within, overlaps), "{one} and {other}");
+            assert_eq!(a.overlaps(&b), b.overlaps(&a), "{one} and {other}");
+        }
     }
 
     #[test]

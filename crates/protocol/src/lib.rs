@@ -18,9 +18,11 @@ mod distribution;
 mod encryption;
 mod ended;
 mod error;
+pub mod ledger;
 pub mod limits;
 pub mod names;
 mod private_server;
+pub mod region;
 mod stream;
 mod version;
 

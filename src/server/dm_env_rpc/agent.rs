@@ -48,7 +48,7 @@ impl Agent {
         let (settings, version, own) = settings::create(self.worlds.catalogue(), &request.settings)?;
         self.worlds.is_free(&self.caller, &own)?;
         let held = self.caller.envs(1)?;
-        let runner = Runner::open(self.worlds.pool(), settings, version).await?;
+        let runner = Runner::open(self.worlds.pool(), settings, version, self.worlds.draws(&self.caller)).await?;
         Ok(rpc::CreateWorldResponse { world_name: self.worlds.add(&self.caller, runner, own, held)? })
     }
 
@@ -71,7 +71,9 @@ impl Agent {
             let actions = specs::actions(world.spec(), &request.actions)?;
             runner.step(&actions, world.take_interruption()).await?
         } else {
-            runner.begin(world.take_changes()).await?
+            let changes = world.take_changes();
+            let begun = runner.begin(changes.clone()).await;
+            begun.inspect_err(|_| world.keep(changes))?
         };
         Ok(specs::response(&outcome, &request.requested_observations))
     }

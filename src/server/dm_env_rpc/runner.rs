@@ -4,7 +4,7 @@ use crate::{
     env::{Distribution, EnvironmentSpec, EpisodeStart, Settings, Version},
     pool::{Batch, BatchSettings, Pool, ResetEntry, Stepped},
     proto::dm_env_rpc::v1::EnvironmentStateType as State,
-    server::status::Refusal,
+    server::{draws::Draws, status::Refusal},
 };
 use bytes::Bytes;
 use std::sync::Arc;
@@ -12,6 +12,7 @@ use std::sync::Arc;
 /// An environment and where its episode stands.
 pub(super) struct Runner {
     batch: Batch,
+    draws: Draws,
     phase: Phase,
     /// The first observation of the episode that was begun last, f32 `[O]`.
     first: Bytes,
@@ -48,6 +49,7 @@ pub(super) struct Outcome {
 }
 
 /// What begins with the next episode.
+#[derive(Clone)]
 pub(super) struct Changes {
     /// The version in force.
     pub(super) version: Version,
@@ -61,16 +63,28 @@ impl Runner {
     /// Makes the environment.
     ///
     /// # Errors
-    /// If the pool is full or a model cannot be loaded.
-    pub(super) async fn open(pool: &Pool, settings: BatchSettings, version: Version) -> Result<Self, Refusal> {
-        let (batch, first, started) = Batch::open(pool, settings).await?;
+    /// If the pool is full or a model cannot be loaded, or the token may not draw from there.
+    pub(super) async fn open(
+        pool: &Pool,
+        settings: BatchSettings,
+        version: Version,
+        draws: Draws,
+    ) -> Result<Self, Refusal> {
+        draws.open(&settings).await?;
+        let (mut batch, first, started) = Batch::open(pool, settings).await?;
+        draws.follow(&mut batch);
         let seed = batch.settings().groups[0].episodes.seed;
-        Ok(Self { batch, phase: Phase::Unseen, first, start: only(started), seed, version })
+        Ok(Self { batch, draws, phase: Phase::Unseen, first, start: only(started), seed, version })
     }
 
     /// What its episodes were fixed by when it was made.
     pub(super) fn episodes(&self) -> &Settings {
         &self.batch.settings().groups[0].episodes
+    }
+
+    /// What it may draw from.
+    pub(super) fn draws(&self) -> &Draws {
+        &self.draws
     }
 
     /// Its environment.
@@ -117,9 +131,10 @@ impl Runner {
     pub(super) async fn begin(&mut self, changes: Changes) -> Result<Outcome, Refusal> {
         let Changes { version, seed, distributions } = changes;
         if self.phase != Phase::Unseen || seed.is_some() || distributions.is_some() {
+            let entries = vec![ResetEntry { slot: 0, seed, distributions, state: None }];
+            self.draws.reset(&self.batch, &entries).await?;
             (self.phase, self.version, self.seed) = (Phase::Over, version, seed.unwrap_or(self.seed));
-            let entry = ResetEntry { slot: 0, seed, distributions, state: None };
-            let (first, started) = self.batch.reset(vec![entry]).await?;
+            let (first, started) = self.batch.reset(entries).await?;
             (self.first, self.start) = (first, only(started));
         }
         self.phase = Phase::Running;

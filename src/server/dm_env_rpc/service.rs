@@ -8,6 +8,7 @@ use crate::{
     server::{
         conversation::{Responses, Sessions},
         frames::Frames,
+        ledger::Ledger,
         requests::{Counted, Counts},
     },
 };
@@ -23,9 +24,9 @@ pub struct Service {
 }
 
 impl Service {
-    /// A service over a pool, without worlds.
-    pub fn new(pool: Arc<Pool>, catalogue: Arc<Catalogue>, sessions: Sessions) -> Self {
-        Self { worlds: Arc::new(Worlds::new(pool, catalogue)), sessions, counts: Counts::of::<Agent>() }
+    /// A service over a pool, without worlds, whose draws the ledger has.
+    pub fn new(pool: Arc<Pool>, catalogue: Arc<Catalogue>, sessions: Sessions, ledger: Option<Ledger>) -> Self {
+        Self { worlds: Arc::new(Worlds::new(pool, catalogue, ledger)), sessions, counts: Counts::of::<Agent>() }
     }
 
     /// The requests so far.

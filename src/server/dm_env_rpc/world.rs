@@ -6,7 +6,7 @@ use super::{
 };
 use crate::{
     env::{Distribution, EnvironmentSpec, Version, resolve},
-    server::status::Refusal,
+    server::{draws::Draws, status::Refusal},
 };
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -14,6 +14,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 pub(super) struct World {
     name: String,
     spec: &'static EnvironmentSpec,
+    draws: Draws,
     wanted: Mutex<Wanted>,
 }
 
@@ -45,7 +46,7 @@ impl World {
             seed: None,
             interruption: false,
         };
-        Self { name, spec: runner.spec(), wanted: Mutex::new(wanted) }
+        Self { name, spec: runner.spec(), draws: runner.draws().clone(), wanted: Mutex::new(wanted) }
     }
 
     /// Its name, unique on the server.
@@ -61,7 +62,7 @@ impl World {
     /// Notes a change for the next episode.
     ///
     /// # Errors
-    /// If a parameter is out of its bounds; nothing is noted then.
+    /// If a parameter is out of its bounds, or the token may not draw from there; nothing is noted then.
     pub(super) fn change(&self, change: Change) -> Result<(), Refusal> {
         let mut wanted = self.lock();
         let version = change.version.unwrap_or(wanted.version);
@@ -71,6 +72,7 @@ impl World {
                 None => wanted.distributions.clone(),
             };
             resolve(self.spec, &mut distributions, change.parameters)?;
+            self.draws.check(self.spec, &distributions)?;
             (wanted.distributions, wanted.new_distributions) = (distributions, true);
         }
         wanted.version = version;
@@ -88,6 +90,13 @@ impl World {
             seed: wanted.seed.take(),
             distributions: new.then(|| wanted.distributions.clone().into()),
         }
+    }
+
+    /// Takes back the changes of an episode that could not begin, but for what was changed since.
+    pub(super) fn keep(&self, changes: Changes) {
+        let mut wanted = self.lock();
+        wanted.seed = wanted.seed.or(changes.seed);
+        wanted.new_distributions |= changes.distributions.is_some();
     }
 
     /// Has the running episode end with its next step.

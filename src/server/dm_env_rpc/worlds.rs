@@ -7,6 +7,8 @@ use crate::{
     env::{Catalogue, shorten},
     pool::Pool,
     server::{
+        draws::Draws,
+        ledger::Ledger,
         status::Refusal,
         tokens::{Bearer, Held},
     },
@@ -47,6 +49,7 @@ type Key = (Option<String>, String);
 pub(super) struct Worlds {
     pool: Arc<Pool>,
     catalogue: Arc<Catalogue>,
+    ledger: Option<Ledger>,
     registry: Mutex<Registry>,
 }
 
@@ -72,8 +75,13 @@ struct Entry {
 
 impl Worlds {
     /// No worlds yet.
-    pub(super) fn new(pool: Arc<Pool>, catalogue: Arc<Catalogue>) -> Self {
-        Self { pool, catalogue, registry: Mutex::default() }
+    pub(super) fn new(pool: Arc<Pool>, catalogue: Arc<Catalogue>, ledger: Option<Ledger>) -> Self {
+        Self { pool, catalogue, ledger, registry: Mutex::default() }
+    }
+
+    /// What a new world of a stream draws from.
+    pub(super) fn draws(&self, maker: &Caller) -> Draws {
+        Draws::new(maker.bearer.clone(), self.ledger.clone())
     }
 
     /// Where worlds' environments run.

@@ -2,6 +2,8 @@
 
 mod certificates;
 mod encryption;
+mod ledger;
+mod roles;
 mod settings;
 mod tokens;
 

@@ -13,29 +13,31 @@ use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 use tonic::Code;
 
-const ANN: &str = "correct-horse-battery";
-const BOB: &str = "staple-correct-horse";
+pub(super) const ANN: &str = "correct-horse-battery";
+pub(super) const BOB: &str = "staple-correct-horse";
 
-struct Guarded {
-    server: Server,
-    directory: TempDir,
+pub(super) struct Guarded {
+    pub(super) server: Server,
+    pub(super) directory: TempDir,
     file: PathBuf,
 }
 
-fn entry(name: &str, token: &str, more: &str) -> String {
+pub(super) fn entry(name: &str, token: &str, more: &str) -> String {
     format!("[[token]]\nname = \"{name}\"\ntoken = \"{token}\"\n{more}\n")
 }
 
 impl Guarded {
-    fn start(tokens: &str) -> Self {
+    pub(super) fn start(tokens: &str) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let file = directory.path().join("tokens.toml");
         std::fs::write(&file, tokens).unwrap();
-        let server = Server::start(&["--tokens", file.to_str().unwrap(), "--log", "debug"]);
+        let ledger = directory.path().join("ledger");
+        let [tokens, ledger] = [&file, &ledger].map(|path| path.to_str().unwrap());
+        let server = Server::start(&["--tokens", tokens, "--ledger", ledger, "--log", "debug"]);
         Self { server, directory, file }
     }
 
-    async fn connect(&self, token: &str) -> Connection {
+    pub(super) async fn connect(&self, token: &str) -> Connection {
         let file = self.directory.path().join(token);
         std::fs::write(&file, format!("{token}\n")).unwrap();
         connect(self.server.tcp(), &[(TOKEN_FILE, &file)]).await.unwrap()

@@ -81,6 +81,14 @@ pub struct AuditArgs {
     /// Play all recorded episodes again.
     #[arg(long, conflicts_with = "episodes")]
     pub all: bool,
+    /// Play nothing, but prove by ledgers, those of all servers that trained (`perturb-server --ledger`), that the trainings
+    /// drew from what they say, and never from what was tested: no episode of a test, and no other test set.
+    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["episodes", "all"])]
+    pub ledger: Vec<PathBuf>,
+    /// Digests that must be those of lines in the ledgers: what a server logged at its end, or an earlier audit printed,
+    /// proves that nothing before was changed.
+    #[arg(long, value_name = "DIGEST", num_args = 1.., requires = "ledger")]
+    pub head: Vec<String>,
     /// Print JSON.
     #[arg(long)]
     pub json: bool,

@@ -1,0 +1,73 @@
+//! `perturb audit --ledger`.
+
+use std::io::Write;
+use std::process::ExitCode;
+
+use serde_json::{Value, json};
+
+use perturb_learner::checkpoint::Checkpoint;
+use perturb_study::ledger::{Head, Ledgers, Proof};
+use perturb_study::records::Records;
+
+use super::super::{args::AuditArgs, error::CommandError, error::Result, lasting_servers};
+use super::Tested;
+
+/// Says of each policy what the ledgers prove.
+pub(super) fn prove(args: &AuditArgs, tested: &[Tested]) -> Result<ExitCode> {
+    let ledgers = Ledgers::read(&args.ledger, &args.head).map_err(CommandError::Failed)?;
+    let servers = lasting_servers(&args.server, args.wait)?;
+    let (mut proofs, mut out) = (Vec::new(), std::io::stdout());
+    for one in tested {
+        let records = Records::read(&one.records)?;
+        let checkpoint = Checkpoint::load(&one.checkpoint)?;
+        let (training, counters) = (&checkpoint.state.config.common, checkpoint.state.counters);
+        let environment = servers.environment(&training.environment)?;
+        let episodes = counters.generated_episodes.max(counters.episodes);
+        proofs.push((one.name.as_str(), ledgers.prove(training, episodes, &environment, &records)));
+        if !args.json {
+            proofs.last().map_or(Ok(()), |(name, proof)| print(name, proof, &records))?;
+        }
+    }
+    let clean = proofs.iter().filter(|(_, proof)| proof.against.is_empty()).count();
+    if args.json {
+        let policies: Vec<Value> = proofs.iter().map(|(name, proof)| document(name, proof)).collect();
+        let heads: Vec<Value> = ledgers.heads().iter().map(head).collect();
+        writeln!(out, "{:#}", json!({ "clean": clean, "policies": policies, "ledgers": heads }))?;
+    } else {
+        for Head { path, lines, digest } in ledgers.heads() {
+            writeln!(out, "{}: {lines} lines, unbroken up to --head {digest}", path.display())?;
+        }
+    }
+    Ok(if clean == proofs.len() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+fn print(name: &str, proof: &Proof, records: &Records) -> std::io::Result<()> {
+    let mut out = std::io::stdout();
+    proof.against.iter().chain(&proof.refused).try_for_each(|line| writeln!(out, "{name}: {line}"))?;
+    if !proof.against.is_empty() {
+        return Ok(());
+    }
+    let tokens: Vec<String> = proof
+        .tokens
+        .iter()
+        .map(|token| token.as_ref().map_or("no token".into(), |token| format!("{token:?}")))
+        .collect();
+    let sets: Vec<&str> = records.about.tests.iter().map(|test| test.set.name.as_str()).collect();
+    let sessions = if proof.sessions == 1 { "session" } else { "sessions" };
+    writeln!(
+        out,
+        "{name}: {} drew its training in {} {sessions}, and before that ended no episode of the tests on {}, nor from \
+         another test set",
+        tokens.join(" and "),
+        proof.sessions,
+        sets.join(", ")
+    )
+}
+
+fn document(name: &str, Proof { tokens, sessions, against, refused }: &Proof) -> Value {
+    json!({ "policy": name, "tokens": tokens, "sessions": sessions, "against": against, "refused": refused })
+}
+
+fn head(Head { path, lines, digest }: &Head) -> Value {
+    json!({ "ledger": path, "lines": lines, "head": digest })
+}

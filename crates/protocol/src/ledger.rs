@@ -1,0 +1,295 @@
+//! The ledger of a server: what every token drew, line by line, each chained to all before it.
+//!
+//! A line is a digest, a space, and an [`Entry`] as JSON. The digest is SHA-256, in hexadecimal, of the digest of the line
+//! before (64 zeros before the first), a space, and the JSON; so nobody can change, leave out or add a line before
+//! another without changing all digests behind it. Whoever knows one digest can prove everything up to it.
+
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, Read as _};
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use crate::region::Region;
+
+/// No line is longer, bytes.
+const LONGEST: u64 = 256 << 20;
+/// Digits of a digest.
+const DIGITS: usize = 64;
+
+/// A line without its digest.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Entry {
+    /// Counts the ledger's lines from 0.
+    pub n: u64,
+    /// When it was written, ms since 1970.
+    pub unix_ms: u64,
+    /// What happened.
+    #[serde(flatten)]
+    pub event: Event,
+}
+
+/// What is written down.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+pub enum Event {
+    /// A server began.
+    Began {
+        /// Its version.
+        version: String,
+        /// Its commit.
+        commit: String,
+        /// Bytes of a line that the server before did not finish, and that were taken away: nobody had an answer then.
+        unfinished: u64,
+    },
+    /// A session draws from something else from now on.
+    Draws(Draws),
+    /// A session was refused what it wanted to draw from.
+    Refused {
+        /// Who.
+        #[serde(flatten)]
+        who: Who,
+        /// From what.
+        region: Region,
+        /// Why not.
+        reason: String,
+    },
+    /// The server ended, all sessions before it.
+    Ended,
+}
+
+/// Whose entry it is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Who {
+    /// Tells the sessions of a server apart, from one beginning to the next.
+    pub session: u64,
+    /// The name of its token; none: it needed none.
+    pub token: Option<String>,
+    /// Of which environment.
+    pub environment: String,
+    /// Its revision.
+    pub revision: u32,
+}
+
+/// Environments of a session that draw from something else from now on, and what they drew before.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Draws {
+    /// Who.
+    #[serde(flatten)]
+    pub who: Who,
+    /// What is drawn from.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub regions: Vec<Region>,
+    /// What begins.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub begins: Vec<Begin>,
+    /// What has ended.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub ends: Vec<End>,
+}
+
+/// Environments that begin to draw: each with the seed, its index and an episode's number fixes the episode.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Begin {
+    /// The seed.
+    pub seed: u64,
+    /// The index of the first environment.
+    pub index: u32,
+    /// How many there are, of successive indices.
+    pub count: u32,
+    /// Which of [`Draws::regions`] they draw from.
+    pub region: u32,
+    /// The first episode that is drawn so.
+    pub episode: u64,
+}
+
+/// Environments that draw so no more.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct End {
+    /// The seed.
+    pub seed: u64,
+    /// The index of the first environment.
+    pub index: u32,
+    /// How many there are, of successive indices.
+    pub count: u32,
+    /// The last episode that was begun.
+    pub episode: u64,
+}
+
+/// The chain, as far as it was written or read.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Chain {
+    /// Lines.
+    lines: u64,
+    /// The last one's digest.
+    head: String,
+}
+
+impl Default for Chain {
+    fn default() -> Self {
+        Self { lines: 0, head: "0".repeat(DIGITS) }
+    }
+}
+
+/// Why a ledger cannot be believed, or read.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The file cannot be read.
+    #[error("cannot read {path}: {source}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
+    /// A line is not what was written.
+    #[error("line {line} of {path} {what}: the file was changed after it was written, or is no ledger")]
+    Broken {
+        /// The file.
+        path: PathBuf,
+        /// Which line, from 1.
+        line: u64,
+        /// What is wrong with it.
+        what: &'static str,
+    },
+}
+
+impl Chain {
+    /// The number of lines.
+    pub fn lines(&self) -> u64 {
+        self.lines
+    }
+
+    /// The digest of the last line, 64 hexadecimal digits.
+    pub fn head(&self) -> &str {
+        &self.head
+    }
+
+    /// The line of an event, with its end.
+    ///
+    /// # Errors
+    /// One that cannot be written as JSON.
+    pub fn add(&mut self, event: &Event, unix_ms: u64) -> serde_json::Result<String> {
+        let entry = Entry { n: self.lines, unix_ms, event: event.clone() };
+        let json = serde_json::to_string(&entry)?;
+        self.head = self.digest(&json);
+        self.lines += 1;
+        Ok(format!("{} {json}\n", self.head))
+    }
+
+    /// Takes a line that was read, without its end.
+    fn take(&mut self, line: &str) -> Result<Entry, &'static str> {
+        let (digest, json) = line.split_once(' ').ok_or("has no digest")?;
+        let own = self.digest(json);
+        if own != digest {
+            return Err("does not follow from the lines before it");
+        }
+        let entry: Entry = serde_json::from_str(json).map_err(|_| "cannot be understood")?;
+        if entry.n != self.lines {
+            return Err("has another number");
+        }
+        (self.head, self.lines) = (own, self.lines + 1);
+        Ok(entry)
+    }
+
+    fn digest(&self, json: &str) -> String {
+        format!("{:x}", Sha256::new().chain_update(&self.head).chain_update(" ").chain_update(json).finalize())
+    }
+}
+
+/// A ledger that was read.
+#[derive(Debug)]
+pub struct Read {
+    /// The chain after the last whole line.
+    pub chain: Chain,
+    /// Bytes of whole lines.
+    pub bytes: u64,
+    /// Bytes behind them: of a line that a server did not finish, or of one that is being written.
+    pub unfinished: u64,
+}
+
+/// Reads a ledger, checks its chain, and hands every entry, with its digest, to `each`.
+///
+/// # Errors
+/// [`Error`].
+pub fn read(path: &Path, mut each: impl FnMut(Entry, &str)) -> Result<Read, Error> {
+    let io = |source| Error::Io { path: path.to_owned(), source };
+    let mut file = BufReader::new(File::open(path).map_err(io)?);
+    let mut read = Read { chain: Chain::default(), bytes: 0, unfinished: 0 };
+    let mut line = Vec::new();
+    loop {
+        line.clear();
+        let n = file.by_ref().take(LONGEST).read_until(b'\n', &mut line).map_err(io)? as u64;
+        let Some(whole) = line.strip_suffix(b"\n") else {
+            read.unfinished = n;
+            return Ok(read);
+        };
+        let text = std::str::from_utf8(whole).map_err(|_| "is no text");
+        let entry = text.and_then(|text| read.chain.take(text));
+        let broken = |what| Error::Broken { path: path.to_owned(), line: read.chain.lines + 1, what };
+        each(entry.map_err(broken)?, &read.chain.head);
+        read.bytes += n;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn event(token: &str) -> Event {
+        let who = Who { session: 1, token: Some(token.into()), environment: "CartPole".into(), revision: 1 };
+        let region = serde_json::from_str(r#"[{"length":"0.3..0.4,0.8..0.9","mass":"1"}]"#).unwrap();
+        let begin = Begin { seed: u64::MAX, index: 3, count: 2, region: 0, episode: 0 };
+        Event::Draws(Draws { who, regions: vec![region], begins: vec![begin], ends: vec![] })
+    }
+
+    fn written(file: &Path, tokens: &[&str]) -> Chain {
+        let mut chain = Chain::default();
+        let text: String = tokens.iter().map(|token| chain.add(&event(token), 7).unwrap()).collect();
+        std::fs::write(file, text).unwrap();
+        chain
+    }
+
+    #[test]
+    fn a_ledger_reads_back_as_it_was_written_and_goes_on() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("ledger");
+        let chain = written(&path, &["ann", "bob"]);
+        let mut entries = Vec::new();
+        let read = read(&path, |entry, head| entries.push((entry, head.to_owned()))).unwrap();
+        assert_eq!(read.chain, chain);
+        assert_eq!((entries[1].0.n, &entries[1].0.event, &*entries[1].1), (1, &event("bob"), chain.head()));
+        assert_eq!((read.bytes, read.unfinished), (std::fs::metadata(&path).unwrap().len(), 0));
+    }
+
+    #[test]
+    fn what_was_changed_left_out_or_put_in_is_found() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("ledger");
+        written(&path, &["ann", "bob", "cid"]);
+        let whole = std::fs::read_to_string(&path).unwrap();
+        let lines: Vec<&str> = whole.split_inclusive('\n').collect();
+        let of = |text: String| {
+            std::fs::write(&path, text).unwrap();
+            read(&path, |_, _| {})
+        };
+        for (text, line) in [
+            (whole.replacen("ann", "bob", 1), 1),
+            (whole.replacen("\"seed\":1", "\"seed\":2", 1), 1),
+            (format!("{}{}", lines[0], lines[2]), 2),
+            (lines[1].to_owned(), 1),
+            (format!("{}{}{}", lines[1], lines[0], lines[2]), 1),
+            (format!("{}{}", lines[0], whole), 2),
+            (format!("{whole}\n"), 4),
+            ("no ledger\n".to_owned(), 1),
+        ] {
+            match of(text) {
+                Err(Error::Broken { line: got, .. }) => assert_eq!(got, line),
+                other => panic!("{other:?}"),
+            }
+        }
+        let cut = of(whole[..whole.len() - 1].to_owned()).unwrap();
+        assert_eq!((cut.chain.lines(), cut.unfinished), (2, lines[2].len() as u64 - 1), "its end was never written");
+    }
+}

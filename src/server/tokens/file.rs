@@ -1,0 +1,205 @@
+//! The file of tokens: what is in it, and what may be.
+
+use super::role::{Role, Set};
+use crate::env::{Catalogue, Distribution, Version, resolve};
+use serde::Deserialize;
+use sha2::{Digest, Sha256};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    fmt::Write,
+    sync::Arc,
+};
+use toml::Spanned;
+
+/// Fewer characters could be guessed.
+const SHORTEST: usize = 16;
+/// What an entry may have.
+const ENTRY: &str = "[[token]] with name = \"…\", sha256 = \"64 hexadecimal digits\" or token = \"…\", and if need be \
+                     max_sessions = N, max_envs = N and role = \"…\"; [[role]] with name, draws = [\"D\", \"R\", …] and \
+                     never = […]; [[set]] with name, environment, version and parameters";
+
+/// Why a file of tokens is refused. Nothing of a token is in it.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("line {line}: {what}; expected {ENTRY}")]
+pub struct Wrong {
+    pub(super) line: usize,
+    what: String,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Listed {
+    #[serde(default)]
+    token: Vec<Spanned<Entry>>,
+    #[serde(default)]
+    role: Vec<Spanned<RoleEntry>>,
+    #[serde(default)]
+    set: Vec<Spanned<SetEntry>>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Entry {
+    pub(super) name: String,
+    sha256: Option<String>,
+    token: Option<String>,
+    pub(super) max_sessions: Option<usize>,
+    pub(super) max_envs: Option<usize>,
+    role: Option<String>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RoleEntry {
+    name: String,
+    draws: Option<Vec<String>>,
+    #[serde(default)]
+    never: Vec<String>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct SetEntry {
+    name: String,
+    environment: String,
+    #[serde(default)]
+    version: Option<String>,
+    parameters: BTreeMap<String, Distribution>,
+}
+
+/// A token of the file.
+pub(super) struct Known {
+    /// SHA-256 of the token.
+    pub(super) digest: [u8; 32],
+    pub(super) entry: Entry,
+    pub(super) role: Option<Arc<Role>>,
+}
+
+/// The tokens of a file, whose sets are of these environments.
+pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<Known>, Wrong> {
+    let line = |byte: usize| 1 + text.bytes().take(byte).filter(|byte| *byte == b'\n').count();
+    let Listed { token: entries, role: roles, set: sets } = toml::from_str(text).map_err(|error| {
+        // A parser's words may quote a token, but for those that are about keys.
+        let words = error.message();
+        let about_keys = ["unknown field", "missing field", "duplicate key"].iter().any(|kind| words.starts_with(kind));
+        let what = if about_keys { words.lines().next().unwrap_or_default() } else { "this cannot be read" };
+        Wrong { line: line(error.span().map_or(0, |span| span.start)), what: what.into() }
+    })?;
+    let mut known_sets: BTreeMap<String, Set> =
+        Version::KNOWN.iter().map(|version| (version.to_string(), Set::Version(*version))).collect();
+    for set in sets {
+        let line = line(set.span().start);
+        let set = set.into_inner();
+        let name = set.name.clone();
+        let own = own_set(catalogue, set).map_err(|what| Wrong { line, what })?;
+        if known_sets.insert(name.clone(), own).is_some() {
+            return Err(Wrong {
+                line,
+                what: format!("there are two sets called {name:?}, of which versions are some"),
+            });
+        }
+    }
+    let mut known_roles: BTreeMap<String, Arc<Role>> = BTreeMap::new();
+    for role in roles {
+        let line = line(role.span().start);
+        let RoleEntry { name, draws, never } = role.into_inner();
+        let find = |names: Vec<String>| names.iter().map(|name| found("set", name, &known_sets)).collect();
+        let sets: Result<(Option<Vec<Set>>, Vec<Set>), String> =
+            draws.map(find).transpose().and_then(|draws| Ok((draws, find(never)?)));
+        let (draws, never) = sets.map_err(|what| Wrong { line, what })?;
+        if known_roles.insert(name.clone(), Arc::new(Role { name: name.clone(), draws, never })).is_some() {
+            return Err(Wrong { line, what: format!("there are two roles called {name:?}") });
+        }
+    }
+    let (mut names, mut digests) = (BTreeSet::new(), BTreeSet::new());
+    let mut listed = Vec::with_capacity(entries.len());
+    for entry in entries {
+        let line = line(entry.span().start);
+        let entry = entry.into_inner();
+        let digest = digest(&entry).map_err(|what| Wrong { line, what })?;
+        if !names.insert(entry.name.clone()) {
+            return Err(Wrong { line, what: format!("there are two tokens called {:?}", entry.name) });
+        }
+        if !digests.insert(digest) {
+            return Err(Wrong { line, what: format!("the token of {:?} is another one's, too", entry.name) });
+        }
+        let role = entry.role.as_ref().map(|role| found("role", role, &known_roles)).transpose();
+        let role = role.map_err(|what| Wrong { line, what })?;
+        listed.push(Known { digest, entry, role });
+    }
+    Ok(listed)
+}
+
+/// The role or set of that name.
+fn found<T: Clone>(what: &str, name: &str, known: &BTreeMap<String, T>) -> Result<T, String> {
+    let names = || known.keys().map(|name| format!("{name:?}")).collect::<Vec<_>>().join(", ");
+    known.get(name).cloned().ok_or_else(|| format!("there is no {what} {name:?}; there are {}", names()))
+}
+
+/// A set of the file's own.
+fn own_set(catalogue: &Catalogue, set: SetEntry) -> Result<Set, String> {
+    let SetEntry { name, environment, version, parameters } = set;
+    let spec = catalogue.find(&environment).map_err(|error| error.to_string())?;
+    let version = version.map_or(Ok(Version::D), |version| version.parse()).map_err(|error| error.to_string())?;
+    let mut distributions = spec.distributions(version);
+    let own = parameters.iter().map(|(name, values)| (name.as_str(), values.clone()));
+    resolve(spec, &mut distributions, own).map_err(|error| error.to_string())?;
+    Ok(Set::Own { name, environment: spec.name, region: spec.region(&distributions) })
+}
+
+/// The digest of an entry's token, or what is wrong with the entry.
+fn digest(entry: &Entry) -> Result<[u8; 32], String> {
+    let name = &entry.name;
+    if name.is_empty() || name.chars().any(char::is_control) {
+        return Err(format!("{name:?} is no name"));
+    }
+    for (key, limit) in [("max_sessions", entry.max_sessions), ("max_envs", entry.max_envs)] {
+        if limit == Some(0) {
+            return Err(format!("{key} of {name:?} is 0, at least 1 is expected; leave the token out to revoke it"));
+        }
+    }
+    match (&entry.sha256, &entry.token) {
+        (Some(hex), None) => {
+            let mut digest = [0; 32];
+            let is_hex = hex.len() == 64 && hex.bytes().all(|digit| digit.is_ascii_hexdigit());
+            if !is_hex {
+                return Err(format!("sha256 of {name:?} is not 64 hexadecimal digits"));
+            }
+            for (byte, place) in digest.iter_mut().zip((0..64).step_by(2)) {
+                *byte = u8::from_str_radix(&hex[place..place + 2], 16).unwrap_or_default();
+            }
+            Ok(digest)
+        }
+        (None, Some(token)) if token.len() < SHORTEST => {
+            Err(format!("the token of {name:?} has fewer than {SHORTEST} characters"))
+        }
+        (None, Some(token)) if !token.bytes().all(|byte| byte.is_ascii_graphic()) => {
+            Err(format!("the token of {name:?} has characters that are no visible ones of ASCII"))
+        }
+        (None, Some(token)) => Ok(Sha256::digest(token).into()),
+        (Some(_), Some(_)) => Err(format!("{name:?} has both sha256 and token; one of them is expected")),
+        (None, None) => Err(format!("{name:?} has neither sha256 nor token")),
+    }
+}
+
+/// A new token of 256 random bits, and its entry in the file of tokens.
+///
+/// # Errors
+/// If the name cannot be one, or the system has no random bits.
+pub fn new_token(name: &str) -> std::io::Result<(String, String)> {
+    let mut bits = [0; 32];
+    std::io::Read::read_exact(&mut std::fs::File::open("/dev/urandom")?, &mut bits)?;
+    let token = hex(&bits);
+    let name = toml::Value::String(name.into());
+    let entry = format!("[[token]]\nname = {name}\nsha256 = \"{:x}\"\n", Sha256::digest(&token));
+    listed(&Catalogue::default(), &entry).map_err(std::io::Error::other)?;
+    Ok((token, entry))
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().fold(String::new(), |mut text, byte| {
+        // A string takes it.
+        let _ = write!(text, "{byte:02x}");
+        text
+    })
+}

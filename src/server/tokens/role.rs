@@ -1,0 +1,68 @@
+//! What a token may draw parameters from.
+
+use crate::env::{EnvironmentSpec, Version};
+use perturb_protocol::region::Region;
+use std::fmt;
+
+/// What the sessions of some tokens may draw from.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Role {
+    pub(super) name: String,
+    /// Nothing that is not within these; none: anything.
+    pub(super) draws: Option<Vec<Set>>,
+    /// Nothing that overlaps one of these.
+    pub(super) never: Vec<Set>,
+}
+
+/// Parameter values with a name.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Set {
+    /// A version of every environment.
+    Version(Version),
+    /// One of the file's own.
+    Own { name: String, environment: &'static str, region: Region },
+}
+
+impl Set {
+    /// The values of an environment, if it has some of that one.
+    fn region(&self, spec: &EnvironmentSpec) -> Option<Region> {
+        match self {
+            Self::Version(version) => Some(spec.region(&spec.distributions(*version))),
+            Self::Own { environment, region, .. } => (*environment == spec.name).then(|| region.clone()),
+        }
+    }
+}
+
+impl fmt::Display for Set {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Version(version) => version.fmt(f),
+            Self::Own { name, .. } => write!(f, "{name:?}"),
+        }
+    }
+}
+
+impl Role {
+    /// What it is called.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Whether it may draw from that.
+    ///
+    /// # Errors
+    /// Why not, in half a sentence.
+    pub fn check(&self, spec: &EnvironmentSpec, region: &Region) -> Result<(), String> {
+        let overlaps = |set: &&Set| set.region(spec).is_some_and(|never| region.overlaps(&never));
+        if let Some(never) = self.never.iter().find(overlaps) {
+            return Err(format!("it may never draw from {never}, which that overlaps"));
+        }
+        let Some(draws) = &self.draws else { return Ok(()) };
+        let within: Vec<Region> = draws.iter().filter_map(|set| set.region(spec)).collect();
+        if region.is_within(&within) {
+            return Ok(());
+        }
+        let names: Vec<String> = draws.iter().map(Set::to_string).collect();
+        Err(format!("it may draw from {} alone", if names.is_empty() { "nothing".into() } else { names.join(" and ") }))
+    }
+}

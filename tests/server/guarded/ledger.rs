@@ -1,0 +1,177 @@
+//! What is drawn is written down.
+
+use super::{
+    connect,
+    tokens::{ANN, BOB, Guarded, entry},
+};
+use crate::{
+    common::server::{Server, channel, command, open, until, within},
+    dm_env_rpc::client::{Agent, Settings, choice, create, double, reset_world, settings, text, uint64},
+};
+use perturb::proto::{Open, Release, Reset, dm_env_rpc::v1::environment_client::EnvironmentClient};
+use perturb_protocol::{
+    Stream,
+    ledger::{Begin, Draws, End, Entry, Event, read},
+};
+use std::path::Path;
+use tonic::Code;
+
+fn entries(path: &Path) -> Vec<Entry> {
+    let mut entries = Vec::new();
+    read(path, |entry, _| entries.push(entry)).unwrap();
+    entries
+}
+
+fn draws(path: &Path) -> Vec<Draws> {
+    let of = |entry: Entry| match entry.event {
+        Event::Draws(draws) => Some(draws),
+        _ => None,
+    };
+    entries(path).into_iter().filter_map(of).collect()
+}
+
+async fn steps(session: &mut Stream, envs: usize, count: usize) {
+    for _ in 0..count {
+        super::steps(session, envs).await.unwrap();
+    }
+}
+
+#[tokio::test]
+async fn what_a_session_draws_is_in_the_ledger_before_it_does_and_how_far_it_came_behind() {
+    let guarded = Guarded::start(&entry("ann", ANN, ""));
+    let path = guarded.directory.path().join("ledger");
+    let ann = guarded.connect(ANN).await;
+    let request = Open { first_environment_index: 5, ..open("CartPole", 4, 7) };
+    let (mut session, _) = within(Stream::open(&ann, request)).await.unwrap();
+    let first = draws(&path);
+    assert_eq!(first[0].begins, [Begin { seed: 7, index: 5, count: 4, region: 0, episode: 0 }]);
+    assert_eq!(first[0].who.token.as_deref(), Some("ann"));
+    assert_eq!((first[0].who.environment.as_str(), first[0].regions.len(), first[0].ends.len()), ("CartPole", 1, 0));
+    let region = first[0].regions[0].to_string();
+    assert!(region.contains("force_magnitude [5, 15]") || region.contains('['), "{region}");
+
+    // Every push to the left fails within ten steps or so.
+    steps(&mut session, 4, 60).await;
+    within(session.ask(Reset { mask: vec![0, 0, 0, 1].into(), seeds: vec![9], ..Reset::default() })).await.unwrap();
+    within(session.ask(Reset::default())).await.unwrap();
+    let reset = draws(&path).pop().unwrap();
+    assert_eq!(reset.begins, [Begin { seed: 9, index: 8, count: 1, region: 0, episode: 0 }]);
+    assert!(matches!(reset.ends[..], [End { seed: 7, index: 8, count: 1, episode: 2.. }]), "{:?}", reset.ends);
+    assert_eq!(draws(&path).len(), 2, "an empty reset draws on");
+
+    within(session.ask(Release { mask: vec![1, 0, 0, 0].into() })).await.unwrap();
+    until("the release is there", async || draws(&path).len() == 3).await;
+    assert!(matches!(draws(&path)[2].ends[..], [End { seed: 7, index: 5, count: 1, episode: 3.. }]));
+    drop(session);
+    until("its end is there", async || draws(&path).len() == 4).await;
+    let end = draws(&path).pop().unwrap();
+    let of_nine = end.ends.iter().find(|end| end.seed == 9).unwrap();
+    assert_eq!((of_nine.index, of_nine.episode, end.begins.len()), (8, 1, 0));
+    assert_eq!(end.ends.iter().map(|end| end.count).sum::<u32>(), 3);
+}
+
+#[tokio::test]
+async fn refusals_are_written_down_and_a_server_that_ends_says_so() {
+    let role = "[[role]]\nname = \"train\"\ndraws = [\"D\"]\n";
+    let mut guarded = Guarded::start(&(entry("ann", ANN, "role = \"train\"") + &entry("bob", BOB, "") + role));
+    let path = guarded.directory.path().join("ledger");
+    let ann = guarded.connect(ANN).await;
+    assert!(within(Stream::open(&ann, open("CartPole", 1, 1))).await.is_err());
+    let bob = guarded.connect(BOB).await;
+    drop(within(Stream::open(&bob, open("CartPole", 1, 1))).await.unwrap());
+    drop((ann, bob));
+    guarded.server.signal("TERM");
+    assert!(guarded.server.ended().await.success());
+    let entries = entries(&path);
+    let kinds: Vec<&str> = entries
+        .iter()
+        .map(|entry| match &entry.event {
+            Event::Began { .. } => "began",
+            Event::Refused { who, .. } => who.token.as_deref().unwrap(),
+            Event::Draws(draws) if draws.ends.is_empty() => "begins",
+            Event::Draws(_) => "ends",
+            Event::Ended => "ended",
+        })
+        .collect();
+    assert_eq!(kinds, ["began", "ann", "begins", "ends", "ended"]);
+    assert!(guarded.server.log().contains("head="), "{}", guarded.server.log());
+
+    // Another goes on with it, one that was changed it does not touch.
+    let flags = ["--ledger", path.to_str().unwrap()];
+    let server = Server::start(&flags);
+    assert_eq!(self::entries(&path).len(), 6);
+    let second = command().args(flags).args(["--listen", "tcp://127.0.0.1:0"]).output().unwrap();
+    let words = String::from_utf8(second.stderr).unwrap();
+    assert!(words.contains("another server writes it") && second.status.code() == Some(2), "{words}");
+    drop(server);
+    let text = std::fs::read_to_string(&path).unwrap();
+    std::fs::write(&path, text.replacen("bob", "eve", 1)).unwrap();
+    let third = command().args(flags).args(["--listen", "tcp://127.0.0.1:0"]).output().unwrap();
+    let words = String::from_utf8(third.stderr).unwrap();
+    assert!(words.contains("line 3") && words.contains("was changed") && third.status.code() == Some(2), "{words}");
+}
+
+#[tokio::test]
+async fn nothing_is_drawn_that_cannot_be_written_down() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("ledger");
+    // Files of this server may have so many blocks, which is what a full disk comes to.
+    let limited = |blocks: u32, path: &Path| {
+        let mut limited = std::process::Command::new("sh");
+        let program = command().get_program().to_owned();
+        limited.args(["-c", "trap '' XFSZ; ulimit -f \"$1\"; shift; exec \"$@\"", "sh", &blocks.to_string()]);
+        limited.arg(program).arg("--ledger").arg(path).args(["--listen", "tcp://127.0.0.1:0"]);
+        limited
+    };
+    for (mut command, part) in [(limited(0, &path), "File too large"), (limited(9, Path::new("/dev/full")), "no file")]
+    {
+        let server = command.output().unwrap();
+        let words = String::from_utf8(server.stderr).unwrap();
+        assert!(words.contains("--ledger") && words.contains(part) && server.status.code() == Some(2), "{words}");
+    }
+    let server = Server::spawn(limited(8, &path), directory, 1);
+    let connection = connect(server.tcp(), &[]).await.unwrap();
+    let mut sessions = Vec::new();
+    let refusal = loop {
+        match within(Stream::open(&connection, open("CartPole", 1, 1))).await {
+            Ok((session, _)) => sessions.push(session),
+            Err(error) => break error.to_string(),
+        }
+        assert!(sessions.len() < 100, "all were written down");
+    };
+    assert!(refusal.contains("writes down what is drawn, and cannot") && !sessions.is_empty(), "{refusal}");
+    for session in &mut sessions {
+        super::steps(session, 1).await.expect("what is drawn already goes on");
+    }
+    assert_eq!(draws(&path).len(), sessions.len(), "no half of a line is there");
+}
+
+#[tokio::test]
+async fn worlds_are_in_the_ledger_and_under_roles_too() {
+    let role = "[[role]]\nname = \"train\"\ndraws = [\"D\"]\n";
+    let guarded = Guarded::start(&(entry("ann", ANN, "role = \"train\"") + role));
+    let path = guarded.directory.path().join("ledger");
+    let mut client = EnvironmentClient::new(channel(guarded.server.tcp()).await);
+    let mut agent = Agent::show(&mut client, Some(ANN)).await.unwrap();
+    let of = |version: &str| settings("CartPole", [("version", text(version)), ("seed", uint64(3))]);
+    let (code, words) = agent.refused(create(of("E"))).await;
+    assert!(code == Code::PermissionDenied && words.contains("role \"train\""), "{words}");
+    let world = agent.create(of("D")).await;
+    agent.join(&world).await;
+    for wrong in [("length", double(0.9)), ("version", text("E"))] {
+        let (code, _) = agent.refused(reset_world(&world, Settings::from([(wrong.0.into(), wrong.1)]))).await;
+        assert_eq!(code, Code::PermissionDenied);
+    }
+    agent.step(choice(0)).await;
+    agent.reset_world(&world, Settings::from([("seed".into(), uint64(4))])).await;
+    agent.step(choice(0)).await;
+    drop(agent);
+    until("its end is there", async || draws(&path).len() == 3).await;
+    let lines = draws(&path);
+    assert_eq!(lines[0].begins, [Begin { seed: 3, index: 0, count: 1, region: 0, episode: 0 }]);
+    assert_eq!(lines[1].begins, [Begin { seed: 4, index: 0, count: 1, region: 0, episode: 0 }]);
+    assert_eq!(lines[1].ends, [End { seed: 3, index: 0, count: 1, episode: 0 }]);
+    assert_eq!(lines[2].ends, [End { seed: 4, index: 0, count: 1, episode: 0 }]);
+    let refused = |entry: &&Entry| matches!(entry.event, Event::Refused { .. });
+    assert_eq!(entries(&path).iter().filter(refused).count(), 3);
+}
