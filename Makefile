@@ -260,10 +260,10 @@ docker-base:
 		}; \
 	done
 
-# Seconds for each of seven targets, and what is mutated from one time to the next.
-FUZZ_SECONDS ?= 43
+# Seconds for each of eight targets, and what is mutated from one time to the next.
+FUZZ_SECONDS ?= 38
 FUZZ = $(TARGET)/fuzz-corpus
-FUZZ_TARGETS = requests snapshots worlds connections checkpoints records plans
+FUZZ_TARGETS = requests snapshots worlds connections checkpoints records plans ledgers
 fuzz: deps ## attack the server and the readers of files with mutated bytes, under AddressSanitizer; five minutes, nightly Rust
 	@cargo +nightly --version >/dev/null || { echo "a nightly toolchain is missing: rustup toolchain install nightly" >&2; exit 1; }
 	@cargo +nightly fuzz --version >/dev/null 2>&1 || cargo +nightly install cargo-fuzz --locked

@@ -1,9 +1,17 @@
 //! What the learner reads back: checkpoints, recorded episodes, experiment files.
 
+use std::sync::LazyLock;
+
+use perturb::config::Config;
+use perturb::tasks;
 use perturb_study::Plan;
 use perturb_study::checkpoint::Checkpoint;
+use perturb_study::ledger::Ledgers;
 use perturb_study::records::Records;
 use serde_json::{Value, json};
+use sha2::{Digest, Sha256};
+
+use crate::seeds::{POLICY, kept};
 
 /// More cells than these would only take time.
 const MOST_BYTES_OF_A_PLAN: usize = 4096;
@@ -40,6 +48,37 @@ pub fn records(data: &[u8]) {
             let _ = records.result(&test.set.name, None);
         }
     }
+}
+
+/// A ledger's lines without their digests, which are made good; what is read is held against a policy that is kept.
+pub fn ledgers(data: &[u8]) {
+    static KEPT: LazyLock<(Checkpoint, Records)> = LazyLock::new(|| {
+        let policy = kept(POLICY);
+        let checkpoint = Checkpoint::load(&policy.join("training/checkpoint")).expect("a checkpoint");
+        (checkpoint, Records::read(&policy.join("episodes.parquet")).expect("recorded"))
+    });
+    let Ok(text) = std::str::from_utf8(data) else { return };
+    let mut head = "0".repeat(64);
+    let mut ledger = String::new();
+    for line in text.lines() {
+        head = format!("{:x}", Sha256::digest(format!("{head} {line}")));
+        ledger += &format!("{head} {line}\n");
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("ledger");
+    std::fs::write(&file, ledger).expect("a file");
+    if let Ok(ledgers) = Ledgers::read(&[file], &[]) {
+        let (checkpoint, records) = &*KEPT;
+        let training = &checkpoint.state.config.common;
+        let environment = listed(&training.environment);
+        let _ = ledgers.prove(training, checkpoint.state.counters.episodes, &environment, records);
+    }
+}
+
+/// An environment of the catalogue.
+fn listed(name: &str) -> perturb::proto::Environment {
+    let listing = perturb::server::listing(&tasks::catalogue(), &Config::default()).expect("models load");
+    listing.environments.into_iter().find(|environment| environment.name == name).expect("it is there")
 }
 
 /// An experiment file.

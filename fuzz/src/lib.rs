@@ -6,7 +6,7 @@ mod files;
 mod seeds;
 mod server;
 
-pub use files::{checkpoints, plans, records};
+pub use files::{checkpoints, ledgers, plans, records};
 pub use seeds::{replies, seeds};
 pub use server::{connections, requests, snapshots, worlds};
 
@@ -19,7 +19,7 @@ pub struct Target {
 }
 
 /// All that are attacked.
-pub const TARGETS: [Target; 7] = [
+pub const TARGETS: [Target; 8] = [
     Target { name: "requests", run: requests },
     Target { name: "snapshots", run: snapshots },
     Target { name: "worlds", run: worlds },
@@ -27,4 +27,5 @@ pub const TARGETS: [Target; 7] = [
     Target { name: "checkpoints", run: checkpoints },
     Target { name: "records", run: records },
     Target { name: "plans", run: plans },
+    Target { name: "ledgers", run: ledgers },
 ];

@@ -20,7 +20,7 @@ use prost::Message;
 use crate::server::{answers, frame, framed, head, open, steps};
 
 /// A policy that is kept, with a recorded test.
-const POLICY: &str = "results/beyond/confirm-2/cells/CartPole-ppo-ff-R-9bd6546b-s7";
+pub(crate) const POLICY: &str = "results/beyond/confirm-2/cells/CartPole-ppo-ff-R-9bd6546b-s7";
 
 /// Those of the target of this name.
 pub fn seeds(name: &str) -> Vec<Vec<u8>> {
@@ -50,11 +50,12 @@ pub fn seeds(name: &str) -> Vec<Vec<u8>> {
         "plans" => ["quick", "classic-ff", "classic-rc", "paper", "beyond/confirm-2", "questions/pendulum"]
             .map(|name| std::fs::read(kept("experiments").join(name).with_extension("toml")).expect("a file"))
             .to_vec(),
+        "ledgers" => vec![include_str!("ledger.jsonl").into()],
         _ => Vec::new(),
     }
 }
 
-fn kept(path: &str) -> std::path::PathBuf {
+pub(crate) fn kept(path: &str) -> std::path::PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
 }
 

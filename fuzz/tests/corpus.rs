@@ -112,3 +112,8 @@ fn records() {
 fn plans() {
     attack("plans");
 }
+
+#[test]
+fn ledgers() {
+    attack("ledgers");
+}

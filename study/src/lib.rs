@@ -23,6 +23,8 @@ mod heatmap_policies;
 mod heatmaps;
 pub mod interrupt;
 pub mod ledger;
+#[cfg(test)]
+mod ledger_tests;
 mod means;
 pub mod outcomes;
 pub mod paper;
