@@ -34,7 +34,7 @@ use std::process::ExitCode;
 use args::{Cli, Command, PlayArgs, ServerArgs, WaitArgs};
 use display::note;
 use error::{CommandError, Result};
-use perturb_learner::client::{ActAt, ServerWait, Servers};
+use perturb_learner::client::{ActAt, Address, PrivateServer, ServerWait, Servers};
 use perturb_study::interrupt::end_on_signals;
 use perturb_study::{Folder, Plan};
 
@@ -94,6 +94,9 @@ fn signal_code(number: i32) -> ExitCode {
     ExitCode::from(u8::try_from(128 + number).unwrap_or(1))
 }
 
+/// So many processes of short steps are as much as the one thread of a server that speaks to clients has time for.
+const JOBS_A_SERVER: usize = 2;
+
 /// The servers that were named, or one of our own.
 fn servers(args: &ServerArgs) -> Result<Servers> {
     if args.server.is_empty() {
@@ -108,7 +111,21 @@ fn lasting_servers(args: &ServerArgs, wait: WaitArgs) -> Result<Servers> {
     Ok(servers(args)?.with_wait(ServerWait { limit: wait.time(), tell: |sentence| note(sentence) }))
 }
 
-/// The same, for those that play.
+/// The servers that all workers share, each group of cells one of them. Private ones share the physics threads.
+fn shared_servers(args: &ServerArgs, jobs: usize) -> Result<(Vec<PrivateServer>, Vec<Address>)> {
+    if !args.server.is_empty() {
+        refuse_workers(args)?;
+        return Ok((Vec::new(), args.server.clone()));
+    }
+    let count = jobs.div_ceil(JOBS_A_SERVER).max(1);
+    let threads = args.workers.unwrap_or_else(cores).div_ceil(count);
+    let start = |_| PrivateServer::start(Some(threads));
+    let servers = (0..count).map(start).collect::<std::result::Result<Vec<_>, _>>()?;
+    let addresses = servers.iter().map(|server| server.address().clone()).collect();
+    Ok((servers, addresses))
+}
+
+/// Servers for those that play.
 fn playing_servers(args: &PlayArgs) -> Result<Servers> {
     let act = if args.act == "client" { ActAt::Client } else { ActAt::Server };
     Ok(lasting_servers(&args.server, args.wait)?.with_act(act))

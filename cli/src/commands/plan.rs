@@ -8,7 +8,7 @@ use serde_json::json;
 
 use super::args::PlanArgs;
 use super::error::{CommandError, Result, system};
-use super::{cores, recurrent, servers};
+use super::{cores, recurrent, shared_servers};
 use perturb_learner::client::Servers;
 use perturb_learner::measure::measure;
 use perturb_study::interrupt::StopFlag;
@@ -114,7 +114,8 @@ fn estimate(
         writeln!(out, "not measured: {}", cells(unknown.len()))?;
     }
     if args.measure > 0 && !unknown.is_empty() {
-        let servers = servers(&args.server)?;
+        let (_private, addresses) = shared_servers(&args.server, grouping.at_a_time)?;
+        let (servers, _) = Servers::connect_to_some(&addresses)?; // what is wrong with others the run will tell
         let limits = step_limits(&servers, plan)?;
         let measurements = measurements(args, plan, grouping, &unknown, &servers, stop, out)?;
         let estimates = estimates(plan, &measurements, &limits);

@@ -13,7 +13,7 @@ use super::cells::Doing;
 use super::display::{is_quiet, note};
 use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
-use super::{cores, recurrent, refuse_workers, slurm};
+use super::{cores, recurrent, shared_servers, slurm};
 use perturb_learner::cell::{CellOrder, run_cells};
 use perturb_learner::client::{Address, PrivateServer, Servers};
 use perturb_learner::measure::{MeasureError, measure};
@@ -118,15 +118,15 @@ fn stop_with_input(stop: &StopFlag) -> Result<()> {
 fn all_cells(args: &RunArgs, plan: Plan, folder: &Folder, stop: &StopFlag) -> Result<ExitCode> {
     recurrent::prepare_for(&plan)?; // the workers are this program
     let grouping = Grouping { most: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
-    let (local, addresses) = shared_servers(args)?;
-    let local = local.map(Mutex::new);
+    let (local, addresses) = shared_servers(&args.server, grouping.at_a_time)?;
+    let local: Vec<Mutex<PrivateServer>> = local.into_iter().map(Mutex::new).collect();
     let (servers, troubles) = Servers::connect_to_some(&addresses)?;
     troubles.iter().for_each(|trouble| eprintln!("perturb: {trouble}; going on with the other servers"));
     step_limits(&servers, &plan)?; // refuses environments that there are not
     let addresses: Vec<String> = addresses.iter().map(Address::to_string).collect();
     let command = || worker(args, folder, &addresses);
-    let server = || {
-        let mut server = local.as_ref()?.lock().ok()?;
+    let end = |server: &Mutex<PrivateServer>| {
+        let mut server = server.lock().ok()?;
         let ended = format!("the private server ended with {}", server.exit_status()?);
         if args.wait.time().is_zero() {
             return Some(News::NoServer(ended));
@@ -136,6 +136,7 @@ fn all_cells(args: &RunArgs, plan: Plan, folder: &Folder, stop: &StopFlag) -> Re
             Err(error) => News::NoServer(format!("{ended}; {error}")),
         })
     };
+    let server = || local.iter().find_map(end);
     let mut doing = Doing::begin(args, plan, folder, stop)?;
     while let Some(plan) = doing.next()? {
         let most = if is_quiet() { Vec::new() } else { most(&servers, &plan, folder, grouping, stop)? };
@@ -180,18 +181,6 @@ fn most(
     let mut most = vec![None; plan.cells.len()];
     unknown.into_iter().for_each(|cell| most[cell] = Some(estimates[cell].seconds()));
     Ok(most)
-}
-
-/// The servers that all workers share.
-fn shared_servers(args: &RunArgs) -> Result<(Option<PrivateServer>, Vec<Address>)> {
-    let named = &args.server.server;
-    if !named.is_empty() {
-        refuse_workers(&args.server)?;
-        return Ok((None, named.clone()));
-    }
-    let server = PrivateServer::start(args.server.workers)?;
-    let address = server.address().clone();
-    Ok((Some(server), vec![address]))
 }
 
 /// The command of a worker.
