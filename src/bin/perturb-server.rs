@@ -119,13 +119,23 @@ fn run(config: &Config) -> Result<(), Failure> {
         // Before the addresses are told: who reads them may send a signal at once.
         let shutdown = shutdown(config.exit_with_stdin)?;
         let mut listeners = Vec::new();
+        let metrics = match &config.metrics {
+            Some(address) => {
+                let bound = Listener::bind_as(address, "--metrics", config.socket_mode).await;
+                Some(bound.map_err(Failure::Address)?)
+            }
+            None => None,
+        };
         for address in &config.listen {
             let listener = Listener::bind(address, config.socket_mode).await.map_err(Failure::Address)?;
             // Whoever started the server need not read on.
             let _ = writeln!(io::stdout(), "listening on {}", told(&listener.address()?, config));
             listeners.push(listener);
         }
-        server::run(listeners, config, &guards, tasks::catalogue(), shutdown).await?;
+        if let Some(listener) = &metrics {
+            let _ = writeln!(io::stdout(), "metrics at {}{}", listener.address()?, server::metrics::endpoint::PATH);
+        }
+        server::run(listeners, metrics, config, &guards, tasks::catalogue(), shutdown).await?;
         Ok(())
     });
     // Connections that did not close by themselves must not keep the program.

@@ -1,6 +1,7 @@
 //! One session: the legal order of its requests, each answered once.
 
 use super::{
+    access::About,
     acting,
     budget::{Budget, Outbox, Share},
     conversation::{Dialogue, MOST_BYTES_BEFORE_OPEN},
@@ -166,6 +167,7 @@ impl Dialogue for Session {
     type Request = proto::SessionRequest;
     type Response = proto::SessionResponse;
     const FIELDS: &'static [Field] = fields::SESSION_REQUEST;
+    const PROTOCOL: &'static str = "perturb.v1";
 
     fn allowance(&self) -> Allowance {
         match &self.batch {
@@ -185,7 +187,15 @@ impl Dialogue for Session {
         self.batch.is_some()
     }
 
-    async fn answer(&mut self, request: Self::Request) -> Self::Response {
+    fn about(&self) -> About {
+        self.batch.as_ref().map_or_else(About::default, |batch| About {
+            environment: Some(batch.settings().spec.name),
+            envs: batch.settings().size(),
+            steps: batch.steps(),
+        })
+    }
+
+    async fn answer(&mut self, request: Self::Request) -> Result<Self::Response, Refusal> {
         let response = match request.request {
             Some(Request::Open(open)) => self.open(open).await.map(Response::Opened),
             Some(Request::Step(step)) => self.step(step).await.map(Response::Stepped),
@@ -198,11 +208,10 @@ impl Dialogue for Session {
             Some(Request::SavePlayer(_)) => self.save_player().map(Response::SavePlayer),
             None => Err(Refusal::value("request", "empty or of a kind this server does not know", "open, step, …")),
         };
-        response
-            .map_or_else(|refusal| self.refuse(refusal), |response| proto::SessionResponse { response: Some(response) })
+        response.map(|response| proto::SessionResponse { response: Some(response) })
     }
 
-    fn refuse(&self, refusal: Refusal) -> Self::Response {
+    fn refusal(refusal: Refusal) -> Self::Response {
         proto::SessionResponse { response: Some(Response::Error(refusal.into())) }
     }
 }
@@ -223,13 +232,6 @@ impl Observed for Session {
             Some(Request::Act(_)) => "act",
             Some(Request::SavePlayer(_)) => "save_player",
             None => "unknown",
-        }
-    }
-
-    fn refusal(response: &Self::Response) -> Option<&str> {
-        match &response.response {
-            Some(Response::Error(error)) => Some(&error.message),
-            _ => None,
         }
     }
 }

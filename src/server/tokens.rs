@@ -2,6 +2,7 @@
 
 use super::{
     peers::{Connection, Peer},
+    refusals::Refusals,
     status::Refusal,
 };
 use serde::Deserialize;
@@ -14,7 +15,7 @@ use std::{
     pin::Pin,
     sync::{
         Arc, PoisonError, RwLock,
-        atomic::{AtomicBool, AtomicUsize, Ordering},
+        atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering},
     },
     task::{Context, Poll},
 };
@@ -93,6 +94,30 @@ pub struct Token {
     told: Notify,
     sessions: Arc<Quota>,
     envs: Arc<Quota>,
+    spent: Arc<Spent>,
+}
+
+/// What was done with a token so far.
+#[derive(Default)]
+pub struct Spent {
+    /// Steps of an environment.
+    pub steps: AtomicU64,
+    /// Requests and calls that were refused.
+    pub refusals: AtomicU64,
+}
+
+/// What a token has, and what was done with it.
+pub struct Used {
+    /// What it is called.
+    pub name: String,
+    /// Sessions now.
+    pub sessions: usize,
+    /// Environments now.
+    pub envs: usize,
+    /// Steps of an environment so far.
+    pub steps: u64,
+    /// What was refused so far.
+    pub refusals: u64,
 }
 
 /// The token of a call.
@@ -102,6 +127,21 @@ impl Token {
     /// What it is called.
     pub fn name(&self) -> &str {
         &self.name
+    }
+
+    /// What was done with it.
+    pub fn spent(&self) -> &Spent {
+        &self.spent
+    }
+
+    fn used(&self) -> Used {
+        Used {
+            name: self.name.clone(),
+            sessions: self.sessions.taken.load(Ordering::Relaxed),
+            envs: self.envs.taken.load(Ordering::Relaxed),
+            steps: self.spent.steps.load(Ordering::Relaxed),
+            refusals: self.spent.refusals.load(Ordering::Relaxed),
+        }
     }
 
     /// Whether it is in the file no more.
@@ -190,6 +230,11 @@ impl Tokens {
         self.0.read().unwrap_or_else(PoisonError::into_inner).len()
     }
 
+    /// What each has and has done.
+    pub fn used(&self) -> Vec<Used> {
+        self.0.read().unwrap_or_else(PoisonError::into_inner).iter().map(|token| token.used()).collect()
+    }
+
     /// Takes the file's new text: tokens that stay keep what they have, others are revoked.
     ///
     /// # Errors
@@ -201,8 +246,9 @@ impl Tokens {
         for (digest, Entry { name, max_sessions, max_envs, .. }) in listed {
             // Another token of the same name has what was taken with the one before, too.
             let before = tokens.iter().find(|token| token.name == name);
-            let (sessions, envs) =
-                before.map_or_else(Default::default, |token| (Arc::clone(&token.sessions), Arc::clone(&token.envs)));
+            let (sessions, envs, spent) = before.map_or_else(Default::default, |token| {
+                (Arc::clone(&token.sessions), Arc::clone(&token.envs), Arc::clone(&token.spent))
+            });
             sessions.bound(max_sessions);
             envs.bound(max_envs);
             renewed.push(match before.filter(|token| token.digest == digest) {
@@ -214,6 +260,7 @@ impl Tokens {
                     told: Notify::new(),
                     sessions,
                     envs,
+                    spent,
                 }),
             });
         }
@@ -340,12 +387,13 @@ fn hex(bytes: &[u8]) -> String {
 pub struct Gated<S> {
     service: S,
     tokens: Option<Tokens>,
+    refusals: Refusals,
 }
 
 impl<S> Gated<S> {
-    /// Asks for one of these, or for none.
-    pub fn new(service: S, tokens: Option<Tokens>) -> Self {
-        Self { service, tokens }
+    /// Asks for one of these, or for none, and counts whom it refuses.
+    pub fn new(service: S, tokens: Option<Tokens>, refusals: Refusals) -> Self {
+        Self { service, tokens, refusals }
     }
 }
 
@@ -377,6 +425,7 @@ where
             Err(refusal) => {
                 let peer = request.extensions().get::<Connection>().map(|connection| connection.peer);
                 tracing::debug!(?peer, path = request.uri().path(), %refusal, "refused a call");
+                self.refusals.count(&refusal, None);
                 Box::pin(ready(Ok(Status::from(refusal).into_http())))
             }
         }

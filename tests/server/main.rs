@@ -17,6 +17,7 @@ mod guarded;
 mod lifecycle;
 #[cfg(feature = "mujoco")]
 mod locomotion;
+mod metrics;
 mod observing;
 mod old_snapshots;
 mod pool;
