@@ -70,7 +70,7 @@ endef
 
 .DEFAULT_GOAL := help
 .PHONY: help deps opengl toolchain build install demo all-pairs report-check serve-test test slurm-test kill-test \
-	qemu-test slurm-acceptance lint bench fuzz bench-peers audit cargo-deny metrics-test python-test wheel wheel-test \
+	qemu-test slurm-acceptance lint bench fuzz bench-peers audit cargo-deny metrics-test otel-test python-test wheel wheel-test \
 	python-acceptance bench-python \
 	python-venv docs docs-test docker docker-base docker-test
 
@@ -120,6 +120,9 @@ serve-test: build opengl ## watch a training and an experiment on the live page 
 metrics-test: build opengl ## have a Prometheus, which it installs, watch a server, and ask it for all that Grafana's dashboard shows
 	@$(call install,prometheus python3)
 	python3 docker/grafana/check.py $(PROGRAMS)
+
+otel-test: deps ## build the server with traces, and test that they come to a collector
+	cargo test $(ALL) --features perturb/otel --test server traces::
 
 test: export PERTURB_TEST_DM_ENV_RPC_PYTHON := $(abspath $(DM_ENV_RPC))/bin/python
 test: deps opengl $(DM_ENV_RPC)/installed ## run all tests, then those of the server without MuJoCo

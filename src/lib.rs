@@ -21,6 +21,8 @@ pub mod render;
 pub mod scene;
 pub mod server;
 pub mod tasks;
+#[cfg(feature = "otel")]
+pub mod traces;
 
 pub use perturb_protocol::proto;
 

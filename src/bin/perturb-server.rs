@@ -10,7 +10,7 @@ use perturb::{
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::{
     error::Error,
-    io::{self, IsTerminal, Read, Write},
+    io::{self, Read, Write},
     process::ExitCode,
 };
 use tokio::{
@@ -45,11 +45,20 @@ fn main() -> ExitCode {
             return ExitCode::from(2);
         }
     };
+    #[cfg(not(feature = "otel"))]
     tracing_subscriber::fmt()
         .with_writer(io::stderr)
-        .with_ansi(io::stderr().is_terminal())
+        .with_ansi(io::IsTerminal::is_terminal(&io::stderr()))
         .with_env_filter(tracing_subscriber::EnvFilter::new(config.filter()))
         .init();
+    #[cfg(feature = "otel")]
+    let _traces = match perturb::traces::init(&config.filter()) {
+        Ok(traces) => traces,
+        Err(error) => {
+            eprintln!("perturb-server: traces cannot be sent: {error}; correct the variables OTEL_…");
+            return ExitCode::from(2);
+        }
+    };
     let done = if arguments.health {
         health(&config)
     } else if arguments.catalogue {

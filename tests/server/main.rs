@@ -30,3 +30,5 @@ mod sharing;
 mod streams;
 mod success;
 mod toy;
+#[cfg(feature = "otel")]
+mod traces;

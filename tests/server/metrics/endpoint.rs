@@ -1,7 +1,10 @@
 //! Where metrics are told, and where not.
 
 use super::{Watched, page};
-use crate::common::server::{DEADLINE, Server, command, lines, until};
+use crate::{
+    common::server::{DEADLINE, Server, command, lines, until},
+    lifecycle::finished,
+};
 use rstest::rstest;
 use std::{
     net::TcpStream,
@@ -11,7 +14,7 @@ use std::{
 
 /// Runs a server that is expected to refuse; what it said.
 fn refused(mut command: Command) -> String {
-    let output = command.stdin(Stdio::null()).output().unwrap();
+    let output = finished(&mut command);
     let words = String::from_utf8(output.stderr).unwrap();
     assert_eq!((output.status.code(), output.stdout.len()), (Some(2), 0), "{command:?}: {words}");
     words
