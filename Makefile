@@ -70,7 +70,7 @@ endef
 
 .DEFAULT_GOAL := help
 .PHONY: help deps opengl toolchain build install demo all-pairs report-check serve-test test slurm-test kill-test \
-	qemu-test slurm-acceptance lint bench fuzz bench-peers audit cargo-deny python-test wheel wheel-test \
+	qemu-test slurm-acceptance lint bench fuzz bench-peers audit cargo-deny metrics-test otel-test python-test wheel wheel-test \
 	python-acceptance bench-python \
 	python-venv docs docs-test docker docker-base docker-test
 
@@ -116,6 +116,13 @@ report-check: build ## make the report of a small experiment and look at it in C
 serve-test: build opengl ## watch a training and an experiment on the live page in Chromium, which it installs; minutes
 	@$(call install,chromium python3)
 	python3 cli/tests/serve_check/watch.py chromium $(PROGRAMS) $(TARGET)/serve-test
+
+metrics-test: build opengl ## have a Prometheus, which it installs, watch a server, and ask it for all that Grafana's dashboard shows
+	@$(call install,prometheus python3)
+	python3 docker/grafana/check.py $(PROGRAMS)
+
+otel-test: deps ## build the server with traces, and test that they come to a collector
+	cargo test $(ALL) --features perturb/otel --test server traces::
 
 test: export PERTURB_TEST_DM_ENV_RPC_PYTHON := $(abspath $(DM_ENV_RPC))/bin/python
 test: deps opengl $(DM_ENV_RPC)/installed ## run all tests, then those of the server without MuJoCo
@@ -163,8 +170,8 @@ python-test wheel python-acceptance bench-python: export PERTURB_SERVER := $(abs
 
 python-test: $(VENV)/installed opengl ## lint, type-check and test the Python package
 	cd python && $(abspath $(VENV))/bin/ruff check . && $(abspath $(VENV))/bin/ruff format --check .
-	$(VENV)/bin/ruff check --config python/pyproject.toml benches/peers
-	$(VENV)/bin/ruff format --check --config python/pyproject.toml benches/peers
+	$(VENV)/bin/ruff check --config python/pyproject.toml benches/peers docker/grafana
+	$(VENV)/bin/ruff format --check --config python/pyproject.toml benches/peers docker/grafana
 	cd python && $(abspath $(VENV))/bin/mypy
 	cd python && $(abspath $(VENV))/bin/pytest -q
 

@@ -118,6 +118,11 @@ pub struct Arguments {
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls_client_ca: Option<PathBuf>,
+    /// Where to tell metrics, as Prometheus scrapes them, at the path /metrics: tcp://127.0.0.1:port or unix:/path. Whoever
+    /// can connect may read them. [default: nowhere]
+    #[arg(long, value_name = "ADDRESS")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub metrics: Option<String>,
     /// Let other machines use this server without asking who they are, or without encryption.
     #[arg(long)]
     #[serde(skip_serializing_if = "std::ops::Not::not")]
@@ -205,6 +210,8 @@ pub struct Config {
     pub tls_key: Option<PathBuf>,
     /// Whose certificates clients must show.
     pub tls_client_ca: Option<PathBuf>,
+    /// Where to tell metrics.
+    pub metrics: Option<ListenAddress>,
     /// Whether other machines may use this server unasked or unencrypted.
     pub insecure: bool,
     /// The mode of Unix sockets' files.
@@ -235,6 +242,7 @@ impl Default for Config {
             tls_cert: None,
             tls_key: None,
             tls_client_ca: None,
+            metrics: None,
             insecure: false,
             socket_mode: SocketMode::default(),
             log: "info".into(),
@@ -364,6 +372,16 @@ pub enum Error {
         /// What is missing.
         lacks: &'static str,
     },
+    /// Other machines could read the metrics.
+    #[error(
+        "{address} of --metrics can be reached by other machines, and metrics are neither encrypted nor is anybody asked \
+         who reads them: give --metrics tcp://127.0.0.1:PORT or unix:/path; or give --insecure, where everybody who \
+         reaches that address may read them"
+    )]
+    InsecureMetrics {
+        /// Where they would be told.
+        address: String,
+    },
     /// A value is out of its range.
     #[error("{key} is {got}; expected {expected}")]
     Value {
@@ -445,6 +463,9 @@ impl Config {
         };
         if let (Some(lacks), Some(address)) = (lacks, self.listen.iter().find(others)) {
             return Err(Error::Insecure { address: address.written(), lacks });
+        }
+        if let Some(address) = self.metrics.as_ref().filter(others).filter(|_| !self.insecure) {
+            return Err(Error::InsecureMetrics { address: address.written() });
         }
         if tracing_subscriber::EnvFilter::try_new(&self.log).is_err() {
             return refuse("log", &self.log, "error, warn, info, debug, trace, or a filter such as perturb=debug");

@@ -8,18 +8,21 @@
 //! - [`tasks`]: the environments, one folder each, and their catalogue.
 //! - [`scene`]: what a picture shows, and [`render`]: drawing it, by a thread of its own.
 //!
-//! [`config`] is the server's configuration and [`proto`] the protocol.
+//! [`config`] is the server's configuration, [`meters`] what is counted on the way, and [`proto`] the protocol.
 #![forbid(unsafe_code)]
 #![deny(clippy::disallowed_methods)]
 
 pub mod config;
 pub mod env;
+pub mod meters;
 pub mod pool;
 mod priority;
 pub mod render;
 pub mod scene;
 pub mod server;
 pub mod tasks;
+#[cfg(feature = "otel")]
+pub mod traces;
 
 pub use perturb_protocol::proto;
 

@@ -127,7 +127,7 @@ fn socket() -> &'static Path {
                 let listener = Listener::bind(&address, config.socket_mode).await.expect("an address");
                 listening.send(()).expect("somebody waits");
                 let (guards, forever) = (Guards::default(), std::future::pending());
-                let served = server::run(vec![listener], &config, &guards, tasks::catalogue(), forever).await;
+                let served = server::run(vec![listener], None, &config, &guards, tasks::catalogue(), forever).await;
                 panic!("the server ended: {served:?}");
             });
         });

@@ -10,7 +10,7 @@ use perturb::{
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::{
     error::Error,
-    io::{self, IsTerminal, Read, Write},
+    io::{self, Read, Write},
     process::ExitCode,
 };
 use tokio::{
@@ -45,11 +45,20 @@ fn main() -> ExitCode {
             return ExitCode::from(2);
         }
     };
+    #[cfg(not(feature = "otel"))]
     tracing_subscriber::fmt()
         .with_writer(io::stderr)
-        .with_ansi(io::stderr().is_terminal())
+        .with_ansi(io::IsTerminal::is_terminal(&io::stderr()))
         .with_env_filter(tracing_subscriber::EnvFilter::new(config.filter()))
         .init();
+    #[cfg(feature = "otel")]
+    let _traces = match perturb::traces::init(&config.filter()) {
+        Ok(traces) => traces,
+        Err(error) => {
+            eprintln!("perturb-server: traces cannot be sent: {error}; correct the variables OTEL_…");
+            return ExitCode::from(2);
+        }
+    };
     let done = if arguments.health {
         health(&config)
     } else if arguments.catalogue {
@@ -119,13 +128,23 @@ fn run(config: &Config) -> Result<(), Failure> {
         // Before the addresses are told: who reads them may send a signal at once.
         let shutdown = shutdown(config.exit_with_stdin)?;
         let mut listeners = Vec::new();
+        let metrics = match &config.metrics {
+            Some(address) => {
+                let bound = Listener::bind_as(address, "--metrics", config.socket_mode).await;
+                Some(bound.map_err(Failure::Address)?)
+            }
+            None => None,
+        };
         for address in &config.listen {
             let listener = Listener::bind(address, config.socket_mode).await.map_err(Failure::Address)?;
             // Whoever started the server need not read on.
             let _ = writeln!(io::stdout(), "listening on {}", told(&listener.address()?, config));
             listeners.push(listener);
         }
-        server::run(listeners, config, &guards, tasks::catalogue(), shutdown).await?;
+        if let Some(listener) = &metrics {
+            let _ = writeln!(io::stdout(), "metrics at {}{}", listener.address()?, server::metrics::endpoint::PATH);
+        }
+        server::run(listeners, metrics, config, &guards, tasks::catalogue(), shutdown).await?;
         Ok(())
     });
     // Connections that did not close by themselves must not keep the program.

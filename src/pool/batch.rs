@@ -10,6 +10,7 @@ use super::{
 };
 use crate::{
     env::{Distribution, Draw, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings},
+    meters::Tally,
     scene::Scene,
 };
 use bytes::{Bytes, BytesMut};
@@ -17,6 +18,7 @@ use std::{
     ops::RangeInclusive,
     sync::{Arc, Mutex, atomic::Ordering},
 };
+use tokio::time::Instant;
 
 /// What one shard should cost, in µs: long enough to hide the queue, short enough that sessions take turns …
 const SHARD_COST: RangeInclusive<f64> = 20.0..=200.0;
@@ -143,12 +145,12 @@ impl Batch {
     /// [`Error::Full`], or [`Error::Environment`] if a model cannot be loaded.
     pub async fn open(pool: &Pool, settings: BatchSettings) -> Result<(Self, Bytes, Vec<(u32, EpisodeStart)>), Error> {
         let (workers, size) = (pool.queue(), settings.size());
-        let permit = Arc::new(workers.reserve(size)?);
+        let owned = (Arc::new(workers.reserve(size)?), Arc::new(Tally::new(pool.meter(settings.spec.name))));
         let shard_size = shard_size(settings.spec, size, pool.workers());
         let spec = settings.spec;
         let parts = cut(&settings.groups, shard_size).into_iter().enumerate();
         let shard = |(i, part)| Mutex::new(Shard::new(&settings, part, i * shard_size));
-        let job = job(spec, parts.map(shard).collect(), pool.workers(), permit, size);
+        let job = job(spec, parts.map(shard).collect(), pool.workers(), owned, size);
         let mut batch = Self {
             settings,
             size,
@@ -178,12 +180,18 @@ impl Batch {
         self.size
     }
 
+    /// Steps of an environment so far.
+    pub fn steps(&self) -> u64 {
+        self.job.tally.steps()
+    }
+
     /// Advances every environment by one step. Discrete actions are i32 `[N]`, each a choice of the space; continuous
     /// ones f32 `[N, A]`, finite: the caller has checked them.
     ///
     /// # Errors
     /// [`Error::Ended`] in [`Autoreset::Disabled`], [`Error::Defect`].
     pub async fn step(&mut self, actions: &[u8]) -> Result<Stepped, Error> {
+        let start = Instant::now();
         if self.settings.autoreset == Autoreset::Disabled {
             self.refuse_ended()?;
         }
@@ -193,7 +201,9 @@ impl Batch {
         let stepped = self.workers.step(&self.job).await;
         self.under_way = false;
         stepped?;
-        Ok(self.gather())
+        let stepped = self.gather();
+        self.job.tally.meter.times(self.size).observe(start.elapsed());
+        Ok(stepped)
     }
 
     /// Has a policy play. Without a new one, that of before goes on; without a new task, with what is left of its own.
@@ -245,9 +255,9 @@ impl Batch {
             let size = part.len();
             shards.push(Mutex::new(Shard::of(&self.settings, part, (first, size))));
         }
-        let permit = Arc::clone(&self.job.permit);
-        permit.give_back(slots.len());
-        self.job = job(spec, shards, self.n_workers, permit, self.size);
+        let owned = (Arc::clone(&self.job.permit), Arc::clone(&self.job.tally));
+        self.job.permit.give_back(slots.len());
+        self.job = job(spec, shards, self.n_workers, owned, self.size);
         Ok(())
     }
 
@@ -313,7 +323,7 @@ impl Batch {
 
     /// Where a slot draws from, and how far it is.
     pub fn draw(&self, slot: usize) -> Draw {
-        lock(&self.job.shards[slot / self.shard_size]).draws().nth(slot % self.shard_size).expect("a slot of the batch")
+        lock(&self.job.shards[slot / self.shard_size]).draw(slot)
     }
 
     /// Tells where its environments drew from, and how far they came, in order of slots, when they are freed.
@@ -490,10 +500,10 @@ fn job(
     spec: &EnvironmentSpec,
     shards: Vec<Mutex<Shard>>,
     workers: usize,
-    permit: Arc<Permit>,
+    owned: (Arc<Permit>, Arc<Tally>),
     size: usize,
 ) -> Arc<Job> {
-    Arc::new(Job::new(shards, workers, permit, spec.step_cost * size as f64))
+    Arc::new(Job::new(shards, workers, owned, spec.step_cost * size as f64))
 }
 
 /// Cuts groups into parts of `size` slots, the last of which may have fewer.

@@ -166,6 +166,11 @@ impl Shard {
         &self.slots[slot - self.first_slot].settings().distributions
     }
 
+    /// Where a slot of the batch draws from.
+    pub(super) fn draw(&self, slot: usize) -> Draw {
+        self.slots[slot - self.first_slot].draw()
+    }
+
     /// Where each environment draws from.
     pub(super) fn draws(&self) -> impl Iterator<Item = Draw> {
         self.slots.iter().map(Episodes::draw)
@@ -176,8 +181,8 @@ impl Shard {
         self.slots[slot - self.first_slot].scene()
     }
 
-    /// Carries out the command.
-    pub(super) fn run(&mut self) {
+    /// Carries out the command. Returns how many environments took a step, and how many episodes ended.
+    pub(super) fn run(&mut self) -> (usize, usize) {
         self.ended.clear();
         self.started.clear();
         self.ended_told.clear();
@@ -185,8 +190,9 @@ impl Shard {
         self.final_observations.clear();
         self.snapshots.clear();
         self.failure = None;
+        let mut steps = 0;
         match std::mem::replace(&mut self.command, Command::Step) {
-            Command::Step => self.step(),
+            Command::Step => steps = self.step(),
             Command::Open => self.open(),
             Command::Reset(resets) => resets.iter().for_each(|reset| self.reset(reset)),
             Command::ResetAll => (0..self.size).for_each(|slot| self.reset(&SlotReset::next(slot))),
@@ -194,6 +200,7 @@ impl Shard {
             Command::Restore(entries) => self.restore(&entries),
             Command::RollBack => self.roll_back(),
         }
+        (steps, self.ended.len())
     }
 
     fn open(&mut self) {
@@ -220,8 +227,9 @@ impl Shard {
         }
     }
 
-    fn step(&mut self) {
-        let n_terms = self.terms.len();
+    /// Returns how many environments took a step, and did not begin an episode instead.
+    fn step(&mut self) -> usize {
+        let (n_terms, mut steps) = (self.terms.len(), 0);
         for slot in 0..self.size {
             let episodes = &mut self.slots[slot];
             if episodes.ended() {
@@ -240,6 +248,7 @@ impl Shard {
                 ActionSpace::Continuous(a) => Action::Continuous(&self.vectors[slot * a.len()..][..a.len()]),
             };
             let outcome = episodes.step(action, &mut self.terms);
+            steps += 1;
             self.rewards[slot] = outcome.reward as f32;
             self.terminated[slot] = outcome.terminated.into();
             self.truncated[slot] = outcome.truncated.into();
@@ -251,6 +260,7 @@ impl Shard {
                 self.finish(slot);
             }
         }
+        steps
     }
 
     fn finish(&mut self, slot: usize) {

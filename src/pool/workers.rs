@@ -1,9 +1,12 @@
 //! The worker threads and their queue.
 
 use super::{Error, round::Round, shard::Shard};
-use crate::priority::lower;
+use crate::{
+    meters::{Histogram, Meter, Tally},
+    priority::lower,
+};
 use std::{
-    collections::VecDeque,
+    collections::{BTreeMap, VecDeque},
     io,
     ops::Range,
     panic::{AssertUnwindSafe, catch_unwind},
@@ -15,7 +18,7 @@ use std::{
     thread::{self, JoinHandle},
     time::Duration,
 };
-use tokio::sync::Notify;
+use tokio::{sync::Notify, time::Instant};
 
 /// How often an idle worker offers its core before it sleeps. A sleeping worker costs the next request a wake-up, which
 /// is more than a step of many small environments.
@@ -61,6 +64,9 @@ impl Pool {
             closing: AtomicBool::new(false),
             used: AtomicUsize::new(0),
             max_environments,
+            changed: Notify::new(),
+            meters: Mutex::default(),
+            waits: Histogram::default(),
         });
         let mut pool = Self { shared, threads: Vec::new() };
         for i in 0..workers.max(1) {
@@ -84,6 +90,31 @@ impl Pool {
     /// Environments in use.
     pub fn environments(&self) -> usize {
         self.shared.used.load(Ordering::Relaxed)
+    }
+
+    /// The most environments there may be.
+    pub fn limit(&self) -> usize {
+        self.shared.max_environments
+    }
+
+    /// Waits until the number of environments in use has changed since this was last waited for, by one caller.
+    pub async fn changed(&self) {
+        self.shared.changed.notified().await;
+    }
+
+    /// Where what happens in environments of this name is counted.
+    pub fn meter(&self, environment: &'static str) -> Arc<Meter> {
+        Arc::clone(lock(&self.shared.meters).entry(environment).or_default())
+    }
+
+    /// What happened in the environments of each kind that has a meter, by name.
+    pub fn meters(&self) -> BTreeMap<&'static str, Arc<Meter>> {
+        lock(&self.shared.meters).clone()
+    }
+
+    /// How long batches with something to do wait for a worker to take a part of it, each time.
+    pub fn waits(&self) -> &Histogram {
+        &self.shared.waits
     }
 
     pub(super) fn queue(&self) -> Arc<Shared> {
@@ -133,11 +164,16 @@ pub(super) struct Shared {
     closing: AtomicBool,
     used: AtomicUsize,
     max_environments: usize,
+    /// Told whenever `used` has changed.
+    changed: Notify,
+    meters: Mutex<BTreeMap<&'static str, Arc<Meter>>>,
+    waits: Histogram,
 }
 
 struct Queue {
-    /// Jobs with the number of their parts, shards or a round's beginning, that nobody has taken, which is never 0.
-    jobs: VecDeque<(Arc<Job>, usize)>,
+    /// Jobs with the number of their parts, shards or a round's beginning, that nobody has taken, which is never 0, and
+    /// since when they are at this place.
+    jobs: VecDeque<(Arc<Job>, usize, Instant)>,
     /// Workers that wait for `ready`.
     sleeping: usize,
     closed: bool,
@@ -149,9 +185,17 @@ impl Shared {
         let limit = self.max_environments;
         let fits = |used: usize| used.checked_add(requested).filter(|&sum| sum <= limit);
         match self.used.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits) {
-            Ok(_) => Ok(Permit { shared: Arc::clone(self), count: AtomicUsize::new(requested) }),
+            Ok(_) => {
+                self.changed.notify_one();
+                Ok(Permit { shared: Arc::clone(self), count: AtomicUsize::new(requested) })
+            }
             Err(used) => Err(Error::Full { requested, used, limit }),
         }
+    }
+
+    fn give_back(&self, environments: usize) {
+        self.used.fetch_sub(environments, Ordering::Relaxed);
+        self.changed.notify_one();
     }
 
     /// Steps the environments of every shard: here if that is soon done, else as [`Shared::run`].
@@ -195,8 +239,9 @@ impl Shared {
 
     /// Puts a job of so many parts at the queue's tail, and wakes no more than `helpers` workers for them.
     fn push(&self, job: &Arc<Job>, parts: usize, helpers: usize) {
+        let now = Instant::now();
         let mut queue = lock(&self.queue);
-        queue.jobs.push_back((Arc::clone(job), parts));
+        queue.jobs.push_back((Arc::clone(job), parts, now));
         self.waiting.store(queue.jobs.len(), Ordering::Release);
         let sleeping = queue.sleeping;
         drop(queue);
@@ -219,9 +264,11 @@ impl Shared {
         }
         let mut queue = lock(&self.queue);
         loop {
-            if let Some((job, parts)) = queue.jobs.pop_front() {
+            if let Some((job, parts, since)) = queue.jobs.pop_front() {
+                let now = Instant::now();
+                self.waits.observe(now - since);
                 if parts > 1 {
-                    queue.jobs.push_back((Arc::clone(&job), parts - 1));
+                    queue.jobs.push_back((Arc::clone(&job), parts - 1, now));
                 }
                 self.waiting.store(queue.jobs.len(), Ordering::Release);
                 return Some(job);
@@ -290,11 +337,17 @@ pub(super) struct Job {
     /// How often the session looks whether a request is done before it sleeps until then.
     patience: usize,
     pub(super) permit: Arc<Permit>,
+    pub(super) tally: Arc<Tally>,
 }
 
 impl Job {
     /// A job of these shards for so many workers. One that takes about `cost` µs and is short is worth waiting for awake.
-    pub(super) fn new(shards: Vec<Mutex<Shard>>, workers: usize, permit: Arc<Permit>, cost: f64) -> Self {
+    pub(super) fn new(
+        shards: Vec<Mutex<Shard>>,
+        workers: usize,
+        (permit, tally): (Arc<Permit>, Arc<Tally>),
+        cost: f64,
+    ) -> Self {
         let bound = |worker: usize| worker * shards.len() / workers;
         let range = |worker: usize| (bound(worker)..bound(worker + 1), AtomicUsize::new(0));
         Self {
@@ -310,6 +363,7 @@ impl Job {
             is_tiny: cost <= TINY,
             patience: if cost <= SHORT { POLLS } else { 0 },
             permit,
+            tally,
         }
     }
 
@@ -387,9 +441,12 @@ impl Job {
     fn run(&self, index: usize) -> bool {
         if !self.abandoned.load(Ordering::Relaxed) {
             let run = AssertUnwindSafe(|| lock(&self.shards[index]).run());
-            if catch_unwind(run).is_err() {
-                tracing::error!(shard = index, "a worker panicked; the batch is lost");
-                self.failed.store(true, Ordering::Relaxed);
+            match catch_unwind(run) {
+                Ok((steps, episodes)) => self.tally.add(steps, episodes),
+                Err(_) => {
+                    tracing::error!(shard = index, "a worker panicked; the batch is lost");
+                    self.failed.store(true, Ordering::Relaxed);
+                }
             }
         }
         // Release: who sees 0 sees what every shard wrote.
@@ -407,13 +464,13 @@ impl Permit {
     /// Gives back so many environments, which must not be more than there are.
     pub(super) fn give_back(&self, count: usize) {
         self.count.fetch_sub(count, Ordering::Relaxed);
-        self.shared.used.fetch_sub(count, Ordering::Relaxed);
+        self.shared.give_back(count);
     }
 }
 
 impl Drop for Permit {
     fn drop(&mut self) {
-        self.shared.used.fetch_sub(*self.count.get_mut(), Ordering::Relaxed);
+        self.shared.give_back(*self.count.get_mut());
     }
 }
 

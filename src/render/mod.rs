@@ -12,7 +12,7 @@ mod canvas;
 mod model;
 mod turns;
 
-use crate::{priority::lower, scene::Scene};
+use crate::{meters::Histogram, priority::lower, scene::Scene};
 use bytes::Bytes;
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
@@ -20,7 +20,7 @@ use std::{
     thread::{self, JoinHandle},
     time::Duration,
 };
-use tokio::sync::oneshot;
+use tokio::{sync::oneshot, time::Instant};
 use turns::Turns;
 
 /// The thread's niceness. Its driver's threads inherit it: physics comes first.
@@ -73,6 +73,7 @@ pub enum Error {
 #[derive(Default)]
 pub struct Renderer {
     thread: Mutex<Option<DrawingThread>>,
+    times: Arc<Histogram>,
 }
 
 /// The thread, and what waits for it.
@@ -91,6 +92,11 @@ impl Renderer {
     /// A renderer whose thread has not started.
     pub fn new() -> Self {
         Self::default()
+    }
+
+    /// How long each picture was drawn.
+    pub fn times(&self) -> Arc<Histogram> {
+        Arc::clone(&self.times)
     }
 
     /// A picture, `[height, width, 3]`: red, green, blue, the uppermost row first. Pictures are drawn one after the
@@ -112,10 +118,10 @@ impl Renderer {
             return Ok(Arc::clone(&thread.jobs));
         }
         let jobs = Arc::new(Turns::new());
-        let own = Arc::clone(&jobs);
+        let (own, times) = (Arc::clone(&jobs), self.times());
         let handle = thread::Builder::new()
             .name("render".into())
-            .spawn(move || work(&own))
+            .spawn(move || work(&own, &times))
             .map_err(|error| Error::NoThread { reason: error.to_string() })?;
         *running = Some(DrawingThread { jobs: Arc::clone(&jobs), handle });
         Ok(jobs)
@@ -139,17 +145,21 @@ impl Drop for Renderer {
 }
 
 /// The thread: draws what is asked for until nobody can ask any more.
-fn work(jobs: &Turns<Job>) {
+fn work(jobs: &Turns<Job>, times: &Histogram) {
     lower(NICENESS);
     let mut cache = Cache::default();
     while let Some(Job { scene, size, reply }) = jobs.pop() {
         if reply.is_closed() {
             continue; // its session is gone
         }
+        let start = Instant::now();
         let drawn = catch_unwind(AssertUnwindSafe(|| cache.draw(&scene, size))).unwrap_or_else(|_| {
             tracing::error!(?scene, "a drawing panicked");
             Err(Error::Defect)
         });
+        if drawn.is_ok() {
+            times.observe(start.elapsed());
+        }
         if matches!(drawn, Err(Error::Failed { .. } | Error::Defect)) {
             cache = Cache::default(); // what a failed drawing leaves behind is not to be trusted
         }

@@ -22,6 +22,16 @@ impl Budget {
         Self(Arc::new(State { used: AtomicUsize::new(0), limit }))
     }
 
+    /// Bytes in flight.
+    pub fn used(&self) -> usize {
+        self.0.used.load(Ordering::Relaxed)
+    }
+
+    /// The most there may be.
+    pub fn limit(&self) -> usize {
+        self.0.limit
+    }
+
     /// Nothing yet, to be grown.
     pub fn nothing(&self) -> Share {
         Share { budget: self.clone(), bytes: 0 }

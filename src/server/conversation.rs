@@ -2,15 +2,18 @@
 //! end or the server's.
 
 use super::{
+    access::{About, Access, Ended},
     drain::{Drain, Phase},
     fields::{Decoder, Field},
-    frames::{Allowance, Frames, Message},
+    frames::{Allowance, Frames, Message, Stop},
     peers::{Full, Place, Places},
+    refusals::{self, Refusals},
     status::Refusal,
     tokens::{Bearer, Held, Token},
 };
 use futures_util::{Stream, stream};
-use std::{future::Future, pin::Pin, time::Duration};
+use std::{future::Future, pin::Pin, sync::atomic::Ordering, time::Duration};
+use tokio::time::Instant;
 use tonic::Status;
 
 /// The most bytes of a request before a session is open: enough for thousands of groups, and little enough that all
@@ -28,6 +31,8 @@ pub trait Dialogue: Send + 'static {
     type Response: Send + 'static;
     /// The parts of a request that are counted before it is decoded.
     const FIELDS: &'static [Field];
+    /// What the protocol is called.
+    const PROTOCOL: &'static str;
 
     /// What the client may send now.
     fn allowance(&self) -> Allowance;
@@ -35,11 +40,17 @@ pub trait Dialogue: Send + 'static {
     /// Whether it holds something that a shutdown should wait for.
     fn is_open(&self) -> bool;
 
-    /// Answers a request.
-    fn answer(&mut self, request: Self::Request) -> impl Future<Output = Self::Response> + Send;
+    /// What has come of it so far.
+    fn about(&self) -> About;
 
-    /// Answers a request that is not decoded.
-    fn refuse(&self, refusal: Refusal) -> Self::Response;
+    /// Answers a request.
+    fn answer(&mut self, request: Self::Request) -> impl Future<Output = Result<Self::Response, Refusal>> + Send;
+
+    /// Takes note of a request that was refused before it was decoded.
+    fn undecoded(&self, _refusal: &Refusal) {}
+
+    /// The answer to a request that is refused.
+    fn refusal(refusal: Refusal) -> Self::Response;
 }
 
 /// What all sessions of the server are subject to: their number, how long they may be silent, and the shutdown.
@@ -49,6 +60,8 @@ pub struct Sessions {
     limits: Limits,
     decoder: Decoder,
     drain: Drain,
+    refusals: Refusals,
+    access: Access,
 }
 
 /// What a session may do.
@@ -63,9 +76,9 @@ pub struct Limits {
 }
 
 impl Sessions {
-    /// Sessions for which there are these places.
-    pub fn new(places: Places, limits: Limits, drain: Drain) -> Self {
-        Self { places, limits, decoder: Decoder::default(), drain }
+    /// Sessions for which there are these places. What is refused and how they end is counted.
+    pub fn new(places: Places, limits: Limits, drain: Drain, refusals: Refusals, access: Access) -> Self {
+        Self { places, limits, decoder: Decoder::default(), drain, refusals, access }
     }
 
     /// How far the shutdown is.
@@ -78,17 +91,11 @@ impl Sessions {
     /// # Errors
     /// If the server is shutting down or has no room for another session, or its token may have no more.
     pub fn begin<D: Dialogue>(&self, requests: Frames, dialogue: D) -> Result<Responses<D::Response>, Status> {
-        if self.phase() != Phase::Running {
-            return Err(Refusal::Draining.into());
-        }
-        let place = self.places.take(requests.connection.as_ref().map(|connection| connection.peer));
-        let place = place.map_err(|full| match full {
-            Full::All(limit) => Refusal::TooManySessions { limit },
-            Full::Peer(limit) => Refusal::TooManyOfAPeer { limit },
-        })?;
-        let held = requests.bearer.as_ref().map(Token::session).transpose()?;
+        let admitted = self.admit(&requests);
+        let _places = admitted.inspect_err(|refusal| self.refusals.count(refusal, requests.bearer.as_ref()))?;
         let sessions = Self { drain: self.drain.enter(), ..self.clone() };
-        let conversation = Conversation { requests, dialogue, sessions, _place: place, _held: held };
+        let (start, ending) = (Instant::now(), GONE);
+        let conversation = Conversation { requests, dialogue, sessions, start, spent: 0, ending, _places };
         // Polled by the connection: when the client is gone the stream is dropped, and what the dialogue holds with it.
         let responses = stream::unfold(Some(conversation), |conversation| async {
             let mut conversation = conversation?;
@@ -99,7 +106,26 @@ impl Sessions {
         });
         Ok(Box::pin(responses))
     }
+
+    fn admit(&self, requests: &Frames) -> Result<(Place, Option<Held>), Refusal> {
+        if self.phase() != Phase::Running {
+            return Err(Refusal::Draining);
+        }
+        let place = self.places.take(requests.connection.as_ref().map(|connection| connection.peer));
+        let place = place.map_err(|full| match full {
+            Full::All(limit) => Refusal::TooManySessions { limit },
+            Full::Peer(limit) => Refusal::TooManyOfAPeer { limit },
+        })?;
+        Ok((place, requests.bearer.as_ref().map(Token::session).transpose()?))
+    }
 }
+
+/// How a session ends whose client or connection is gone.
+const GONE: &str = "gone";
+/// One whose client has ended it.
+const CLOSED: &str = "closed";
+/// One whose requests were not to be understood.
+const BROKEN: &str = "broken";
 
 /// A dialogue and its transport.
 struct Conversation<D: Dialogue> {
@@ -107,49 +133,105 @@ struct Conversation<D: Dialogue> {
     dialogue: D,
     /// What this one is subject to; it counts as running as long as it holds this.
     sessions: Sessions,
-    _place: Place,
-    _held: Option<Held>,
+    start: Instant,
+    /// Its steps that its token was told of.
+    spent: u64,
+    ending: &'static str,
+    _places: (Place, Option<Held>),
 }
 
 impl<D: Dialogue> Conversation<D> {
     /// The next response; an error ends the stream, and so does the client's end.
     async fn next(&mut self) -> Option<Result<D::Response, Status>> {
+        let bearer = self.requests.bearer.clone();
+        let answer = self.answer(bearer.as_ref()).await;
+        self.spend();
+        match answer {
+            Ok(Some(Ok(response))) => Some(Ok(response)),
+            Ok(Some(Err(refusal))) => {
+                self.sessions.refusals.count(&refusal, bearer.as_ref());
+                Some(Ok(D::refusal(refusal)))
+            }
+            Ok(None) => {
+                self.ending = CLOSED;
+                None
+            }
+            Err(Stop::Refused(refusal)) => {
+                self.sessions.refusals.count(&refusal, bearer.as_ref());
+                self.ending = refusals::reason(&refusal);
+                Some(Err(refusal.into()))
+            }
+            Err(Stop::Broken(status)) => {
+                self.ending = BROKEN;
+                Some(Err(status))
+            }
+        }
+    }
+
+    /// The answer to the next request, none at the client's end.
+    async fn answer(&mut self, bearer: Option<&Bearer>) -> Result<Option<Result<D::Response, Refusal>>, Stop> {
         let Limits { bytes, handshake, idle } = self.sessions.limits;
         let mut allowance = self.dialogue.allowance();
         allowance.bytes = allowance.bytes.min(bytes);
         let limit =
             if self.dialogue.is_open() { idle } else { Some(idle.map_or(handshake, |idle| idle.min(handshake))) };
-        let bearer = self.requests.bearer.clone();
         let request = tokio::select! {
             biased; // the end comes first: a client that never pauses must not outlast it
-            () = self.sessions.drain.closed() => return Some(Err(Refusal::Draining.into())),
-            refusal = revoked(bearer.as_ref()) => return Some(Err(refusal.into())),
-            request = self.requests.next(allowance) => match request {
-                Ok(request) => request?,
-                Err(status) => return Some(Err(status)),
+            () = self.sessions.drain.closed() => return Err(Stop::Refused(Refusal::Draining)),
+            refusal = revoked(bearer) => return Err(Stop::Refused(refusal)),
+            request = self.requests.next(allowance) => match request? {
+                Some(request) => request,
+                None => return Ok(None),
             },
             () = silence(limit) => {
                 let seconds = limit.map_or(0, |limit| limit.as_secs());
-                return Some(Err(Refusal::Idle { seconds }.into()));
+                return Err(Stop::Refused(Refusal::Idle { seconds }));
             }
         };
         if self.sessions.phase() != Phase::Running && !self.dialogue.is_open() {
-            return Some(Err(Refusal::Draining.into()));
+            return Err(Stop::Refused(Refusal::Draining));
         }
         // Until it is answered its bytes are kept.
         let (request, _share) = match request {
             Message::Whole(bytes, share) => (bytes, share),
-            Message::Refused(refusal) => return Some(Ok(self.dialogue.refuse(refusal))),
+            Message::Refused(refusal) => return Ok(Some(self.undecoded(refusal))),
         };
-        match self.sessions.decoder.decode(request, D::FIELDS, allowance).await {
-            Ok(Ok(request)) => Some(tokio::select! {
+        match self.sessions.decoder.decode(request, D::FIELDS, allowance).await? {
+            Ok(request) => tokio::select! {
                 biased; // it mostly is there at once
-                response = self.dialogue.answer(request) => Ok(response),
-                refusal = revoked(bearer.as_ref()) => Err(refusal.into()),
-            }),
-            Ok(Err(refusal)) => Some(Ok(self.dialogue.refuse(refusal))),
-            Err(status) => Some(Err(status)),
+                response = self.dialogue.answer(request) => Ok(Some(response)),
+                refusal = revoked(bearer) => Err(Stop::Refused(refusal)),
+            },
+            Err(refusal) => Ok(Some(self.undecoded(refusal))),
         }
+    }
+
+    fn undecoded(&self, refusal: Refusal) -> Result<D::Response, Refusal> {
+        self.dialogue.undecoded(&refusal);
+        Err(refusal)
+    }
+
+    /// Tells its token of the steps that it was not told of.
+    fn spend(&mut self) {
+        if let Some(bearer) = &self.requests.bearer {
+            let steps = self.dialogue.about().steps;
+            bearer.spent().steps.fetch_add(steps.saturating_sub(self.spent), Ordering::Relaxed);
+            self.spent = steps;
+        }
+    }
+}
+
+impl<D: Dialogue> Drop for Conversation<D> {
+    fn drop(&mut self) {
+        self.spend();
+        self.sessions.access.ended(&Ended {
+            peer: self.requests.connection.as_ref().map(|connection| connection.peer),
+            token: self.requests.bearer.as_ref().map(|bearer| bearer.name()),
+            protocol: D::PROTOCOL,
+            about: self.dialogue.about(),
+            time: self.start.elapsed(),
+            ending: self.ending,
+        });
     }
 }
 

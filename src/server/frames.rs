@@ -146,6 +146,20 @@ pub enum Message {
     Refused(Refusal),
 }
 
+/// Why a stream ends before its client's end.
+pub enum Stop {
+    /// The server wants no more of it.
+    Refused(Refusal),
+    /// What came is not to be understood, or the server has a defect.
+    Broken(Status),
+}
+
+impl From<Status> for Stop {
+    fn from(status: Status) -> Self {
+        Self::Broken(status)
+    }
+}
+
 impl Frames {
     /// Those of a request whose body was kept.
     ///
@@ -166,8 +180,8 @@ impl Frames {
     /// nothing is lost.
     ///
     /// # Errors
-    /// A status that ends the stream: the message is too large, or never ends, or what came is not gRPC.
-    pub async fn next(&mut self, allowance: Allowance) -> Result<Option<Message>, Status> {
+    /// What ends the stream: the message is too large, or never ends, or what came is not gRPC.
+    pub async fn next(&mut self, allowance: Allowance) -> Result<Option<Message>, Stop> {
         loop {
             if self.message.is_none() && self.buffer.len() >= HEADER {
                 self.message = Some(self.begin(allowance)?);
@@ -182,34 +196,34 @@ impl Frames {
                     }
                 }
                 Some(Err(status)) if status.code() == Code::Cancelled => return Ok(None),
-                Some(Err(status)) => return Err(status),
+                Some(Err(status)) => return Err(status.into()),
                 None if self.buffer.is_empty() && self.message.is_none() => return Ok(None),
-                None => return Err(Status::internal("the stream ended within a message")),
+                None => return Err(Status::internal("the stream ended within a message").into()),
             }
         }
     }
 
     /// The next frame of HTTP's; within a message it must come in time.
-    async fn frame(&mut self) -> Result<Option<Result<http_body::Frame<Bytes>, Status>>, Status> {
+    async fn frame(&mut self) -> Result<Option<Result<http_body::Frame<Bytes>, Status>>, Stop> {
         let next = self.body.frame();
         match self.transit.limit.filter(|_| self.message.is_some()) {
             None => Ok(next.await),
             Some(limit) => tokio::time::timeout(limit, next)
                 .await
-                .map_err(|_| Refusal::Unfinished { seconds: limit.as_secs() }.into()),
+                .map_err(|_| Stop::Refused(Refusal::Unfinished { seconds: limit.as_secs() })),
         }
     }
 
     /// Reads a frame's header.
-    fn begin(&mut self, allowance: Allowance) -> Result<Begun, Status> {
+    fn begin(&mut self, allowance: Allowance) -> Result<Begun, Stop> {
         match self.buffer.get_u8() {
             0 => {}
-            1 => return Err(Status::internal("a message came compressed; send it as it is")),
-            flag => return Err(Status::internal(format!("a frame began with {flag}; expected 0: is it gRPC?"))),
+            1 => return Err(Status::internal("a message came compressed; send it as it is").into()),
+            flag => return Err(Status::internal(format!("a frame began with {flag}; expected 0: is it gRPC?")).into()),
         }
         let length = self.buffer.get_u32() as usize;
         if length > allowance.bytes {
-            return Err(Refusal::TooLarge { got: length, limit: allowance.bytes }.into());
+            return Err(Stop::Refused(Refusal::TooLarge { got: length, limit: allowance.bytes }));
         }
         Ok(Begun::Wanted(length))
     }

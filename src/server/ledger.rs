@@ -1,7 +1,7 @@
 //! Writes the ledger: what every token drew, before it draws it. See [`perturb_protocol::ledger`].
 
 use super::status::Refusal;
-use perturb_protocol::ledger::{Chain, Event, read};
+use perturb_protocol::ledger::{Chain, Event, LONGEST, read};
 use std::{
     fs::{File, OpenOptions},
     io::{self, Write},
@@ -38,11 +38,22 @@ impl Ledger {
         }
         file.try_lock().map_err(|_| io::Error::other("another server writes it"))?;
         let there = read(path, |_, _| {}).map_err(io::Error::other)?;
-        let mut book = Book { file, path: path.to_owned(), bytes: there.bytes, chain: there.chain, kept: Vec::new() };
-        book.file.set_len(there.bytes)?;
+        if there.chain.lines() == 0 && there.unfinished > 0 {
+            return Err(io::Error::other("that is no ledger, and not empty: give another name"));
+        }
+        let mut book = Book {
+            file,
+            path: path.to_owned(),
+            bytes: there.bytes,
+            chain: there.chain,
+            kept: Vec::new(),
+            is_torn: true,
+        };
         let (version, commit) = (env!("CARGO_PKG_VERSION").into(), env!("PERTURB_COMMIT").into());
         let began = Event::Began { version, commit, unfinished: there.unfinished };
         book.write([&began]).map_err(io::Error::other)?;
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        File::open(folder)?.sync_all()?; // the name of a new file, too
         let (lines, received) = channel();
         std::thread::Builder::new().name("ledger".into()).spawn(move || book.keep(&received))?;
         Ok(Self { lines, sessions: Arc::default() })
@@ -58,6 +69,16 @@ impl Ledger {
     /// # Errors
     /// [`Refusal::NoLedger`].
     pub async fn write(&self, event: Event) -> Result<(), Refusal> {
+        // What a session asks for is bounded, but numbers are longer as text.
+        let size = serde_json::to_vec(&event).map_or(usize::MAX, |json| json.len());
+        if size as u64 > LONGEST / 2 {
+            let got = format!("{size} bytes as a line of this server's ledger");
+            return Err(Refusal::value(
+                "what is to be drawn",
+                got,
+                format!("at most {}: ask for less at a time", LONGEST / 2),
+            ));
+        }
         let (done, written) = oneshot::channel();
         let _ = self.lines.send((event, Some(done))); // nobody is there only if the thread is gone, and then nobody answers
         let reason = match written.await {
@@ -87,6 +108,8 @@ struct Book {
     path: PathBuf,
     bytes: u64,
     chain: Chain,
+    /// Whether there may be more in the file.
+    is_torn: bool,
     /// What nobody waits for and could not be written yet.
     kept: Vec<Line>,
 }
@@ -102,6 +125,10 @@ impl Book {
             if let Err(reason) = &written {
                 tracing::error!("{} cannot be written: {reason}", self.path.display());
             }
+            if lines.iter().any(|(event, _)| matches!(event, Event::Ended)) {
+                let (lines, head) = (self.chain.lines(), self.chain.head());
+                tracing::info!(lines, head, "the ledger {}", self.path.display());
+            }
             for (event, done) in lines {
                 match done {
                     Some(done) => drop(done.send(written.clone())),
@@ -110,7 +137,6 @@ impl Book {
                 }
             }
         }
-        tracing::info!(lines = self.chain.lines(), head = self.chain.head(), "the ledger {}", self.path.display());
     }
 
     /// Writes lines and waits for the disk; all, or none.
@@ -121,9 +147,13 @@ impl Book {
         let mut chain = self.chain.clone();
         let lines: Result<String, _> = events.into_iter().map(|event| chain.add(event, unix_ms)).collect();
         let lines = lines.map_err(|error| error.to_string())?;
+        if self.is_torn {
+            self.file.set_len(self.bytes).map_err(|error| error.to_string())?;
+            self.is_torn = false;
+        }
         if let Err(error) = self.file.write_all(lines.as_bytes()).and_then(|()| self.file.sync_data()) {
             // What is there of them is no line.
-            let _ = self.file.set_len(self.bytes);
+            self.is_torn = self.file.set_len(self.bytes).is_err();
             return Err(error.to_string());
         }
         self.bytes += lines.len() as u64;

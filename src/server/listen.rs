@@ -143,26 +143,24 @@ pub fn unix_connections(
     })
 }
 
-/// Why an address cannot be had, and what to do.
-fn explain(address: &ListenAddress, error: &io::Error) -> String {
+/// Why an address cannot be had, and what to do about the flag that gives it.
+fn explain(address: &ListenAddress, flag: &str, error: &io::Error) -> String {
     let text = address.written();
     match (address, error.kind()) {
         (ListenAddress::Tcp(tcp), ErrorKind::AddrInUse) => {
             let free = ListenAddress::Tcp(std::net::SocketAddr::new(tcp.ip(), 0)).written();
-            format!("cannot listen at {text}: another program does; end it, or take a free port with --listen {free}")
+            format!("cannot listen at {text}: another program does; end it, or take a free port with {flag} {free}")
         }
         (_, ErrorKind::AddrInUse) => {
-            format!(
-                "cannot listen at {text}: another program does, or the file is no socket; give --listen another path"
-            )
+            format!("cannot listen at {text}: another program does, or the file is no socket; give {flag} another path")
         }
         (_, ErrorKind::AddrNotAvailable) => {
-            format!("cannot listen at {text}: it is no address of this machine; --listen tcp://0.0.0.0:PORT means all")
+            format!("cannot listen at {text}: it is no address of this machine; {flag} tcp://0.0.0.0:PORT means all")
         }
         (_, ErrorKind::NotFound) => {
-            format!("cannot listen at {text}: its folder is not there; create it, or correct --listen")
+            format!("cannot listen at {text}: its folder is not there; create it, or correct {flag}")
         }
-        _ => format!("cannot listen at {text}: {error}; correct --listen"),
+        _ => format!("cannot listen at {text}: {error}; correct {flag}"),
     }
 }
 
@@ -200,7 +198,15 @@ impl Listener {
     /// # Errors
     /// If the address is in use or may not be bound; the message names it.
     pub async fn bind(address: &ListenAddress, mode: SocketMode) -> io::Result<Self> {
-        let explain = |error: io::Error| io::Error::new(error.kind(), explain(address, &error));
+        Self::bind_as(address, "--listen", mode).await
+    }
+
+    /// The same of an address that another flag gives.
+    ///
+    /// # Errors
+    /// As [`Listener::bind`].
+    pub async fn bind_as(address: &ListenAddress, flag: &str, mode: SocketMode) -> io::Result<Self> {
+        let explain = |error: io::Error| io::Error::new(error.kind(), explain(address, flag, &error));
         match address {
             ListenAddress::Tcp(tcp) => Ok(Self::Tcp(TcpListener::bind(tcp).await.map_err(explain)?)),
             ListenAddress::Unix(path) => {

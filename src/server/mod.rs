@@ -11,10 +11,12 @@
 //! - [`session`]: the legal order of a session's requests.
 //! - [`convert`]: the protocol to the domain and back, with all validation; [`acting`]: that of policies.
 //! - [`status`]: every refusal, and its gRPC code.
+//! - [`metrics`]: what the server says of itself; [`access`], [`refusals`] and [`fullness`] what it counts and tells for that.
 //! - [`dm_env_rpc`]: the same environments by DeepMind's protocol.
 //! - [`listen`] and [`drain`]: how it begins and how it ends.
 //! - [`probe`]: asking another process's server for its health.
 
+pub mod access;
 pub mod acting;
 pub mod budget;
 pub mod conversation;
@@ -24,11 +26,14 @@ pub mod drain;
 pub mod draws;
 pub mod fields;
 pub mod frames;
+pub mod fullness;
 pub mod guards;
 pub mod ledger;
 pub mod listen;
+pub mod metrics;
 pub mod peers;
 pub mod probe;
+pub mod refusals;
 pub mod replies;
 pub mod requests;
 pub mod service;
@@ -42,17 +47,21 @@ pub mod watch;
 use crate::{
     config::Config,
     env::{self, Catalogue},
+    meters::Histogram,
     pool::Pool,
     proto::{self, dm_env_rpc::v1::environment_server::EnvironmentServer, perturb_server::PerturbServer},
     render::Renderer,
 };
+use access::Access;
 use budget::Budget;
 use conversation::{Limits, Sessions};
 use drain::{Controller, Phase};
 use frames::{Keeping, Transit};
 use guards::Guards;
 use listen::{Admission, Listener};
+use metrics::Sources;
 use peers::Places;
+use refusals::Refusals;
 use service::Service;
 use session::Shared;
 use std::{future::Future, io, sync::Arc, time::Duration};
@@ -91,7 +100,7 @@ pub enum Error {
     Reflection(#[from] tonic_reflection::server::Error),
 }
 
-/// Serves these environments on the listeners, to whom the guards let in, until `shutdown` resolves; then drains: new
+/// Serves these environments on the listeners, to whom the guards let in, and metrics on another, if there is one, until `shutdown` resolves; then drains: new
 /// sessions are refused, running ones may go on for the grace period, and connections are closed. Must run on a tokio
 /// runtime; a current-thread one is fastest.
 ///
@@ -99,6 +108,7 @@ pub enum Error {
 /// [`Error`], before anything is served, or when a listener fails.
 pub async fn run(
     listeners: Vec<Listener>,
+    metrics: Option<Listener>,
     config: &Config,
     guards: &Guards,
     catalogue: Catalogue,
@@ -107,24 +117,43 @@ pub async fn run(
     let listing = listing(&catalogue, config)?;
     let catalogue = Arc::new(catalogue);
     let pool = Arc::new(Pool::new(config.workers, config.max_envs)?);
+    // Told from the beginning: who watches a rate needs its zero.
+    catalogue.names().for_each(|name| _ = pool.meter(name));
     let (controller, drain) = Controller::new();
     let idle = (config.idle_seconds > 0).then(|| Duration::from_secs(config.idle_seconds));
     let handshake = Duration::from_secs(config.handshake_seconds);
     let limits = Limits { bytes: config.max_message_bytes, handshake, idle };
     let of_a_peer = if config.max_peer_sessions > 0 { config.max_peer_sessions } else { usize::MAX };
-    let sessions = Sessions::new(Places::new(config.max_sessions, of_a_peer), limits, drain.clone());
+    let (refusals, access) = (Refusals::default(), Access::default());
+    let places = Places::new(config.max_sessions, of_a_peer);
+    let sessions = Sessions::new(places.clone(), limits, drain.clone(), refusals.clone(), access.clone());
     let admission = Admission { places: Places::new(usize::MAX, of_a_peer.saturating_add(OTHER_STREAMS)), handshake };
     let stall = (config.stall_seconds > 0).then(|| Duration::from_secs(config.stall_seconds));
     let transit = Transit { budget: Budget::new(config.max_memory), limit: stall };
+    let renderer = Renderer::new();
     let worlds = dm_env_rpc::service::Service::new(
         Arc::clone(&pool),
         Arc::clone(&catalogue),
         sessions.clone(),
         guards.ledger.clone(),
     );
+    let pictures = renderer.times();
     let ledger = guards.ledger.clone();
-    let service = Service::new(Shared { pool, catalogue, listing, renderer: Renderer::new(), ledger }, sessions);
-    let counts = [("perturb.v1", service.counts()), ("dm_env_rpc.v1", worlds.counts())];
+    let shared = Shared { pool: Arc::clone(&pool), catalogue, listing, renderer, ledger };
+    let service = Service::new(shared, sessions);
+    let requests = [("perturb.v1", service.counts()), ("dm_env_rpc.v1", worlds.counts())];
+    let sources = Arc::new(Sources {
+        pool: Arc::clone(&pool),
+        sessions: places.clone(),
+        connections: admission.places.clone(),
+        budget: transit.budget.clone(),
+        requests,
+        refusals: refusals.clone(),
+        access,
+        tokens: guards.tokens.clone(),
+        pictures,
+        lag: Histogram::default(),
+    });
     let worlds = EnvironmentServer::new(worlds).max_encoding_message_size(usize::MAX);
     let worlds = Keeping::new(worlds, "/dm_env_rpc.v1.Environment/Process", transit.clone());
     let service = PerturbServer::new(service)
@@ -148,13 +177,28 @@ pub async fn run(
         .initial_connection_window_size(CONNECTION_WINDOW)
         .max_concurrent_streams(u32::try_from(config.max_sessions.saturating_add(OTHER_STREAMS)).unwrap_or(u32::MAX))
         .timeout(UNARY_LIMIT) // until an answer begins, which that of a stream does at once
-        .add_service(Gated::new(service, tokens()))
-        .add_service(Gated::new(worlds, tokens()))
+        .add_service(Gated::new(service, tokens(), refusals.clone()))
+        .add_service(Gated::new(worlds, tokens(), refusals.clone()))
         // Health is for everybody: whoever watches over servers need not be able to use them.
         .add_service(health_service.max_decoding_message_size(UNARY_BYTES))
-        .add_service(Gated::new(reflection().build_v1()?.max_decoding_message_size(UNARY_BYTES), tokens()))
-        .add_service(Gated::new(reflection().build_v1alpha()?.max_decoding_message_size(UNARY_BYTES), tokens()));
+        .add_service(Gated::new(
+            reflection().build_v1()?.max_decoding_message_size(UNARY_BYTES),
+            tokens(),
+            refusals.clone(),
+        ))
+        .add_service(Gated::new(
+            reflection().build_v1alpha()?.max_decoding_message_size(UNARY_BYTES),
+            tokens(),
+            refusals.clone(),
+        ));
 
+    // They end with this function.
+    let mut watching = tokio::task::JoinSet::new();
+    if let Some(listener) = metrics {
+        let watched = Arc::clone(&sources);
+        watching.spawn(async move { watched.watch_lag().await });
+        watching.spawn(metrics::endpoint::serve(listener, Arc::clone(&sources)));
+    }
     let mut servers = tokio::task::JoinSet::new();
     for listener in listeners {
         let (router, mut closed, admission, tls) =
@@ -176,6 +220,7 @@ pub async fn run(
     }
     tokio::select! {
         () = shutdown => {}
+        () = fullness::watch(&health, &places, &pool) => {}
         // A listener ends by itself only if it fails.
         Some(ended) = servers.join_next() => return Ok(ended.map_err(io::Error::other)??),
     }
@@ -184,12 +229,13 @@ pub async fn run(
     controller.set(Phase::Draining);
     health.set_not_serving::<PerturbServer<Service>>().await;
     health.set_not_serving::<EnvironmentServer<dm_env_rpc::service::Service>>().await;
+    health.set_service_status(fullness::NEW_SESSIONS, ServingStatus::NotServing).await;
     health.set_service_status("", ServingStatus::NotServing).await;
     if tokio::time::timeout(config.grace(), controller.idle()).await.is_err() {
         tracing::warn!("the grace period is over: ending the sessions that still run");
     }
     controller.set(Phase::Closed);
-    for (protocol, counts) in counts {
+    for (protocol, counts) in &sources.requests {
         tracing::info!(protocol, "requests: {counts}");
     }
     let farewell = async { while servers.join_next().await.is_some() {} };

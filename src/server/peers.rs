@@ -3,6 +3,7 @@
 use futures_util::task::AtomicWaker;
 use std::{
     collections::BTreeMap,
+    fmt,
     future::Future,
     io::{self, ErrorKind, IoSlice},
     net::{IpAddr, Ipv6Addr},
@@ -16,6 +17,7 @@ use std::{
 };
 use tokio::{
     io::{AsyncRead, AsyncWrite, ReadBuf},
+    sync::Notify,
     time::{Sleep, sleep},
 };
 use tonic::transport::server::Connected;
@@ -42,6 +44,16 @@ impl Peer {
     }
 }
 
+impl fmt::Display for Peer {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Machine(address) => address.fmt(f),
+            Self::User(Some(user)) => write!(f, "user {user}"),
+            Self::User(None) => f.write_str("a user"),
+        }
+    }
+}
+
 /// Places, of which there are so many in all and for each peer.
 #[derive(Clone)]
 pub struct Places(Arc<State>);
@@ -50,6 +62,8 @@ struct State {
     all: usize,
     each: usize,
     taken: Mutex<(usize, BTreeMap<Peer, usize>)>,
+    /// Told whenever `taken` has changed.
+    changed: Notify,
 }
 
 /// Why there is no place.
@@ -70,7 +84,7 @@ pub struct Place {
 impl Places {
     /// So many in all, and for each peer.
     pub fn new(all: usize, each: usize) -> Self {
-        Self(Arc::new(State { all, each, taken: Mutex::default() }))
+        Self(Arc::new(State { all, each, taken: Mutex::default(), changed: Notify::new() }))
     }
 
     /// A place for a peer. One that is not known has no quota of its own.
@@ -91,7 +105,23 @@ impl Places {
             *its += 1;
         }
         *all += 1;
+        self.0.changed.notify_one();
         Ok(Place { places: self.clone(), peer })
+    }
+
+    /// How many are taken.
+    pub fn taken(&self) -> usize {
+        self.lock().0
+    }
+
+    /// How many there are.
+    pub fn limit(&self) -> usize {
+        self.0.all
+    }
+
+    /// Waits until some were taken or given back since this was last waited for, by one caller.
+    pub async fn changed(&self) {
+        self.0.changed.notified().await;
     }
 
     fn lock(&self) -> MutexGuard<'_, (usize, BTreeMap<Peer, usize>)> {
@@ -104,6 +134,7 @@ impl Drop for Place {
         let mut taken = self.places.lock();
         let (all, by_peer) = &mut *taken;
         *all -= 1;
+        self.places.0.changed.notify_one();
         if let Some(peer) = self.peer
             && let Some(its) = by_peer.get_mut(&peer)
         {

@@ -1,6 +1,6 @@
 //! Spans and counts of requests: a layer around the dialogues of both protocols.
 
-use super::{conversation::Dialogue, fields::Field, frames::Allowance, status::Refusal};
+use super::{access::About, conversation::Dialogue, fields::Field, frames::Allowance, status::Refusal};
 use std::{
     fmt,
     sync::{
@@ -17,9 +17,6 @@ pub trait Observed: Dialogue {
 
     /// Which of the kinds it is.
     fn kind(request: &Self::Request) -> &'static str;
-
-    /// Why the request was refused, if it was.
-    fn refusal(response: &Self::Response) -> Option<&str>;
 }
 
 /// Requests of one kind since the server began.
@@ -70,9 +67,9 @@ impl<D: Observed> Counted<D> {
 }
 
 impl<D: Observed> Counted<D> {
-    fn count(&self, kind: &str, refusal: Option<&str>) {
+    fn count(&self, kind: &str, refusal: Option<&Refusal>) {
         if let Some(refusal) = refusal {
-            tracing::debug!(refusal, "refused");
+            tracing::debug!(refusal = refusal.to_string(), "refused");
         }
         if let Some((_, count)) = self.counts.iter().find(|(known, _)| *known == kind) {
             count.answered.fetch_add(1, Ordering::Relaxed);
@@ -85,6 +82,7 @@ impl<D: Observed> Dialogue for Counted<D> {
     type Request = D::Request;
     type Response = D::Response;
     const FIELDS: &'static [Field] = D::FIELDS;
+    const PROTOCOL: &'static str = D::PROTOCOL;
 
     fn allowance(&self) -> Allowance {
         self.dialogue.allowance()
@@ -94,16 +92,23 @@ impl<D: Observed> Dialogue for Counted<D> {
         self.dialogue.is_open()
     }
 
-    async fn answer(&mut self, request: Self::Request) -> Self::Response {
+    fn about(&self) -> About {
+        self.dialogue.about()
+    }
+
+    async fn answer(&mut self, request: Self::Request) -> Result<Self::Response, Refusal> {
         let kind = D::kind(&request);
         let span = tracing::debug_span!("request", kind);
         let response = self.dialogue.answer(request).instrument(span.clone()).await;
-        span.in_scope(|| self.count(kind, D::refusal(&response)));
+        span.in_scope(|| self.count(kind, response.as_ref().err()));
         response
     }
 
-    fn refuse(&self, refusal: Refusal) -> Self::Response {
-        self.count("unknown", Some(&refusal.to_string()));
-        self.dialogue.refuse(refusal)
+    fn undecoded(&self, refusal: &Refusal) {
+        self.count("unknown", Some(refusal));
+    }
+
+    fn refusal(refusal: Refusal) -> Self::Response {
+        D::refusal(refusal)
     }
 }

@@ -1,6 +1,7 @@
 //! One session: the legal order of its requests, each answered once.
 
 use super::{
+    access::About,
     acting,
     budget::{Budget, Outbox, Share},
     conversation::{Dialogue, MOST_BYTES_BEFORE_OPEN},
@@ -77,8 +78,9 @@ impl Session {
         // More than there can be is for the pool to refuse.
         let kept = (envs <= most).then(|| self.budget.take(sizes::session(&settings, envs))).transpose()?;
         let held = self.bearer.as_ref().map(|bearer| bearer.envs(envs)).transpose()?;
-        self.draws.open(&settings).await?;
-        let (mut batch, observations, started) = Batch::open(&self.shared.pool, settings).await?;
+        let (begun, spec) = (self.draws.open(&settings).await?, settings.spec);
+        let opened = Batch::open(&self.shared.pool, settings).await;
+        let (mut batch, observations, started) = opened.inspect_err(|_| self.draws.not_opened(spec, begun))?;
         self.draws.follow(&mut batch);
         (self.batch, self.kept, self.held) = (Some(batch), kept, held);
         let started = convert::started(started);
@@ -125,8 +127,15 @@ impl Session {
     async fn restore(&mut self, request: proto::Restore) -> Result<proto::Restored, Refusal> {
         let batch = self.batch.as_mut().ok_or(Refusal::NotOpen { request: "restore" })?;
         let entries = convert::restore(batch.size(), request)?;
-        self.draws.restore(batch, &entries).await?;
-        let observations = batch.restore(entries).await?;
+        let begun = self.draws.restore(batch, &entries).await?;
+        let slots: Vec<usize> = entries.iter().map(|(slot, _)| *slot).collect();
+        let observations = match batch.restore(entries).await {
+            Ok(observations) => observations,
+            Err(error) => {
+                self.draws.not_restored(batch, &slots, begun);
+                return Err(error.into());
+            }
+        };
         self.playing = None;
         Ok(proto::Restored { observations })
     }
@@ -177,6 +186,7 @@ impl Dialogue for Session {
     type Request = proto::SessionRequest;
     type Response = proto::SessionResponse;
     const FIELDS: &'static [Field] = fields::SESSION_REQUEST;
+    const PROTOCOL: &'static str = "perturb.v1";
 
     fn allowance(&self) -> Allowance {
         match &self.batch {
@@ -196,7 +206,15 @@ impl Dialogue for Session {
         self.batch.is_some()
     }
 
-    async fn answer(&mut self, request: Self::Request) -> Self::Response {
+    fn about(&self) -> About {
+        self.batch.as_ref().map_or_else(About::default, |batch| About {
+            environment: Some(batch.settings().spec.name),
+            envs: batch.settings().size(),
+            steps: batch.steps(),
+        })
+    }
+
+    async fn answer(&mut self, request: Self::Request) -> Result<Self::Response, Refusal> {
         let response = match request.request {
             Some(Request::Open(open)) => self.open(open).await.map(Response::Opened),
             Some(Request::Step(step)) => self.step(step).await.map(Response::Stepped),
@@ -209,11 +227,10 @@ impl Dialogue for Session {
             Some(Request::SavePlayer(_)) => self.save_player().map(Response::SavePlayer),
             None => Err(Refusal::value("request", "empty or of a kind this server does not know", "open, step, …")),
         };
-        response
-            .map_or_else(|refusal| self.refuse(refusal), |response| proto::SessionResponse { response: Some(response) })
+        response.map(|response| proto::SessionResponse { response: Some(response) })
     }
 
-    fn refuse(&self, refusal: Refusal) -> Self::Response {
+    fn refusal(refusal: Refusal) -> Self::Response {
         proto::SessionResponse { response: Some(Response::Error(refusal.into())) }
     }
 }
@@ -234,13 +251,6 @@ impl Observed for Session {
             Some(Request::Act(_)) => "act",
             Some(Request::SavePlayer(_)) => "save_player",
             None => "unknown",
-        }
-    }
-
-    fn refusal(response: &Self::Response) -> Option<&str> {
-        match &response.response {
-            Some(Response::Error(error)) => Some(&error.message),
-            _ => None,
         }
     }
 }

@@ -3,12 +3,12 @@
 //! Who trained is known by tokens: the names under which the training's seed was drawn. Whatever these drew before the
 //! training's end may have been learned from, in whichever session.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use perturb_protocol::ledger::{Begin, Draws, End, Entry, Event, Who, read};
+use perturb_protocol::ledger::{Begin, Draws, End, Entry, Event, Read, Who, read};
 use perturb_protocol::proto;
 use perturb_protocol::region::Region;
 
@@ -19,14 +19,30 @@ use crate::settings::Common;
 #[derive(Debug, Default)]
 pub struct Ledgers {
     heads: Vec<Head>,
+    /// One for each environment that began.
     drawn: Vec<Drawn>,
-    ended: Vec<Ended>,
+    /// Those of each address in a session.
+    at: BTreeMap<(Session, u64, u32), Address>,
     refused: Vec<Refused>,
-    /// When each beginning of each server was over, whether or not it said so, ms.
-    over: Vec<u64>,
+    /// When each beginning of each server was over, whether or not it said so.
+    over: Vec<Option<Moment>>,
     /// A line that contradicts itself.
-    defect: Option<u64>,
+    defect: Option<(u64, &'static str)>,
 }
+
+/// What environments of one seed and index drew in a session.
+#[derive(Debug, Default)]
+struct Address {
+    /// Which of `drawn` have not ended.
+    open: Vec<usize>,
+    /// What ended of them so far. Only when all have is it known of which.
+    ends: Vec<(Option<u64>, Moment)>,
+    /// Which had ended last.
+    closed: Vec<usize>,
+}
+
+/// The most environments that a line may name.
+const MOST_ENVS: u32 = 1 << 22;
 
 /// Where a ledger ends now.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -37,6 +53,8 @@ pub struct Head {
     pub lines: u64,
     /// The last one's digest.
     pub digest: String,
+    /// Bytes behind it, of a line that is being written or was not finished.
+    pub unfinished: u64,
 }
 
 /// What was found of one policy.
@@ -58,27 +76,46 @@ type Session = (usize, u64);
 /// Where a line stands.
 #[derive(Debug, Clone)]
 struct Line {
-    ledger: usize,
-    n: u64,
-    unix_ms: u64,
+    at: Moment,
     session: Session,
     who: Who,
 }
 
-/// Environments that began to draw.
+/// When something was written: by its place in its ledger, and between ledgers by the clock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Moment {
+    ledger: usize,
+    n: u64,
+    unix_ms: u64,
+}
+
+impl Moment {
+    fn is_before(self, other: Self) -> bool {
+        if self.ledger == other.ledger { self.n <= other.n } else { self.unix_ms <= other.unix_ms }
+    }
+}
+
+/// An environment that began to draw.
 #[derive(Debug)]
 struct Drawn {
-    line: Line,
-    begin: Begin,
+    line: Arc<Line>,
+    seed: u64,
+    index: u32,
+    /// The first episode …
+    first: u64,
+    /// … and the last, if it is known; none at all if nothing was drawn.
+    last: Last,
+    /// When the last was begun.
+    ended: Option<Moment>,
     region: Arc<Region>,
 }
 
-/// How far environments had come.
-#[derive(Debug)]
-struct Ended {
-    session: Session,
-    unix_ms: u64,
-    end: End,
+/// The last episode that was begun.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Last {
+    None,
+    Episode(u64),
+    Unknown,
 }
 
 /// What a session wanted to draw from.
@@ -102,11 +139,19 @@ impl Ledgers {
                 missing.retain(|known| *known != digest);
                 ledgers.take(ledger, entry);
             });
-            let chain = read.map_err(|error| error.to_string())?.chain;
-            if let Some(n) = ledgers.defect {
-                return Err(format!("line {} of {} names a region that it does not have", n + 1, path.display()));
+            let Read { chain, unfinished, .. } = read.map_err(|error| error.to_string())?;
+            if let Some((n, what)) = ledgers.defect {
+                return Err(format!("line {} of {} {what}", n + 1, path.display()));
             }
-            ledgers.heads.push(Head { path: path.clone(), lines: chain.lines(), digest: chain.head().into() });
+            if ledgers.heads.iter().any(|head| head.digest == chain.head()) {
+                return Err(format!("{} was given already, by this or another name", path.display()));
+            }
+            ledgers.heads.push(Head {
+                path: path.clone(),
+                lines: chain.lines(),
+                digest: chain.head().into(),
+                unfinished,
+            });
         }
         match missing.first() {
             Some(digest) => Err(format!("no line has the digest {digest}: the ledger is another, or was written anew")),
@@ -120,34 +165,73 @@ impl Ledgers {
     }
 
     fn take(&mut self, ledger: usize, Entry { n, unix_ms, event }: Entry) {
+        let at = Moment { ledger, n, unix_ms };
+        if n == 0 && !matches!(event, Event::Began { .. }) {
+            self.defect = Some((n, "does not say that a server began"));
+            return;
+        }
         let beginning = self.over.len().saturating_sub(1);
-        let line = |who: Who| Line { ledger, n, unix_ms, session: (beginning, who.session), who };
+        let line = |who: Who| Line { at, session: (beginning, who.session), who };
         match event {
             Event::Began { .. } => {
                 // The one before it, of the same ledger, ended by then.
                 if n > 0
                     && let Some(over) = self.over.last_mut()
                 {
-                    *over = unix_ms.min(*over);
+                    over.get_or_insert(at);
                 }
-                self.over.push(u64::MAX);
+                self.over.push(None);
             }
-            Event::Ended => self.over.last_mut().into_iter().for_each(|over| *over = unix_ms),
+            Event::Ended => self.over.last_mut().into_iter().for_each(|over| *over = Some(at)),
             Event::Refused { who, region, reason } => self.refused.push(Refused { line: line(who), region, reason }),
-            Event::Draws(Draws { who, regions, begins, ends }) => {
-                let line = line(who);
-                let ended = |end| Ended { session: line.session, unix_ms, end };
-                self.ended.extend(ends.into_iter().map(ended));
-                let regions: Vec<Arc<Region>> = regions.into_iter().map(Arc::new).collect();
-                for begin in begins {
-                    match regions.get(begin.region as usize) {
-                        Some(region) => {
-                            self.drawn.push(Drawn { line: line.clone(), region: Arc::clone(region), begin })
-                        }
-                        None => self.defect = Some(n),
-                    }
-                }
+            Event::Draws(draws) => self.take_draws(line(draws.who.clone()), draws),
+        }
+    }
+
+    /// What a line ends it ends before it begins something.
+    fn take_draws(&mut self, line: Line, Draws { regions, begins, ends, .. }: Draws) {
+        let named = begins.iter().map(|begin| begin.count).chain(ends.iter().map(|end| end.count));
+        if named.fold(0, u32::saturating_add) > MOST_ENVS {
+            self.defect = Some((line.at.n, "names more environments than a session has"));
+            return;
+        }
+        for End { seed, index, count, episode } in ends {
+            for index in (0..count).map(|offset| index.saturating_add(offset)) {
+                self.end_one((line.session, seed, index), (episode, line.at));
             }
+        }
+        let (line, regions) = (Arc::new(line), regions.into_iter().map(Arc::new).collect::<Vec<_>>());
+        for Begin { seed, index, count, region, episode: first } in begins {
+            let Some(region) = regions.get(region as usize) else {
+                self.defect = Some((line.at.n, "names a region that it does not have"));
+                return;
+            };
+            for index in (0..count).map(|offset| index.saturating_add(offset)) {
+                self.at.entry((line.session, seed, index)).or_default().open.push(self.drawn.len());
+                let (line, region) = (Arc::clone(&line), Arc::clone(region));
+                self.drawn.push(Drawn { line, seed, index, first, last: Last::Unknown, ended: None, region });
+            }
+        }
+    }
+
+    fn end_one(&mut self, address: (Session, u64, u32), end: (Option<u64>, Moment)) {
+        let address = self.at.entry(address).or_default();
+        address.ends.push(end);
+        // Where nothing was open, what had ended went on after all.
+        let went_on = address.open.is_empty();
+        if address.ends.len() < address.open.len() {
+            return;
+        }
+        if !went_on {
+            address.closed = std::mem::take(&mut address.open);
+        }
+        let ends = std::mem::take(&mut address.ends);
+        let last =
+            ends.iter().map(|(episode, _)| episode.map_or(Last::None, Last::Episode)).max().unwrap_or(Last::None);
+        for &which in &address.closed {
+            let drawn = &mut self.drawn[which];
+            drawn.last = if went_on { drawn.last.max(last) } else { last };
+            drawn.ended = Some(end.1);
         }
     }
 
@@ -163,10 +247,10 @@ impl Ledgers {
         let claimed = Region::of(environment, training.version, &training.parameters);
         // Other trainings with its seed, on something else, are told by what they draw from.
         let is_own = |drawn: &&Drawn| {
-            let Begin { seed, index, .. } = drawn.begin;
             drawn.line.who.environment == environment.name
-                && seed == training.seed
-                && (index as usize) < training.num_envs
+                && drawn.last != Last::None
+                && drawn.seed == training.seed
+                && (drawn.index as usize) < training.num_envs
                 && drawn.region.is_within([&claimed])
                 && claimed.is_within([&*drawn.region])
         };
@@ -174,7 +258,7 @@ impl Ledgers {
         let sessions: BTreeSet<Session> = own.iter().map(|drawn| drawn.line.session).collect();
         let tokens = own.iter().map(|drawn| drawn.line.who.token.clone()).collect();
         let mut proof = Proof { tokens, sessions: sessions.len(), ..Proof::default() };
-        let drawn = own.iter().map(|drawn| self.episodes(drawn)).fold(0, u64::saturating_add);
+        let drawn = own.iter().map(|drawn| drawn.episodes()).fold(0, u64::saturating_add);
         if drawn < episodes || own.is_empty() {
             let name =
                 format!("{}, seed {}, trained on {}", training.environment, training.seed, training.trained_on());
@@ -182,16 +266,23 @@ impl Ledgers {
                 format!("of the {episodes} episodes of its training, {name}, {drawn} were drawn: give all ledgers");
             proof.against.push(few);
         }
-        let end = sessions.iter().map(|session| self.end(*session, training.seed)).max().unwrap_or_default();
+        // A session that did not say how far it came went on as long as its server.
+        let end = |drawn: &&Drawn| drawn.ended.or(self.over.get(drawn.line.session.0).copied().flatten());
+        let ends: Vec<Option<Moment>> = own.iter().map(end).collect();
         let is_its = |line: &Line| {
-            line.who.environment == environment.name && line.unix_ms <= end && proof.tokens.contains(&line.who.token)
+            line.who.environment == environment.name
+                && proof.tokens.contains(&line.who.token)
+                && ends.iter().any(|end| end.is_none_or(|end| line.at.is_before(end)))
         };
         for test in &records.about.tests {
             let set = &test.set.name;
             let others = tested(environment, test, &claimed);
             let overlaps = |region: &Region| others.iter().any(|other| other.overlaps(region));
-            for drawn in self.drawn.iter().filter(|drawn| is_its(&drawn.line)) {
-                let what = if self.has_episode(drawn, test, records) {
+            let mut said: Option<Moment> = None;
+            for drawn in self.drawn.iter().filter(|drawn| drawn.last != Last::None && is_its(&drawn.line)) {
+                let what = if said == Some(drawn.line.at) {
+                    continue;
+                } else if drawn.has_episode(test, records) {
                     format!("episodes of the test on {set}")
                 } else if !drawn.region.is_within([&claimed]) && overlaps(&drawn.region) {
                     format!("{}, of the test set {set},", drawn.region)
@@ -200,6 +291,7 @@ impl Ledgers {
                 };
                 let what = format!("{what} had been drawn before the training ended");
                 proof.against.push(self.sentence(&drawn.line, &what));
+                said = Some(drawn.line.at);
             }
         }
         let refused = self.refused.iter().filter(|refused| is_its(&refused.line));
@@ -209,46 +301,8 @@ impl Ledgers {
         proof
     }
 
-    /// How many episodes environments drew, as far as it is known.
-    fn episodes(&self, drawn: &Drawn) -> u64 {
-        let Begin { index, count, episode, .. } = drawn.begin;
-        let each = (0..count).map(|offset| match self.last(drawn, index.saturating_add(offset)) {
-            Some(last) => (last + 1).saturating_sub(episode),
-            None => u64::MAX, // its session did not end
-        });
-        each.fold(0, u64::saturating_add)
-    }
-
-    /// The last episode that an environment of those had begun when its session was seen last.
-    fn last(&self, drawn: &Drawn, of: u32) -> Option<u64> {
-        let its = self.ended.iter().filter(|ended| {
-            let End { seed, index, count, .. } = ended.end;
-            ended.session == drawn.line.session && seed == drawn.begin.seed && covers(index, count, of)
-        });
-        its.map(|ended| ended.end.episode).max()
-    }
-
-    /// When a session had drawn the last episode with a seed, ms.
-    fn end(&self, session: Session, seed: u64) -> u64 {
-        let its = self.ended.iter().filter(|ended| ended.session == session && ended.end.seed == seed);
-        its.map(|ended| ended.unix_ms).max().unwrap_or(self.over.get(session.0).copied().unwrap_or(u64::MAX))
-    }
-
-    /// Whether environments may have drawn a recorded episode of a test.
-    fn has_episode(&self, drawn: &Drawn, test: &RecordedTest, records: &Records) -> bool {
-        let Begin { seed, index, count, episode, .. } = drawn.begin;
-        if seed != test.seed {
-            return false;
-        }
-        let its = records.episodes.iter().filter(|record| record.set == test.set.name && record.seed == seed);
-        its.filter(|record| covers(index, count, record.environment_index)).any(|record| {
-            let last = self.last(drawn, record.environment_index).unwrap_or(u64::MAX);
-            (episode..=last).contains(&record.episode_index)
-        })
-    }
-
     fn sentence(&self, line: &Line, what: &str) -> String {
-        let Line { ledger, n, unix_ms, who, .. } = line;
+        let Line { at: Moment { ledger, n, unix_ms }, who, .. } = line;
         let path = self.heads.get(*ledger).map(|head| head.path.display().to_string()).unwrap_or_default();
         let mut sentence = format!("line {} of {path}: {what}", n + 1);
         let token = who.token.as_ref().map_or("without a token".into(), |token| format!("by the token {token:?}"));
@@ -264,6 +318,25 @@ fn tested(environment: &proto::Environment, test: &RecordedTest, claimed: &Regio
     test.set.listed().iter().map(of).filter(|region| !region.is_within([claimed])).collect()
 }
 
-fn covers(first: u32, count: u32, index: u32) -> bool {
-    index.checked_sub(first).is_some_and(|offset| offset < count)
+impl Drawn {
+    /// How many episodes it drew; if that is not known, no end of them.
+    fn episodes(&self) -> u64 {
+        match self.last {
+            Last::None => 0,
+            Last::Episode(last) => last.saturating_sub(self.first).saturating_add(u64::from(last >= self.first)),
+            Last::Unknown => u64::MAX,
+        }
+    }
+
+    /// Whether it may have drawn a recorded episode of a test.
+    fn has_episode(&self, test: &RecordedTest, records: &Records) -> bool {
+        let may = |episode: u64| match self.last {
+            Last::None => false,
+            Last::Episode(last) => (self.first..=last).contains(&episode),
+            Last::Unknown => self.first <= episode,
+        };
+        let its = records.episodes.iter().filter(|record| record.set == test.set.name && record.seed == test.seed);
+        self.seed == test.seed
+            && its.filter(|record| record.environment_index == self.index).any(|record| may(record.episode_index))
+    }
 }

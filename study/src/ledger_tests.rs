@@ -41,6 +41,8 @@ fn prove(ledgers: &Ledgers) -> Proof {
 
 fn written(directory: &Path, name: &str, events: &[Event]) -> PathBuf {
     let (path, mut chain) = (directory.join(name), Chain::default());
+    let began = Event::Began { version: "0.1.0".into(), commit: name.into(), unfinished: 0 };
+    let events = std::iter::once(&began).chain(events);
     let text: String = (0..).zip(events).map(|(time, event)| chain.add(event, 1000 * time).unwrap()).collect();
     std::fs::write(&path, text).unwrap();
     path
@@ -48,8 +50,7 @@ fn written(directory: &Path, name: &str, events: &[Event]) -> PathBuf {
 
 fn proof(events: &[Event]) -> Proof {
     let directory = tempfile::tempdir().unwrap();
-    let began = Event::Began { version: "0.1.0".into(), commit: "0".into(), unfinished: 0 };
-    let path = written(directory.path(), "ledger", &[&[began], events].concat());
+    let path = written(directory.path(), "ledger", events);
     prove(&Ledgers::read(&[path], &[]).unwrap())
 }
 
@@ -64,7 +65,7 @@ fn begins(session: u64, token: &str, version: Version, (seed, index, count, epis
 }
 
 fn ends(session: u64, token: &str, (seed, index, count, episode): (u64, u32, u32, u64)) -> Event {
-    let ends = vec![End { seed, index, count, episode }];
+    let ends = vec![End { seed, index, count, episode: Some(episode) }];
     Event::Draws(Draws { who: who(session, token), regions: Vec::new(), begins: Vec::new(), ends })
 }
 
@@ -136,4 +137,29 @@ fn sessions_on_several_servers_are_found_in_all_their_ledgers() {
     says(&prove(&Ledgers::read(&paths[..1], &digests[..1]).unwrap()), "50 were drawn");
     let missing = Ledgers::read(&paths[..1], &digests).unwrap_err();
     assert!(missing.contains(&digests[1]), "{missing}");
+}
+
+#[test]
+fn an_end_is_that_of_what_was_open_and_of_nothing_later() {
+    let [begun, ended] = trained();
+    // The same seed drawn twice, the second time without an end.
+    let again = begins(1, "ann", R, (7, 0, 1, 0));
+    let reset = [begun.clone(), again.clone(), ends(1, "ann", (7, 0, 1, 0)), again, ended.clone()];
+    let found = proof(&reset);
+    assert_eq!(found.against.len(), 2, "{found:?}");
+    // Many short ones are not one long one for each.
+    let short: Vec<Event> =
+        (0..9).flat_map(|_| [begins(0, "ann", R, (1, 0, 2, 0)), ends(0, "ann", (1, 0, 2, 4))]).collect();
+    says(&proof(&short), "90 were drawn");
+    // A part that was given back early does not end the others.
+    let early = [begun.clone(), ends(0, "ann", (1, 0, 1, 49)), begins(1, "ann", E, (9, 0, 1, 0))];
+    says(&proof(&early), "of the test set E");
+    // What was refused by the server drew nothing.
+    let withdrawn = Event::Draws(Draws {
+        who: who(1, "ann"),
+        regions: Vec::new(),
+        begins: Vec::new(),
+        ends: vec![End { seed: 9, index: 0, count: 1, episode: None }],
+    });
+    assert!(proof(&[begun, begins(1, "ann", E, (9, 0, 1, 0)), withdrawn, ended]).against.is_empty());
 }

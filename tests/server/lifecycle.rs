@@ -27,7 +27,7 @@ async fn health(address: &str, service: &str) -> Result<ServingStatus, Status> {
 }
 
 /// Runs a server that is expected to end by itself.
-fn finished(command: &mut std::process::Command) -> Output {
+pub fn finished(command: &mut std::process::Command) -> Output {
     let mut child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let start = Instant::now();
     while child.try_wait().unwrap().is_none() {

@@ -17,6 +17,7 @@ mod guarded;
 mod lifecycle;
 #[cfg(feature = "mujoco")]
 mod locomotion;
+mod metrics;
 mod observing;
 mod old_snapshots;
 mod pool;
@@ -29,3 +30,5 @@ mod sharing;
 mod streams;
 mod success;
 mod toy;
+#[cfg(feature = "otel")]
+mod traces;

@@ -307,7 +307,7 @@ impl InThread {
                 tell.send(listener.address().expect("bound").to_string()).expect("heard");
                 let stop = async { drop(end.await) };
                 let guards = Guards::default();
-                perturb::server::run(vec![listener], &config, &guards, catalogue, stop).await.expect("served");
+                perturb::server::run(vec![listener], None, &config, &guards, catalogue, stop).await.expect("served");
             });
         });
         let address = address.blocking_recv().expect("it listens");

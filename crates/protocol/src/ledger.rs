@@ -13,8 +13,8 @@ use sha2::{Digest, Sha256};
 
 use crate::region::Region;
 
-/// No line is longer, bytes.
-const LONGEST: u64 = 256 << 20;
+/// No line is longer, bytes, its end among them.
+pub const LONGEST: u64 = 64 << 20;
 /// Digits of a digest.
 const DIGITS: usize = 64;
 
@@ -113,8 +113,8 @@ pub struct End {
     pub index: u32,
     /// How many there are, of successive indices.
     pub count: u32,
-    /// The last episode that was begun.
-    pub episode: u64,
+    /// The last episode that was begun; none, if the request was refused or failed and nothing was drawn.
+    pub episode: Option<u64>,
 }
 
 /// The chain, as far as it was written or read.
@@ -221,14 +221,17 @@ pub fn read(path: &Path, mut each: impl FnMut(Entry, &str)) -> Result<Read, Erro
     loop {
         line.clear();
         let n = file.by_ref().take(LONGEST).read_until(b'\n', &mut line).map_err(io)? as u64;
+        let broken = |line: u64, what| Error::Broken { path: path.to_owned(), line: line + 1, what };
         let Some(whole) = line.strip_suffix(b"\n") else {
+            if n == LONGEST {
+                return Err(broken(read.chain.lines(), "is longer than any that was written"));
+            }
             read.unfinished = n;
             return Ok(read);
         };
         let text = std::str::from_utf8(whole).map_err(|_| "is no text");
         let entry = text.and_then(|text| read.chain.take(text));
-        let broken = |what| Error::Broken { path: path.to_owned(), line: read.chain.lines + 1, what };
-        each(entry.map_err(broken)?, &read.chain.head);
+        each(entry.map_err(|what| broken(read.chain.lines(), what))?, &read.chain.head);
         read.bytes += n;
     }
 }

@@ -12,6 +12,7 @@ use crate::{
         self as rpc, environment_request::Payload as Request, environment_response::Payload as Response,
     },
     server::{
+        access::About,
         conversation::{Dialogue, MOST_BYTES_BEFORE_OPEN, Sessions},
         drain::Phase,
         fields::{self, Field},
@@ -32,13 +33,14 @@ pub(super) struct Agent {
     caller: Caller,
     sessions: Sessions,
     joined: Option<Joined>,
+    about: About,
 }
 
 impl Agent {
     /// A stream that has joined no world.
     pub(super) fn new(worlds: Arc<Worlds>, bearer: Option<Bearer>, sessions: Sessions) -> Self {
         let caller = worlds.caller(bearer);
-        Self { worlds, caller, sessions, joined: None }
+        Self { worlds, caller, sessions, joined: None, about: About::default() }
     }
 
     async fn create_world(&mut self, request: rpc::CreateWorldRequest) -> Result<rpc::CreateWorldResponse, Refusal> {
@@ -60,6 +62,7 @@ impl Agent {
         let (world, runner) = self.worlds.join(&self.caller, &request.world_name)?;
         // Before anything is awaited: if the client goes now, the world is left and not lost.
         let joined = self.joined.insert(Joined { world, runner });
+        self.about = About { environment: Some(joined.world.spec().name), envs: 1, ..self.about };
         joined.runner.settle().await;
         Ok(rpc::JoinWorldResponse { specs: Some(specs::of(joined.world.spec())) })
     }
@@ -69,7 +72,9 @@ impl Agent {
         specs::check_requested(&request.requested_observations)?;
         let outcome = if runner.is_running() {
             let actions = specs::actions(world.spec(), &request.actions)?;
-            runner.step(&actions, world.take_interruption()).await?
+            let outcome = runner.step(&actions, world.take_interruption()).await?;
+            self.about.steps += 1;
+            outcome
         } else {
             let changes = world.take_changes();
             let begun = runner.begin(changes.clone()).await;
@@ -123,6 +128,7 @@ impl Dialogue for Agent {
     type Request = rpc::EnvironmentRequest;
     type Response = rpc::EnvironmentResponse;
     const FIELDS: &'static [Field] = fields::ENVIRONMENT_REQUEST;
+    const PROTOCOL: &'static str = "dm_env_rpc.v1";
 
     fn allowance(&self) -> Allowance {
         Allowance { bytes: if self.is_open() { MOST_BYTES } else { MOST_BYTES_BEFORE_OPEN }, entries: 1, covered: 0 }
@@ -133,7 +139,11 @@ impl Dialogue for Agent {
         self.joined.is_some() || self.worlds.are_made_by(&self.caller)
     }
 
-    async fn answer(&mut self, request: Self::Request) -> Self::Response {
+    fn about(&self) -> About {
+        self.about
+    }
+
+    async fn answer(&mut self, request: Self::Request) -> Result<Self::Response, Refusal> {
         let response = match request.payload {
             Some(Request::CreateWorld(create)) => self.create_world(create).await.map(Response::CreateWorld),
             Some(Request::JoinWorld(join)) => self.join_world(join).await.map(Response::JoinWorld),
@@ -153,11 +163,10 @@ impl Dialogue for Agent {
                 Err(Refusal::value("request", "empty or of a kind this server does not know", expected))
             }
         };
-        response
-            .map_or_else(|refusal| self.refuse(refusal), |payload| rpc::EnvironmentResponse { payload: Some(payload) })
+        response.map(|payload| rpc::EnvironmentResponse { payload: Some(payload) })
     }
 
-    fn refuse(&self, refusal: Refusal) -> Self::Response {
+    fn refusal(refusal: Refusal) -> Self::Response {
         rpc::EnvironmentResponse { payload: Some(Response::Error(refusal.into())) }
     }
 }
@@ -186,13 +195,6 @@ impl Observed for Agent {
             Some(Request::DestroyWorld(_)) => "destroy_world",
             Some(Request::Extension(_)) => "extension",
             None => "unknown",
-        }
-    }
-
-    fn refusal(response: &Self::Response) -> Option<&str> {
-        match &response.payload {
-            Some(Response::Error(status)) => Some(&status.message),
-            _ => None,
         }
     }
 }

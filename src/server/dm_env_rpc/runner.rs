@@ -70,8 +70,9 @@ impl Runner {
         version: Version,
         draws: Draws,
     ) -> Result<Self, Refusal> {
-        draws.open(&settings).await?;
-        let (mut batch, first, started) = Batch::open(pool, settings).await?;
+        let (begun, spec) = (draws.open(&settings).await?, settings.spec);
+        let opened = Batch::open(pool, settings).await;
+        let (mut batch, first, started) = opened.inspect_err(|_| draws.not_opened(spec, begun))?;
         draws.follow(&mut batch);
         let seed = batch.settings().groups[0].episodes.seed;
         Ok(Self { batch, draws, phase: Phase::Unseen, first, start: only(started), seed, version })

@@ -107,6 +107,13 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<Known>, Wr
         let sets: Result<(Option<Vec<Set>>, Vec<Set>), String> =
             draws.map(find).transpose().and_then(|draws| Ok((draws, find(never)?)));
         let (draws, never) = sets.map_err(|what| Wrong { line, what })?;
+        if draws.is_none() && !never.is_empty() {
+            // A hair beside the set would do.
+            return Err(Wrong {
+                line,
+                what: format!("the role {name:?} has never without draws: say what it may draw from"),
+            });
+        }
         if known_roles.insert(name.clone(), Arc::new(Role { name: name.clone(), draws, never })).is_some() {
             return Err(Wrong { line, what: format!("there are two roles called {name:?}") });
         }

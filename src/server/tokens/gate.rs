@@ -1,7 +1,7 @@
 //! The gate before the services.
 
 use super::Tokens;
-use crate::server::peers::Connection;
+use crate::server::{peers::Connection, refusals::Refusals};
 use std::{
     convert::Infallible,
     future::{Future, ready},
@@ -20,12 +20,13 @@ use tonic::{
 pub struct Gated<S> {
     service: S,
     tokens: Option<Tokens>,
+    refusals: Refusals,
 }
 
 impl<S> Gated<S> {
-    /// Asks for one of these, or for none.
-    pub fn new(service: S, tokens: Option<Tokens>) -> Self {
-        Self { service, tokens }
+    /// Asks for one of these, or for none, and counts whom it refuses.
+    pub fn new(service: S, tokens: Option<Tokens>, refusals: Refusals) -> Self {
+        Self { service, tokens, refusals }
     }
 }
 
@@ -57,6 +58,7 @@ where
             Err(refusal) => {
                 let peer = request.extensions().get::<Connection>().map(|connection| connection.peer);
                 tracing::debug!(?peer, path = request.uri().path(), %refusal, "refused a call");
+                self.refusals.count(&refusal, None);
                 Box::pin(ready(Ok(Status::from(refusal).into_http())))
             }
         }

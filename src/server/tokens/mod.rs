@@ -17,7 +17,7 @@ use file::{Entry, Known, listed};
 use sha2::{Digest, Sha256};
 use std::sync::{
     Arc, PoisonError, RwLock,
-    atomic::{AtomicBool, AtomicUsize, Ordering},
+    atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering},
 };
 use subtle::ConstantTimeEq;
 use tokio::sync::Notify;
@@ -58,6 +58,30 @@ pub struct Token {
     told: Notify,
     sessions: Arc<Quota>,
     envs: Arc<Quota>,
+    spent: Arc<Spent>,
+}
+
+/// What was done with a token so far.
+#[derive(Default)]
+pub struct Spent {
+    /// Steps of an environment.
+    pub steps: AtomicU64,
+    /// Requests and calls that were refused.
+    pub refusals: AtomicU64,
+}
+
+/// What a token has, and what was done with it.
+pub struct Used {
+    /// What it is called.
+    pub name: String,
+    /// Sessions now.
+    pub sessions: usize,
+    /// Environments now.
+    pub envs: usize,
+    /// Steps of an environment so far.
+    pub steps: u64,
+    /// What was refused so far.
+    pub refusals: u64,
 }
 
 /// The token of a call.
@@ -67,6 +91,21 @@ impl Token {
     /// What it is called.
     pub fn name(&self) -> &str {
         &self.name
+    }
+
+    /// What was done with it.
+    pub fn spent(&self) -> &Spent {
+        &self.spent
+    }
+
+    fn used(&self) -> Used {
+        Used {
+            name: self.name.clone(),
+            sessions: self.sessions.taken.load(Ordering::Relaxed),
+            envs: self.envs.taken.load(Ordering::Relaxed),
+            steps: self.spent.steps.load(Ordering::Relaxed),
+            refusals: self.spent.refusals.load(Ordering::Relaxed),
+        }
     }
 
     /// What it may draw from; none: from anything.
@@ -159,6 +198,11 @@ impl Tokens {
         self.good.read().unwrap_or_else(PoisonError::into_inner).len()
     }
 
+    /// What each has and has done.
+    pub fn used(&self) -> Vec<Used> {
+        self.good.read().unwrap_or_else(PoisonError::into_inner).iter().map(|token| token.used()).collect()
+    }
+
     /// Takes the file's new text: tokens that stay, with the same role, keep what they have, others are revoked.
     ///
     /// # Errors
@@ -170,8 +214,9 @@ impl Tokens {
         for Known { digest, entry: Entry { name, max_sessions, max_envs, .. }, role } in listed {
             // Another token of the same name has what was taken with the one before, too.
             let before = tokens.iter().find(|token| token.name == name);
-            let (sessions, envs) =
-                before.map_or_else(Default::default, |token| (Arc::clone(&token.sessions), Arc::clone(&token.envs)));
+            let (sessions, envs, spent) = before.map_or_else(Default::default, |token| {
+                (Arc::clone(&token.sessions), Arc::clone(&token.envs), Arc::clone(&token.spent))
+            });
             sessions.bound(max_sessions);
             envs.bound(max_envs);
             renewed.push(match before.filter(|token| token.digest == digest && token.role == role) {
@@ -184,6 +229,7 @@ impl Tokens {
                     told: Notify::new(),
                     sessions,
                     envs,
+                    spent,
                 }),
             });
         }

@@ -1,6 +1,6 @@
 //! A policy played by the server: the bytes of a client that acts by itself.
 
-mod game;
+pub mod game;
 mod refusals;
 mod turns;
 

@@ -102,6 +102,13 @@ impl Server {
         }
     }
 
+    /// When it was started, s since 1970, as its log's file tells.
+    pub fn started_seconds(&self) -> f64 {
+        let log = std::fs::metadata(self.directory.path().join("log")).unwrap();
+        let created = log.created().or_else(|_| log.modified()).unwrap();
+        created.duration_since(std::time::UNIX_EPOCH).unwrap().as_secs_f64()
+    }
+
     /// Its resident memory, in bytes.
     pub fn memory(&self) -> usize {
         self.memory_line("VmRSS:")
@@ -207,8 +214,17 @@ impl Session {
 
     /// A session on this connection, not open yet.
     pub async fn start(client: &mut PerturbClient<Channel>) -> Result<Self, Status> {
+        Self::show(client, None).await
+    }
+
+    /// The same, which shows a token.
+    pub async fn show(client: &mut PerturbClient<Channel>, token: Option<&str>) -> Result<Self, Status> {
         let (requests, receiver) = tokio::sync::mpsc::channel(1024);
-        let responses = within(client.session(ReceiverStream::new(receiver))).await?.into_inner();
+        let mut call = tonic::Request::new(ReceiverStream::new(receiver));
+        if let Some(token) = token {
+            call.metadata_mut().insert("authorization", format!("Bearer {token}").parse().unwrap());
+        }
+        let responses = within(client.session(call)).await?.into_inner();
         Ok(Self { requests: Some(requests), responses })
     }
 

@@ -38,7 +38,7 @@ impl InThread {
                 tell.send(listener.address().unwrap().to_string()).unwrap();
                 let catalogue = tasks::catalogue().with(&ball::SPEC);
                 let end = async { drop(end.await) };
-                run(vec![listener], &config, &Guards::default(), catalogue, end).await.unwrap();
+                run(vec![listener], None, &config, &Guards::default(), catalogue, end).await.unwrap();
             });
         });
         Self { address: address.await.unwrap(), shutdown: Some(shutdown), thread: Some(thread) }

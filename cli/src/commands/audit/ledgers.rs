@@ -20,6 +20,15 @@ pub(super) fn prove(args: &AuditArgs, tested: &[Tested]) -> Result<ExitCode> {
     for one in tested {
         let records = Records::read(&one.records)?;
         let checkpoint = Checkpoint::load(&one.checkpoint)?;
+        let got = checkpoint.id().map_err(|reason| CommandError::Failed(format!("{}: {reason}", one.name)))?;
+        if got != records.about.policy {
+            let (of, name) = (&records.about.policy, &one.name);
+            let message = format!("{name}: the episodes were recorded of the policy {of}, the checkpoint is {got}");
+            return Err(CommandError::Usage(message));
+        }
+        if records.about.tests.is_empty() {
+            return Err(CommandError::Failed(format!("{}: no test is recorded, so nothing can be proved", one.name)));
+        }
         let (training, counters) = (&checkpoint.state.config.common, checkpoint.state.counters);
         let environment = servers.environment(&training.environment)?;
         let episodes = counters.generated_episodes.max(counters.episodes);
@@ -34,8 +43,10 @@ pub(super) fn prove(args: &AuditArgs, tested: &[Tested]) -> Result<ExitCode> {
         let heads: Vec<Value> = ledgers.heads().iter().map(head).collect();
         writeln!(out, "{:#}", json!({ "clean": clean, "policies": policies, "ledgers": heads }))?;
     } else {
-        for Head { path, lines, digest } in ledgers.heads() {
-            writeln!(out, "{}: {lines} lines, unbroken up to --head {digest}", path.display())?;
+        for Head { path, lines, digest, unfinished } in ledgers.heads() {
+            let rest =
+                if *unfinished > 0 { format!(", and {unfinished} bytes of an unfinished line") } else { String::new() };
+            writeln!(out, "{}: {lines} lines{rest}, unbroken up to --head {digest}", path.display())?;
         }
     }
     Ok(if clean == proofs.len() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
@@ -68,6 +79,6 @@ fn document(name: &str, Proof { tokens, sessions, against, refused }: &Proof) ->
     json!({ "policy": name, "tokens": tokens, "sessions": sessions, "against": against, "refused": refused })
 }
 
-fn head(Head { path, lines, digest }: &Head) -> Value {
-    json!({ "ledger": path, "lines": lines, "head": digest })
+fn head(Head { path, lines, digest, unfinished }: &Head) -> Value {
+    json!({ "ledger": path, "lines": lines, "head": digest, "unfinished_bytes": unfinished })
 }

@@ -1,0 +1,106 @@
+//! The access log: a line for each session that ended, so many a second, so that clients that come and go fill no disk.
+
+use super::peers::Peer;
+use std::{
+    collections::BTreeMap,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::Duration,
+};
+use tokio::{runtime::Handle, time::Instant};
+
+/// The most lines in …
+const MOST_LINES: u64 = 20;
+/// … this time; then one that says how many were left out.
+const WINDOW: Duration = Duration::from_secs(1);
+
+/// What a session came to.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct About {
+    /// What it was opened with.
+    pub environment: Option<&'static str>,
+    /// How many environments it was opened with.
+    pub envs: usize,
+    /// Steps of an environment.
+    pub steps: u64,
+}
+
+/// A session that ended.
+pub struct Ended<'a> {
+    /// Whom it was from; none where nobody knows.
+    pub peer: Option<Peer>,
+    /// What its token is called.
+    pub token: Option<&'a str>,
+    /// By which protocol it came.
+    pub protocol: &'static str,
+    /// What it came to.
+    pub about: About,
+    /// How long it was.
+    pub time: Duration,
+    /// How it ended: a word of few.
+    pub ending: &'static str,
+}
+
+/// The log, and how many sessions ended how.
+#[derive(Clone, Default)]
+pub struct Access(Arc<Mutex<State>>);
+
+#[derive(Default)]
+struct State {
+    /// By protocol and ending.
+    endings: BTreeMap<(&'static str, &'static str), u64>,
+    /// The window's beginning, and the lines that it wanted.
+    window: Option<(Instant, u64)>,
+}
+
+impl Access {
+    /// Adds a session's end.
+    pub fn ended(&self, ended: &Ended<'_>) {
+        if !self.has_room(ended.protocol, ended.ending) {
+            return;
+        }
+        let Ended { peer, token, protocol, about: About { environment, envs, steps }, time, ending } = ended;
+        let (peer, seconds) = (peer.map(tracing::field::display), (time.as_secs_f64() * 1e3).round() / 1e3);
+        tracing::info!(
+            target: "perturb::access",
+            peer, token, protocol, environment, envs, steps, seconds, ending, "a session ended"
+        );
+    }
+
+    /// How many sessions ended, by protocol and ending.
+    pub fn endings(&self) -> Vec<((&'static str, &'static str), u64)> {
+        self.lock().endings.iter().map(|(key, count)| (*key, *count)).collect()
+    }
+
+    /// Counts one; whether there is to be a line.
+    fn has_room(&self, protocol: &'static str, ending: &'static str) -> bool {
+        let mut state = self.lock();
+        *state.endings.entry((protocol, ending)).or_default() += 1;
+        let now = Instant::now();
+        let (since, wanted) = state.window.get_or_insert((now, 0));
+        // A window with lines left out ends when they are told.
+        if *wanted <= MOST_LINES && since.elapsed() >= WINDOW {
+            (*since, *wanted) = (now, 0);
+        }
+        *wanted += 1;
+        if *wanted == MOST_LINES + 1
+            && let Ok(runtime) = Handle::try_current()
+        {
+            let (access, end) = (self.clone(), *since + WINDOW);
+            runtime.spawn(async move {
+                tokio::time::sleep_until(end).await;
+                access.tell_left_out();
+            });
+        }
+        *wanted <= MOST_LINES
+    }
+
+    fn tell_left_out(&self) {
+        let window = self.lock().window.take();
+        let left_out = window.map_or(0, |(_, wanted)| wanted.saturating_sub(MOST_LINES));
+        tracing::info!(target: "perturb::access", left_out, "more sessions ended than there are lines for");
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}

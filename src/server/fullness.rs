@@ -1,0 +1,24 @@
+//! Whether there is room for another session, as health tells it to load balancers.
+
+use super::peers::Places;
+use crate::pool::Pool;
+use tonic_health::{ServingStatus, server::HealthReporter};
+
+/// The name for which health says NOT_SERVING while all sessions or all environments are taken, and in a drain.
+pub const NEW_SESSIONS: &str = "perturb.v1.Perturb.NewSessions";
+
+/// Keeps the health of [`NEW_SESSIONS`], for ever.
+pub async fn watch(health: &HealthReporter, sessions: &Places, pool: &Pool) {
+    let mut told = None;
+    loop {
+        let full = sessions.taken() >= sessions.limit() || pool.environments() >= pool.limit();
+        let status = if full { ServingStatus::NotServing } else { ServingStatus::Serving };
+        if told.replace(full) != Some(full) {
+            health.set_service_status(NEW_SESSIONS, status).await;
+        }
+        tokio::select! {
+            () = sessions.changed() => {}
+            () = pool.changed() => {}
+        }
+    }
+}

@@ -1,0 +1,81 @@
+//! HTTP, for whoever scrapes: one page, small requests, few connections at a time.
+
+use super::{Sources, page};
+use crate::server::listen::Listener;
+use bytes::Bytes;
+use http_body_util::Full;
+use hyper::{
+    Method, Request, Response, StatusCode, body::Incoming, header::CONTENT_TYPE, server::conn::http1,
+    service::service_fn,
+};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use std::{convert::Infallible, io, sync::Arc, time::Duration};
+use tokio::{
+    io::{AsyncRead, AsyncWrite},
+    sync::Semaphore,
+    time::{sleep, timeout},
+};
+
+/// Where the page is.
+pub const PATH: &str = "/metrics";
+/// Connections at a time; others wait to be accepted.
+const AT_A_TIME: usize = 16;
+/// How long a connection may be there, which asks once.
+const LIMIT: Duration = Duration::from_secs(5);
+/// How long to wait where the system has no room for another connection.
+const PAUSE: Duration = Duration::from_millis(200);
+/// The most bytes of a request's head.
+const HEAD: usize = 16 << 10;
+const FORMAT: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
+
+/// Answers whoever connects, for ever.
+pub async fn serve(listener: Listener, sources: Arc<Sources>) {
+    let places = Arc::new(Semaphore::new(AT_A_TIME));
+    loop {
+        let Ok(place) = Arc::clone(&places).acquire_owned().await else { return };
+        let sources = Arc::clone(&sources);
+        let accepted = match &listener {
+            Listener::Tcp(listener) => listener.accept().await.map(|(stream, _)| {
+                tokio::spawn(async move { (converse(stream, sources).await, drop(place)) });
+            }),
+            Listener::Unix(listener, _) => listener.accept().await.map(|(stream, _)| {
+                tokio::spawn(async move { (converse(stream, sources).await, drop(place)) });
+            }),
+        };
+        if let Err(error) = accepted {
+            pause(&error).await;
+        }
+    }
+}
+
+async fn pause(error: &io::Error) {
+    tracing::warn!(%error, "cannot accept a connection for metrics");
+    sleep(PAUSE).await;
+}
+
+/// One request, one answer.
+async fn converse(stream: impl AsyncRead + AsyncWrite + Unpin, sources: Arc<Sources>) {
+    let answer = service_fn(|request| {
+        let response = answer(&request, &sources);
+        async move { Ok::<_, Infallible>(response) }
+    });
+    let mut http = http1::Builder::new();
+    http.timer(TokioTimer::new()).header_read_timeout(LIMIT).keep_alive(false).max_buf_size(HEAD);
+    // Whoever goes early or sends what is no HTTP gets nothing, and nobody else minds.
+    let _ = timeout(LIMIT, http.serve_connection(TokioIo::new(stream), answer)).await;
+}
+
+fn answer(request: &Request<Incoming>, sources: &Arc<Sources>) -> Response<Full<Bytes>> {
+    let (status, format, text) = match (request.uri().path(), request.method()) {
+        (PATH, &Method::GET) => match page::page(sources) {
+            Ok(text) => (StatusCode::OK, FORMAT, text),
+            Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, "text/plain", format!("{error}\n")),
+        },
+        (PATH, _) => (StatusCode::METHOD_NOT_ALLOWED, "text/plain", "ask with GET\n".into()),
+        _ => (StatusCode::NOT_FOUND, "text/plain", format!("ask for {PATH}\n")),
+    };
+    let mut response = Response::new(Full::new(text.into()));
+    *response.status_mut() = status;
+    response.headers_mut().insert(CONTENT_TYPE, hyper::header::HeaderValue::from_static(format));
+    response
+}

@@ -1,0 +1,52 @@
+//! What the server says of itself: numbers, in the text format of OpenMetrics, which Prometheus scrapes.
+//!
+//! - [`endpoint`]: HTTP, for whoever scrapes.
+//! - [`page`]: the metrics, each with its name, labels and sentence.
+//! - [`process`]: what the system says of the process.
+
+pub mod endpoint;
+pub mod page;
+pub mod process;
+
+use super::{access::Access, budget::Budget, peers::Places, refusals::Refusals, requests::Counts, tokens::Tokens};
+use crate::{meters::Histogram, pool::Pool};
+use std::{sync::Arc, time::Duration};
+use tokio::time::{Instant, sleep_until};
+
+/// How often it is looked how late the transport's thread wakes.
+const TICK: Duration = Duration::from_millis(100);
+
+/// Where the numbers are, which others count.
+pub struct Sources {
+    /// Environments, and what happens in them.
+    pub pool: Arc<Pool>,
+    /// Those of sessions.
+    pub sessions: Places,
+    /// Those of connections.
+    pub connections: Places,
+    /// Bytes in flight.
+    pub budget: Budget,
+    /// Requests of each protocol.
+    pub requests: [(&'static str, Arc<Counts>); 2],
+    /// Why requests were refused.
+    pub refusals: Refusals,
+    /// How sessions ended.
+    pub access: Access,
+    /// Whose sessions there are.
+    pub tokens: Option<Tokens>,
+    /// How long pictures were drawn.
+    pub pictures: Arc<Histogram>,
+    /// How late the transport's thread wakes.
+    pub lag: Histogram,
+}
+
+impl Sources {
+    /// Watches how late the thread wakes that runs this, for ever.
+    pub async fn watch_lag(&self) {
+        loop {
+            let due = Instant::now() + TICK;
+            sleep_until(due).await;
+            self.lag.observe(due.elapsed());
+        }
+    }
+}

@@ -1,0 +1,218 @@
+//! The metrics. Labels have names of this program, of its environments and of the file of tokens: nothing that clients
+//! send.
+
+use super::{Sources, process};
+use crate::meters::Histogram;
+use prometheus_client::{
+    collector::Collector,
+    encoding::{DescriptorEncoder, EncodeLabelSet, MetricEncoder, NoLabelSet, text},
+    metrics::MetricType,
+    registry::Registry,
+};
+use std::{
+    fmt,
+    sync::{Arc, atomic::Ordering},
+};
+use tonic::Code;
+
+type Written = Result<(), fmt::Error>;
+type Labels<'a, const N: usize> = [(&'static str, &'a str); N];
+/// Of a metric that has no other.
+const NONE: Labels<'static, 0> = [];
+
+/// The page of these numbers, as they are now.
+///
+/// # Errors
+/// A defect: memory takes all text.
+pub fn page(sources: &Arc<Sources>) -> Result<String, fmt::Error> {
+    let mut registry = Registry::default();
+    registry.register_collector(Box::new(Numbers(Arc::clone(sources))));
+    let mut text = String::new();
+    text::encode(&mut text, &registry)?;
+    Ok(text)
+}
+
+struct Numbers(Arc<Sources>);
+
+impl fmt::Debug for Numbers {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Numbers")
+    }
+}
+
+impl Collector for Numbers {
+    fn encode(&self, encoder: DescriptorEncoder<'_>) -> Written {
+        let mut page = Page(encoder);
+        let labels = [("version", env!("CARGO_PKG_VERSION")), ("commit", env!("PERTURB_COMMIT"))];
+        page.gauges("perturb_build_info", "1, with the version and the commit that were built", [(labels, 1.0)])?;
+        self.places(&mut page)?;
+        self.requests(&mut page)?;
+        self.environments(&mut page)?;
+        self.tokens(&mut page)?;
+        resources(&mut page)
+    }
+}
+
+impl Numbers {
+    /// What there is, and how much there may be.
+    fn places(&self, page: &mut Page<'_>) -> Written {
+        let Sources { pool, sessions, connections, budget, .. } = &*self.0;
+        for (name, help, value) in [
+            ("perturb_sessions", "Sessions now", sessions.taken()),
+            ("perturb_sessions_limit", "The most sessions at a time", sessions.limit()),
+            ("perturb_connections", "Connections now", connections.taken()),
+            ("perturb_environments", "Environments now", pool.environments()),
+            ("perturb_environments_limit", "The most environments", pool.limit()),
+            ("perturb_in_flight_bytes", "Bytes in flight now", budget.used()),
+            ("perturb_in_flight_bytes_limit", "The most bytes in flight", budget.limit()),
+        ] {
+            page.gauges(name, help, [(NONE, value as f64)])?;
+        }
+        Ok(())
+    }
+
+    fn requests(&self, page: &mut Page<'_>) -> Written {
+        let Sources { requests, refusals, access, .. } = &*self.0;
+        let each = requests.iter().flat_map(|(protocol, counts)| {
+            counts.iter().flat_map(move |(kind, count)| {
+                let refused = count.refused.load(Ordering::Relaxed);
+                let done = count.answered.load(Ordering::Relaxed).saturating_sub(refused);
+                let labels = move |outcome| [("protocol", *protocol), ("kind", *kind), ("outcome", outcome)];
+                [(labels("done"), done as f64), (labels("refused"), refused as f64)]
+            })
+        });
+        page.counters("perturb_requests", "Requests of sessions that were answered", each)?;
+        let counts = refusals.counts();
+        let named: Vec<_> = counts.iter().map(|(code, reason, count)| (written(*code), *reason, *count)).collect();
+        let each = named.iter().map(|(code, reason, n)| ([("code", code.as_str()), ("reason", reason)], *n as f64));
+        page.counters("perturb_refusals", "Requests, calls and sessions that were refused or ended, by reason", each)?;
+        let endings = access.endings();
+        let each = endings.iter().map(|((of, how), count)| ([("protocol", *of), ("ending", *how)], *count as f64));
+        page.counters("perturb_sessions_ended", "Sessions that ended", each)
+    }
+
+    fn environments(&self, page: &mut Page<'_>) -> Written {
+        let meters = self.0.pool.meters();
+        let name = |name: &'static str| [("environment", name)];
+        let each = meters.iter().map(|(of, meter)| (name(of), meter.steps.load(Ordering::Relaxed) as f64));
+        page.counters("perturb_steps", "Steps of an environment", each)?;
+        let each = meters.iter().map(|(of, meter)| (name(of), meter.episodes.load(Ordering::Relaxed) as f64));
+        page.counters("perturb_episodes", "Episodes that ended", each)?;
+        let each = meters.iter().flat_map(|(name, meter)| {
+            let used = meter.classes().filter(|(_, times)| times.counts().iter().any(|(_, count)| *count > 0));
+            used.map(move |(class, times)| ([("environment", *name), ("batch", class)], times))
+        });
+        let help = "How long a step request takes from its check to its reply, by the size of the batch";
+        page.histograms("perturb_step_seconds", help, each)?;
+        let Sources { pool, pictures, lag, .. } = &*self.0;
+        let help = "How long a batch waits until a worker takes a part of it, each time";
+        page.histograms("perturb_queue_wait_seconds", help, [(NONE, pool.waits())])?;
+        let help = "How late the thread wakes that talks to clients; 1 ms or 2 are the timer's own";
+        page.histograms("perturb_transport_lag_seconds", help, [(NONE, lag)])?;
+        page.histograms("perturb_picture_seconds", "How long a picture is drawn", [(NONE, &**pictures)])
+    }
+
+    fn tokens(&self, page: &mut Page<'_>) -> Written {
+        let tokens = self.0.tokens.as_ref().map(|tokens| tokens.used()).unwrap_or_default();
+        let each = |number: fn(&super::super::tokens::Used) -> f64| {
+            tokens.iter().map(move |used| ([("token", used.name.as_str())], number(used)))
+        };
+        page.gauges("perturb_token_sessions", "Sessions of a token now", each(|used| used.sessions as f64))?;
+        page.gauges("perturb_token_environments", "Environments of a token now", each(|used| used.envs as f64))?;
+        page.counters("perturb_token_steps", "Steps of a token's environments", each(|used| used.steps as f64))?;
+        page.counters("perturb_token_refusals", "What was refused to a token", each(|used| used.refusals as f64))
+    }
+}
+
+/// What the system says of the process, if it does.
+fn resources(page: &mut Page<'_>) -> Written {
+    let Ok(resources) = process::resources() else { return Ok(()) };
+    page.counters("process_cpu_seconds", "Processor time", [(NONE, resources.cpu_seconds)])?;
+    for (name, help, value) in [
+        ("process_resident_memory_bytes", "Memory in use", resources.resident_bytes as f64),
+        ("process_start_time_seconds", "When the process started, since 1970", resources.start_seconds),
+        ("process_threads", "Threads", resources.threads as f64),
+        ("process_open_fds", "File descriptors in use", resources.descriptors as f64),
+        (
+            "process_max_fds",
+            "The most file descriptors",
+            resources.most_descriptors.map_or(f64::INFINITY, |n| n as f64),
+        ),
+    ] {
+        page.gauges(name, help, [(NONE, value)])?;
+    }
+    Ok(())
+}
+
+/// A code as gRPC's documents write it.
+fn written(code: Code) -> String {
+    let mut text = String::new();
+    for letter in format!("{code:?}").chars() {
+        if letter.is_uppercase() && !text.is_empty() {
+            text.push('_');
+        }
+        text.push(letter.to_ascii_uppercase());
+    }
+    text
+}
+
+/// What is written on.
+struct Page<'a>(DescriptorEncoder<'a>);
+
+impl Page<'_> {
+    fn gauges<S: EncodeLabelSet>(
+        &mut self,
+        name: &str,
+        help: &str,
+        each: impl IntoIterator<Item = (S, f64)>,
+    ) -> Written {
+        self.series(name, help, MetricType::Gauge, each, |mut encoder, value| encoder.encode_gauge(&value))
+    }
+
+    /// Names end with `_total`, which is not given.
+    fn counters<S: EncodeLabelSet>(
+        &mut self,
+        name: &str,
+        help: &str,
+        each: impl IntoIterator<Item = (S, f64)>,
+    ) -> Written {
+        let encode = |mut encoder: MetricEncoder<'_>, value| encoder.encode_counter::<NoLabelSet, _, f64>(&value, None);
+        self.series(name, help, MetricType::Counter, each, encode)
+    }
+
+    fn histograms<'h, S: EncodeLabelSet>(
+        &mut self,
+        name: &str,
+        help: &str,
+        each: impl IntoIterator<Item = (S, &'h Histogram)>,
+    ) -> Written {
+        self.series(name, help, MetricType::Histogram, each, |mut encoder, times: &Histogram| {
+            let counts = times.counts();
+            let all = counts.iter().map(|(_, count)| count).sum();
+            encoder.encode_histogram::<NoLabelSet>(times.seconds(), all, &counts, None)
+        })
+    }
+
+    fn series<S: EncodeLabelSet, V>(
+        &mut self,
+        name: &str,
+        help: &str,
+        kind: MetricType,
+        each: impl IntoIterator<Item = (S, V)>,
+        encode: impl Fn(MetricEncoder<'_>, V) -> Written,
+    ) -> Written {
+        let mut metric = self.0.encode_descriptor(name, help, None, kind)?;
+        each.into_iter().try_for_each(|(labels, value)| encode(metric.encode_family(&labels)?, value))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn codes_are_written_as_in_grpcs_documents() {
+        assert_eq!(written(Code::ResourceExhausted), "RESOURCE_EXHAUSTED");
+        assert_eq!(written(Code::Ok), "OK");
+    }
+}

@@ -1,0 +1,38 @@
+//! What the server says of itself: metrics, health when it is full, the access log.
+
+mod counts;
+mod endpoint;
+mod health;
+mod log;
+mod page;
+
+use crate::common::server::{Server, until};
+use page::Page;
+use std::path::PathBuf;
+use tempfile::TempDir;
+
+/// A server that tells metrics at a socket.
+struct Watched {
+    server: Server,
+    socket: PathBuf,
+    _directory: TempDir,
+}
+
+impl Watched {
+    fn start(flags: &[&str]) -> Self {
+        let directory = tempfile::tempdir().unwrap();
+        let socket = directory.path().join("metrics");
+        let metrics = format!("unix:{}", socket.display());
+        Self { server: Server::start(&[&["--metrics", &metrics], flags].concat()), socket, _directory: directory }
+    }
+
+    fn page(&self) -> Page {
+        Page::scrape(&self.socket)
+    }
+
+    /// Waits until a series has this number.
+    async fn until(&self, series: &str, number: f64) {
+        let what = format!("{series} is {number}");
+        until(&what, async || self.page().number(series) == number).await;
+    }
+}
