@@ -8,7 +8,9 @@ use crate::{
     common::server::{Server, channel, command, open, until, within},
     dm_env_rpc::client::{Agent, Settings, choice, create, double, reset_world, settings, text, uint64},
 };
-use perturb::proto::{Open, Release, Reset, dm_env_rpc::v1::environment_client::EnvironmentClient};
+use perturb::proto::{
+    AutoresetMode, Open, Release, Reset, Restore, Snapshot, Step, dm_env_rpc::v1::environment_client::EnvironmentClient,
+};
 use perturb_protocol::{
     Stream,
     ledger::{Begin, Draws, End, Entry, Event, read},
@@ -174,4 +176,46 @@ async fn worlds_are_in_the_ledger_and_under_roles_too() {
     assert_eq!(lines[2].ends, [End { seed: 4, index: 0, count: 1, episode: Some(0) }]);
     let refused = |entry: &&Entry| matches!(entry.event, Event::Refused { .. });
     assert_eq!(entries(&path).iter().filter(refused).count(), 3);
+}
+
+#[tokio::test]
+async fn what_was_refused_or_failed_after_it_was_written_is_taken_back() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("ledger");
+    let server = Server::start(&["--ledger", path.to_str().unwrap(), "--max-envs", "2"]);
+    let connection = connect(server.tcp(), &[]).await.unwrap();
+    let (mut session, _) = within(Stream::open(&connection, open("CartPole", 2, 1))).await.unwrap();
+    assert!(within(Stream::open(&connection, open("CartPole", 1, 9))).await.is_err(), "the server is full");
+    until("it is taken back", async || draws(&path).len() == 3).await;
+    assert_eq!(draws(&path)[2].ends, [End { seed: 9, index: 0, count: 1, episode: None }]);
+
+    // A snapshot of an episode that has ended, which same-step mode does not take.
+    drop(session);
+    until("there is room", async || draws(&path).len() == 4).await;
+    let disabled = Open { autoreset_mode: AutoresetMode::Disabled.into(), ..open("CartPole", 1, 5) };
+    let (mut ended, _) = within(Stream::open(&connection, disabled)).await.unwrap();
+    while within(ended.ask(Step { actions: vec![0; 4].into() })).await.unwrap().ended.is_empty() {}
+    let snapshots = within(ended.ask(Snapshot::default())).await.unwrap().snapshots;
+    drop(ended);
+    until("there is room again", async || draws(&path).len() == 6).await;
+    let same_step = Open { autoreset_mode: AutoresetMode::SameStep.into(), ..open("CartPole", 1, 6) };
+    (session, _) = within(Stream::open(&connection, same_step)).await.unwrap();
+    assert!(within(session.ask(Restore { snapshots, ..Restore::default() })).await.is_err());
+    until("it goes on as before", async || draws(&path).len() == 9).await;
+    let last = draws(&path).pop().unwrap();
+    assert_eq!(last.ends, [End { seed: 5, index: 0, count: 1, episode: None }]);
+    assert_eq!(last.begins, [Begin { seed: 6, index: 0, count: 1, region: 0, episode: 0 }]);
+}
+
+#[test]
+fn a_file_that_is_no_ledger_is_left_as_it_is() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("token");
+    for text in ["correct-horse-battery", "{}\n", "a\nb"] {
+        std::fs::write(&path, text).unwrap();
+        let refused = command().arg("--ledger").arg(&path).args(["--listen", "tcp://127.0.0.1:0"]).output().unwrap();
+        let words = String::from_utf8(refused.stderr).unwrap();
+        assert!(words.contains("--ledger") && words.contains("no ledger"), "{words}");
+        assert_eq!((refused.status.code(), std::fs::read_to_string(&path).unwrap().as_str()), (Some(2), text));
+    }
 }
