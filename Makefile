@@ -277,7 +277,7 @@ fuzz: deps ## attack the server and the readers of files with mutated bytes, und
 	cargo run --release --locked --manifest-path fuzz/Cargo.toml --target-dir $(TARGET)/fuzz --bin seeds -- $(FUZZ)
 	@set -e; for target in $(FUZZ_TARGETS); do \
 		mkdir -p fuzz/corpus/$$target; \
-		cargo +nightly fuzz run --fuzz-dir fuzz --target-dir $(TARGET)/fuzz --features libfuzzer $$target $(FUZZ)/$$target fuzz/corpus/$$target -- \
+		LSAN_OPTIONS=suppressions=$(abspath fuzz/leaks.txt) cargo +nightly fuzz run --fuzz-dir fuzz --target-dir $(TARGET)/fuzz --features libfuzzer $$target $(FUZZ)/$$target fuzz/corpus/$$target -- \
 			-max_total_time=$(FUZZ_SECONDS) -timeout=60 -rss_limit_mb=4096 -max_len=65536 -print_final_stats=1; \
 	done
 
