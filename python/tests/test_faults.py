@@ -283,6 +283,9 @@ import os, signal, threading, time, numpy as np, perturb
 envs = perturb.PerturbVectorEnv("CartPole", 4, server={address!r}, timeout=float("inf"))
 envs.reset(seed=1)
 os.kill({server}, signal.SIGSTOP)
+tasks = "/proc/{server}/task"
+while any(open(f"{{tasks}}/{{task}}/stat").read().rsplit(")", 1)[1].split()[0] != "T" for task in os.listdir(tasks)):
+    time.sleep(0.01)  # until then it may still answer
 
 def interrupt():
     while not envs._client.session.waits:
@@ -303,7 +306,8 @@ def test_ctrl_c_interrupts_a_step_at_once_and_the_process_ends(start_server: Cal
     running = start_server()
     code = INTERRUPTED.format(address=running.address, server=running.process.pid)
     with within(SECONDS):
-        assert output_of(code) == ("interrupted True\n", "")
+        out, errors = output_of(code)
+        assert (out, errors) == ("interrupted True\n", ""), errors
 
 
 def test_a_session_that_nobody_uses_tells_the_server_that_it_lives(start_server: Callable[..., Any]) -> None:
