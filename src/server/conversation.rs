@@ -12,6 +12,7 @@ use super::{
     tokens::{Bearer, Held, Token},
 };
 use futures_util::{Stream, stream};
+use perturb_protocol::Awake;
 use std::{future::Future, pin::Pin, sync::atomic::Ordering, time::Duration};
 use tokio::time::Instant;
 use tonic::Status;
@@ -94,8 +95,8 @@ impl Sessions {
         let admitted = self.admit(&requests);
         let _places = admitted.inspect_err(|refusal| self.refusals.count(refusal, requests.bearer.as_ref()))?;
         let sessions = Self { drain: self.drain.enter(), ..self.clone() };
-        let (start, ending) = (Instant::now(), GONE);
-        let conversation = Conversation { requests, dialogue, sessions, start, spent: 0, ending, _places };
+        let (start, awake, ending) = (Instant::now(), Awake::default(), GONE);
+        let conversation = Conversation { requests, dialogue, sessions, start, spent: 0, awake, ending, _places };
         // Polled by the connection: when the client is gone the stream is dropped, and what the dialogue holds with it.
         let responses = stream::unfold(Some(conversation), |conversation| async {
             let mut conversation = conversation?;
@@ -136,6 +137,7 @@ struct Conversation<D: Dialogue> {
     start: Instant,
     /// Its steps that its token was told of.
     spent: u64,
+    awake: Awake,
     ending: &'static str,
     _places: (Place, Option<Held>),
 }
@@ -179,7 +181,7 @@ impl<D: Dialogue> Conversation<D> {
             biased; // the end comes first: a client that never pauses must not outlast it
             () = self.sessions.drain.closed() => return Err(Stop::Refused(Refusal::Draining)),
             refusal = revoked(bearer) => return Err(Stop::Refused(refusal)),
-            request = self.requests.next(allowance) => match request? {
+            request = self.awake.until(self.requests.next(allowance)) => match request? {
                 Some(request) => request,
                 None => return Ok(None),
             },

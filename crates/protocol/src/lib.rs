@@ -5,12 +5,14 @@
 //! - [`names`]: how people may spell names.
 //! - [`catalogue`]: the environments and limits as JSON.
 //! - [`Connection`] and [`Stream`]: a client's side of a session, one typed reply for each request.
+//! - [`Awake`]: how both sides wait for each other.
 //! - [`credentials`]: what a client shows, and whom it trusts.
 //! - [`EndedEpisode`]: what came of an episode.
 //! - [`PrivateServer`]: a server of a program's own.
 #![forbid(unsafe_code)]
 
 mod address;
+mod awake;
 pub mod catalogue;
 mod connection;
 pub mod credentials;
@@ -27,6 +29,7 @@ mod stream;
 mod version;
 
 pub use address::{Address, AddressError};
+pub use awake::Awake;
 pub use connection::{Connection, Machines, Patience, first_of, machines};
 pub use distribution::{Distribution, DistributionError, Interval};
 pub use ended::EndedEpisode;

@@ -8,6 +8,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Status, Streaming};
 
 use crate::address::Address;
+use crate::awake::Awake;
 use crate::connection::Connection;
 use crate::error::{ClientError, lost, timed_out};
 use crate::proto::{self, SessionRequest, SessionResponse, session_request::Request, session_response::Response};
@@ -81,6 +82,7 @@ pub struct Stream {
     replies: Streaming<SessionResponse>,
     /// Replies that came while a request could not be sent.
     arrived: VecDeque<SessionResponse>,
+    awake: Awake,
 }
 
 impl Stream {
@@ -102,7 +104,7 @@ impl Stream {
             .map_err(|_| timed_out(&address, proto::Open::NAME, limit))?
             .map_err(|status| lost(&status))?
             .into_inner();
-        let mut stream = Self { address, limit, requests, replies, arrived: VecDeque::new() };
+        let mut stream = Self { address, limit, requests, replies, arrived: VecDeque::new(), awake: Awake::default() };
         let opened = stream.receive::<proto::Open>().await?;
         Ok((stream, opened))
     }
@@ -153,7 +155,7 @@ impl Stream {
     pub async fn receive<A: Ask>(&mut self) -> Result<A::Reply, ClientError> {
         let message = match self.arrived.pop_front() {
             Some(arrived) => Some(arrived),
-            None => tokio::time::timeout(self.limit, self.replies.message())
+            None => tokio::time::timeout(self.limit, self.awake.until(self.replies.message()))
                 .await
                 .map_err(|_| timed_out(&self.address, A::NAME, self.limit))?
                 .map_err(|status| lost(&self.address, A::NAME, &status))?,
