@@ -17,6 +17,7 @@ use crate::files::{self, FileError, read_if_there};
 use crate::outcomes::PolicyOutcomes;
 use crate::plan::{Plan, TrainedOn};
 use crate::records::{FILE, Records, RecordsError};
+use crate::seal::{self, Sealed};
 use crate::selection::{MethodResults, Reported, SelectedRun};
 use crate::settings::{Observe, Preset};
 use crate::value_error::ValueError;
@@ -208,13 +209,14 @@ impl Assessed {
     pub fn read(path: &Path) -> Result<Self> {
         let json = path.join(ASSESSMENT);
         let Some(text) = read_if_there(&json)? else { return Err(AssessedError::Missing { path: path.to_owned() }) };
-        let damaged =
-            |error: serde_json::Error| AssessedError::Damaged { path: json.clone(), reason: error.to_string() };
-        let value: serde_json::Value = serde_json::from_slice(&text).map_err(damaged)?;
+        let broken = |reason: String| AssessedError::Damaged { path: json.clone(), reason };
+        let damaged = |error: serde_json::Error| broken(error.to_string());
+        let mut value: serde_json::Value = serde_json::from_slice(&text).map_err(damaged)?;
         match value.get("format_version").and_then(serde_json::Value::as_u64) {
             Some(got) if got != u64::from(FORMAT_VERSION) => return Err(AssessedError::Format { path: json, got }),
             _ => {}
         }
+        seal::open(&mut value).map_err(|reason| broken(reason.into()))?;
         let document: Document = serde_json::from_value(value).map_err(damaged)?;
         let mut policies = Vec::new();
         for Entry { file, known } in document.policies {
@@ -254,7 +256,8 @@ impl Assessed {
         }
         let (environment, agent) = (self.environment().to_owned(), self.agent.clone());
         let document = Document { format_version: FORMAT_VERSION, environment, agent, policies: entries };
-        files::write_json(&json, &document)?;
+        let sealed = Sealed::new(&document).map_err(|error| files::io("write", &json)(error.into()))?;
+        files::write_json(&json, &sealed)?;
         let is_kept = |file: &str| document.policies.iter().any(|entry| entry.file == file);
         let gone = former.iter().filter(|file| !is_kept(file));
         Ok(gone.map(|file| path.join(file)).try_for_each(|path| files::delete(&path))?)
@@ -287,7 +290,10 @@ impl Assessed {
 /// The records that the document `json` names, files beside it; none if it is not there or cannot be understood.
 fn records_named_in(json: &Path) -> Result<BTreeSet<String>> {
     let text = read_if_there(json)?.unwrap_or_default();
-    let entries = serde_json::from_slice(&text).map_or_else(|_| Vec::new(), |document: Document| document.policies);
+    let mut value = serde_json::from_slice(&text).unwrap_or_default();
+    // What was changed names its files all the same.
+    let _ = seal::open(&mut value);
+    let entries = serde_json::from_value(value).map_or_else(|_| Vec::new(), |document: Document| document.policies);
     let names = entries.iter().filter_map(|entry| Path::new(&entry.file).file_name()?.to_str());
     let is_records = |name: &&str| name.starts_with("episodes") && name.ends_with(".parquet");
     Ok(names.filter(is_records).map(str::to_owned).collect())

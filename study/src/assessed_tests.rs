@@ -48,6 +48,21 @@ fn what_is_damaged_can_be_overwritten() {
     assert_eq!(Assessed::read(directory.path()).unwrap().policies(), assessed.policies());
 }
 
+#[test]
+fn what_was_changed_is_refused_and_can_be_overwritten() {
+    let directory = tempfile::tempdir().unwrap();
+    let assessed = fixture::assessed("PPO", "CartPole", &[Some(D), Some(R)], [200; 3]);
+    assessed.write(directory.path(), false).unwrap();
+    let json = directory.path().join(ASSESSMENT);
+    let written = fs::read_to_string(&json).unwrap();
+    fs::write(&json, written.replace("\"PPO\"", "\"A2C\"")).unwrap();
+    let refused = Assessed::read(directory.path()).unwrap_err().to_string();
+    assert!(refused.contains("its checksum is another"), "{refused}");
+    let less = fixture::assessed("PPO", "CartPole", &[Some(D)], [200; 3]);
+    less.write(directory.path(), true).unwrap();
+    assert_eq!(files::list(directory.path()).unwrap().len(), 2, "the former's records are gone");
+}
+
 #[rstest]
 #[case("{", "is damaged")]
 #[case(r#"{"format_version": 2, "policies": 1}"#, "has format 2; this program reads 1")]
