@@ -1,7 +1,11 @@
 //! A model and the data that MuJoCo computes on it.
 
 use crate::{Error, Model, Warning, model::last_error, sys};
-use std::{ffi::c_int, ptr::NonNull, slice};
+use std::{
+    ffi::c_int,
+    ptr::{self, NonNull},
+    slice,
+};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Status {
@@ -25,11 +29,13 @@ pub struct Simulation {
     model: Model,
     // Made by mj_makeData for `model`, owned, freed in drop. The model is never replaced by one of other sizes.
     data: NonNull<sys::mjData>,
+    /// Made of `model`, whose arrays it shares; owned, freed in drop. None where the model does not allow for it.
+    pairs: Option<NonNull<sys::perturb_mj_pairs>>,
     status: Status,
 }
 
-// SAFETY: mjData is plain memory without ties to a thread; `Simulation` owns it alone. The error handler of a call is
-// that of the calling thread, and is removed before the call returns.
+// SAFETY: mjData and the pairs are plain memory without ties to a thread; `Simulation` owns them alone. The error handler
+// of a call is that of the calling thread, and is removed before the call returns.
 unsafe impl Send for Simulation {}
 // SAFETY: through `&Simulation` nothing is written: the accessors read, and mj_objectVelocity takes all as const.
 unsafe impl Sync for Simulation {}
@@ -41,7 +47,10 @@ impl Simulation {
     /// [`Error::Fatal`] without memory.
     pub fn new(model: Model) -> Result<Self, Error> {
         let data = make_data(&model)?;
-        Ok(Self { model, data, status: Status::Sound })
+        // SAFETY: a valid model, only read; its memory stays where it is as long as `model` lives, which is as long as the
+        // pairs do; the result is new, or null.
+        let pairs = NonNull::new(unsafe { sys::perturb_mj_make_pairs(model.as_ptr()) });
+        Ok(Self { model, data, pairs, status: Status::Sound })
     }
 
     /// The model as edited.
@@ -149,6 +158,22 @@ impl Simulation {
         self.run(sys::perturb_mj_step)
     }
 
+    /// [`step`](Self::step), to the same bytes, in less time where only the world's geoms can touch others: MuJoCo then
+    /// need not search for those that are near each other, which it does by all pairs' bounding boxes.
+    ///
+    /// # Errors
+    /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
+    pub fn step_without_search(&mut self) -> Result<(), Error> {
+        let Some(pairs) = self.pairs else { return self.step() };
+        // SAFETY: the pairs are those of this model, which `&mut self` lends to nobody else.
+        self.run_with(|model, data| unsafe { sys::perturb_mj_step_pairs(model, pairs.as_ptr(), data) })
+    }
+
+    /// Whether [`step_without_search`](Self::step_without_search) does without.
+    pub fn has_pairs(&self) -> bool {
+        self.pairs.is_some()
+    }
+
     /// Checks positions and velocities, and computes the poses and the velocities of bodies. It is a part of
     /// [`step1`](Self::step1), of which contacts and forces are left out: they stay those before.
     ///
@@ -198,13 +223,18 @@ impl Simulation {
     }
 
     fn run(&mut self, call: unsafe extern "C" fn(*const sys::mjModel, *mut sys::mjData) -> c_int) -> Result<(), Error> {
+        // SAFETY: `call` is one of the shim's, which want what `run_with` gives.
+        self.run_with(|model, data| unsafe { call(model, data) })
+    }
+
+    /// Calls the shim with the model and data that belong to it and are sound; `&mut self` excludes other users.
+    fn run_with(&mut self, call: impl FnOnce(*const sys::mjModel, *mut sys::mjData) -> c_int) -> Result<(), Error> {
         match self.status {
             Status::Sound => {}
             Status::Diverged(warning) => return Err(Error::Diverged { warning }),
             Status::Poisoned => return Err(Error::Poisoned),
         }
-        // SAFETY: `call` is one of the shim's; `data` belongs to `model` and is sound; `&mut self` excludes other users.
-        let failed = unsafe { call(self.model.as_ptr(), self.data.as_ptr()) };
+        let failed = call(self.model.as_ptr(), self.data.as_ptr());
         self.poison_if(failed)?;
         // MuJoCo answers a bad number by resetting the state and counting a warning, nothing else.
         match Warning::ALL.into_iter().find(|&warning| self.warnings(warning) != 0) {
@@ -402,8 +432,11 @@ impl Simulation {
 impl Drop for Simulation {
     fn drop(&mut self) {
         // SAFETY: the data came from mj_makeData, are owned by `self`, and are freed once; also after a fatal error the
-        // two buffers that this frees are as mj_makeData left them.
-        unsafe { sys::mj_deleteData(self.data.as_ptr()) }
+        // two buffers that this frees are as mj_makeData left them. So do the pairs, of which MuJoCo keeps nothing.
+        unsafe {
+            sys::mj_deleteData(self.data.as_ptr());
+            sys::perturb_mj_free_pairs(self.pairs.map_or(ptr::null_mut(), NonNull::as_ptr));
+        }
     }
 }
 

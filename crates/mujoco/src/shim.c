@@ -100,6 +100,95 @@ int perturb_mj_step(const mjModel* model, mjData* data) {
   return failed;
 }
 
+struct perturb_mj_pairs {
+  mjModel view;  // the model, but with these pairs as the only ones: what mj_collision is given
+  int geoms[];   // for each pair the geom whose contacts it has: that of higher priority
+};
+
+// MuJoCo's rules for geoms that no pair of the model's own names.
+static int can_touch(const mjModel* m, int a, int b) {
+  return ((m->geom_contype[a] & m->geom_conaffinity[b]) || (m->geom_contype[b] & m->geom_conaffinity[a])) &&
+         m->body_weldid[m->geom_bodyid[a]] != m->body_weldid[m->geom_bodyid[b]];
+}
+
+perturb_mj_pairs* perturb_mj_make_pairs(const mjModel* m) {
+  if (m->npair || m->nexclude || m->opt.collision != mjCOL_ALL || m->opt.integrator != mjINT_EULER ||
+      m->opt.enableflags) {
+    return NULL;
+  }
+  int n = 0;
+  for (int a = 0; a < m->ngeom; a++) {
+    for (int b = a + 1; b < m->ngeom; b++) {
+      if (!can_touch(m, a, b)) continue;
+      // Of two other bodies the search decides whether they are near each other, and no pair of theirs could take its place.
+      if (m->geom_bodyid[a] != 0 || m->geom_priority[a] == m->geom_priority[b]) return NULL;
+      n++;
+    }
+  }
+  size_t numbers = (size_t)n * (mjNREF + mjNIMP + 5 + 2), indices = (size_t)n * 5;
+  size_t head = (sizeof(perturb_mj_pairs) + indices * sizeof(int) + sizeof(mjtNum) - 1) / sizeof(mjtNum);
+  perturb_mj_pairs* pairs = calloc(head + numbers, sizeof(mjtNum));
+  if (!pairs) return NULL;
+  mjModel* view = &pairs->view;
+  *view = *m;
+  view->npair = n;
+  view->opt.collision = mjCOL_PAIR;
+  view->pair_geom1 = pairs->geoms + n;
+  view->pair_geom2 = pairs->geoms + 2 * n;
+  view->pair_dim = pairs->geoms + 3 * n;
+  view->pair_signature = pairs->geoms + 4 * n;
+  view->pair_friction = (mjtNum*)pairs + head;
+  view->pair_solref = view->pair_friction + 5 * n;
+  view->pair_solimp = view->pair_solref + mjNREF * n;
+  view->pair_margin = view->pair_solimp + mjNIMP * n;
+  view->pair_gap = view->pair_margin + n;
+  // By bodies, and within one by the world's geoms: the order of contacts.
+  int i = 0;
+  for (int body = 1; body < m->nbody; body++) {
+    for (int a = m->body_geomadr[0]; a < m->body_geomadr[0] + m->body_geomnum[0]; a++) {
+      for (int b = m->body_geomadr[body]; b < m->body_geomadr[body] + m->body_geomnum[body]; b++) {
+        if (!can_touch(m, a, b)) continue;
+        int geom = m->geom_priority[a] > m->geom_priority[b] ? a : b;
+        pairs->geoms[i] = geom;
+        view->pair_geom1[i] = a;
+        view->pair_geom2[i] = b;
+        view->pair_dim[i] = m->geom_condim[geom];
+        view->pair_signature[i] = body + 1 + (1 << 16);
+        memcpy(view->pair_solref + mjNREF * i, m->geom_solref + mjNREF * geom, mjNREF * sizeof(mjtNum));
+        memcpy(view->pair_solimp + mjNIMP * i, m->geom_solimp + mjNIMP * geom, mjNIMP * sizeof(mjtNum));
+        view->pair_margin[i] = mju_max(m->geom_margin[a], m->geom_margin[b]);
+        view->pair_gap[i] = mju_max(m->geom_gap[a], m->geom_gap[b]);
+        i++;
+      }
+    }
+  }
+  return pairs;
+}
+
+void perturb_mj_free_pairs(perturb_mj_pairs* pairs) { free(pairs); }
+
+static void collide(const mjModel* model, perturb_mj_pairs* pairs, mjData* data) {
+  // Friction is edited.
+  for (int i = 0; i < pairs->view.npair; i++) {
+    const mjtNum* from = model->geom_friction + 3 * pairs->geoms[i];
+    mjtNum* to = pairs->view.pair_friction + 5 * i;
+    to[0] = to[1] = from[0];
+    to[2] = from[1];
+    to[3] = to[4] = from[2];
+  }
+  mj_collision(&pairs->view, data);
+}
+
+int perturb_mj_step_pairs(const mjModel* model, perturb_mj_pairs* pairs, mjData* data) {
+  // mj_step1 by its parts, of which mj_collision is another.
+  GUARDED(mj_checkPos(model, data); mj_checkVel(model, data); mj_kinematics(model, data); mj_comPos(model, data);
+          mj_camlight(model, data); mj_tendon(model, data); mj_crb(model, data); mj_factorM(model, data);
+          collide(model, pairs, data); mj_makeConstraint(model, data); mj_transmission(model, data);
+          mj_projectConstraint(model, data); mj_sensorPos(model, data); mj_fwdVelocity(model, data);
+          mj_sensorVel(model, data); mj_step2(model, data))
+  return failed;
+}
+
 int perturb_mj_motion(const mjModel* model, mjData* data) {
   GUARDED(mj_checkPos(model, data); mj_checkVel(model, data); mj_kinematics(model, data); mj_comPos(model, data);
           mj_comVel(model, data))

@@ -161,12 +161,12 @@ impl Walker {
         for (ctrl, &a) in simulation.ctrl_mut().iter_mut().zip(action) {
             *ctrl = self.power * f64::from(a).clamp(-1.0, 1.0);
         }
-        simulation.step()?;
+        simulation.step_without_search()?;
         // A timestep begins with the contacts of the state before it. So those after the last one are computed by the
         // next step, which is the first to need them.
         let contacts = self.contacts.unwrap_or_else(|| self.pristine.touching(simulation));
         for _ in 1..N_SUBSTEPS {
-            simulation.step()?;
+            simulation.step_without_search()?;
         }
         simulation.motion()?;
         let Some((height, pitch)) = self.perceive(simulation, &contacts) else { return Ok(None) };

@@ -2,5 +2,6 @@
 #![allow(clippy::unwrap_used)]
 
 mod faults;
+mod pairs;
 mod render;
 mod states;

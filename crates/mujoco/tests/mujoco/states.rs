@@ -25,7 +25,7 @@ fn simulation() -> Simulation {
     Simulation::new(Model::from_xml(BLOCK).unwrap()).unwrap()
 }
 
-fn state(simulation: &Simulation) -> Vec<f64> {
+pub(crate) fn state(simulation: &Simulation) -> Vec<f64> {
     let mut state = vec![f64::NAN; simulation.model().n_state()];
     simulation.state(&mut state);
     state
