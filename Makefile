@@ -8,6 +8,8 @@ OPENGL := libegl1 libgl1-mesa-dri
 SLURM_PACKAGES := slurmctld slurmd slurm-client munge
 # Emulates other processors, for the test that all compute the same.
 QEMU := qemu-user
+# Has clocks jump, for a test.
+FAKETIME := libfaketime
 # What encodes the .mp4 files of `perturb video`, some 60 MB; everything else but the site runs without it.
 FFMPEG := ffmpeg
 CARGO_DENY_VERSION := 0.20.2
@@ -70,7 +72,7 @@ endef
 
 .DEFAULT_GOAL := help
 .PHONY: help deps opengl toolchain build install demo all-pairs report-check serve-test test slurm-test kill-test \
-	qemu-test slurm-acceptance lint bench fuzz bench-peers audit cargo-deny metrics-test otel-test python-test wheel wheel-test \
+	load-test faults-test asan-test qemu-test slurm-acceptance lint bench fuzz bench-peers audit cargo-deny metrics-test otel-test python-test wheel wheel-test \
 	python-acceptance bench-python \
 	python-venv docs docs-test docker docker-base docker-test
 
@@ -133,6 +135,17 @@ test: deps opengl $(DM_ENV_RPC)/installed ## run all tests, then those of the se
 slurm-test: build ## do a plan on a real Slurm of two nodes, started for it, one of which dies
 	@$(call install,$(SLURM_PACKAGES))
 	PERTURB_SLURM_REQUIRED=1 cargo test $(ALL) --test cli slurm::
+
+load-test: build ## a server full of Hoppers for five minutes: 1024 sessions of 16, and one more that is refused
+	PERTURB_TEST_FULL_SERVER_SECONDS=$(LOAD_SECONDS) cargo test $(ALL) --test server -- --nocapture every_place_can_be_taken
+
+faults-test: build ## lines, disks and clocks with faults, again and again, by a seed that PERTURB_SEED repeats; minutes
+	@$(call install,$(FAKETIME))
+	for round in $$(seq $(FAULTS_ROUNDS)); do \
+		PERTURB_FAKETIME_REQUIRED=1 cargo test $(ALL) --package perturb-cli --test cli -- --nocapture lines:: clocks:: \
+			experiments::faults:: && \
+		cargo test $(ALL) --package perturb --test server -- --nocapture faults::lines || exit 1; \
+	done
 
 kill-test: build ## kill servers a hundred times while policies are trained, and compare their weights; minutes
 	cargo test $(ALL) --test cli -- --ignored --nocapture a_hundred_kills
@@ -267,6 +280,17 @@ docker-base:
 		}; \
 	done
 
+# How often `make faults-test` tries, and how long `make load-test` steps.
+FAULTS_ROUNDS ?= 5
+LOAD_SECONDS ?= 300
+
+# AddressSanitizer needs a nightly compiler. What the compiler of C makes of the shim is not looked into, but every
+# allocation of MuJoCo's is. Debian's OpenGL in software keeps what it allocated for a thread that draws.
+asan-test: deps opengl ## run crates/mujoco's tests under AddressSanitizer; nightly Rust
+	@cargo +nightly --version >/dev/null || { echo "a nightly toolchain is missing: rustup toolchain install nightly" >&2; exit 1; }
+	RUSTFLAGS=-Zsanitizer=address LSAN_OPTIONS=suppressions=$(abspath fuzz/leaks.txt) \
+		cargo +nightly test --package perturb-mujoco --locked --target $$(rustc -vV | sed -n 's/^host: //p') --target-dir $(TARGET)/asan
+
 # Seconds for each of eight targets, and what is mutated from one time to the next.
 FUZZ_SECONDS ?= 38
 FUZZ = $(TARGET)/fuzz-corpus
@@ -281,5 +305,6 @@ fuzz: deps ## attack the server and the readers of files with mutated bytes, und
 			-max_total_time=$(FUZZ_SECONDS) -timeout=60 -rss_limit_mb=4096 -max_len=65536 -print_final_stats=1; \
 	done
 
-docker-test: docker ## run an experiment on servers and learners in containers, and stop a server in mid-run
+docker-test: docker ## run experiments on servers and learners in containers, stop a server in mid-run, and let nobody in who may not
 	docker/test.sh
+	docker/test_guarded.sh

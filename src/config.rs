@@ -95,7 +95,8 @@ pub struct Arguments {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub keepalive_seconds: Option<u64>,
     /// A TOML file of tokens, one of which every call by TCP must show: for each a name, sha256 (or token), and if
-    /// need be max_sessions, max_envs and a role, which says what may be drawn from. It is read again when it changes.
+    /// need be max_sessions, max_envs, max_steps_per_second, max_bytes and a role, which says what may be drawn from. It
+    /// is read again when it changes.
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tokens: Option<PathBuf>,

@@ -38,8 +38,9 @@ struct Sizes {
     action: ActionKind,
 }
 
-/// Checks an `act` against the batch and the policy at play.
-pub fn turn(batch: &Batch, request: proto::Act) -> Result<Turn, Refusal> {
+/// Checks an `act` against the batch and the policy at play, of a client whose environments may take so many steps a
+/// second, if that is bounded.
+pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<Turn, Refusal> {
     let (settings, n_envs) = (batch.settings(), batch.size());
     let order = |when: &'static str, advice| Refusal::Order { request: "act", when: when.into(), advice };
     if settings.autoreset != Autoreset::SameStep {
@@ -93,6 +94,9 @@ pub fn turn(batch: &Batch, request: proto::Act) -> Result<Turn, Refusal> {
         return Err(Refusal::value("act.policy", got, "fewer, so that a step takes less than about a second"));
     }
     let affordable = (MOST_COST / ((settings.spec.step_cost + computed) * n_envs as f64)).max(1.0) as usize;
+    // Of a second, so that none waits long for the next.
+    let allowed = rate.map_or(usize::MAX, |rate| (rate as usize / n_envs.max(1)).max(1));
+    let affordable = affordable.min(allowed);
     let most_steps = if most_steps == 0 { affordable } else { affordable.min(most_steps as usize) };
     Ok(Turn { policy, weights: given_weights, task, most_steps, only_ended })
 }

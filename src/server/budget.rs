@@ -1,15 +1,22 @@
-//! The bytes in flight: one budget for requests, replies, pictures and policies, over all sessions.
+//! The bytes in flight: one budget for requests, replies, pictures and policies, over all sessions, of which a token may
+//! have a part.
 
-use super::status::Refusal;
+use super::{
+    status::Refusal,
+    tokens::{Bearer, Held, Token},
+};
 use bytes::Bytes;
 use std::sync::{
     Arc, Mutex, PoisonError,
     atomic::{AtomicUsize, Ordering},
 };
 
-/// The server's bytes.
+/// The server's bytes, as who has a token may take of them.
 #[derive(Clone)]
-pub struct Budget(Arc<State>);
+pub struct Budget {
+    state: Arc<State>,
+    bearer: Option<Bearer>,
+}
 
 struct State {
     used: AtomicUsize,
@@ -17,30 +24,35 @@ struct State {
 }
 
 impl Budget {
-    /// Of so many bytes.
+    /// Of so many bytes, which are nobody's.
     pub fn new(limit: usize) -> Self {
-        Self(Arc::new(State { used: AtomicUsize::new(0), limit }))
+        Self { state: Arc::new(State { used: AtomicUsize::new(0), limit }), bearer: None }
+    }
+
+    /// The same bytes, of which this token, if there is one, takes no more than it may.
+    pub fn of(&self, bearer: Option<Bearer>) -> Self {
+        Self { state: Arc::clone(&self.state), bearer }
     }
 
     /// Bytes in flight.
     pub fn used(&self) -> usize {
-        self.0.used.load(Ordering::Relaxed)
+        self.state.used.load(Ordering::Relaxed)
     }
 
     /// The most there may be.
     pub fn limit(&self) -> usize {
-        self.0.limit
+        self.state.limit
     }
 
     /// Nothing yet, to be grown.
     pub fn nothing(&self) -> Share {
-        Share { budget: self.clone(), bytes: 0 }
+        Share { state: Arc::clone(&self.state), bytes: 0, held: self.bearer.as_ref().map(Token::no_bytes) }
     }
 
     /// So many bytes, until the share is dropped.
     ///
     /// # Errors
-    /// [`Refusal::NoMemory`].
+    /// [`Refusal::NoMemory`], [`Refusal::TooManyOfAToken`].
     pub fn take(&self, bytes: usize) -> Result<Share, Refusal> {
         let mut share = self.nothing();
         share.grow(bytes)?;
@@ -50,33 +62,44 @@ impl Budget {
 
 /// A part of the budget.
 pub struct Share {
-    budget: Budget,
+    state: Arc<State>,
     bytes: usize,
+    /// As many, of those that the token may have.
+    held: Option<Held>,
 }
 
 impl Share {
     /// Takes so many bytes more.
     ///
     /// # Errors
-    /// [`Refusal::NoMemory`]; then it is as before.
+    /// [`Refusal::NoMemory`], [`Refusal::TooManyOfAToken`]; then it is as before.
     pub fn grow(&mut self, bytes: usize) -> Result<(), Refusal> {
         if bytes == 0 {
             return Ok(());
         }
-        let State { used, limit } = &*self.budget.0;
+        self.held.as_mut().map(|held| held.grow(bytes)).transpose()?;
+        let State { used, limit } = &*self.state;
         let fits = |used: usize| used.checked_add(bytes).filter(|sum| sum <= limit);
         match used.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits) {
             Ok(_) => {
                 self.bytes += bytes;
                 Ok(())
             }
-            Err(used) => Err(Refusal::NoMemory { wanted: bytes, used, limit: *limit }),
+            Err(used) => {
+                if let Some(held) = &mut self.held {
+                    held.give_back(bytes);
+                }
+                Err(Refusal::NoMemory { wanted: bytes, used, limit: *limit })
+            }
         }
     }
 
     /// Makes it as large as what was made in the end, which may be more than was expected.
     pub fn set(&mut self, bytes: usize) {
-        let used = &self.budget.0.used;
+        if let Some(held) = &mut self.held {
+            held.set(bytes);
+        }
+        let used = &self.state.used;
         used.fetch_add(bytes, Ordering::Relaxed);
         used.fetch_sub(std::mem::replace(&mut self.bytes, bytes), Ordering::Relaxed);
     }
@@ -84,7 +107,7 @@ impl Share {
 
 impl Drop for Share {
     fn drop(&mut self) {
-        self.budget.0.used.fetch_sub(self.bytes, Ordering::Relaxed);
+        self.state.used.fetch_sub(self.bytes, Ordering::Relaxed);
     }
 }
 

@@ -13,7 +13,7 @@ use super::{
 };
 use futures_util::{Stream, stream};
 use perturb_protocol::Awake;
-use std::{future::Future, pin::Pin, sync::atomic::Ordering, time::Duration};
+use std::{future::Future, pin::Pin, time::Duration};
 use tokio::time::Instant;
 use tonic::Status;
 
@@ -198,6 +198,16 @@ impl<D: Dialogue> Conversation<D> {
             Message::Whole(bytes, share) => (bytes, share),
             Message::Refused(refusal) => return Ok(Some(self.undecoded(refusal))),
         };
+        // Who is ahead of their rate waits, and nothing has happened yet.
+        tokio::select! {
+            biased;
+            turn = turn(bearer) => match turn {
+                Ok(()) => {}
+                Err(refusal) => return Ok(Some(self.undecoded(refusal))),
+            },
+            () = self.sessions.drain.closed() => return Err(Stop::Refused(Refusal::Draining)),
+            refusal = revoked(bearer) => return Err(Stop::Refused(refusal)),
+        }
         match self.sessions.decoder.decode(request, D::FIELDS, allowance).await? {
             Ok(request) => tokio::select! {
                 biased; // it mostly is there at once
@@ -217,7 +227,7 @@ impl<D: Dialogue> Conversation<D> {
     fn spend(&mut self) {
         if let Some(bearer) = &self.requests.bearer {
             let steps = self.dialogue.about().steps;
-            bearer.spent().steps.fetch_add(steps.saturating_sub(self.spent), Ordering::Relaxed);
+            bearer.stepped(steps.saturating_sub(self.spent));
             self.spent = steps;
         }
     }
@@ -242,6 +252,14 @@ async fn revoked(bearer: Option<&Bearer>) -> Refusal {
     match bearer {
         Some(bearer) => bearer.revoked().await,
         None => std::future::pending().await,
+    }
+}
+
+/// Resolves when the token, if there is one, lets its environments step.
+async fn turn(bearer: Option<&Bearer>) -> Result<(), Refusal> {
+    match bearer {
+        Some(bearer) => bearer.turn().await,
+        None => Ok(()),
     }
 }
 

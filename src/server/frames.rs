@@ -83,25 +83,27 @@ where
     }
 
     fn call(&mut self, mut request: http::Request<Body>) -> Self::Future {
-        let (outbox, transit) = (Outbox::default(), self.transit.clone());
+        let outbox = Outbox::default();
         let connection = request.extensions().get::<Connection>().cloned();
         let is_stream = request.uri().path() == self.path;
+        // What is no stream is one small reply.
+        let limit = self.transit.limit.filter(|_| is_stream);
         if is_stream {
+            let bearer = request.extensions_mut().remove::<Bearer>();
+            let transit = Transit { budget: self.transit.budget.of(bearer.clone()), limit };
             let body = std::mem::take(request.body_mut());
             let frames = Frames {
                 body,
                 buffer: BytesMut::new(),
                 message: None,
                 share: transit.budget.nothing(),
-                transit: transit.clone(),
+                transit,
                 connection: connection.clone(),
-                bearer: request.extensions_mut().remove::<Bearer>(),
+                bearer,
                 outbox: outbox.clone(),
             };
             request.extensions_mut().insert(Kept(Arc::new(Mutex::new(Some(frames)))));
         }
-        // What is no stream is one small reply.
-        let limit = transit.limit.filter(|_| is_stream);
         let response = self.service.call(request);
         Box::pin(
             async move { Ok(response.await?.map(|body| Body::new(Replies::new(body, outbox, connection, limit)))) },

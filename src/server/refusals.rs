@@ -4,7 +4,7 @@ use super::{status::Refusal, tokens::Bearer};
 use crate::{env, pool, render};
 use std::{
     collections::BTreeMap,
-    sync::{Arc, Mutex, PoisonError, atomic::Ordering},
+    sync::{Arc, Mutex, PoisonError},
 };
 use tonic::Code;
 
@@ -18,7 +18,7 @@ impl Refusals {
         let key = (refusal.code() as i32, reason(refusal));
         *self.0.lock().unwrap_or_else(PoisonError::into_inner).entry(key).or_default() += 1;
         if let Some(bearer) = bearer {
-            bearer.spent().refusals.fetch_add(1, Ordering::Relaxed);
+            bearer.refused();
         }
     }
 
@@ -57,6 +57,7 @@ pub fn reason(refusal: &Refusal) -> &'static str {
         Refusal::WrongToken => "wrong_token",
         Refusal::RevokedToken { .. } => "revoked_token",
         Refusal::TooManyOfAToken { .. } => "token_quota",
+        Refusal::TooFast { .. } => "token_rate",
         Refusal::NotAllowed { .. } => "role",
         Refusal::NoLedger { .. } => "no_ledger",
         Refusal::NoMemory { .. } => "memory_full",

@@ -165,7 +165,7 @@ impl Session {
         let batch = self.batch.as_mut().ok_or(Refusal::NotOpen { request: "act" })?;
         let policy = sizes::policy(&request, batch.size());
         let policy = (policy > 0).then(|| self.budget.take(policy)).transpose()?;
-        let turn = acting::turn(batch, request)?;
+        let turn = acting::turn(batch, self.bearer.as_ref().and_then(|bearer| bearer.rate()), request)?;
         let share = self.budget.take(sizes::reply_to(&turn, batch))?;
         self.playing = policy.or(self.playing.take());
         let acted = acting::acted(batch.act(turn).await?);

@@ -90,8 +90,21 @@ pub enum Refusal {
         wanted: usize,
         /// The most there may be.
         limit: usize,
-        /// Sessions or environments.
+        /// Sessions, environments or bytes in flight.
         what: &'static str,
+    },
+    /// A token's environments have stepped too fast for too long.
+    #[error(
+        "the token {name:?} may take {rate} steps a second here, and its sessions are {seconds} s ahead of that; step \
+         fewer environments at a time or in fewer sessions, or try again later"
+    )]
+    TooFast {
+        /// What it is called.
+        name: String,
+        /// The most steps a second.
+        rate: u32,
+        /// How long until it may step again.
+        seconds: u64,
     },
     /// The token's role does not allow it.
     #[error(
@@ -239,7 +252,7 @@ impl Refusal {
             | Self::Render(render::Error::NoThread { .. }) => Code::ResourceExhausted,
             // What is more than it may ever have is not to be tried again.
             Self::TooManyOfAToken { wanted, limit, .. } if wanted > limit => Code::InvalidArgument,
-            Self::TooManyOfAToken { .. } => Code::ResourceExhausted,
+            Self::TooManyOfAToken { .. } | Self::TooFast { .. } => Code::ResourceExhausted,
             Self::Pool(pool::Error::Ended { .. })
             | Self::NotOpen { .. }
             | Self::AlreadyOpen

@@ -3,10 +3,12 @@
 
 mod common;
 
+mod clocks;
 mod end_to_end;
 mod experiments;
 mod guarded;
 mod ledgers;
+mod lines;
 mod misuse;
 mod patience;
 mod processors;

@@ -1,25 +1,25 @@
 //! Servers are killed at random moments, and what goes on comes to the bytes that it comes to undisturbed.
 
 use std::fs::File;
-use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant, SystemTime};
+use std::time::Instant;
 
 use rstest::rstest;
 use tempfile::TempDir;
 
 use crate::common::{child_server, ended, kill, perturb, run, server, stderr, wait_for};
+use perturb_faults::Dice;
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::Servers;
 
-const PPO_CART_POLE: &str = "environment = 'CartPole'\nversion = 'R'\nalgorithm = 'ppo'\narchitecture = 'ff'\n\
+pub const PPO_CART_POLE: &str = "environment = 'CartPole'\nversion = 'R'\nalgorithm = 'ppo'\narchitecture = 'ff'\n\
                              episodes = 800\nnum_envs = 8\nn_steps = 64\ncheckpoint_interval = 20";
 const A2C_PENDULUM: &str = "environment = 'Pendulum'\nversion = 'R'\nalgorithm = 'a2c'\narchitecture = 'ff'\n\
                             episodes = 400\nnum_envs = 8\ncheckpoint_interval = 8";
 
 /// Whose servers are killed.
-#[derive(Clone, Copy, Debug, Hash)]
+#[derive(Clone, Copy, Debug)]
 enum Victim {
     /// The only one, which the learner started itself.
     Private,
@@ -27,31 +27,6 @@ enum Victim {
     Named,
     /// One of two, which somebody starts again.
     OneOfTwo,
-}
-
-/// Numbers that follow from a seed.
-struct Dice(u64, u64);
-
-impl Dice {
-    /// Of the moment, and printed: a failure can be tried again with `PERTURB_SEED`.
-    fn new() -> Self {
-        let now = || SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).expect("a time").subsec_nanos();
-        let given = std::env::var("PERTURB_SEED").ok().map(|text| text.parse().expect("PERTURB_SEED is a number"));
-        let seed = given.unwrap_or_else(|| now().into());
-        println!("PERTURB_SEED={seed}");
-        Self(seed, 0)
-    }
-
-    fn below(&mut self, end: u64) -> u64 {
-        let mut hasher = DefaultHasher::new();
-        self.1 += 1;
-        (self.0, self.1).hash(&mut hasher);
-        hasher.finish() % end
-    }
-
-    fn wait(&mut self, from: u64, to: u64) {
-        std::thread::sleep(Duration::from_millis(from + self.below(to - from)));
-    }
 }
 
 /// A server at a socket, which can be killed and started again.

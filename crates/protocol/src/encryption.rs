@@ -161,7 +161,7 @@ impl Watched {
     fn hear(&self, error: &io::Error) {
         use AlertDescription as Alert;
         let Some(Error::AlertReceived(
-            Alert::CertificateRequired
+            alert @ (Alert::CertificateRequired
             | Alert::BadCertificate
             | Alert::UnsupportedCertificate
             | Alert::CertificateRevoked
@@ -169,12 +169,15 @@ impl Watched {
             | Alert::CertificateUnknown
             | Alert::UnknownCA
             | Alert::AccessDenied
-            | Alert::DecryptError, // a signature that is not its issuer's
+            | Alert::DecryptError), // a signature that is not its issuer's
         )) = error.get_ref().and_then(|error| error.downcast_ref())
         else {
             return;
         };
         let reason = match self.shows_certificate {
+            true if *alert == Alert::CertificateExpired => {
+                format!("the certificate of {CERT} has expired; have it renewed by who signed it")
+            }
             true => format!("it accepts no client with the certificate of {CERT}: another authority must sign it"),
             false => format!("it asks for a client's certificate; set {CERT} and {KEY} to the files of yours"),
         };

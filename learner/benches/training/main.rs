@@ -8,10 +8,9 @@
 //!
 //! An argument that is part of a measurement's name restricts what is measured.
 
-mod delay;
-
 use std::time::{Duration, Instant};
 
+use perturb_faults::{Course, Line};
 use perturb_learner::client::{ActAt, Address, PrivateServer, Servers};
 use perturb_learner::logging::TimeShares;
 use perturb_learner::training::{Entry, RunDirectory, Start, train, train_together};
@@ -39,8 +38,8 @@ fn main() -> Result<()> {
         }
     }
     if is_wanted("alone/delayed") {
-        let proxy = delay::Proxy::start(&address, DELAY)?;
-        alone("alone/delayed/act_server", &Servers::connect(&[proxy.address().parse()?])?)?;
+        let line = Line::start(&address.to_string(), |_| Course { delay: DELAY, ..Course::default() })?;
+        alone("alone/delayed/act_server", &Servers::connect(&[line.address().parse()?])?)?;
     }
     let a2c = "algorithm = 'a2c'\nnum_envs = 1\nn_steps = 5";
     let ppo = "algorithm = 'ppo'\nnum_envs = 1\nn_steps = 128\nn_minibatches = 4";

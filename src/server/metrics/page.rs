@@ -119,6 +119,9 @@ impl Numbers {
         };
         page.gauges("perturb_token_sessions", "Sessions of a token now", each(|used| used.sessions as f64))?;
         page.gauges("perturb_token_environments", "Environments of a token now", each(|used| used.envs as f64))?;
+        page.gauges("perturb_token_in_flight_bytes", "Bytes of a token in flight now", each(|used| used.bytes as f64))?;
+        let help = "How long requests of a token waited for its rate";
+        page.counters("perturb_token_wait_seconds", help, each(|used| used.waited.as_secs_f64()))?;
         page.counters("perturb_token_steps", "Steps of a token's environments", each(|used| used.steps as f64))?;
         page.counters("perturb_token_refusals", "What was refused to a token", each(|used| used.refusals as f64))
     }

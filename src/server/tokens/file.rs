@@ -15,7 +15,8 @@ use toml::Spanned;
 const SHORTEST: usize = 16;
 /// What an entry may have.
 const ENTRY: &str = "[[token]] with name = \"…\", sha256 = \"64 hexadecimal digits\" or token = \"…\", and if need be \
-                     max_sessions = N, max_envs = N and role = \"…\"; [[role]] with name, draws = [\"D\", \"R\", …] and \
+                     max_sessions = N, max_envs = N, \
+                     max_steps_per_second = N, max_bytes = N and role = \"…\"; [[role]] with name, draws = [\"D\", \"R\", …] and \
                      never = […]; [[set]] with name, environment, version and parameters";
 
 /// Why a file of tokens is refused. Nothing of a token is in it.
@@ -45,6 +46,8 @@ pub(super) struct Entry {
     token: Option<String>,
     pub(super) max_sessions: Option<usize>,
     pub(super) max_envs: Option<usize>,
+    pub(super) max_steps_per_second: Option<u32>,
+    pub(super) max_bytes: Option<usize>,
     role: Option<String>,
 }
 
@@ -160,7 +163,12 @@ fn digest(entry: &Entry) -> Result<[u8; 32], String> {
     if name.is_empty() || name.chars().any(char::is_control) {
         return Err(format!("{name:?} is no name"));
     }
-    for (key, limit) in [("max_sessions", entry.max_sessions), ("max_envs", entry.max_envs)] {
+    for (key, limit) in [
+        ("max_sessions", entry.max_sessions),
+        ("max_envs", entry.max_envs),
+        ("max_steps_per_second", entry.max_steps_per_second.map(|rate| rate as usize)),
+        ("max_bytes", entry.max_bytes),
+    ] {
         if limit == Some(0) {
             return Err(format!("{key} of {name:?} is 0, at least 1 is expected; leave the token out to revoke it"));
         }

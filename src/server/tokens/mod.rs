@@ -2,10 +2,13 @@
 
 mod file;
 mod gate;
+mod pace;
+mod quota;
 mod role;
 
 pub use file::{Wrong, new_token};
 pub use gate::Gated;
+pub use quota::Held;
 pub use role::Role;
 
 use super::{
@@ -14,38 +17,19 @@ use super::{
 };
 use crate::env::Catalogue;
 use file::{Entry, Known, listed};
+use pace::{Pace, TooFast};
+use quota::{Kind, Quota};
 use sha2::{Digest, Sha256};
-use std::sync::{
-    Arc, PoisonError, RwLock,
-    atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering},
+use std::{
+    sync::{
+        Arc, PoisonError, RwLock,
+        atomic::{AtomicBool, AtomicU64, Ordering},
+    },
+    time::Duration,
 };
 use subtle::ConstantTimeEq;
 use tokio::sync::Notify;
 use tonic::{body::Body, codegen::http};
-
-/// So many of something, of which a token may have no more than a limit.
-#[derive(Default)]
-struct Quota {
-    taken: AtomicUsize,
-    limit: AtomicUsize,
-}
-
-impl Quota {
-    fn bound(&self, limit: Option<usize>) {
-        self.limit.store(limit.unwrap_or(usize::MAX), Ordering::Relaxed);
-    }
-
-    /// Takes so many, or says how many there may be.
-    fn take(&self, wanted: usize) -> Result<(), usize> {
-        let limit = self.limit.load(Ordering::Relaxed);
-        let grown = |taken: usize| taken.checked_add(wanted).filter(|sum| *sum <= limit);
-        self.taken.fetch_update(Ordering::Relaxed, Ordering::Relaxed, grown).map(|_| ()).map_err(|_| limit)
-    }
-
-    fn give_back(&self, count: usize) {
-        self.taken.fetch_sub(count, Ordering::Relaxed);
-    }
-}
 
 /// What a client shows, and what whoever shows it may have.
 pub struct Token {
@@ -56,18 +40,19 @@ pub struct Token {
     revoked: AtomicBool,
     /// Wakes who waits for that.
     told: Notify,
-    sessions: Arc<Quota>,
-    envs: Arc<Quota>,
-    spent: Arc<Spent>,
+    /// Of all tokens that have had its name.
+    quotas: Arc<Quotas>,
 }
 
-/// What was done with a token so far.
+/// What a token may have and do, and what it did.
 #[derive(Default)]
-pub struct Spent {
-    /// Steps of an environment.
-    pub steps: AtomicU64,
-    /// Requests and calls that were refused.
-    pub refusals: AtomicU64,
+struct Quotas {
+    sessions: Quota,
+    envs: Quota,
+    bytes: Quota,
+    pace: Pace,
+    steps: AtomicU64,
+    refusals: AtomicU64,
 }
 
 /// What a token has, and what was done with it.
@@ -78,8 +63,12 @@ pub struct Used {
     pub sessions: usize,
     /// Environments now.
     pub envs: usize,
+    /// Bytes in flight now.
+    pub bytes: usize,
     /// Steps of an environment so far.
     pub steps: u64,
+    /// How long its requests waited for its rate so far.
+    pub waited: Duration,
     /// What was refused so far.
     pub refusals: u64,
 }
@@ -93,19 +82,46 @@ impl Token {
         &self.name
     }
 
-    /// What was done with it.
-    pub fn spent(&self) -> &Spent {
-        &self.spent
+    /// Counts steps of its environments, which are all known only when they were done.
+    pub fn stepped(&self, steps: u64) {
+        self.quotas.steps.fetch_add(steps, Ordering::Relaxed);
+        self.quotas.pace.add(steps);
+    }
+
+    /// Counts something that was refused to it.
+    pub fn refused(&self) {
+        self.quotas.refusals.fetch_add(1, Ordering::Relaxed);
     }
 
     fn used(&self) -> Used {
+        let Quotas { sessions, envs, bytes, pace, steps, refusals } = &*self.quotas;
         Used {
             name: self.name.clone(),
-            sessions: self.sessions.taken.load(Ordering::Relaxed),
-            envs: self.envs.taken.load(Ordering::Relaxed),
-            steps: self.spent.steps.load(Ordering::Relaxed),
-            refusals: self.spent.refusals.load(Ordering::Relaxed),
+            sessions: sessions.taken(),
+            envs: envs.taken(),
+            bytes: bytes.taken(),
+            steps: steps.load(Ordering::Relaxed),
+            waited: pace.waited(),
+            refusals: refusals.load(Ordering::Relaxed),
         }
+    }
+
+    /// The most steps a second that its environments may take together; none: as many as there can be.
+    pub fn rate(&self) -> Option<u32> {
+        self.quotas.pace.rate()
+    }
+
+    /// Waits until its environments may step again.
+    ///
+    /// # Errors
+    /// [`Refusal::TooFast`], at once, if that would be too long.
+    pub async fn turn(&self) -> Result<(), Refusal> {
+        let turn = self.quotas.pace.turn().await;
+        turn.map_err(|TooFast { rate, ahead }| Refusal::TooFast {
+            name: self.name.clone(),
+            rate,
+            seconds: ahead.as_secs(),
+        })
     }
 
     /// What it may draw from; none: from anything.
@@ -139,7 +155,7 @@ impl Token {
     /// # Errors
     /// [`Refusal::TooManyOfAToken`].
     pub fn session(self: &Arc<Self>) -> Result<Held, Refusal> {
-        self.take(1, |token| &token.sessions, "sessions")
+        self.take(1, Kind::Sessions)
     }
 
     /// So many environments of it.
@@ -147,35 +163,18 @@ impl Token {
     /// # Errors
     /// [`Refusal::TooManyOfAToken`].
     pub fn envs(self: &Arc<Self>, count: usize) -> Result<Held, Refusal> {
-        self.take(count, |token| &token.envs, "environments")
+        self.take(count, Kind::Environments)
     }
 
-    fn take(self: &Arc<Self>, count: usize, of: fn(&Self) -> &Quota, what: &'static str) -> Result<Held, Refusal> {
-        let refuse = |limit| Refusal::TooManyOfAToken { name: self.name.clone(), wanted: count, limit, what };
-        of(self).take(count).map_err(refuse)?;
-        Ok(Held { token: Arc::clone(self), count, of })
+    /// No bytes of it in flight, to be grown.
+    pub fn no_bytes(self: &Arc<Self>) -> Held {
+        Held::nothing(Arc::clone(self), Kind::Bytes)
     }
-}
 
-/// A part of a quota, until it is dropped.
-pub struct Held {
-    token: Bearer,
-    count: usize,
-    of: fn(&Token) -> &Quota,
-}
-
-impl Held {
-    /// Gives some of it back.
-    pub fn give_back(&mut self, count: usize) {
-        let count = count.min(self.count);
-        self.count -= count;
-        (self.of)(&self.token).give_back(count);
-    }
-}
-
-impl Drop for Held {
-    fn drop(&mut self) {
-        self.give_back(self.count);
+    fn take(self: &Arc<Self>, count: usize, kind: Kind) -> Result<Held, Refusal> {
+        let mut held = Held::nothing(Arc::clone(self), kind);
+        held.grow(count)?;
+        Ok(held)
     }
 }
 
@@ -211,26 +210,20 @@ impl Tokens {
         let listed = listed(&self.catalogue, text)?;
         let mut tokens = self.good.write().unwrap_or_else(PoisonError::into_inner);
         let mut renewed = Vec::with_capacity(listed.len());
-        for Known { digest, entry: Entry { name, max_sessions, max_envs, .. }, role } in listed {
+        for Known { digest, entry, role } in listed {
+            let Entry { name, max_sessions, max_envs, max_steps_per_second, max_bytes, .. } = entry;
             // Another token of the same name has what was taken with the one before, too.
             let before = tokens.iter().find(|token| token.name == name);
-            let (sessions, envs, spent) = before.map_or_else(Default::default, |token| {
-                (Arc::clone(&token.sessions), Arc::clone(&token.envs), Arc::clone(&token.spent))
-            });
-            sessions.bound(max_sessions);
-            envs.bound(max_envs);
+            let quotas = before.map_or_else(Default::default, |token| Arc::clone(&token.quotas));
+            quotas.sessions.bound(max_sessions);
+            quotas.envs.bound(max_envs);
+            quotas.bytes.bound(max_bytes);
+            quotas.pace.bound(max_steps_per_second);
             renewed.push(match before.filter(|token| token.digest == digest && token.role == role) {
                 Some(token) => Arc::clone(token),
-                None => Arc::new(Token {
-                    name,
-                    digest,
-                    role,
-                    revoked: AtomicBool::new(false),
-                    told: Notify::new(),
-                    sessions,
-                    envs,
-                    spent,
-                }),
+                None => {
+                    Arc::new(Token { name, digest, role, revoked: AtomicBool::new(false), told: Notify::new(), quotas })
+                }
             });
         }
         let gone = |token: &&Bearer| !renewed.iter().any(|kept| Arc::ptr_eq(kept, token));
@@ -306,6 +299,9 @@ mod tests {
     #[case::spaces(&file("correct horse battery", ""), 1, "visible")]
     #[case::no_number(&file(SECRET, "max_envs = \"correct-horse-battery\""), 4, "cannot be read")]
     #[case::nothing(&file(SECRET, "max_envs = 0"), 1, "leave the token out")]
+    #[case::no_bytes(&file(SECRET, "max_bytes = 0"), 1, "leave the token out")]
+    #[case::no_steps(&file(SECRET, "max_steps_per_second = 0"), 1, "leave the token out")]
+    #[case::too_many_steps(&file(SECRET, "max_steps_per_second = 5000000000"), 4, "cannot be read")]
     #[case::twice(&(file(SECRET, "") + &file("another-horse-battery", "")), 4, "two tokens called \"ann\"")]
     #[case::shared(&(file(SECRET, "") + &file(SECRET, "").replace("ann", "bob")), 4, "another one's")]
     fn a_wrong_file_is_refused_with_its_line_and_no_token(#[case] text: &str, #[case] line: usize, #[case] part: &str) {
@@ -337,6 +333,6 @@ mod tests {
         tokens.renew("").unwrap();
         assert!(new.is_revoked() && tokens.find(SECRET.as_bytes()).is_none());
         drop((first, held));
-        assert_eq!(ann.envs.taken.load(Ordering::Relaxed) + ann.sessions.taken.load(Ordering::Relaxed), 0);
+        assert_eq!((ann.used().envs, ann.used().sessions), (0, 0));
     }
 }

@@ -1,6 +1,8 @@
 //! What one client may take of the server: each attack is tried beside a neighbour, who must not notice.
 
 pub mod client;
+#[cfg(feature = "mujoco")]
+mod closing;
 mod memory;
 mod messages;
 mod pictures;

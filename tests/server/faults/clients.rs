@@ -106,7 +106,7 @@ impl Drop for ClientProcess {
 }
 
 /// Waits until so many environments can be opened at once.
-async fn room_for(address: &str, n: u32) {
+pub(super) async fn room_for(address: &str, n: u32) {
     until("the environments are free again", async || {
         let mut session = Session::connect(address).await;
         match session.answer(open("Acrobot", n, 1)).await {

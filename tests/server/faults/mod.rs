@@ -2,7 +2,9 @@
 //! notice: its bytes equal those of an undisturbed run.
 
 mod clients;
+mod lines;
 mod requests;
+mod strings;
 
 use crate::common::server::{Actor, Session, environment, open, until, within};
 use perturb::proto::{Environment, SessionResponse};

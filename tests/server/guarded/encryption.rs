@@ -1,11 +1,11 @@
 //! TLS: who trusts whom.
 
-use super::{
-    begin,
-    certificates::{Authority, Pair},
-    connect, logged, steps, unauthenticated, unsafe_words,
-};
+use super::{begin, connect, logged, steps, unauthenticated, unsafe_words};
 use crate::common::server::{self, Server, within};
+use perturb_faults::{
+    Course, Fault, Kind, Line,
+    certificates::{Authority, Pair},
+};
 use perturb_protocol::{
     ClientError,
     credentials::{CA, CERT, KEY, TOKEN_FILE},
@@ -106,9 +106,9 @@ async fn a_server_may_ask_for_certificates_of_clients() {
     };
     let connection = with(&good).await.unwrap();
     let _session = begin(&connection, 1).await.unwrap();
-    for pair in [old, bad] {
+    for (pair, part) in [(old, "has expired; have it renewed"), (bad, "accepts no client with the certificate")] {
         let words = unsafe_words(with(&pair).await);
-        assert!(words.contains("accepts no client with the certificate"), "{words}");
+        assert!(words.contains(part), "{words}");
     }
     let words = unsafe_words(connect(encrypted.address(), &[(CA, &encrypted.ca)]).await);
     assert!(words.contains("asks for a client's certificate; set PERTURB_CERT"), "{words}");
@@ -170,29 +170,6 @@ async fn handshakes_that_do_not_end_hold_up_nobody() {
     assert!(start.elapsed() >= Duration::from_secs(1), "they had their time");
 }
 
-/// What passes between a client and a server, with one bit of it changed.
-async fn changed_on_its_way(server: &str, place: usize) -> u16 {
-    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
-    let (port, server) = (listener.local_addr().unwrap().port(), server.to_owned());
-    tokio::spawn(async move {
-        let (client, _) = listener.accept().await.unwrap();
-        let (mut from_client, mut to_client) = client.into_split();
-        let (mut from_server, mut to_server) = TcpStream::connect(server).await.unwrap().into_split();
-        tokio::spawn(async move { tokio::io::copy(&mut from_client, &mut to_server).await });
-        let (mut buffer, mut come) = (vec![0; 1 << 14], 0);
-        while let Ok(count @ 1..) = from_server.read(&mut buffer).await {
-            if (come..come + count).contains(&place) {
-                buffer[place - come] ^= 1;
-            }
-            come += count;
-            if tokio::io::AsyncWriteExt::write_all(&mut to_client, &buffer[..count]).await.is_err() {
-                break;
-            }
-        }
-    });
-    port
-}
-
 #[tokio::test]
 async fn with_tls_no_changed_byte_is_taken_for_the_servers() {
     let encrypted = Encrypted::usual();
@@ -208,11 +185,11 @@ async fn with_tls_no_changed_byte_is_taken_for_the_servers() {
         Ok(played)
     };
     let truth = played(encrypted.address().into()).await.unwrap();
-    let port = encrypted.address().strip_prefix("https://").unwrap();
     let mut errors = 0;
     for place in [3, 60, 200, 700, 1000, 1500, 2000, 3000, 4000, 6000] {
-        let proxy = changed_on_its_way(port, place).await;
-        match played(format!("https://127.0.0.1:{proxy}")).await {
+        let from_server = Some(Fault { at: place, kind: Kind::Change });
+        let line = Line::start(encrypted.address(), move |_| Course { from_server, ..Course::default() }).unwrap();
+        match played(format!("https://{}", line.address())).await {
             Ok(same) => assert_eq!(same, truth, "the byte at {place} was changed, and believed"),
             Err(error) => {
                 errors += 1;

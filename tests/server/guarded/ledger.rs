@@ -11,6 +11,7 @@ use crate::{
 use perturb::proto::{
     AutoresetMode, Open, Release, Reset, Restore, Snapshot, Step, dm_env_rpc::v1::environment_client::EnvironmentClient,
 };
+use perturb_faults::disk;
 use perturb_protocol::{
     Stream,
     ledger::{Begin, Draws, End, Entry, Event, read},
@@ -119,11 +120,9 @@ async fn nothing_is_drawn_that_cannot_be_written_down() {
     let path = directory.path().join("ledger");
     // Files of this server may have so many blocks, which is what a full disk comes to.
     let limited = |blocks: u32, path: &Path| {
-        let mut limited = std::process::Command::new("sh");
-        let program = command().get_program().to_owned();
-        limited.args(["-c", "trap '' XFSZ; ulimit -f \"$1\"; shift; exec \"$@\"", "sh", &blocks.to_string()]);
-        limited.arg(program).arg("--ledger").arg(path).args(["--listen", "tcp://127.0.0.1:0"]);
-        limited
+        let mut server = command();
+        server.arg("--ledger").arg(path).args(["--listen", "tcp://127.0.0.1:0"]);
+        disk::small_files(&server, blocks)
     };
     for (mut command, part) in [(limited(0, &path), "File too large"), (limited(9, Path::new("/dev/full")), "no file")]
     {

@@ -1,11 +1,13 @@
 //! Servers that ask who comes: tokens, TLS, and what is refused without.
 
-mod certificates;
 mod encryption;
 mod ledger;
+mod quotas;
 mod roles;
 mod settings;
 mod tokens;
+
+pub use tokens::entry;
 
 use crate::common::server::{DEADLINE, Server, open, within};
 use perturb_protocol::{Address, ClientError, Connection, Patience, Stream, credentials::Credentials};

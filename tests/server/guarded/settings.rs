@@ -1,7 +1,8 @@
 //! What is refused before any port is bound, and what is not.
 
-use super::{certificates::Authority, connect};
+use super::connect;
 use crate::common::server::{Server, command};
+use perturb_faults::certificates::Authority;
 use rstest::rstest;
 use std::{
     os::unix::fs::PermissionsExt,

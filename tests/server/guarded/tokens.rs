@@ -19,10 +19,10 @@ pub(super) const BOB: &str = "staple-correct-horse";
 pub(super) struct Guarded {
     pub(super) server: Server,
     pub(super) directory: TempDir,
-    file: PathBuf,
+    pub(super) file: PathBuf,
 }
 
-pub(super) fn entry(name: &str, token: &str, more: &str) -> String {
+pub fn entry(name: &str, token: &str, more: &str) -> String {
     format!("[[token]]\nname = \"{name}\"\ntoken = \"{token}\"\n{more}\n")
 }
 

@@ -170,6 +170,8 @@ async fn each_token_has_its_numbers_by_its_name() {
         (format!("perturb_token_sessions{ann}"), 2.0),
         (format!("perturb_token_environments{ann}"), 4.0),
         (format!("perturb_token_steps_total{ann}"), 12.0),
+        (format!("perturb_token_wait_seconds_total{ann}"), 0.0),
+        (r#"perturb_token_in_flight_bytes{token="bob"}"#.into(), 0.0),
         (format!("perturb_token_refusals_total{ann}"), 1.0),
         (r#"perturb_token_steps_total{token="bob"}"#.into(), 0.0),
         (r#"perturb_refusals_total{code="UNAUTHENTICATED",reason="no_token"}"#.into(), 1.0),
@@ -179,6 +181,9 @@ async fn each_token_has_its_numbers_by_its_name() {
         assert!(page.tells(&series), "no {series} in\n{}", page.text);
         assert_eq!(page.number(&series), number, "{series} in\n{}", page.text);
     }
+    let bytes = page.number(&format!("perturb_token_in_flight_bytes{ann}"));
+    assert_eq!(bytes, page.number("perturb_in_flight_bytes"), "nobody else has any");
+    assert!(bytes > 0.0, "an open session keeps what its steps need");
     assert!(!page.text.contains(ANN) && !page.text.contains("no-such-token"), "{}", page.text);
 
     write_tokens(&file, "carol");

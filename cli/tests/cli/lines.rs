@@ -1,0 +1,67 @@
+//! Trainings over lines with faults come to the weights that they come to without.
+
+use std::path::Path;
+use std::time::Duration;
+
+use perturb_faults::{Course, Dice, Kind, Line};
+use rstest::rstest;
+use tempfile::TempDir;
+
+use crate::common::{ended, perturb, server, stderr};
+use crate::guarded::{ALL, Guarded, weights};
+use crate::patience::PPO_CART_POLE;
+
+/// Connections that have a fault; those behind them have none, so that it ends.
+const FAULTY: usize = 4;
+/// Where the first fault is at least: who cannot even begin is told so, and does not wait.
+const BEGUN: usize = 20_000;
+/// Beyond it there is no fault: a training's connection carries more, both ways.
+const MOST: u64 = 200_000;
+
+/// Trains at that address.
+fn train(address: &str, out: &Path, guarded: Option<&Guarded>) -> (String, Vec<u8>) {
+    let settings = out.with_extension("toml");
+    std::fs::write(&settings, PPO_CART_POLE).expect("written");
+    let mut command = perturb(&["train", "--server", address, "--server-wait", "200", "--threads", "1", "--config"]);
+    command.arg(settings).arg("--out").arg(out);
+    if let Some(guarded) = guarded {
+        guarded.equip(&mut command, ALL);
+    }
+    let trained = ended(command.spawn().expect("perturb"));
+    assert!(trained.status.success(), "{}: {}", trained.status, stderr(&trained));
+    weights(out)
+}
+
+/// What becomes of a connection.
+fn course(dice: &mut Dice, number: usize) -> Course {
+    let mut course = Course { delay: Duration::from_micros(dice.below(1000)), ..Course::default() };
+    if number < FAULTY {
+        let mut fault = dice.fault(&Kind::LOSSES, MOST);
+        fault.at += if number == 0 { BEGUN } else { 0 };
+        let is_servers = dice.below(2) == 0;
+        *(if is_servers { &mut course.from_server } else { &mut course.from_client }) = Some(fault);
+    }
+    println!("connection {number}: {course:?}");
+    course
+}
+
+#[rstest]
+#[case::plain(false)]
+#[case::encrypted(true)]
+fn a_training_over_a_line_with_faults_comes_to_the_same_weights(#[case] encrypted: bool) {
+    let out = TempDir::new().expect("a directory");
+    let guarded = encrypted.then(Guarded::start);
+    let own = (!encrypted).then(|| server(1));
+    let address = match (&guarded, &own) {
+        (Some(guarded), _) => guarded.address.clone(),
+        (None, own) => own.as_ref().expect("one of both").address().to_string(),
+    };
+    let truth = train(&address, &out.path().join("truth"), guarded.as_ref());
+    let mut dice = Dice::new();
+    let line = Line::start(&address, move |number| course(&mut dice, number)).expect("a port");
+    let scheme = if encrypted { "https://" } else { "" };
+    let got = train(&format!("{scheme}{}", line.address()), &out.path().join("run"), guarded.as_ref());
+    println!("{} faults on {} connections", line.faults(), line.connections());
+    assert!(line.faults() > 0, "nothing happened");
+    assert!(got == truth, "{} and not {}", got.0, truth.0);
+}

@@ -1,0 +1,220 @@
+//! How fast a token's environments may step. Who is ahead of that waits with the next request, while nothing is held but
+//! the request itself; what was not used can be made up for within a second.
+
+use std::{
+    sync::{Mutex, MutexGuard, PoisonError},
+    time::Duration,
+};
+use tokio::time::{Instant, sleep};
+
+/// Steps of so long can be made up for, s.
+const BURST: f64 = 1.0;
+/// The longest wait: clients give a reply a minute.
+const LONGEST: Duration = Duration::from_secs(30);
+/// What is rounded away is waited for, too.
+const SHORTEST: Duration = Duration::from_micros(1);
+/// How often a request that waits looks whether the rate is another one by now.
+const LOOK: Duration = Duration::from_millis(500);
+
+/// A token's rate, and where it stands.
+#[derive(Default)]
+pub(super) struct Pace(Mutex<State>);
+
+#[derive(Default)]
+struct State {
+    /// Steps a second; none: as many as there can be.
+    rate: Option<u32>,
+    /// Steps so far.
+    done: f64,
+    /// Those that the rate has allowed by `at`, at most [`BURST`] more than were done.
+    allowed: f64,
+    at: Option<Instant>,
+    waited: Duration,
+}
+
+/// What was done is so far ahead of the rate that nobody should wait for it.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) struct TooFast {
+    pub(super) rate: u32,
+    pub(super) ahead: Duration,
+}
+
+impl Pace {
+    /// From now on so many steps a second.
+    pub(super) fn bound(&self, rate: Option<u32>) {
+        self.lock().bound(rate, Instant::now());
+    }
+
+    /// The most steps a second.
+    pub(super) fn rate(&self) -> Option<u32> {
+        self.lock().rate
+    }
+
+    /// How long requests waited so far.
+    pub(super) fn waited(&self) -> Duration {
+        self.lock().waited
+    }
+
+    /// Counts steps that were done.
+    pub(super) fn add(&self, steps: u64) {
+        self.lock().done += steps as f64;
+    }
+
+    /// Waits until the rate has allowed what was done when this was asked: so those who wait go one after the other.
+    ///
+    /// # Errors
+    /// [`TooFast`], at once, if that takes more than half a minute.
+    pub(super) async fn turn(&self) -> Result<(), TooFast> {
+        let mut ticket = None;
+        while let Some(wait) = self.wait(&mut ticket)? {
+            sleep(wait).await;
+        }
+        Ok(())
+    }
+
+    fn wait(&self, ticket: &mut Option<f64>) -> Result<Option<Duration>, TooFast> {
+        self.lock().wait(ticket, Instant::now())
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    fn bound(&mut self, rate: Option<u32>, now: Instant) {
+        self.settle(now);
+        self.rate = rate;
+    }
+
+    /// Allows what the time since the last call allows.
+    fn settle(&mut self, now: Instant) {
+        let elapsed = self.at.map_or(Duration::ZERO, |at| now.saturating_duration_since(at)).as_secs_f64();
+        self.allowed = match self.rate.map(f64::from) {
+            Some(rate) => (self.allowed + elapsed * rate).min(self.done + BURST * rate),
+            None => self.done,
+        };
+        self.at = Some(now);
+    }
+
+    /// How long the holder of this ticket, which is none at first, is to wait before this is asked again; none: no more.
+    fn wait(&mut self, ticket: &mut Option<f64>, now: Instant) -> Result<Option<Duration>, TooFast> {
+        self.settle(now);
+        let Some(rate) = self.rate else { return Ok(None) };
+        let is_new = ticket.is_none();
+        let steps = *ticket.get_or_insert(self.done) - self.allowed;
+        if steps <= 0.0 {
+            return Ok(None);
+        }
+        // A rate is at least 1.
+        let ahead = Duration::from_secs_f64(steps / f64::from(rate));
+        if is_new && ahead > LONGEST {
+            return Err(TooFast { rate, ahead });
+        }
+        let wait = ahead.clamp(SHORTEST, LOOK);
+        self.waited += wait;
+        Ok(Some(wait))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A rate's state, and a clock that only waiting moves.
+    struct Clocked {
+        state: State,
+        now: Instant,
+    }
+
+    impl Clocked {
+        fn new() -> Self {
+            Self { state: State::default(), now: Instant::now() }
+        }
+
+        fn bound(&mut self, rate: u32) {
+            self.state.bound(Some(rate), self.now);
+        }
+
+        /// How long the next turn takes, s.
+        fn turn(&mut self) -> Result<f64, TooFast> {
+            let (start, mut ticket) = (self.now, None);
+            while let Some(wait) = self.state.wait(&mut ticket, self.now)? {
+                self.now += wait;
+            }
+            Ok((self.now - start).as_secs_f64())
+        }
+    }
+
+    fn is_about(seconds: f64, expected: f64) -> bool {
+        // A wait is of a microsecond at least.
+        (seconds - expected).abs() < 1e-5
+    }
+
+    #[test]
+    fn what_was_done_is_waited_for_and_a_second_can_be_made_up_for() {
+        let mut clocked = Clocked::new();
+        clocked.state.done += 1e6;
+        assert_eq!(clocked.turn(), Ok(0.0), "there is no rate");
+        clocked.bound(100);
+        assert_eq!(clocked.turn(), Ok(0.0), "what was before is forgotten");
+        clocked.state.done += 250.0;
+        assert!(is_about(clocked.turn().unwrap(), 2.5));
+        assert_eq!(clocked.turn(), Ok(0.0));
+        clocked.now += Duration::from_secs(60);
+        assert_eq!(clocked.turn(), Ok(0.0));
+        clocked.state.done += 300.0;
+        assert!(is_about(clocked.turn().unwrap(), 2.0), "not more than a second is made up for");
+        assert!(is_about(clocked.state.waited.as_secs_f64(), 4.5), "{:?}", clocked.state.waited);
+    }
+
+    #[test]
+    fn those_who_wait_go_one_after_the_other_at_the_rate() {
+        const ROUNDS: usize = 50;
+        let mut clocked = Clocked::new();
+        clocked.bound(1000);
+        let start = clocked.now;
+        // When each asks next, with which ticket, and how often it had its turn.
+        let mut sessions = [(start, None, 0); 4];
+        while let Some((at, ticket, turns)) =
+            sessions.iter_mut().filter(|session| session.2 < ROUNDS).min_by_key(|session| session.0)
+        {
+            match clocked.state.wait(ticket, *at).unwrap() {
+                Some(wait) => *at += wait,
+                None => {
+                    clocked.state.done += 100.0;
+                    (*ticket, *turns) = (None, *turns + 1);
+                }
+            }
+            clocked.now = *at;
+            let turns = sessions.map(|session| session.2);
+            assert!(turns.iter().max().unwrap() - turns.iter().min().unwrap() <= 1, "{turns:?}");
+        }
+        // 20 000 steps at 1000 a second, but that nobody waits for the last.
+        let seconds = (clocked.now - start).as_secs_f64();
+        assert!((19.5..20.0).contains(&seconds), "{seconds} s");
+    }
+
+    #[test]
+    fn who_is_half_a_minute_ahead_is_refused() {
+        let mut clocked = Clocked::new();
+        clocked.bound(10);
+        clocked.state.done += 400.0;
+        assert_eq!(clocked.turn(), Err(TooFast { rate: 10, ahead: Duration::from_secs(40) }));
+        clocked.now += Duration::from_secs(20);
+        assert!(is_about(clocked.turn().unwrap(), 20.0));
+    }
+
+    #[test]
+    fn another_rate_counts_for_those_who_wait_already() {
+        let mut clocked = Clocked::new();
+        clocked.bound(10);
+        clocked.state.done += 200.0;
+        let mut ticket = None;
+        let wait = clocked.state.wait(&mut ticket, clocked.now).unwrap().unwrap();
+        clocked.now += wait;
+        clocked.bound(1000);
+        let wait = clocked.state.wait(&mut ticket, clocked.now).unwrap().unwrap();
+        assert!(is_about(wait.as_secs_f64(), 0.195), "{wait:?}");
+    }
+}

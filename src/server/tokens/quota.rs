@@ -1,0 +1,102 @@
+//! What a token may have at a time.
+
+use super::{Bearer, Token};
+use crate::server::status::Refusal;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// So many of something, of which a token may have no more than a limit.
+#[derive(Default)]
+pub(super) struct Quota {
+    taken: AtomicUsize,
+    limit: AtomicUsize,
+}
+
+impl Quota {
+    pub(super) fn bound(&self, limit: Option<usize>) {
+        self.limit.store(limit.unwrap_or(usize::MAX), Ordering::Relaxed);
+    }
+
+    pub(super) fn taken(&self) -> usize {
+        self.taken.load(Ordering::Relaxed)
+    }
+
+    /// Takes so many, or says how many there may be.
+    fn take(&self, wanted: usize) -> Result<(), usize> {
+        let limit = self.limit.load(Ordering::Relaxed);
+        let grown = |taken: usize| taken.checked_add(wanted).filter(|sum| *sum <= limit);
+        self.taken.fetch_update(Ordering::Relaxed, Ordering::Relaxed, grown).map(|_| ()).map_err(|_| limit)
+    }
+}
+
+/// What there are quotas of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kind {
+    Sessions,
+    Environments,
+    Bytes,
+}
+
+impl Kind {
+    fn of(self, token: &Token) -> &Quota {
+        match self {
+            Self::Sessions => &token.quotas.sessions,
+            Self::Environments => &token.quotas.envs,
+            Self::Bytes => &token.quotas.bytes,
+        }
+    }
+
+    fn what(self) -> &'static str {
+        match self {
+            Self::Sessions => "sessions",
+            Self::Environments => "environments",
+            Self::Bytes => "bytes in flight",
+        }
+    }
+}
+
+/// A part of a quota, until it is dropped.
+pub struct Held {
+    token: Bearer,
+    count: usize,
+    kind: Kind,
+}
+
+impl Held {
+    /// Nothing of it yet.
+    pub(super) fn nothing(token: Bearer, kind: Kind) -> Self {
+        Self { token, count: 0, kind }
+    }
+
+    /// Takes so many more.
+    ///
+    /// # Errors
+    /// [`Refusal::TooManyOfAToken`]; then it is as before.
+    pub fn grow(&mut self, count: usize) -> Result<(), Refusal> {
+        self.kind.of(&self.token).take(count).map_err(|limit| Refusal::TooManyOfAToken {
+            name: self.token.name.clone(),
+            wanted: count,
+            limit,
+            what: self.kind.what(),
+        })?;
+        self.count += count;
+        Ok(())
+    }
+
+    /// Makes it so many, which may be more than the quota.
+    pub fn set(&mut self, count: usize) {
+        let taken = &self.kind.of(&self.token).taken;
+        taken.fetch_add(count, Ordering::Relaxed);
+        taken.fetch_sub(std::mem::replace(&mut self.count, count), Ordering::Relaxed);
+    }
+
+    /// Gives some of it back.
+    pub fn give_back(&mut self, count: usize) {
+        self.set(self.count.saturating_sub(count));
+    }
+}
+
+impl Drop for Held {
+    fn drop(&mut self) {
+        self.set(0);
+    }
+}

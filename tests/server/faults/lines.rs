@@ -1,0 +1,76 @@
+//! Many clients over lines with faults, beside one whose line has none.
+
+use super::{Bystander, clients::room_for};
+use crate::common::server::{self, Server, within};
+use perturb::proto::{Step, Stepped};
+use perturb_faults::{Course, Dice, Kind, Line};
+use perturb_protocol::{Address, ClientError, Connection, Patience, Stream};
+use std::{
+    sync::{Arc, Mutex},
+    time::Duration,
+};
+
+const CLIENTS: usize = 60;
+const ENVS: usize = 5;
+const STEPS: usize = 40;
+/// Beyond it there is no fault: so many bytes a client's steps come to, with what goes before them.
+const MOST: u64 = 20_000;
+/// Short, so that halves are given up soon.
+const PATIENCE: Patience = Patience {
+    reply: Duration::from_secs(3),
+    keepalive_interval: Duration::from_secs(1),
+    keepalive_limit: Duration::from_secs(2),
+};
+
+/// What a client sees until it has done its steps, or something is wrong.
+async fn play(address: &str, seen: &mut Vec<Stepped>) -> Result<(), ClientError> {
+    let address: Address = address.parse().unwrap();
+    let connection = Connection::open_with(&address, PATIENCE).await?;
+    let (mut stream, _) = Stream::open(&connection, server::open("CartPole", ENVS as u32, 1)).await?;
+    for _ in 0..STEPS {
+        seen.push(stream.ask(Step { actions: vec![0; 4 * ENVS].into() }).await?);
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn faults_of_lines_end_sessions_and_change_none() {
+    let flags = ["--max-envs", "2003", "--keepalive-seconds", "1", "--stall-seconds", "2", "--handshake-seconds", "3"];
+    let server = Server::start(&flags);
+    let bystander = Bystander::start(server.unix()).await;
+    let mut truth = Vec::new();
+    play(server.unix(), &mut truth).await.unwrap();
+    let (mut dice, courses) = (Dice::new(), Arc::new(Mutex::new(Vec::new())));
+    let drawn: Vec<Course> = (0..CLIENTS)
+        .map(|_| {
+            let (fault, is_servers) = (Some(dice.fault(&Kind::ALL, MOST)), dice.below(2) == 0);
+            let delay = Duration::from_micros(dice.below(3000));
+            let [from_server, from_client] = if is_servers { [fault, None] } else { [None, fault] };
+            Course { delay, from_server, from_client }
+        })
+        .collect();
+    let clients = drawn.into_iter().map(|course| {
+        let line = Line::start(server.tcp(), move |_| course).unwrap();
+        let courses = Arc::clone(&courses);
+        tokio::spawn(async move {
+            let mut seen = Vec::new();
+            let end = play(&line.address(), &mut seen).await;
+            courses.lock().unwrap().push((course, line.faults(), seen, end.err()));
+        })
+    });
+    for client in clients.collect::<Vec<_>>() {
+        within(client).await.unwrap();
+    }
+    let (mut happened, mut noticed) = (0, 0);
+    for (course, faults, seen, error) in courses.lock().unwrap().iter() {
+        let kind = course.from_server.or(course.from_client).map(|fault| fault.kind);
+        // A changed byte that nothing protects may be believed.
+        assert!(kind == Some(Kind::Change) || truth.starts_with(seen), "{course:?} changed what was seen");
+        assert!(*faults > 0 || error.is_none(), "{course:?}: nothing happened, but {error:?}");
+        (happened, noticed) = (happened + faults, noticed + usize::from(error.is_some()));
+    }
+    println!("{happened} faults on {CLIENTS} lines, {noticed} noticed");
+    assert!(happened > CLIENTS / 4 && noticed > CLIENTS / 8, "{happened} happened, {noticed} were noticed");
+    room_for(server.unix(), 2_000).await;
+    bystander.ends_unharmed().await;
+}

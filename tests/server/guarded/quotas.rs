@@ -1,0 +1,144 @@
+//! How much a token may have in flight, and how fast its environments may step.
+
+use super::{
+    logged,
+    tokens::{ANN, BOB, Guarded, entry},
+};
+use crate::{
+    acting::game::{Game, PLAIN, play},
+    common::server::{Session, channel, client, open, until},
+    dm_env_rpc::client::{self as worlds, Agent},
+};
+use bytes::Bytes;
+use perturb::proto::{
+    Act, AutoresetMode, Open, Render, act::Task, dm_env_rpc::v1::environment_client::EnvironmentClient,
+    session_response::Response,
+};
+use std::time::{Duration, Instant};
+use tonic::Code;
+
+/// A session of who has the token, on a connection of its own.
+async fn session(guarded: &Guarded, token: &str, open: Open) -> Session {
+    let mut session = Session::show(&mut client(guarded.server.tcp()).await, Some(token)).await.unwrap();
+    session.ask(open).await;
+    session
+}
+
+/// So many steps of `envs` environments, and how long they took.
+async fn timed(session: &mut Session, envs: usize, count: usize) -> (Vec<Bytes>, Duration) {
+    let start = Instant::now();
+    let mut seen = Vec::new();
+    for _ in 0..count {
+        seen.push(session.step(vec![0; 4 * envs].into()).await.observations);
+    }
+    (seen, start.elapsed())
+}
+
+#[tokio::test]
+async fn a_tokens_sessions_step_at_its_rate_together_and_see_what_others_see() {
+    const ENVS: usize = 20;
+    let rate = "max_steps_per_second = 200";
+    let guarded = Guarded::start(&(entry("ann", ANN, rate) + &entry("bob", BOB, "")));
+    let open = |seed| open("CartPole", ENVS as u32, seed);
+    let (mut one, mut other) = (session(&guarded, ANN, open(1)).await, session(&guarded, ANN, open(2)).await);
+    let mut bob = session(&guarded, BOB, open(1)).await;
+    let ((slow, took), (_, its)) = tokio::join!(timed(&mut one, ENVS, 10), timed(&mut other, ENVS, 10));
+    // 400 steps, but that nobody waits for the last of each, and none were allowed for the time before.
+    let least = Duration::from_secs_f64((400.0 - 2.0 * ENVS as f64) / 200.0 - 1.0);
+    assert!(took.max(its) > least, "{took:?}, {its:?}");
+    let (fast, took) = timed(&mut bob, ENVS, 10).await;
+    println!("another's ten steps took {took:?}");
+    assert!(fast == slow, "a rate changes no number");
+    // Some seconds ahead of it, whatever time passes until the next request.
+    let (_, took) = timed(&mut one, ENVS, 20).await;
+    assert!(took > Duration::from_secs_f64(0.8), "{took:?}");
+    // By the machine's own socket no token is asked for, and nobody is slow.
+    let (mut neighbour, _) = Session::open(guarded.server.unix(), open(1)).await;
+    assert!(timed(&mut neighbour, ENVS, 10).await.0 == slow);
+}
+
+#[tokio::test]
+async fn what_the_server_plays_is_cut_by_the_rate_and_the_same_bytes() {
+    let game = Game { n: 5, ..PLAIN };
+    let guarded = Guarded::start(&entry("ann", ANN, "max_steps_per_second = 50"));
+    let (mut neighbour, environment) = game.session(&guarded.server).await;
+    let mut ann = session(&guarded, ANN, game.open()).await;
+    let act = || Act { most_steps: 0, ..game.act(&environment, Task::Steps(30)) };
+    let (whole, replies) = play(&mut neighbour, act()).await;
+    assert_eq!(replies, 1);
+    let start = Instant::now();
+    let (slow, replies) = play(&mut ann, act()).await;
+    assert_eq!(replies, 3, "a second's worth in each");
+    assert!(slow == whole);
+    assert!(start.elapsed() > Duration::from_millis(900), "{:?}", start.elapsed());
+}
+
+#[tokio::test]
+async fn an_agent_of_the_other_protocol_steps_at_the_rate_too() {
+    let guarded = Guarded::start(&entry("ann", ANN, "max_steps_per_second = 10"));
+    let mut client = EnvironmentClient::new(channel(guarded.server.tcp()).await);
+    let mut agent = Agent::show(&mut client, Some(ANN)).await.unwrap();
+    let world = agent.create(worlds::settings("Pendulum", [])).await;
+    agent.join(&world).await;
+    let start = Instant::now();
+    for _ in 0..24 {
+        agent.step(worlds::vector(&[0.0])).await;
+    }
+    assert!(start.elapsed() > Duration::from_secs(1), "{:?}", start.elapsed());
+}
+
+#[tokio::test]
+async fn who_is_too_far_ahead_is_told_and_a_new_file_sets_free_at_once() {
+    let guarded = Guarded::start(&entry("ann", ANN, "max_steps_per_second = 1"));
+    let mut session = session(&guarded, ANN, open("CartPole", 100, 1)).await;
+    session.step(vec![0; 400].into()).await;
+    let (code, words) = session.refused(crate::common::server::step(vec![0; 400])).await;
+    assert_eq!(code, Code::ResourceExhausted, "{words}");
+    assert!(words.contains("\"ann\" may take 1 steps a second") && words.contains(" s ahead"), "{words}");
+    std::fs::write(&guarded.file, entry("ann", ANN, "")).unwrap();
+    logged(&guarded.server, "read tokens again").await;
+    timed(&mut session, 100, 3).await;
+}
+
+#[tokio::test]
+async fn who_waits_for_a_rate_is_told_when_the_token_is_revoked() {
+    let guarded = Guarded::start(&entry("ann", ANN, "max_steps_per_second = 4"));
+    let mut session = session(&guarded, ANN, open("CartPole", 100, 1)).await;
+    session.step(vec![0; 400].into()).await;
+    session.send(crate::common::server::step(vec![0; 400])).await;
+    std::fs::write(&guarded.file, entry("bob", BOB, "")).unwrap();
+    let start = Instant::now();
+    let status = session.end().await;
+    assert_eq!(status.code(), Code::Unauthenticated, "{status:?}");
+    assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
+}
+
+#[tokio::test]
+async fn a_token_has_so_many_bytes_in_flight_and_no_more() {
+    let quota = entry("ann", ANN, "max_bytes = 4000000");
+    let guarded = Guarded::start(&(quota + &entry("bob", BOB, "")));
+    let picture = || Render { slot: 0, width: 1024, height: 1024 };
+    let one = || Open { autoreset_mode: AutoresetMode::SameStep.into(), ..open("CartPole", 1, 1) };
+    let mut ann = session(&guarded, ANN, one()).await;
+    let large = Open { batch_size: 1_000, ..one() };
+    let mut other = session(&guarded, ANN, large.clone()).await;
+    let (code, words) = ann.refused(picture()).await;
+    assert_eq!(code, Code::ResourceExhausted, "{words}");
+    assert!(words.contains("\"ann\" may have 4000000 bytes in flight here"), "{words}");
+    // More than it may ever have need not be tried again.
+    let (code, words) = other.refused(Render { slot: 0, width: 2048, height: 2048 }).await;
+    assert_eq!(code, Code::InvalidArgument, "{words}");
+    let (code, words) = ann.refused(Act { weights: vec![0; 5_000_000].into(), ..Act::default() }).await;
+    assert_eq!(code, Code::ResourceExhausted, "{words}");
+    for (session, envs) in [(&mut ann, 1), (&mut other, 1_000)] {
+        timed(session, envs, 3).await;
+    }
+    let mut bob = session(&guarded, BOB, large).await;
+    bob.ask(picture()).await;
+    drop(other);
+    until("the bytes are free again", async || matches!(ann.answer(picture()).await, Response::Render(_))).await;
+    // Each is free once it is written.
+    for _ in 0..5 {
+        ann.ask(picture()).await;
+    }
+}
