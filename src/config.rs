@@ -89,6 +89,11 @@ pub struct Arguments {
     #[arg(long, value_name = "SECONDS")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub idle_seconds: Option<u64>,
+    /// How long a session whose client asked for a lease stays when its connection is lost, so that it can be taken up
+    /// again; 0 = no leases. [default: 60]
+    #[arg(long, value_name = "SECONDS")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lease_seconds: Option<u64>,
     /// How often a silent connection is asked whether it lives; one that does not answer within this time is closed and
     /// its environments are freed. [default: 60]
     #[arg(long, value_name = "SECONDS")]
@@ -199,6 +204,8 @@ pub struct Config {
     pub grace_seconds: u64,
     /// Ends sessions that send nothing for so long, s; 0 = never.
     pub idle_seconds: u64,
+    /// How long a session with a lease stays without a connection, s, at most 86400; 0 = no leases.
+    pub lease_seconds: u64,
     /// How often a silent connection is asked whether it lives, s, 1 … 86400.
     pub keepalive_seconds: u64,
     /// The file of tokens that callers must show.
@@ -237,6 +244,7 @@ impl Default for Config {
             stall_seconds: 300,
             grace_seconds: 30,
             idle_seconds: 0,
+            lease_seconds: 60,
             keepalive_seconds: 60,
             tokens: None,
             ledger: None,
@@ -441,6 +449,9 @@ impl Config {
         }
         if self.stall_seconds > MOST_SECONDS {
             return refuse("stall_seconds", &self.stall_seconds, "at most 86400");
+        }
+        if self.lease_seconds > MOST_SECONDS {
+            return refuse("lease_seconds", &self.lease_seconds, "at most 86400");
         }
         match (&self.tls_cert, &self.tls_key, &self.tls_client_ca) {
             (Some(_), None, _) => return refuse("tls_key", &"not given", "the private key of tls_cert"),

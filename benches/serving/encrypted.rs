@@ -5,20 +5,19 @@ use super::{
     client::{Client, Process},
     median,
 };
+use perturb_faults::certificates::{Authority, Pair};
 use perturb_protocol::{Address, Connection, Patience, credentials::Credentials};
 
 /// CartPole in batches of so many.
 pub(crate) async fn stepped(batch: usize) -> Result<(), Failure> {
     const TRIPS: usize = 400;
     let directory = tempfile::tempdir()?;
-    let own = rcgen::KeyPair::generate()?;
-    let certificate = rcgen::CertificateParams::new(vec!["127.0.0.1".into()])?.self_signed(&own)?;
-    let [cert, key] = ["cert.pem", "key.pem"].map(|name| directory.path().join(name));
-    std::fs::write(&cert, certificate.pem())?;
-    std::fs::write(&key, own.serialize_pem())?;
+    let authority = Authority::new("the bench's authority");
+    let known = authority.file(directory.path(), "ca.pem");
+    let Pair { cert, key } = authority.issue(directory.path(), "server", &["127.0.0.1"], 2200);
     let (plain, encrypted) = (Process::tcp(&[])?, Process::tcp(&[("--tls-cert", &cert), ("--tls-key", &key)])?);
     let mut bare = Client::on(&connected(&plain.address, Credentials::default()).await?, "CartPole", batch).await?;
-    let credentials = Credentials::knowing(&cert)?;
+    let credentials = Credentials::knowing(&known)?;
     let mut hidden = Client::on(&connected(&encrypted.address, credentials).await?, "CartPole", batch).await?;
     let (mut plains, mut ratios) = (Vec::new(), Vec::new());
     for _ in 0..ROUNDS {

@@ -36,6 +36,8 @@ pub struct Ended<'a> {
     pub about: About,
     /// How long it was.
     pub time: Duration,
+    /// How often another stream took it up; none: never.
+    pub resumed: Option<u32>,
     /// How it ended: a word of few.
     pub ending: &'static str,
 }
@@ -58,11 +60,11 @@ impl Access {
         if !self.has_room(ended.protocol, ended.ending) {
             return;
         }
-        let Ended { peer, token, protocol, about: About { environment, envs, steps }, time, ending } = ended;
+        let Ended { peer, token, protocol, about: About { environment, envs, steps }, time, resumed, ending } = ended;
         let (peer, seconds) = (peer.map(tracing::field::display), (time.as_secs_f64() * 1e3).round() / 1e3);
         tracing::info!(
             target: "perturb::access",
-            peer, token, protocol, environment, envs, steps, seconds, ending, "a session ended"
+            peer, token, protocol, environment, envs, steps, seconds, resumed, ending, "a session ended"
         );
     }
 

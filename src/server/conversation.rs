@@ -1,11 +1,15 @@
 //! The transport that the streams of both protocols share: one response for each request, in order, until the client's
 //! end or the server's.
 
+mod leased;
+
 use super::{
     access::{About, Access, Ended},
+    budget::Outbox,
     drain::{Drain, Phase},
     fields::{Decoder, Field},
     frames::{Allowance, Frames, Message, Stop},
+    leases::{Arrived, Grant, Numbers, One, Ticket},
     peers::{Full, Place, Places},
     refusals::{self, Refusals},
     status::Refusal,
@@ -14,7 +18,7 @@ use super::{
 use futures_util::{Stream, stream};
 use perturb_protocol::Awake;
 use std::{future::Future, pin::Pin, time::Duration};
-use tokio::time::Instant;
+use tokio::{sync::mpsc, time::Instant};
 use tonic::Status;
 
 /// The most bytes of a request before a session is open: enough for thousands of groups, and little enough that all
@@ -24,12 +28,23 @@ pub const MOST_BYTES_BEFORE_OPEN: usize = 64 << 10;
 /// Responses as they come, or the status that ends the stream.
 pub type Responses<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
+/// Where responses go that are made elsewhere than in the stream which sends them.
+pub type Line<T> = mpsc::Sender<Result<T, Status>>;
+
+/// What becomes of a stream after a response.
+pub enum Turn<R> {
+    /// Its session has a lease, and outlives it.
+    Leased(Grant<R>),
+    /// It goes on with the session that it has taken up.
+    TakesUp(Ticket<R>),
+}
+
 /// The server's part of a conversation. Dropping it frees what it holds.
 pub trait Dialogue: Send + 'static {
     /// What the client sends.
     type Request: prost::Message + Default + 'static;
     /// What it gets.
-    type Response: Send + 'static;
+    type Response: prost::Message + Clone + 'static;
     /// The parts of a request that are counted before it is decoded.
     const FIELDS: &'static [Field];
     /// What the protocol is called.
@@ -50,6 +65,19 @@ pub trait Dialogue: Send + 'static {
     /// Takes note of a request that was refused before it was decoded.
     fn undecoded(&self, _refusal: &Refusal) {}
 
+    /// Whether a request takes up another session, by protocols that have that.
+    fn takes_up(_request: &Self::Request) -> bool {
+        false
+    }
+
+    /// What becomes of the stream after the response that was just given, if not what was before; told once.
+    fn turn(&mut self) -> Option<Turn<Self::Response>> {
+        None
+    }
+
+    /// Its responses go by another stream now, or by none: this is where their shares go.
+    fn attach(&mut self, _outbox: Outbox) {}
+
     /// The answer to a request that is refused.
     fn refusal(refusal: Refusal) -> Self::Response;
 }
@@ -63,6 +91,7 @@ pub struct Sessions {
     drain: Drain,
     refusals: Refusals,
     access: Access,
+    leases: Numbers,
 }
 
 /// What a session may do.
@@ -78,8 +107,15 @@ pub struct Limits {
 
 impl Sessions {
     /// Sessions for which there are these places. What is refused and how they end is counted.
-    pub fn new(places: Places, limits: Limits, drain: Drain, refusals: Refusals, access: Access) -> Self {
-        Self { places, limits, decoder: Decoder::default(), drain, refusals, access }
+    pub fn new(
+        places: Places,
+        limits: Limits,
+        drain: Drain,
+        refusals: Refusals,
+        access: Access,
+        leases: Numbers,
+    ) -> Self {
+        Self { places, limits, decoder: Decoder::default(), drain, refusals, access, leases }
     }
 
     /// How far the shutdown is.
@@ -92,23 +128,43 @@ impl Sessions {
     /// # Errors
     /// If the server is shutting down or has no room for another session, or its token may have no more.
     pub fn begin<D: Dialogue>(&self, requests: Frames, dialogue: D) -> Result<Responses<D::Response>, Status> {
-        let admitted = self.admit(&requests);
-        let _places = admitted.inspect_err(|refusal| self.refusals.count(refusal, requests.bearer.as_ref()))?;
+        let place = self.admit(&requests).or_else(|refusal| self.spare(refusal));
+        let place = place.inspect_err(|refusal| self.refusals.count(refusal, requests.bearer.as_ref()))?;
         let sessions = Self { drain: self.drain.enter(), ..self.clone() };
         let (start, awake, ending) = (Instant::now(), Awake::default(), GONE);
-        let conversation = Conversation { requests, dialogue, sessions, start, spent: 0, awake, ending, _places };
-        // Polled by the connection: when the client is gone the stream is dropped, and what the dialogue holds with it.
-        let responses = stream::unfold(Some(conversation), |conversation| async {
-            let mut conversation = conversation?;
-            match conversation.next().await? {
-                Ok(response) => Some((Ok(response), Some(conversation))),
-                Err(status) => Some((Err(status), None)),
+        let conversation =
+            Conversation { requests, dialogue, sessions, start, spent: 0, awake, ending, resumed: 0, place };
+        // Polled by the connection: when the client is gone the stream is dropped, and what the dialogue holds with it,
+        // unless it has a lease.
+        let responses = stream::unfold(Some(Speaker::Own(Box::new(conversation))), |speaker| async {
+            match speaker? {
+                Speaker::Own(mut conversation) => match conversation.next().await? {
+                    Ok(response) => Some((Ok(response), Some(conversation.turn()))),
+                    Err(status) => Some((Err(status), None)),
+                },
+                Speaker::Leased(mut line) => {
+                    let response = line.recv().await?;
+                    let goes_on = response.is_ok().then_some(Speaker::Leased(line));
+                    Some((response, goes_on))
+                }
             }
         });
         Ok(Box::pin(responses))
     }
 
-    fn admit(&self, requests: &Frames) -> Result<(Place, Option<Held>), Refusal> {
+    /// Lets a stream in for which there is no place, if it might be one that takes up a session, which has a place.
+    fn spare(&self, refusal: Refusal) -> Result<Seat, Refusal> {
+        let is_full = matches!(
+            refusal,
+            Refusal::TooManySessions { .. } | Refusal::TooManyOfAPeer { .. } | Refusal::TooManyOfAToken { .. }
+        );
+        match self.leases.spare().filter(|_| is_full) {
+            Some(spare) => Ok(Seat::Spare(spare, refusal)),
+            None => Err(refusal),
+        }
+    }
+
+    fn admit(&self, requests: &Frames) -> Result<Seat, Refusal> {
         if self.phase() != Phase::Running {
             return Err(Refusal::Draining);
         }
@@ -117,7 +173,7 @@ impl Sessions {
             Full::All(limit) => Refusal::TooManySessions { limit },
             Full::Peer(limit) => Refusal::TooManyOfAPeer { limit },
         })?;
-        Ok((place, requests.bearer.as_ref().map(Token::session).transpose()?))
+        Ok(Seat::Own(place, requests.bearer.as_ref().map(Token::session).transpose()?))
     }
 }
 
@@ -127,6 +183,25 @@ const GONE: &str = "gone";
 const CLOSED: &str = "closed";
 /// One whose requests were not to be understood.
 const BROKEN: &str = "broken";
+
+/// A stream that goes on with another session, and leaves nothing to be told of.
+const MOVED: &str = "moved";
+
+/// Who makes a stream's responses.
+enum Speaker<D: Dialogue> {
+    /// The stream itself.
+    Own(Box<Conversation<D>>),
+    /// A task that outlives it.
+    Leased(mpsc::Receiver<Result<D::Response, Status>>),
+}
+
+/// What a stream was let in on.
+enum Seat {
+    /// A place of its own, with that of its token.
+    Own(#[expect(dead_code, reason = "held")] Place, #[expect(dead_code, reason = "held")] Option<Held>),
+    /// That it takes up a session; otherwise this is its refusal.
+    Spare(#[expect(dead_code, reason = "held")] One, Refusal),
+}
 
 /// A dialogue and its transport.
 struct Conversation<D: Dialogue> {
@@ -139,82 +214,128 @@ struct Conversation<D: Dialogue> {
     spent: u64,
     awake: Awake,
     ending: &'static str,
-    _places: (Place, Option<Held>),
+    /// How often another stream took it up.
+    resumed: u32,
+    place: Seat,
 }
 
 impl<D: Dialogue> Conversation<D> {
     /// The next response; an error ends the stream, and so does the client's end.
     async fn next(&mut self) -> Option<Result<D::Response, Status>> {
-        let bearer = self.requests.bearer.clone();
-        let answer = self.answer(bearer.as_ref()).await;
-        self.spend();
-        match answer {
-            Ok(Some(Ok(response))) => Some(Ok(response)),
-            Ok(Some(Err(refusal))) => {
-                self.sessions.refusals.count(&refusal, bearer.as_ref());
-                Some(Ok(D::refusal(refusal)))
-            }
-            Ok(None) => {
+        let answer = match self.request().await {
+            Ok(Some(message)) => self.answer(message).await,
+            Ok(None) | Err(Stop::Cancelled) => {
                 self.ending = CLOSED;
-                None
+                return None;
             }
-            Err(Stop::Refused(refusal)) => {
-                self.sessions.refusals.count(&refusal, bearer.as_ref());
-                self.ending = refusals::reason(&refusal);
-                Some(Err(refusal.into()))
+            Err(stop) => Err(stop),
+        };
+        Some(self.told(answer))
+    }
+
+    /// What becomes of it after a response.
+    fn turn(mut self: Box<Self>) -> Speaker<D> {
+        let (line, receiver) = mpsc::channel(1);
+        match self.dialogue.turn() {
+            None => return Speaker::Own(self),
+            Some(Turn::Leased(grant)) => leased::begin(*self, grant, line),
+            Some(Turn::TakesUp(ticket)) => {
+                self.ending = MOVED;
+                // If whoever runs the session is gone by now, the line ends at once.
+                let _ = ticket.arrival.send(Arrived { requests: self.requests.leave(), line });
             }
-            Err(Stop::Broken(status)) => {
-                self.ending = BROKEN;
-                Some(Err(status))
+        }
+        Speaker::Leased(receiver)
+    }
+
+    fn allowance(&self) -> Allowance {
+        let allowance = self.dialogue.allowance();
+        Allowance { bytes: allowance.bytes.min(self.sessions.limits.bytes), ..allowance }
+    }
+
+    /// The next request, none at the client's end. To be called again if its future was dropped: nothing is lost.
+    async fn request(&mut self) -> Result<Option<Message>, Stop> {
+        let Limits { handshake, idle, .. } = self.sessions.limits;
+        let allowance = self.allowance();
+        let limit =
+            if self.dialogue.is_open() { idle } else { Some(idle.map_or(handshake, |idle| idle.min(handshake))) };
+        let bearer = self.requests.bearer.clone();
+        tokio::select! {
+            biased; // the end comes first: a client that never pauses must not outlast it
+            () = self.sessions.drain.closed() => Err(Stop::Refused(Refusal::Draining)),
+            refusal = revoked(bearer.as_ref()) => Err(Stop::Refused(refusal)),
+            request = self.awake.until(self.requests.next(allowance)) => request,
+            () = silence(limit) => {
+                let seconds = limit.map_or(0, |limit| limit.as_secs());
+                Err(Stop::Refused(Refusal::Idle { seconds }))
             }
         }
     }
 
-    /// The answer to the next request, none at the client's end.
-    async fn answer(&mut self, bearer: Option<&Bearer>) -> Result<Option<Result<D::Response, Refusal>>, Stop> {
-        let Limits { bytes, handshake, idle } = self.sessions.limits;
-        let mut allowance = self.dialogue.allowance();
-        allowance.bytes = allowance.bytes.min(bytes);
-        let limit =
-            if self.dialogue.is_open() { idle } else { Some(idle.map_or(handshake, |idle| idle.min(handshake))) };
-        let request = tokio::select! {
-            biased; // the end comes first: a client that never pauses must not outlast it
-            () = self.sessions.drain.closed() => return Err(Stop::Refused(Refusal::Draining)),
-            refusal = revoked(bearer) => return Err(Stop::Refused(refusal)),
-            request = self.awake.until(self.requests.next(allowance)) => match request? {
-                Some(request) => request,
-                None => return Ok(None),
-            },
-            () = silence(limit) => {
-                let seconds = limit.map_or(0, |limit| limit.as_secs());
-                return Err(Stop::Refused(Refusal::Idle { seconds }));
-            }
-        };
+    /// The answer to a request.
+    async fn answer(&mut self, message: Message) -> Result<Result<D::Response, Refusal>, Stop> {
         if self.sessions.phase() != Phase::Running && !self.dialogue.is_open() {
             return Err(Stop::Refused(Refusal::Draining));
         }
         // Until it is answered its bytes are kept.
-        let (request, _share) = match request {
+        let (request, _share) = match message {
             Message::Whole(bytes, share) => (bytes, share),
-            Message::Refused(refusal) => return Ok(Some(self.undecoded(refusal))),
+            Message::Refused(refusal) => return Ok(self.undecoded(refusal)),
         };
         // Who is ahead of their rate waits, and nothing has happened yet.
+        let bearer = self.requests.bearer.clone();
         tokio::select! {
             biased;
-            turn = turn(bearer) => match turn {
+            paced = paced(bearer.as_ref()) => match paced {
                 Ok(()) => {}
-                Err(refusal) => return Ok(Some(self.undecoded(refusal))),
+                Err(refusal) => return Ok(self.undecoded(refusal)),
             },
             () = self.sessions.drain.closed() => return Err(Stop::Refused(Refusal::Draining)),
-            refusal = revoked(bearer) => return Err(Stop::Refused(refusal)),
+            refusal = revoked(bearer.as_ref()) => return Err(Stop::Refused(refusal)),
         }
-        match self.sessions.decoder.decode(request, D::FIELDS, allowance).await? {
-            Ok(request) => tokio::select! {
-                biased; // it mostly is there at once
-                response = self.dialogue.answer(request) => Ok(Some(response)),
-                refusal = revoked(bearer) => Err(Stop::Refused(refusal)),
-            },
-            Err(refusal) => Ok(Some(self.undecoded(refusal))),
+        let request = match self.sessions.decoder.decode(request, D::FIELDS, self.allowance()).await? {
+            Ok(request) => request,
+            Err(refusal) => return Ok(self.undecoded(refusal)),
+        };
+        if let Seat::Spare(_, refusal) = &self.place
+            && !D::takes_up(&request)
+        {
+            return Err(Stop::Refused(refusal.clone()));
+        }
+        let answer = tokio::select! {
+            biased; // it mostly is there at once
+            answer = self.dialogue.answer(request) => answer,
+            refusal = revoked(bearer.as_ref()) => return Err(Stop::Refused(refusal)),
+        };
+        match (&self.place, answer) {
+            (Seat::Spare(..), Err(refusal)) => Err(Stop::Refused(refusal)),
+            (_, answer) => Ok(answer),
+        }
+    }
+
+    /// The response that an answer is; an error ends the stream.
+    fn told(&mut self, answer: Result<Result<D::Response, Refusal>, Stop>) -> Result<D::Response, Status> {
+        self.spend();
+        let count = |refusal: &Refusal| self.sessions.refusals.count(refusal, self.requests.bearer.as_ref());
+        match answer {
+            Ok(Ok(response)) => Ok(response),
+            Ok(Err(refusal)) => {
+                count(&refusal);
+                Ok(D::refusal(refusal))
+            }
+            Err(Stop::Refused(refusal)) => {
+                count(&refusal);
+                self.ending = refusals::reason(&refusal);
+                Err(refusal.into())
+            }
+            Err(Stop::Broken(status)) => {
+                self.ending = BROKEN;
+                Err(status)
+            }
+            Err(Stop::Cancelled) => {
+                self.ending = CLOSED;
+                Err(Status::cancelled("the client has cancelled the stream"))
+            }
         }
     }
 
@@ -235,6 +356,9 @@ impl<D: Dialogue> Conversation<D> {
 
 impl<D: Dialogue> Drop for Conversation<D> {
     fn drop(&mut self) {
+        if self.ending == MOVED {
+            return;
+        }
         self.spend();
         self.sessions.access.ended(&Ended {
             peer: self.requests.connection.as_ref().map(|connection| connection.peer),
@@ -242,6 +366,7 @@ impl<D: Dialogue> Drop for Conversation<D> {
             protocol: D::PROTOCOL,
             about: self.dialogue.about(),
             time: self.start.elapsed(),
+            resumed: (self.resumed > 0).then_some(self.resumed),
             ending: self.ending,
         });
     }
@@ -256,7 +381,7 @@ async fn revoked(bearer: Option<&Bearer>) -> Refusal {
 }
 
 /// Resolves when the token, if there is one, lets its environments step.
-async fn turn(bearer: Option<&Bearer>) -> Result<(), Refusal> {
+async fn paced(bearer: Option<&Bearer>) -> Result<(), Refusal> {
     match bearer {
         Some(bearer) => bearer.turn().await,
         None => Ok(()),

@@ -60,7 +60,16 @@ impl Drain {
 
     /// Waits for [`Phase::Closed`].
     pub async fn closed(&mut self) {
-        if self.phase.wait_for(|phase| *phase == Phase::Closed).await.is_err() {
+        self.reached(Phase::Closed).await;
+    }
+
+    /// Waits for [`Phase::Draining`].
+    pub async fn draining(&mut self) {
+        self.reached(Phase::Draining).await;
+    }
+
+    async fn reached(&mut self, wanted: Phase) {
+        if self.phase.wait_for(|phase| *phase >= wanted).await.is_err() {
             std::future::pending().await // the controller is gone: nobody will close
         }
     }

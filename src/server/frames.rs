@@ -152,8 +152,10 @@ pub enum Message {
 pub enum Stop {
     /// The server wants no more of it.
     Refused(Refusal),
-    /// What came is not to be understood, or the server has a defect.
+    /// What came is not to be understood, the connection broke, or the server has a defect.
     Broken(Status),
+    /// The client wants no more of it, or something in between.
+    Cancelled,
 }
 
 impl From<Status> for Stop {
@@ -178,8 +180,22 @@ impl Frames {
         &self.transit.budget
     }
 
-    /// The next message; none at the client's end, whatever that looks like. To be called again if its future was dropped:
-    /// nothing is lost.
+    /// Their place, when they go elsewhere: nothing comes there any more.
+    pub fn leave(&mut self) -> Self {
+        let left = Self {
+            body: Body::empty(),
+            buffer: BytesMut::new(),
+            message: None,
+            share: self.transit.budget.nothing(),
+            transit: self.transit.clone(),
+            connection: self.connection.clone(),
+            bearer: self.bearer.clone(),
+            outbox: Outbox::default(),
+        };
+        std::mem::replace(self, left)
+    }
+
+    /// The next message; none at the client's end. To be called again if its future was dropped: nothing is lost.
     ///
     /// # Errors
     /// What ends the stream: the message is too large, or never ends, or what came is not gRPC.
@@ -197,7 +213,7 @@ impl Frames {
                         self.take(&data, allowance);
                     }
                 }
-                Some(Err(status)) if status.code() == Code::Cancelled => return Ok(None),
+                Some(Err(status)) if status.code() == Code::Cancelled => return Err(Stop::Cancelled),
                 Some(Err(status)) => return Err(status.into()),
                 None if self.buffer.is_empty() && self.message.is_none() => return Ok(None),
                 None => return Err(Status::internal("the stream ended within a message").into()),

@@ -1,7 +1,7 @@
 //! The server: gRPC in, gRPC out.
 //!
 //! - [`service`]: one short method for each call.
-//! - [`conversation`]: the transport of a session.
+//! - [`conversation`]: the transport of a session; [`leases`]: those that outlive their streams.
 //! - [`frames`] and [`fields`]: how requests come off the wire, with bounds for all that they are made of.
 //! - [`replies`]: how replies go onto it; [`budget`]: the bytes of both; [`sizes`]: how many they are.
 //! - [`peers`]: whom connections are from, and what each may have.
@@ -28,6 +28,7 @@ pub mod fields;
 pub mod frames;
 pub mod fullness;
 pub mod guards;
+pub mod leases;
 pub mod ledger;
 pub mod listen;
 pub mod metrics;
@@ -58,6 +59,7 @@ use conversation::{Limits, Sessions};
 use drain::{Controller, Phase};
 use frames::{Keeping, Transit};
 use guards::Guards;
+use leases::Leases;
 use listen::{Admission, Listener};
 use metrics::Sources;
 use peers::Places;
@@ -126,7 +128,10 @@ pub async fn run(
     let of_a_peer = if config.max_peer_sessions > 0 { config.max_peer_sessions } else { usize::MAX };
     let (refusals, access) = (Refusals::default(), Access::default());
     let places = Places::new(config.max_sessions, of_a_peer);
-    let sessions = Sessions::new(places.clone(), limits, drain.clone(), refusals.clone(), access.clone());
+    let leased = leases::Numbers::default();
+    let leases = Leases::new(Duration::from_secs(config.lease_seconds), leased.clone());
+    let sessions =
+        Sessions::new(places.clone(), limits, drain.clone(), refusals.clone(), access.clone(), leased.clone());
     let admission = Admission { places: Places::new(usize::MAX, of_a_peer.saturating_add(OTHER_STREAMS)), handshake };
     let stall = (config.stall_seconds > 0).then(|| Duration::from_secs(config.stall_seconds));
     let transit = Transit { budget: Budget::new(config.max_memory), limit: stall };
@@ -139,12 +144,13 @@ pub async fn run(
     );
     let pictures = renderer.times();
     let ledger = guards.ledger.clone();
-    let shared = Shared { pool: Arc::clone(&pool), catalogue, listing, renderer, ledger };
+    let shared = Shared { pool: Arc::clone(&pool), catalogue, listing, renderer, ledger, leases };
     let service = Service::new(shared, sessions);
     let requests = [("perturb.v1", service.counts()), ("dm_env_rpc.v1", worlds.counts())];
     let sources = Arc::new(Sources {
         pool: Arc::clone(&pool),
         sessions: places.clone(),
+        leases: leased,
         connections: admission.places.clone(),
         budget: transit.budget.clone(),
         requests,

@@ -1,6 +1,6 @@
 //! How many requests and calls were refused, and why.
 
-use super::{status::Refusal, tokens::Bearer};
+use super::{leases, status::Refusal, tokens::Bearer};
 use crate::{env, pool, render};
 use std::{
     collections::BTreeMap,
@@ -46,6 +46,13 @@ pub fn reason(refusal: &Refusal) -> &'static str {
         Refusal::Render(render::Error::NoThread { .. }) => "no_thread",
         Refusal::Render(render::Error::Missing { .. }) => "no_opengl",
         Refusal::Render(render::Error::Failed { .. }) => "drawing_failed",
+        Refusal::Lease(error) => match error {
+            leases::Error::Unknown => "unknown_lease",
+            leases::Error::OtherToken => "other_token",
+            leases::Error::NoReply { .. } => "no_such_reply",
+            leases::Error::Forgotten { .. } => "reply_not_kept",
+            leases::Error::TakenUp => "taken_up",
+        },
         Refusal::NothingToDraw { .. } => "nothing_to_draw",
         Refusal::Value { .. } => "bad_value",
         Refusal::NotOpen { .. } => "not_open",

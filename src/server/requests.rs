@@ -1,6 +1,13 @@
 //! Spans and counts of requests: a layer around the dialogues of both protocols.
 
-use super::{access::About, conversation::Dialogue, fields::Field, frames::Allowance, status::Refusal};
+use super::{
+    access::About,
+    budget::Outbox,
+    conversation::{Dialogue, Turn},
+    fields::Field,
+    frames::Allowance,
+    status::Refusal,
+};
 use std::{
     fmt,
     sync::{
@@ -106,6 +113,18 @@ impl<D: Observed> Dialogue for Counted<D> {
 
     fn undecoded(&self, refusal: &Refusal) {
         self.count("unknown", Some(refusal));
+    }
+
+    fn takes_up(request: &Self::Request) -> bool {
+        D::takes_up(request)
+    }
+
+    fn turn(&mut self) -> Option<Turn<Self::Response>> {
+        self.dialogue.turn()
+    }
+
+    fn attach(&mut self, outbox: Outbox) {
+        self.dialogue.attach(outbox);
     }
 
     fn refusal(refusal: Refusal) -> Self::Response {

@@ -4,11 +4,12 @@ use super::{
     access::About,
     acting,
     budget::{Budget, Outbox, Share},
-    conversation::{Dialogue, MOST_BYTES_BEFORE_OPEN},
+    conversation::{Dialogue, MOST_BYTES_BEFORE_OPEN, Turn},
     convert,
     draws::Draws,
     fields::{self, Field},
     frames::Allowance,
+    leases::{Leases, MOST_KEPT},
     ledger::Ledger,
     requests::Observed,
     sizes,
@@ -21,6 +22,7 @@ use crate::{
     proto::{self, session_request::Request, session_response::Response},
     render::Renderer,
 };
+use bytes::Bytes;
 use std::sync::Arc;
 
 /// A step's bytes beside its actions.
@@ -38,6 +40,8 @@ pub struct Shared {
     pub renderer: Renderer,
     /// Has what is drawn.
     pub ledger: Option<Ledger>,
+    /// Sessions that outlive their streams.
+    pub leases: Leases<proto::SessionResponse>,
 }
 
 /// A client's session. Dropping it frees its environments.
@@ -55,20 +59,29 @@ pub struct Session {
     kept: Option<Share>,
     /// What the policy needs that plays.
     playing: Option<Share>,
+    /// What becomes of its stream after this reply.
+    turn: Option<Turn<proto::SessionResponse>>,
 }
 
 impl Session {
     /// A session that is not open yet, whose replies' bytes are taken from the budget until they leave the outbox.
     pub fn new(shared: Arc<Shared>, bearer: Option<Bearer>, budget: Budget, outbox: Outbox) -> Self {
         let draws = Draws::new(bearer.clone(), shared.ledger.clone());
-        Self { shared, batch: None, bearer, held: None, draws, budget, outbox, kept: None, playing: None }
+        Self { shared, batch: None, bearer, held: None, draws, budget, outbox, kept: None, playing: None, turn: None }
     }
 
     async fn open(&mut self, request: proto::Open) -> Result<proto::Opened, Refusal> {
         if self.batch.is_some() {
             return Err(Refusal::AlreadyOpen);
         }
-        let autoreset_mode = request.autoreset_mode;
+        let (autoreset_mode, unanswered) = (request.autoreset_mode, request.lease);
+        if unanswered > MOST_KEPT {
+            return Err(Refusal::value(
+                "open.lease",
+                unanswered,
+                format!("requests that wait at a time, 0 … {MOST_KEPT}"),
+            ));
+        }
         let most = self.shared.listing.max_batch_size as usize;
         let settings = convert::open(&self.shared.catalogue, most, request)?;
         let (observes_parameters, receipt_arrays) = (settings.observe_parameters, settings.receipt_arrays);
@@ -82,6 +95,13 @@ impl Session {
         let opened = Batch::open(&self.shared.pool, settings).await;
         let (mut batch, observations, started) = opened.inspect_err(|_| self.draws.not_opened(spec, begun))?;
         self.draws.follow(&mut batch);
+        let grant = match unanswered {
+            0 => None,
+            most => self.shared.leases.give(self.bearer.clone(), most as usize)?,
+        };
+        let lease = grant.as_ref().map_or_else(Bytes::new, |grant| Bytes::copy_from_slice(&grant.name));
+        let lease_seconds = grant.as_ref().map_or(0, |grant| grant.time().as_secs() as u32);
+        self.turn = grant.map(Turn::Leased);
         (self.batch, self.kept, self.held) = (Some(batch), kept, held);
         let started = convert::started(started);
         let acts = true;
@@ -93,6 +113,8 @@ impl Session {
             acts,
             observes_parameters,
             receipt_arrays,
+            lease,
+            lease_seconds,
         })
     }
 
@@ -177,6 +199,21 @@ impl Session {
         acting::saved(self.opened("save_player")?)
     }
 
+    async fn resume(&mut self, request: proto::Resume) -> Result<proto::Resumed, Refusal> {
+        if self.batch.is_some() {
+            return Err(Refusal::Order {
+                request: "resume",
+                when: "on a session that is open".into(),
+                advice: "send it on a stream of its own",
+            });
+        }
+        let proto::Resume { lease, last_reply } = request;
+        let ticket = self.shared.leases.ask(&lease, self.bearer.as_ref(), last_reply).await?;
+        let last_reply = ticket.last_reply;
+        self.turn = Some(Turn::TakesUp(ticket));
+        Ok(proto::Resumed { last_reply })
+    }
+
     fn opened(&mut self, request: &'static str) -> Result<&mut Batch, Refusal> {
         self.batch.as_mut().ok_or(Refusal::NotOpen { request })
     }
@@ -225,9 +262,22 @@ impl Dialogue for Session {
             Some(Request::Release(release)) => self.release(&release).map(Response::Release),
             Some(Request::Act(act)) => self.act(act).await.map(Response::Act),
             Some(Request::SavePlayer(_)) => self.save_player().map(Response::SavePlayer),
+            Some(Request::Resume(resume)) => self.resume(resume).await.map(Response::Resumed),
             None => Err(Refusal::value("request", "empty or of a kind this server does not know", "open, step, …")),
         };
         response.map(|response| proto::SessionResponse { response: Some(response) })
+    }
+
+    fn takes_up(request: &Self::Request) -> bool {
+        matches!(request.request, Some(Request::Resume(_)))
+    }
+
+    fn turn(&mut self) -> Option<Turn<Self::Response>> {
+        self.turn.take()
+    }
+
+    fn attach(&mut self, outbox: Outbox) {
+        self.outbox = outbox;
     }
 
     fn refusal(refusal: Refusal) -> Self::Response {
@@ -236,8 +286,19 @@ impl Dialogue for Session {
 }
 
 impl Observed for Session {
-    const KINDS: &'static [&'static str] =
-        &["open", "step", "reset", "snapshot", "restore", "render", "release", "act", "save_player", "unknown"];
+    const KINDS: &'static [&'static str] = &[
+        "open",
+        "step",
+        "reset",
+        "snapshot",
+        "restore",
+        "render",
+        "release",
+        "act",
+        "save_player",
+        "resume",
+        "unknown",
+    ];
 
     fn kind(request: &Self::Request) -> &'static str {
         match request.request {
@@ -250,6 +311,7 @@ impl Observed for Session {
             Some(Request::Release(_)) => "release",
             Some(Request::Act(_)) => "act",
             Some(Request::SavePlayer(_)) => "save_player",
+            Some(Request::Resume(_)) => "resume",
             None => "unknown",
         }
     }

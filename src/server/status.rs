@@ -1,5 +1,6 @@
 //! Every refusal, and the only place that turns one into a gRPC code.
 
+use super::leases;
 use crate::{env, pool, proto, render};
 use std::borrow::Cow;
 use tonic::{Code, Status};
@@ -17,6 +18,9 @@ pub enum Refusal {
     /// There is no picture.
     #[error(transparent)]
     Render(#[from] render::Error),
+    /// A session cannot be taken up, or was.
+    #[error(transparent)]
+    Lease(#[from] leases::Error),
     /// The environment to be drawn has no state.
     #[error("the physics of slot {slot} diverged and left no state to draw; reset it first")]
     NothingToDraw {
@@ -210,8 +214,8 @@ pub enum Refusal {
         /// The name.
         world: String,
     },
-    /// dm_env_rpc: a world cannot have a name of its own.
-    #[error("the system gives no random numbers for a world's name; ask for a name by the setting world_name")]
+    /// There can be no name that nobody guesses.
+    #[error("the system gives no random numbers; ask for no lease, or name a world by the setting world_name")]
     NoRandomness,
     /// dm_env_rpc: a property does not allow this.
     #[error("property {key:?} cannot be {access}; list_property tells what each property allows")]
@@ -267,6 +271,13 @@ impl Refusal {
             Self::Value { .. } => Code::InvalidArgument,
             Self::TooLarge { .. } => Code::OutOfRange,
             Self::Idle { .. } | Self::Unfinished { .. } => Code::DeadlineExceeded,
+            Self::Lease(error) => match error {
+                leases::Error::Unknown => Code::NotFound,
+                leases::Error::OtherToken => Code::PermissionDenied,
+                leases::Error::NoReply { .. } => Code::OutOfRange,
+                leases::Error::Forgotten { .. } => Code::FailedPrecondition,
+                leases::Error::TakenUp => Code::Aborted,
+            },
             Self::NoToken | Self::WrongToken | Self::RevokedToken { .. } => Code::Unauthenticated,
             Self::Draining => Code::Unavailable,
             Self::Unknown { .. } => Code::NotFound,

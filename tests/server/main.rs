@@ -14,6 +14,7 @@ mod drawing;
 mod faults;
 mod groups;
 mod guarded;
+mod leases;
 mod lifecycle;
 #[cfg(feature = "mujoco")]
 mod locomotion;

@@ -1,6 +1,8 @@
-//! Servers are killed at random moments, and what goes on comes to the bytes that it comes to undisturbed.
+//! Servers are killed at random moments, and lines to them cut; what goes on comes to the bytes that it comes to
+//! undisturbed.
 
 use std::fs::File;
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Instant;
@@ -9,7 +11,7 @@ use rstest::rstest;
 use tempfile::TempDir;
 
 use crate::common::{child_server, ended, kill, perturb, run, server, stderr, wait_for};
-use perturb_faults::Dice;
+use perturb_faults::{Course, Dice, Fault, Kind, Line};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::Servers;
 
@@ -149,6 +151,57 @@ fn a_training_outlives_its_servers_and_comes_to_the_same_weights(#[case] text: &
     let (kills, got) = harassed(text, victim, 3, &mut Dice::new());
     assert!(kills > 0, "it ended before anything was killed");
     assert_eq!(got, undisturbed(text), "after {kills} kills");
+}
+
+/// A server at a free port.
+struct AtPort {
+    child: Child,
+    address: String,
+}
+
+impl AtPort {
+    fn new() -> Self {
+        let program = Path::new(env!("CARGO_BIN_EXE_perturb")).with_file_name("perturb-server");
+        let mut command = Command::new(program);
+        command.args(["--listen", "tcp://127.0.0.1:0", "--log", "error", "--workers", "1", "--exit-with-stdin"]);
+        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("perturb-server");
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().expect("its output")).read_line(&mut line).expect("a line");
+        let address = line.trim().strip_prefix("listening on http://").expect("an address").to_owned();
+        Self { child, address }
+    }
+}
+
+impl Drop for AtPort {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+#[rstest]
+#[case::the_server_acts(PPO_CART_POLE, &[])]
+#[case::the_learner_acts(A2C_PENDULUM, &["--act", "client"])]
+fn a_training_over_lines_that_break_goes_back_to_no_checkpoint(#[case] text: &str, #[case] arguments: &[&str]) {
+    let mut dice = Dice::new();
+    let folder = tempfile::tempdir().expect("a directory");
+    let server = AtPort::new();
+    // The first connections have to say what the server can do.
+    let course = move |number: usize| {
+        let at = if number == 0 { 300_000 } else { dice.below(100_000) as usize };
+        Course { from_server: Some(Fault { at, kind: Kind::End }), ..Course::default() }
+    };
+    let line = Line::start(&server.address, course).expect("a line");
+    let address = line.address();
+    let arguments = [&["--server", &address], arguments].concat();
+    let (child, out, said) = train(&folder, text, &arguments);
+    let status = ended(child).status;
+    let said = std::fs::read_to_string(said).expect("words");
+    assert!(status.success(), "{status}: {said}");
+    assert!(!said.contains("waiting for it"), "it went back: {said}");
+    assert!(said.contains("took the session up again"), "nobody heard of it: {said}");
+    assert!(line.faults() >= 5, "{} cuts", line.faults());
+    assert_eq!(result(&out), undisturbed(text), "after {} cuts", line.faults());
 }
 
 /// `make kill-test`: some minutes.

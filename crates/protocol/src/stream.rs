@@ -1,11 +1,15 @@
 //! A session's stream, typed: every request has its reply.
 
+mod lease;
+
 use std::collections::VecDeque;
 use std::time::Duration;
 
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Status, Streaming};
+
+use self::lease::Lease;
 
 use crate::address::Address;
 use crate::awake::Awake;
@@ -15,6 +19,8 @@ use crate::proto::{self, SessionRequest, SessionResponse, session_request::Reque
 
 /// Requests that may lie in the channel before they are sent.
 const QUEUE: usize = 4;
+/// How long [`Stream::close`] waits for the server.
+const FAREWELL: Duration = Duration::from_secs(1);
 
 /// A request of a session.
 pub trait Ask: Into<Request> {
@@ -71,18 +77,49 @@ requests! {
     Release => Released, Release, Release, "release", "to release environments";
     Act => Acted, Act, Act, "act", "to act";
     SavePlayer => PlayerSaved, SavePlayer, SavePlayer, "save_player", "to save a player";
+    Resume => Resumed, Resume, Resumed, "resumed", "to take up a session";
 }
 
 /// One session. Requests may be sent ahead; replies are taken in the order of their requests.
+///
+/// One that was opened with [a lease](proto::Open::lease) survives the loss of its connection: it is taken up again by
+/// another, and nobody notices but for a warning in the log. No more requests than that says may wait for their replies.
 #[derive(Debug)]
 pub struct Stream {
-    address: Address,
-    limit: Duration,
-    requests: mpsc::Sender<SessionRequest>,
-    replies: Streaming<SessionResponse>,
+    connection: Connection,
+    line: Line,
     /// Replies that came while a request could not be sent.
     arrived: VecDeque<SessionResponse>,
     awake: Awake,
+    lease: Option<Lease>,
+}
+
+/// What goes out and what comes in.
+#[derive(Debug)]
+struct Line {
+    requests: mpsc::Sender<SessionRequest>,
+    replies: Streaming<SessionResponse>,
+}
+
+impl Line {
+    /// Begins a stream with its first request, and with room for so many more. That lies in the channel before the call is
+    /// made: a server may wait for it before it answers at all.
+    async fn begin(
+        connection: &Connection,
+        first: impl Into<Request>,
+        room: usize,
+    ) -> Result<Result<Self, Status>, ClientError> {
+        let (requests, receiver) = mpsc::channel(QUEUE + room);
+        let message = SessionRequest { request: Some(first.into()) };
+        let limit = connection.patience().reply;
+        if let Err(error) = requests.try_send(message) {
+            return Ok(Err(Status::internal(error.to_string())));
+        }
+        let mut client = connection.client();
+        let call = tokio::time::timeout(limit, client.session(ReceiverStream::new(receiver))).await;
+        let call = call.map_err(|_| timed_out(connection.address(), proto::Open::NAME, limit))?;
+        Ok(call.map(|call| Self { requests, replies: call.into_inner() }))
+    }
 }
 
 impl Stream {
@@ -91,59 +128,71 @@ impl Stream {
     /// # Errors
     /// [`ClientError::Refused`] with the server's sentence, and the failures of a connection.
     pub async fn open(connection: &Connection, open: proto::Open) -> Result<(Self, proto::Opened), ClientError> {
-        let (requests, receiver) = mpsc::channel(QUEUE);
-        let (address, limit) = (connection.address().clone(), connection.patience().reply);
-        let lost = |status: &Status| lost(&address, proto::Open::NAME, status);
-        // The request lies in the channel before the call is made: a server may wait for it before it answers at all.
-        let message = SessionRequest { request: Some(open.into()) };
-        requests.try_send(message).map_err(|error| lost(&Status::internal(error.to_string())))?;
-        let mut client = connection.client();
-        let call = client.session(ReceiverStream::new(receiver));
-        let replies = tokio::time::timeout(limit, call)
-            .await
-            .map_err(|_| timed_out(&address, proto::Open::NAME, limit))?
-            .map_err(|status| lost(&status))?
-            .into_inner();
-        let mut stream = Self { address, limit, requests, replies, arrived: VecDeque::new(), awake: Awake::default() };
+        let line = Line::begin(connection, open, 0).await?;
+        let line = line.map_err(|status| lost(connection.address(), proto::Open::NAME, &status))?;
+        let (connection, arrived, awake) = (connection.clone(), VecDeque::new(), Awake::default());
+        let mut stream = Self { connection, line, arrived, awake, lease: None };
         let opened = stream.receive::<proto::Open>().await?;
+        stream.lease = Lease::of(&opened);
         Ok((stream, opened))
     }
 
     /// Where the server is.
     pub fn address(&self) -> &Address {
-        &self.address
+        self.connection.address()
     }
 
     /// Sends a request.
     ///
     /// # Errors
     /// [`ClientError::Lost`].
-    pub async fn send<A: Ask>(&self, request: A) -> Result<(), ClientError> {
+    pub async fn send<A: Ask>(&mut self, request: A) -> Result<(), ClientError> {
         let message = SessionRequest { request: Some(request.into()) };
+        if let Some(lease) = &mut self.lease {
+            // Whatever becomes of it, it is sent again if it must be when the reply is waited for.
+            lease.asked(&message);
+            let _ = self.line.requests.send(message).await;
+            return Ok(());
+        }
         // The channel has room for a request, and is closed only after the stream has ended.
-        let ended = |_| lost(&self.address, A::NAME, &Status::unavailable("the stream has ended"));
-        self.requests.send(message).await.map_err(ended)
+        let ended = |_| lost(self.connection.address(), A::NAME, &Status::unavailable("the stream has ended"));
+        self.line.requests.send(message).await.map_err(ended)
     }
 
     /// Sends one of many requests whose replies are taken later. A server that has no room for replies reads no requests
-    /// either: so those that come are kept while this one has to wait.
+    /// either: so those that come are kept while this one has to wait. With a lease it is as [`Stream::send`].
     ///
     /// # Errors
     /// [`ClientError::Lost`].
     pub async fn send_ahead<A: Ask>(&mut self, request: A) -> Result<(), ClientError> {
+        if self.lease.is_some() {
+            return self.send(request).await;
+        }
         let message = SessionRequest { request: Some(request.into()) };
-        let ended = || lost(&self.address, A::NAME, &Status::unavailable("the stream has ended"));
+        let address = self.connection.address();
+        let ended = || lost(address, A::NAME, &Status::unavailable("the stream has ended"));
         loop {
             let arrived = tokio::select! {
                 biased;
-                room = self.requests.reserve() => {
+                room = self.line.requests.reserve() => {
                     room.map_err(|_| ended())?.send(message);
                     return Ok(());
                 }
-                arrived = self.replies.message() => arrived,
+                arrived = self.line.replies.message() => arrived,
             };
-            let arrived = arrived.map_err(|status| lost(&self.address, A::NAME, &status))?;
+            let arrived = arrived.map_err(|status| lost(address, A::NAME, &status))?;
             self.arrived.push_back(arrived.ok_or_else(ended)?);
+        }
+    }
+
+    /// Ends a session with a lease, which the server would otherwise hold for a while; any other ends when it is dropped.
+    /// Waits a second at most.
+    pub async fn close(self) {
+        let Self { line: Line { requests, mut replies }, lease, .. } = self;
+        drop(requests);
+        if lease.is_some() {
+            // However it ends.
+            let _ = tokio::time::timeout(FAREWELL, async { while let Ok(Some(_)) = replies.message().await {} }).await;
         }
     }
 
@@ -155,14 +204,11 @@ impl Stream {
     pub async fn receive<A: Ask>(&mut self) -> Result<A::Reply, ClientError> {
         let message = match self.arrived.pop_front() {
             Some(arrived) => Some(arrived),
-            None => tokio::time::timeout(self.limit, self.awake.until(self.replies.message()))
-                .await
-                .map_err(|_| timed_out(&self.address, A::NAME, self.limit))?
-                .map_err(|status| lost(&self.address, A::NAME, &status))?,
+            None => self.message::<A>().await?,
         };
         match message.map(|message| message.response) {
             Some(Some(Response::Error(proto::Error { code, message }))) => {
-                let address = self.address.clone();
+                let address = self.address().clone();
                 Err(ClientError::Refused { address, request: A::NAME, code: Code::from_i32(code), message })
             }
             Some(Some(response)) => A::reply(response).map_err(|other| {
@@ -170,7 +216,37 @@ impl Stream {
                 self.mismatch::<A>(other.into(), expected)
             }),
             Some(None) => Err(self.mismatch::<A>("an empty reply".into(), "a reply".into())),
-            None => Err(lost(&self.address, A::NAME, &Status::unavailable("the server ended the stream"))),
+            None => Err(lost(self.address(), A::NAME, &Status::unavailable("the server ended the stream"))),
+        }
+    }
+
+    /// The next message that comes, of another stream if this one is lost and there is a lease.
+    async fn message<A: Ask>(&mut self) -> Result<Option<SessionResponse>, ClientError> {
+        let limit = self.connection.patience().reply;
+        loop {
+            let next = self.awake.until(self.line.replies.message());
+            let next = tokio::time::timeout(limit, next).await;
+            let status = match next.map_err(|_| timed_out(self.connection.address(), A::NAME, limit))? {
+                Ok(message) => {
+                    self.lease.iter_mut().for_each(Lease::answered);
+                    return Ok(message);
+                }
+                Err(status) => status,
+            };
+            let error = lost(self.connection.address(), A::NAME, &status);
+            let Some(lease) = self.lease.as_mut().filter(|_| lease::is_of_the_line(&status)) else {
+                return Err(error);
+            };
+            match lease.take_up(&self.connection).await {
+                Some(line) => {
+                    tracing::warn!("{error}; took the session up again");
+                    self.line = line;
+                }
+                None => {
+                    self.lease = None;
+                    return Err(error);
+                }
+            }
         }
     }
 
@@ -200,6 +276,6 @@ impl Stream {
 
     /// The error for a reply to an `A` that does not follow the protocol.
     pub fn mismatch<A: Ask>(&self, got: String, expected: String) -> ClientError {
-        ClientError::Protocol { address: self.address.clone(), request: A::NAME, got, expected }
+        ClientError::Protocol { address: self.address().clone(), request: A::NAME, got, expected }
     }
 }

@@ -28,11 +28,12 @@ pub struct OpenOptions {
 }
 
 /// The request for the slots of `range`, counted over all `options`; `None` if an index is beyond what the protocol can
-/// number. Slots of one option alone are asked for as servers of every age understand it.
+/// number. Slots of one option alone are asked for as servers of every age understand it. `lease` is that of the protocol.
 pub(super) fn open_request(
     options: &[OpenOptions],
     range: Range<usize>,
     autoreset_mode: AutoresetMode,
+    lease: u32,
 ) -> Option<proto::Open> {
     let mut first = 0;
     let mut groups = Vec::new();
@@ -49,6 +50,7 @@ pub(super) fn open_request(
         autoreset_mode: autoreset_mode.into(),
         receipts: true,
         observe_parameters: observe.sees_parameters(),
+        lease,
         ..proto::Open::default()
     };
     Some(match <[proto::SlotGroup; 1]>::try_from(groups) {
@@ -95,12 +97,12 @@ mod tests {
     fn slots_of_several_options_are_groups_that_count_from_their_own_first() {
         let options = [options(3, 7), options(2, 8)];
         let groups = |range| {
-            let open = open_request(&options, range, AutoresetMode::SameStep).unwrap();
+            let open = open_request(&options, range, AutoresetMode::SameStep, 0).unwrap();
             open.groups.iter().map(|g| (g.seed, g.first_environment_index, g.size)).collect::<Vec<_>>()
         };
         assert_eq!(groups(0..5), [(7, 0, 3), (8, 0, 2)]);
         assert_eq!(groups(2..4), [(7, 2, 1), (8, 0, 1)]);
-        let alone = open_request(&options, 1..3, AutoresetMode::SameStep).unwrap();
+        let alone = open_request(&options, 1..3, AutoresetMode::SameStep, 0).unwrap();
         assert!(alone.groups.is_empty());
         assert_eq!((alone.seed, alone.first_environment_index, alone.batch_size), (7, 1, 2));
     }

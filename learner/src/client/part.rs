@@ -22,14 +22,15 @@ pub(super) struct Part {
 }
 
 impl Part {
-    /// Opens the slots of `range`, counted over all `options`.
+    /// Opens the slots of `range`, counted over all `options`, with a lease of so many requests that wait, or 0 for none.
     pub(super) async fn open(
         connection: &Connection,
         options: &[OpenOptions],
         range: Range<usize>,
         autoreset_mode: AutoresetMode,
+        lease: u32,
     ) -> Result<(Self, proto::Opened), ClientError> {
-        let open = open_request(options, range.clone(), autoreset_mode).ok_or_else(|| ClientError::Refused {
+        let open = open_request(options, range.clone(), autoreset_mode, lease).ok_or_else(|| ClientError::Refused {
             address: connection.address().clone(),
             request: proto::Open::NAME,
             code: tonic::Code::InvalidArgument,

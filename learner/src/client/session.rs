@@ -3,7 +3,8 @@
 use std::ops::Range;
 
 use bytes::Bytes;
-use perturb_protocol::{Ask, ClientError, Distribution};
+use perturb_protocol::{Address, Ask, ClientError, Distribution};
+use tokio::runtime::Handle;
 
 use super::acting::ActAt;
 use super::options::OpenOptions;
@@ -15,9 +16,12 @@ use crate::proto::{self, AutoresetMode};
 /// So many snapshots are restored by one request: of HalfCheetah some 600 kB, far below what a server accepts.
 const RESTORED_AT_ONCE: usize = 1024;
 
+/// Requests to one server that wait for their replies, of which none is sent before the last is answered.
+const WAITING: u32 = 1;
+
 /// N environments in same-step autoreset mode, of one training or of several. Environment i of a training has index i and
 /// gives the same bytes however many servers share the batch, and whatever else is in it: each server owns a contiguous
-/// range.
+/// range. Where a connection by TCP is lost, but not the server, its part [goes on](perturb_protocol::Stream) as it was.
 #[derive(Debug)]
 pub struct Session<'a> {
     pub(super) servers: &'a Servers,
@@ -51,37 +55,36 @@ impl<'a> Session<'a> {
         let num_envs = options.iter().map(|options| options.num_envs).sum();
         let connections = servers.connections();
         let ranges = split(num_envs, connections.len());
-        let mut acts = servers.act() == ActAt::Server;
-        let mut parts: Vec<Part> = Vec::new();
-        let mut environment: Option<proto::Environment> = None;
+        let acts = servers.act() == ActAt::Server;
+        let environment = proto::Environment::default();
+        let mut session = Self { servers, parts: Vec::new(), environment, observation_size: 0, num_envs, acts };
         observations.clear();
         for (connection, range) in connections.iter().zip(ranges) {
             if range.is_empty() {
                 continue; // more servers than environments
             }
-            let opening = Part::open(connection, options, range, AutoresetMode::SameStep);
+            // A Unix socket is lost with its server alone.
+            let lease = if matches!(connection.address(), Address::Tcp { .. }) { WAITING } else { 0 };
+            let opening = Part::open(connection, options, range, AutoresetMode::SameStep, lease);
             let (part, opened) = servers.runtime().block_on(opening).map_err(|error| servers.explain(error))?;
             let described = opened.environment.unwrap_or_default();
-            acts &= opened.acts;
+            session.acts &= opened.acts;
             let expected = part.range.len() * described.observation.len();
             let first = observations.len();
             observations.resize(first + expected, 0.0);
             part.stream.decode::<proto::Open>("observations", &opened.observations, &mut observations[first..])?;
-            match &environment {
-                Some(known) if *known != described => {
-                    return Err(ClientError::Disagreement {
-                        first: parts[0].stream.address().clone(),
-                        other: part.stream.address().clone(),
-                        environment: described.name,
-                    });
+            let other = part.stream.address().clone();
+            session.parts.push(part);
+            match session.parts.as_slice() {
+                [first, _, ..] if session.environment != described => {
+                    let first = first.stream.address().clone();
+                    return Err(ClientError::Disagreement { first, other, environment: described.name });
                 }
-                _ => environment = Some(described),
+                _ => session.environment = described,
             }
-            parts.push(part);
         }
-        let environment = environment.unwrap_or_default();
-        let observation_size = environment.observation.len();
-        Ok(Self { servers, parts, environment, observation_size, num_envs, acts })
+        session.observation_size = session.environment.observation.len();
+        Ok(session)
     }
 
     /// What was opened.
@@ -242,7 +245,7 @@ impl<'a> Session<'a> {
     /// The failures of a connection.
     pub fn release(&mut self, slots: Range<usize>) -> Result<(), ClientError> {
         // What would be left without environments is closed.
-        self.parts.retain(|part| part.overlap(&slots) != part.range);
+        self.close(|part| part.overlap(&slots) == part.range);
         self.exchange(|part| part.mask(&slots).map(|mask| proto::Release { mask }), |_, _| Ok(()))?;
         let mut first = 0;
         for part in &mut self.parts {
@@ -252,6 +255,16 @@ impl<'a> Session<'a> {
         }
         self.num_envs = first;
         Ok(())
+    }
+
+    /// Closes those parts, so that no server keeps them for a lease's time.
+    fn close(&mut self, over: impl Fn(&Part) -> bool) {
+        let closing = self.parts.extract_if(.., |part| over(part)).map(|part| part.stream.close());
+        let closing = futures_util::future::join_all(closing);
+        // Within a runtime nothing can be waited for.
+        if Handle::try_current().is_err() {
+            self.servers.block_on(closing);
+        }
     }
 
     /// Sends every server its request, if it has one, and takes its reply. All are heard before the first failure is returned, so that
@@ -278,6 +291,12 @@ impl<'a> Session<'a> {
             outcome
         });
         exchanged.map_err(|error| servers.explain(error))
+    }
+}
+
+impl Drop for Session<'_> {
+    fn drop(&mut self) {
+        self.close(|_| true);
     }
 }
 

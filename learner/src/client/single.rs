@@ -62,7 +62,7 @@ impl<'a> Single<'a> {
             let source = std::io::ErrorKind::NotConnected.into();
             return Err(ClientError::System { action: "open an environment", source });
         };
-        let opening = Part::open(connection, std::slice::from_ref(options), 0..1, AutoresetMode::Disabled);
+        let opening = Part::open(connection, std::slice::from_ref(options), 0..1, AutoresetMode::Disabled, 0);
         let (part, opened) = servers.runtime().block_on(opening).map_err(|error| servers.explain(error))?;
         let environment = opened.environment.unwrap_or_default();
         observation.resize(environment.observation.len(), 0.0);

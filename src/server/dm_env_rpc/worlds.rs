@@ -8,6 +8,7 @@ use crate::{
     pool::Pool,
     server::{
         draws::Draws,
+        leases,
         ledger::Ledger,
         status::Refusal,
         tokens::{Bearer, Held},
@@ -227,12 +228,7 @@ impl Registry {
 
 /// One that nobody guesses.
 fn random_name(environment: &str) -> Result<String, Refusal> {
-    let mut bytes = [0; 16];
-    let got = rustix::rand::getrandom(&mut bytes, rustix::rand::GetRandomFlags::empty());
-    if !got.is_ok_and(|n| n == bytes.len()) {
-        return Err(Refusal::NoRandomness);
-    }
-    Ok(format!("{environment}-{:032x}", u128::from_ne_bytes(bytes)))
+    Ok(format!("{environment}-{:032x}", u128::from_ne_bytes(leases::random()?)))
 }
 
 fn unknown(name: &str) -> Refusal {

@@ -8,7 +8,10 @@ pub mod endpoint;
 pub mod page;
 pub mod process;
 
-use super::{access::Access, budget::Budget, peers::Places, refusals::Refusals, requests::Counts, tokens::Tokens};
+use super::{
+    access::Access, budget::Budget, leases::Numbers, peers::Places, refusals::Refusals, requests::Counts,
+    tokens::Tokens,
+};
 use crate::{meters::Histogram, pool::Pool};
 use std::{sync::Arc, time::Duration};
 use tokio::time::{Instant, sleep_until};
@@ -22,6 +25,8 @@ pub struct Sources {
     pub pool: Arc<Pool>,
     /// Those of sessions.
     pub sessions: Places,
+    /// Which of them have leases.
+    pub leases: Numbers,
     /// Those of connections.
     pub connections: Places,
     /// Bytes in flight.

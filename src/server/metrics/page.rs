@@ -56,10 +56,11 @@ impl Collector for Numbers {
 impl Numbers {
     /// What there is, and how much there may be.
     fn places(&self, page: &mut Page<'_>) -> Written {
-        let Sources { pool, sessions, connections, budget, .. } = &*self.0;
+        let Sources { pool, sessions, leases, connections, budget, .. } = &*self.0;
         for (name, help, value) in [
             ("perturb_sessions", "Sessions now", sessions.taken()),
             ("perturb_sessions_limit", "The most sessions at a time", sessions.limit()),
+            ("perturb_sessions_detached", "Sessions now that have a lease and no stream", leases.detached()),
             ("perturb_connections", "Connections now", connections.taken()),
             ("perturb_environments", "Environments now", pool.environments()),
             ("perturb_environments_limit", "The most environments", pool.limit()),
@@ -68,7 +69,8 @@ impl Numbers {
         ] {
             page.gauges(name, help, [(NONE, value as f64)])?;
         }
-        Ok(())
+        let resumed = [(NONE, leases.resumed() as f64)];
+        page.counters("perturb_sessions_resumed", "How often a session was taken up by another stream", resumed)
     }
 
     fn requests(&self, page: &mut Page<'_>) -> Written {

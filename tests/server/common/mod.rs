@@ -1,5 +1,6 @@
 //! What several test files need: environments at their first episode, actions, and transcripts to compare.
 
+pub mod proxy;
 pub mod server;
 
 use perturb::env::{Action, ActionSpace, EnvironmentSpec, Episodes, Outcome, Purpose, Settings, Stream, Version};

@@ -12,26 +12,26 @@ use std::path::PathBuf;
 use tempfile::TempDir;
 
 /// A server that tells metrics at a socket.
-struct Watched {
-    server: Server,
+pub struct Watched {
+    pub server: Server,
     socket: PathBuf,
     _directory: TempDir,
 }
 
 impl Watched {
-    fn start(flags: &[&str]) -> Self {
+    pub fn start(flags: &[&str]) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let socket = directory.path().join("metrics");
         let metrics = format!("unix:{}", socket.display());
         Self { server: Server::start(&[&["--metrics", &metrics], flags].concat()), socket, _directory: directory }
     }
 
-    fn page(&self) -> Page {
+    pub fn page(&self) -> Page {
         Page::scrape(&self.socket)
     }
 
     /// Waits until a series has this number.
-    async fn until(&self, series: &str, number: f64) {
+    pub async fn until(&self, series: &str, number: f64) {
         let what = format!("{series} is {number}");
         until(&what, async || self.page().number(series) == number).await;
     }

@@ -140,6 +140,7 @@ impl Session {
             // Of one environment by itself a message is as good.
             receipt_arrays: receipts && !self.actions.single,
             groups: Vec::new(),
+            lease: 0, // a batch that loses its connection is lost
         };
         {
             let mut state = self.state();
