@@ -3,6 +3,7 @@
 use std::fs::{File, Metadata};
 use std::io::SeekFrom;
 use std::ops::RangeInclusive;
+use std::os::fd::AsRawFd;
 use std::path::Path;
 
 use axum::body::Body;
@@ -63,10 +64,11 @@ pub(crate) async fn send(root: Root, relative: Relative, headers: &HeaderMap) ->
     Some(response)
 }
 
-/// Opens a plain file, and no link.
+/// Opens the plain file at a `path` without links. Had a part of it become a link meanwhile, another one would be open.
 fn open(path: &Path) -> std::io::Result<(File, Metadata)> {
-    match std::fs::symlink_metadata(path)?.is_file() {
-        true => open_plain(path),
+    let opened = open_plain(path)?;
+    match std::fs::read_link(format!("/proc/self/fd/{}", opened.0.as_raw_fd()))? == path {
+        true => Ok(opened),
         false => Err(std::io::ErrorKind::InvalidInput.into()),
     }
 }
@@ -105,5 +107,19 @@ mod tests {
     #[case("lines=1-2", Asked::Whole)]
     fn a_part_of_ten_bytes(#[case] header: &str, #[case] expected: Asked) {
         assert_eq!(part(header, 10), expected);
+    }
+
+    #[test]
+    fn what_has_become_a_link_meanwhile_is_not_opened() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| directory.path().canonicalize().unwrap().join(name);
+        std::fs::create_dir(path("folder")).unwrap();
+        std::fs::write(path("folder/a.csv"), "x").unwrap();
+        std::os::unix::fs::symlink("folder", path("link")).unwrap();
+        std::os::unix::fs::symlink("a.csv", path("folder/b.csv")).unwrap();
+        assert_eq!(
+            ["folder/a.csv", "link/a.csv", "folder/b.csv"].map(|name| open(&path(name)).is_ok()),
+            [true, false, false]
+        );
     }
 }

@@ -1,7 +1,7 @@
 //! The reports of experiments as they stand: made one at a time, kept while nothing changes, and made again so seldom that
 //! trainings do not notice.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -22,6 +22,10 @@ const LEAST: Duration = Duration::from_secs(5);
 const REST: u32 = 10;
 /// So long somebody waits for one.
 const PATIENCE: Duration = Duration::from_secs(60);
+/// One that takes longer, as where a file system does not answer, no longer keeps others from being made.
+const LONGEST: Duration = Duration::from_secs(120);
+/// Said to those for whom it takes too long.
+const STILL: &str = "it is still being made; load this page again in a minute";
 
 /// What makes a report.
 type Make = fn(&Path) -> Result<Arc<str>, String>;
@@ -33,7 +37,10 @@ pub(crate) struct Reports {
     /// Whoever has it makes one, not before this moment.
     turn: tokio::sync::Mutex<Instant>,
     waiting: Arc<Semaphore>,
+    /// Whose reports take longer than [`LONGEST`].
+    stuck: Mutex<HashSet<PathBuf>>,
     make: Make,
+    longest: Duration,
 }
 
 /// A report.
@@ -55,14 +62,14 @@ impl Made {
 
 impl Default for Reports {
     fn default() -> Self {
-        Self::by(make)
+        Self::by(make, LONGEST)
     }
 }
 
 impl Reports {
-    fn by(make: Make) -> Self {
+    fn by(make: Make, longest: Duration) -> Self {
         let (turn, waiting) = (tokio::sync::Mutex::new(Instant::now()), Arc::new(Semaphore::new(MOST_WAITING)));
-        Self { made: Mutex::default(), turn, waiting, make }
+        Self { made: Mutex::default(), turn, waiting, stuck: Mutex::default(), make, longest }
     }
 
     /// The state of which a report would be sent now: `state`, which the files have, or an earlier one.
@@ -80,13 +87,28 @@ impl Reports {
         let making = tokio::spawn(async move {
             let _place = place;
             let mut turn = this.turn.lock().await;
+            if this.stuck().contains(&folder) {
+                return Err(STILL.into());
+            }
             if let Some(made) = this.known().get(&folder).filter(|made| made.serves(state)) {
                 return made.page.clone();
             }
             tokio::time::sleep_until((*turn).into()).await;
             let (at, place, make) = (Instant::now(), folder.clone(), this.make);
-            let made = tokio::task::spawn_blocking(move || make(&place)).await;
-            *turn = Instant::now() + PAUSE * at.elapsed();
+            let mut making = tokio::task::spawn_blocking(move || make(&place));
+            let made = match tokio::time::timeout(this.longest, &mut making).await {
+                Ok(made) => {
+                    *turn = Instant::now() + PAUSE * at.elapsed();
+                    made
+                }
+                Err(_) => {
+                    drop(turn);
+                    this.stuck().insert(folder.clone());
+                    let made = making.await;
+                    this.stuck().remove(&folder);
+                    made
+                }
+            };
             let page = made.unwrap_or_else(|error| Err(error.to_string()));
             let mut known = this.known();
             let oldest = known.iter().min_by_key(|(_, made)| made.at).map(|(folder, _)| folder.clone());
@@ -99,8 +121,12 @@ impl Reports {
         });
         match tokio::time::timeout(PATIENCE, making).await {
             Ok(page) => page.unwrap_or_else(|error| Err(error.to_string())),
-            Err(_) => Err("it is still being made; load this page again in a minute".into()),
+            Err(_) => Err(STILL.into()),
         }
+    }
+
+    fn stuck(&self) -> MutexGuard<'_, HashSet<PathBuf>> {
+        self.stuck.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn known(&self) -> MutexGuard<'_, HashMap<PathBuf, Made>> {
@@ -116,7 +142,7 @@ fn make(folder: &Path) -> Result<Arc<str>, String> {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::atomic::{AtomicUsize, Ordering};
+    use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
     use super::*;
 
@@ -142,7 +168,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_report_is_made_again_when_it_is_another_one_and_not_too_often() {
-        let (reports, good, bad) = (Arc::new(Reports::by(counted)), Path::new("good"), Path::new("bad"));
+        let (reports, good, bad) = (Arc::new(Reports::by(counted, LONGEST)), Path::new("good"), Path::new("bad"));
         let first = reports.page(good, 1).await.unwrap();
         assert_eq!(reports.page(good, 1).await.unwrap(), first);
         assert_eq!(reports.page(good, 2).await.unwrap(), first, "too early");
@@ -166,7 +192,7 @@ mod tests {
 
     #[tokio::test]
     async fn however_many_experiments_there_are_some_reports_are_kept_and_between_two_is_a_rest() {
-        let (reports, begun) = (Arc::new(Reports::by(slow)), Instant::now());
+        let (reports, begun) = (Arc::new(Reports::by(slow, LONGEST)), Instant::now());
         for number in 0..=MOST {
             reports.page(&PathBuf::from(number.to_string()), 1).await.unwrap();
         }
@@ -177,7 +203,7 @@ mod tests {
 
     #[tokio::test]
     async fn so_many_wait_and_no_more() {
-        let reports = Arc::new(Reports::by(slow));
+        let reports = Arc::new(Reports::by(slow, LONGEST));
         let ask = |number: usize| {
             let reports = Arc::clone(&reports);
             async move { reports.page(&PathBuf::from((number % 2).to_string()), 1).await }
@@ -185,5 +211,33 @@ mod tests {
         let answers = futures_util::future::join_all((0..=MOST_WAITING).map(ask)).await;
         let refused: Vec<_> = answers.into_iter().filter_map(Result::err).collect();
         assert_eq!(refused, ["too many wait for reports already"]);
+    }
+
+    /// Whether reports of folders of this name hang.
+    static HANGS: AtomicBool = AtomicBool::new(true);
+
+    fn hanging(folder: &Path) -> Result<Arc<str>, String> {
+        while folder.ends_with("hangs") && HANGS.load(Ordering::Relaxed) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        Ok(folder.display().to_string().into())
+    }
+
+    #[tokio::test]
+    async fn one_that_hangs_keeps_no_other_from_being_made() {
+        let reports = Arc::new(Reports::by(hanging, Duration::from_millis(50)));
+        let ask = |name: &'static str| {
+            let reports = Arc::clone(&reports);
+            tokio::spawn(async move { reports.page(Path::new(name), 1).await })
+        };
+        let stuck = ask("hangs");
+        while reports.stuck().is_empty() {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        assert_eq!(ask("other").await.unwrap().as_deref(), Ok("other"));
+        assert_eq!(ask("hangs").await.unwrap(), Err(STILL.into()), "it is not begun a second time");
+        HANGS.store(false, Ordering::Relaxed);
+        assert_eq!(stuck.await.unwrap().as_deref(), Ok("hangs"));
+        assert!(reports.stuck().is_empty());
     }
 }

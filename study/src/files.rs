@@ -8,6 +8,8 @@ use std::time::Duration;
 
 use serde::Serialize;
 
+use crate::words::quoted;
+
 mod plain;
 
 pub use self::plain::{Stamp, leads_out, open_plain, read_plain, read_plain_text};
@@ -148,7 +150,7 @@ pub fn require_writable(path: &Path) -> Result<()> {
         let (kind, words) = match folder.exists() {
             true => (ErrorKind::NotADirectory, format!("{} is no folder", folder.display())),
             false => {
-                let command = format!("mkdir -p {}", folder.display());
+                let command = format!("mkdir -p {}", quoted(folder));
                 (ErrorKind::NotFound, format!("there is no folder {}; make it with `{command}`", folder.display()))
             }
         };

@@ -1,5 +1,6 @@
 //! Ctrl-C and SIGTERM as a flag that loops look at, and folders that do not outlive them.
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicI32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -46,7 +47,7 @@ impl StopFlag {
 /// The operating system's.
 pub fn end_on_signals() -> std::io::Result<()> {
     watch(|number| {
-        eprintln!("stopped by signal {number}");
+        let _ = writeln!(std::io::stderr(), "stopped by signal {number}"); // the terminal may be gone
         end(number);
     })
 }

@@ -234,7 +234,9 @@ pub fn set_of(name: &str, version: Version, assignments: Vec<Assignment>) -> Res
 /// [`ValueError`], which names the line.
 pub fn set_of_csv(name: &str, version: Version, text: &[u8]) -> Result<TestSet, ValueError> {
     let mut reader = csv::Reader::from_reader(text);
-    let wrong = |error: csv::Error| ValueError::new(name, error, "CSV: a header of parameters, then a row a context");
+    let wrong = |error: csv::Error| {
+        ValueError::new(name, format!("not understood ({error})"), "CSV: a header of parameters, then a row a context")
+    };
     let header = reader.headers().map_err(wrong)?.clone();
     let mut contexts = Vec::new();
     for (row, record) in reader.records().enumerate() {

@@ -1,4 +1,6 @@
-//! Numbers, times and long texts as people read them.
+//! Numbers, times and long texts as people read them, and commands as they paste them.
+
+use std::ffi::OsStr;
 
 /// A number with its digits in groups of three.
 pub fn grouped(number: usize) -> String {
@@ -24,6 +26,12 @@ pub fn duration(seconds: f64) -> String {
         (0..1000, _, _) => format!("{days} d {} h", hours % 24),
         _ => format!("{} years", grouped((days as f64 / 365.25).round() as usize)),
     }
+}
+
+/// A word, the path of a file for instance, as a shell takes it for one.
+pub fn quoted(word: impl AsRef<OsStr>) -> String {
+    let word = word.as_ref().to_string_lossy();
+    shlex::try_quote(&word).map_or_else(|_| word.to_string(), |quoted| quoted.into_owned())
 }
 
 /// Of a text that anybody may have written: no more than anybody reads, characters.

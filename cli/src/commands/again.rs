@@ -5,24 +5,20 @@ use std::path::Path;
 use super::args::{PlayArgs, WaitArgs};
 use super::error::CommandError;
 use perturb_learner::training::{LastCheckpoint, TrainError};
-
-/// A word as a shell takes it for one.
-fn quoted(word: &str) -> String {
-    shlex::try_quote(word).map_or_else(|_| word.to_owned(), |quoted| quoted.into_owned())
-}
+use perturb_study::words::quoted;
 
 /// What this process was given, as it was typed.
 pub(super) fn this_command() -> String {
-    let words = std::env::args_os().skip(1).map(|word| quoted(&word.to_string_lossy()));
+    let words = std::env::args_os().skip(1).map(quoted);
     ["perturb".to_owned()].into_iter().chain(words).collect::<Vec<_>>().join(" ")
 }
 
 /// What goes on with the run in `path`, with the same servers.
 pub(super) fn resume_command(path: &Path, play: &PlayArgs) -> String {
-    let mut command = format!("perturb train --resume {}", quoted(&path.to_string_lossy()));
+    let mut command = format!("perturb train --resume {}", quoted(path));
     let servers: Vec<String> = play.server.server.iter().map(ToString::to_string).collect();
     if !servers.is_empty() {
-        command += &format!(" --server {}", quoted(&servers.join(",")));
+        command += &format!(" --server {}", quoted(servers.join(",")));
     }
     if play.act == "client" {
         command += " --act client";

@@ -16,7 +16,7 @@ use perturb_study::records::{FILE, Records};
 use perturb_study::{Assessed, Folder, files};
 
 use super::args::AuditArgs;
-use super::display::Display;
+use super::display::{Display, say};
 use super::error::{CommandError, Result, system};
 use super::rates::file_in;
 use super::{lasting_servers, plan_in};
@@ -33,6 +33,7 @@ struct Tested {
 }
 
 pub(super) fn run(args: &AuditArgs) -> Result<ExitCode> {
+    args.json.check()?;
     let tested = tested(args)?;
     if !args.ledger.is_empty() {
         return ledgers::prove(args, &tested);
@@ -47,21 +48,19 @@ pub(super) fn run(args: &AuditArgs) -> Result<ExitCode> {
             Err(error) if tested.len() == 1 || stop.signal().is_some() => return Err(error),
             audit => audits.push((one.name.as_str(), audit.map_err(|error| error.to_string()))),
         }
-        if !args.json {
+        if !args.json.is_printed() {
             audits.last().map_or(Ok(()), |(name, audit)| print(name, audit))?;
         }
     }
     let done = || audits.iter().filter_map(|(_, audit)| audit.as_ref().ok());
     let played: u64 = done().map(|audit| audit.episodes).sum();
     let different: usize = done().map(|audit| audit.different.len()).sum();
-    let mut out = std::io::stdout();
-    if args.json {
-        let policies: Vec<_> = audits.iter().map(|(name, audit)| document(name, audit)).collect();
-        let same = played - different as u64;
-        writeln!(out, "{:#}", json!({ "episodes": played, "same": same, "policies": policies }))?;
-    } else {
+    let same = played - different as u64;
+    let policies: Vec<_> = audits.iter().map(|(name, audit)| document(name, audit)).collect();
+    args.json.write(json!({ "episodes": played, "same": same, "policies": policies }))?;
+    if !args.json.is_printed() {
         let recorded = if tested.len() == 1 { "1 policy".to_owned() } else { format!("{} policies", tested.len()) };
-        writeln!(out, "{} of {played} episodes of {recorded} have the same bytes", played - different as u64)?;
+        writeln!(std::io::stdout(), "{same} of {played} episodes of {recorded} have the same bytes")?;
     }
     Ok(if different == 0 && done().count() == tested.len() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
@@ -163,9 +162,9 @@ fn of_assessment(path: &Path, checkpoints: &[PathBuf]) -> Result<Vec<Tested>> {
             Some((checkpoint, _)) => {
                 tested.push(Tested { name, records: path.join(policy.file_name()), checkpoint: checkpoint.clone() });
             }
-            None => eprintln!(
+            None => say(format_args!(
                 "{name}: {recorded} is no checkpoint that was given; Assessment.audit(policy) replays it in Python"
-            ),
+            )),
         }
     }
     if tested.is_empty() {

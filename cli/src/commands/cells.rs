@@ -1,17 +1,19 @@
 //! Doing a plan's cells, whatever does them.
 
 use std::collections::HashMap;
+use std::io::Write;
 use std::process::ExitCode;
 
 use super::again::this_command;
 use super::args::RunArgs;
 use super::display::{Display, note};
 use super::error::{CommandError, Result};
-use super::report;
 use super::signal_code;
+use super::{json, report};
 use perturb_study::interrupt::StopFlag;
 use perturb_study::report::Sources;
 use perturb_study::scheduler::{Announcement, Backend, Rate, RunEnd, RunError, count, run as run_plan, write_line};
+use perturb_study::words::quoted;
 use perturb_study::{FailureMark, Folder, Plan};
 
 /// So many kinds of cells are told of at the end.
@@ -30,14 +32,17 @@ pub(super) struct Doing<'a> {
     end: Option<RunEnd>,
     /// Success of what is done.
     rates: Vec<Rate>,
+    /// Where what happens is told as JSON.
+    lines: Option<Box<dyn Write>>,
 }
 
 impl<'a> Doing<'a> {
     /// Keeps the plan in its folder.
     pub(super) fn begin(args: &'a RunArgs, plan: Plan, folder: &'a Folder, stop: &'a StopFlag) -> Result<Self> {
+        let lines = args.json.as_deref().map(json::lines).transpose()?;
         keep_plan(args, &plan, folder)?;
         let forgiven = if args.retry_failed { folder.failures()? } else { HashMap::new() };
-        Ok(Self { args, folder, stop, plan, forgiven, end: None, rates: Vec::new() })
+        Ok(Self { args, folder, stop, plan, forgiven, end: None, rates: Vec::new(), lines })
     }
 
     /// The cells to do next: the plan's, then those that it has beside them when these are done; `None` at the end.
@@ -68,8 +73,7 @@ impl<'a> Doing<'a> {
                 rates.clone_from(&status.rates);
             }
             Announcement::Note(sentence) => note(sentence),
-            Announcement::Line(line) if self.args.json => write_line(&mut std::io::stdout(), line),
-            Announcement::Line(_) => {}
+            Announcement::Line(line) => self.lines.iter_mut().for_each(|out| write_line(out, line)),
         };
         let end = run_plan(plan, self.folder, backend, &self.forgiven, self.args.wait.time(), self.stop, &mut report);
         drop(display);
@@ -86,7 +90,7 @@ impl<'a> Doing<'a> {
         let Self { args, folder, plan, end, rates, .. } = self;
         rates.iter().take(MOST_RATES).for_each(note);
         if rates.len() > MOST_RATES {
-            note(format_args!("and {} more: perturb report {}", rates.len() - MOST_RATES, folder.path().display()));
+            note(format_args!("and {} more: perturb report {}", rates.len() - MOST_RATES, quoted(folder.path())));
         }
         let failed = match end {
             Some(RunEnd::Stopped { signal, left }) => {
@@ -109,7 +113,7 @@ impl<'a> Doing<'a> {
             note(format_args!("the report is in {} and {}", page.display(), tables.display()));
         }
         let Some(first) = failed.first() else {
-            note(format_args!("all {} cells are done; perturb report {}", plan.cells.len(), folder.path().display()));
+            note(format_args!("all {} cells are done; perturb report {}", plan.cells.len(), quoted(folder.path())));
             return Ok(ExitCode::SUCCESS);
         };
         Err(CommandError::Failed(format!(

@@ -1,6 +1,6 @@
 //! How far something is, on standard error: a bar on a terminal, which fits its width, plain lines elsewhere.
 
-use std::io::IsTerminal;
+use std::io::{IsTerminal, Write};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -40,9 +40,14 @@ pub(super) fn note(sentence: impl std::fmt::Display) {
         return;
     }
     match &*shown() {
-        Some(bar) => bar.suspend(|| eprintln!("{sentence}")),
-        None => eprintln!("{sentence}"),
+        Some(bar) => bar.suspend(|| say(&sentence)),
+        None => say(&sentence),
     }
+}
+
+/// A line on standard error, even for those who want to hear nothing. That nobody reads it is no reason to stop.
+pub(super) fn say(line: impl std::fmt::Display) {
+    let _ = writeln!(std::io::stderr(), "{line}");
 }
 
 fn shown() -> MutexGuard<'static, Option<MultiProgress>> {
@@ -152,7 +157,7 @@ impl Display {
             bar.show(position, [vec![words], lines()].concat());
         } else if !is_quiet() && self.last_line.is_none_or(|time| time.elapsed() >= LINE_INTERVAL) {
             self.last_line = Some(Instant::now());
-            eprintln!("{}{words}", self.what);
+            say(format_args!("{}{words}", self.what));
         }
     }
 }
@@ -169,8 +174,8 @@ impl Bar {
     fn new(what: &str, total: u64) -> Self {
         let all = MultiProgress::new();
         let bar = ProgressBar::new(total).with_style(style("{prefix}{wide_bar} {percent:>3} %"));
-        bar.set_prefix(what.to_owned());
-        let bar = all.add(bar);
+        // Setting the prefix would draw the bar by itself, and nobody would wipe that away.
+        let bar = all.add(bar.with_prefix(what.to_owned()));
         *shown() = Some(all.clone());
         Self { all, bar, lines: Vec::new() }
     }

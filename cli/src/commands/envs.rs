@@ -11,12 +11,13 @@ use perturb_learner::proto::{Channel, Distribution, Environment, action_space::K
 use perturb_study::table::Table;
 
 pub(super) fn run(args: &EnvsArgs) -> Result<()> {
+    args.json.check()?;
     let catalogue = servers(&args.server)?.catalogue()?;
-    let mut out = std::io::stdout().lock();
-    if args.json {
-        writeln!(out, "{:#}", catalogue::to_json(&catalogue))?;
+    args.json.write(catalogue::to_json(&catalogue))?;
+    if args.json.is_printed() {
         return Ok(());
     }
+    let mut out = std::io::stdout().lock();
     for environment in &catalogue.environments {
         print(&mut out, environment)?;
     }

@@ -118,8 +118,10 @@ impl CommandError {
             | Self::Value(_)
             | Self::Serve(ServeError::NoFolder { .. } | ServeError::Address { .. })
             | Self::Checkpoint(CheckpointError::Missing { .. } | CheckpointError::Several { .. })
-            | Self::Records(RecordsError::Missing { .. })
+            | Self::Records(RecordsError::Missing { .. } | RecordsError::Other { .. })
+            | Self::Audit(AuditError::Policy { .. })
             | Self::Folder(FolderError::NoPlan { .. })
+            | Self::Slurm(SlurmError::NotInstalled { .. })
             | Self::Video(VideoError::Extension { .. } | VideoError::NoFfmpeg { .. })
             | Self::Test(TestError::Value(_))
             | Self::Heatmap(HeatmapError::Parameter { .. } | HeatmapError::Fixed { .. }) => true,

@@ -1,7 +1,6 @@
 //! `perturb evaluate`.
 
 use std::io::Write;
-use std::path::Path;
 
 use serde_json::{Map, Value, json};
 
@@ -12,15 +11,15 @@ use super::{playing_servers, sets};
 use perturb_learner::checkpoint::{Checkpoint, State};
 use perturb_learner::evaluation::{TestOptions, Tester};
 use perturb_study::TestResult;
-use perturb_study::files::{require_writable, write_json};
+use perturb_study::files::require_writable;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::sets::TestSet;
 use perturb_study::settings::TrainConfig;
 use perturb_study::table::Table;
 
 pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
-    let json = args.json.as_deref().filter(|path| *path != Path::new("-"));
-    args.records.as_deref().into_iter().chain(json).try_for_each(require_writable)?;
+    args.json.check()?;
+    args.records.as_deref().map_or(Ok(()), require_writable)?;
     let checkpoint = Checkpoint::load(&args.checkpoint)?;
     let sets = sets::tested(&args.versions, &args.set)?;
     let seed = args.seed.unwrap_or(checkpoint.state.config.common.seed);
@@ -46,10 +45,9 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
     }
     let results: Vec<(String, TestResult)> =
         sets.iter().map(|set| (set.name.clone(), records.result(&set.name, None))).collect();
-    if let Some(path) = json {
-        write_json(path, &document(state, seed, &results))?;
-    } else if args.json.is_some() {
-        return Ok(writeln!(std::io::stdout(), "{:#}", document(state, seed, &results))?);
+    args.json.write(document(state, seed, &results))?;
+    if args.json.is_printed() {
+        return Ok(());
     }
     let table = Table::of("", &results)
         .text("tested on", |(set, _)| set)

@@ -1,6 +1,6 @@
 //! `perturb ls`.
 
-use std::io::Write;
+use std::io::{IsTerminal, Write};
 
 use super::args::LsArgs;
 use super::error::{CommandError, Result};
@@ -9,25 +9,43 @@ use perturb_study::table::Table;
 use perturb_study::words::grouped;
 
 pub(super) fn run(args: &LsArgs) -> Result<()> {
+    args.json.check()?;
     if !args.dir.is_dir() {
         return Err(CommandError::Usage(no_folder(&args.dir)));
     }
     let found: Vec<RunSummary> = places(&args.dir, usize::MAX)?.runs.iter().map(RunSummary::read).collect();
-    let mut out = std::io::stdout();
-    if args.json {
-        return Ok(writeln!(out, "{:#}", serde_json::to_value(found).unwrap_or_default())?);
+    args.json.write(&found)?;
+    if args.json.is_printed() {
+        return Ok(());
     }
+    let mut out = std::io::stdout();
     if found.is_empty() {
         return Ok(writeln!(out, "{} holds neither trainings nor experiments", args.dir.display())?);
     }
+    let done = |found: &RunSummary| {
+        if found.unit.is_empty() {
+            return String::new(); // it is not understood
+        }
+        let number = |number: u64| grouped(number as usize);
+        format!("{} of {} {}", number(found.done), number(found.budget), found.unit)
+    };
     let table = Table::of("", &found)
         .text("run", |found| found.path.display())
         .text("what", |found| &found.what)
-        .number("done", |found| {
-            let number = |number: u64| grouped(number as usize);
-            format!("{} of {} {}", number(found.done), number(found.budget), found.unit)
-        })
+        .number("done", done)
         .number("success, %", |found| found.success_percent.map_or_else(String::new, |percent| format!("{percent:.1}")))
         .text("state", |found| found.state);
-    Ok(writeln!(out, "{}", table.build().to_text())?)
+    let table = table.build().to_text();
+    let width = out.is_terminal().then(|| usize::from(console::Term::stdout().size().1));
+    if width.is_none_or(|width| table.lines().all(|line| line.chars().count() <= width)) {
+        return Ok(writeln!(out, "{table}")?);
+    }
+    // A table would be broken where the terminal ends.
+    for found in &found {
+        let success = found.success_percent.map(|percent| format!("success {percent:.1} %"));
+        let words = [found.what.clone(), done(found), success.unwrap_or_default(), found.state.to_owned()];
+        let words: Vec<String> = words.into_iter().filter(|words| !words.is_empty()).collect();
+        writeln!(out, "{}\n  {}", found.path.display(), words.join(", "))?;
+    }
+    Ok(())
 }

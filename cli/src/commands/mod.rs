@@ -15,6 +15,7 @@ mod envs;
 mod error;
 mod evaluate;
 mod heatmap;
+mod json;
 mod ls;
 mod plan;
 mod rates;
@@ -54,7 +55,12 @@ pub fn main() -> ExitCode {
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new(usual));
     let no_color = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
     let colours = std::io::stderr().is_terminal() && !no_color; // a worker's is a file
-    tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours).with_writer(std::io::stderr).init();
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_ansi(colours)
+        .with_writer(std::io::stderr)
+        .log_internal_errors(false) // they would go to standard error, which is what fails, and end the program
+        .init();
     if matches!(cli.command, Command::Envs(_) | Command::Report(_) | Command::Curves(_) | Command::Serve(_)) {
         // They have nothing to finish; the others look at a flag.
         let _ = end_on_signals(); // without it they end as any program does
@@ -85,7 +91,7 @@ fn fail(error: &CommandError) -> ExitCode {
     if error.is_closed_pipe() {
         return ExitCode::SUCCESS;
     }
-    eprintln!("perturb: {error}");
+    display::say(format_args!("perturb: {error}"));
     error.signal().map_or(ExitCode::from(if error.is_usage() { 2 } else { 1 }), signal_code)
 }
 

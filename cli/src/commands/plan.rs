@@ -21,14 +21,15 @@ use perturb_study::{
 
 pub(super) fn run(args: &PlanArgs) -> Result<()> {
     let plan = Plan::load(&args.file)?;
-    if args.measure > 0 && !args.json && args.missing.is_none() {
+    if args.measure > 0 && !args.json.is_printed() && args.missing.is_none() {
         recurrent::prepare_for(&plan)?;
     }
     let mut out = std::io::stdout();
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    if args.json && !args.cells && args.missing.is_none() {
+    if args.json.json.is_some() && !args.cells && args.missing.is_none() {
         return Err(CommandError::Usage("--json lists cells: give --cells or --missing DIR with it".into()));
     }
+    args.json.check()?;
     let folder = args.missing.as_deref().map(Folder::new);
     let known = folder.as_ref().map_or_else(|| Ok(plan.clone()), |folder| plan.in_folder(folder))?;
     let listed: Vec<&Cell> = match &folder {
@@ -36,9 +37,8 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
         None if args.cells => known.cells.iter().collect(),
         None => Vec::new(),
     };
-    if args.json {
-        let listed: Vec<_> = listed.iter().map(|cell| json!({ "index": cell.index, "id": cell.id })).collect();
-        writeln!(out, "{:#}", json!(listed))?;
+    args.json.write(listed.iter().map(|cell| json!({ "index": cell.index, "id": cell.id })).collect::<Vec<_>>())?;
+    if args.json.is_printed() {
         return Ok(());
     }
     for cell in listed {
@@ -47,6 +47,17 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     if folder.is_some() {
         return Ok(());
     }
+    let from = args.from.as_deref().map(Folder::new);
+    from.iter().try_for_each(|folder| folder.require_plan().map(drop))?;
+    let known = plan.in_full(from.as_ref())?;
+    let grouping = Grouping { most: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
+    let all: Vec<usize> = (0..known.cells.len()).collect();
+    let groups = known.groups(&all, grouping);
+    let groups_shown = groups_line(&groups, grouping);
+    let grouping = Grouping { at_a_time: grouping.at_a_time.min(groups.len()), ..grouping };
+    let (_private, addresses) = shared_servers(&args.server, grouping.at_a_time)?;
+    let (servers, _) = Servers::connect_to_some(&addresses)?; // what is wrong with others the run will tell
+    let limits = step_limits(&servers, &known)?; // refuses environments that there are not
     let counts = plan.counts();
     writeln!(
         out,
@@ -58,23 +69,15 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
         count(counts.runs as usize, "run"),
         if plan.selection == Selection::Clean { " to select from" } else { "" }
     )?;
-    let from = args.from.as_deref().map(Folder::new);
-    from.iter().try_for_each(|folder| folder.require_plan().map(drop))?;
-    let known = plan.in_full(from.as_ref())?;
     let anew = &known.cells[plan.cells.len()..];
     if let Some(pairs) = anew.first().map(|cell| cell.tests.sets.len()) {
         let (cells, runs) = (anew.len(), plan.runs as usize);
         let trained = format!("{} are selected and trained anew", grouped(cells / runs));
         writeln!(out, "{trained}, {} train/test pairs with {}", grouped(cells * pairs), count(runs, "run"))?;
     }
-    let plan = known;
-    let grouping = Grouping { most: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
-    let all: Vec<usize> = (0..plan.cells.len()).collect();
-    let groups = plan.groups(&all, grouping);
-    writeln!(out, "{}", groups_line(&groups, grouping))?;
-    let grouping = Grouping { at_a_time: grouping.at_a_time.min(groups.len()), ..grouping };
-    let taken = from.map(|folder| (folder.clone(), Taken::read(&plan, &folder)));
-    estimate(args, &plan, grouping, taken.as_ref(), &stop, &mut out)
+    writeln!(out, "{groups_shown}")?;
+    let taken = from.map(|folder| (folder.clone(), Taken::read(&known, &folder)));
+    estimate(args, &known, grouping, taken.as_ref(), (&servers, &limits), &stop)
 }
 
 /// "24 cells in 4 groups of 5 to 7, 2 at a time".
@@ -92,9 +95,10 @@ fn estimate(
     plan: &Plan,
     grouping: Grouping,
     taken: Option<&(Folder, Taken<'_>)>,
+    (servers, limits): (&Servers, &HashMap<&str, u32>),
     stop: &StopFlag,
-    out: &mut impl Write,
 ) -> Result<()> {
+    let mut out = std::io::stdout();
     let as_others = |cell: &Cell| taken.and_then(|(_, taken)| taken.seconds(cell));
     let (known, unknown): (Vec<usize>, Vec<usize>) =
         (0..plan.cells.len()).partition(|&cell| as_others(&plan.cells[cell]).is_some());
@@ -114,13 +118,10 @@ fn estimate(
         writeln!(out, "not measured: {}", cells(unknown.len()))?;
     }
     if args.measure > 0 && !unknown.is_empty() {
-        let (_private, addresses) = shared_servers(&args.server, grouping.at_a_time)?;
-        let (servers, _) = Servers::connect_to_some(&addresses)?; // what is wrong with others the run will tell
-        let limits = step_limits(&servers, plan)?;
-        let measurements = measurements(args, plan, grouping, &unknown, &servers, stop, out)?;
-        let estimates = estimates(plan, &measurements, &limits);
+        let measurements = measurements(args, plan, grouping, &unknown, servers, stop, &mut out)?;
+        let estimates = estimates(plan, &measurements, limits);
         unknown.iter().for_each(|&cell| seconds[cell] = Some(estimates[cell].seconds()));
-        print_most(out, unknown.len(), &unknown.iter().map(|&cell| estimates[cell]).sum())?;
+        print_most(&mut out, unknown.len(), &unknown.iter().map(|&cell| estimates[cell]).sum())?;
     }
     if seconds.iter().all(Option::is_some) {
         let jobs = grouping.at_a_time;

@@ -14,6 +14,7 @@ use super::args::RatesArgs;
 use super::error::{CommandError, Result};
 
 pub(super) fn run(args: &RatesArgs) -> Result<()> {
+    args.json.check()?;
     let records = Records::read(&file_in(&args.file))?;
     let about = &records.about;
     let Some(own) = &about.success else {
@@ -29,12 +30,15 @@ pub(super) fn run(args: &RatesArgs) -> Result<()> {
         let name = test.set.name.as_str();
         rows.extend(criteria.iter().map(|criterion| (name, criterion, records.result(name, Some(criterion)))));
     }
-    if args.json {
+    if args.json.json.is_some() {
         let rows =
             rows.iter().map(|(set, success, result)| json!({ "set": set, "success": success, "result": result }));
         let rates: Vec<_> = rows.collect();
         let document = json!({ "environment": about.environment, "policy": about.policy, "rates": rates });
-        return Ok(writeln!(std::io::stdout(), "{document:#}")?);
+        args.json.write(document)?;
+    }
+    if args.json.is_printed() {
+        return Ok(());
     }
     let table = Table::of("", &rows)
         .text("tested on", |(set, ..)| set)

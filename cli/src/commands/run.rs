@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use super::args::{Engine, RunArgs};
 use super::cells::Doing;
-use super::display::{is_quiet, note};
+use super::display::{is_quiet, note, say};
 use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
 use super::{cores, recurrent, shared_servers, slurm};
@@ -19,6 +19,7 @@ use perturb_learner::client::{Address, PrivateServer, Servers};
 use perturb_learner::measure::{MeasureError, measure};
 use perturb_study::files::require_writable;
 use perturb_study::interrupt::StopFlag;
+use perturb_study::runs::Kind;
 use perturb_study::scheduler::{CellEvent, Local, News, Order, OrderedCell, Teller, count};
 use perturb_study::{Cell, Folder, Grouping, Plan, Taken, estimates, representatives};
 
@@ -32,6 +33,14 @@ pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
         return work(args, &folder, &stop);
     }
     let plan = Plan::load(&args.plan)?;
+    let wrong = match Kind::of(&args.out) {
+        _ if args.out.is_file() => Some("is a file; give a directory"),
+        Some(Kind::Training) => Some("holds a training (config.toml): choose another directory"),
+        _ => None,
+    };
+    if let Some(wrong) = wrong {
+        return Err(CommandError::Usage(format!("--out {} {wrong}", args.out.display())));
+    }
     // What is in the folder of the results, or beside it, has its folder when it is written.
     let is_made = |page: &Path| {
         let beside = |folder: &Path| args.out.starts_with(folder) || folder.starts_with(&args.out);
@@ -121,7 +130,7 @@ fn all_cells(args: &RunArgs, plan: Plan, folder: &Folder, stop: &StopFlag) -> Re
     let (local, addresses) = shared_servers(&args.server, grouping.at_a_time)?;
     let local: Vec<Mutex<PrivateServer>> = local.into_iter().map(Mutex::new).collect();
     let (servers, troubles) = Servers::connect_to_some(&addresses)?;
-    troubles.iter().for_each(|trouble| eprintln!("perturb: {trouble}; going on with the other servers"));
+    troubles.iter().for_each(|trouble| say(format_args!("perturb: {trouble}; going on with the other servers")));
     step_limits(&servers, &plan)?; // refuses environments that there are not
     let addresses: Vec<String> = addresses.iter().map(Address::to_string).collect();
     let command = || worker(args, folder, &addresses);

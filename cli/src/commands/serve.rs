@@ -3,7 +3,7 @@
 use std::io::Write;
 
 use super::args::ServeArgs;
-use super::display::note;
+use super::display::{note, say};
 use super::error::{Result, system};
 use perturb_serve::{Options, Server};
 
@@ -18,7 +18,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<()> {
             let warning = "anybody who reaches this address can see everything in the folder: there is neither \
                            authentication nor encryption; and so can any site that somebody who reaches it opens in a \
                            browser, as names are not checked: prefer 127.0.0.1 and `ssh -L`";
-            eprintln!("perturb: {warning}");
+            say(format_args!("perturb: {warning}"));
         }
         let mut out = std::io::stdout();
         writeln!(out, "http://{address}")?;

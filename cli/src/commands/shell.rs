@@ -5,6 +5,7 @@ use std::io::Write;
 use super::args::{Cli, CompletionsArgs, ManArgs};
 use super::display::note;
 use super::error::{CommandError, Result, system};
+use perturb_study::words::quoted;
 
 pub(super) fn completions(args: &CompletionsArgs) -> Result<()> {
     let mut script = Vec::new();
@@ -15,7 +16,8 @@ pub(super) fn completions(args: &CompletionsArgs) -> Result<()> {
 pub(super) fn man(args: &ManArgs) -> Result<()> {
     if !args.dir.is_dir() {
         let folder = args.dir.display();
-        return Err(CommandError::Usage(format!("there is no folder {folder}; make it with `mkdir -p {folder}`")));
+        let command = format!("mkdir -p {}", quoted(&args.dir));
+        return Err(CommandError::Usage(format!("there is no folder {folder}; make it with `{command}`")));
     }
     clap_mangen::generate_to(Cli::parser(), &args.dir).map_err(system("write the manual pages"))?;
     note(format_args!("the manual pages are in {}", args.dir.display()));

@@ -4,6 +4,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+use serde_json::json;
 use toml::{Table, Value};
 
 use super::again::{explain, resume_command};
@@ -11,18 +12,21 @@ use super::args::TrainArgs;
 use super::display::{Display, note};
 use super::error::{CommandError, Result, system};
 use super::{playing_servers, recurrent, sets, signal_code, threads};
-use perturb_learner::checkpoint::Checkpoint;
+use perturb_learner::checkpoint::{Checkpoint, State};
 use perturb_learner::logging::{EpisodeFigures, Progress, TimeShares};
 use perturb_learner::training::{Outcome, RunDirectory, TrainError, is_over, resume, train};
 use perturb_study::Version;
 use perturb_study::files::{create_folder, io, write_atomically};
 use perturb_study::interrupt::StopFlag;
+use perturb_study::runs::Kind;
 use perturb_study::settings::TrainConfig;
+use perturb_study::words::quoted;
 
 /// What a TOML file can hold.
 const MOST_EPISODES: u64 = i64::MAX as u64;
 
 pub(super) fn run(args: &TrainArgs) -> Result<ExitCode> {
+    args.json.check()?;
     match &args.resume {
         Some(path) => go_on(args, path),
         None => begin(args),
@@ -37,6 +41,10 @@ fn begin(args: &TrainArgs) -> Result<ExitCode> {
     }
     let mut config = TrainConfig::load(args.config.as_deref(), &args.set, flags(args)?)?;
     recurrent::prepare(config.common.architecture, false)?;
+    if let Some(out) = args.out.as_deref().filter(|out| Kind::of(out) == Some(Kind::Experiment)) {
+        let message = format!("--out {} holds an experiment (plan.toml): choose another directory", out.display());
+        return Err(CommandError::Usage(message));
+    }
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let chosen = args.out.as_deref().map(|out| RunDirectory::choose(out, args.overwrite)).transpose()?;
     let servers = playing_servers(&args.play)?;
@@ -76,7 +84,8 @@ fn go_on(args: &TrainArgs, path: &Path) -> Result<ExitCode> {
             (true, None) => note(format_args!("{finished}, and stopped at {rate} % success")),
             (false, _) => note(format_args!("{finished}; train on with --extend EPISODES")),
         }
-        print_policy(&directory)?;
+        let recent = EpisodeFigures::mean(state.history.recent.iter());
+        say(args, &directory, &checkpoint.state, recent, None)?;
         return Ok(ExitCode::SUCCESS);
     }
     note(format_args!("{config}: going on after {done} of {budget} episodes"));
@@ -112,27 +121,53 @@ fn end(
     if !config.settings.is_random() {
         summarise(&outcome.progress);
     }
-    match outcome.signal {
-        Some(number) => {
-            note(format_args!(
-                "stopped by signal {number} after {} of {} episodes; go on with: {}",
-                outcome.progress.episodes,
-                config.common.episodes,
-                resume_command(directory.path(), &args.play)
-            ));
-            Ok(signal_code(number))
-        }
-        None => {
-            print_policy(directory)?;
-            Ok(ExitCode::SUCCESS)
-        }
+    if let Some(number) = outcome.signal {
+        note(format_args!(
+            "stopped by signal {number} after {} of {} episodes; go on with: {}",
+            outcome.progress.episodes,
+            config.common.episodes,
+            resume_command(directory.path(), &args.play)
+        ));
     }
+    say(args, directory, &outcome.checkpoint.state, outcome.progress.recent, outcome.signal)?;
+    Ok(outcome.signal.map_or(ExitCode::SUCCESS, signal_code))
 }
 
-fn print_policy(directory: &RunDirectory) -> std::io::Result<()> {
+/// Says where the policy is and, as JSON, what it is; `recent` are the means over the last 100 episodes.
+fn say(
+    args: &TrainArgs,
+    directory: &RunDirectory,
+    state: &State,
+    recent: Option<EpisodeFigures>,
+    signal: Option<i32>,
+) -> Result<()> {
+    let TrainConfig { common, settings } = &state.config;
+    args.json.write(json!({
+        "run": directory.path(),
+        "checkpoint": directory.checkpoint(),
+        "environment": common.environment,
+        "algorithm": settings.name(),
+        "architecture": common.architecture,
+        "train_version": common.version,
+        "train_parameters": common.parameters,
+        "seed": common.seed,
+        "training_episodes": state.counters.episodes,
+        "training_steps": state.counters.timesteps,
+        "budget": common.episodes,
+        "finished": signal.is_none(),
+        "last_100": recent.map(|EpisodeFigures { episode_return, length, success }| json!({
+            "success_percent": 100.0 * success,
+            "mean_return": episode_return,
+            "mean_length": length,
+        })),
+    }))?;
+    if signal.is_some() || args.json.is_printed() {
+        return Ok(());
+    }
     let mut out = std::io::stdout();
     writeln!(out, "trained policy: {}", directory.checkpoint().display())?;
-    writeln!(out, "test it: perturb evaluate --checkpoint {}", directory.path().display())
+    let command = format!("perturb evaluate --checkpoint {}", quoted(directory.path()));
+    Ok(writeln!(out, "test it: {command}")?)
 }
 
 /// Makes the folder of a run that nobody gave a place: another one for each, also of those that begin in the same second.

@@ -27,11 +27,14 @@ impl Place {
         for (name, content) in [
             ("plan.toml", PLAN),
             ("wrong.toml", &PLAN.replace("CartPole", "CartPol")),
+            ("runs.toml", &PLAN.replace("runs = 2", "runs = 1e4")),
             ("bad.toml", "environment = 'CartPole\n"),
             ("file", ""),
         ] {
             std::fs::write(place.path(name), content).expect("written");
         }
+        std::fs::create_dir(place.path("an experiment")).expect("a folder");
+        std::fs::write(place.path("an experiment/plan.toml"), PLAN).expect("written");
         place
     }
 
@@ -120,6 +123,8 @@ fn each_misuse_is_refused_with_a_remedy_and_leaves_nothing() {
         with(&["--version", "D", "--set", "version=R"]),
         with(&["--episodes", "1e4"]),
         with(&["--episodes", "-5"]),
+        with(&["--episodes", "99999999999999999999"]),
+        with(&["--workers", "5000"]),
         with(&["--extend", "5"]),
         with(&["--config", "bad.toml"]),
         with(&["--config", "missing.toml"]),
@@ -134,18 +139,29 @@ fn each_misuse_is_refused_with_a_remedy_and_leaves_nothing() {
         vec!["perturb", "evaluate", "--checkpoint", "run", "--json", "missing/result.json"],
         vec!["perturb", "evaluate", "--checkpoint", "run", "--records", "file/records.parquet"],
         vec!["perturb", "evaluate", "--checkpoint", "run", "--json", "tmp"],
+        vec!["perturb", "ls", "--json", "tmp"],
+        vec!["perturb", "rates", "--json", "run"],
+        vec!["perturb", "demo", "--out", "run"],
+        vec!["perturb", "demo", "--env", "hoper", "--out", "new"],
         vec!["perturb", "evaluate", "--checkpoint", "run", "--contexts", "missing.csv"],
         vec!["perturb", "heatmap", "--checkpoint", "run", "--out", "missing/heatmap"],
         vec!["perturb", "heatmap", "missing"],
         vec!["perturb", "video", "--checkpoint", "run", "--out", "missing/a.gif"],
         vec!["perturb", "plan", "bad.toml"],
         vec!["perturb", "plan", "missing.toml"],
+        vec!["perturb", "plan", "wrong.toml", "--measure", "0"],
+        vec!["perturb", "plan", "runs.toml"],
         vec!["perturb", "plan", "plan.toml", "--from", "missing"],
         vec!["perturb", "run", "wrong.toml", "--out", "out"],
         vec!["perturb", "run", "plan.toml", "--out", "out", "--html", "missing/page.html"],
+        vec!["perturb", "run", "plan.toml", "--out", "out", "--json", "missing/lines.jsonl"],
+        vec!["perturb", "run", "plan.toml", "--out", "run"],
+        vec!["perturb", "run", "plan.toml", "--out", "file"],
+        vec!["perturb", "train", "--env", "CartPole", "--out", "an experiment"],
         vec!["perturb", "report", "missing"],
         vec!["perturb", "audit", "missing"],
         vec!["perturb", "rates", "missing.parquet"],
+        vec!["perturb", "rates", "plan.toml"],
         vec!["perturb", "ls", "missing"],
         vec!["perturb", "serve", "missing"],
         vec!["perturb", "serve", "file"],
@@ -170,38 +186,61 @@ fn each_misuse_is_refused_with_a_remedy_and_leaves_nothing() {
     assert_snapshot!(names.iter().fold(said, |said, (long, name)| said.replace(long, name)));
 }
 
-/// Ctrl-C, once something has begun: what is said at last, in which numbers do not matter.
+/// Ctrl-C, once something has begun: what is said at last, and what remains, in which numbers do not matter.
 #[rstest]
 #[case::train(
     "perturb train --env CartPole --episodes 1000000 --out run",
     "run/progress.csv",
-    "stopped by signal N after N of N episodes; go on with: perturb train --resume run"
+    "stopped by signal N after N of N episodes; go on with: perturb train --resume run",
+    "run, run/checkpoint, run/config.toml, run/events.out.tfevents.N.perturb, run/monitor.csv, run/progress.csv"
 )]
 #[case::run(
     "perturb run plan.toml --out out",
     "out/plan.toml",
-    "stopped by signal N; the same command goes on: perturb run plan.toml --out out"
+    "stopped by signal N; the same command goes on: perturb run plan.toml --out out",
+    "out, out/cells, out/plan.toml"
 )]
 #[case::plan(
     "perturb plan plan.toml --measure 60",
     "tmp",
-    "perturb: stopped by signal N while measuring; nothing is kept of it"
+    "perturb: stopped by signal N while measuring; nothing is kept of it",
+    ""
 )]
 #[case::evaluate(
-    "perturb evaluate --checkpoint short --episodes 1000000",
+    "perturb evaluate --checkpoint short --episodes 1000000 --json new.json --records new.parquet",
     "tmp",
-    "perturb: stopped before all episodes were tested"
+    "perturb: stopped before all episodes were tested",
+    ""
 )]
 #[case::demo(
     "perturb demo --env CartPole --episodes 1000000 --out demo",
     "demo/trained-on-D/progress.csv",
-    "stopped by signal N; what is done is kept in demo"
+    "stopped by signal N; what is done is kept in demo",
+    "demo, demo/trained-on-D"
 )]
-fn ctrl_c_ends_soon_and_leaves_nothing_temporary(#[case] words: &str, #[case] begun: &str, #[case] said: &str) {
+#[case::heatmap(
+    "perturb heatmap --checkpoint short --grid 100 --episodes 1000 --out new",
+    "tmp",
+    "perturb: stopped before all episodes were tested",
+    ""
+)]
+#[case::video(
+    "perturb video --checkpoint short --episodes 10000 --out new.gif",
+    "tmp",
+    "perturb: stopped before all episodes were tested",
+    ""
+)]
+fn ctrl_c_ends_soon_and_leaves_nothing_temporary(
+    #[case] words: &str,
+    #[case] begun: &str,
+    #[case] said: &str,
+    #[case] remains: &str,
+) {
     let place = Place::new();
     if words.contains("short") {
         place.output(&["perturb", "train", "--env", "CartPole", "--episodes", "5", "--out", "short"]);
     }
+    let before = place.files();
     let child = place.start(&words.split(' ').collect::<Vec<_>>());
     // Whatever has begun has a server, and that a folder.
     let has_begun = || match begun {
@@ -217,10 +256,16 @@ fn ctrl_c_ends_soon_and_leaves_nothing_temporary(#[case] words: &str, #[case] be
     assert_eq!(output.status.code(), Some(130), "{}", stderr(&output));
     let words = stderr(&output);
     let last = words.lines().last().unwrap_or_default();
-    let digits = |c: char| c.is_ascii_digit();
-    let last = last.split(digits).filter(|part| !part.is_empty()).collect::<Vec<_>>().join("N");
-    assert_eq!(last, said, "{words}");
+    assert_eq!(without_numbers(last), said, "{words}");
+    let left: Vec<String> = place.files().difference(&before).cloned().collect();
+    let whole = |name: &&String| name.matches('/').count() < 2;
+    assert_eq!(without_numbers(&left.iter().filter(whole).cloned().collect::<Vec<_>>().join(", ")), remains);
     assert_eq!(temporary(&place), Vec::<String>::new());
+}
+
+fn without_numbers(text: &str) -> String {
+    let digits = |c: char| c.is_ascii_digit();
+    text.split(digits).filter(|part| !part.is_empty()).collect::<Vec<_>>().join("N")
 }
 
 /// What is in the folder of temporary files.
@@ -285,4 +330,35 @@ fn what_is_quiet_says_nothing_and_what_is_json_is_on_standard_output() {
     assert_eq!((&value["environment"], &value["results"]["D"]["episodes"]), (&"CartPole".into(), &5.into()));
     let refused = place.output(&["perturb", "-q", "evaluate", "--checkpoint", "missing"]);
     assert!(refused.status.code() == Some(2) && !refused.stderr.is_empty(), "an error is said nevertheless");
+
+    // What has --json says what came of it there, or in a file.
+    let printed = |words: &str| -> serde_json::Value {
+        let output = place.output(&words.split(' ').collect::<Vec<_>>());
+        assert!(output.status.success(), "{words}: {}", stderr(&output));
+        serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{words}: {error}"))
+    };
+    let training = printed("perturb train --resume run --extend 5 --json -");
+    assert_eq!((&training["run"], &training["finished"]), (&"run".into(), &true.into()), "{training:#}");
+    assert!(training["training_episodes"].as_u64() >= Some(5) && training["last_100"]["mean_return"].is_number());
+    assert_eq!(printed("perturb train --resume run --json")["finished"], true);
+    assert_eq!(printed("perturb ls . --json")[0]["unit"], "episodes");
+    assert!(printed("perturb envs --json -")["environments"].is_array());
+    assert_eq!(printed("perturb plan plan.toml --cells --json -").as_array().map(Vec::len), Some(2));
+    let short = std::fs::read_to_string(place.path("plan.toml")).expect("a plan").replace("100000", "5");
+    std::fs::write(place.path("plan.toml"), short).expect("written");
+    let ran = place.output(&["perturb", "run", "plan.toml", "--out", "out", "--json", "lines.jsonl"]);
+    assert!(ran.status.success() && ran.stdout.is_empty(), "{}", stderr(&ran));
+    let lines = std::fs::read_to_string(place.path("lines.jsonl")).expect("lines");
+    assert!(lines.lines().all(|line| line.starts_with("{\"cell\":")), "{lines}");
+    assert_eq!(lines.matches("\"event\":\"done\"").count(), 2, "{lines}");
+}
+
+#[test]
+fn that_nobody_reads_standard_error_ends_nothing() {
+    let place = Place::new();
+    let mut command =
+        place.command(&["perturb", "-vv", "train", "--env", "CartPole", "--episodes", "5", "--out", "run"]);
+    let full = std::fs::File::options().write(true).open("/dev/full").expect("a device");
+    let status = command.stderr(full).status().expect("it runs");
+    assert!(status.success() && place.path("run/checkpoint/checkpoint.json").exists(), "{status}");
 }

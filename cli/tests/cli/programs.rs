@@ -56,12 +56,51 @@ fn lines(drawn: &str) -> Vec<String> {
     rows.map(|row| row.trim_end().to_owned()).filter(|row| !row.is_empty()).collect()
 }
 
+/// What a terminal shows in the end.
+fn screen(drawn: &str) -> Vec<String> {
+    let (mut rows, mut row, mut column) = (vec![Vec::new()], 0_usize, 0_usize);
+    let mut rest = drawn.chars();
+    while let Some(c) = rest.next() {
+        match c {
+            '\r' => column = 0,
+            '\n' => row += 1,
+            '\u{1b}' => {
+                let mut words = String::new();
+                for c in rest.by_ref() {
+                    words.push(c);
+                    if c.is_ascii_alphabetic() {
+                        break;
+                    }
+                }
+                let count = words.trim_matches(|c: char| !c.is_ascii_digit()).parse().unwrap_or(1);
+                match words.chars().last() {
+                    Some('A') => row = row.saturating_sub(count),
+                    Some('B') => row += count,
+                    Some('K') => rows[row].clear(),
+                    _ => {}
+                }
+            }
+            c => {
+                let line: &mut Vec<char> = &mut rows[row];
+                line.resize(line.len().max(column + 1), ' ');
+                line[column] = c;
+                column += 1;
+            }
+        }
+        rows.resize(rows.len().max(row + 1), Vec::new());
+    }
+    rows.iter().map(|row| row.iter().collect::<String>().trim_end().to_owned()).filter(|row| !row.is_empty()).collect()
+}
+
 #[test]
 fn a_bar_fits_80_columns_and_tells_the_time_that_is_left() {
     let folder = folder();
     let train =
         "perturb train --env CartPole --version R+E --algorithm a2c --observe parameters --episodes 6000 --out run";
-    let drawn = lines(&on_a_terminal(folder.path(), train));
+    let drawn = on_a_terminal(folder.path(), train);
+    let left = screen(&drawn);
+    assert!(!left.iter().any(|row| row.contains(['█', '░'])), "nothing is left of the bar: {left:#?}");
+    let drawn = lines(&drawn);
     // The bar ends where the row does, and the figures begin the next one.
     let bars = drawn.windows(2).filter(|rows| rows[0].contains('█') && rows[1].contains("/6 000 episodes, "));
     let mut count = 0;
@@ -128,6 +167,11 @@ fn a_run_has_a_place_of_its_own_unless_one_is_given_and_all_are_listed() {
     drop(lock);
     let table = printed(&run(folder.path(), &["ls"]));
     assert!(table.contains("runs/group/b") && table.contains(" of 30 episodes"), "{table}");
+    // Which is too wide for a terminal of 80 columns.
+    let listed = lines(&on_a_terminal(folder.path(), "perturb ls"));
+    assert_eq!(listed.len(), 6, "{listed:#?}");
+    assert_eq!(listed[0], format!("runs/{name}"));
+    assert!(listed[1].starts_with("  CartPole D a2c ff, ") && listed[1].ends_with(" %, finished"), "{listed:#?}");
 }
 
 #[test]

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use perturb_study::files::{self, FileError, Lock};
+use perturb_study::words::quoted;
 
 use crate::checkpoint::{Checkpoint, CheckpointError, ResumeState};
 
@@ -38,7 +39,8 @@ pub enum RunDirectoryError {
     /// A new run would delete an earlier one.
     #[error(
         "{path} already holds a run ({file}): choose another --out, give --overwrite to delete that run, or go on with \
-         it: perturb train --resume {path}",
+         it: perturb train --resume {}",
+        quoted(path),
         path = path.display()
     )]
     HoldsRun {
@@ -68,7 +70,8 @@ pub enum RunDirectoryError {
     /// The run was too short.
     #[error(
         "the run in {path} ended before its first checkpoint, so there is nothing to resume; start again with perturb \
-         train --out {path} --overwrite and the same settings",
+         train --out {} --overwrite and the same settings",
+        quoted(path),
         path = path.display()
     )]
     NoCheckpoint {

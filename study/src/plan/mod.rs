@@ -180,7 +180,7 @@ impl Plan {
     pub fn own_sets(path: &Path) -> Result<Vec<TestSet>, PlanError> {
         let refused = |reason: AnyError| PlanError::Refused { path: path.display().to_string(), reason };
         let text = files::read_text(path)?;
-        let file: File = toml::from_str(&text).map_err(|error| refused(error.to_string().trim().into()))?;
+        let file: File = toml::from_str(&text).map_err(|error| refused(words(&error).into()))?;
         let folder = path.parent().unwrap_or(Path::new(""));
         let sets = sets::read(&file.sets, folder, &mut BTreeMap::new()).map_err(|error| refused(error.into()))?;
         Ok(sets.into_values().filter(|set| set.plain().is_none()).collect())
@@ -201,7 +201,7 @@ impl Plan {
     }
 
     fn expand(path: &str, text: String) -> Result<Self, AnyError> {
-        let mut file: File = toml::from_str(&text).map_err(|error| error.to_string().trim().to_owned())?;
+        let mut file: File = toml::from_str(&text).map_err(|error| words(&error))?;
         let revisions = file.spell()?;
         file.check()?;
         let mut beside = BTreeMap::new();
@@ -359,6 +359,14 @@ impl Cell {
 pub(crate) fn distinct<T: Eq + std::hash::Hash + Clone>(items: impl Iterator<Item = T>) -> Vec<T> {
     let mut seen = HashSet::new();
     items.filter(|item| seen.insert(item.clone())).collect()
+}
+
+/// What is wrong with a file, without the names that numbers have in this program.
+fn words(error: &toml::de::Error) -> String {
+    let whole = "expected a whole number that is not negative, in digits";
+    ["expected u32", "expected u64"]
+        .iter()
+        .fold(error.to_string().trim().to_owned(), |text, word| text.replace(word, whole))
 }
 
 #[cfg(test)]

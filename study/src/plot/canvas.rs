@@ -55,13 +55,20 @@ pub(super) fn text_width(text: &str) -> f64 {
     known.map_or(0.6 * f64::from(TEXT) * text.chars().count() as f64, |(width, _)| f64::from(width))
 }
 
-/// Lines that are at most so wide, unless a word is wider.
+/// Lines that are at most so wide, unless a word is wider. A number stays with the word before it, as in "seed 1".
 pub(super) fn wrapped(text: &str, width: f64) -> Vec<String> {
-    let mut lines: Vec<String> = Vec::new();
+    let mut words: Vec<String> = Vec::new();
     for word in text.split_whitespace() {
+        match words.last_mut().filter(|last| last.chars().all(char::is_alphabetic)) {
+            Some(last) if word.parse::<f64>().is_ok() => *last += &format!(" {word}"),
+            _ => words.push(word.to_owned()),
+        }
+    }
+    let mut lines: Vec<String> = Vec::new();
+    for word in words {
         match lines.last_mut() {
             Some(line) if text_width(&format!("{line} {word}")) <= width => *line = format!("{line} {word}"),
-            _ => lines.push(word.to_owned()),
+            _ => lines.push(word),
         }
     }
     lines

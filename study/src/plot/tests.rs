@@ -21,6 +21,9 @@ fn a_text_is_broken_where_a_line_ends() {
     assert!(lines.len() == 2 && lines.iter().all(|line| text_width(line) <= INSIDE), "{lines:?}");
     assert_eq!(wrapped(" one\n two ", INSIDE), ["one two"]);
     assert_eq!(wrapped("extraordinarily", 10.0), ["extraordinarily"]);
+    let width = text_width("trained on D, seed");
+    assert_eq!(wrapped("trained on D, seed 1", width), ["trained on D,", "seed 1"]);
+    assert_eq!(wrapped("of 1 000 episodes", 10.0), ["of 1", "000", "episodes"]);
     // DejaVu's digits are 0.636 em wide.
     assert!((text_width("0000000000") / 10.0 - 0.636 * 14.6).abs() < 0.2, "{}", text_width("0000000000"));
 }

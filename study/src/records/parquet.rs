@@ -28,6 +28,8 @@ use crate::seal;
 pub const FILE: &str = "episodes.parquet";
 /// The key of [`About`] in the file's metadata.
 const KEY: &str = "perturb";
+/// What every Parquet file begins with.
+const MAGIC: &[u8] = b"PAR1";
 
 /// Why records cannot be read or written.
 #[derive(Debug, thiserror::Error)]
@@ -40,6 +42,13 @@ pub enum RecordsError {
     /// There is no such file.
     #[error("there are no recorded episodes in {}", path.display())]
     Missing { path: PathBuf },
+    /// The file is of another kind.
+    #[error(
+        "{} holds no recorded episodes: it is no Parquet file; give the --records of `perturb evaluate`, or a cell of \
+         `perturb run`",
+        path.display()
+    )]
+    Other { path: PathBuf },
     /// The file is not what this program writes.
     #[error("{} does not hold recorded episodes: {reason}", path.display())]
     Damaged {
@@ -139,6 +148,9 @@ impl Records {
     /// [`RecordsError`].
     pub fn read(path: &Path) -> Result<Self, RecordsError> {
         let content = read_if_there(path)?.ok_or_else(|| RecordsError::Missing { path: path.to_owned() })?;
+        if !content.starts_with(MAGIC) {
+            return Err(RecordsError::Other { path: path.to_owned() });
+        }
         let damaged = |error: AnyError| RecordsError::Damaged { path: path.to_owned(), reason: error.to_string() };
         Self::decode(content).map_err(damaged)
     }

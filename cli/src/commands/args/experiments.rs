@@ -6,21 +6,20 @@ use clap::Args;
 use perturb_study::scheduler::slurm::TimeLimit;
 use perturb_study::{Grouping, Selection};
 
-use super::{ServerArgs, WaitArgs, at_least_one, natural};
+use super::{JsonArgs, ServerArgs, WaitArgs, at_least_one, natural};
 
 #[derive(Args, Debug)]
 pub struct PlanArgs {
     /// An experiment file, e.g. experiments/paper.toml.
     pub file: PathBuf,
-    /// List the cells with their indices and ids.
+    /// List the cells with their indices and ids, which --json has then.
     #[arg(long)]
     pub cells: bool,
-    /// List the cells that have neither a result in this folder nor failed there, and nothing else.
+    /// List the cells that have neither a result in this folder nor failed there, and nothing else; --json has these then.
     #[arg(long, value_name = "DIR", conflicts_with = "cells")]
     pub missing: Option<PathBuf>,
-    /// List --cells or --missing as JSON, and nothing else.
-    #[arg(long)]
-    pub json: bool,
+    #[command(flatten)]
+    pub json: JsonArgs,
     /// Seconds that each group of trainings is measured; 0 measures nothing.
     #[arg(long, value_name = "SECONDS", default_value_t = 3, value_parser = natural::<u64>)]
     pub measure: u64,
@@ -65,9 +64,9 @@ pub struct RunArgs {
     /// When nothing is left to do, also write the report, as `perturb report DIR --html FILE` does.
     #[arg(long, value_name = "FILE", conflicts_with = "cell")]
     pub html: Option<PathBuf>,
-    /// Print what happens to each cell as JSON lines.
-    #[arg(long, conflicts_with = "engine")]
-    pub json: bool,
+    /// Write what happens to each cell to this file, as JSON lines; `-`, or no name, prints them.
+    #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-", conflicts_with = "engine")]
+    pub json: Option<PathBuf>,
     /// Do the cells that a line of standard input names; stop when standard input is closed.
     #[arg(long, hide = true, requires = "server",
         conflicts_with_all = ["cell", "jobs", "group", "engine", "retry_failed", "html"])]

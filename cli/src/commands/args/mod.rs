@@ -6,6 +6,7 @@ mod training;
 
 use std::fmt::Display;
 use std::ops::RangeInclusive;
+use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::Duration;
 
@@ -94,6 +95,17 @@ pub enum Command {
     Man(ManArgs),
 }
 
+/// Where what came of a command goes, for other programs.
+#[derive(Args, Clone, Debug)]
+pub struct JsonArgs {
+    /// Also write what came of it to this file, as JSON; `-`, or no name, prints it in place of all else.
+    #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
+    pub json: Option<PathBuf>,
+}
+
+/// What a server takes.
+const MOST_WORKERS: usize = 1024;
+
 /// Where environments run.
 #[derive(Args, Clone, Debug)]
 pub struct ServerArgs {
@@ -102,7 +114,7 @@ pub struct ServerArgs {
     #[arg(long, value_name = "ADDRESS", value_delimiter = ',')]
     pub server: Vec<Address>,
     /// Physics threads of the server that perturb starts itself [default: one a core].
-    #[arg(long, value_name = "N", value_parser = at_least_one::<usize>)]
+    #[arg(long, value_name = "N", value_parser = |text: &str| within(text, 1..=MOST_WORKERS))]
     pub workers: Option<usize>,
 }
 
@@ -155,6 +167,9 @@ fn natural<T: TryFrom<u64>>(text: &str) -> Result<T, String> {
 fn whole<T: TryFrom<u64>>(text: &str, least: u64) -> Result<T, String> {
     let number = text.parse::<u64>().ok().filter(|number| *number >= least);
     number.and_then(|number| T::try_from(number).ok()).ok_or_else(|| {
+        if number.is_some() || (text.len() > 15 && text.bytes().all(|digit| digit.is_ascii_digit())) {
+            return "expected a smaller number".to_owned();
+        }
         let meant = text.parse::<f64>().ok().filter(|x| x.fract() == 0.0 && *x >= least as f64 && *x < 1e15);
         let digits = meant.map_or_else(String::new, |number| format!(", in digits: {number}"));
         format!("expected a whole number, at least {least}{digits}")
@@ -180,8 +195,8 @@ mod tests {
         let refused: Vec<&str> =
             train.get_arg_conflicts_with(of("resume")).iter().map(|argument| argument.get_id().as_str()).collect();
         for argument in train.get_arguments().map(|argument| argument.get_id().as_str()) {
-            let accepted =
-                ["resume", "extend", "server", "server_wait", "workers", "act", "threads", "help"].contains(&argument);
+            let accepted = ["resume", "extend", "json", "server", "server_wait", "workers", "act", "threads", "help"]
+                .contains(&argument);
             assert_ne!(refused.contains(&argument), accepted, "--{argument}");
         }
     }

@@ -7,7 +7,7 @@ use perturb_study::sets::Assignment;
 use perturb_study::success::Rule;
 use perturb_study::{MOST_POINTS, Version};
 
-use super::{PlayArgs, ServerArgs, WaitArgs, at_least_one, natural, within};
+use super::{JsonArgs, PlayArgs, ServerArgs, WaitArgs, at_least_one, natural, within};
 use crate::video::PIXELS;
 
 #[derive(Args, Debug)]
@@ -44,9 +44,8 @@ pub struct EvaluateArgs {
     /// has them.
     #[arg(long)]
     pub selection: bool,
-    /// Also write the result to a file, as JSON; `-` prints it in place of the table.
-    #[arg(long, value_name = "FILE")]
-    pub json: Option<PathBuf>,
+    #[command(flatten)]
+    pub json: JsonArgs,
     #[command(flatten)]
     pub play: PlayArgs,
 }
@@ -89,9 +88,8 @@ pub struct AuditArgs {
     /// proves that nothing before was changed.
     #[arg(long, value_name = "DIGEST", num_args = 1.., requires = "ledger")]
     pub head: Vec<String>,
-    /// Print JSON.
-    #[arg(long)]
-    pub json: bool,
+    #[command(flatten)]
+    pub json: JsonArgs,
     #[command(flatten)]
     pub server: ServerArgs,
     #[command(flatten)]
@@ -106,9 +104,8 @@ pub struct RatesArgs {
     /// tested with].
     #[arg(long, value_name = "text|code|QUANTITY=NUMBER", num_args = 1..)]
     pub success: Vec<Rule>,
-    /// Print JSON.
-    #[arg(long)]
-    pub json: bool,
+    #[command(flatten)]
+    pub json: JsonArgs,
 }
 
 #[derive(Args, Debug)]

@@ -9,15 +9,14 @@ use perturb_study::Version;
 use perturb_study::sets::Assignment;
 use perturb_study::settings::{Architecture, Observe, Preset, Settings};
 
-use super::{PlayArgs, ServerArgs, WaitArgs, at_least_one, natural, within};
+use super::{JsonArgs, PlayArgs, ServerArgs, WaitArgs, at_least_one, natural, within};
 
 #[derive(Args, Debug)]
 pub struct EnvsArgs {
     #[command(flatten)]
     pub server: ServerArgs,
-    /// Print JSON.
-    #[arg(long)]
-    pub json: bool,
+    #[command(flatten)]
+    pub json: JsonArgs,
 }
 
 /// What is typed beats --config, which beats the algorithm's defaults; flags and --set may not contradict each other.
@@ -92,6 +91,8 @@ pub struct TrainArgs {
     #[arg(long, value_name = "EPISODES", value_parser = at_least_one::<u64>)]
     pub extend: Option<u64>,
     #[command(flatten)]
+    pub json: JsonArgs,
+    #[command(flatten)]
     pub play: PlayArgs,
 }
 
@@ -128,9 +129,8 @@ pub struct LsArgs {
     /// Where to look, however deep.
     #[arg(value_name = "DIR", default_value = "runs")]
     pub dir: PathBuf,
-    /// Print JSON.
-    #[arg(long)]
-    pub json: bool,
+    #[command(flatten)]
+    pub json: JsonArgs,
 }
 
 /// The page changes nothing: it only shows what is in the folder. There is no authentication, so it listens on this machine's

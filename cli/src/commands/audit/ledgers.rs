@@ -33,16 +33,15 @@ pub(super) fn prove(args: &AuditArgs, tested: &[Tested]) -> Result<ExitCode> {
         let environment = servers.environment(&training.environment)?;
         let episodes = counters.generated_episodes.max(counters.episodes);
         proofs.push((one.name.as_str(), ledgers.prove(training, episodes, &environment, &records)));
-        if !args.json {
+        if !args.json.is_printed() {
             proofs.last().map_or(Ok(()), |(name, proof)| print(name, proof, &records))?;
         }
     }
     let clean = proofs.iter().filter(|(_, proof)| proof.against.is_empty()).count();
-    if args.json {
-        let policies: Vec<Value> = proofs.iter().map(|(name, proof)| document(name, proof)).collect();
-        let heads: Vec<Value> = ledgers.heads().iter().map(head).collect();
-        writeln!(out, "{:#}", json!({ "clean": clean, "policies": policies, "ledgers": heads }))?;
-    } else {
+    let policies: Vec<Value> = proofs.iter().map(|(name, proof)| document(name, proof)).collect();
+    let heads: Vec<Value> = ledgers.heads().iter().map(head).collect();
+    args.json.write(json!({ "clean": clean, "policies": policies, "ledgers": heads }))?;
+    if !args.json.is_printed() {
         for Head { path, lines, digest, unfinished } in ledgers.heads() {
             let rest =
                 if *unfinished > 0 { format!(", and {unfinished} bytes of an unfinished line") } else { String::new() };

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::{options, test, wanted_axes};
 use crate::commands::args::HeatmapArgs;
-use crate::commands::display::note;
+use crate::commands::display::{note, say};
 use crate::commands::error::{CommandError, Result, system};
 use crate::commands::{plan_in, playing_servers};
 use perturb_learner::checkpoint::Checkpoint;
@@ -111,7 +111,7 @@ fn make(
     let checkpoint = match checkpoint_of(folder, selected) {
         Ok(checkpoint) => checkpoint,
         Err(error) => {
-            eprintln!("{place}: {error}");
+            say(format_args!("{place}: {error}"));
             return Ok(false);
         }
     };
