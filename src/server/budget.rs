@@ -69,6 +69,11 @@ pub struct Share {
 }
 
 impl Share {
+    /// How many they are.
+    pub fn bytes(&self) -> usize {
+        self.bytes
+    }
+
     /// Takes so many bytes more.
     ///
     /// # Errors

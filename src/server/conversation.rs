@@ -65,7 +65,10 @@ pub trait Dialogue: Send + 'static {
     /// Takes note of a request that was refused before it was decoded.
     fn undecoded(&self, _refusal: &Refusal) {}
 
-    /// Whether a request takes up another session, by protocols that have that.
+    /// Whether there are requests that take up another session.
+    const TAKES_UP: bool = false;
+
+    /// Whether a request does.
     fn takes_up(_request: &Self::Request) -> bool {
         false
     }
@@ -128,7 +131,8 @@ impl Sessions {
     /// # Errors
     /// If the server is shutting down or has no room for another session, or its token may have no more.
     pub fn begin<D: Dialogue>(&self, requests: Frames, dialogue: D) -> Result<Responses<D::Response>, Status> {
-        let place = self.admit(&requests).or_else(|refusal| self.spare(refusal));
+        let place = self.admit(&requests);
+        let place = if D::TAKES_UP { place.or_else(|refusal| self.spare(refusal)) } else { place };
         let place = place.inspect_err(|refusal| self.refusals.count(refusal, requests.bearer.as_ref()))?;
         let sessions = Self { drain: self.drain.enter(), ..self.clone() };
         let (start, awake, ending) = (Instant::now(), Awake::default(), GONE);
@@ -272,8 +276,15 @@ impl<D: Dialogue> Conversation<D> {
         }
     }
 
-    /// The answer to a request.
+    /// The answer to a request. A stream that was let in to take up a session ends with its first refusal.
     async fn answer(&mut self, message: Message) -> Result<Result<D::Response, Refusal>, Stop> {
+        match (self.respond(message).await?, &self.place) {
+            (Err(refusal), Seat::Spare(..)) => Err(Stop::Refused(refusal)),
+            (answer, _) => Ok(answer),
+        }
+    }
+
+    async fn respond(&mut self, message: Message) -> Result<Result<D::Response, Refusal>, Stop> {
         if self.sessions.phase() != Phase::Running && !self.dialogue.is_open() {
             return Err(Stop::Refused(Refusal::Draining));
         }
@@ -282,11 +293,12 @@ impl<D: Dialogue> Conversation<D> {
             Message::Whole(bytes, share) => (bytes, share),
             Message::Refused(refusal) => return Ok(self.undecoded(refusal)),
         };
-        // Who is ahead of their rate waits, and nothing has happened yet.
+        // Who is ahead of their rate waits, and nothing has happened yet. Nothing steps before a session is open.
         let bearer = self.requests.bearer.clone();
+        let paced_bearer = bearer.as_ref().filter(|_| self.dialogue.is_open());
         tokio::select! {
             biased;
-            paced = paced(bearer.as_ref()) => match paced {
+            paced = paced(paced_bearer) => match paced {
                 Ok(()) => {}
                 Err(refusal) => return Ok(self.undecoded(refusal)),
             },
@@ -302,14 +314,10 @@ impl<D: Dialogue> Conversation<D> {
         {
             return Err(Stop::Refused(refusal.clone()));
         }
-        let answer = tokio::select! {
+        tokio::select! {
             biased; // it mostly is there at once
-            answer = self.dialogue.answer(request) => answer,
-            refusal = revoked(bearer.as_ref()) => return Err(Stop::Refused(refusal)),
-        };
-        match (&self.place, answer) {
-            (Seat::Spare(..), Err(refusal)) => Err(Stop::Refused(refusal)),
-            (_, answer) => Ok(answer),
+            answer = self.dialogue.answer(request) => Ok(answer),
+            refusal = revoked(bearer.as_ref()) => Err(Stop::Refused(refusal)),
         }
     }
 

@@ -89,6 +89,7 @@ impl<D: Observed> Dialogue for Counted<D> {
     type Request = D::Request;
     type Response = D::Response;
     const FIELDS: &'static [Field] = D::FIELDS;
+    const TAKES_UP: bool = D::TAKES_UP;
     const PROTOCOL: &'static str = D::PROTOCOL;
 
     fn allowance(&self) -> Allowance {

@@ -223,6 +223,7 @@ impl Dialogue for Session {
     type Request = proto::SessionRequest;
     type Response = proto::SessionResponse;
     const FIELDS: &'static [Field] = fields::SESSION_REQUEST;
+    const TAKES_UP: bool = true;
     const PROTOCOL: &'static str = "perturb.v1";
 
     fn allowance(&self) -> Allowance {

@@ -9,7 +9,7 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Code, Status, Streaming};
 
-use self::lease::Lease;
+use self::lease::{Lease, MOST_WITHOUT_REPLY};
 
 use crate::address::Address;
 use crate::awake::Awake;
@@ -223,6 +223,7 @@ impl Stream {
     /// The next message that comes, of another stream if this one is lost and there is a lease.
     async fn message<A: Ask>(&mut self) -> Result<Option<SessionResponse>, ClientError> {
         let limit = self.connection.patience().reply;
+        let mut taken_up = 0;
         loop {
             let next = self.awake.until(self.line.replies.message());
             let next = tokio::time::timeout(limit, next).await;
@@ -234,13 +235,16 @@ impl Stream {
                 Err(status) => status,
             };
             let error = lost(self.connection.address(), A::NAME, &status);
-            let Some(lease) = self.lease.as_mut().filter(|_| lease::is_of_the_line(&status)) else {
+            let Some(lease) =
+                self.lease.as_mut().filter(|_| lease::is_of_the_line(&status) && taken_up < MOST_WITHOUT_REPLY)
+            else {
                 return Err(error);
             };
             match lease.take_up(&self.connection).await {
                 Some(line) => {
                     tracing::warn!("{error}; took the session up again");
                     self.line = line;
+                    taken_up += 1;
                 }
                 None => {
                     self.lease = None;

@@ -18,6 +18,9 @@ use tonic::Status;
 
 /// How a session ends whose lease is over.
 const OVER: &str = "lease_over";
+/// The most bytes that the replies of one session keep, unless the last one alone has more: a client that has not heard of
+/// that much is better off with a snapshot.
+const MOST_KEPT: usize = 4 << 20;
 /// A kept reply's bytes beside those that are sent.
 const REST: usize = 512;
 
@@ -62,8 +65,13 @@ impl<D: Dialogue> Leased<D> {
         loop {
             let Self { conversation, grant, .. } = self;
             if self.sent < self.kept.last() {
+                let bearer = conversation.requests.bearer.clone();
                 tokio::select! {
                     biased;
+                    () = conversation.sessions.drain.closed() => {
+                        return self.stopped(line.clone(), Stop::Refused(Refusal::Draining));
+                    }
+                    refusal = revoked(bearer.as_ref()) => return self.stopped(line.clone(), Stop::Refused(refusal)),
                     Some(ask) = grant.asks.recv() => if let Some(coming) = self.agree(ask) {
                         return Some(self.give_way(line.clone(), coming));
                     },
@@ -186,12 +194,16 @@ impl<D: Dialogue> Leased<D> {
 
     /// Keeps an answer as a reply. Where the budget has no room beside those before, they go.
     fn keep(&mut self, answer: Result<D::Response, Refusal>) {
+        if matches!(answer, Err(Refusal::NoMemory { .. } | Refusal::TooManyOfAToken { .. })) {
+            self.kept.clear(); // they were received, and may be what is in the way
+        }
         let Ok(reply) = self.conversation.told(Ok(answer)) else { return };
         let (budget, bytes) = (self.conversation.requests.budget().clone(), reply.encoded_len() + REST);
+        let held: usize = self.kept.replies().map(|(_, share)| share.as_ref().map_or(0, Share::bytes)).sum();
         let mut share = budget.take(bytes);
-        if share.is_err() {
+        if share.is_err() || held + bytes > MOST_KEPT {
             self.kept.clear();
-            share = budget.take(bytes);
+            share = share.or_else(|_| budget.take(bytes));
         }
         self.kept.made((reply, share.ok()));
     }

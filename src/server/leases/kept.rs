@@ -33,6 +33,11 @@ impl<R> Kept<R> {
         self.replies.push_back(reply);
     }
 
+    /// Those that are here.
+    pub fn replies(&self) -> impl Iterator<Item = &R> {
+        self.replies.iter()
+    }
+
     /// Lets go of all of them.
     pub fn clear(&mut self) {
         self.replies.clear();

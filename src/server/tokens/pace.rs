@@ -101,14 +101,13 @@ impl State {
     fn wait(&mut self, ticket: &mut Option<f64>, now: Instant) -> Result<Option<Duration>, TooFast> {
         self.settle(now);
         let Some(rate) = self.rate else { return Ok(None) };
-        let is_new = ticket.is_none();
         let steps = *ticket.get_or_insert(self.done) - self.allowed;
         if steps <= 0.0 {
             return Ok(None);
         }
         // A rate is at least 1.
         let ahead = Duration::from_secs_f64(steps / f64::from(rate));
-        if is_new && ahead > LONGEST {
+        if ahead > LONGEST {
             return Err(TooFast { rate, ahead });
         }
         let wait = ahead.clamp(SHORTEST, LOOK);
@@ -216,5 +215,17 @@ mod tests {
         clocked.bound(1000);
         let wait = clocked.state.wait(&mut ticket, clocked.now).unwrap().unwrap();
         assert!(is_about(wait.as_secs_f64(), 0.195), "{wait:?}");
+    }
+
+    #[test]
+    fn who_waits_while_the_rate_is_lowered_is_refused_like_those_who_come() {
+        let mut clocked = Clocked::new();
+        clocked.bound(1000);
+        clocked.state.done += 20_000.0;
+        let mut ticket = None;
+        assert!(clocked.state.wait(&mut ticket, clocked.now).is_ok_and(|wait| wait.is_some()));
+        clocked.bound(100);
+        let refused = clocked.state.wait(&mut ticket, clocked.now);
+        assert!(refused.is_err_and(|error| error.rate == 100), "some 200 s are half a minute at most for nobody");
     }
 }

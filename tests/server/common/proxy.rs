@@ -1,4 +1,4 @@
-//! A line that breaks: a proxy in front of a server, whose connections are cut or fall silent. `cli`'s tests have it, too.
+//! A line that breaks: a proxy in front of a server, whose connections are cut or fall silent.
 
 use std::{
     io::{Read, Write},

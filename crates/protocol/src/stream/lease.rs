@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 use std::error::Error;
+use std::fmt;
 use std::io::ErrorKind;
 use std::time::{Duration, Instant};
 
@@ -11,17 +12,18 @@ use tonic::{Code, Status};
 
 use super::{Ask, Line};
 use crate::connection::Connection;
-use crate::proto::{self, SessionRequest, SessionResponse};
+use crate::proto::{self, SessionRequest, SessionResponse, session_response::Response};
 
 /// After the first attempt, which is at once, the pause before the next; it doubles with each …
 const FIRST_PAUSE: Duration = Duration::from_millis(50);
 /// … up to this.
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
+/// A line that breaks so often in a row before a reply comes will not carry it.
+pub(super) const MOST_WITHOUT_REPLY: u32 = 8;
 /// Where nobody listens this often in a row, the server is gone, and not the line to it.
 const REFUSED: u32 = 4;
 
 /// What a session is taken up by.
-#[derive(Debug)]
 pub(super) struct Lease {
     name: Bytes,
     time: Duration,
@@ -38,6 +40,16 @@ enum Failure {
     Refused,
     /// It never will.
     Ever,
+}
+
+/// Its name is a secret.
+impl fmt::Debug for Lease {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.debug_struct("Lease")
+            .field("time", &self.time)
+            .field("last_reply", &self.last_reply)
+            .finish_non_exhaustive()
+    }
 }
 
 impl Lease {
@@ -93,6 +105,11 @@ impl Lease {
         let Some(SessionResponse { response: Some(response) }) = reply.map_err(Failure::of)? else {
             return Err(Failure::Ever);
         };
+        if let Response::Error(error) = &response
+            && error.code == i32::from(Code::ResourceExhausted)
+        {
+            return Err(Failure::Now);
+        }
         // A refusal, most likely.
         let resumed = proto::Resume::reply(response).map_err(|_| Failure::Ever)?;
         let arrived = resumed.last_reply.checked_sub(self.last_reply).ok_or(Failure::Ever)?;
