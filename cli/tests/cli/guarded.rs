@@ -131,7 +131,7 @@ fn who_lacks_something_is_told_at_once_what(#[case] has: Has, #[case] version: &
     let guarded = Guarded::start();
     let refused = guarded.train(&guarded.address, "bad", version, has);
     let words = stderr(&refused);
-    assert_eq!(refused.status.code(), Some(1), "{words}");
+    assert!(!refused.status.success(), "{words}");
     assert!(words.contains(part) && !words.contains("waiting for it"), "{words}");
     let trained = guarded.train(&guarded.address, "good", "R", ALL);
     assert!(trained.status.success(), "{}", stderr(&trained));
@@ -142,7 +142,7 @@ fn a_server_whose_certificate_has_expired_is_not_trusted() {
     let guarded = Guarded::until(2021);
     let refused = guarded.train(&guarded.address, "bad", "R", ALL);
     let words = stderr(&refused);
-    assert_eq!(refused.status.code(), Some(1), "{words}");
+    assert!(!refused.status.success(), "{words}");
     assert!(words.contains("has expired") && !words.contains("waiting for it"), "{words}");
 }
 
