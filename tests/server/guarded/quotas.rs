@@ -11,7 +11,7 @@ use crate::{
 };
 use bytes::Bytes;
 use perturb::proto::{
-    Act, AutoresetMode, Open, Render, act::Task, dm_env_rpc::v1::environment_client::EnvironmentClient,
+    Act, AutoresetMode, Open, Render, Resume, Step, act::Task, dm_env_rpc::v1::environment_client::EnvironmentClient,
     session_response::Response,
 };
 use std::time::{Duration, Instant};
@@ -141,4 +141,18 @@ async fn a_token_has_so_many_bytes_in_flight_and_no_more() {
     for _ in 0..5 {
         ann.ask(picture()).await;
     }
+}
+
+#[tokio::test]
+async fn a_session_is_taken_up_however_far_its_token_is_ahead_of_its_rate() {
+    let guarded = Guarded::start(&entry("ann", ANN, "max_steps_per_second = 1"));
+    let mut connection = client(guarded.server.tcp()).await;
+    let mut lost = Session::show(&mut connection, Some(ANN)).await.unwrap();
+    let opened = lost.ask(Open { lease: 1, ..open("CartPole", 40, 1) }).await;
+    let step = || Step { actions: vec![0; 4 * 40].into() };
+    lost.ask(step()).await;
+    drop(lost);
+    let mut session = Session::show(&mut connection, Some(ANN)).await.unwrap();
+    assert_eq!(session.ask(Resume { lease: opened.lease, last_reply: 1 }).await.last_reply, 1);
+    assert_eq!(session.refused(step()).await.0, Code::ResourceExhausted, "40 s are too long to wait");
 }

@@ -81,6 +81,17 @@ async fn kept_replies_come_out_of_the_budget_and_go_when_there_is_no_room() {
 }
 
 #[tokio::test]
+async fn a_session_keeps_little_however_much_room_there_is() {
+    let watched = Watched::start(&[]);
+    let (mut session, _) = Session::open(watched.server.unix(), Open { lease: 64, ..open("CartPole", 1, 1) }).await;
+    for _ in 0..20 {
+        session.ask(Render { slot: 0, width: 512, height: 512 }).await;
+        let page = watched.page();
+        assert!(page.number("perturb_in_flight_bytes") < 6e6, "{}", page.text);
+    }
+}
+
+#[tokio::test]
 async fn the_server_says_which_sessions_have_no_stream_and_how_often_one_was_taken_up() {
     let watched = Watched::start(&[]);
     let (session, opened, _) = begin(watched.server.tcp(), 1).await;
