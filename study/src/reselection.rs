@@ -16,7 +16,7 @@ use perturb_policy::random::{Purpose, stream, uniform};
 
 use crate::plan::{Cell, SELECTION_TEST, Selection, TrainedOn};
 use crate::selection::{MethodResults, Results, Selected, common_runs};
-use crate::statistics::{Bootstrapped, are_enough, percentile_interval, resample};
+use crate::statistics::{Bootstrapped, percentile_interval, resample};
 use crate::{CellResult, CellState, Method, Metric, TestResult, Version, mean};
 
 /// Of the runs, as in the interval without selection.
@@ -93,7 +93,8 @@ impl<'a> Reselection<'a> {
         let sizes: Vec<usize> = reported.iter().map(Vec::len).collect();
         let mut rng = stream(SELECTION_SEED, Purpose::Bootstrap);
         let mut uniform = || uniform(&mut rng);
-        let resamples = if are_enough(&sizes) { resamples } else { 0 };
+        // A run alone can only be drawn again, and says nothing of others.
+        let resamples = if runs > 1 || sizes.iter().any(|size| *size > 1) { resamples } else { 0 };
         resample(&sizes, resamples, RUNS_SEED, |draws| {
             let winners: Vec<_> = contests.iter().map(|contest| contest.decide(&mut uniform)).collect();
             for ((drawn, runs), draws) in drawn.iter_mut().zip(&reported).zip(draws) {

@@ -28,7 +28,7 @@ use crate::seal;
 pub const FILE: &str = "episodes.parquet";
 /// The key of [`About`] in the file's metadata.
 const KEY: &str = "perturb";
-/// What every Parquet file begins with.
+/// What every Parquet file begins and ends with.
 const MAGIC: &[u8] = b"PAR1";
 
 /// Why records cannot be read or written.
@@ -148,7 +148,8 @@ impl Records {
     /// [`RecordsError`].
     pub fn read(path: &Path) -> Result<Self, RecordsError> {
         let content = read_if_there(path)?.ok_or_else(|| RecordsError::Missing { path: path.to_owned() })?;
-        if !content.starts_with(MAGIC) {
+        let is_other = !content.is_empty() && !content.starts_with(MAGIC) && !content.ends_with(MAGIC);
+        if is_other {
             return Err(RecordsError::Other { path: path.to_owned() });
         }
         let damaged = |error: AnyError| RecordsError::Damaged { path: path.to_owned(), reason: error.to_string() };

@@ -124,6 +124,9 @@ fn a_file_of_something_else_is_refused() {
         let error = Records::read(&path).unwrap_err().to_string();
         assert!(error.contains("does not hold recorded episodes"), "{error}");
     }
+    std::fs::write(&path, "environment = 'CartPole'").unwrap();
+    let error = Records::read(&path).unwrap_err().to_string();
+    assert!(error.contains("it is no Parquet file"), "{error}");
 }
 
 #[test]

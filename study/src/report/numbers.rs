@@ -8,7 +8,7 @@ use crate::paper;
 use crate::plan::TrainedOn;
 use crate::reselection::Reselection;
 use crate::selection::{MethodResults, average, interquartile, scores};
-use crate::statistics::{Bootstrapped, Summary, interquartile_mean, optimality_gap};
+use crate::statistics::{Bootstrapped, Summary, are_enough, interquartile_mean, optimality_gap};
 use crate::{Method, Metric, Scenario, TestResult, mean};
 
 /// Resamples of a bootstrap, as many as rliable takes.
@@ -168,9 +168,12 @@ fn known<T>(of: impl Fn(Metric) -> Option<T>) -> BTreeMap<Metric, T> {
     Metric::ALL.into_iter().filter_map(|metric| Some((metric, of(metric)?))).collect()
 }
 
-/// Over environments and the runs that all of them have.
+/// Over environments and the runs that all of them have. A resample of few runs is too often the lowest or the highest of
+/// them alone for an interval to be more than these two.
 fn mean_with_interval(selections: &[&MethodResults<'_>], metric: Metric) -> Option<Bootstrapped> {
-    Bootstrapped::of(&scores(selections, metric), MEANS, 1, |strata| mean(strata.concat().into_iter()))
+    let strata = scores(selections, metric);
+    let mean = Bootstrapped::of(&strata, MEANS, 1, |strata| mean(strata.concat().into_iter()))?;
+    Some(Bootstrapped { interval_95: mean.interval_95.filter(|_| are_enough(&strata)), ..mean })
 }
 
 fn least(runs: impl Fn(Metric) -> Option<usize>) -> usize {
