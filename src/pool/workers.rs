@@ -12,7 +12,7 @@ use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{
         Arc, Condvar, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicBool, AtomicUsize, Ordering},
+        atomic::{AtomicBool, AtomicPtr, AtomicUsize, Ordering},
         mpsc::{self, RecvTimeoutError},
     },
     thread::{self, JoinHandle},
@@ -27,6 +27,9 @@ const YIELDS_BEFORE_SLEEP: usize = 200;
 /// A job of at most so many µs is done by whoever asks. To have a worker do it takes longer, and no more than one would be
 /// set to it.
 const TINY: f64 = 20.0;
+/// The same for a session that stepped last, too: to hand a job over and to be told of its end costs more, where all
+/// cores are awake, than a second worker saves, and no other session waits.
+const TINY_ALONE: f64 = 80.0;
 /// One of at most so many µs is short, …
 const SHORT: f64 = 50.0;
 /// … and looked after so often before its session sleeps, about twice that time.
@@ -65,6 +68,7 @@ impl Pool {
             used: AtomicUsize::new(0),
             max_environments,
             changed: Notify::new(),
+            last: AtomicPtr::default(),
             meters: Mutex::default(),
             waits: Histogram::default(),
         });
@@ -166,6 +170,8 @@ pub(super) struct Shared {
     max_environments: usize,
     /// Told whenever `used` has changed.
     changed: Notify,
+    /// Whose environments moved last; only to be compared.
+    last: AtomicPtr<Job>,
     meters: Mutex<BTreeMap<&'static str, Arc<Meter>>>,
     waits: Histogram,
 }
@@ -200,7 +206,8 @@ impl Shared {
 
     /// Steps the environments of every shard: here if that is soon done, else as [`Shared::run`].
     pub(super) async fn step(&self, job: &Arc<Job>) -> Result<(), Error> {
-        if !job.is_tiny {
+        let tiny = if self.moves(job) { TINY_ALONE } else { TINY };
+        if job.cost > tiny {
             return self.run(job).await;
         }
         job.prepare();
@@ -218,10 +225,17 @@ impl Shared {
 
     /// Runs a round on the workers: its beginning, and whatever steps it wants. Gives it back at its end.
     pub(super) async fn play(&self, job: &Arc<Job>, round: Box<Round>) -> Result<Box<Round>, Error> {
+        self.moves(job);
         job.prepare_round(round);
         self.push(job, 1, 1);
         self.wait(job).await?;
         job.take_round().ok_or(Error::Defect)
+    }
+
+    /// Takes note that a job's environments move, and says whether they were the last that did.
+    fn moves(&self, job: &Arc<Job>) -> bool {
+        let job = Arc::as_ptr(job).cast_mut();
+        self.last.swap(job, Ordering::Relaxed) == job
     }
 
     /// Waits for the end of a job that was pushed.
@@ -332,8 +346,8 @@ pub(super) struct Job {
     /// Nobody waits for the round any more: it ends with its present step.
     pub(super) halted: AtomicBool,
     failed: AtomicBool,
-    /// A step of all environments takes less than to wake a worker.
-    is_tiny: bool,
+    /// What a step of all environments takes, µs.
+    cost: f64,
     /// How often the session looks whether a request is done before it sleeps until then.
     patience: usize,
     pub(super) permit: Arc<Permit>,
@@ -360,7 +374,7 @@ impl Job {
             abandoned: AtomicBool::new(false),
             halted: AtomicBool::new(false),
             failed: AtomicBool::new(false),
-            is_tiny: cost <= TINY,
+            cost,
             patience: if cost <= SHORT { POLLS } else { 0 },
             permit,
             tally,

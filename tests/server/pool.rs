@@ -438,6 +438,34 @@ async fn a_step_that_is_soon_done_waits_for_no_worker() {
 }
 
 #[tokio::test]
+async fn a_session_that_steps_alone_waits_for_no_worker_for_somewhat_longer_steps() {
+    let pool = Pool::new(1, 10_000).unwrap();
+    let open = |name, size| {
+        Batch::open(&pool, batch_settings(tasks::catalogue().find(name).unwrap(), size, Autoreset::SameStep))
+    };
+    let (mut one, ..) = open("CartPole", 1024).await.unwrap();
+    let (mut other, ..) = open("CartPole", 1).await.unwrap();
+    let (mut large, ..) = open("CartPole", 4096).await.unwrap();
+    let taken = || pool.waits().counts().iter().map(|(_, count)| count).sum::<u64>();
+    let before = taken();
+    one.step(&[0; 4 * 1024]).await.unwrap();
+    assert!(taken() > before, "nobody knows yet that it is alone");
+    let before = taken();
+    for _ in 0..5 {
+        one.step(&[0; 4 * 1024]).await.unwrap();
+    }
+    assert_eq!(taken(), before, "alone");
+    other.step(&[0; 4]).await.unwrap();
+    one.step(&[0; 4 * 1024]).await.unwrap();
+    assert!(taken() > before, "another one came in between");
+    for _ in 0..2 {
+        let before = taken();
+        large.step(&[0; 4 * 4096]).await.unwrap();
+        assert!(taken() > before, "too much to keep the session's thread");
+    }
+}
+
+#[tokio::test]
 async fn workers_that_fell_asleep_are_woken_for_every_job() {
     let pool = Pool::new(2, 1000).unwrap();
     let open = |name, size| {

@@ -8,9 +8,9 @@ use std::time::{Duration, Instant};
 use tokio::task::yield_now;
 
 /// How long a wait is spent awake …
-const AWAKE: Duration = Duration::from_micros(200);
+const AWAKE: Duration = Duration::from_micros(400);
 /// … if the one before took no longer than this: whoever just misses the first is still worth it.
-const SHORT: Duration = Duration::from_micros(300);
+const SHORT: Duration = Duration::from_micros(500);
 
 /// Waits of one kind, each of which tells how the next one is spent. To put a thread to sleep and to wake it takes tens of
 /// microseconds, as long as a round trip with 256 steps of CartPole.
