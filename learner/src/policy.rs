@@ -3,7 +3,7 @@
 use perturb_policy::math::exp;
 use perturb_policy::random::{Purpose, stream};
 use perturb_policy::{
-    Acting, ActionKind, Descent, Differentiator, Losses, NamedArray, Objective, PolicySpec, RecurrentBatch,
+    Acting, ActionKind, Descent, Differentiator, Losses, NamedArray, Objective, Player, PolicySpec, RecurrentBatch,
     RecurrentDifferentiator, Samples, SequenceSamples, Weights, initial_weights, recurrent_differentiator,
 };
 
@@ -16,15 +16,21 @@ pub struct Policy {
     spec: PolicySpec,
     /// `[P]`.
     weights: Vec<f32>,
+    /// `[P]` of the last step.
+    gradient: Vec<f32>,
     calculus: Calculus,
 }
 
 /// Where gradients of feed-forward policies of one shape are computed.
-pub type Room = Box<Differentiator>;
+pub struct Room {
+    networks: Box<Differentiator>,
+    /// `[P]`.
+    gradient: Vec<f32>,
+}
 
 enum Calculus {
-    /// Whether the room has the weights as they are now.
-    FeedForward(Room, bool),
+    /// Whether it has the weights as they are now.
+    FeedForward(Box<Differentiator>, bool),
     Recurrent(Box<dyn RecurrentDifferentiator>),
 }
 
@@ -77,7 +83,7 @@ impl Policy {
             None => Calculus::FeedForward(Box::new(Differentiator::new(&spec, 1)?), false),
             Some(_) => Calculus::Recurrent(recurrent_differentiator(&spec)?),
         };
-        Ok(Policy { spec, weights, calculus })
+        Ok(Policy { spec, gradient: vec![0.0; weights.len()], weights, calculus })
     }
 
     /// Computes gradients of feed-forward policies with `threads` threads, at least 1. Their number changes no byte.
@@ -96,7 +102,10 @@ impl Policy {
     /// Those of [`Differentiator::new`].
     pub fn room(&self) -> Result<Option<Room>> {
         match self.calculus {
-            Calculus::FeedForward(..) => Ok(Some(Box::new(Differentiator::new(&self.spec, 1)?))),
+            Calculus::FeedForward(..) => Ok(Some(Room {
+                networks: Box::new(Differentiator::new(&self.spec, 1)?),
+                gradient: vec![0.0; self.weights.len()],
+            })),
             Calculus::Recurrent(_) => Ok(None),
         }
     }
@@ -104,9 +113,19 @@ impl Policy {
     /// Exchanges the room for another one. Policies of one shape that learn by turns in the same room find it in the
     /// processor's caches.
     pub fn change_room(&mut self, other: &mut Room) {
-        if let Calculus::FeedForward(room, is_current) = &mut self.calculus {
-            std::mem::swap(room, other);
+        if let Calculus::FeedForward(networks, is_current) = &mut self.calculus {
+            std::mem::swap(networks, &mut other.networks);
+            std::mem::swap(&mut self.gradient, &mut other.gradient);
             *is_current = false;
+        }
+    }
+
+    /// Takes over the networks of a player that has played with the weights as they are: they need not be loaded again. It
+    /// must load weights before it plays on.
+    pub fn take_networks(&mut self, player: &mut Player) {
+        if let Calculus::FeedForward(networks, is_current) = &mut self.calculus {
+            player.give_networks(networks);
+            *is_current = true;
         }
     }
 
@@ -216,8 +235,11 @@ impl Policy {
         descent: &mut Descent,
         learning_rate: f64,
     ) -> Result<(Losses, f64)> {
-        let losses = self.gradient(batch, sequences, objective, descent.gradient_mut())?;
-        let norm = descent.step(losses.total, &mut self.weights, learning_rate)?;
+        let mut gradient = std::mem::take(&mut self.gradient);
+        let losses = self.gradient(batch, sequences, objective, &mut gradient);
+        self.gradient = gradient;
+        let losses = losses?;
+        let norm = descent.step(losses.total, &self.gradient, &mut self.weights, learning_rate)?;
         if let Calculus::FeedForward(_, is_current) = &mut self.calculus {
             *is_current = false;
         }
@@ -240,7 +262,8 @@ impl Policy {
                 take_over(networks, is_current, &self.weights)?;
                 let acting =
                     acting.as_ref().map(|acting| Acting { outputs: &acting.outputs, log_std: &acting.log_std });
-                Ok(networks.gradient(&Samples { acting, ..*samples }, sequences, objective, gradient)?)
+                let samples = Samples { acting, ..*samples };
+                Ok(networks.gradient(&self.weights, &samples, sequences, objective, gradient)?)
             }
             (Calculus::Recurrent(_), Data::Recurrent(batch)) => {
                 Ok(batch.gradient(&self.weights, sequences, objective, gradient)?)
@@ -250,10 +273,10 @@ impl Policy {
     }
 }
 
-/// Has `room` use `weights`, if it does not.
-fn take_over(room: &mut Room, is_current: &mut bool, weights: &[f32]) -> Result<()> {
+/// Has `networks` use `weights`, if they do not.
+fn take_over(networks: &mut Differentiator, is_current: &mut bool, weights: &[f32]) -> Result<()> {
     if !std::mem::replace(is_current, true) {
-        room.load(weights)?;
+        networks.load(weights)?;
     }
     Ok(())
 }

@@ -100,9 +100,6 @@ fn signal_code(number: i32) -> ExitCode {
     ExitCode::from(u8::try_from(128 + number).unwrap_or(1))
 }
 
-/// So many processes of short steps are as much as the one thread of a server that speaks to clients has time for.
-const JOBS_A_SERVER: usize = 2;
-
 /// The servers that were named, or one of our own.
 fn servers(args: &ServerArgs) -> Result<Servers> {
     if args.server.is_empty() {
@@ -117,13 +114,15 @@ fn lasting_servers(args: &ServerArgs, wait: WaitArgs) -> Result<Servers> {
     Ok(servers(args)?.with_wait(ServerWait { limit: wait.time(), tell: |sentence| note(sentence) }))
 }
 
-/// The servers that all workers share, each group of cells one of them. Private ones share the physics threads.
+/// The servers that all workers share, each group of cells one of them. There is a private one for each worker, for one
+/// thread of a server speaks to all its clients, and those with short steps would wait for each other; they share the
+/// physics threads.
 fn shared_servers(args: &ServerArgs, jobs: usize) -> Result<(Vec<PrivateServer>, Vec<Address>)> {
     if !args.server.is_empty() {
         refuse_workers(args)?;
         return Ok((Vec::new(), args.server.clone()));
     }
-    let count = jobs.div_ceil(JOBS_A_SERVER).max(1);
+    let count = jobs.max(1);
     let threads = args.workers.unwrap_or_else(cores).div_ceil(count);
     let start = |_| PrivateServer::start(Some(threads));
     let servers = (0..count).map(start).collect::<std::result::Result<Vec<_>, _>>()?;

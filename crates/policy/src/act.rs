@@ -5,7 +5,7 @@
 
 use rand_chacha::ChaCha8Rng;
 
-use crate::act_ff::FeedForward;
+use crate::act_ff::{FeedForward, Networks};
 use crate::act_rc::Recurrent;
 use crate::error::{Error, Result, check_length};
 use crate::kernel::Rows;
@@ -105,11 +105,19 @@ impl Actor {
         check_length("weights [P]", weights.len(), self.spec.n_weights())?;
         let mut rest = weights;
         match &mut self.network {
-            Network::FeedForward(network) => network.load(&mut rest),
+            Network::FeedForward(network) => network.networks_mut().load(&mut rest),
             Network::Recurrent(network) => network.load(&mut rest),
         }
         self.log_std.copy_from_slice(rest);
         Ok(())
+    }
+
+    /// The networks of a feed-forward policy, and log σ `[A]` of its actions.
+    pub(crate) fn feed_forward(&mut self) -> Option<(&mut Networks, &[f32])> {
+        match &mut self.network {
+            Network::FeedForward(network) => Some((network.networks_mut(), &self.log_std)),
+            Network::Recurrent(_) => None,
+        }
     }
 
     /// Samples an action for each normalised observation of `observations` `[N, O]`, in order of n; draws from `streams`

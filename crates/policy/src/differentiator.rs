@@ -4,11 +4,12 @@ use rayon::{ThreadPool, ThreadPoolBuilder};
 
 use pulp::Simd;
 
-use crate::act_ff::network;
+use crate::act::Actor;
+use crate::act_ff::Networks;
 use crate::error::{Error, Result, check_length};
 use crate::kernel::{Kernel, Rows, run};
 use crate::objective::{Acting, Gaussian, Losses, Objective, Outputs, Sample};
-use crate::perceptron::{Derivatives, Forward, Give, Perceptron, Transposed};
+use crate::perceptron::{Backward, Forward};
 use crate::spec::{ActionKind, PolicySpec};
 
 /// Samples whose activations are kept at once: those of both networks stay in the processor's second cache.
@@ -45,43 +46,39 @@ pub struct Differentiator {
     /// P.
     n_weights: usize,
     networks: Networks,
+    gaussian: Gaussian,
     parts: Vec<Part>,
     /// None: the calling thread does everything.
     threads: Option<ThreadPool>,
 }
 
-/// The weights.
-#[derive(Debug)]
-struct Networks {
-    policy: Perceptron,
-    value: Perceptron,
-    policy_transposed: Transposed,
-    value_transposed: Transposed,
-    gaussian: Gaussian,
-}
-
-/// Room for a part of a minibatch: activations of a block, and sums over the part.
+/// Room for a part of a minibatch.
 #[derive(Debug)]
 struct Part {
-    observations: Rows,
-    policy_layers: Vec<Rows>,
-    value_layers: Vec<Rows>,
-    by_policy: Derivatives,
-    by_value: Derivatives,
-    by_log_std: Vec<f32>,
+    block: Block,
+    /// `[P]` the derivatives of the part's losses; the first part's go to who asked.
+    gradient: Vec<f32>,
     losses: Losses,
 }
 
-impl Part {
+/// Activations of a block.
+#[derive(Debug)]
+struct Block {
+    observations: Rows,
+    policy_layers: Vec<Rows>,
+    value_layers: Vec<Rows>,
+    through_policy: Backward,
+    through_value: Backward,
+}
+
+impl Block {
     fn new(spec: &PolicySpec, networks: &Networks) -> Self {
-        Part {
+        Block {
             observations: Rows::new(BLOCK, spec.observation_size),
             policy_layers: networks.policy.room(BLOCK),
             value_layers: networks.value.room(BLOCK),
-            by_policy: Derivatives::new(&networks.policy, BLOCK),
-            by_value: Derivatives::new(&networks.value, BLOCK),
-            by_log_std: vec![0.0; networks.gaussian.log_std.len()],
-            losses: Losses::default(),
+            through_policy: Backward::new(&networks.policy, BLOCK),
+            through_value: Backward::new(&networks.value, BLOCK),
         }
     }
 }
@@ -92,7 +89,6 @@ impl Differentiator {
     /// # Errors
     /// [`Error::Threads`] if the system starts no more.
     pub fn new(spec: &PolicySpec, threads: usize) -> Result<Self> {
-        let (policy, value) = (network(spec, spec.action.outputs()), network(spec, 1));
         let n_log_std = match spec.action {
             ActionKind::Discrete { .. } => 0,
             ActionKind::Continuous { size } => size,
@@ -103,13 +99,8 @@ impl Differentiator {
         Ok(Differentiator {
             spec: spec.clone(),
             n_weights: spec.n_weights(),
-            networks: Networks {
-                policy_transposed: Transposed::new(&policy),
-                value_transposed: Transposed::new(&value),
-                policy,
-                value,
-                gaussian: Gaussian::new(n_log_std),
-            },
+            networks: Networks::new(spec),
+            gaussian: Gaussian::new(n_log_std),
             parts: Vec::new(),
             threads: threads.map_err(|error| Error::Threads { wanted: others, reason: error.to_string() })?,
         })
@@ -121,18 +112,23 @@ impl Differentiator {
     /// Another length.
     pub fn load(&mut self, weights: &[f32]) -> Result<()> {
         check_length("weights [P]", weights.len(), self.n_weights)?;
-        let networks = &mut self.networks;
         let mut rest = weights;
-        networks.policy.load(&mut rest);
-        networks.policy_transposed.load(&networks.policy, weights);
-        let values = rest;
-        networks.value.load(&mut rest);
-        networks.value_transposed.load(&networks.value, values);
-        networks.gaussian.load(rest);
+        self.networks.load(&mut rest);
+        self.gaussian.load(rest);
         Ok(())
     }
 
-    /// The losses of the samples at `indices`, and in `gradient` `[P]` the derivatives of their total by the weights.
+    /// Takes over the networks of an actor of this shape that has the weights, which is quicker than to load them. The
+    /// actor has others then, and must be loaded before it acts again.
+    pub fn load_from(&mut self, actor: &mut Actor) {
+        if let Some((networks, log_std)) = actor.feed_forward() {
+            std::mem::swap(networks, &mut self.networks);
+            self.gaussian.load(log_std);
+        }
+    }
+
+    /// The losses of the samples at `indices`, and in `gradient` `[P]` the derivatives of their total by `weights` `[P]`,
+    /// which are those that were loaded.
     ///
     /// # Errors
     /// Lengths that do not fit, or no indices.
@@ -141,31 +137,38 @@ impl Differentiator {
     /// If an index is not one of a sample, or a discrete action is not in 0 … n-1.
     pub fn gradient(
         &mut self,
+        weights: &[f32],
         samples: &Samples<'_>,
         indices: &[u32],
         objective: &Objective,
         gradient: &mut [f32],
     ) -> Result<Losses> {
         self.check(samples)?;
+        check_length("weights [P]", weights.len(), self.n_weights)?;
         check_length("gradient [P]", gradient.len(), self.n_weights)?;
         if indices.is_empty() {
             return Err(Error::NoSamples);
         }
         let n_parts = indices.len().div_ceil(BLOCK).min(MOST_PARTS);
         while self.parts.len() < n_parts {
-            self.parts.push(Part::new(&self.spec, &self.networks));
+            let length = if self.parts.is_empty() { 0 } else { self.n_weights };
+            let block = Block::new(&self.spec, &self.networks);
+            self.parts.push(Part { block, gradient: vec![0.0; length], losses: Losses::default() });
         }
         let (mean, scale) =
             if objective.normalize_advantages { mean_and_scale(samples.advantages, indices) } else { (0.0, 1.0) };
-        let (spec, networks, n) = (&self.spec, &self.networks, indices.len());
+        let Self { spec, networks, gaussian, parts, threads, .. } = self;
+        let (spec, networks, gaussian, n) = (&*spec, &*networks, &*gaussian, indices.len());
         let size = n.div_ceil(n_parts);
-        let work = |first: usize, parts: &mut [Part]| {
-            for (part, indices) in parts.iter_mut().zip(indices.chunks(size).skip(first)) {
-                run(Differentiation { spec, networks, samples, indices, objective, mean, scale, n, part });
-            }
+        let work = |place: usize, part: &mut Part, gradient: Option<&mut [f32]>| {
+            let Part { block, gradient: own, losses } = part;
+            let (sums, first) = (gradient.unwrap_or(own), place * size);
+            let indices = &indices[first..n.min(first + size)];
+            let shared = Shared { spec, networks, gaussian, weights, samples, objective, mean, scale, n };
+            run(Differentiation { shared, indices, block, sums, losses });
         };
-        let parts = &mut self.parts[..n.div_ceil(size)];
-        match &self.threads {
+        let parts = &mut parts[..n.div_ceil(size)];
+        match threads {
             // To wake a thread takes about as long as a part.
             Some(pool) if parts.len() > 2 => {
                 let share = parts.len().div_ceil(pool.current_num_threads() + 1).max(2);
@@ -173,28 +176,28 @@ impl Differentiator {
                     let (own, others) = parts.split_at_mut(share);
                     for (i, parts) in others.chunks_mut(share).enumerate() {
                         let work = &work;
-                        scope.spawn(move |_| work((i + 1) * share, parts));
+                        scope.spawn(move |_| {
+                            parts.iter_mut().enumerate().for_each(|(k, part)| work((i + 1) * share + k, part, None));
+                        });
                     }
-                    work(0, own);
+                    let mut gradient = Some(&mut *gradient);
+                    own.iter_mut().enumerate().for_each(|(k, part)| work(k, part, gradient.take()));
                 });
             }
-            _ => work(0, parts),
-        }
-        Ok(self.sum(n.div_ceil(size), n, objective, gradient))
-    }
-
-    /// Adds the parts up, in order.
-    fn sum(&self, n_parts: usize, n: usize, objective: &Objective, gradient: &mut [f32]) -> Losses {
-        let mut losses = Losses::default();
-        for (i, part) in self.parts[..n_parts].iter().enumerate() {
-            let (mut rest, add) = (&mut gradient[..], i > 0);
-            for derivatives in [&part.by_policy, &part.by_value] {
-                run(Give { derivatives, gradient: &mut rest, add });
+            _ => {
+                let mut gradient = Some(&mut *gradient);
+                parts.iter_mut().enumerate().for_each(|(k, part)| work(k, part, gradient.take()));
             }
-            rest.iter_mut().zip(&part.by_log_std).for_each(|(sum, x)| *sum = if add { *sum + x } else { *x });
-            losses += part.losses;
         }
-        losses.means(n, objective)
+        // In order, whoever came first.
+        let mut losses = Losses::default();
+        for (place, part) in parts.iter().enumerate() {
+            losses += part.losses;
+            if place > 0 {
+                run(Add { sums: gradient, more: &part.gradient });
+            }
+        }
+        Ok(losses.means(n, objective))
     }
 
     /// Replaces `outputs` by the logits `[B, n]` or means `[B, A]` at `observations` `[B, O]`.
@@ -205,16 +208,17 @@ impl Differentiator {
         let size = self.spec.observation_size;
         check_length("observations [B, O]", observations.len(), observations.len() / size * size)?;
         if self.parts.is_empty() {
-            self.parts.push(Part::new(&self.spec, &self.networks));
+            let block = Block::new(&self.spec, &self.networks);
+            self.parts.push(Part { block, gradient: Vec::new(), losses: Losses::default() });
         }
-        let (part, networks) = (&mut self.parts[0], &self.networks);
+        let (room, networks) = (&mut self.parts[0].block, &self.networks);
         outputs.clear();
         for block in observations.chunks(BLOCK * size) {
             let n = block.len() / size;
-            part.observations.copy(block, size);
-            let Part { observations, policy_layers, .. } = part;
+            room.observations.copy(block, size);
+            let Block { observations, policy_layers, .. } = room;
             run(Forward { network: &networks.policy, inputs: observations, n, outputs: policy_layers });
-            let head = &part.policy_layers[part.policy_layers.len() - 1];
+            let head = &room.policy_layers[room.policy_layers.len() - 1];
             outputs.extend((0..n).flat_map(|b| &head.row(b)[..self.spec.action.outputs()]));
         }
         Ok(())
@@ -232,7 +236,7 @@ impl Differentiator {
         }
         let Some(acting) = acting else { return Ok(()) };
         check_length("acting outputs [B, n]", acting.outputs.len(), n * self.spec.action.outputs())?;
-        check_length("acting log_std [A]", acting.log_std.len(), self.networks.gaussian.log_std.len())
+        check_length("acting log_std [A]", acting.log_std.len(), self.gaussian.log_std.len())
     }
 }
 
@@ -245,71 +249,96 @@ fn mean_and_scale(advantages: &[f32], indices: &[u32]) -> (f32, f32) {
     (mean as f32, (1.0 / (variance.sqrt() + 1e-8)) as f32)
 }
 
-/// The work on one part.
-struct Differentiation<'a> {
+/// Adds `more` to `sums`.
+struct Add<'a> {
+    sums: &'a mut [f32],
+    more: &'a [f32],
+}
+
+impl Kernel for Add<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        self.sums.iter_mut().zip(self.more).for_each(|(sum, x)| *sum += x);
+    }
+}
+
+/// What the parts of a minibatch have in common.
+struct Shared<'a> {
     spec: &'a PolicySpec,
     networks: &'a Networks,
+    gaussian: &'a Gaussian,
+    weights: &'a [f32],
     samples: &'a Samples<'a>,
-    indices: &'a [u32],
     objective: &'a Objective,
     /// Of the advantages, and what the distance from it is multiplied with.
     mean: f32,
     scale: f32,
     /// Samples in the minibatch.
     n: usize,
-    part: &'a mut Part,
+}
+
+/// The work on one part.
+struct Differentiation<'a> {
+    shared: Shared<'a>,
+    indices: &'a [u32],
+    block: &'a mut Block,
+    /// `[P]`.
+    sums: &'a mut [f32],
+    losses: &'a mut Losses,
 }
 
 impl Kernel for Differentiation<'_> {
     #[inline(always)]
     fn run<S: Simd>(mut self, simd: S) {
-        self.part.by_policy.clear();
-        self.part.by_value.clear();
-        self.part.by_log_std.fill(0.0);
-        self.part.losses = Losses::default();
-        for block in self.indices.chunks(BLOCK) {
-            self.block(simd, block);
+        *self.losses = Losses::default();
+        for (i, block) in self.indices.chunks(BLOCK).enumerate() {
+            if i == 0 { self.block::<S, false>(simd, block) } else { self.block::<S, true>(simd, block) }
         }
     }
 }
 
 impl Differentiation<'_> {
+    /// The samples at `indices`; with `ADD` the sums go on.
     #[inline(always)]
-    fn block<S: Simd>(&mut self, simd: S, indices: &[u32]) {
-        let Part { observations, policy_layers, value_layers, by_policy, by_value, by_log_std, losses } =
-            &mut *self.part;
-        let (size, n) = (self.spec.observation_size, indices.len());
+    fn block<S: Simd, const ADD: bool>(&mut self, simd: S, indices: &[u32]) {
+        let Block { observations, policy_layers, value_layers, through_policy, through_value } = &mut *self.block;
+        let Shared { spec, networks, gaussian, weights, samples, objective, mean, scale, n: of } = &self.shared;
+        let (size, n) = (spec.observation_size, indices.len());
         for (b, &i) in indices.iter().enumerate() {
-            observations.row_mut(b)[..size].copy_from_slice(&self.samples.observations[i as usize * size..][..size]);
+            observations.row_mut(b)[..size].copy_from_slice(&samples.observations[i as usize * size..][..size]);
         }
-        self.networks.policy.forward(simd, observations, n, policy_layers);
-        self.networks.value.forward(simd, observations, n, value_layers);
+        networks.policy.forward(simd, observations, n, policy_layers);
+        networks.value.forward(simd, observations, n, value_layers);
         let (heads, values) = (&policy_layers[policy_layers.len() - 1], &value_layers[value_layers.len() - 1]);
-        let (n_outputs, width) = (self.spec.action.outputs(), self.spec.action.width());
+        let (n_outputs, width) = (spec.action.outputs(), spec.action.width());
+        let (policy_sums, rest) = self.sums.split_at_mut(through_policy.n_weights());
+        let (value_sums, by_log_std) = rest.split_at_mut(through_value.n_weights());
+        if !ADD {
+            by_log_std.fill(0.0);
+        }
         for (b, &i) in indices.iter().enumerate() {
             let i = i as usize;
             let sample = Sample {
-                action: &self.samples.actions[i * width..][..width],
-                old_log_prob: self.samples.old_log_probs[i],
-                old_value: self.samples.old_values[i],
-                advantage: (self.samples.advantages[i] - self.mean) * self.scale,
-                return_: self.samples.returns[i],
-                acting: self
-                    .samples
-                    .acting
-                    .map(|acting| (&acting.outputs[i * n_outputs..][..n_outputs], acting.log_std)),
+                action: &samples.actions[i * width..][..width],
+                old_log_prob: samples.old_log_probs[i],
+                old_value: samples.old_values[i],
+                advantage: (samples.advantages[i] - mean) * scale,
+                return_: samples.returns[i],
+                acting: samples.acting.map(|acting| (&acting.outputs[i * n_outputs..][..n_outputs], acting.log_std)),
             };
             let outputs = Outputs {
                 head: &heads.row(b)[..n_outputs],
-                gaussian: &self.networks.gaussian,
+                gaussian,
                 value: values.row(b)[0],
-                by_head: &mut by_policy.by_outputs().row_mut(b)[..n_outputs],
+                by_head: &mut through_policy.by_outputs().row_mut(b)[..n_outputs],
                 by_log_std,
-                by_value: &mut by_value.by_outputs().row_mut(b)[0],
+                by_value: &mut through_value.by_outputs().row_mut(b)[0],
             };
-            *losses += self.objective.differentiate(self.spec.action, &sample, outputs, self.n);
+            *self.losses += objective.differentiate(spec.action, &sample, outputs, *of);
         }
-        by_policy.add(simd, &self.networks.policy_transposed, observations, policy_layers, n);
-        by_value.add(simd, &self.networks.value_transposed, observations, value_layers, n);
+        let (policy_weights, rest) = weights.split_at(policy_sums.len());
+        let value_weights = &rest[..value_sums.len()];
+        through_policy.sum::<S, ADD>(simd, policy_weights, policy_sums, observations, policy_layers, n);
+        through_value.sum::<S, ADD>(simd, value_weights, value_sums, observations, value_layers, n);
     }
 }

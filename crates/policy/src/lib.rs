@@ -20,6 +20,7 @@ mod objective;
 mod optimiser;
 mod perceptron;
 mod player;
+mod product;
 pub mod random;
 mod recurrent;
 mod sample;

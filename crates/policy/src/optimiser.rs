@@ -2,7 +2,7 @@
 
 use pulp::Simd;
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, check_length};
 use crate::kernel::{Kernel, run};
 use crate::weights::{NamedArray, check_arrays};
 
@@ -69,6 +69,14 @@ impl Optimiser {
         match self {
             Optimiser::RmsProp(state) => run(RmsPropStep { state, learning_rate, weights, gradient, scale }),
             Optimiser::Adam(state) => run(AdamStep { state, update, learning_rate, weights, gradient, scale }),
+        }
+    }
+
+    /// P.
+    fn size(&self) -> usize {
+        match self {
+            Optimiser::RmsProp(state) => state.mean_square.len(),
+            Optimiser::Adam(state) => state.mean.len(),
         }
     }
 
@@ -144,14 +152,12 @@ pub struct Descent {
     optimiser: Optimiser,
     max_grad_norm: f64,
     n_updates: u64,
-    /// `[P]`.
-    gradient: Vec<f32>,
 }
 
 impl Descent {
-    /// Fresh, for `n_weights`; gradients longer than `max_grad_norm` are scaled down to it.
-    pub fn new(optimiser: Optimiser, max_grad_norm: f64, n_weights: usize) -> Self {
-        Descent { optimiser, max_grad_norm, n_updates: 0, gradient: vec![0.0; n_weights] }
+    /// Fresh; gradients longer than `max_grad_norm` are scaled down to it.
+    pub fn new(optimiser: Optimiser, max_grad_norm: f64) -> Self {
+        Descent { optimiser, max_grad_norm, n_updates: 0 }
     }
 
     /// Gradient steps so far.
@@ -159,26 +165,23 @@ impl Descent {
         self.n_updates
     }
 
-    /// `[P]` where the gradient of the next step goes.
-    pub fn gradient_mut(&mut self) -> &mut [f32] {
-        &mut self.gradient
-    }
-
-    /// One step of `weights` `[P]` down the gradient of a loss that came to `loss`. Gives the gradient's global norm before
-    /// clipping.
+    /// One step of `weights` `[P]` down the `gradient` `[P]` of a loss that came to `loss`. Gives the gradient's global norm
+    /// before clipping.
     ///
     /// Clipping scales the whole gradient by max_grad_norm/norm where norm > max_grad_norm, exactly, as TensorFlow's
     /// `clip_by_global_norm`; libtorch adds 1e-6 to the norm.
     ///
     /// # Errors
-    /// [`Error::NotFinite`] for a loss or a gradient that is not; nothing was changed then.
-    pub fn step(&mut self, loss: f64, weights: &mut [f32], learning_rate: f64) -> Result<f64> {
+    /// [`Error::NotFinite`] for a loss or a gradient that is not, [`Error::Length`]; nothing was changed then.
+    pub fn step(&mut self, loss: f64, gradient: &[f32], weights: &mut [f32], learning_rate: f64) -> Result<f64> {
+        check_length("gradient [P]", gradient.len(), self.optimiser.size())?;
+        check_length("weights [P]", weights.len(), self.optimiser.size())?;
         self.check_finite("the loss", loss)?;
         let mut norm = 0.0;
-        run(Norm { gradient: &self.gradient, norm: &mut norm });
+        run(Norm { gradient, norm: &mut norm });
         self.check_finite("the norm of the gradient", norm)?;
         let scale = if norm > self.max_grad_norm { (self.max_grad_norm / norm) as f32 } else { 1.0 };
-        self.optimiser.step(self.n_updates, learning_rate, weights, &self.gradient, scale);
+        self.optimiser.step(self.n_updates, learning_rate, weights, gradient, scale);
         self.n_updates += 1;
         Ok(norm)
     }
@@ -202,7 +205,7 @@ impl Descent {
     /// # Errors
     /// [`Error::Arrays`] if it is another optimiser's.
     pub fn load_state(&mut self, n_updates: u64, arrays: &[NamedArray]) -> Result<()> {
-        let size = self.gradient.len();
+        let size = self.optimiser.size();
         let mut averages = self.optimiser.averages_mut();
         let layout: Vec<_> = averages.iter().map(|(name, _)| ((*name).to_owned(), vec![size])).collect();
         check_arrays(arrays, &layout)?;
@@ -249,10 +252,9 @@ mod tests {
         for (largest, scale) in [(0.5, 0.1), (5.0, 1.0), (10.0, 1.0)] {
             let step = |largest, gradient: [f32; 3]| {
                 // With α 0 and a large ε a step is the gradient over 1000, but for ε's share.
-                let mut descent = Descent::new(Optimiser::rms_prop(0.0, 1e6, 3), largest, 3);
-                descent.gradient_mut().copy_from_slice(&gradient);
+                let mut descent = Descent::new(Optimiser::rms_prop(0.0, 1e6, 3), largest);
                 let mut weights = WEIGHTS;
-                (descent.step(1.0, &mut weights, 1.0).expect("a step"), weights)
+                (descent.step(1.0, &gradient, &mut weights, 1.0).expect("a step"), weights)
             };
             let (norm, weights) = step(largest, gradient);
             assert_eq!(norm, 5.0);
@@ -263,10 +265,10 @@ mod tests {
     #[test]
     fn what_is_not_finite_changes_nothing() {
         for (loss, entry) in [(f64::NAN, 1.0), (1.0, f32::INFINITY), (1.0, f32::NAN)] {
-            let mut descent = Descent::new(Optimiser::adam(1e-5, 3), 0.5, 3);
-            descent.gradient_mut()[1] = entry;
+            let mut descent = Descent::new(Optimiser::adam(1e-5, 3), 0.5);
             let (before, mut weights) = (descent.state(), WEIGHTS);
-            assert!(matches!(descent.step(loss, &mut weights, 1.0), Err(Error::NotFinite { update: 0, .. })));
+            let step = descent.step(loss, &[0.0, entry, 0.0], &mut weights, 1.0);
+            assert!(matches!(step, Err(Error::NotFinite { update: 0, .. })));
             assert_eq!((weights, descent.state(), descent.n_updates()), (WEIGHTS, before, 0));
         }
     }

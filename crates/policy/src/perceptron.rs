@@ -2,7 +2,8 @@
 
 use pulp::Simd;
 
-use crate::kernel::{Kernel, LANES, Lane, Matrix, Rows, add_outer, add_rows, lanes};
+use crate::kernel::{Kernel, LANES, Lane, Rows, lanes};
+use crate::product::{Factor, Matrix, outer, sum_rows};
 
 /// A linear layer.
 #[derive(Clone, Debug)]
@@ -38,7 +39,7 @@ impl Layer {
     /// bias + Σ_i input_i weight_i of the first `n` rows, added up in order of i.
     #[inline(always)]
     pub(crate) fn apply<S: Simd>(&self, simd: S, from: &Rows, n: usize, to: &mut Rows) {
-        self.matrix.apply(simd, from, n, Some(&self.biases), to);
+        self.matrix.factor().apply(simd, from, n, Some(&self.biases), to);
     }
 }
 
@@ -104,127 +105,78 @@ impl Kernel for Forward<'_> {
     }
 }
 
-/// The derivatives of a sum over samples by a perceptron's weights. Its last layer must be without tanh.
+/// The way back through a perceptron whose last layer is without tanh.
 #[derive(Clone, Debug)]
-pub(crate) struct Derivatives {
-    layers: Vec<LayerDerivatives>,
+pub(crate) struct Backward {
+    /// P: the number of its weights and biases.
+    n_weights: usize,
+    layers: Vec<LayerBackward>,
 }
 
 #[derive(Clone, Debug)]
-struct LayerDerivatives {
+struct LayerBackward {
     inputs: usize,
     outputs: usize,
-    /// [lanes of inputs, outputs].
-    weights: Vec<Lane>,
-    /// [lanes of outputs].
-    biases: Vec<Lane>,
-    /// By this layer's outputs before their tanh, of a batch.
+    /// Derivatives by this layer's outputs before their tanh, of a batch.
     deltas: Rows,
 }
 
-impl Derivatives {
-    /// 0, for the weights of `perceptron`, with room for batches of `n`.
+impl Backward {
+    /// Through `perceptron`, with room for batches of `n`.
     pub(crate) fn new(perceptron: &Perceptron, n: usize) -> Self {
-        let of = |layer: &Layer| LayerDerivatives {
+        let of = |layer: &Layer| LayerBackward {
             inputs: layer.inputs,
             outputs: layer.outputs,
-            weights: vec![[0.0; LANES]; lanes(layer.inputs) * layer.outputs],
-            biases: vec![[0.0; LANES]; lanes(layer.outputs)],
             deltas: Rows::new(n, layer.outputs),
         };
-        Derivatives { layers: perceptron.layers.iter().map(of).collect() }
+        let layers: Vec<_> = perceptron.layers.iter().map(of).collect();
+        Backward { n_weights: layers.iter().map(LayerBackward::n_weights).sum(), layers }
     }
 
-    /// Starts a sum.
-    pub(crate) fn clear(&mut self) {
-        for layer in &mut self.layers {
-            layer.weights.fill([0.0; LANES]);
-            layer.biases.fill([0.0; LANES]);
-        }
+    /// P.
+    pub(crate) fn n_weights(&self) -> usize {
+        self.n_weights
     }
 
-    /// By the perceptron's outputs: to be filled before [`Derivatives::add`].
+    /// By the perceptron's outputs: to be filled before [`Backward::sum`].
     pub(crate) fn by_outputs(&mut self) -> &mut Rows {
         let last = self.layers.len() - 1;
         &mut self.layers[last].deltas
     }
 
-    /// Adds those of the first `n` rows: `outputs` are what [`Perceptron::forward`] computed of `inputs`.
+    /// Puts the derivatives of a sum over the first `n` rows by `weights` `[P]` in `sums` `[P]`, or with `ADD` adds them:
+    /// `outputs` are what [`Perceptron::forward`] computed of `inputs`.
     #[inline(always)]
-    pub(crate) fn add<S: Simd>(&mut self, simd: S, transposed: &Transposed, inputs: &Rows, outputs: &[Rows], n: usize) {
+    pub(crate) fn sum<S: Simd, const ADD: bool>(
+        &mut self,
+        simd: S,
+        mut weights: &[f32],
+        mut sums: &mut [f32],
+        inputs: &Rows,
+        outputs: &[Rows],
+        n: usize,
+    ) {
         for i in (0..self.layers.len()).rev() {
             let (below, own) = self.layers.split_at_mut(i);
-            let own = &mut own[0];
+            let LayerBackward { inputs: size, deltas, .. } = &own[0];
+            let first = sums.len() - own[0].n_weights();
+            let (rest, sums_here) = sums.split_at_mut(first);
+            let (by_weights, by_biases) = sums_here.split_at_mut(size * own[0].outputs);
             let inputs = if i == 0 { inputs } else { &outputs[i - 1] };
-            add_outer(simd, &mut own.weights, &own.deltas, own.outputs, inputs, n);
-            add_rows(&mut own.biases, &own.deltas, n);
+            outer::<S, ADD>(simd, by_weights, *size, deltas, inputs, n);
+            sum_rows::<ADD>(by_biases, deltas, n);
             if let Some(below) = below.last_mut() {
-                transposed.0[i - 1].apply(simd, &own.deltas, n, None, &mut below.deltas);
+                let matrix = &weights[first..][..by_weights.len()];
+                Factor::rows(matrix, *size).apply(simd, deltas, n, None, &mut below.deltas);
                 below.deltas.differentiate_tanh(inputs, n);
             }
-        }
-    }
-
-    /// Puts them, or adds them, to the front of `gradient`, in the order of the weights; it moves on.
-    #[inline(always)]
-    fn give<const ADD: bool>(&self, gradient: &mut &mut [f32]) {
-        for layer in &self.layers {
-            let (weights, rest) = std::mem::take(gradient).split_at_mut(layer.outputs * layer.inputs);
-            let (biases, rest) = rest.split_at_mut(layer.outputs);
-            *gradient = rest;
-            for (column, block) in layer.weights.chunks_exact(layer.outputs).enumerate() {
-                for (row, lane) in weights.chunks_exact_mut(layer.inputs).zip(block) {
-                    match row[column * LANES..].first_chunk_mut::<LANES>() {
-                        Some(whole) => give::<ADD>(whole, lane),
-                        None => give::<ADD>(&mut row[column * LANES..], lane),
-                    }
-                }
-            }
-            give::<ADD>(biases, layer.biases.as_flattened());
+            (weights, sums) = (&weights[..first], rest);
         }
     }
 }
 
-/// Replaces `to` by the first numbers of `from`, or adds those.
-#[inline(always)]
-fn give<const ADD: bool>(to: &mut [f32], from: &[f32]) {
-    for (to, from) in to.iter_mut().zip(from) {
-        *to = if ADD { *to + from } else { *from };
-    }
-}
-
-/// Adds derivatives to a gradient, or begins it with them.
-pub(crate) struct Give<'a, 'b> {
-    pub(crate) derivatives: &'a Derivatives,
-    pub(crate) gradient: &'a mut &'b mut [f32],
-    pub(crate) add: bool,
-}
-
-impl Kernel for Give<'_, '_> {
-    #[inline(always)]
-    fn run<S: Simd>(self, _: S) {
-        let Give { derivatives, gradient, add } = self;
-        if add { derivatives.give::<true>(gradient) } else { derivatives.give::<false>(gradient) }
-    }
-}
-
-/// The weights of a perceptron's layers but the first, from outputs to inputs.
-#[derive(Clone, Debug)]
-pub(crate) struct Transposed(Vec<Matrix>);
-
-impl Transposed {
-    pub(crate) fn new(perceptron: &Perceptron) -> Self {
-        Transposed(perceptron.layers.iter().skip(1).map(|layer| Matrix::new(layer.outputs, layer.inputs)).collect())
-    }
-
-    /// Takes over what [`Perceptron::load`] does.
-    pub(crate) fn load(&mut self, perceptron: &Perceptron, mut numbers: &[f32]) {
-        for (i, layer) in perceptron.layers.iter().enumerate() {
-            let weights = take(&mut numbers, layer.outputs * layer.inputs);
-            take(&mut numbers, layer.outputs);
-            if i > 0 {
-                self.0[i - 1].load_transposed(weights);
-            }
-        }
+impl LayerBackward {
+    fn n_weights(&self) -> usize {
+        self.outputs * (self.inputs + 1)
     }
 }

@@ -3,6 +3,7 @@
 use rand_chacha::ChaCha8Rng;
 
 use crate::act::{Actor, Acts, Streams};
+use crate::differentiator::Differentiator;
 use crate::error::{Result, check_length};
 use crate::inputs::Inputs;
 use crate::normalisers::{Normalisers, Statistics};
@@ -237,6 +238,12 @@ impl Player {
     /// [`Error::Length`](crate::Error::Length).
     pub fn load(&mut self, weights: &[f32]) -> Result<()> {
         self.actor.load_flat(weights)
+    }
+
+    /// Gives the networks with which it acts to who differentiates them, see [`Differentiator::load_from`]; weights are to
+    /// be loaded before it plays on.
+    pub fn give_networks(&mut self, to: &mut Differentiator) {
+        to.load_from(&mut self.actor);
     }
 
     /// A trial begins in every environment with `observations` `[N, O]`; running statistics take in those of the

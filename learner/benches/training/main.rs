@@ -4,7 +4,7 @@
 //!   socket, with actions chosen at the server and at the client; and with the server behind a line that takes 5 ms each
 //!   way.
 //! - `together`: 36 A2C FF CartPoles with the paper's one environment of 5 steps, and 9 PPO FF ones with one of 128, in two
-//!   groups of this process that share a private server, as `perturb run --jobs 2` has them.
+//!   groups of this process with a private server each, as `perturb run --jobs 2` has them.
 //!
 //! An argument that is part of a measurement's name restricts what is measured.
 
@@ -45,7 +45,7 @@ fn main() -> Result<()> {
     let ppo = "algorithm = 'ppo'\nnum_envs = 1\nn_steps = 128\nn_minibatches = 4";
     for (name, settings, cells) in [("together/a2c_ff/36", a2c, 36), ("together/ppo_ff/9", ppo, 9)] {
         if is_wanted(name) {
-            together(name, &address, settings, cells)?;
+            together(name, settings, cells)?;
         }
     }
     Ok(())
@@ -85,11 +85,13 @@ fn alone(name: &str, servers: &Servers) -> Result<()> {
     Ok(())
 }
 
-/// Steps of all cells between two moments, over the time between.
-fn together(name: &str, address: &Address, settings: &str, cells: usize) -> Result<()> {
+/// Steps of all cells between two moments, over the time between. Each group has a server, as in `perturb run`.
+fn together(name: &str, settings: &str, cells: usize) -> Result<()> {
     let (stop, start) = (StopFlag::default(), Instant::now());
     let group = |group: usize| {
-        group_of(address, settings, (group * cells / GROUPS)..((group + 1) * cells / GROUPS), &stop, start)
+        let server = PrivateServer::start(Some(1))?;
+        let seeds = (group * cells / GROUPS)..((group + 1) * cells / GROUPS);
+        group_of(server.address(), settings, seeds, &stop, start)
     };
     let rates: Vec<f64> = std::thread::scope(|scope| {
         let group = &group;

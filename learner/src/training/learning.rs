@@ -229,10 +229,19 @@ impl<'a> Learning<'a> {
         Ok(self.policy.room()?)
     }
 
-    /// Learns from the rollout, which took so long to collect, and notes what came of it.
-    pub(super) fn learn(&mut self, acting: Duration, waiting: Duration) -> Result<Progress> {
+    /// Learns from the rollout, which took so long to collect, and notes what came of it. A `player` that collected it here
+    /// must load weights before it plays on.
+    pub(super) fn learn(
+        &mut self,
+        player: Option<&mut Player>,
+        acting: Duration,
+        waiting: Duration,
+    ) -> Result<Progress> {
         let (ended, steps) = self.note_rollout()?;
         let updating = Instant::now();
+        if let Some(player) = player {
+            self.policy.take_networks(player);
+        }
         let remaining = self.progress_remaining();
         let update = self.algorithm.update(&mut self.policy, &self.rollout, remaining)?;
         let elapsed = updating.elapsed();
@@ -255,9 +264,15 @@ impl<'a> Learning<'a> {
     }
 
     /// The same in a room that others use by turns.
-    pub(super) fn learn_in(&mut self, room: &mut Room, acting: Duration, waiting: Duration) -> Result<Progress> {
+    pub(super) fn learn_in(
+        &mut self,
+        room: &mut Room,
+        player: Option<&mut Player>,
+        acting: Duration,
+        waiting: Duration,
+    ) -> Result<Progress> {
         self.policy.change_room(room);
-        let progress = self.learn(acting, waiting);
+        let progress = self.learn(player, acting, waiting);
         self.policy.change_room(room);
         progress
     }

@@ -178,9 +178,10 @@ impl<'a> Seat<'a> {
     fn learn(&mut self, room: Option<&mut Room>, now: Times) -> Result<()> {
         self.collecting = false;
         let (acting, waiting) = (now.acting - self.begun.acting, now.waiting - self.begun.waiting);
+        let player = Some(self.collector.player_mut());
         self.learned = Some(match room {
-            Some(room) => self.learning.learn_in(room, acting, waiting)?,
-            None => self.learning.learn(acting, waiting)?,
+            Some(room) => self.learning.learn_in(room, player, acting, waiting)?,
+            None => self.learning.learn(player, acting, waiting)?,
         });
         Ok(())
     }

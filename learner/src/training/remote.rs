@@ -104,8 +104,8 @@ impl<'a> Remote<'a> {
         }
         let waiting = together.waited - *waited;
         let progress = keep_alive(together.servers, learning.last_update(), || match &mut together.room {
-            Some(room) => learning.learn_in(room, Duration::ZERO, waiting),
-            None => learning.learn(Duration::ZERO, waiting),
+            Some(room) => learning.learn_in(room, None, Duration::ZERO, waiting),
+            None => learning.learn(None, Duration::ZERO, waiting),
         })?;
         report(*index, &progress);
         let turn = learning.turn(progress, together.stop)?;

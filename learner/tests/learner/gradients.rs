@@ -204,7 +204,9 @@ fn gradients_agree_with_libtorch(
     let mut network = Differentiator::new(&spec, 2).expect("threads");
     network.load(policy.flat_weights()).expect("weights that fit");
     let mut gradient = vec![f32::NAN; spec.n_weights()];
-    let losses = network.gradient(&data.samples(), &indices, &objective, &mut gradient).expect("a gradient");
+    let losses = network
+        .gradient(policy.flat_weights(), &data.samples(), &indices, &objective, &mut gradient)
+        .expect("a gradient");
     let (expected, reference) = data.torch(&torch(&spec, policy.flat_weights()), &indices, &objective);
     assert_arrays_close(&spec, &gradient, &reference);
     let pairs = [
@@ -240,18 +242,17 @@ fn ten_updates_agree_with_libtorch(
     let mut rng = stream(12, Purpose::Minibatches);
     let minibatches: Vec<Vec<u32>> =
         (0..10).map(|_| (0..64).map(|_| (128.0 * uniform(&mut rng)) as u32).collect()).collect();
-    let descent = || Descent::new(optimiser.clone(), 0.5, spec.n_weights());
+    let descent = || Descent::new(optimiser.clone(), 0.5);
     let (mut own, mut own_descent, mut network) =
         (begin.clone(), descent(), Differentiator::new(&spec, 2).expect("threads"));
     let (mut reference, mut reference_descent) = (begin.clone(), descent());
+    let mut gradient = begin.clone();
     for indices in &minibatches {
         network.load(&own).expect("weights that fit");
-        let gradient = own_descent.gradient_mut();
-        let losses = network.gradient(&data.samples(), indices, &objective, gradient).expect("a gradient");
-        own_descent.step(losses.total, &mut own, learning_rate).expect("a step");
+        let losses = network.gradient(&own, &data.samples(), indices, &objective, &mut gradient).expect("a gradient");
+        own_descent.step(losses.total, &gradient, &mut own, learning_rate).expect("a step");
         let (losses, gradient) = data.torch(&torch(&spec, &reference), indices, &objective);
-        reference_descent.gradient_mut().copy_from_slice(&gradient);
-        reference_descent.step(losses.total, &mut reference, learning_rate).expect("a step");
+        reference_descent.step(losses.total, &gradient, &mut reference, learning_rate).expect("a step");
     }
     assert_arrays_close(&spec, &own, &reference);
     let moved = own.iter().zip(&begin).filter(|(new, old)| new != old).count();

@@ -30,6 +30,8 @@ struct Worker {
     cells: BTreeMap<String, usize>,
     /// Those whose turn has come.
     begun: HashSet<usize>,
+    /// The lowest number that no other worker has: with as many servers as workers each has one for itself.
+    seat: usize,
     child: Child,
     events: File,
     /// Up to where they were read.
@@ -72,12 +74,14 @@ impl<'a> Local<'a> {
             Ok((child, events))
         };
         let (mut child, events) = start().map_err(io("start a worker process of", &program))?;
-        let order = Order { cells, turn: self.first_turn().wrapping_add(first.group + first.lost_servers) };
+        let is_free = |seat: &usize| self.workers.iter().all(|worker| worker.seat != *seat);
+        let seat = (0..self.workers.len()).find(is_free).unwrap_or(self.workers.len());
+        let order = Order { cells, turn: self.first_turn().wrapping_add(seat + first.lost_servers) };
         if let Some(input) = &mut child.stdin {
             write_line(input, &order);
         }
         let cells = group.iter().map(|offer| (self.id(offer.cell).to_owned(), offer.cell)).collect();
-        Ok(Some(Worker { cells, begun: HashSet::new(), child, events, offset: 0, log: path, log_start }))
+        Ok(Some(Worker { cells, begun: HashSet::new(), seat, child, events, offset: 0, log: path, log_start }))
     }
 
     /// The log of a group, which is that of its first cell; the others' say so.
@@ -258,15 +262,27 @@ mod tests {
 
     #[test]
     fn a_worker_reads_its_order_and_its_lines_are_heard() {
+        for at_a_time in [1, 2] {
+            orders_are_read(at_a_time);
+        }
+    }
+
+    fn orders_are_read(at_a_time: usize) {
         let (_directory, folder, ids) = place();
         let script = "say '\"server\",\"address\":\"unix:/x\"'; echo x >result.json; say '\"done\"'";
-        let ran = run_script(&folder, script, &StopFlag::default(), &|| None);
+        let grouping = Grouping { most: 1, at_a_time };
+        let ran = run_grouped(grouping, &folder, script, &StopFlag::default(), &|| None);
         assert_eq!(ran.end.unwrap(), RunEnd::Finished { failed: Vec::new() });
-        for (turn, id) in ids.iter().enumerate() {
+        for (number, id) in ids.iter().enumerate() {
             let orders = std::fs::read_to_string(folder.cell(id).path().join("orders")).unwrap();
             let order: Order = serde_json::from_str(&orders).unwrap();
             assert_eq!(order.cells, [OrderedCell { cell: id.clone(), retry: None }]);
-            assert_eq!(order.turn, crc32c::crc32c(ids[0].as_bytes()) as usize + turn, "they go around the servers");
+            let seat = number % at_a_time;
+            assert_eq!(
+                order.turn,
+                crc32c::crc32c(ids[0].as_bytes()) as usize + seat,
+                "a server of those that there are"
+            );
             let events: Vec<String> = ran.lines.iter().filter(|line| line.cell == *id).map(said).collect();
             assert_eq!(events, [r#"{"event":"server","address":"unix:/x"}"#, r#"{"event":"done"}"#]);
         }

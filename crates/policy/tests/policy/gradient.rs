@@ -4,7 +4,7 @@ use std::f64::consts::TAU;
 
 use perturb_policy::random::{Purpose, normal, stream};
 use perturb_policy::{
-    Acting, ActionKind, Differentiator, Error, Objective, PolicySpec, Samples, Surrogate, initial_weights,
+    Acting, ActionKind, Actor, Differentiator, Error, Objective, PolicySpec, Samples, Surrogate, initial_weights,
 };
 use rstest::rstest;
 
@@ -47,7 +47,7 @@ fn gradient(action: ActionKind, n: usize, threads: usize) -> Vec<f32> {
     network.load(&weights).expect("weights that fit");
     let mut gradient = vec![f32::NAN; spec.n_weights()];
     let indices: Vec<u32> = (0..n as u32).collect();
-    network.gradient(&samples, &indices, &OBJECTIVE, &mut gradient).expect("a gradient");
+    network.gradient(&weights, &samples, &indices, &OBJECTIVE, &mut gradient).expect("a gradient");
     gradient
 }
 
@@ -62,6 +62,42 @@ fn the_number_of_threads_changes_no_byte(
         let bits = |gradient: &[f32]| gradient.iter().map(|g| g.to_bits()).collect::<Vec<_>>();
         assert_eq!(bits(&one), bits(&gradient(action, n, threads)), "{threads} threads");
     }
+}
+
+#[rstest]
+fn an_actors_networks_give_the_same_gradient(
+    #[values(ActionKind::Discrete { n: 2 }, ActionKind::Continuous { size: 3 })] action: ActionKind,
+) {
+    let spec = PolicySpec::feed_forward(O, action);
+    let weights: Vec<f32> = numbers(spec.n_weights(), 1).iter().map(|x| 0.1 * x).collect();
+    let samples = Samples {
+        observations: &numbers(O, 3),
+        actions: &vec![1.0; action.width()],
+        old_log_probs: &[-1.0],
+        old_values: &[0.5],
+        advantages: &[2.0],
+        returns: &[1.0],
+        acting: None,
+    };
+    let objective = Objective { normalize_advantages: false, ..OBJECTIVE };
+    let gradient = |network: &mut Differentiator| {
+        let mut gradient = vec![f32::NAN; spec.n_weights()];
+        network.gradient(&weights, &samples, &[0], &objective, &mut gradient).expect("a gradient");
+        gradient
+    };
+    let mut loaded = Differentiator::new(&spec, 1).expect("threads");
+    loaded.load(&weights).expect("weights that fit");
+    let mut actor = Actor::new(&spec, 1);
+    actor.load_flat(&weights).expect("weights that fit");
+    let mut taken = Differentiator::new(&spec, 1).expect("threads");
+    taken.load_from(&mut actor);
+    let expected = gradient(&mut loaded);
+    assert!(expected.iter().filter(|&&g| g != 0.0).count() > expected.len() / 2);
+    assert_eq!(gradient(&mut taken), expected);
+    // The actor acts again once it has weights.
+    actor.load_flat(&weights).expect("weights that fit");
+    taken.load_from(&mut actor);
+    assert_eq!(gradient(&mut taken), expected);
 }
 
 /// A perceptron in f64, whose weights are taken from the front of `weights`.
@@ -181,7 +217,7 @@ fn gradients_are_finite_differences(
     network.load(&weights).expect("weights that fit");
     let mut gradient = vec![f32::NAN; weights.len()];
     let indices: Vec<u32> = (0..n as u32).rev().collect();
-    let losses = network.gradient(&samples, &indices, &objective, &mut gradient).expect("a gradient");
+    let losses = network.gradient(&weights, &samples, &indices, &objective, &mut gradient).expect("a gradient");
     let exact: Vec<f64> = weights.iter().map(|&w| f64::from(w)).collect();
     let expected = total(&spec, &exact, &samples, &objective);
     assert!((losses.total - expected).abs() < 1e-5 * expected.abs().max(1.0), "{} {expected}", losses.total);
@@ -214,7 +250,8 @@ fn lengths_that_do_not_fit_are_refused() {
         returns: &[0.0; 2],
         acting: None,
     };
-    let mut gradient = vec![0.0; spec.n_weights()];
+    let weights = vec![0.0; spec.n_weights()];
+    let mut gradient = weights.clone();
     let wrong = [
         Samples { observations: &[0.0; O], ..samples },
         Samples { actions: &[0.0; 3], ..samples },
@@ -223,10 +260,10 @@ fn lengths_that_do_not_fit_are_refused() {
         Samples { advantages: &[0.0; 1], ..samples },
     ];
     for samples in wrong {
-        let result = network.gradient(&samples, &[0], &OBJECTIVE, &mut gradient);
+        let result = network.gradient(&weights, &samples, &[0], &OBJECTIVE, &mut gradient);
         assert!(matches!(result, Err(Error::Length { .. })), "{result:?}");
     }
-    assert_eq!(network.gradient(&samples, &[], &OBJECTIVE, &mut gradient), Err(Error::NoSamples));
-    let result = network.gradient(&samples, &[0], &OBJECTIVE, &mut [0.0; 3]);
+    assert_eq!(network.gradient(&weights, &samples, &[], &OBJECTIVE, &mut gradient), Err(Error::NoSamples));
+    let result = network.gradient(&weights, &samples, &[0], &OBJECTIVE, &mut [0.0; 3]);
     assert!(matches!(result, Err(Error::Length { name: "gradient [P]", got: 3, .. })), "{result:?}");
 }

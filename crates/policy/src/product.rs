@@ -1,0 +1,436 @@
+//! Products of small matrices, as loops that the compiler turns into vector instructions.
+//!
+//! Every number is one sum in one order, whatever the width of the vectors and the other rows of a batch: vectors run
+//! over numbers that do not wait for each other. Multiplications and additions stay apart, for a fused one rounds
+//! differently, and not every processor has it. So the bytes are the same on all.
+//!
+//! Loops count where an iterator would read better: iterators and `from_fn` over arrays were not compiled into the kernels,
+//! and their calls took a third of a small gradient.
+#![allow(clippy::needless_range_loop)]
+
+use pulp::Simd;
+
+use crate::kernel::{LANES, Lane, Rows, lanes};
+
+/// A sum's start where there is none.
+const ZERO: Lane = [0.0; LANES];
+
+/// A matrix in the order in which a product reads it: for each lane of outputs, for each input, that input's weights.
+#[derive(Clone, Debug)]
+pub(crate) struct Matrix {
+    inputs: usize,
+    /// [lanes of outputs, inputs].
+    data: Vec<Lane>,
+}
+
+impl Matrix {
+    pub(crate) fn new(inputs: usize, outputs: usize) -> Self {
+        Matrix { inputs, data: vec![[0.0; LANES]; lanes(outputs) * inputs] }
+    }
+
+    /// Takes over the weights of the inputs from `first` on: `matrix` [outputs, their number].
+    pub(crate) fn load(&mut self, first: usize, matrix: &[f32], outputs: usize) {
+        let inputs = matrix.len() / outputs;
+        for (block, lanes) in matrix.chunks(LANES * inputs).zip(self.data.chunks_exact_mut(self.inputs)) {
+            let lanes = &mut lanes[first..][..inputs];
+            let done = if block.len() == LANES * inputs { transpose(block, lanes) } else { 0 };
+            for (o, row) in block.chunks_exact(inputs).enumerate() {
+                lanes[done..].iter_mut().zip(&row[done..]).for_each(|(lane, weight)| lane[o] = *weight);
+            }
+        }
+    }
+
+    /// What a product with it reads.
+    #[inline(always)]
+    pub(crate) fn factor(&self) -> Factor<'_> {
+        let outputs = self.data.len() / self.inputs * LANES;
+        let numbers = self.data.as_flattened();
+        Factor { numbers, inputs: self.inputs, outputs, per_column: self.inputs * LANES, per_input: LANES }
+    }
+}
+
+/// The right side of a product, wherever its numbers lie.
+#[derive(Clone, Copy)]
+pub(crate) struct Factor<'a> {
+    numbers: &'a [f32],
+    inputs: usize,
+    outputs: usize,
+    /// Numbers from a lane of outputs to the next, …
+    per_column: usize,
+    /// … and from an input to the next.
+    per_input: usize,
+}
+
+impl<'a> Factor<'a> {
+    /// The rows of `matrix` [inputs, `outputs`] as they are.
+    #[inline(always)]
+    pub(crate) fn rows(matrix: &'a [f32], outputs: usize) -> Self {
+        Factor { numbers: matrix, inputs: matrix.len() / outputs, outputs, per_column: LANES, per_input: outputs }
+    }
+
+    /// The first `n` rows of `from` times this: to_b = start + Σ_i from_bi weights_i, added up in order of i. `start` has one
+    /// lane for each of outputs.
+    #[inline(always)]
+    pub(crate) fn apply<S: Simd>(self, simd: S, from: &Rows, n: usize, start: Option<&[Lane]>, to: &mut Rows) {
+        let whole = self.outputs / LANES;
+        let few = if n % 8 < 4 { n % 8 } else { 0 };
+        for column in 0..whole {
+            self.columns::<S, true>(simd, from, n - few, start, to, column);
+        }
+        let mut column = 0;
+        while column < whole && few > 0 {
+            let step = if column + 4 <= whole { 4 } else { 1 };
+            for row in n - few..n {
+                if step == 4 {
+                    self.row_product::<S, 4, true>(simd, from, row, start, to, column);
+                } else {
+                    self.row_product::<S, 1, true>(simd, from, row, start, to, column);
+                }
+            }
+            column += step;
+        }
+        if whole * LANES < self.outputs {
+            self.columns::<S, false>(simd, from, n - few, start, to, whole);
+            for row in n - few..n {
+                self.row_product::<S, 1, false>(simd, from, row, start, to, whole);
+            }
+        }
+    }
+
+    /// A lane of outputs of `n` rows, eight and at last four to seven of them at once. `WHOLE`: the lane is.
+    #[inline(always)]
+    fn columns<S: Simd, const WHOLE: bool>(
+        self,
+        simd: S,
+        from: &Rows,
+        n: usize,
+        start: Option<&[Lane]>,
+        to: &mut Rows,
+        column: usize,
+    ) {
+        let mut row = 0;
+        while row + 8 <= n {
+            self.product::<S, 8, WHOLE>(simd, from, row, start, to, column);
+            row += 8;
+        }
+        match n - row {
+            4 => self.product::<S, 4, WHOLE>(simd, from, row, start, to, column),
+            5 => self.product::<S, 5, WHOLE>(simd, from, row, start, to, column),
+            6 => self.product::<S, 6, WHOLE>(simd, from, row, start, to, column),
+            7 => self.product::<S, 7, WHOLE>(simd, from, row, start, to, column),
+            _ => {}
+        }
+    }
+
+    /// Vector number `vector` of a lane of outputs at `weights`, those of one input on.
+    #[inline(always)]
+    fn vector<S: Simd, const WHOLE: bool>(self, weights: &[f32], vector: usize) -> S::f32s {
+        if WHOLE {
+            return S::as_simd_f32s(&weights[vector * S::F32_LANES..][..S::F32_LANES]).0[0];
+        }
+        let mut lane = ZERO;
+        let left = self.outputs % LANES;
+        lane[..left].copy_from_slice(&weights[..left]);
+        S::as_simd_f32s(&lane).0[vector]
+    }
+
+    /// `R` rows at once: each vector of weights is loaded once for all.
+    #[inline(always)]
+    fn product<S: Simd, const R: usize, const WHOLE: bool>(
+        self,
+        simd: S,
+        from: &Rows,
+        row: usize,
+        start: Option<&[Lane]>,
+        to: &mut Rows,
+        column: usize,
+    ) {
+        let width = from.width * LANES;
+        let inputs = &from.data.as_flattened()[row * width..][..R * width];
+        let weights = &self.numbers[column * self.per_column..];
+        let (start, _) = S::as_simd_f32s(start.map_or(&ZERO, |start| &start[column]));
+        for vector in 0..start.len() {
+            let mut sums = [start[vector]; R];
+            for (i, weights) in weights.chunks(self.per_input).take(self.inputs).enumerate() {
+                let weights = self.vector::<S, WHOLE>(weights, vector);
+                for r in 0..R {
+                    sums[r] = simd.add_f32s(sums[r], simd.mul_f32s(simd.splat_f32s(inputs[r * width + i]), weights));
+                }
+            }
+            for r in 0..R {
+                S::as_mut_simd_f32s(&mut to.data[(row + r) * to.width + column]).0[vector] = sums[r];
+            }
+        }
+    }
+
+    /// One row, `C` columns at once: sums that do not wait for each other.
+    #[inline(always)]
+    fn row_product<S: Simd, const C: usize, const WHOLE: bool>(
+        self,
+        simd: S,
+        from: &Rows,
+        row: usize,
+        start: Option<&[Lane]>,
+        to: &mut Rows,
+        column: usize,
+    ) {
+        let inputs = &from.row(row)[..self.inputs];
+        let weights = &self.numbers[column * self.per_column..];
+        for vector in 0..LANES / S::F32_LANES {
+            let mut sums = [simd.splat_f32s(0.0); C];
+            if let Some(start) = start {
+                for c in 0..C {
+                    sums[c] = S::as_simd_f32s(&start[column + c]).0[vector];
+                }
+            }
+            for (i, input) in inputs.iter().enumerate() {
+                let input = simd.splat_f32s(*input);
+                for c in 0..C {
+                    let weights = &weights[c * self.per_column + i * self.per_input..];
+                    let weights = self.vector::<S, WHOLE>(weights, vector);
+                    sums[c] = simd.add_f32s(sums[c], simd.mul_f32s(input, weights));
+                }
+            }
+            for c in 0..C {
+                S::as_mut_simd_f32s(&mut to.data[row * to.width + column + c]).0[vector] = sums[c];
+            }
+        }
+    }
+}
+
+/// Transposes `block` [[`LANES`], columns], four columns at a time; says how many of them could be.
+fn transpose(block: &[f32], columns: &mut [Lane]) -> usize {
+    let width = columns.len();
+    let (columns, _) = columns.as_chunks_mut::<4>();
+    for k in 0..LANES / 4 {
+        let row = |r: usize| block[(4 * k + r) * width..][..width].as_chunks::<4>().0;
+        let rows = row(0).iter().zip(row(1)).zip(row(2)).zip(row(3));
+        for ((((a, b), c), d), columns) in rows.zip(&mut *columns) {
+            for (column, numbers) in columns.iter_mut().zip(transpose_tile([*a, *b, *c, *d])) {
+                column.as_chunks_mut::<4>().0[k] = numbers;
+            }
+        }
+    }
+    4 * columns.len()
+}
+
+/// With the instructions that are made for it, which the compiler does not find by itself.
+#[inline(always)]
+fn transpose_tile(rows: [[f32; 4]; 4]) -> [[f32; 4]; 4] {
+    #[cfg(target_arch = "x86_64")]
+    if let Some(sse) = pulp::core_arch::x86::Sse::try_new() {
+        let [a, b, c, d] = rows.map(pulp::cast::<_, std::arch::x86_64::__m128>);
+        let (low, high) = (sse._mm_unpacklo_ps(a, b), sse._mm_unpackhi_ps(a, b));
+        let (low_2, high_2) = (sse._mm_unpacklo_ps(c, d), sse._mm_unpackhi_ps(c, d));
+        return [
+            pulp::cast(sse._mm_movelh_ps(low, low_2)),
+            pulp::cast(sse._mm_movehl_ps(low_2, low)),
+            pulp::cast(sse._mm_movelh_ps(high, high_2)),
+            pulp::cast(sse._mm_movehl_ps(high_2, high)),
+        ];
+    }
+    std::array::from_fn(|column| rows.map(|row| row[column]))
+}
+
+/// Puts Σ_b deltas_bo inputs_bi, over the first `n` rows in order of b, in `sums` [outputs, `size`]; with `ADD` it goes on
+/// with the sums that are there.
+#[inline(always)]
+pub(crate) fn outer<S: Simd, const ADD: bool>(
+    simd: S,
+    sums: &mut [f32],
+    size: usize,
+    deltas: &Rows,
+    inputs: &Rows,
+    n: usize,
+) {
+    let (eights, rest) = (sums.len() / size / 8 * 8, sums.len() / size % 8);
+    for column in 0..size / LANES {
+        for first in (0..eights).step_by(8) {
+            outers::<S, 8, ADD, true>(simd, sums, size, (deltas, first), (inputs, column), n);
+        }
+        for first in eights..eights + rest {
+            outers::<S, 1, ADD, true>(simd, sums, size, (deltas, first), (inputs, column), n);
+        }
+    }
+    if !size.is_multiple_of(LANES) {
+        for first in (0..eights).step_by(8) {
+            outers::<S, 8, ADD, false>(simd, sums, size, (deltas, first), (inputs, size / LANES), n);
+        }
+        for first in eights..eights + rest {
+            outers::<S, 1, ADD, false>(simd, sums, size, (deltas, first), (inputs, size / LANES), n);
+        }
+    }
+}
+
+/// `R` outputs from `first` on, a lane of inputs. `WHOLE`: that lane is.
+#[inline(always)]
+fn outers<S: Simd, const R: usize, const ADD: bool, const WHOLE: bool>(
+    simd: S,
+    sums: &mut [f32],
+    size: usize,
+    (deltas, first): (&Rows, usize),
+    (inputs, column): (&Rows, usize),
+    n: usize,
+) {
+    let (inputs, width, stride) = (inputs.lanes(n), inputs.width, deltas.width * LANES);
+    let deltas = deltas.lanes(n).as_flattened();
+    let sums = &mut sums[first * size + column * LANES..];
+    let left = if WHOLE { LANES } else { size % LANES };
+    let mut lanes = [ZERO; R];
+    if ADD {
+        for r in 0..R {
+            lanes[r][..left].copy_from_slice(&sums[r * size..][..left]);
+        }
+    }
+    for vector in 0..LANES / S::F32_LANES {
+        let mut local = [simd.splat_f32s(0.0); R];
+        if ADD {
+            for r in 0..R {
+                local[r] = S::as_simd_f32s(&lanes[r]).0[vector];
+            }
+        }
+        for b in 0..n {
+            let inputs = S::as_simd_f32s(&inputs[b * width + column]).0[vector];
+            let deltas = &deltas[b * stride + first..][..R];
+            for r in 0..R {
+                local[r] = simd.add_f32s(local[r], simd.mul_f32s(simd.splat_f32s(deltas[r]), inputs));
+            }
+        }
+        for r in 0..R {
+            if WHOLE {
+                let sums = &mut sums[r * size + vector * S::F32_LANES..][..S::F32_LANES];
+                S::as_mut_simd_f32s(sums).0[0] = local[r];
+            } else {
+                S::as_mut_simd_f32s(&mut lanes[r]).0[vector] = local[r];
+            }
+        }
+    }
+    if !WHOLE {
+        for r in 0..R {
+            sums[r * size..][..left].copy_from_slice(&lanes[r][..left]);
+        }
+    }
+}
+
+/// Puts the sums of the first `n` rows, in their order, in `sums`; with `ADD` it goes on with what is there.
+#[inline(always)]
+pub(crate) fn sum_rows<const ADD: bool>(sums: &mut [f32], rows: &Rows, n: usize) {
+    if !ADD {
+        sums.fill(0.0);
+    }
+    for row in rows.lanes(n).chunks_exact(rows.width) {
+        for (sum, x) in sums.iter_mut().zip(row.as_flattened()) {
+            *sum += x;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernel::{Kernel, lanes, run};
+    use crate::math::tanh;
+    use crate::random::{Purpose, normal, stream};
+    use pulp::Scalar128b;
+
+    const INPUTS: usize = 37;
+    const OUTPUTS: usize = 85;
+
+    /// Products of `n` rows and back, and sums over the rows.
+    struct Products<'a> {
+        matrix: &'a Matrix,
+        /// `[OUTPUTS, INPUTS]`, the same.
+        flat: &'a [f32],
+        from: &'a Rows,
+        n: usize,
+        start: &'a [Lane],
+        to: &'a mut Rows,
+        back: &'a mut Rows,
+        outer: &'a mut [f32],
+        sum: &'a mut [f32],
+    }
+
+    impl Kernel for Products<'_> {
+        fn run<S: Simd>(self, simd: S) {
+            let Products { matrix, flat, from, n, start, to, back, outer: products, sum } = self;
+            matrix.factor().apply(simd, from, n, Some(start), to);
+            to.squash(n);
+            Factor::rows(flat, INPUTS).apply(simd, to, n, None, back);
+            outer::<S, false>(simd, products, INPUTS, to, from, n);
+            outer::<S, true>(simd, products, INPUTS, to, from, n);
+            sum_rows::<false>(sum, to, n);
+            sum_rows::<true>(sum, to, n);
+        }
+    }
+
+    fn numbers(n: usize, seed: u64) -> Vec<f32> {
+        let mut rng = stream(seed, Purpose::Weights);
+        (0..n).map(|_| normal(&mut rng) as f32).collect()
+    }
+
+    /// What `run` computes, as bits.
+    fn bits(n: usize, run: impl FnOnce(Products<'_>)) -> Vec<u32> {
+        let flat = numbers(INPUTS * OUTPUTS, 1);
+        let mut matrix = Matrix::new(INPUTS, OUTPUTS);
+        matrix.load(0, &flat, OUTPUTS);
+        let (mut from, mut to, mut back) = (Rows::new(n, INPUTS), Rows::new(n, OUTPUTS), Rows::new(n, INPUTS));
+        from.copy(&numbers(n * INPUTS, 2), INPUTS);
+        let mut start = [[0.0; LANES]; lanes(OUTPUTS)];
+        start.as_flattened_mut()[..OUTPUTS].copy_from_slice(&numbers(OUTPUTS, 3));
+        let (mut outer, mut sum) = (vec![f32::NAN; INPUTS * OUTPUTS], vec![f32::NAN; OUTPUTS]);
+        run(Products {
+            matrix: &matrix,
+            flat: &flat,
+            from: &from,
+            n,
+            start: &start,
+            to: &mut to,
+            back: &mut back,
+            outer: &mut outer,
+            sum: &mut sum,
+        });
+        let rows = |rows: &Rows, length| (0..n).flat_map(|b| rows.row(b)[..length].to_vec()).collect::<Vec<f32>>();
+        let all = [rows(&to, OUTPUTS), rows(&back, INPUTS), outer, sum];
+        all.concat().iter().map(|x| x.to_bits()).collect()
+    }
+
+    /// The same by the definitions, one number after the other.
+    fn naive(n: usize) -> Vec<u32> {
+        let (matrix, rows, start) = (numbers(INPUTS * OUTPUTS, 1), numbers(n * INPUTS, 2), numbers(OUTPUTS, 3));
+        let (mut to, mut back) = (vec![0.0; n * OUTPUTS], vec![0.0; n * INPUTS]);
+        let (mut outer, mut sum) = (vec![0.0; INPUTS * OUTPUTS], vec![0.0; OUTPUTS]);
+        for twice in [false, true] {
+            for (b, row) in rows.chunks_exact(INPUTS).enumerate() {
+                for o in 0..OUTPUTS {
+                    let dot = (0..INPUTS).fold(start[o], |sum, i| sum + row[i] * matrix[o * INPUTS + i]);
+                    let x = tanh(dot);
+                    to[b * OUTPUTS + o] = x;
+                    sum[o] += x;
+                    for i in 0..INPUTS {
+                        outer[o * INPUTS + i] += x * row[i];
+                        back[b * INPUTS + i] += if twice { 0.0 } else { x * matrix[o * INPUTS + i] };
+                    }
+                }
+            }
+        }
+        [to, back, outer, sum].concat().iter().map(|x: &f32| x.to_bits()).collect()
+    }
+
+    #[test]
+    fn every_vector_unit_computes_the_same_bytes() {
+        for n in [1, 3, 4, 5, 8, 13, 64] {
+            let expected = naive(n);
+            assert_eq!(bits(n, |products| run(products)), expected, "{n} rows, the widest");
+            assert_eq!(bits(n, |products| products.run(Scalar128b)), expected, "{n} rows, 128 bits");
+            #[cfg(target_arch = "x86_64")]
+            {
+                if let Some(simd) = pulp::x86::V3::try_new() {
+                    assert_eq!(bits(n, |products| products.run(simd)), expected, "{n} rows, AVX2");
+                }
+                if let Some(simd) = pulp::x86::V4::try_new() {
+                    assert_eq!(bits(n, |products| products.run(simd)), expected, "{n} rows, AVX-512");
+                }
+            }
+        }
+    }
+}
