@@ -22,7 +22,7 @@ use tokio::{sync::Notify, time::Instant};
 
 /// How often an idle worker offers its core before it sleeps. A sleeping worker costs the next request a wake-up, which
 /// is more than a step of many small environments.
-const YIELDS_BEFORE_SLEEP: usize = 200;
+const YIELDS_BEFORE_SLEEP: usize = 100;
 
 /// A job of at most so many µs is done by whoever asks. To have a worker do it takes longer, and no more than one would be
 /// set to it.
