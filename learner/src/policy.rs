@@ -110,8 +110,8 @@ impl Policy {
         }
     }
 
-    /// Exchanges the room for another one. Policies of one shape that learn by turns in the same room find it in the
-    /// processor's caches.
+    /// Exchanges the room for another one. Policies of one shape that learn by turns in the same room find its activations
+    /// and its gradient in the processor's caches.
     pub fn change_room(&mut self, other: &mut Room) {
         if let Calculus::FeedForward(networks, is_current) = &mut self.calculus {
             std::mem::swap(networks, &mut other.networks);
@@ -124,8 +124,7 @@ impl Policy {
     /// must load weights before it plays on.
     pub fn take_networks(&mut self, player: &mut Player) {
         if let Calculus::FeedForward(networks, is_current) = &mut self.calculus {
-            player.give_networks(networks);
-            *is_current = true;
+            *is_current = player.give_networks(networks);
         }
     }
 
@@ -235,10 +234,7 @@ impl Policy {
         descent: &mut Descent,
         learning_rate: f64,
     ) -> Result<(Losses, f64)> {
-        let mut gradient = std::mem::take(&mut self.gradient);
-        let losses = self.gradient(batch, sequences, objective, &mut gradient);
-        self.gradient = gradient;
-        let losses = losses?;
+        let losses = self.calculus.gradient(&self.weights, batch, sequences, objective, &mut self.gradient)?;
         let norm = descent.step(losses.total, &self.gradient, &mut self.weights, learning_rate)?;
         if let Calculus::FeedForward(_, is_current) = &mut self.calculus {
             *is_current = false;
@@ -257,16 +253,29 @@ impl Policy {
         objective: &Objective,
         gradient: &mut [f32],
     ) -> Result<Losses> {
-        match (&mut self.calculus, &batch.0) {
-            (Calculus::FeedForward(networks, is_current), Data::FeedForward { samples, acting, .. }) => {
-                take_over(networks, is_current, &self.weights)?;
+        self.calculus.gradient(&self.weights, batch, sequences, objective, gradient)
+    }
+}
+
+impl Calculus {
+    fn gradient(
+        &mut self,
+        weights: &[f32],
+        batch: &Batch<'_>,
+        sequences: &[u32],
+        objective: &Objective,
+        gradient: &mut [f32],
+    ) -> Result<Losses> {
+        match (self, &batch.0) {
+            (Self::FeedForward(networks, is_current), Data::FeedForward { samples, acting, .. }) => {
+                take_over(networks, is_current, weights)?;
                 let acting =
                     acting.as_ref().map(|acting| Acting { outputs: &acting.outputs, log_std: &acting.log_std });
                 let samples = Samples { acting, ..*samples };
-                Ok(networks.gradient(&self.weights, &samples, sequences, objective, gradient)?)
+                Ok(networks.gradient(weights, &samples, sequences, objective, gradient)?)
             }
-            (Calculus::Recurrent(_), Data::Recurrent(batch)) => {
-                Ok(batch.gradient(&self.weights, sequences, objective, gradient)?)
+            (Self::Recurrent(_), Data::Recurrent(batch)) => {
+                Ok(batch.gradient(weights, sequences, objective, gradient)?)
             }
             _ => unreachable!("a batch is made by a policy of its architecture"),
         }

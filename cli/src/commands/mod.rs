@@ -114,18 +114,16 @@ fn lasting_servers(args: &ServerArgs, wait: WaitArgs) -> Result<Servers> {
     Ok(servers(args)?.with_wait(ServerWait { limit: wait.time(), tell: |sentence| note(sentence) }))
 }
 
-/// The servers that all workers share, each group of cells one of them. There is a private one for each worker, for one
-/// thread of a server speaks to all its clients, and those with short steps would wait for each other; they share the
-/// physics threads.
-fn shared_servers(args: &ServerArgs, jobs: usize) -> Result<(Vec<PrivateServer>, Vec<Address>)> {
+/// The servers of `jobs` processes at a time: those that were named, which all share, or a private one for each, since one
+/// thread of a server speaks to all its clients, and processes with short steps would wait for each other. Each has a
+/// physics thread for every core, for the last process has all cores; more threads than cores are no slower.
+fn servers_of_jobs(args: &ServerArgs, jobs: usize) -> Result<(Vec<PrivateServer>, Vec<Address>)> {
     if !args.server.is_empty() {
         refuse_workers(args)?;
         return Ok((Vec::new(), args.server.clone()));
     }
-    let count = jobs.max(1);
-    let threads = args.workers.unwrap_or_else(cores).div_ceil(count);
-    let start = |_| PrivateServer::start(Some(threads));
-    let servers = (0..count).map(start).collect::<std::result::Result<Vec<_>, _>>()?;
+    let start = |_| PrivateServer::start(args.workers);
+    let servers = (0..jobs.max(1)).map(start).collect::<std::result::Result<Vec<_>, _>>()?;
     let addresses = servers.iter().map(|server| server.address().clone()).collect();
     Ok((servers, addresses))
 }

@@ -8,7 +8,7 @@ use serde_json::json;
 
 use super::args::PlanArgs;
 use super::error::{CommandError, Result, system};
-use super::{cores, recurrent, shared_servers};
+use super::{cores, recurrent, servers_of_jobs};
 use perturb_learner::client::Servers;
 use perturb_learner::measure::measure;
 use perturb_study::interrupt::StopFlag;
@@ -55,7 +55,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     let groups = known.groups(&all, grouping);
     let groups_shown = groups_line(&groups, grouping);
     let grouping = Grouping { at_a_time: grouping.at_a_time.min(groups.len()), ..grouping };
-    let (_private, addresses) = shared_servers(&args.server, grouping.at_a_time)?;
+    let (_private, addresses) = servers_of_jobs(&args.server, grouping.at_a_time)?;
     let (servers, _) = Servers::connect_to_some(&addresses)?; // what is wrong with others the run will tell
     let limits = step_limits(&servers, &known)?; // refuses environments that there are not
     let counts = plan.counts();

@@ -13,7 +13,7 @@ use super::cells::Doing;
 use super::display::{is_quiet, note, say};
 use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
-use super::{cores, recurrent, shared_servers, slurm};
+use super::{cores, recurrent, servers_of_jobs, slurm};
 use perturb_learner::cell::{CellOrder, run_cells};
 use perturb_learner::client::{Address, PrivateServer, Servers};
 use perturb_learner::measure::{MeasureError, measure};
@@ -127,13 +127,17 @@ fn stop_with_input(stop: &StopFlag) -> Result<()> {
 fn all_cells(args: &RunArgs, plan: Plan, folder: &Folder, stop: &StopFlag) -> Result<ExitCode> {
     recurrent::prepare_for(&plan)?; // the workers are this program
     let grouping = Grouping { most: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
-    let (local, addresses) = shared_servers(&args.server, grouping.at_a_time)?;
+    let all = plan.in_full(Some(folder))?.cells.len();
+    let (local, addresses) = servers_of_jobs(&args.server, grouping.at_a_time.min(all))?;
     let local: Vec<Mutex<PrivateServer>> = local.into_iter().map(Mutex::new).collect();
     let (servers, troubles) = Servers::connect_to_some(&addresses)?;
     troubles.iter().for_each(|trouble| say(format_args!("perturb: {trouble}; going on with the other servers")));
     step_limits(&servers, &plan)?; // refuses environments that there are not
     let addresses: Vec<String> = addresses.iter().map(Address::to_string).collect();
-    let command = || worker(args, folder, &addresses);
+    let command = |seat: usize| match local.len() {
+        0 => worker(args, folder, &addresses.join(",")),
+        count => worker(args, folder, &addresses[seat % count]),
+    };
     let end = |server: &Mutex<PrivateServer>| {
         let mut server = server.lock().ok()?;
         let ended = format!("the private server ended with {}", server.exit_status()?);
@@ -193,13 +197,13 @@ fn most(
 }
 
 /// The command of a worker.
-fn worker(args: &RunArgs, folder: &Folder, addresses: &[String]) -> Command {
+fn worker(args: &RunArgs, folder: &Folder, servers: &str) -> Command {
     // The running program, even if its file has been replaced meanwhile: all cells of a run are of one commit.
     let mut command = Command::new("/proc/self/exe");
     // The copy, which nobody edits meanwhile, unless it may be another plan's.
     let plan = if args.cell.is_empty() { folder.plan_path() } else { args.plan.clone() };
     command.arg0("perturb").arg("run").arg(plan).arg("--out").arg(folder.path());
-    command.args(["--worker", "--server", &addresses.join(",")]);
+    command.args(["--worker", "--server", servers]);
     recurrent::set_one_thread(&mut command);
     command
 }

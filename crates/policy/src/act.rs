@@ -26,6 +26,8 @@ pub struct Actor {
     log_std: Vec<f32>,
     /// Continuous actions are uniform in a box, not Gaussian.
     uniform: bool,
+    /// Its networks are somebody else's.
+    is_stale: bool,
 }
 
 /// What an architecture computes with.
@@ -79,7 +81,7 @@ impl Actor {
             Some(width) => Network::Recurrent(Box::new(Recurrent::new(spec, width, max_batch))),
             None => Network::FeedForward(FeedForward::new(spec, max_batch)),
         };
-        Actor { spec: spec.clone(), max_batch, network, log_std, uniform: false }
+        Actor { spec: spec.clone(), max_batch, network, log_std, uniform: false, is_stale: false }
     }
 
     /// From now on a continuous action is uniform in the box whose middle is the policy's mean and half of whose width is its
@@ -109,14 +111,18 @@ impl Actor {
             Network::Recurrent(network) => network.load(&mut rest),
         }
         self.log_std.copy_from_slice(rest);
+        self.is_stale = false;
         Ok(())
     }
 
-    /// The networks of a feed-forward policy, and log σ `[A]` of its actions.
-    pub(crate) fn feed_forward(&mut self) -> Option<(&mut Networks, &[f32])> {
+    /// The networks of a feed-forward policy of shape `spec`, to be exchanged for others, and log σ `[A]` of its actions.
+    pub(crate) fn give_networks(&mut self, spec: &PolicySpec) -> Option<(&mut Networks, &[f32])> {
         match &mut self.network {
-            Network::FeedForward(network) => Some((network.networks_mut(), &self.log_std)),
-            Network::Recurrent(_) => None,
+            Network::FeedForward(network) if self.spec == *spec => {
+                self.is_stale = true;
+                Some((network.networks_mut(), &self.log_std))
+            }
+            _ => None,
         }
     }
 
@@ -209,6 +215,7 @@ impl Actor {
 
     /// The number of observations.
     fn count(&self, observations: &[f32]) -> Result<usize> {
+        debug_assert!(!self.is_stale, "weights are to be loaded after the networks were given away");
         let n_envs = observations.len() / self.spec.observation_size;
         let expected = self.max_batch.min(n_envs) * self.spec.observation_size;
         check_length("observations [N, O]", observations.len(), expected)?;

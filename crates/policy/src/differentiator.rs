@@ -118,13 +118,14 @@ impl Differentiator {
         Ok(())
     }
 
-    /// Takes over the networks of an actor of this shape that has the weights, which is quicker than to load them. The
-    /// actor has others then, and must be loaded before it acts again.
-    pub fn load_from(&mut self, actor: &mut Actor) {
-        if let Some((networks, log_std)) = actor.feed_forward() {
-            std::mem::swap(networks, &mut self.networks);
-            self.gaussian.load(log_std);
-        }
+    /// Takes over the networks of an actor that has the weights, which is quicker than to load them, and says whether it
+    /// did: they must be of this shape. The actor has others then, and must be loaded before it acts again.
+    #[must_use]
+    pub fn load_from(&mut self, actor: &mut Actor) -> bool {
+        let Some((networks, log_std)) = actor.give_networks(&self.spec) else { return false };
+        std::mem::swap(networks, &mut self.networks);
+        self.gaussian.load(log_std);
+        true
     }
 
     /// The losses of the samples at `indices`, and in `gradient` `[P]` the derivatives of their total by `weights` `[P]`,

@@ -240,10 +240,11 @@ impl Player {
         self.actor.load_flat(weights)
     }
 
-    /// Gives the networks with which it acts to who differentiates them, see [`Differentiator::load_from`]; weights are to
-    /// be loaded before it plays on.
-    pub fn give_networks(&mut self, to: &mut Differentiator) {
-        to.load_from(&mut self.actor);
+    /// Gives the networks with which it acts to who differentiates them, if they fit, see [`Differentiator::load_from`];
+    /// weights are to be loaded then before it plays on.
+    #[must_use]
+    pub fn give_networks(&mut self, to: &mut Differentiator) -> bool {
+        to.load_from(&mut self.actor)
     }
 
     /// A trial begins in every environment with `observations` `[N, O]`; running statistics take in those of the

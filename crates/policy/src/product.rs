@@ -333,7 +333,7 @@ mod tests {
     use crate::random::{Purpose, normal, stream};
     use pulp::Scalar128b;
 
-    const INPUTS: usize = 37;
+    const INPUTS: usize = 69;
     const OUTPUTS: usize = 85;
 
     /// Products of `n` rows and back, and sums over the rows.
@@ -418,7 +418,7 @@ mod tests {
 
     #[test]
     fn every_vector_unit_computes_the_same_bytes() {
-        for n in [1, 3, 4, 5, 8, 13, 64] {
+        for n in [1, 2, 3, 4, 5, 6, 7, 8, 13, 64] {
             let expected = naive(n);
             assert_eq!(bits(n, |products| run(products)), expected, "{n} rows, the widest");
             assert_eq!(bits(n, |products| products.run(Scalar128b)), expected, "{n} rows, 128 bits");

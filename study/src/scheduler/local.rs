@@ -18,7 +18,7 @@ pub struct Local<'a> {
     plan: &'a Plan,
     folder: &'a Folder,
     grouping: Grouping,
-    command: &'a dyn Fn() -> Command,
+    command: &'a dyn Fn(usize) -> Command,
     server: &'a dyn Fn() -> Option<News>,
     workers: Vec<Worker>,
     /// What each cell may take at most, s of a process, as far as it was measured.
@@ -30,7 +30,7 @@ struct Worker {
     cells: BTreeMap<String, usize>,
     /// Those whose turn has come.
     begun: HashSet<usize>,
-    /// The lowest number that no other worker has: with as many servers as workers each has one for itself.
+    /// The lowest number that no other worker has.
     seat: usize,
     child: Child,
     events: File,
@@ -42,13 +42,14 @@ struct Worker {
 }
 
 impl<'a> Local<'a> {
-    /// `grouping.at_a_time` workers, started by `command`; each reads an [`Order`] and writes
-    /// [`Line`](super::Line)s. `server` says what has become of the server that they share, if anything.
+    /// `grouping.at_a_time` workers, started by `command` for their seat, the lowest number from 0 that no other worker
+    /// has; each reads an [`Order`] and writes [`Line`](super::Line)s. `server` says what has become of their servers, if
+    /// anything.
     pub fn new(
         plan: &'a Plan,
         folder: &'a Folder,
         grouping: Grouping,
-        command: &'a dyn Fn() -> Command,
+        command: &'a dyn Fn(usize) -> Command,
         server: &'a dyn Fn() -> Option<News>,
     ) -> Self {
         Self { plan, folder, grouping, command, server, workers: Vec::new(), most: Vec::new() }
@@ -65,7 +66,9 @@ impl<'a> Local<'a> {
             group.iter().map(|offer| OrderedCell { cell: self.id(offer.cell).into(), retry: offer.retry }).collect();
         let (log, path) = self.open_logs(group)?;
         let log_start = log.metadata().map_err(io("read", &path))?.len();
-        let mut command = (self.command)();
+        let is_free = |seat: &usize| self.workers.iter().all(|worker| worker.seat != *seat);
+        let seat = (0..self.workers.len()).find(is_free).unwrap_or(self.workers.len());
+        let mut command = (self.command)(seat);
         let program = PathBuf::from(command.get_program());
         let mut start = || {
             // A file, not a pipe: nobody has to read while the worker writes.
@@ -74,9 +77,7 @@ impl<'a> Local<'a> {
             Ok((child, events))
         };
         let (mut child, events) = start().map_err(io("start a worker process of", &program))?;
-        let is_free = |seat: &usize| self.workers.iter().all(|worker| worker.seat != *seat);
-        let seat = (0..self.workers.len()).find(is_free).unwrap_or(self.workers.len());
-        let order = Order { cells, turn: self.first_turn().wrapping_add(seat + first.lost_servers) };
+        let order = Order { cells, turn: self.first_turn().wrapping_add(first.group + first.lost_servers) };
         if let Some(input) = &mut child.stdin {
             write_line(input, &order);
         }
@@ -217,6 +218,7 @@ mod tests {
         [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
     /// What every worker of these tests begins with: it reads its order, and works in its cell's folder.
     const BEGIN: &str = r#"read -r order; id=${order#*:\"}; id=${id%%\"*}; cd "cells/$id"; echo "$order" >>orders
+        echo "$SEAT" >>seats
         say() { echo "{\"cell\":\"$id\",\"event\":$1}"; };"#;
 
     struct Ran {
@@ -236,20 +238,30 @@ mod tests {
         stop: &StopFlag,
         server: &dyn Fn() -> Option<News>,
     ) -> Ran {
-        let plan = Plan::parse("test", PLAN.into()).unwrap();
-        let command = || {
+        run_plan(&Plan::parse("test", PLAN.into()).unwrap(), grouping, folder, script, stop, server)
+    }
+
+    fn run_plan(
+        plan: &Plan,
+        grouping: Grouping,
+        folder: &Folder,
+        script: &str,
+        stop: &StopFlag,
+        server: &dyn Fn() -> Option<News>,
+    ) -> Ran {
+        let command = |seat: usize| {
             let mut command = Command::new("sh");
-            command.arg("-c").arg(format!("{BEGIN} {script}")).current_dir(folder.path());
+            command.arg("-c").arg(format!("{BEGIN} {script}")).current_dir(folder.path()).env("SEAT", seat.to_string());
             command
         };
-        let mut local = Local::new(&plan, folder, grouping, &command, server);
+        let mut local = Local::new(plan, folder, grouping, &command, server);
         let mut lines = Vec::new();
         let mut report = |report: Announcement<'_>| {
             if let Announcement::Line(line) = report {
                 lines.push(line.clone());
             }
         };
-        let end = run(&plan, folder, &mut local, &HashMap::new(), Duration::ZERO, stop, &mut report);
+        let end = run(plan, folder, &mut local, &HashMap::new(), Duration::ZERO, stop, &mut report);
         Ran { end, lines }
     }
 
@@ -277,15 +289,44 @@ mod tests {
             let orders = std::fs::read_to_string(folder.cell(id).path().join("orders")).unwrap();
             let order: Order = serde_json::from_str(&orders).unwrap();
             assert_eq!(order.cells, [OrderedCell { cell: id.clone(), retry: None }]);
-            let seat = number % at_a_time;
             assert_eq!(
                 order.turn,
-                crc32c::crc32c(ids[0].as_bytes()) as usize + seat,
-                "a server of those that there are"
+                turn(&ids[0], number),
+                "they go around the servers, also if these are more than workers"
             );
             let events: Vec<String> = ran.lines.iter().filter(|line| line.cell == *id).map(said).collect();
             assert_eq!(events, [r#"{"event":"server","address":"unix:/x"}"#, r#"{"event":"done"}"#]);
         }
+    }
+
+    fn turn(first: &str, number: usize) -> usize {
+        crc32c::crc32c(first.as_bytes()) as usize + number
+    }
+
+    #[test]
+    fn a_worker_has_the_lowest_seat_that_is_free_and_goes_on_with_the_next_server() {
+        let (_directory, folder, _) = place();
+        let plan = Plan::parse("test", PLAN.replace("runs = 2", "runs = 3")).unwrap();
+        let [first, second, third] = [0, 1, 2].map(|cell: usize| plan.cells[cell].id.clone());
+        // The second works until the others are done, the third loses its first server.
+        let script = format!(
+            r#"case "$id" in
+                {second}) until [ -e ../{third}/result.json ] && [ -e ../{first}/result.json ]; do sleep 0.01; done ;;
+                {third}) if [ "$(wc -l <seats)" = 1 ]; then say '"lost_server","reason":"gone"'; exit; fi ;;
+            esac
+            echo x >result.json; say '"done"'"#
+        );
+        let grouping = Grouping { most: 1, at_a_time: 2 };
+        let ran = run_plan(&plan, grouping, &folder, &script, &StopFlag::default(), &|| None);
+        assert_eq!(ran.end.unwrap(), RunEnd::Finished { failed: Vec::new() });
+        let read = |id: &str, name: &str| std::fs::read_to_string(folder.cell(id).path().join(name)).unwrap();
+        assert_eq!([&first, &second, &third].map(|id| read(id, "seats")), ["0\n", "1\n", "0\n0\n"]);
+        let turns = |id: &str| -> Vec<usize> {
+            let orders = read(id, "orders");
+            orders.lines().map(|order| serde_json::from_str::<Order>(order).unwrap().turn).collect()
+        };
+        assert_eq!(turns(&second), [turn(&first, 1)]);
+        assert_eq!(turns(&third), [turn(&first, 2), turn(&first, 3)]);
     }
 
     fn said(line: &Line) -> String {

@@ -92,6 +92,8 @@ pub struct Offer {
     pub cell: usize,
     /// The failure that is forgiven it.
     pub retry: Option<FailureMark>,
+    /// The number of its group in this run, also if it is offered alone.
+    pub group: usize,
     /// How many servers it has lost.
     pub lost_servers: usize,
     /// What other cells of its environment and learner took, s; `None` before the first.
@@ -498,7 +500,7 @@ impl<'a> Scheduler<'a> {
                 continue;
             }
             let seconds = self.times.of_pair(&self.plan.cells[cell]);
-            let offer = Offer { cell, retry, lost_servers, seconds };
+            let offer = Offer { cell, retry, group, lost_servers, seconds };
             match place {
                 Some(place) => offers[place].push(offer),
                 None => {

@@ -110,10 +110,11 @@ const MOST_WORKERS: usize = 1024;
 #[derive(Args, Clone, Debug)]
 pub struct ServerArgs {
     /// Running servers, separated by commas: unix:/path, host:port, http://host:port or tcp://host:port, with TLS
-    /// https://host:port. Without this, perturb starts a server of its own and ends it afterwards.
+    /// https://host:port. Without this, perturb starts a server of its own, for each process that trains, and ends it
+    /// afterwards.
     #[arg(long, value_name = "ADDRESS", value_delimiter = ',')]
     pub server: Vec<Address>,
-    /// Physics threads of the server that perturb starts itself [default: one a core].
+    /// Physics threads of each server that perturb starts itself [default: one a core].
     #[arg(long, value_name = "N", value_parser = |text: &str| within(text, 1..=MOST_WORKERS))]
     pub workers: Option<usize>,
 }

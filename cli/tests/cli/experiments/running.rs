@@ -226,7 +226,7 @@ fn a_lost_server_is_no_cells_failure() {
 fn a_run_starts_its_private_server_again_and_comes_to_the_same_results() {
     let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 300, checkpoint_interval = 20"));
     succeeded(&experiment.run("undisturbed", &["--jobs", "2"]));
-    let child = experiment.command("out", &["--jobs", "2"]).spawn().expect("started");
+    let child = experiment.command("out", &["--jobs", "1"]).spawn().expect("started"); // the only server is in use
     let mut killed = None;
     for cell in [0, 3] {
         let cell = experiment.out("out/cells").join(&experiment.plan.cells[cell].id);

@@ -4,7 +4,7 @@ use std::f64::consts::TAU;
 
 use perturb_policy::random::{Purpose, normal, stream};
 use perturb_policy::{
-    Acting, ActionKind, Actor, Differentiator, Error, Objective, PolicySpec, Samples, Surrogate, initial_weights,
+    Acting, ActionKind, Actor, Acts, Differentiator, Error, Objective, PolicySpec, Samples, Surrogate, initial_weights,
 };
 use rstest::rstest;
 
@@ -90,14 +90,46 @@ fn an_actors_networks_give_the_same_gradient(
     let mut actor = Actor::new(&spec, 1);
     actor.load_flat(&weights).expect("weights that fit");
     let mut taken = Differentiator::new(&spec, 1).expect("threads");
-    taken.load_from(&mut actor);
+    assert!(taken.load_from(&mut actor));
     let expected = gradient(&mut loaded);
     assert!(expected.iter().filter(|&&g| g != 0.0).count() > expected.len() / 2);
     assert_eq!(gradient(&mut taken), expected);
-    // The actor acts again once it has weights.
-    actor.load_flat(&weights).expect("weights that fit");
-    taken.load_from(&mut actor);
-    assert_eq!(gradient(&mut taken), expected);
+
+    // The actor has what the other one had; once it has weights, it acts as a new one does, and can give them, too.
+    let others: Vec<f32> = numbers(spec.n_weights(), 7).iter().map(|x| 0.2 * x).collect();
+    let acts = |actor: &mut Actor| {
+        let mut acts = Acts::new(action, 1);
+        actor.load_flat(&others).expect("weights that fit");
+        actor.act(&numbers(O, 3), &mut stream(1, Purpose::Actions), &mut acts).expect("acts");
+        acts
+    };
+    assert_eq!(acts(&mut actor), acts(&mut Actor::new(&spec, 1)));
+    assert!(taken.load_from(&mut actor));
+    loaded.load(&others).expect("weights that fit");
+    let gradient = |network: &mut Differentiator| {
+        let mut gradient = vec![f32::NAN; spec.n_weights()];
+        network.gradient(&others, &samples, &[0], &objective, &mut gradient).expect("a gradient");
+        gradient
+    };
+    assert_eq!(gradient(&mut taken), gradient(&mut loaded));
+    assert_ne!(gradient(&mut taken), expected);
+}
+
+#[test]
+fn only_networks_of_the_same_shape_are_taken_over() {
+    let spec = PolicySpec::feed_forward(O, ActionKind::Discrete { n: 2 });
+    let mut differentiator = Differentiator::new(&spec, 1).expect("threads");
+    for other in [
+        PolicySpec::feed_forward(O + 1, ActionKind::Discrete { n: 2 }),
+        PolicySpec::feed_forward(O, ActionKind::Continuous { size: 2 }),
+        PolicySpec::recurrent(O, ActionKind::Discrete { n: 2 }),
+    ] {
+        let mut actor = Actor::new(&other, 1);
+        assert!(!differentiator.load_from(&mut actor), "{other:?}");
+        actor
+            .act(&numbers(other.observation_size, 3), &mut stream(1, Purpose::Actions), &mut Acts::new(other.action, 1))
+            .expect("it has its networks");
+    }
 }
 
 /// A perceptron in f64, whose weights are taken from the front of `weights`.
