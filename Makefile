@@ -72,9 +72,9 @@ endef
 
 .DEFAULT_GOAL := help
 .PHONY: help deps opengl toolchain build install demo all-pairs report-check serve-test test slurm-test kill-test \
-	load-test faults-test asan-test qemu-test slurm-acceptance lint bench fuzz bench-peers audit cargo-deny metrics-test otel-test python-test wheel wheel-test \
-	python-acceptance bench-python \
-	python-venv docs docs-test docker docker-base docker-test
+	load-test bounds-test faults-test asan-test qemu-test slurm-acceptance lint bench fuzz bench-peers audit cargo-deny \
+	metrics-test otel-test python-test wheel wheel-test python-acceptance bench-python python-venv docs docs-test docker \
+	docker-base docker-test
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -138,6 +138,9 @@ slurm-test: build ## do a plan on a real Slurm of two nodes, started for it, one
 
 load-test: build ## a server full of Hoppers for five minutes: 1024 sessions of 16, and one more that is refused
 	PERTURB_TEST_FULL_SERVER_SECONDS=$(LOAD_SECONDS) cargo test $(ALL) --test server -- --nocapture every_place_can_be_taken
+
+bounds-test: build opengl ## attack a server beside a neighbour, 99 of 100 of whose steps take less than 50 ms; on an idle machine
+	PERTURB_TEST_NEIGHBOUR_P99_MS=50 cargo test $(ALL) --package perturb --test server -- --nocapture --test-threads 1 bounds::
 
 faults-test: build ## lines, disks and clocks with faults, again and again, by a seed that PERTURB_SEED repeats; minutes
 	@$(call install,$(FAKETIME))
