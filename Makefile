@@ -72,7 +72,7 @@ endef
 
 .DEFAULT_GOAL := help
 .PHONY: help deps opengl toolchain build install demo all-pairs report-check serve-test test slurm-test kill-test \
-	load-test bounds-test faults-test asan-test qemu-test slurm-acceptance lint bench fuzz bench-peers audit cargo-deny \
+	load-test bounds-test attack-test faults-test asan-test qemu-test slurm-acceptance lint bench fuzz bench-peers audit cargo-deny \
 	metrics-test otel-test python-test wheel wheel-test python-acceptance bench-python python-venv docs docs-test docker \
 	docker-base docker-test
 
@@ -307,6 +307,10 @@ fuzz: deps ## attack the server and the readers of files with mutated bytes, und
 		LSAN_OPTIONS=suppressions=$(abspath fuzz/leaks.txt) cargo +nightly fuzz run --fuzz-dir fuzz --target-dir $(TARGET)/fuzz --features libfuzzer $$target $(FUZZ)/$$target fuzz/corpus/$$target -- \
 			-max_total_time=$(FUZZ_SECONDS) -timeout=60 -rss_limit_mb=4096 -max_len=65536 -print_final_stats=1; \
 	done
+
+attack-test: deps ## a million mutated requests and a hundred thousand snapshots, which may take no memory along; minutes
+	PERTURB_FUZZ_INPUTS=1000000 cargo test $(ALL) --package perturb-fuzz --test corpus -- --nocapture --exact requests
+	PERTURB_FUZZ_INPUTS=100000 cargo test $(ALL) --package perturb-fuzz --test corpus -- --nocapture --exact snapshots
 
 docker-test: docker ## run experiments on servers and learners in containers, stop a server in mid-run, and let nobody in who may not
 	docker/test.sh

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::Path;
 use std::sync::{Mutex, Once, PoisonError};
+use std::time::Instant;
 
 use perturb_fuzz::{TARGETS, Target, replies, seeds};
 use rand_chacha::ChaCha8Rng;
@@ -11,6 +12,10 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 
 /// Mutated inputs of each target, unless `PERTURB_FUZZ_INPUTS` says how many.
 const INPUTS: u64 = 200;
+/// So many inputs, of one target at a time, show what is not given back: `make attack-test`. …
+const MANY: u64 = 100_000;
+/// … It is less than this after the first tenth, in bytes.
+const MOST_GROWN: usize = 20 << 20;
 
 /// What each target is attacked with at present.
 static SEEDS: Mutex<BTreeMap<String, u64>> = Mutex::new(BTreeMap::new());
@@ -36,10 +41,27 @@ fn attack(name: &str) {
     inputs.iter().for_each(|input| run(input));
     let number = |name: &str, usual| std::env::var(name).map_or(usual, |text| text.parse().expect("a number"));
     let (count, first) = (number("PERTURB_FUZZ_INPUTS", INPUTS), number("PERTURB_FUZZ_SEED", 1));
+    let (start, mut at_first) = (Instant::now(), 0);
     for seed in first..first + count {
+        if seed == first + count / 10 {
+            at_first = memory();
+        }
         SEEDS.lock().unwrap_or_else(PoisonError::into_inner).insert(name.to_owned(), seed);
         run(&mutated(&inputs, &mut ChaCha8Rng::seed_from_u64(seed)));
     }
+    if count < MANY {
+        return;
+    }
+    let grown = memory().saturating_sub(at_first);
+    println!("{name}: {count} inputs in {:.0?}, {} kB more since the first tenth", start.elapsed(), grown >> 10);
+    assert!(grown < MOST_GROWN, "{name}: {grown} bytes were taken and not given back");
+}
+
+/// Bytes of this process that are in memory.
+fn memory() -> usize {
+    let status = std::fs::read_to_string("/proc/self/status").expect("Linux");
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).expect("a size");
+    line.trim_end_matches("kB").trim().parse::<usize>().expect("kB") << 10
 }
 
 /// One of these, changed in a few places.
