@@ -191,6 +191,13 @@ impl<S> Guarded<S> {
     }
 }
 
+impl<S> Drop for Guarded<S> {
+    /// Nobody needs to be woken any more; the waker would keep the connection's memory as long as a call knows of it.
+    fn drop(&mut self) {
+        self.connection.end.waker.take();
+    }
+}
+
 impl<S> Connected for Guarded<S> {
     type ConnectInfo = Connection;
 

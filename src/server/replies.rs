@@ -6,11 +6,14 @@ use bytes::Bytes;
 use http_body::{Body as HttpBody, Frame, SizeHint};
 use std::{
     pin::Pin,
-    sync::{Arc, Mutex, PoisonError, Weak},
+    sync::{Arc, Mutex, OnceLock, PoisonError, Weak},
     task::{Context, Poll},
     time::Duration,
 };
-use tokio::time::{Instant, sleep};
+use tokio::{
+    task::AbortHandle,
+    time::{Instant, sleep},
+};
 use tonic::{Status, body::Body};
 
 /// How often a stalled stream is looked after within its time.
@@ -23,13 +26,18 @@ pub struct Replies {
     waiting: Arc<Waiting>,
 }
 
-/// How many replies with shares wait for the client to read, and since when it has read none of them to its end.
-struct Waiting(Mutex<(usize, Instant)>);
+/// The replies with shares that wait for the client to read.
+struct Waiting {
+    /// How many they are, and since when the client has read none of them to its end.
+    state: Mutex<(usize, Instant)>,
+    /// Who looks after them, up to their end: as long as that waits it holds what it needs of the connection.
+    watch: OnceLock<AbortHandle>,
+}
 
 impl Waiting {
     /// One more, or one less.
     fn change(&self, change: impl FnOnce(usize) -> usize) {
-        let mut waiting = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut waiting = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let (before, after) = (waiting.0, change(waiting.0));
         waiting.0 = after;
         if before == 0 || after < before {
@@ -38,8 +46,14 @@ impl Waiting {
     }
 
     fn elapsed(&self) -> Duration {
-        let (replies, since) = *self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let (replies, since) = *self.state.lock().unwrap_or_else(PoisonError::into_inner);
         if replies == 0 { Duration::ZERO } else { since.elapsed() }
+    }
+}
+
+impl Drop for Waiting {
+    fn drop(&mut self) {
+        self.watch.get().into_iter().for_each(AbortHandle::abort);
     }
 }
 
@@ -63,9 +77,10 @@ impl Replies {
     /// A body whose replies' shares are in the outbox. If its client does not read such a reply within `limit`, its
     /// connection ends.
     pub fn new(body: Body, outbox: Outbox, connection: Option<Connection>, limit: Option<Duration>) -> Self {
-        let waiting = Arc::new(Waiting(Mutex::new((0, Instant::now()))));
+        let waiting = Arc::new(Waiting { state: Mutex::new((0, Instant::now())), watch: OnceLock::new() });
         if let (Some(connection), Some(limit)) = (connection, limit) {
-            tokio::spawn(watch(Arc::downgrade(&waiting), connection, limit));
+            let watch = tokio::spawn(watch(Arc::downgrade(&waiting), connection, limit));
+            waiting.watch.get_or_init(|| watch.abort_handle());
         }
         Self { body, outbox, waiting }
     }
