@@ -81,16 +81,22 @@ impl Demo<'_> {
         let mut out = std::io::stdout();
         writeln!(
             out,
-            "{}: PPO with feed-forward networks is trained on default physics (D) and on random physics (R),\n\
-             and tested on both and on extreme physics (E), which neither has met.\n",
+            "{}: PPO with feed-forward networks is trained on default physics (D)\n\
+             and on random physics (R), and tested on both and on extreme physics (E), which\n\
+             neither has met.\n",
             environment.name
         )?;
         let trained =
             TRAINED_ON.into_iter().map(|version| self.train(&environment.name, version)).collect::<Result<Vec<_>>>()?;
         writeln!(out, "{}\n", rates_table(&trained).to_text())?;
         writeln!(out, "{}\n", self.papers_table(&environment.name, &trained).to_text())?;
+        writeln!(
+            out,
+            "Default is trained and tested on D, Interpolation on R; Extrapolation is the\n\
+             geometric mean of D tested on R, D on E and R on E.\n"
+        )?;
         if ["Hopper", "HalfCheetah"].contains(&environment.name.as_str()) {
-            writeln!(out, "The paper's robots ran in another simulator: compare what is lost, not the numbers.\n")?;
+            writeln!(out, "The paper's robots ran in another simulator: compare losses, not numbers.\n")?;
         }
         writeln!(out, "{}", conclusion(&trained))?;
         let heatmap = self.heatmap(&trained, environment.heatmap_axes.clone())?;
@@ -148,8 +154,8 @@ impl Demo<'_> {
         Table::of("", &rows)
             .text("success, %", |(row, ..)| *row)
             .number("runs", |(_, runs, ..)| runs)
-            .number("episodes each", |(.., episodes, _)| grouped(*episodes as usize))
-            .number("of a test", |(.., tested)| grouped(*tested as usize))
+            .number("episodes", |(.., episodes, _)| grouped(*episodes as usize))
+            .number("tests", |(.., tested)| grouped(*tested as usize))
             .number("Default", of(Metric::Default))
             .number("Interpolation", of(Metric::Interpolation))
             .number("Extrapolation", of(Metric::Extrapolation))
@@ -181,7 +187,7 @@ impl Demo<'_> {
     /// The policy that was trained on D: an episode on D that goes well, and one on E that does not.
     fn films(&self, checkpoint: &Checkpoint) -> Result<Vec<(&'static str, PathBuf)>> {
         let wanted =
-            [("trained on D: success on D", Version::D, true), ("trained on D: failure on E", Version::E, false)];
+            [("a success on D of what was trained there", Version::D, true), ("its failure on E", Version::E, false)];
         let mut films = Vec::new();
         for (what, version, success) in wanted {
             let path = self.out.join(if success { "success.gif" } else { "failure.gif" });
@@ -236,7 +242,8 @@ fn conclusion(trained: &[Trained]) -> String {
     let [dd, dr, de] = Version::ALL.map(|test| rate(0, test));
     let [_, rr, re] = Version::ALL.map(|test| rate(1, test));
     format!(
-        "Trained on default physics, a policy that succeeds in {dd:.0} % of its own episodes succeeds in {dr:.0} % where the\n\
-         physics is random, and in {de:.0} % where it is extreme. Trained on random physics, it is {rr:.0} % and {re:.0} %."
+        "Trained on default physics, a policy that succeeds in {dd:.1} % of its own\n\
+         episodes succeeds in {dr:.1} % where the physics is random, and in {de:.1} %\n\
+         where it is extreme. Trained on random physics, it is {rr:.1} % and {re:.1} %."
     )
 }

@@ -24,10 +24,11 @@ impl Report<'_> {
         format!("Generalisation of {methods} on {}", listed(&self.scope.environments))
     }
 
-    /// What the plan says of itself before its first key.
+    /// What the plan says of itself before its first key, up to an empty line: commands may follow.
     pub(super) fn abstract_text(&self) -> String {
-        let comment = self.plan.text.lines().map_while(|line| line.trim().strip_prefix('#'));
-        comment.map(str::trim).collect::<Vec<_>>().join(" ").trim().to_owned()
+        let comment = self.plan.text.lines().map_while(|line| line.trim().strip_prefix('#')).map(str::trim);
+        let paragraph = comment.skip_while(|line| line.is_empty()).take_while(|line| !line.is_empty());
+        paragraph.collect::<Vec<_>>().join(" ")
     }
 
     /// Names and what there is to say, without those of which there is nothing.

@@ -1,7 +1,8 @@
 //! How far a training is, whose episodes grow longer or shorter while it learns: the time is that of its steps.
 
-/// How much of the last stretch the length of an episode is taken from, as opposed to what was known before.
-const RECENT: f64 = 0.3;
+/// The length of an episode is taken from about so many of the last ones, whatever stretches they are told of in: a few
+/// say little where lengths differ as much as they are.
+const RECENT: f64 = 100.0;
 /// So much of all steps must be done before anything is said.
 const LEAST: f64 = 0.01;
 
@@ -23,8 +24,10 @@ impl Pace {
         if self.first.is_none() {
             self.first = Some((episodes, steps));
         } else if episodes > self.last.0 {
-            let length = (steps - self.last.1) / (episodes - self.last.0);
-            self.length = Some(self.length.map_or(length, |known| known + RECENT * (length - known)));
+            let stretch = episodes - self.last.0;
+            let length = (steps - self.last.1) / stretch;
+            let share = (1.0 - (-stretch / RECENT).exp()).max(stretch / (episodes - self.begun()));
+            self.length = Some(self.length.map_or(length, |known| known + share * (length - known)));
         } else {
             return; // it counts with the next episode
         }
@@ -63,6 +66,21 @@ mod tests {
         assert!((0.9..1.22).contains(&left), "{left}");
         pace.hear(100.0, 9100);
         assert_eq!(pace.left(100.0), Some(0.0));
+    }
+
+    #[test]
+    fn a_few_long_episodes_change_little() {
+        let mut pace = Pace::default();
+        pace.hear(0.0, 0);
+        (1..=50).for_each(|i| pace.hear(10.0 * f64::from(i), 1000 * i as u64));
+        let before = pace.left(2000.0).unwrap();
+        pace.hear(502.0, 50_000 + 2 * 1000);
+        let after = pace.left(2000.0).unwrap();
+        assert!((before - 3.0).abs() < 1e-9 && (1.0..1.2).contains(&(after / before)), "{before}, then {after}");
+        // However stretches are cut, episodes that are twice as long for long enough are believed.
+        (1..=200).for_each(|i| pace.hear(502.0 + 2.0 * f64::from(i), 52_000 + 400 * i as u64));
+        let length = pace.left(2000.0).unwrap() * 132_000.0 / (2000.0 - 902.0);
+        assert!((190.0..=210.0).contains(&length), "{length}");
     }
 
     #[test]
