@@ -72,9 +72,9 @@ endef
 
 .DEFAULT_GOAL := help
 .PHONY: help deps opengl toolchain build install demo all-pairs report-check serve-test test slurm-test kill-test \
-	load-test bounds-test attack-test faults-test asan-test qemu-test slurm-acceptance lint bench fuzz bench-peers audit cargo-deny \
-	metrics-test otel-test python-test wheel wheel-test python-acceptance bench-python python-venv docs docs-test docker \
-	docker-base docker-test
+	load-test bounds-test attack-test faults-test asan-test qemu-test slurm-acceptance lint bench fuzz bench-peers \
+	audit cargo-deny metrics-test otel-test python-test wheel wheel-test python-acceptance bench-python python-venv \
+	docs docs-test docker docker-base docker-test
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -139,8 +139,9 @@ slurm-test: build ## do a plan on a real Slurm of two nodes, started for it, one
 load-test: build ## a server full of Hoppers for five minutes: 1024 sessions of 16, and one more that is refused
 	PERTURB_TEST_FULL_SERVER_SECONDS=$(LOAD_SECONDS) cargo test $(ALL) --test server -- --nocapture every_place_can_be_taken
 
-bounds-test: build opengl ## attack a server beside a neighbour, 99 of 100 of whose steps take less than 50 ms; on an idle machine
-	PERTURB_TEST_NEIGHBOUR_P99_MS=50 cargo test $(ALL) --package perturb --test server -- --nocapture --test-threads 1 bounds::
+bounds-test: build opengl ## attack a server beside a neighbour, who waits 50 ms at most (p99); on an idle machine
+	PERTURB_TEST_NEIGHBOUR_P99_MS=50 cargo test $(ALL) --package perturb --test server -- --nocapture \
+		--test-threads 1 bounds::
 
 faults-test: build ## lines, disks and clocks with faults, again and again, by a seed that PERTURB_SEED repeats; minutes
 	@$(call install,$(FAKETIME))
@@ -228,9 +229,11 @@ docs-test: docs $(VENV)/installed ## run the tutorials' blocks, follow all links
 	@$(call install,chromium)
 	$(VENV)/bin/ruff check --config python/pyproject.toml --extend-ignore ANN,D101,D102,D103 docs/site
 	$(VENV)/bin/ruff format --check --config python/pyproject.toml docs/site
-	$(VENV)/bin/python docs/site/run_blocks.py $(PROGRAMS)
-	python3 docs/site/links.py $(DOCS)/site
-	python3 docs/site/look.py chromium $(DOCS)/site $(DOCS)/pictures
+	failed=; \
+	$(VENV)/bin/python docs/site/run_blocks.py $(PROGRAMS) || failed="$$failed blocks"; \
+	python3 docs/site/links.py $(DOCS)/site || failed="$$failed links"; \
+	python3 docs/site/look.py chromium $(DOCS)/site $(DOCS)/pictures || failed="$$failed look"; \
+	[ -z "$$failed" ] || { echo "docs-test failed:$$failed" >&2; exit 1; }
 
 $(PROGRAMS)/perturb-server: build ;
 
@@ -309,8 +312,10 @@ fuzz: deps ## attack the server and the readers of files with mutated bytes, und
 	done
 
 attack-test: deps ## a million mutated requests and a hundred thousand snapshots, which may take no memory along; minutes
-	PERTURB_FUZZ_INPUTS=1000000 cargo test $(ALL) --package perturb-fuzz --test corpus -- --nocapture --exact requests
-	PERTURB_FUZZ_INPUTS=100000 cargo test $(ALL) --package perturb-fuzz --test corpus -- --nocapture --exact snapshots
+	for inputs in "1000000 requests" "100000 snapshots"; do \
+		PERTURB_FUZZ_MOST_GROWN_MB=20 PERTURB_FUZZ_INPUTS=$${inputs% *} cargo test $(ALL) --package perturb-fuzz \
+			--test corpus -- --nocapture --exact $${inputs#* } || exit 1; \
+	done
 
 docker-test: docker ## run experiments on servers and learners in containers, stop a server in mid-run, and let nobody in who may not
 	docker/test.sh

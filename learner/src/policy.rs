@@ -120,8 +120,8 @@ impl Policy {
         }
     }
 
-    /// Takes over the networks of a player that has played with the weights as they are: they need not be loaded again. It
-    /// must load weights before it plays on.
+    /// Takes over the networks of a player that has played with the weights as they are: they need not be loaded again.
+    /// It must load weights before it plays on.
     pub fn take_networks(&mut self, player: &mut Player) {
         if let Calculus::FeedForward(networks, is_current) = &mut self.calculus {
             *is_current = player.give_networks(networks);

@@ -1,5 +1,7 @@
 //! Tables, and what becomes of them: text for a terminal, Markdown, CSV. The same table gives the same bytes everywhere.
 
+use std::ops::Range;
+
 use comfy_table::presets::{ASCII_MARKDOWN, NOTHING};
 use comfy_table::{CellAlignment, TableStyle};
 
@@ -56,6 +58,34 @@ impl Table {
     /// Columns under each other, without the title.
     pub fn to_text(&self) -> String {
         self.drawn(NOTHING, str::to_owned).trim_fmt()
+    }
+
+    /// The same for a terminal of so many columns: what does not fit stands below, beside the first texts once more.
+    pub fn to_text_within(&self, width: usize) -> String {
+        let keys = self.columns.iter().take_while(|column| !column.is_number).count();
+        let mut blocks: Vec<String> = Vec::new();
+        let mut first = keys;
+        while first < self.columns.len() {
+            // One column at least, however narrow the terminal.
+            let with = |end: usize| self.with_columns(&[0..keys, first..end]).to_text();
+            let (mut end, mut block) = (first + 1, with(first + 1));
+            while end < self.columns.len() {
+                let wider = with(end + 1);
+                if wider.lines().any(|line| line.chars().count() > width) {
+                    break;
+                }
+                (end, block) = (end + 1, wider);
+            }
+            blocks.push(block);
+            first = end;
+        }
+        if blocks.is_empty() { self.to_text() } else { blocks.join("\n\n") }
+    }
+
+    fn with_columns(&self, ranges: &[Range<usize>]) -> Table {
+        let columns = ranges.iter().flat_map(|range| self.columns[range.clone()].iter().cloned()).collect();
+        let row = |row: &Vec<Entry>| ranges.iter().flat_map(|range| row[range.clone()].iter().cloned()).collect();
+        Table { title: self.title.clone(), columns, rows: self.rows.iter().map(row).collect() }
     }
 
     /// For GitHub and the like, without the title.
@@ -136,6 +166,30 @@ mod tests {
          a|b
          c
         ");
+    }
+
+    #[test]
+    fn a_table_that_is_wider_than_the_terminal_goes_on_below() {
+        let sources = [("ppo ff", 93.25), ("a2c ff", 1.5)];
+        let table = Table::of("", &sources)
+            .text("method", |(method, _)| method)
+            .number("Default", |(_, success)| success)
+            .number("Interpolation", |(_, success)| success)
+            .number("Extrapolation", |(_, success)| success)
+            .build();
+        let whole = table.to_text();
+        let width = whole.lines().map(str::len).max().unwrap();
+        assert_eq!(table.to_text_within(width), whole);
+        insta::assert_snapshot!(table.to_text_within(width - 1), @r"
+         method  Default  Interpolation
+         ppo ff    93.25          93.25
+         a2c ff      1.5            1.5
+
+         method  Extrapolation
+         ppo ff          93.25
+         a2c ff            1.5
+        ");
+        assert_eq!(table.to_text_within(0).lines().filter(|line| line.contains("method")).count(), 3);
     }
 
     #[test]

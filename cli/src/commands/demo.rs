@@ -155,7 +155,7 @@ impl Demo<'_> {
             .text("success, %", |(row, ..)| *row)
             .number("runs", |(_, runs, ..)| runs)
             .number("episodes", |(.., episodes, _)| grouped(*episodes as usize))
-            .number("tests", |(.., tested)| grouped(*tested as usize))
+            .number("tested", |(.., tested)| grouped(*tested as usize))
             .number("Default", of(Metric::Default))
             .number("Interpolation", of(Metric::Interpolation))
             .number("Extrapolation", of(Metric::Extrapolation))

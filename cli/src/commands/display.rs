@@ -54,6 +54,11 @@ fn shown() -> MutexGuard<'static, Option<MultiProgress>> {
     SHOWN.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
+/// Columns of the terminal that results are printed on, if they are.
+pub(super) fn terminal_width() -> Option<usize> {
+    std::io::stdout().is_terminal().then(|| usize::from(console::Term::stdout().size().1))
+}
+
 /// The episodes of a training or a test, or the cells of a run.
 pub(super) struct Display {
     bar: Option<Bar>,
@@ -103,11 +108,12 @@ impl Display {
 
     /// After an iteration of a training.
     pub(super) fn training(&mut self, progress: &Progress) {
-        let left = self.pace.as_mut().and_then(|(pace, total)| {
+        let mut figures = Vec::new();
+        if let Some((pace, total)) = &mut self.pace {
             pace.hear(progress.generated_episodes as f64, progress.timesteps);
-            pace.left(*total)
-        });
-        let mut figures = Vec::from_iter(self.left(left));
+            let (left, least) = (pace.left(*total), if pace.is_least(*total) { "at least " } else { "" });
+            figures.extend(self.left(left).map(|left| format!("{least}{left}")));
+        }
         if let Some(EpisodeFigures { episode_return, success, .. }) = progress.recent {
             figures.push(format!("success {:.0} %, return {episode_return:.1}", 100.0 * success));
         }

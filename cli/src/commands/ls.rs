@@ -1,8 +1,9 @@
 //! `perturb ls`.
 
-use std::io::{IsTerminal, Write};
+use std::io::Write;
 
 use super::args::LsArgs;
+use super::display::terminal_width;
 use super::error::{CommandError, Result};
 use perturb_study::runs::{RunSummary, no_folder, places};
 use perturb_study::table::Table;
@@ -36,8 +37,7 @@ pub(super) fn run(args: &LsArgs) -> Result<()> {
         .number("success, %", |found| found.success_percent.map_or_else(String::new, |percent| format!("{percent:.1}")))
         .text("state", |found| found.state);
     let table = table.build().to_text();
-    let width = out.is_terminal().then(|| usize::from(console::Term::stdout().size().1));
-    if width.is_none_or(|width| table.lines().all(|line| line.chars().count() <= width)) {
+    if terminal_width().is_none_or(|width| table.lines().all(|line| line.chars().count() <= width)) {
         return Ok(writeln!(out, "{table}")?);
     }
     // A table would be broken where the terminal ends.

@@ -114,18 +114,25 @@ fn lasting_servers(args: &ServerArgs, wait: WaitArgs) -> Result<Servers> {
     Ok(servers(args)?.with_wait(ServerWait { limit: wait.time(), tell: |sentence| note(sentence) }))
 }
 
-/// The servers of `jobs` processes at a time: those that were named, which all share, or a private one for each, since one
-/// thread of a server speaks to all its clients, and processes with short steps would wait for each other. Each has a
-/// physics thread for every core, for the last process has all cores; more threads than cores are no slower.
+/// The servers of `jobs` processes at a time: those that were named, which all share, or a private one for each, since
+/// one thread of a server speaks to all its clients, and processes with short steps would wait for each other.
 fn servers_of_jobs(args: &ServerArgs, jobs: usize) -> Result<(Vec<PrivateServer>, Vec<Address>)> {
     if !args.server.is_empty() {
         refuse_workers(args)?;
         return Ok((Vec::new(), args.server.clone()));
     }
-    let start = |_| PrivateServer::start(args.workers);
+    let workers = args.workers.unwrap_or_else(|| workers_of_each(jobs, cores()));
+    let start = |_| PrivateServer::start(Some(workers));
     let servers = (0..jobs.max(1)).map(start).collect::<std::result::Result<Vec<_>, _>>()?;
     let addresses = servers.iter().map(|server| server.address().clone()).collect();
     Ok((servers, addresses))
+}
+
+/// Physics threads of each of the private servers of `jobs` processes. One a core as long as all together have no more
+/// than two a core: with two cores, two processes took the same time with one or two threads each, and the last one,
+/// which has all cores, a quarter less with two.
+fn workers_of_each(jobs: usize, cores: usize) -> usize {
+    (2 * cores / jobs.max(1)).clamp(1, cores)
 }
 
 /// Servers for those that play.

@@ -4,7 +4,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use super::args::{CurvesArgs, ReportArgs};
-use super::display::note;
+use super::display::{note, terminal_width};
 use super::error::{CommandError, Result};
 use super::plan_in;
 use perturb_study::files::{require_writable, write_atomically};
@@ -43,7 +43,7 @@ pub(super) fn write(sources: Sources, out: Option<PathBuf>, page: Option<&Path>)
         if let Some(path) = page {
             write_atomically(path, whole.page()?.as_bytes())?;
         }
-        Ok((report.text(), out.clone()))
+        Ok((report.text(terminal_width().unwrap_or(usize::MAX)), out.clone()))
     })
 }
 

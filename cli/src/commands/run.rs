@@ -127,8 +127,9 @@ fn stop_with_input(stop: &StopFlag) -> Result<()> {
 fn all_cells(args: &RunArgs, plan: Plan, folder: &Folder, stop: &StopFlag) -> Result<ExitCode> {
     recurrent::prepare_for(&plan)?; // the workers are this program
     let grouping = Grouping { most: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
-    let all = plan.in_full(Some(folder))?.cells.len();
-    let (local, addresses) = servers_of_jobs(&args.server, grouping.at_a_time.min(all))?;
+    let in_full = plan.in_full(Some(folder))?;
+    let groups = in_full.groups(&unsettled(&in_full, folder), grouping).len();
+    let (local, addresses) = servers_of_jobs(&args.server, grouping.at_a_time.min(groups))?;
     let local: Vec<Mutex<PrivateServer>> = local.into_iter().map(Mutex::new).collect();
     let (servers, troubles) = Servers::connect_to_some(&addresses)?;
     troubles.iter().for_each(|trouble| say(format_args!("perturb: {trouble}; going on with the other servers")));
@@ -158,8 +159,13 @@ fn all_cells(args: &RunArgs, plan: Plan, folder: &Folder, stop: &StopFlag) -> Re
     doing.end()
 }
 
-/// What cells may take at most that are of kinds which do not begin at once, so that the time that is left can be told: by
-/// a short measurement.
+/// The places in the plan of the cells that a run has yet to do.
+fn unsettled(plan: &Plan, folder: &Folder) -> Vec<usize> {
+    (0..plan.cells.len()).filter(|&cell| !folder.cell(&plan.cells[cell].id).is_settled(true)).collect()
+}
+
+/// What cells may take at most that are of kinds which do not begin at once, so that the time that is left can be told:
+/// by a short measurement.
 fn most(
     servers: &Servers,
     plan: &Plan,
@@ -168,10 +174,10 @@ fn most(
     stop: &StopFlag,
 ) -> Result<Vec<Option<f64>>> {
     let kind = |cell: usize| (&plan.cells[cell].config.common.environment, plan.cells[cell].method());
-    let left: Vec<usize> =
-        (0..plan.cells.len()).filter(|&cell| !folder.cell(&plan.cells[cell].id).is_settled(true)).collect();
+    let left = unsettled(plan, folder);
     let groups = plan.groups(&left, grouping);
-    let first: HashSet<_> = groups.iter().take(grouping.at_a_time).flatten().map(|&cell| kind(cell)).collect();
+    let at_a_time = grouping.at_a_time.min(groups.len());
+    let first: HashSet<_> = groups.iter().take(at_a_time).flatten().map(|&cell| kind(cell)).collect();
     let taken = Taken::read(plan, folder);
     let unknown = |&cell: &usize| !first.contains(&kind(cell)) && taken.seconds(&plan.cells[cell]).is_none();
     let unknown: Vec<usize> = left.into_iter().filter(unknown).collect();
@@ -180,7 +186,7 @@ fn most(
     }
     let groups = representatives(plan, &unknown, grouping);
     note(format_args!("measuring what cells cost that begin later: {}", count(groups.len(), "group")));
-    let measure = |group: Vec<&Cell>| measure(servers, &group, grouping.at_a_time, MEASURE, stop);
+    let measure = |group: Vec<&Cell>| measure(servers, &group, at_a_time, MEASURE, stop);
     let measured = match groups.into_iter().map(measure).collect::<Result<Vec<_>, _>>() {
         Err(MeasureError::Stopped { .. }) => return Ok(Vec::new()), // the run hears of it, too
         // Settings that come to numbers that are not finite, for instance: the cell will say so, when its turn comes.

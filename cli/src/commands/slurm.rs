@@ -51,7 +51,7 @@ fn options(args: &RunArgs) -> Result<SlurmOptions> {
         program: recurrent::usual_program()?,
         jobs,
         group: args.group,
-        workers: args.server.workers.unwrap_or(jobs),
+        workers: args.server.workers.unwrap_or(1),
         servers: named.iter().map(Address::to_string).collect(),
         server_wait: args.wait.server_wait,
     };

@@ -202,6 +202,7 @@ fn the_demo_says_what_is_lost_and_what_it_cost_beside_the_paper() {
     {
         assert!(text.contains(part), "{part}: {text}");
     }
+    assert!(text.lines().all(|line| line.chars().count() <= 80), "{text}");
     assert!(read(folder.path(), "demo/trained-on-R/config.toml").contains("version = \"R\""));
     let picture = std::fs::read(folder.path().join("demo/heatmap.png")).expect("a picture");
     assert!(picture.starts_with(b"\x89PNG"));

@@ -116,6 +116,7 @@ impl Actor {
     }
 
     /// The networks of a feed-forward policy of shape `spec`, to be exchanged for others, and log σ `[A]` of its actions.
+    /// Until weights are loaded it refuses to act.
     pub(crate) fn give_networks(&mut self, spec: &PolicySpec) -> Option<(&mut Networks, &[f32])> {
         match &mut self.network {
             Network::FeedForward(network) if self.spec == *spec => {
@@ -213,9 +214,11 @@ impl Actor {
         Ok(())
     }
 
-    /// The number of observations.
+    /// The number of observations, of a policy that may act.
     fn count(&self, observations: &[f32]) -> Result<usize> {
-        debug_assert!(!self.is_stale, "weights are to be loaded after the networks were given away");
+        if self.is_stale {
+            return Err(Error::NoWeights);
+        }
         let n_envs = observations.len() / self.spec.observation_size;
         let expected = self.max_batch.min(n_envs) * self.spec.observation_size;
         check_length("observations [N, O]", observations.len(), expected)?;

@@ -119,7 +119,8 @@ impl Differentiator {
     }
 
     /// Takes over the networks of an actor that has the weights, which is quicker than to load them, and says whether it
-    /// did: they must be of this shape. The actor has others then, and must be loaded before it acts again.
+    /// did: they must be of this shape. The actor has others then, and refuses to act until it has loaded weights
+    /// ([`Error::NoWeights`]).
     #[must_use]
     pub fn load_from(&mut self, actor: &mut Actor) -> bool {
         let Some((networks, log_std)) = actor.give_networks(&self.spec) else { return false };

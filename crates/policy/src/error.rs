@@ -48,6 +48,9 @@ pub enum Error {
         /// Which of the N environments.
         environment: usize,
     },
+    /// A policy was to act whose networks were given away.
+    #[error("the policy's networks were given away; load weights before it acts again")]
+    NoWeights,
     /// A gradient of no samples was asked for.
     #[error("a minibatch is empty, but must have at least 1 sample")]
     NoSamples,

@@ -240,8 +240,8 @@ impl Player {
         self.actor.load_flat(weights)
     }
 
-    /// Gives the networks with which it acts to who differentiates them, if they fit, see [`Differentiator::load_from`];
-    /// weights are to be loaded then before it plays on.
+    /// Gives the networks with which it acts to who differentiates them, if they fit, see
+    /// [`Differentiator::load_from`]; weights are to be loaded then before it plays on.
     #[must_use]
     pub fn give_networks(&mut self, to: &mut Differentiator) -> bool {
         to.load_from(&mut self.actor)

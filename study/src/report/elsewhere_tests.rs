@@ -131,7 +131,7 @@ fn a_folder_is_an_experiment_or_an_assessment() {
 fn another_revision_is_told() {
     let plan = Plan::parse("test", PLAN.into()).unwrap();
     let agent = fixture::assessed("PPO", "CartPole", &[None], [200; 3]);
-    assert!(!report(&plan, std::slice::from_ref(&agent), |report| report.text()).contains("revision"));
+    assert!(!report(&plan, std::slice::from_ref(&agent), |report| report.text(usize::MAX)).contains("revision"));
     let mut results = fixture::results(&plan, |_| Some(([90.0; 3], 1.0)));
     for state in &mut results.states {
         let crate::CellState::Done(result) = state else { unreachable!("all are done") };

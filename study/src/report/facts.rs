@@ -24,11 +24,9 @@ impl Report<'_> {
         format!("Generalisation of {methods} on {}", listed(&self.scope.environments))
     }
 
-    /// What the plan says of itself before its first key, up to an empty line: commands may follow.
-    pub(super) fn abstract_text(&self) -> String {
-        let comment = self.plan.text.lines().map_while(|line| line.trim().strip_prefix('#')).map(str::trim);
-        let paragraph = comment.skip_while(|line| line.is_empty()).take_while(|line| !line.is_empty());
-        paragraph.collect::<Vec<_>>().join(" ")
+    /// The paragraphs in which the plan says what it is.
+    pub(super) fn abstract_paragraphs(&self) -> Vec<String> {
+        opening_comment(&self.plan.text)
     }
 
     /// Names and what there is to say, without those of which there is nothing.
@@ -89,6 +87,15 @@ impl Report<'_> {
     }
 }
 
+/// The paragraphs of the comment before a file's first key, without commands, which are indented.
+fn opening_comment(text: &str) -> Vec<String> {
+    let is_command = |line: &&str| line.starts_with("  ") || line.starts_with('\t');
+    let comment = text.lines().map_while(|line| line.trim().strip_prefix('#')).filter(|line| !is_command(line));
+    let lines: Vec<&str> = comment.map(str::trim).collect();
+    let paragraphs = lines.split(|line| line.is_empty()).map(|lines| lines.join(" "));
+    paragraphs.filter(|paragraph| !paragraph.is_empty()).collect()
+}
+
 /// What is said where it is the paper's budget.
 fn with_papers(budget: String, papers: u64) -> String {
     let said = if budget == papers.to_string() { "as the paper".to_owned() } else { format!("the paper: {papers}") };
@@ -104,4 +111,23 @@ fn success<'a>(cells: impl Iterator<Item = &'a Cell>) -> String {
         Some(rule) => format!("by `{rule}`"),
     };
     listed(&distinct(cells.map(|cell| said(&cell.tests.success))))
+}
+
+#[cfg(test)]
+mod tests {
+    use rstest::rstest;
+
+    use super::opening_comment;
+
+    #[rstest]
+    #[case::nothing("runs = 3\n# later", &[])]
+    #[case::lines("# One\n# paragraph.\nruns = 3", &["One paragraph."])]
+    #[case::paragraphs("#\n# One.\n#\n#\n#Two.\n\n# later", &["One.", "Two."])]
+    #[case::commands("# One.\n#\n#   perturb run\n#\tperturb report\n# Two.", &["One.", "Two."])]
+    fn an_abstract_is_what_is_said_before_the_first_key_without_commands(
+        #[case] text: &str,
+        #[case] paragraphs: &[&str],
+    ) {
+        assert_eq!(opening_comment(text), paragraphs);
+    }
 }

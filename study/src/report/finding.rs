@@ -30,6 +30,60 @@ impl Report<'_> {
         of_environments.map(|rows| self.finding_picture(rows)).collect()
     }
 
+    /// What the opening figures show, in words: a sentence or two for each.
+    pub(super) fn finding_sentences(&self) -> Vec<String> {
+        let rows: Vec<&[MethodMetrics<'_>]> = match self.has_average() {
+            true => vec![&self.averages],
+            false => self.metrics.chunk_by(|a, b| a.environment == b.environment).collect(),
+        };
+        rows.into_iter().filter_map(|rows| self.finding_sentence(rows)).collect()
+    }
+
+    fn finding_sentence(&self, rows: &[MethodMetrics<'_>]) -> Option<String> {
+        let mean = |row: &MethodMetrics<'_>, metric| row.means.get(&metric).copied();
+        let mut ranked: Vec<_> = rows.iter().filter_map(|row| Some((row, mean(row, Metric::Extrapolation)?))).collect();
+        ranked.sort_by(|(_, a), (_, b)| b.point.total_cmp(&a.point));
+        let shown = |mean: Bootstrapped| match mean.interval_95 {
+            Some([low, high]) => format!("{:.1} % ({low:.1} to {high:.1})", mean.point),
+            None => format!("{:.1} %", mean.point),
+        };
+        let (best, extrapolation) = *ranked.first()?;
+        let of = self.finding_of(rows);
+        let mut said = format!("{of}: {} has the highest Extrapolation, {}", best.method, shown(extrapolation));
+        if let Some(default) = mean(best, Metric::Default) {
+            said += &format!(", and {} as Default", shown(default));
+        }
+        if let Some((next, its)) = ranked.get(1) {
+            said += &format!("; {} has the next, {}", next.method, shown(*its));
+            if let (Some([low, _]), Some([_, high])) = (extrapolation.interval_95, its.interval_95) {
+                said += if high < low { ", and the intervals are apart" } else { ", and the intervals overlap" };
+            }
+        }
+        said += ".";
+        let losses = ranked.iter().filter_map(|(row, its)| Some(mean(row, Metric::Default)?.point - its.point));
+        let losses: Vec<f64> = losses.collect();
+        if losses.len() > 1 {
+            let [least, most] = [f64::min, f64::max].map(|of| losses.iter().copied().reduce(of).unwrap_or_default());
+            said += &format!(
+                " From Default to Extrapolation the {} methods lose {least:.1} to {most:.1} points.",
+                losses.len()
+            );
+        }
+        Some(said)
+    }
+
+    /// What rows are of: an environment, or the average of several.
+    fn finding_of(&self, rows: &[MethodMetrics<'_>]) -> String {
+        if rows[0].environment != AVERAGE {
+            return rows[0].environment.to_owned();
+        }
+        let environments = match self.scope.averaged.len() {
+            2 => listed(&self.scope.averaged),
+            several => count(several, "environment"),
+        };
+        format!("Average over {environments}")
+    }
+
     /// Numbers of all environments together and of each, with their intervals.
     pub(super) fn finding_file(&self) -> Table {
         let averages = self.averages.iter().filter(|_| self.has_average());
@@ -38,15 +92,8 @@ impl Report<'_> {
 
     fn finding_picture(&self, rows: &[MethodMetrics<'_>]) -> Picture {
         let is_average = rows[0].environment == AVERAGE;
-        let (of, file) = if is_average {
-            let environments = match self.scope.averaged.len() {
-                2 => listed(&self.scope.averaged),
-                several => count(several, "environment"),
-            };
-            (format!("Average over {environments}"), "finding".to_owned())
-        } else {
-            (rows[0].environment.to_owned(), format!("{}-finding", rows[0].environment))
-        };
+        let of = self.finding_of(rows);
+        let file = if is_average { "finding".to_owned() } else { format!("{of}-finding") };
         let over = if is_average { "environments and runs" } else { "runs" };
         let of_rows = |has: &dyn Fn(&MethodMetrics<'_>) -> bool| rows.iter().any(has);
         let intervals = match of_rows(&|row| row.means.values().any(|mean| mean.interval_95.is_some())) {

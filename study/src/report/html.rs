@@ -119,13 +119,12 @@ fn page(report: &Report<'_>, finding: &[Figure], sections: &[&Section]) -> Marku
                 main {
                     header {
                         h1 { (title) }
-                        @let said = report.abstract_text();
-                        @if !said.is_empty() { p.abstract { (prose(&said)) } }
+                        @for said in report.abstract_paragraphs() { p.abstract { (prose(&said)) } }
                         (facts(report))
                     }
                     section id="finding" aria-label="Finding" {
                         @for one in finding { div.opening { (figure(one)) } }
-                        div.notes { @for line in &report.overview { p { (prose(line)) } } }
+                        div.notes { @for line in report.opening() { p { (prose(&line)) } } }
                     }
                     @for section in sections { (section.body()) }
                 }

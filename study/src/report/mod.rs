@@ -120,11 +120,11 @@ impl<'a> Report<'a> {
         }
     }
 
-    /// For a terminal, without what goes into details; `report.md` has them.
-    pub fn text(&self) -> String {
+    /// For a terminal of so many columns, without what goes into details; `report.md` has them.
+    pub fn text(&self, width: usize) -> String {
         let tables = self.number_tables().chain(self.failure_table()).chain(self.elsewhere_table());
-        let shown = tables.map(|table| format!("\n{}\n{}\n", table.title, table.to_text()));
-        format!("{}\n{}", self.overview.join("\n"), shown.collect::<String>())
+        let shown = tables.map(|table| format!("\n{}\n{}\n", table.title, table.to_text_within(width)));
+        format!("{}\n{}", self.opening().join("\n"), shown.collect::<String>())
     }
 
     /// For GitHub and the like.
@@ -134,7 +134,12 @@ impl<'a> Report<'a> {
         let others = self.failure_table().into_iter().chain(self.elsewhere_table());
         let tables = self.number_tables().chain(details).chain(cells).chain(others);
         let shown = tables.map(|table| format!("\n## {}\n\n{}\n", table.title, table.to_markdown()));
-        format!("# Results\n\n{}\n{}", self.overview.join("\n\n"), shown.collect::<String>())
+        format!("# Results\n\n{}\n{}", self.opening().join("\n\n"), shown.collect::<String>())
+    }
+
+    /// What was found, and of what.
+    fn opening(&self) -> Vec<String> {
+        self.finding_sentences().into_iter().chain(self.overview.iter().cloned()).collect()
     }
 
     fn number_tables(&self) -> impl Iterator<Item = Table> {

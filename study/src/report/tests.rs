@@ -77,7 +77,7 @@ fn figures() -> Figures {
 
 /// The name of a snapshot is that of its file, so that files can move with the module.
 #[rstest]
-#[case("text", |report: &Report<'_>| report.text())]
+#[case("text", |report: &Report<'_>| report.text(usize::MAX))]
 #[case("markdown", |report: &Report<'_>| report.markdown())]
 #[case("csv", |report: &Report<'_>| {
     let lines = |table: Table| format!("{}\n{}", table.title, String::from_utf8(table.to_csv()).unwrap());

@@ -42,8 +42,8 @@ struct Worker {
 }
 
 impl<'a> Local<'a> {
-    /// `grouping.at_a_time` workers, started by `command` for their seat, the lowest number from 0 that no other worker
-    /// has; each reads an [`Order`] and writes [`Line`](super::Line)s. `server` says what has become of their servers, if
+    /// `grouping.at_a_time` workers, started by `command` for their seat, the lowest number from 0 that no other
+    /// worker has; each reads an [`Order`] and writes [`Line`](super::Line)s. `server` says what has become of their servers, if
     /// anything.
     pub fn new(
         plan: &'a Plan,
@@ -311,7 +311,8 @@ mod tests {
         // The second works until the others are done, the third loses its first server.
         let script = format!(
             r#"case "$id" in
-                {second}) until [ -e ../{third}/result.json ] && [ -e ../{first}/result.json ]; do sleep 0.01; done ;;
+                {second}) for _ in $(seq 2000); do
+                    [ -e ../{third}/result.json ] && [ -e ../{first}/result.json ] && break; sleep 0.01; done ;;
                 {third}) if [ "$(wc -l <seats)" = 1 ]; then say '"lost_server","reason":"gone"'; exit; fi ;;
             esac
             echo x >result.json; say '"done"'"#

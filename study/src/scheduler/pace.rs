@@ -5,6 +5,10 @@
 const RECENT: f64 = 100.0;
 /// So much of all steps must be done before anything is said.
 const LEAST: f64 = 0.01;
+/// Episodes grow while the last ones are so much longer than all …
+const GROWING: f64 = 1.1;
+/// … and no more than this share of the budget is done: later, what is left is a good part of what was seen.
+const EARLY: f64 = 0.25;
 
 /// What was told of a training, in one process, and what follows from it.
 #[derive(Clone, Debug, Default)]
@@ -46,6 +50,13 @@ impl Pace {
         let left = (episodes - self.last.0).max(0.0) * self.length?;
         (done > LEAST * (done + left)).then(|| left / done)
     }
+
+    /// Whether what is left of `episodes` is the least that it will be: they grow longer, and few are done.
+    pub fn is_least(&self, episodes: f64) -> bool {
+        let (Some((_, first)), Some(length)) = (self.first, self.length) else { return false };
+        let mean = (self.last.1 - first) / (self.last.0 - self.begun());
+        self.last.0 < EARLY * episodes && length > GROWING * mean
+    }
 }
 
 #[cfg(test)]
@@ -66,6 +77,19 @@ mod tests {
         assert!((0.9..1.22).contains(&left), "{left}");
         pace.hear(100.0, 9100);
         assert_eq!(pace.left(100.0), Some(0.0));
+    }
+
+    #[test]
+    fn what_is_left_of_episodes_that_grow_is_the_least_until_a_quarter_is_done() {
+        let mut pace = Pace::default();
+        pace.hear(0.0, 0);
+        assert!(!pace.is_least(4000.0), "nothing is known");
+        pace.hear(500.0, 5000);
+        assert!(!pace.is_least(4000.0), "all were of a length");
+        pace.hear(700.0, 10_000);
+        assert!(pace.is_least(4000.0) && !pace.is_least(2000.0));
+        pace.hear(900.0, 11_000);
+        assert!(!pace.is_least(4000.0), "they grow no more");
     }
 
     #[test]

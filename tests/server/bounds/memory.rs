@@ -197,9 +197,9 @@ async fn nothing_is_left_of_a_connection_that_has_ended() {
     come_and_go(500).await;
     let before = server.memory();
     come_and_go(5_000).await;
-    let grown = server.memory().saturating_sub(before);
-    println!("5000 connections left {} kB", grown >> 10);
-    assert!(grown < MOST, "5000 connections left {grown} bytes");
+    // The last ones may still be ending.
+    until("memory is given back", async || server.memory() < before + MOST).await;
+    println!("5000 connections left {} kB", server.memory().saturating_sub(before) >> 10);
 }
 
 #[cfg(feature = "mujoco")]
@@ -217,7 +217,8 @@ async fn environments_opened_and_dropped_again_and_again_take_little_more_than_o
         }
         drop(session);
     }
-    // Without a thread that frees them all it was 1.5: each worker's heap grew by what the others had.
+    // Without a thread that frees them all it was 1.5: each worker's heap grew by what the others had. With one, 1.0 to
+    // 1.1 in twenty runs, with 2 workers and with 16.
     until("memory is given back", async || server.memory() as f64 <= 1.3 * once as f64).await;
     let (now, peak) = (server.memory(), server.peak_memory());
     println!("once {} MB, ten times {} MB, at most {} MB", once >> 20, now >> 20, peak >> 20);

@@ -20,8 +20,11 @@ use std::{
 
 /// The longest step of a neighbour, whose machine may be busy with much else. What it comes to is printed.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Where nothing else runs, the most that 99 of 100 of its steps take, ms: `make bounds-test`.
+/// Where nothing else runs, the most that 99 of 100 of its steps take, ms: `make bounds-test`. …
 const P99_MS: &str = "PERTURB_TEST_NEIGHBOUR_P99_MS";
+/// … It looks at so many steps at least, of which none takes longer than this.
+const FEWEST: usize = 100;
+const LONGEST: Duration = Duration::from_secs(1);
 
 /// A session that steps all the time, on a thread of its own, and measures how long each step takes.
 struct Neighbour {
@@ -39,7 +42,7 @@ impl Neighbour {
                 let environment = environment(&address, "CartPole").await;
                 let (mut session, _) = Session::open(&address, open(&environment.name, 4, 1)).await;
                 let mut times = Vec::new();
-                while !stopped.load(Ordering::Relaxed) || times.len() < 20 {
+                while !stopped.load(Ordering::Relaxed) || times.len() < FEWEST {
                     let start = Instant::now();
                     session.send(step(vec![0; 16])).await;
                     within(session.receive()).await.unwrap().expect("the stream ended");
@@ -64,6 +67,7 @@ impl Neighbour {
         if let Ok(most) = std::env::var(P99_MS) {
             let most = Duration::from_millis(most.parse().expect("a number of ms"));
             assert!(p99 < most, "one of a hundred steps of a neighbour took {p99:?} or longer");
+            assert!(longest < LONGEST, "a neighbour's step took {longest:?}");
         }
     }
 }

@@ -95,7 +95,14 @@ fn an_actors_networks_give_the_same_gradient(
     assert!(expected.iter().filter(|&&g| g != 0.0).count() > expected.len() / 2);
     assert_eq!(gradient(&mut taken), expected);
 
-    // The actor has what the other one had; once it has weights, it acts as a new one does, and can give them, too.
+    // The actor has what the other one had, and says so in place of acting.
+    let mut acts = Acts::new(action, 1);
+    let refused = actor.act(&numbers(O, 3), &mut stream(1, Purpose::Actions), &mut acts);
+    assert_eq!(refused, Err(Error::NoWeights));
+    assert_eq!(actor.values(&numbers(O, 3), &mut Vec::new()), Err(Error::NoWeights));
+    assert_eq!(actor.values_in(&numbers(O, 3), &[0], &mut Vec::new()), Err(Error::NoWeights));
+
+    // Once it has weights, it acts as a new one does, and can give them, too.
     let others: Vec<f32> = numbers(spec.n_weights(), 7).iter().map(|x| 0.2 * x).collect();
     let acts = |actor: &mut Actor| {
         let mut acts = Acts::new(action, 1);

@@ -32,7 +32,8 @@ pub struct Task {
     pub jobs: usize,
     /// The most cells in a group, at least 1.
     pub group: usize,
-    /// Physics threads of the server that the job starts on its node, at least 1; without meaning if there are `servers`.
+    /// Physics threads of each of the `jobs` servers that the job starts on its node, at least 1; without meaning if there
+    /// are `servers`.
     pub workers: usize,
     /// Addresses of servers that all jobs share; empty for a private one in each job.
     pub servers: Vec<String>,
@@ -41,9 +42,10 @@ pub struct Task {
 }
 
 impl Task {
-    /// The cores that a job asks for. A group's trainings and their environments take turns, so that one does for both.
+    /// The cores that a job asks for. A group's trainings and their environments take turns, so that one does for both;
+    /// further threads of its server have a core each.
     pub fn cores(&self) -> usize {
-        if self.servers.is_empty() { self.jobs.max(self.workers) } else { self.jobs }
+        if self.servers.is_empty() { self.jobs.saturating_mul(self.workers) } else { self.jobs }
     }
 }
 
@@ -187,7 +189,7 @@ mod tests {
     #[test]
     fn a_job_asks_for_the_cores_that_it_uses() {
         let task = Task { program: "/x".into(), jobs: 2, group: 36, workers: 3, servers: Vec::new(), server_wait: 0 };
-        assert_eq!(task.cores(), 3);
+        assert_eq!(task.cores(), 6);
         assert_eq!(Task { servers: vec!["a:1".into()], ..task }.cores(), 2);
     }
 }
