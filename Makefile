@@ -227,9 +227,9 @@ docs: build $(DOCS)/installed ## build the site in target/docs/site; a link to n
 
 docs-test: docs $(VENV)/installed ## run the tutorials' blocks, follow all links, look at the site in Chromium; minutes
 	@$(call install,chromium)
-	$(VENV)/bin/ruff check --config python/pyproject.toml --extend-ignore ANN,D101,D102,D103 docs/site
-	$(VENV)/bin/ruff format --check --config python/pyproject.toml docs/site
 	failed=; \
+	$(VENV)/bin/ruff check --config python/pyproject.toml --extend-ignore ANN,D101,D102,D103 docs/site && \
+	$(VENV)/bin/ruff format --check --config python/pyproject.toml docs/site || failed="$$failed ruff"; \
 	$(VENV)/bin/python docs/site/run_blocks.py $(PROGRAMS) || failed="$$failed blocks"; \
 	python3 docs/site/links.py $(DOCS)/site || failed="$$failed links"; \
 	python3 docs/site/look.py chromium $(DOCS)/site $(DOCS)/pictures || failed="$$failed look"; \
@@ -311,11 +311,10 @@ fuzz: deps ## attack the server and the readers of files with mutated bytes, und
 			-max_total_time=$(FUZZ_SECONDS) -timeout=60 -rss_limit_mb=4096 -max_len=65536 -print_final_stats=1; \
 	done
 
+attack-test: export PERTURB_FUZZ_MOST_GROWN_MB = 20
 attack-test: deps ## a million mutated requests and a hundred thousand snapshots, which may take no memory along; minutes
-	for inputs in "1000000 requests" "100000 snapshots"; do \
-		PERTURB_FUZZ_MOST_GROWN_MB=20 PERTURB_FUZZ_INPUTS=$${inputs% *} cargo test $(ALL) --package perturb-fuzz \
-			--test corpus -- --nocapture --exact $${inputs#* } || exit 1; \
-	done
+	PERTURB_FUZZ_INPUTS=1000000 cargo test $(ALL) --package perturb-fuzz --test corpus -- --nocapture --exact requests
+	PERTURB_FUZZ_INPUTS=100000 cargo test $(ALL) --package perturb-fuzz --test corpus -- --nocapture --exact snapshots
 
 docker-test: docker ## run experiments on servers and learners in containers, stop a server in mid-run, and let nobody in who may not
 	docker/test.sh

@@ -6,7 +6,7 @@ use bytes::Bytes;
 use http_body::{Body as HttpBody, Frame, SizeHint};
 use std::{
     pin::Pin,
-    sync::{Arc, Mutex, PoisonError, Weak},
+    sync::{Arc, Mutex, OnceLock, PoisonError, Weak},
     task::{Context, Poll},
     time::Duration,
 };
@@ -31,7 +31,7 @@ struct Waiting {
     /// How many they are, and since when the client has read none of them to its end.
     state: Mutex<(usize, Instant)>,
     /// Who looks after them, up to their end: as long as that waits it holds what it needs of the connection.
-    watch: Option<AbortHandle>,
+    watch: OnceLock<AbortHandle>,
 }
 
 impl Waiting {
@@ -53,7 +53,7 @@ impl Waiting {
 
 impl Drop for Waiting {
     fn drop(&mut self) {
-        self.watch.iter().for_each(AbortHandle::abort);
+        self.watch.get().into_iter().for_each(AbortHandle::abort);
     }
 }
 
@@ -77,12 +77,12 @@ impl Replies {
     /// A body whose replies' shares are in the outbox. If its client does not read such a reply within `limit`, its
     /// connection ends.
     pub fn new(body: Body, outbox: Outbox, connection: Option<Connection>, limit: Option<Duration>) -> Self {
-        let waiting = Arc::new_cyclic(|waiting| {
-            let watched = connection.zip(limit);
-            let watched = watched.map(|(connection, limit)| watch(waiting.clone(), connection, limit));
-            let watch = watched.map(|watch| tokio::spawn(watch).abort_handle());
-            Waiting { state: Mutex::new((0, Instant::now())), watch }
-        });
+        // The watch begins when there is something to look after: it ends where there is nothing.
+        let waiting = Arc::new(Waiting { state: Mutex::new((0, Instant::now())), watch: OnceLock::new() });
+        if let (Some(connection), Some(limit)) = (connection, limit) {
+            let watch = tokio::spawn(watch(Arc::downgrade(&waiting), connection, limit));
+            waiting.watch.get_or_init(|| watch.abort_handle());
+        }
         Self { body, outbox, waiting }
     }
 }

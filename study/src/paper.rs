@@ -36,7 +36,7 @@ pub struct Method {
 
 impl Method {
     /// Whether it learns nothing.
-    fn is_random(&self) -> bool {
+    pub(crate) fn is_random(&self) -> bool {
         self.algorithm == "random" && !self.elsewhere
     }
 

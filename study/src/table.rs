@@ -63,23 +63,28 @@ impl Table {
     /// The same for a terminal of so many columns: what does not fit stands below, beside the first texts once more.
     pub fn to_text_within(&self, width: usize) -> String {
         let keys = self.columns.iter().take_while(|column| !column.is_number).count();
-        let mut blocks: Vec<String> = Vec::new();
-        let mut first = keys;
+        let fits = |text: &str| text.lines().all(|line| line.chars().count() <= width);
+        if keys == self.columns.len() || !fits(&self.with_columns(&[0..keys]).to_text()) {
+            return self.to_text();
+        }
+        let (mut blocks, mut first): (Vec<String>, usize) = (Vec::new(), keys);
         while first < self.columns.len() {
-            // One column at least, however narrow the terminal.
-            let with = |end: usize| self.with_columns(&[0..keys, first..end]).to_text();
-            let (mut end, mut block) = (first + 1, with(first + 1));
-            while end < self.columns.len() {
-                let wider = with(end + 1);
-                if wider.lines().any(|line| line.chars().count() > width) {
-                    break;
-                }
-                (end, block) = (end + 1, wider);
-            }
+            let mut ends = (first + 1..=self.columns.len()).filter(|&end| self.may_begin(end));
+            let with = |end: usize| (end, self.with_columns(&[0..keys, first..end]).to_text());
+            // One part at least, however narrow the terminal.
+            let narrowest = ends.next().map_or_else(|| with(self.columns.len()), with);
+            let (end, block) = ends.map(with).take_while(|(_, text)| fits(text)).last().unwrap_or(narrowest);
             blocks.push(block);
             first = end;
         }
-        if blocks.is_empty() { self.to_text() } else { blocks.join("\n\n") }
+        blocks.join("\n\n")
+    }
+
+    /// Whether the column at this place, or the end, can follow a break: one whose name another has, too, is understood
+    /// beside those before it alone.
+    fn may_begin(&self, place: usize) -> bool {
+        let Some(column) = self.columns.get(place) else { return true };
+        self.columns.iter().filter(|other| other.name == column.name).count() == 1
     }
 
     fn with_columns(&self, ranges: &[Range<usize>]) -> Table {
@@ -171,25 +176,27 @@ mod tests {
     #[test]
     fn a_table_that_is_wider_than_the_terminal_goes_on_below() {
         let sources = [("ppo ff", 93.25), ("a2c ff", 1.5)];
-        let table = Table::of("", &sources)
-            .text("method", |(method, _)| method)
-            .number("Default", |(_, success)| success)
-            .number("Interpolation", |(_, success)| success)
-            .number("Extrapolation", |(_, success)| success)
-            .build();
+        let mut table = Table::of("", &sources).text("method", |(method, _)| method);
+        for metric in ["Default", "Interpolation", "Extrapolation"] {
+            table = table.number(metric, |(_, success)| success).number("paper", |_| 70);
+        }
+        let table = table.build();
         let whole = table.to_text();
         let width = whole.lines().map(str::len).max().unwrap();
         assert_eq!(table.to_text_within(width), whole);
         insta::assert_snapshot!(table.to_text_within(width - 1), @r"
-         method  Default  Interpolation
-         ppo ff    93.25          93.25
-         a2c ff      1.5            1.5
+         method  Default  paper  Interpolation  paper
+         ppo ff    93.25     70          93.25     70
+         a2c ff      1.5     70            1.5     70
 
-         method  Extrapolation
-         ppo ff          93.25
-         a2c ff            1.5
+         method  Extrapolation  paper
+         ppo ff          93.25     70
+         a2c ff            1.5     70
         ");
-        assert_eq!(table.to_text_within(0).lines().filter(|line| line.contains("method")).count(), 3);
+        assert_eq!(table.to_text_within(10).lines().filter(|line| line.contains("method")).count(), 3);
+        assert_eq!(table.to_text_within(5), whole, "not even the methods have room");
+        let texts = Table::of("", &sources).text("method", |(method, _)| method).build();
+        assert_eq!(texts.to_text_within(5), texts.to_text());
     }
 
     #[test]

@@ -128,9 +128,9 @@ fn servers_of_jobs(args: &ServerArgs, jobs: usize) -> Result<(Vec<PrivateServer>
     Ok((servers, addresses))
 }
 
-/// Physics threads of each of the private servers of `jobs` processes. One a core as long as all together have no more
-/// than two a core: with two cores, two processes took the same time with one or two threads each, and the last one,
-/// which has all cores, a quarter less with two.
+/// Physics threads of each of the private servers of `jobs` processes: one a core, or fewer where all together would have
+/// more than two a core. With two cores, two processes took the same time with one or two threads each, and the last
+/// one, which has both cores, a quarter less with two.
 fn workers_of_each(jobs: usize, cores: usize) -> usize {
     (2 * cores / jobs.max(1)).clamp(1, cores)
 }
@@ -162,4 +162,29 @@ fn refuse_workers(args: &ServerArgs) -> Result<()> {
         return Err(CommandError::Usage(message.into()));
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use rstest::rstest;
+
+    use super::workers_of_each;
+
+    #[rstest]
+    #[case(1, 1, 1)]
+    #[case(1, 2, 2)]
+    #[case(2, 2, 2)]
+    #[case(3, 2, 1)]
+    #[case(9, 2, 1)]
+    #[case(1, 64, 64)]
+    #[case(2, 64, 64)]
+    #[case(64, 64, 2)]
+    #[case::nothing_to_do(0, 2, 2)]
+    fn private_servers_together_have_two_threads_a_core_at_most(
+        #[case] jobs: usize,
+        #[case] cores: usize,
+        #[case] each: usize,
+    ) {
+        assert_eq!(workers_of_each(jobs, cores), each);
+    }
 }

@@ -127,9 +127,8 @@ fn stop_with_input(stop: &StopFlag) -> Result<()> {
 fn all_cells(args: &RunArgs, plan: Plan, folder: &Folder, stop: &StopFlag) -> Result<ExitCode> {
     recurrent::prepare_for(&plan)?; // the workers are this program
     let grouping = Grouping { most: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
-    let in_full = plan.in_full(Some(folder))?;
-    let groups = in_full.groups(&unsettled(&in_full, folder), grouping).len();
-    let (local, addresses) = servers_of_jobs(&args.server, grouping.at_a_time.min(groups))?;
+    let left = unsettled(args, &plan.in_full(Some(folder))?, folder).len();
+    let (local, addresses) = servers_of_jobs(&args.server, grouping.at_a_time.min(left))?;
     let local: Vec<Mutex<PrivateServer>> = local.into_iter().map(Mutex::new).collect();
     let (servers, troubles) = Servers::connect_to_some(&addresses)?;
     troubles.iter().for_each(|trouble| say(format_args!("perturb: {trouble}; going on with the other servers")));
@@ -153,20 +152,22 @@ fn all_cells(args: &RunArgs, plan: Plan, folder: &Folder, stop: &StopFlag) -> Re
     let server = || local.iter().find_map(end);
     let mut doing = Doing::begin(args, plan, folder, stop)?;
     while let Some(plan) = doing.next()? {
-        let most = if is_quiet() { Vec::new() } else { most(&servers, &plan, folder, grouping, stop)? };
+        let most = if is_quiet() { Vec::new() } else { most(args, &servers, &plan, folder, grouping, stop)? };
         doing.run(&plan, &mut Local::new(&plan, folder, grouping, &command, &server).with_most(most))?;
     }
     doing.end()
 }
 
 /// The places in the plan of the cells that a run has yet to do.
-fn unsettled(plan: &Plan, folder: &Folder) -> Vec<usize> {
-    (0..plan.cells.len()).filter(|&cell| !folder.cell(&plan.cells[cell].id).is_settled(true)).collect()
+fn unsettled(args: &RunArgs, plan: &Plan, folder: &Folder) -> Vec<usize> {
+    let is_settled = |&cell: &usize| folder.cell(&plan.cells[cell].id).is_settled(!args.retry_failed);
+    (0..plan.cells.len()).filter(|cell| !is_settled(cell)).collect()
 }
 
 /// What cells may take at most that are of kinds which do not begin at once, so that the time that is left can be told:
 /// by a short measurement.
 fn most(
+    args: &RunArgs,
     servers: &Servers,
     plan: &Plan,
     folder: &Folder,
@@ -174,7 +175,7 @@ fn most(
     stop: &StopFlag,
 ) -> Result<Vec<Option<f64>>> {
     let kind = |cell: usize| (&plan.cells[cell].config.common.environment, plan.cells[cell].method());
-    let left = unsettled(plan, folder);
+    let left = unsettled(args, plan, folder);
     let groups = plan.groups(&left, grouping);
     let at_a_time = grouping.at_a_time.min(groups.len());
     let first: HashSet<_> = groups.iter().take(at_a_time).flatten().map(|&cell| kind(cell)).collect();

@@ -3,12 +3,12 @@
 use std::process::ExitCode;
 use std::time::Duration;
 
-use super::args::RunArgs;
+use super::args::{RunArgs, ServerArgs};
 use super::cells::Doing;
 use super::display::note;
 use super::error::{Result, system};
 use super::plan::step_limits;
-use super::{recurrent, refuse_workers};
+use super::{recurrent, refuse_workers, servers_of_jobs};
 use perturb_learner::client::{Address, Servers};
 use perturb_learner::measure::measure;
 use perturb_study::interrupt::StopFlag;
@@ -29,13 +29,18 @@ pub(super) fn run(args: &RunArgs, plan: Plan, stop: &StopFlag) -> Result<ExitCod
     options.check(&path)?;
     let slurm = Slurm::default();
     slurm.check(stop)?;
-    // Which environments there are, and what they cost, is found out here: servers that jobs share may be out of reach.
-    let servers = || Servers::local(args.server.workers);
-    step_limits(&servers()?, &plan)?;
+    // Which environments there are, and what they cost, is found out here, with servers as a job has them: those that
+    // jobs share may be out of reach.
+    step_limits(&Servers::local(args.server.workers)?, &plan)?;
     let grouping = Grouping { most: args.group, at_a_time: options.task.jobs };
+    let as_in_a_job = ServerArgs { server: Vec::new(), workers: Some(options.task.workers) };
     let mut doing = Doing::begin(args, plan, &folder, stop)?;
     while let Some(plan) = doing.next()? {
-        let costs = || Ok(costs(&servers()?, &plan, grouping, stop)?);
+        let costs = || {
+            let (_private, addresses) = servers_of_jobs(&as_in_a_job, grouping.at_a_time)?;
+            let (servers, _) = Servers::connect_to_some(&addresses)?;
+            Ok(costs(&servers, &plan, grouping, stop)?)
+        };
         doing.run(&plan, &mut Jobs::new(&plan, &folder, &slurm, &options, &costs, stop))?;
     }
     doing.end()

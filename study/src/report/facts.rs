@@ -87,13 +87,13 @@ impl Report<'_> {
     }
 }
 
-/// The paragraphs of the comment before a file's first key, without commands, which are indented.
+/// The paragraphs of the comment that a file begins with. One whose lines are all indented has commands.
 fn opening_comment(text: &str) -> Vec<String> {
+    let comment = text.lines().skip_while(|line| line.trim().is_empty());
+    let lines: Vec<&str> = comment.map_while(|line| line.trim().strip_prefix('#')).collect();
     let is_command = |line: &&str| line.starts_with("  ") || line.starts_with('\t');
-    let comment = text.lines().map_while(|line| line.trim().strip_prefix('#')).filter(|line| !is_command(line));
-    let lines: Vec<&str> = comment.map(str::trim).collect();
-    let paragraphs = lines.split(|line| line.is_empty()).map(|lines| lines.join(" "));
-    paragraphs.filter(|paragraph| !paragraph.is_empty()).collect()
+    let paragraphs = lines.split(|line| line.trim().is_empty()).filter(|lines| !lines.iter().all(|it| is_command(&it)));
+    paragraphs.map(|lines| lines.iter().map(|line| line.trim()).collect::<Vec<_>>().join(" ")).collect()
 }
 
 /// What is said where it is the paper's budget.
@@ -123,7 +123,8 @@ mod tests {
     #[case::nothing("runs = 3\n# later", &[])]
     #[case::lines("# One\n# paragraph.\nruns = 3", &["One paragraph."])]
     #[case::paragraphs("#\n# One.\n#\n#\n#Two.\n\n# later", &["One.", "Two."])]
-    #[case::commands("# One.\n#\n#   perturb run\n#\tperturb report\n# Two.", &["One.", "Two."])]
+    #[case::commands("\n# One.\n#\n#   perturb run\n#\tperturb report\n#\n# Two.", &["One.", "Two."])]
+    #[case::a_list("# One:\n# - two\n#   lines", &["One: - two lines"])]
     fn an_abstract_is_what_is_said_before_the_first_key_without_commands(
         #[case] text: &str,
         #[case] paragraphs: &[&str],

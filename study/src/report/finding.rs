@@ -10,66 +10,36 @@ use crate::statistics::Bootstrapped;
 use crate::table::Table;
 use crate::{Metric, scheduler::count};
 
-impl Report<'_> {
+impl<'a> Report<'a> {
     /// What the page opens with: all environments together; where nothing can be said of these, or there is one alone, each.
     pub(super) fn finding_pictures(&self) -> Vec<Picture> {
-        if self.has_average() { vec![self.finding_picture(&self.averages)] } else { self.each_environment() }
+        self.opening_rows().into_iter().map(|rows| self.finding_picture(rows)).collect()
+    }
+
+    /// The same in words: a sentence or two for each picture.
+    pub(super) fn finding_sentences(&self) -> Vec<String> {
+        let rows = self.opening_rows().into_iter();
+        rows.filter_map(|rows| Some(format!("{}: {}", self.finding_of(rows), finding_sentence(rows)?))).collect()
     }
 
     /// Of each environment, where the page opens with all together.
     pub(super) fn environment_pictures(&self) -> Vec<Picture> {
-        if self.has_average() { self.each_environment() } else { Vec::new() }
+        if !self.has_average() {
+            return Vec::new();
+        }
+        self.each_environment().map(|rows| self.finding_picture(rows)).collect()
+    }
+
+    fn opening_rows(&self) -> Vec<&[MethodMetrics<'a>]> {
+        if self.has_average() { vec![&self.averages] } else { self.each_environment().collect() }
     }
 
     fn has_average(&self) -> bool {
         self.scope.averaged.len() > 1 && self.averages.iter().any(|row| !row.ours.is_empty())
     }
 
-    fn each_environment(&self) -> Vec<Picture> {
-        let of_environments = self.metrics.chunk_by(|a, b| a.environment == b.environment);
-        of_environments.map(|rows| self.finding_picture(rows)).collect()
-    }
-
-    /// What the opening figures show, in words: a sentence or two for each.
-    pub(super) fn finding_sentences(&self) -> Vec<String> {
-        let rows: Vec<&[MethodMetrics<'_>]> = match self.has_average() {
-            true => vec![&self.averages],
-            false => self.metrics.chunk_by(|a, b| a.environment == b.environment).collect(),
-        };
-        rows.into_iter().filter_map(|rows| self.finding_sentence(rows)).collect()
-    }
-
-    fn finding_sentence(&self, rows: &[MethodMetrics<'_>]) -> Option<String> {
-        let mean = |row: &MethodMetrics<'_>, metric| row.means.get(&metric).copied();
-        let mut ranked: Vec<_> = rows.iter().filter_map(|row| Some((row, mean(row, Metric::Extrapolation)?))).collect();
-        ranked.sort_by(|(_, a), (_, b)| b.point.total_cmp(&a.point));
-        let shown = |mean: Bootstrapped| match mean.interval_95 {
-            Some([low, high]) => format!("{:.1} % ({low:.1} to {high:.1})", mean.point),
-            None => format!("{:.1} %", mean.point),
-        };
-        let (best, extrapolation) = *ranked.first()?;
-        let of = self.finding_of(rows);
-        let mut said = format!("{of}: {} has the highest Extrapolation, {}", best.method, shown(extrapolation));
-        if let Some(default) = mean(best, Metric::Default) {
-            said += &format!(", and {} as Default", shown(default));
-        }
-        if let Some((next, its)) = ranked.get(1) {
-            said += &format!("; {} has the next, {}", next.method, shown(*its));
-            if let (Some([low, _]), Some([_, high])) = (extrapolation.interval_95, its.interval_95) {
-                said += if high < low { ", and the intervals are apart" } else { ", and the intervals overlap" };
-            }
-        }
-        said += ".";
-        let losses = ranked.iter().filter_map(|(row, its)| Some(mean(row, Metric::Default)?.point - its.point));
-        let losses: Vec<f64> = losses.collect();
-        if losses.len() > 1 {
-            let [least, most] = [f64::min, f64::max].map(|of| losses.iter().copied().reduce(of).unwrap_or_default());
-            said += &format!(
-                " From Default to Extrapolation the {} methods lose {least:.1} to {most:.1} points.",
-                losses.len()
-            );
-        }
-        Some(said)
+    fn each_environment(&self) -> impl Iterator<Item = &[MethodMetrics<'a>]> {
+        self.metrics.chunk_by(|a, b| a.environment == b.environment)
     }
 
     /// What rows are of: an environment, or the average of several.
@@ -146,6 +116,43 @@ impl Report<'_> {
             other: row.papers.get(&metric).map(|paper| paper.mean),
         }
     }
+}
+
+/// Who extrapolates best, by how much, and what Extrapolation is beside Default; `None` if no method has it. Of the random
+/// policy, which has learned nothing that could be lost, nothing is said.
+fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
+    let learned: Vec<_> = rows.iter().filter(|row| !row.method.is_random()).collect();
+    let mean = |row: &MethodMetrics<'_>, metric| row.means.get(&metric).copied();
+    let shown = |mean: Bootstrapped| match mean.interval_95 {
+        Some([low, high]) => format!("{:.1} % [{:.1}, {:.1}]", mean.point, low + 0.0, high + 0.0), // no negative zero
+        None => format!("{:.1} %", mean.point),
+    };
+    let both = |row: &MethodMetrics<'_>| Some((mean(row, Metric::Default)?, mean(row, Metric::Extrapolation)?));
+    let mut ranked: Vec<_> =
+        learned.iter().filter_map(|row| both(row).map(|(default, its)| (&row.method, default, its))).collect();
+    ranked.sort_by(|(.., a), (.., b)| b.point.total_cmp(&a.point));
+    let &(best, default, extrapolation) = ranked.first()?;
+    let numbers = format!("Extrapolation of {} and Default of {}", shown(extrapolation), shown(default));
+    let Some(&(next, _, its)) = ranked.get(1) else { return Some(format!("{best} comes to {numbers}.")) };
+    let of = if ranked.len() < learned.len() { format!(" of {}", learned.len()) } else { String::new() };
+    let intervals = match (extrapolation.interval_95, its.interval_95) {
+        (Some([low, _]), Some([_, high])) if high < low => ", and their intervals are apart",
+        (Some(_), Some(_)) => ", and their intervals overlap",
+        _ => "",
+    };
+    let differences: Vec<f64> = ranked.iter().map(|(_, default, its)| rounded(its.point - default.point)).collect();
+    let [least, most] = [f64::min, f64::max].map(|of| differences.iter().copied().reduce(of).unwrap_or_default());
+    Some(format!(
+        "of {}{of} methods {best} generalises best, with {numbers}; next is {next}, with Extrapolation of \
+         {}{intervals}. Extrapolation less Default is {least:+.1} to {most:+.1} points.",
+        ranked.len(),
+        shown(its),
+    ))
+}
+
+/// As it is shown, without a negative zero.
+fn rounded(points: f64) -> f64 {
+    (10.0 * points).round() / 10.0 + 0.0
 }
 
 fn finding_table(name: &str, rows: &[&MethodMetrics<'_>]) -> Table {

@@ -1,8 +1,11 @@
+use std::collections::BTreeMap;
+
 use rstest::rstest;
 
 use super::*;
 use crate::fixture;
 use crate::outcomes::Recorded;
+use crate::paper::Method;
 use crate::plan::{Cell, Plan};
 use crate::report::{Figures, html};
 
@@ -97,6 +100,54 @@ fn too_few_seeds_have_no_interval_and_it_says_so(#[case] runs: u32, #[case] said
         let rows = drawn.groups.iter().flat_map(|group| &group.rows);
         assert!(rows.into_iter().all(|row| row.interval.is_some() == said.is_none()));
     });
+}
+
+/// A method's Default and Extrapolation, with the ends of the latter's interval.
+fn said_of(rows: &[(&str, f64, f64, Option<[f64; 2]>)], missing: usize) -> Option<String> {
+    let plan = plan("'CartPole'", 1);
+    let method = |name: &str| Method { algorithm: name.into(), ..plan.cells[0].method() };
+    let bootstrapped = |point, interval_95| Bootstrapped { point, interval_95, runs: 5 };
+    let of = |method: Method, means: BTreeMap<Metric, Bootstrapped>| MethodMetrics {
+        environment: "CartPole",
+        method,
+        ours: BTreeMap::new(),
+        papers: BTreeMap::new(),
+        means,
+        iqms: BTreeMap::new(),
+        gaps: BTreeMap::new(),
+        reselected: BTreeMap::new(),
+        done: 5,
+        cells: 5,
+    };
+    let known = rows.iter().map(|&(name, default, extrapolation, interval)| {
+        let means = [
+            (Metric::Default, bootstrapped(default, None)),
+            (Metric::Extrapolation, bootstrapped(extrapolation, interval)),
+        ];
+        of(method(name), means.into())
+    });
+    let rows: Vec<_> = known.chain((0..missing).map(|_| of(method("late"), BTreeMap::new()))).collect();
+    finding_sentence(&rows)
+}
+
+#[rstest]
+#[case::nothing(&[], 1, None)]
+#[case::one(&[("a2c", 90.0, 30.25, None)], 0, Some("a2c ff (paper) comes to Extrapolation of 30.2 % and Default of 90.0 %."))]
+#[case::without_intervals_and_some_missing(&[("a2c", 0.0, 0.9, None), ("ppo", 90.0, 0.5, None)], 1, Some(
+    "of 2 of 3 methods a2c ff (paper) generalises best, with Extrapolation of 0.9 % and Default of 0.0 %; next is ppo ff (paper), \
+     with Extrapolation of 0.5 %. Extrapolation less Default is -89.5 to +0.9 points."))]
+#[case::apart(&[("ppo", 9.0, 5.0, Some([3.0, 6.0])), ("a2c", 9.0, 8.0, Some([6.5, 9.0]))], 0, Some(
+    "of 2 methods a2c ff (paper) generalises best, with Extrapolation of 8.0 % [6.5, 9.0] and Default of 9.0 %; next is ppo ff \
+     (paper), with Extrapolation of 5.0 % [3.0, 6.0], and their intervals are apart. Extrapolation less Default is -4.0 to -1.0 points."))]
+#[case::overlapping_and_random(&[("ppo", 9.0, 8.0, Some([6.0, 9.0])), ("a2c", 8.0, 8.0, Some([6.5, 9.0])), ("random", 1.0, 99.0, None)], 0,
+    Some("of 2 methods ppo ff (paper) generalises best, with Extrapolation of 8.0 % [6.0, 9.0] and Default of 9.0 %; next is a2c ff \
+     (paper), with Extrapolation of 8.0 % [6.5, 9.0], and their intervals overlap. Extrapolation less Default is -1.0 to +0.0 points."))]
+fn the_finding_in_words(
+    #[case] rows: &[(&str, f64, f64, Option<[f64; 2]>)],
+    #[case] missing: usize,
+    #[case] said: Option<&str>,
+) {
+    assert_eq!(said_of(rows, missing).as_deref(), said);
 }
 
 #[test]

@@ -123,8 +123,9 @@ fn page(report: &Report<'_>, finding: &[Figure], sections: &[&Section]) -> Marku
                         (facts(report))
                     }
                     section id="finding" aria-label="Finding" {
+                        @for said in report.finding_sentences() { p { (prose(&said)) } }
                         @for one in finding { div.opening { (figure(one)) } }
-                        div.notes { @for line in report.opening() { p { (prose(&line)) } } }
+                        div.notes { @for line in &report.overview { p { (prose(line)) } } }
                     }
                     @for section in sections { (section.body()) }
                 }

@@ -6,7 +6,7 @@ const RECENT: f64 = 100.0;
 /// So much of all steps must be done before anything is said.
 const LEAST: f64 = 0.01;
 /// Episodes grow while the last ones are so much longer than all …
-const GROWING: f64 = 1.1;
+const GROWING: f64 = 1.3;
 /// … and no more than this share of the budget is done: later, what is left is a good part of what was seen.
 const EARLY: f64 = 0.25;
 
@@ -51,7 +51,7 @@ impl Pace {
         (done > LEAST * (done + left)).then(|| left / done)
     }
 
-    /// Whether what is left of `episodes` is the least that it will be: they grow longer, and few are done.
+    /// Whether what is left of `episodes` is probably more than [`Pace::left`] says: they grow longer, and few are done.
     pub fn is_least(&self, episodes: f64) -> bool {
         let (Some((_, first)), Some(length)) = (self.first, self.length) else { return false };
         let mean = (self.last.1 - first) / (self.last.0 - self.begun());

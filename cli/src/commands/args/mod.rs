@@ -114,8 +114,8 @@ pub struct ServerArgs {
     /// afterwards.
     #[arg(long, value_name = "ADDRESS", value_delimiter = ',')]
     pub server: Vec<Address>,
-    /// Physics threads of each server that perturb starts itself [default: one a core, of many servers of --jobs less; 1
-    /// in a job of Slurm].
+    /// Physics threads of each server that perturb starts itself [default: one a core, fewer where --jobs starts many
+    /// servers; 1 in a job of Slurm].
     #[arg(long, value_name = "N", value_parser = |text: &str| within(text, 1..=MOST_WORKERS))]
     pub workers: Option<usize>,
 }

@@ -224,7 +224,7 @@ fn a_lost_server_is_no_cells_failure() {
 
 #[test]
 fn a_run_starts_its_private_server_again_and_comes_to_the_same_results() {
-    let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 300, checkpoint_interval = 20"));
+    let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 1000, checkpoint_interval = 20"));
     succeeded(&experiment.run("undisturbed", &["--jobs", "2"]));
     let child = experiment.command("out", &["--jobs", "1"]).spawn().expect("started"); // the only server is in use
     let cell = experiment.out("out/cells").join(&experiment.plan.cells[0].id);
@@ -239,7 +239,7 @@ fn a_run_starts_its_private_server_again_and_comes_to_the_same_results() {
             server.is_some()
         });
         kill("-KILL", server.expect("a private server"));
-        (killed, at_its_end) = (server, checkpoint());
+        (killed, at_its_end) = (server, Some(checkpoint().expect("a checkpoint")));
     }
     let output = ended(child);
     succeeded(&output);
