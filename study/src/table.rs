@@ -64,13 +64,13 @@ impl Table {
     pub fn to_text_within(&self, width: usize) -> String {
         let keys = self.columns.iter().take_while(|column| !column.is_number).count();
         let fits = |text: &str| text.lines().all(|line| line.chars().count() <= width);
-        if keys == self.columns.len() || !fits(&self.with_columns(&[0..keys]).to_text()) {
+        if keys == self.columns.len() || !fits(&self.with_columns(0..keys, keys..keys).to_text()) {
             return self.to_text();
         }
         let (mut blocks, mut first): (Vec<String>, usize) = (Vec::new(), keys);
         while first < self.columns.len() {
             let mut ends = (first + 1..=self.columns.len()).filter(|&end| self.may_begin(end));
-            let with = |end: usize| (end, self.with_columns(&[0..keys, first..end]).to_text());
+            let with = |end: usize| (end, self.with_columns(0..keys, first..end).to_text());
             // One part at least, however narrow the terminal.
             let narrowest = ends.next().map_or_else(|| with(self.columns.len()), with);
             let (end, block) = ends.map(with).take_while(|(_, text)| fits(text)).last().unwrap_or(narrowest);
@@ -87,9 +87,9 @@ impl Table {
         self.columns.iter().filter(|other| other.name == column.name).count() == 1
     }
 
-    fn with_columns(&self, ranges: &[Range<usize>]) -> Table {
-        let columns = ranges.iter().flat_map(|range| self.columns[range.clone()].iter().cloned()).collect();
-        let row = |row: &Vec<Entry>| ranges.iter().flat_map(|range| row[range.clone()].iter().cloned()).collect();
+    fn with_columns(&self, some: Range<usize>, more: Range<usize>) -> Table {
+        let columns = [&self.columns[some.clone()], &self.columns[more.clone()]].concat();
+        let row = |row: &Vec<Entry>| [&row[some.clone()], &row[more.clone()]].concat();
         Table { title: self.title.clone(), columns, rows: self.rows.iter().map(row).collect() }
     }
 

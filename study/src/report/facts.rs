@@ -92,7 +92,7 @@ fn opening_comment(text: &str) -> Vec<String> {
     let comment = text.lines().skip_while(|line| line.trim().is_empty());
     let lines: Vec<&str> = comment.map_while(|line| line.trim().strip_prefix('#')).collect();
     let is_command = |line: &&str| line.starts_with("  ") || line.starts_with('\t');
-    let paragraphs = lines.split(|line| line.trim().is_empty()).filter(|lines| !lines.iter().all(|it| is_command(&it)));
+    let paragraphs = lines.split(|line| line.trim().is_empty()).filter(|lines| !lines.iter().all(is_command));
     paragraphs.map(|lines| lines.iter().map(|line| line.trim()).collect::<Vec<_>>().join(" ")).collect()
 }
 
