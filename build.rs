@@ -7,7 +7,7 @@ use std::process::Command;
 /// Names the commit where there is no repository to ask, e.g. in a container.
 const VARIABLE: &str = "PERTURB_COMMIT";
 /// What the programs are made of, from the top of the repository.
-const SOURCES: [&str; 8] = ["Cargo.lock", "cli", "crates", "learner", "models", "proto", "src", "study"];
+const SOURCES: [&str; 9] = ["Cargo.lock", "cli", "crates", "learner", "models", "proto", "serve", "src", "study"];
 
 fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo:rerun-if-env-changed={VARIABLE}");

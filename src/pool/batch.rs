@@ -2,14 +2,15 @@
 
 use super::{
     Autoreset, Error, Play, Played, Pool, Turn,
-    bytes::{put, put_actions, put_wide},
+    bytes::{put, put_actions},
+    follow::{Follow, Follower},
+    gather::{Gather, Stepped, collect},
     round::Round,
     shard::{Command, Shard, SlotReset},
-    told::Told,
     workers::{Job, Permit, Shared, lock},
 };
 use crate::{
-    env::{Distribution, Draw, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings},
+    env::{Distribution, Draw, EnvironmentSpec, EpisodeStart, Episodes, Settings},
     meters::Tally,
     scene::Scene,
 };
@@ -90,32 +91,6 @@ pub struct ResetEntry {
     pub state: Option<Vec<f64>>,
 }
 
-/// The outcome of a step; arrays are little-endian, as on the wire.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct Stepped {
-    /// f32 `[N, O]`
-    pub observations: Bytes,
-    /// f32 `[N]`
-    pub rewards: Bytes,
-    /// u8 `[N]`
-    pub terminated: Bytes,
-    /// u8 `[N]`
-    pub truncated: Bytes,
-    /// f32 `[N, terms]`, or empty
-    pub reward_terms: Bytes,
-    /// f32 `[K, O]`
-    pub final_observations: Bytes,
-    /// `[K]`: slot and episode.
-    pub ended: Vec<(u32, EpisodeEnd)>,
-    /// Slot and episode; only with receipts.
-    pub started: Vec<(u32, EpisodeStart)>,
-    /// u64 `[M, 5]`, of what ended, then of what began; only with receipts as arrays: slot, indices of environment, trial
-    /// and episode, number in the trial.
-    pub receipt_episodes: Bytes,
-    /// f64 `[M, P + Q]`: requested and applied values.
-    pub receipt_values: Bytes,
-}
-
 /// A batch of environments. Dropping it frees them at once, or as soon as the shards under way have finished.
 pub struct Batch {
     settings: BatchSettings,
@@ -126,8 +101,12 @@ pub struct Batch {
     workers: Arc<Shared>,
     n_workers: usize,
     buffer: BytesMut,
+    /// Requests that workers were asked for.
+    asked: u64,
     /// A request has been handed to the workers and its end not been waited for.
     under_way: bool,
+    /// When the next request, a step that followed, began.
+    followed: Option<Instant>,
     /// The policy that plays, until somebody else changes the environments.
     play: Option<Box<Play>>,
     /// Who is told when it is freed.
@@ -147,10 +126,10 @@ impl Batch {
         let (workers, size) = (pool.queue(), settings.size());
         let owned = (Arc::new(workers.reserve(size)?), Arc::new(Tally::new(pool.meter(settings.spec.name))));
         let shard_size = shard_size(settings.spec, size, pool.workers());
-        let spec = settings.spec;
         let parts = cut(&settings.groups, shard_size).into_iter().enumerate();
         let shard = |(i, part)| Mutex::new(Shard::new(&settings, part, i * shard_size));
-        let job = job(spec, parts.map(shard).collect(), pool.workers(), owned, size);
+        let shards = parts.map(shard).collect();
+        let job = job(&settings, shards, pool.workers(), owned, size);
         let mut batch = Self {
             settings,
             size,
@@ -159,14 +138,16 @@ impl Batch {
             workers,
             n_workers: pool.workers(),
             buffer: BytesMut::new(),
+            asked: 0,
             under_way: false,
+            followed: None,
             play: None,
             farewell: None,
         };
         batch.run().await?;
         batch.check_failures()?;
-        let observations = batch.all_observations();
-        let started = batch.collect(|shard| &mut shard.started);
+        let observations = batch.gather().observations();
+        let started = collect(&batch.job.shards, |shard| &mut shard.started);
         Ok((batch, observations, started))
     }
 
@@ -191,19 +172,58 @@ impl Batch {
     /// # Errors
     /// [`Error::Ended`] in [`Autoreset::Disabled`], [`Error::Defect`].
     pub async fn step(&mut self, actions: &[u8]) -> Result<Stepped, Error> {
-        let start = Instant::now();
-        if self.settings.autoreset == Autoreset::Disabled {
-            self.refuse_ended()?;
-        }
-        self.play = None;
-        put_actions(&self.job.shards, actions);
-        self.under_way = true;
-        let stepped = self.workers.step(&self.job).await;
+        let start = match self.followed.take() {
+            Some(start) => start,
+            None => {
+                self.ready().await?;
+                if self.settings.autoreset == Autoreset::Disabled {
+                    self.refuse_ended()?;
+                }
+                let start = Instant::now();
+                self.play = None;
+                put_actions(&self.job.shards, actions);
+                if self.workers.step_here(&self.job) {
+                    self.job.result()?;
+                    return Ok(self.stepped(start, Instant::now()));
+                }
+                self.workers.begin_step(&self.job);
+                start
+            }
+        };
+        let number = self.ask();
+        let ended = self.workers.wait(&self.job, number).await;
         self.under_way = false;
-        stepped?;
-        let stepped = self.gather();
-        self.job.tally.meter.times(self.size).observe(start.elapsed());
-        Ok(stepped)
+        // The worker has gathered what came of it if another step followed at once.
+        let (followed, end) = {
+            let mut follow = lock(&self.job.follow);
+            (follow.take(), follow.ended())
+        };
+        self.followed = followed.as_ref().map(|(_, begun)| *begun);
+        ended?;
+        match followed {
+            Some((stepped, end)) => {
+                self.observe(start, end);
+                Ok(stepped)
+            }
+            None => Ok(self.stepped(start, end.unwrap_or_else(Instant::now))),
+        }
+    }
+
+    /// What came of the step that has ended.
+    fn stepped(&mut self, start: Instant, end: Instant) -> Stepped {
+        self.observe(start, end);
+        let reward_terms = self.settings.reward_terms;
+        self.gather().stepped(reward_terms)
+    }
+
+    fn observe(&self, start: Instant, end: Instant) {
+        self.job.tally.meter.times(self.size).observe(end.saturating_duration_since(start));
+    }
+
+    /// Where the step is left that follows the next one; none where a step needs to know what came of the one before.
+    pub fn follower(&self) -> Option<Follower> {
+        let (job, spec, size) = (Arc::clone(&self.job), self.settings.spec, self.size);
+        (self.settings.autoreset != Autoreset::Disabled).then_some(Follower { job, spec, size })
     }
 
     /// Has a policy play. Without a new one, that of before goes on; without a new task, with what is left of its own.
@@ -213,9 +233,10 @@ impl Batch {
     /// # Errors
     /// [`Error::Policy`] if numbers are not finite, [`Error::Defect`]; after both another policy must be given.
     pub async fn act(&mut self, turn: Turn) -> Result<Played, Error> {
+        self.ready().await?;
         let round = Box::new(Round::new(turn, self.play.take()));
-        self.under_way = true;
-        let round = self.workers.play(&self.job, round).await;
+        let number = self.ask();
+        let round = self.workers.play(&self.job, round, number).await;
         self.under_way = false;
         let (play, played) = round?.finish()?;
         self.play = play;
@@ -231,10 +252,8 @@ impl Batch {
     ///
     /// # Errors
     /// [`Error::Defect`].
-    pub fn release(&mut self, slots: &[usize]) -> Result<(), Error> {
-        if self.job.failed() {
-            return Err(Error::Defect);
-        }
+    pub async fn release(&mut self, slots: &[usize]) -> Result<(), Error> {
+        self.ready().await?;
         self.play = None;
         let mut leaves = vec![false; self.size];
         slots.iter().for_each(|&slot| leaves[slot] = true);
@@ -248,7 +267,6 @@ impl Batch {
         }));
         self.size = all.len();
         self.shard_size = shard_size(self.settings.spec, self.size, self.n_workers);
-        let spec = self.settings.spec;
         let mut shards = Vec::new();
         for first in (0..self.size).step_by(self.shard_size) {
             let part: Vec<Episodes> = all.drain(..self.shard_size.min(all.len())).collect();
@@ -257,7 +275,8 @@ impl Batch {
         }
         let owned = (Arc::clone(&self.job.permit), Arc::clone(&self.job.tally));
         self.job.permit.give_back(slots.len());
-        self.job = job(spec, shards, self.n_workers, owned, self.size);
+        self.job = job(&self.settings, shards, self.n_workers, owned, self.size);
+        self.asked = 0;
         Ok(())
     }
 
@@ -267,6 +286,7 @@ impl Batch {
     /// # Errors
     /// [`Error::Defect`].
     pub async fn reset(&mut self, entries: Vec<ResetEntry>) -> Result<(Bytes, Vec<(u32, EpisodeStart)>), Error> {
+        self.ready().await?;
         let slots: Vec<usize> = entries.iter().map(|entry| entry.slot).collect();
         let commands = self.split(entries, |entry| entry.slot);
         self.command(commands, |first, entries| {
@@ -280,7 +300,7 @@ impl Batch {
         });
         self.play = None;
         self.run().await?;
-        Ok((self.observations(&slots), self.collect(|shard| &mut shard.started)))
+        Ok((self.observations(&slots), collect(&self.job.shards, |shard| &mut shard.started)))
     }
 
     /// Saves environments, in order of slots.
@@ -288,10 +308,11 @@ impl Batch {
     /// # Errors
     /// [`Error::Defect`].
     pub async fn snapshot(&mut self, slots: Vec<usize>) -> Result<Vec<Bytes>, Error> {
+        self.ready().await?;
         let commands = self.split(slots, |&slot| slot);
         self.command(commands, |first, slots| Command::Snapshot(slots.iter().map(|slot| slot - first).collect()));
         self.run().await?;
-        Ok(self.collect(|shard| &mut shard.snapshots).into_iter().map(Bytes::from).collect())
+        Ok(collect(&self.job.shards, |shard| &mut shard.snapshots).into_iter().map(Bytes::from).collect())
     }
 
     /// Restores environments, in order of slots: all, or none if one cannot be. Returns their observations, f32
@@ -300,6 +321,7 @@ impl Batch {
     /// # Errors
     /// [`Error::Environment`] for a snapshot that cannot be restored, [`Error::Defect`].
     pub async fn restore(&mut self, entries: Vec<(usize, Bytes)>) -> Result<Bytes, Error> {
+        self.ready().await?;
         let slots: Vec<usize> = entries.iter().map(|entry| entry.0).collect();
         let commands = self.split(entries, |entry| entry.0);
         self.command(commands, |first, entries| {
@@ -332,13 +354,21 @@ impl Batch {
     }
 
     /// Waits for the end of a request whose future was dropped before it was ready. To be called before the next one,
-    /// then; the workers still run it, and another would mix with it. A policy that plays ends with its present step.
+    /// then; the workers still run it, and another would mix with it, and maybe a step that follows. A policy that plays
+    /// ends with its present step.
     pub async fn settle(&mut self) {
+        // Whether any of it failed the next request will tell.
         if self.under_way {
             self.job.halted.store(true, Ordering::Relaxed);
-            // Whether it failed the next request will tell.
-            let _ = self.workers.wait(&self.job).await;
+            lock(&self.job.follow).stop();
+            let _ = self.workers.wait(&self.job, self.asked).await;
             self.job.take_round();
+            self.under_way = false;
+            self.followed = lock(&self.job.follow).take().map(|(_, begun)| begun);
+        }
+        if self.followed.take().is_some() {
+            let number = self.ask();
+            let _ = self.workers.wait(&self.job, number).await;
             self.under_way = false;
         }
     }
@@ -355,11 +385,24 @@ impl Batch {
         Ok(lock(&self.job.shards[slot / self.shard_size]).scene(slot))
     }
 
+    /// Before a request that is not the step which followed: nothing is under way, and nothing has failed.
+    async fn ready(&mut self) -> Result<(), Error> {
+        self.settle().await;
+        self.job.result()
+    }
+
     async fn run(&mut self) -> Result<(), Error> {
-        self.under_way = true;
-        let result = self.workers.run(&self.job).await;
+        let number = self.ask();
+        let result = self.workers.run(&self.job, number).await;
         self.under_way = false;
         result
+    }
+
+    /// The number of the request that the workers are asked for now.
+    fn ask(&mut self) -> u64 {
+        self.under_way = true;
+        self.asked += 1;
+        self.asked
     }
 
     fn check_failures(&self) -> Result<(), Error> {
@@ -400,18 +443,6 @@ impl Batch {
         }
     }
 
-    fn collect<T>(&self, field: impl Fn(&mut Shard) -> &mut Vec<T>) -> Vec<T> {
-        let mut all = Vec::new();
-        for shard in &self.job.shards {
-            all.append(field(&mut lock(shard)));
-        }
-        all
-    }
-
-    fn all_observations(&mut self) -> Bytes {
-        self.gather_f32(|shard| &shard.observations)
-    }
-
     fn observations(&mut self, slots: &[usize]) -> Bytes {
         let n = self.settings.observation_size();
         for &slot in slots {
@@ -421,48 +452,8 @@ impl Batch {
         self.buffer.split().freeze()
     }
 
-    fn gather(&mut self) -> Stepped {
-        Stepped {
-            observations: self.all_observations(),
-            rewards: self.gather_f32(|shard| &shard.rewards),
-            terminated: self.gather_u8(|shard| &shard.terminated),
-            truncated: self.gather_u8(|shard| &shard.truncated),
-            reward_terms: if self.settings.reward_terms {
-                self.gather_f32(|shard| &shard.reward_terms)
-            } else {
-                Bytes::new()
-            },
-            final_observations: self.gather_f32(|shard| &shard.final_observations),
-            ended: self.collect(|shard| &mut shard.ended),
-            started: self.collect(|shard| &mut shard.started),
-            receipt_episodes: self.gather_told(|told| &told.episodes, u64::to_le_bytes),
-            receipt_values: self.gather_told(|told| &told.values, f64::to_le_bytes),
-        }
-    }
-
-    fn gather_f32(&mut self, field: impl Fn(&Shard) -> &Vec<f32>) -> Bytes {
-        for shard in &self.job.shards {
-            put(&mut self.buffer, field(&lock(shard)));
-        }
-        self.buffer.split().freeze()
-    }
-
-    /// Of what ended in all shards, then of what began.
-    fn gather_told<T: Copy>(&mut self, column: fn(&Told) -> &Vec<T>, encode: fn(T) -> [u8; 8]) -> Bytes {
-        let parts: [fn(&Shard) -> &Told; 2] = [|shard| &shard.ended_told, |shard| &shard.started_told];
-        for told in parts {
-            for shard in &self.job.shards {
-                put_wide(&mut self.buffer, column(told(&lock(shard))), encode);
-            }
-        }
-        self.buffer.split().freeze()
-    }
-
-    fn gather_u8(&mut self, field: impl Fn(&Shard) -> &Vec<u8>) -> Bytes {
-        for shard in &self.job.shards {
-            self.buffer.extend_from_slice(field(&lock(shard)));
-        }
-        self.buffer.split().freeze()
+    fn gather(&mut self) -> Gather<'_> {
+        Gather { shards: &self.job.shards, buffer: &mut self.buffer }
     }
 }
 
@@ -497,13 +488,14 @@ fn draws(job: &Job) -> Vec<Draw> {
 
 /// The job of a batch of `size` environments.
 fn job(
-    spec: &EnvironmentSpec,
+    settings: &BatchSettings,
     shards: Vec<Mutex<Shard>>,
     workers: usize,
     owned: (Arc<Permit>, Arc<Tally>),
     size: usize,
 ) -> Arc<Job> {
-    Arc::new(Job::new(shards, workers, owned, spec.step_cost * size as f64))
+    let (cost, follow) = (settings.spec.step_cost * size as f64, Follow::new(settings.reward_terms));
+    Arc::new(Job::new(shards, workers, owned, cost, follow))
 }
 
 /// Cuts groups into parts of `size` slots, the last of which may have fewer.

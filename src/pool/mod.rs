@@ -5,18 +5,25 @@
 //! shards remain, so that batches of different sessions take turns, whatever their sizes. The last shard to finish wakes
 //! the session, which gathers the outputs into one reply. Which worker ran which shard cannot be seen from outside.
 //!
+//! A step that was asked for before the one under way had ended begins at once when that ends: the last shard's worker
+//! gathers the outputs, and puts the batch back, before the session is woken.
+//!
 //! Where a policy plays, the last shard's worker gathers them itself, computes the next actions and puts the batch back
 //! into the queue; only the end of such a round wakes the session.
 
 mod batch;
 mod bytes;
+mod follow;
+mod gather;
 mod play;
 mod round;
 mod shard;
 mod told;
 mod workers;
 
-pub use batch::{Batch, BatchSettings, Farewell, ResetEntry, SlotGroup, Stepped};
+pub use batch::{Batch, BatchSettings, Farewell, ResetEntry, SlotGroup};
+pub use follow::Follower;
+pub use gather::Stepped;
 pub use play::{Play, Policy, PolicyRole};
 pub use round::{EndedAt, Played, Turn};
 pub use shard::Autoreset;

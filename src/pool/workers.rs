@@ -1,6 +1,6 @@
 //! The worker threads and their queue.
 
-use super::{Error, round::Round, shard::Shard};
+use super::{Error, follow::Follow, round::Round, shard::Shard};
 use crate::{
     meters::{Histogram, Meter, Tally},
     priority::lower,
@@ -12,7 +12,7 @@ use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{
         Arc, Condvar, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicBool, AtomicPtr, AtomicUsize, Ordering},
+        atomic::{AtomicBool, AtomicPtr, AtomicU64, AtomicUsize, Ordering},
         mpsc::{self, RecvTimeoutError},
     },
     thread::{self, JoinHandle},
@@ -204,50 +204,64 @@ impl Shared {
         self.changed.notify_one();
     }
 
-    /// Steps the environments of every shard: here if that is soon done, else as [`Shared::run`].
-    pub(super) async fn step(&self, job: &Arc<Job>) -> Result<(), Error> {
+    /// Steps the environments of every shard here, if that is soon done; whether it was.
+    pub(super) fn step_here(&self, job: &Job) -> bool {
         let tiny = if self.moves(job) { TINY_ALONE } else { TINY };
         if job.cost > tiny {
-            return self.run(job).await;
+            return false;
         }
         job.prepare();
         (0..job.shards.len()).for_each(|shard| _ = job.run(shard));
-        job.result()
+        true
     }
 
-    /// Runs every shard of the job on the workers and waits for the last.
-    pub(super) async fn run(&self, job: &Arc<Job>) -> Result<(), Error> {
+    /// Has the workers step the environments of every shard. Another step may follow.
+    pub(super) fn begin_step(&self, job: &Arc<Job>) {
+        lock(&job.follow).begin();
+        self.begin(job);
+    }
+
+    /// Runs every shard of the job on the workers and waits for the last: the job's `number`th request.
+    pub(super) async fn run(&self, job: &Arc<Job>, number: u64) -> Result<(), Error> {
+        self.begin(job);
+        self.wait(job, number).await
+    }
+
+    fn begin(&self, job: &Arc<Job>) {
         job.prepare();
         let shards = job.shards.len();
         self.push(job, shards, shards); // its lock publishes the job's counters
-        self.wait(job).await
     }
 
     /// Runs a round on the workers: its beginning, and whatever steps it wants. Gives it back at its end.
-    pub(super) async fn play(&self, job: &Arc<Job>, round: Box<Round>) -> Result<Box<Round>, Error> {
+    pub(super) async fn play(&self, job: &Arc<Job>, round: Box<Round>, number: u64) -> Result<Box<Round>, Error> {
         self.moves(job);
         job.prepare_round(round);
         self.push(job, 1, 1);
-        self.wait(job).await?;
+        self.wait(job, number).await?;
         job.take_round().ok_or(Error::Defect)
     }
 
     /// Takes note that a job's environments move, and says whether they were the last that did.
-    fn moves(&self, job: &Arc<Job>) -> bool {
-        let job = Arc::as_ptr(job).cast_mut();
+    fn moves(&self, job: &Job) -> bool {
+        let job = std::ptr::from_ref(job).cast_mut();
         self.last.swap(job, Ordering::Relaxed) == job
     }
 
-    /// Waits for the end of a job that was pushed.
-    pub(super) async fn wait(&self, job: &Arc<Job>) -> Result<(), Error> {
+    /// Waits until a job's first `number` requests that workers were asked for have ended.
+    pub(super) async fn wait(&self, job: &Arc<Job>, number: u64) -> Result<(), Error> {
+        let has_ended = || job.ended.load(Ordering::Acquire) >= number;
         // A job that is nearly done is worth more polls than a sleep: being woken costs more than many steps.
         for _ in 0..job.patience {
-            if job.left.load(Ordering::Acquire) == 0 {
+            if has_ended() {
                 break;
             }
             tokio::task::yield_now().await;
         }
-        job.done.notified().await;
+        // What told of one end may have been meant for the one before.
+        while !has_ended() {
+            job.done.notified().await;
+        }
         job.result()
     }
 
@@ -312,23 +326,43 @@ impl Shared {
         }
     }
 
-    /// A job's last part has ended: its session is told, unless a round wants another step.
+    /// A job's last part has ended: its session is told, and another step begins if a round wants one or one follows.
     fn conduct(&self, job: &Arc<Job>) {
-        while job.conduct(self.closing.load(Ordering::Relaxed)) {
+        loop {
+            let next = job.conduct(self.closing.load(Ordering::Relaxed));
+            if matches!(next, Next::Nothing) {
+                return job.tell();
+            }
             job.prepare();
             let shards = job.shards.len();
-            if shards > 1 || self.waiting.load(Ordering::Acquire) > 0 {
-                // Others have their turn first. One part is this worker's, which is awake.
-                return self.push(job, shards, shards - 1);
+            // Others have their turn first. One part is this worker's, which is awake, if nobody waits: through the queue
+            // an idle worker would snatch a job that is in this one's cache.
+            let is_own = shards == 1 && self.waiting.load(Ordering::Acquire) == 0;
+            if !is_own {
+                self.push(job, shards, shards - 1);
             }
-            // Nobody waits: through the queue an idle worker would snatch a job that is in this one's cache.
+            if matches!(next, Next::Request) {
+                self.moves(job);
+                job.tell();
+            }
+            if !is_own {
+                return;
+            }
             job.run(0);
         }
-        job.done.notify_one();
     }
 }
 
-/// A batch's shards and the state of its current request. A batch has at most one request under way.
+/// What a job does at a step's end.
+enum Next {
+    Nothing,
+    /// Another step of the round.
+    Step,
+    /// The step that follows: another request.
+    Request,
+}
+
+/// A batch's shards and the state of its current request. A batch has at most one request under way, and one that follows.
 pub(super) struct Job {
     pub(super) shards: Vec<Mutex<Shard>>,
     /// For each worker the shards that it takes first, and the next of them. A worker that meets the same environments
@@ -338,8 +372,13 @@ pub(super) struct Job {
     left: AtomicUsize,
     /// What decides between two steps whether and how there is another, while a policy plays.
     round: Mutex<Option<Box<Round>>>,
+    /// What is to be done after a step without a round.
+    pub(super) follow: Mutex<Follow>,
     /// The part that is to run next is the beginning of the round, not a shard.
     begins: AtomicBool,
+    /// Requests that have ended, of those that workers were asked for.
+    ended: AtomicU64,
+    /// Told whenever one has.
     done: Notify,
     /// The session is gone: what has not run need not.
     pub(super) abandoned: AtomicBool,
@@ -361,6 +400,7 @@ impl Job {
         workers: usize,
         (permit, tally): (Arc<Permit>, Arc<Tally>),
         cost: f64,
+        follow: Follow,
     ) -> Self {
         let bound = |worker: usize| worker * shards.len() / workers;
         let range = |worker: usize| (bound(worker)..bound(worker + 1), AtomicUsize::new(0));
@@ -369,7 +409,9 @@ impl Job {
             shards,
             left: AtomicUsize::new(0),
             round: Mutex::new(None),
+            follow: Mutex::new(follow),
             begins: AtomicBool::new(false),
+            ended: AtomicU64::new(0),
             done: Notify::new(),
             abandoned: AtomicBool::new(false),
             halted: AtomicBool::new(false),
@@ -386,7 +428,7 @@ impl Job {
         self.failed.load(Ordering::Relaxed)
     }
 
-    fn result(&self) -> Result<(), Error> {
+    pub(super) fn result(&self) -> Result<(), Error> {
         if self.failed() { Err(Error::Defect) } else { Ok(()) }
     }
 
@@ -434,21 +476,38 @@ impl Job {
         self.run(self.claim(worker))
     }
 
-    /// Has the round, if there is one, take what a step brought; whether there is to be another. None is if the pool is
-    /// `closing`.
-    fn conduct(&self, closing: bool) -> bool {
+    /// A request has ended.
+    fn tell(&self) {
+        self.ended.fetch_add(1, Ordering::Release);
+        self.done.notify_one();
+    }
+
+    /// Whether a step is to follow, and which. None is if the pool is `closing`.
+    fn conduct(&self, closing: bool) -> Next {
         if self.failed() || self.abandoned.load(Ordering::Relaxed) {
-            return false;
+            lock(&self.follow).stop();
+            return Next::Nothing;
         }
         let mut round = lock(&self.round);
-        let Some(round) = round.as_mut() else { return false };
+        let Some(round) = round.as_mut() else {
+            drop(round);
+            return self.unless_it_panics(Next::Request, || !closing && lock(&self.follow).go_on(&self.shards));
+        };
         let halted = closing || self.halted.load(Ordering::Relaxed);
-        let conduct = AssertUnwindSafe(|| round.conduct(&self.shards, halted));
-        catch_unwind(conduct).unwrap_or_else(|_| {
-            tracing::error!("a worker panicked while a policy played; the batch is lost");
-            self.failed.store(true, Ordering::Relaxed);
-            false
-        })
+        self.unless_it_panics(Next::Step, || round.conduct(&self.shards, halted))
+    }
+
+    /// `next` if there is to be one.
+    fn unless_it_panics(&self, next: Next, is_wanted: impl FnOnce() -> bool) -> Next {
+        match catch_unwind(AssertUnwindSafe(is_wanted)) {
+            Ok(true) => next,
+            Ok(false) => Next::Nothing,
+            Err(_) => {
+                tracing::error!("a worker panicked between two steps; the batch is lost");
+                self.failed.store(true, Ordering::Relaxed);
+                Next::Nothing
+            }
+        }
     }
 
     /// Runs a shard; whether it was the last.

@@ -7,11 +7,9 @@ use crate::{
     proto,
 };
 use bytes::Bytes;
-use perturb_policy::{
-    ActionKind, Inputs, Normalisers, ObservationNormaliser, PlayerState, PolicySpec, RewardNormaliser, RunningMoments,
-    Task,
-};
-use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
+use perturb_policy::{ActionKind, Inputs, Normalisers, ObservationNormaliser, PlayerState, PolicySpec, Task};
+use perturb_protocol::player::{Unreadable, player_state, read_floats};
+use rand_chacha::ChaCha8Rng;
 
 /// The most hidden layers of a policy …
 const MOST_LAYERS: usize = 8;
@@ -23,8 +21,6 @@ const MOST_NUMBERS: usize = 1 << 25;
 const MOST_COST: f64 = 1e6;
 /// … where a policy computes so many weights in a µs.
 const WEIGHTS_A_MICROSECOND: f64 = 5000.0;
-/// The most vectors that statistics can have seen: counts are computed with as float64.
-const MOST_COUNTED: u64 = 1 << 53;
 
 /// Numbers of each kind in a batch.
 #[derive(Clone, Copy)]
@@ -117,18 +113,17 @@ fn policy(policy: proto::Policy, given: &Bytes, sizes: Sizes, episodes_per_trial
     let spec = spec(&policy, inputs.size(), sizes)?;
     let weights = weights(given, &spec)?;
     let normalisers = Normalisers {
-        observations: policy
-            .observations
-            .map(|it| moments("act.policy.observations", &it).map(ObservationNormaliser::from_moments))
-            .transpose()?
-            .map(|it| it.leaving_alone(sizes.parameters)),
-        rewards: policy.rewards.map(|it| reward_normaliser(&it)).transpose()?,
+        observations: read("act.policy.observations", &policy.observations)?
+            .map(|moments| ObservationNormaliser::from_moments(moments).leaving_alone(sizes.parameters)),
+        rewards: read("act.policy.rewards", &policy.rewards)?,
     };
     normalisers.check(sizes.envs, sizes.observation, sizes.parameters).map_err(|error| {
         Refusal::value("act.policy", format!("with statistics that do not fit: {error}"), "those of this session")
     })?;
     let role = match policy.role {
-        Some(proto::policy::Role::Training(stream)) => PolicyRole::Training(random_stream(&stream)?),
+        Some(proto::policy::Role::Training(stream)) => {
+            PolicyRole::Training((&stream).try_into().map_err(within("act.policy.training"))?)
+        }
         Some(proto::policy::Role::Testing(proto::TestStreams { seed })) => PolicyRole::Testing { seed },
         None => return Err(Refusal::value("act.policy.role", "missing", "training or testing")),
     };
@@ -174,32 +169,24 @@ fn spec(policy: &proto::Policy, input_size: usize, sizes: Sizes) -> Result<Polic
 }
 
 fn weights(given: &Bytes, spec: &PolicySpec) -> Result<Vec<f32>, Refusal> {
-    floats("act.weights", given, spec.n_weights(), "float32 [P]")
+    has_floats("act.weights", given, spec.n_weights(), "float32 [P]")?;
+    read_floats("weights", given).map_err(within("act"))
 }
 
-fn moments(field: &'static str, moments: &proto::Moments) -> Result<RunningMoments, Refusal> {
-    if moments.count > MOST_COUNTED {
-        return Err(Refusal::value(format!("{field}.count"), moments.count, "at most 2^53"));
+/// What is there of it.
+fn read<'a, M, T: TryFrom<&'a M, Error = Unreadable>>(
+    field: &'static str,
+    given: &'a Option<M>,
+) -> Result<Option<T>, Refusal> {
+    given.as_ref().map(T::try_from).transpose().map_err(within(field))
+}
+
+/// Names the message that a field is of.
+fn within(message: &'static str) -> impl Fn(Unreadable) -> Refusal {
+    move |wrong| {
+        let Unreadable { field, got, expected } = wrong.within(message);
+        Refusal::value(field, got, expected)
     }
-    let mean = doubles(&format!("{field}.mean"), &moments.mean)?;
-    Ok(RunningMoments::from_parts(moments.count, mean, doubles(&format!("{field}.squares"), &moments.squares)?))
-}
-
-fn reward_normaliser(rewards: &proto::RewardMoments) -> Result<RewardNormaliser, Refusal> {
-    const FIELD: &str = "act.policy.rewards.moments";
-    let Some(given) = &rewards.moments else { return Err(Refusal::value(FIELD, "missing", "their statistics")) };
-    let returns = doubles("act.policy.rewards.returns", &rewards.returns)?;
-    Ok(RewardNormaliser::from_parts(rewards.gamma, returns, moments(FIELD, given)?).running_on(rewards.runs_on))
-}
-
-fn random_stream(stream: &proto::RandomStream) -> Result<ChaCha8Rng, Refusal> {
-    let Ok(key) = <[u8; 32]>::try_from(&stream.key[..]) else {
-        return Err(Refusal::value("act.policy.training.key", format!("{} bytes", stream.key.len()), "32 bytes"));
-    };
-    let mut rng = ChaCha8Rng::from_seed(key);
-    rng.set_stream(stream.stream);
-    rng.set_word_pos(stream.position.into());
-    Ok(rng)
 }
 
 fn state(
@@ -209,45 +196,23 @@ fn state(
     memory_size: usize,
     actions: ChaCha8Rng,
 ) -> Result<PlayerState, Refusal> {
-    const STARTS: &str = "act.policy.state.starts";
-    let (n, observation) = (sizes.envs, sizes.observation);
+    let n = sizes.envs;
     if given.starts.len() != n {
         let got = format!("{} bytes", given.starts.len());
-        return Err(Refusal::value(STARTS, got, format!("{n} bytes: uint8 [N] with N = {n}")));
+        return Err(Refusal::value("act.policy.state.starts", got, format!("{n} bytes: uint8 [N] with N = {n}")));
     }
-    if let Some(slot) = given.starts.iter().position(|&flag| flag > 1) {
-        return Err(Refusal::value(STARTS, format!("{} in slot {slot}", given.starts[slot]), "0 or 1"));
-    }
-    let numbers = |field: &'static str, bytes, size: usize, shape| floats(field, bytes, n * size, shape);
-    Ok(PlayerState {
-        observations: numbers("act.policy.state.observations", &given.observations, observation, "float32 [N, O]")?,
-        starts: given.starts.iter().map(|&flag| flag == 1).collect(),
-        outcomes: numbers("act.policy.state.outcomes", &given.outcomes, extra, "float32 [N, E]")?,
-        memory: numbers("act.policy.state.memory", &given.memory, memory_size, "float32 [N, S]")?,
-        actions,
-    })
+    let has = |field, bytes, size, shape| has_floats(field, bytes, n * size, shape);
+    has("act.policy.state.observations", &given.observations, sizes.observation, "float32 [N, O]")?;
+    has("act.policy.state.outcomes", &given.outcomes, extra, "float32 [N, E]")?;
+    has("act.policy.state.memory", &given.memory, memory_size, "float32 [N, S]")?;
+    player_state(given, actions).map_err(within("act.policy.state"))
 }
 
-/// Exactly `count` finite numbers.
-fn floats(field: &'static str, bytes: &Bytes, count: usize, shape: &str) -> Result<Vec<f32>, Refusal> {
-    if bytes.len() != 4 * count {
-        let expected = format!("{} bytes: {shape}, {count} numbers", 4 * count);
-        return Err(Refusal::value(field, format!("{} bytes", bytes.len()), expected));
-    }
-    let numbers: Vec<f32> = bytes.as_chunks::<4>().0.iter().map(|word| f32::from_le_bytes(*word)).collect();
-    match numbers.iter().position(|x| !x.is_finite()) {
-        Some(i) => Err(Refusal::value(field, format!("{} in element {i}", numbers[i]), "finite numbers")),
-        None => Ok(numbers),
-    }
-}
-
-/// Any number of numbers, which are checked later.
-fn doubles(field: &str, bytes: &Bytes) -> Result<Vec<f64>, Refusal> {
-    let (words, rest) = bytes.as_chunks::<8>();
-    if !rest.is_empty() {
-        return Err(Refusal::value(field.to_owned(), format!("{} bytes", bytes.len()), "8 bytes for each float64"));
-    }
-    Ok(words.iter().map(|word| f64::from_le_bytes(*word)).collect())
+/// Whether there are bytes for exactly `count` numbers.
+fn has_floats(field: &'static str, bytes: &Bytes, count: usize, shape: &str) -> Result<(), Refusal> {
+    let expected = || format!("{} bytes: {shape}, {count} numbers", 4 * count);
+    let got = || format!("{} bytes", bytes.len());
+    if bytes.len() == 4 * count { Ok(()) } else { Err(Refusal::value(field, got(), expected())) }
 }
 
 /// What was played.
@@ -286,41 +251,14 @@ pub fn saved(batch: &Batch) -> Result<proto::PlayerSaved, Refusal> {
     let Some(state) = play.player().state() else {
         return order("in a test, which has nothing to save", "save in training");
     };
-    let Ok(position) = u64::try_from(state.actions.get_word_pos()) else {
+    if state.actions.get_word_pos() > u64::MAX.into() {
         return order("after 2^64 words of the stream of actions", "begin another stream");
-    };
+    }
     let Normalisers { observations, rewards } = play.player().normalisers();
-    let save = |it: &RunningMoments| proto::Moments {
-        count: it.count(),
-        mean: bytes64(it.mean()),
-        squares: bytes64(it.squares()),
-    };
     Ok(proto::PlayerSaved {
-        observations: observations.as_ref().map(|it| save(it.moments())),
-        rewards: rewards.as_ref().map(|it| proto::RewardMoments {
-            gamma: it.gamma(),
-            returns: bytes64(it.returns()),
-            moments: Some(save(it.moments())),
-            runs_on: it.runs_on(),
-        }),
-        actions: Some(proto::RandomStream {
-            key: state.actions.get_seed().to_vec().into(),
-            stream: state.actions.get_stream(),
-            position,
-        }),
-        state: Some(proto::PlayerState {
-            observations: bytes32(&state.observations),
-            starts: state.starts.iter().map(|&flag| u8::from(flag)).collect(),
-            outcomes: bytes32(&state.outcomes),
-            memory: bytes32(&state.memory),
-        }),
+        observations: observations.as_ref().map(|it| it.moments().into()),
+        rewards: rewards.as_ref().map(Into::into),
+        actions: Some((&state.actions).into()),
+        state: Some((&state).into()),
     })
-}
-
-fn bytes32(numbers: &[f32]) -> Bytes {
-    numbers.iter().flat_map(|x| x.to_le_bytes()).collect()
-}
-
-fn bytes64(numbers: &[f64]) -> Bytes {
-    numbers.iter().flat_map(|x| x.to_le_bytes()).collect()
 }

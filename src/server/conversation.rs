@@ -7,7 +7,7 @@ use super::{
     access::{About, Access, Ended},
     budget::Outbox,
     drain::{Drain, Phase},
-    fields::{Decoder, Field},
+    fields::{Decoder, Field, decoded_at_once},
     frames::{Allowance, Frames, Message, Stop},
     leases::{Arrived, Grant, Numbers, One, Ticket},
     peers::{Full, Place, Places},
@@ -15,9 +15,10 @@ use super::{
     status::Refusal,
     tokens::{Bearer, Held, Token},
 };
+use crate::pool::Follower;
 use futures_util::{Stream, stream};
 use perturb_protocol::Awake;
-use std::{future::Future, pin::Pin, time::Duration};
+use std::{convert::Infallible, future::Future, pin::Pin, time::Duration};
 use tokio::{sync::mpsc, time::Instant};
 use tonic::Status;
 
@@ -61,6 +62,14 @@ pub trait Dialogue: Send + 'static {
 
     /// Answers a request.
     fn answer(&mut self, request: Self::Request) -> impl Future<Output = Result<Self::Response, Refusal>> + Send;
+
+    /// Where the request after this one is told of that comes before it is answered; none if it must wait for its turn.
+    fn follower(&self, _request: &Self::Request) -> Option<Follower> {
+        None
+    }
+
+    /// Tells of it. It will be the next that is answered.
+    fn follow(_follower: &Follower, _request: Self::Request) {}
 
     /// Takes note of a request that was refused before it was decoded.
     fn undecoded(&self, _refusal: &Refusal) {}
@@ -136,8 +145,20 @@ impl Sessions {
         let place = place.inspect_err(|refusal| self.refusals.count(refusal, requests.bearer.as_ref()))?;
         let sessions = Self { drain: self.drain.enter(), ..self.clone() };
         let (start, awake, ending) = (Instant::now(), Awake::default(), GONE);
-        let conversation =
-            Conversation { requests, dialogue, sessions, start, spent: 0, awake, ending, resumed: 0, place };
+        let conversation = Conversation {
+            requests,
+            ahead: None,
+            came_ahead: false,
+            reads_ahead: true,
+            dialogue,
+            sessions,
+            start,
+            spent: 0,
+            awake,
+            ending,
+            resumed: 0,
+            place,
+        };
         // Polled by the connection: when the client is gone the stream is dropped, and what the dialogue holds with it,
         // unless it has a lease.
         let responses = stream::unfold(Some(Speaker::Own(Box::new(conversation))), |speaker| async {
@@ -210,6 +231,12 @@ enum Seat {
 /// A dialogue and its transport.
 struct Conversation<D: Dialogue> {
     requests: Frames,
+    /// What came while the request before it was being answered.
+    ahead: Option<Result<Option<Message>, Stop>>,
+    /// Whether the present request came so, and may have begun then.
+    came_ahead: bool,
+    /// Whether anything may: not where it might have to be asked for again.
+    reads_ahead: bool,
     dialogue: D,
     /// What this one is subject to; it counts as running as long as it holds this.
     sessions: Sessions,
@@ -261,14 +288,22 @@ impl<D: Dialogue> Conversation<D> {
     async fn request(&mut self) -> Result<Option<Message>, Stop> {
         let Limits { handshake, idle, .. } = self.sessions.limits;
         let allowance = self.allowance();
+        let bearer = self.requests.bearer.clone();
+        let Self { requests, ahead, came_ahead, awake, .. } = self;
+        *came_ahead = ahead.is_some();
+        let next = async {
+            match ahead.take() {
+                Some(request) => request,
+                None => awake.until(requests.next(allowance)).await,
+            }
+        };
         let limit =
             if self.dialogue.is_open() { idle } else { Some(idle.map_or(handshake, |idle| idle.min(handshake))) };
-        let bearer = self.requests.bearer.clone();
         tokio::select! {
             biased; // the end comes first: a client that never pauses must not outlast it
             () = self.sessions.drain.closed() => Err(Stop::Refused(Refusal::Draining)),
             refusal = revoked(bearer.as_ref()) => Err(Stop::Refused(refusal)),
-            request = self.awake.until(self.requests.next(allowance)) => request,
+            request = next => request,
             () = silence(limit) => {
                 let seconds = limit.map_or(0, |limit| limit.as_secs());
                 Err(Stop::Refused(Refusal::Idle { seconds }))
@@ -293,9 +328,10 @@ impl<D: Dialogue> Conversation<D> {
             Message::Whole(bytes, share) => (bytes, share),
             Message::Refused(refusal) => return Ok(self.undecoded(refusal)),
         };
-        // Who is ahead of their rate waits, and nothing has happened yet. Nothing steps before a session is open.
+        // Who is ahead of their rate waits, and nothing has happened yet. Nothing steps before a session is open; what
+        // came ahead had no rate to keep.
         let bearer = self.requests.bearer.clone();
-        let paced_bearer = bearer.as_ref().filter(|_| self.dialogue.is_open());
+        let paced_bearer = bearer.as_ref().filter(|_| self.dialogue.is_open() && !self.came_ahead);
         tokio::select! {
             biased;
             paced = paced(paced_bearer) => match paced {
@@ -314,10 +350,14 @@ impl<D: Dialogue> Conversation<D> {
         {
             return Err(Stop::Refused(refusal.clone()));
         }
+        let follower = self.dialogue.follower(&request).filter(|_| self.reads_ahead);
+        let allowance = self.allowance();
+        let Self { dialogue, requests, ahead, .. } = self;
         tokio::select! {
             biased; // it mostly is there at once
-            answer = self.dialogue.answer(request) => Ok(answer),
+            answer = dialogue.answer(request) => Ok(answer),
             refusal = revoked(bearer.as_ref()) => Err(Stop::Refused(refusal)),
+            never = read_ahead::<D>(requests, ahead, follower, allowance) => match never {},
         }
     }
 
@@ -378,6 +418,25 @@ impl<D: Dialogue> Drop for Conversation<D> {
             ending: self.ending,
         });
     }
+}
+
+/// Takes the request that comes while another is answered, and tells the follower of it.
+async fn read_ahead<D: Dialogue>(
+    requests: &mut Frames,
+    ahead: &mut Option<Result<Option<Message>, Stop>>,
+    follower: Option<Follower>,
+    allowance: Allowance,
+) -> Infallible {
+    if let Some(follower) = follower.filter(|_| ahead.is_none()) {
+        let came = requests.next(allowance).await;
+        if let Ok(Some(Message::Whole(bytes, _))) = &came
+            && let Some(request) = decoded_at_once(bytes.clone(), D::FIELDS, allowance)
+        {
+            D::follow(&follower, request);
+        }
+        *ahead = Some(came);
+    }
+    std::future::pending().await
 }
 
 /// Resolves when the token is revoked, if there is one.

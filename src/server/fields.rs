@@ -110,6 +110,16 @@ impl Default for Decoder {
     }
 }
 
+/// The request of these bytes, if it is a good one and decoded at once.
+pub fn decoded_at_once<T: Message + Default>(
+    bytes: Bytes,
+    fields: &'static [Field],
+    allowance: Allowance,
+) -> Option<T> {
+    check(&bytes, fields, allowance, FEW_FIELDS).ok()?;
+    decoded(bytes).ok()
+}
+
 impl Decoder {
     /// The request of these bytes, or why it is refused.
     ///

@@ -8,6 +8,7 @@ use super::{
     frames::Allowance,
     status::Refusal,
 };
+use crate::pool::Follower;
 use std::{
     fmt,
     sync::{
@@ -110,6 +111,14 @@ impl<D: Observed> Dialogue for Counted<D> {
         let response = self.dialogue.answer(request).instrument(span.clone()).await;
         span.in_scope(|| self.count(kind, response.as_ref().err()));
         response
+    }
+
+    fn follower(&self, request: &Self::Request) -> Option<Follower> {
+        self.dialogue.follower(request)
+    }
+
+    fn follow(follower: &Follower, request: Self::Request) {
+        D::follow(follower, request);
     }
 
     fn undecoded(&self, refusal: &Refusal) {

@@ -18,7 +18,7 @@ use super::{
 };
 use crate::{
     env::Catalogue,
-    pool::{Batch, Pool},
+    pool::{Batch, Follower, Pool},
     proto::{self, session_request::Request, session_response::Response},
     render::Renderer,
 };
@@ -172,11 +172,11 @@ impl Session {
         Ok(proto::Rendered { pixels, width: size.width.into(), height: size.height.into() })
     }
 
-    fn release(&mut self, request: &proto::Release) -> Result<proto::Released, Refusal> {
+    async fn release(&mut self, request: proto::Release) -> Result<proto::Released, Refusal> {
         let batch = self.batch.as_mut().ok_or(Refusal::NotOpen { request: "release" })?;
-        let slots = convert::release(batch.size(), request)?;
+        let slots = convert::release(batch.size(), &request)?;
         self.draws.release(batch, &slots);
-        batch.release(&slots)?;
+        batch.release(&slots).await?;
         if let Some(held) = &mut self.held {
             held.give_back(slots.len());
         }
@@ -260,13 +260,28 @@ impl Dialogue for Session {
             Some(Request::Snapshot(snapshot)) => self.snapshot(snapshot).await.map(Response::Snapshot),
             Some(Request::Restore(restore)) => self.restore(restore).await.map(Response::Restore),
             Some(Request::Render(render)) => self.render(render).await.map(Response::Render),
-            Some(Request::Release(release)) => self.release(&release).map(Response::Release),
+            Some(Request::Release(release)) => self.release(release).await.map(Response::Release),
             Some(Request::Act(act)) => self.act(act).await.map(Response::Act),
             Some(Request::SavePlayer(_)) => self.save_player().map(Response::SavePlayer),
             Some(Request::Resume(resume)) => self.resume(resume).await.map(Response::Resumed),
             None => Err(Refusal::value("request", "empty or of a kind this server does not know", "open, step, …")),
         };
         response.map(|response| proto::SessionResponse { response: Some(response) })
+    }
+
+    /// Steps follow steps, unless a token has to wait between them.
+    fn follower(&self, request: &Self::Request) -> Option<Follower> {
+        let batch = self.batch.as_ref().filter(|_| matches!(request.request, Some(Request::Step(_))))?;
+        let is_free = self.bearer.as_ref().is_none_or(|bearer| bearer.rate().is_none());
+        batch.follower().filter(|_| is_free)
+    }
+
+    fn follow(follower: &Follower, request: Self::Request) {
+        if let Some(Request::Step(proto::Step { actions })) = request.request
+            && convert::actions(follower.spec, follower.size, &actions).is_ok()
+        {
+            follower.follow(actions);
+        }
     }
 
     fn takes_up(request: &Self::Request) -> bool {

@@ -42,13 +42,13 @@ pub fn step_request(settings: &BatchSettings, envs: usize) -> usize {
     envs.saturating_mul(4 * action_width(settings))
 }
 
-/// What a session holds as long as it is open, so that no step is refused for what others hold: a step's request and two
-/// replies, one being computed and one being sent.
+/// What a session holds as long as it is open, so that no step is refused for what others hold: the requests of a step and
+/// of one that follows it, and three replies, one being computed, one that waits and one being sent.
 pub fn session(settings: &BatchSettings, envs: usize) -> usize {
     let numbers = 2 * settings.observation_size() + 1 + settings.spec.reward_terms.len();
     let ends = if settings.receipts { 2 * RECEIPT } else { END };
     let reply = envs.saturating_mul(4 * numbers + 2 + ends);
-    step_request(settings, envs).saturating_add(reply.saturating_mul(2))
+    step_request(settings, envs).saturating_mul(2).saturating_add(reply.saturating_mul(3))
 }
 
 /// The snapshots of so many environments.

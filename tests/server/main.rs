@@ -12,6 +12,7 @@ mod distributions;
 mod dm_env_rpc;
 mod drawing;
 mod faults;
+mod following;
 mod groups;
 mod guarded;
 mod leases;

@@ -11,9 +11,10 @@ use perturb_learner::proto;
 use perturb_policy::{Ended, Player};
 use perturb_study::interrupt::StopFlag;
 use perturb_study::sets::TestSet;
+use perturb_study::success::Criterion;
 
 /// The end of an episode stays for so many seconds.
-const HOLD: f64 = 1.0;
+const HOLD: f64 = 2.0;
 
 /// What to film.
 #[derive(Clone, Debug)]
@@ -173,7 +174,8 @@ impl<'a> Film<'a> {
             format!("{} {}", environment.name, set.name),
             format!("{}, trained on {}", state.config.method(), state.config.common.trained_on()),
         );
-        let panel = Panel::new(options.size, title, environment.parameters.len())?;
+        let rule = Criterion::of(&environment).map_or_else(String::new, |criterion| format!("success: {criterion}"));
+        let panel = Panel::new(options.size, title, rule.replace('_', " "), environment.parameters.len())?;
         let mut film = Self {
             options,
             set,
@@ -299,6 +301,9 @@ impl<'a> Film<'a> {
         shown.episode_return = end.episode_return;
         let truncated = reply.truncated[0];
         shown.ending = Some(ShownEnding { success: end.success, terminated: end.terminated, truncated });
+        if let (Some(rule), Some(achieved)) = (&self.environment.success, end.achieved) {
+            shown.achieved = parameter(&rule.quantity.replace('_', " "), achieved, &rule.unit);
+        }
         let names = self.environment.parameters.iter().map(|parameter| parameter.name.clone());
         self.footage.episodes.push(Filmed {
             set: self.set.name.clone(),

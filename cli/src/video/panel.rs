@@ -56,6 +56,8 @@ pub(super) struct Shown {
     pub(super) episode_return: f64,
     /// `None` while it goes on.
     pub(super) ending: Option<ShownEnding>,
+    /// What it achieved of what decides about success, once it has ended, e.g. "distance 20.3 m"; empty if nothing.
+    pub(super) achieved: String,
 }
 
 /// Makes frames of pictures: the picture, and below it the panel. Both sides of a frame are even, as H.264 wants them.
@@ -65,19 +67,26 @@ pub(super) struct Panel {
     /// Of the frame.
     frame: (u32, u32),
     title: PanelLine,
+    /// What is a success.
+    rule: String,
     letter: u32,
 }
 
 impl Panel {
-    /// For pictures of `width` and `height`, with `parameters` lines of parameters. `title` stands above all else, on the
-    /// left and on the right.
-    pub(super) fn new((width, height): (u32, u32), title: PanelLine, parameters: usize) -> Result<Self, VideoError> {
+    /// For pictures of `width` and `height`, of an environment with so many `parameters`. `title` stands above all else, on
+    /// the left and on the right, and `rule` says what is a success.
+    pub(super) fn new(
+        (width, height): (u32, u32),
+        title: PanelLine,
+        rule: String,
+        parameters: usize,
+    ) -> Result<Self, VideoError> {
         load_font()?;
         let letter = (width / LETTERS).max(10);
-        let lines = 3 + parameters.div_ceil(2) as u32;
+        let lines = 4 + parameters.div_ceil(2) as u32;
         let even = |pixels: u32| pixels + pixels % 2;
         let frame = (even(width), even(height + lines * line_height(letter) + letter));
-        Ok(Self { picture: (width, height), frame, title, letter })
+        Ok(Self { picture: (width, height), frame, title, rule, letter })
     }
 
     /// Width and height of frames.
@@ -109,6 +118,7 @@ impl Panel {
             (self.title.clone(), PALE),
             ((shown.episode.clone(), format!("{:.2} s, step {}", shown.time, shown.step)), INK),
             ((format!("return {:.1}", shown.episode_return), String::new()), INK),
+            ((self.rule.clone(), shown.achieved.clone()), PALE),
         ];
         lines.extend(shown.parameters.chunks(2).map(|pair| {
             let mut pair = pair.iter().cloned();
@@ -129,11 +139,11 @@ impl Panel {
                 let (text, style) = (ending.text(), font(&ink, HPos::Right));
                 let (text_width, _) = area.estimate_text_size(&text, &style).map_err(drawing)?;
                 let corners = [
-                    (width - margin - text_width as i32 - margin / 2, y - margin * 2 / 5),
-                    (width - margin / 2, y + margin * 3 / 4),
+                    (width - margin * 2 - text_width as i32, y - margin * 2 / 5),
+                    (width - margin, y + margin * 3 / 4),
                 ];
                 area.draw(&Rectangle::new(corners, ground.filled())).map_err(drawing)?;
-                area.draw_text(&text, &style, (width - margin, y)).map_err(drawing)?;
+                area.draw_text(&text, &style, (width - margin * 3 / 2, y)).map_err(drawing)?;
             }
             y += line_height(self.letter) as i32;
         }
@@ -169,11 +179,13 @@ mod tests {
             time: 0.198,
             episode_return: 34.5,
             ending: None,
+            achieved: String::new(),
         }
     }
 
     fn panel(size: (u32, u32)) -> Panel {
-        Panel::new(size, ("Hopper E".into(), "ppo ff, trained on D".into()), 3).unwrap()
+        let title = ("Hopper E".into(), "ppo ff, trained on D".into());
+        Panel::new(size, title, "success: distance at least 20 m".into(), 3).unwrap()
     }
 
     fn frame(panel: &Panel, shown: &Shown) -> Vec<u8> {
@@ -218,6 +230,7 @@ mod tests {
             Shown { ending: ending(false, false, true), ..shown() },
             Shown { ending: ending(false, true, false), ..shown() },
             Shown { ending: ending(false, true, true), ..shown() },
+            Shown { achieved: "distance 20.3 m".into(), ..shown() },
         ];
         let frames: std::collections::HashSet<Vec<u8>> =
             others.iter().map(|other| frame(&panel, other)).chain([plain]).collect();

@@ -139,6 +139,9 @@ fn harassed(text: &str, victim: Victim, most: usize, dice: &mut Dice) -> (usize,
     let status = child.wait().expect("ended");
     let said = std::fs::read_to_string(said).expect("words");
     assert!(status.success(), "{status}: {said}");
+    if named.is_empty() && kills > 1 {
+        assert!(said.contains("; starting it again") && !said.contains("waiting for it"), "{said}"); // nobody waits
+    }
     (kills, result(&out))
 }
 

@@ -82,9 +82,9 @@ fn a_gif_has_a_frame_for_each_start_and_each_step() {
         let (size, delays, frames) = decoded(&file);
         let expected: Vec<u16> = lengths
             .iter()
-            .flat_map(|&steps| (0..=steps).map(move |step| if step == steps { 100 } else { delay }))
+            .flat_map(|&steps| (0..=steps).map(move |step| if step == steps { 200 } else { delay }))
             .collect();
-        assert_eq!(delays, expected, "real time, and a second at the end of each episode");
+        assert_eq!(delays, expected, "real time, and two seconds at the end of each episode");
         assert!(stdout.contains(&format!("{} frames of {} × {} pixels at 1.00 ×", frames.len(), size.0, size.1)));
         assert!(size.0 == 240 && size.1 > 240 && size.1 % 2 == 0, "{size:?}");
 
@@ -253,14 +253,14 @@ fn an_mp4_is_what_every_player_shows() {
     assert!(stdout.contains("at 1.00 × real time"), "{stdout}");
 
     let probed = probed(&file);
-    // 201 frames, the last one for a second of 20.
+    // 201 frames, the last one for two seconds of 20.
     for expected in [
         "codec_name=h264",
         "pix_fmt=yuv420p",
         "width=302",
         "r_frame_rate=20/1",
         "color_space=bt709",
-        "nb_read_frames=220",
+        "nb_read_frames=240",
     ] {
         assert!(probed.lines().any(|line| line == expected), "{expected}: {probed}");
     }

@@ -1,4 +1,4 @@
-//! Acting with the recurrent network; the equations are in the learner's `rc.rs`.
+//! Acting with the recurrent network; the equations are in `rc.rs` of `crates/torch`.
 
 use pulp::Simd;
 

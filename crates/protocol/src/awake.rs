@@ -21,7 +21,7 @@ pub struct Awake {
 
 impl Awake {
     /// Waits for `event`. While it stays awake, the thread's other tasks have their turns, and so have other threads: it
-    /// offers them its core again and again.
+    /// offers them its core again and again, but not before these tasks, one of which may send what is answered.
     pub async fn until<F: Future>(&mut self, event: F) -> F::Output {
         let begun = Instant::now();
         let mut event = pin!(event);
@@ -41,8 +41,8 @@ impl Awake {
 
 async fn stay_awake(since: Instant) {
     while since.elapsed() < AWAKE {
-        thread::yield_now();
         yield_now().await;
+        thread::yield_now();
     }
 }
 

@@ -8,6 +8,7 @@
 //! - [`Awake`]: how both sides wait for each other.
 //! - [`credentials`]: what a client shows, and whom it trusts.
 //! - [`EndedEpisode`]: what came of an episode.
+//! - [`player`]: a policy that plays, between its messages and [`perturb_policy`].
 //! - [`PrivateServer`]: a server of a program's own.
 #![forbid(unsafe_code)]
 
@@ -23,6 +24,7 @@ mod error;
 pub mod ledger;
 pub mod limits;
 pub mod names;
+pub mod player;
 mod private_server;
 pub mod region;
 mod stream;

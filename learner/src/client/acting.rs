@@ -3,13 +3,9 @@
 use std::io::ErrorKind;
 use std::ops::Range;
 
-use bytes::Bytes;
-use perturb_policy::{
-    Normalisers, ObservationNormaliser, Player, PlayerState, PolicySpec, RewardNormaliser, Role, RunningMoments,
-};
+use perturb_policy::{Normalisers, Player, PlayerState, PolicySpec, Role};
+use perturb_protocol::player::{Unreadable, doubles, observation_normaliser, player_state};
 use perturb_protocol::{ClientError, EndedEpisode};
-use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::SeedableRng;
 
 use super::part::Part;
 use super::session::Session;
@@ -100,11 +96,11 @@ impl Session<'_> {
         self.exchange(
             |_| Some(proto::SavePlayer {}),
             |part, saved: proto::PlayerSaved| {
-                let mismatch = || {
+                let mismatch = |got| {
                     let expected = "what a later policy goes on from";
-                    part.stream.mismatch::<proto::SavePlayer>("an incomplete player".into(), expected.into())
+                    part.stream.mismatch::<proto::SavePlayer>(format!("a player whose {got}"), expected.into())
                 };
-                states.push(saved_player(&saved, size).ok_or_else(mismatch)?);
+                states.push(saved_player(&saved, size).map_err(mismatch)?);
                 Ok(())
             },
         )?;
@@ -146,27 +142,13 @@ pub fn policy(spec: &PolicySpec, player: &Player) -> proto::Policy {
         hidden: spec.hidden.iter().map(|&width| width as u32).collect(),
         lstm: spec.lstm.map_or(0, |width| width as u32),
         outcomes: spec.observation_size > player.observation_size(),
-        observations: observations.as_ref().map(|it| moments(it.moments())),
-        rewards: rewards.as_ref().map(|it| proto::RewardMoments {
-            gamma: it.gamma(),
-            returns: doubles(it.returns()),
-            moments: Some(moments(it.moments())),
-            runs_on: it.runs_on(),
-        }),
+        observations: observations.as_ref().map(|it| it.moments().into()),
+        rewards: rewards.as_ref().map(Into::into),
         role: Some(match player.role() {
-            Role::Training(stream) => proto::policy::Role::Training(proto::RandomStream {
-                key: stream.get_seed().to_vec().into(),
-                stream: stream.get_stream(),
-                position: stream.get_word_pos() as u64,
-            }),
+            Role::Training(stream) => proto::policy::Role::Training(stream.into()),
             Role::Testing(trials) => proto::policy::Role::Testing(proto::TestStreams { seed: trials.seed() }),
         }),
-        state: player.state().map(|state| proto::PlayerState {
-            observations: floats(&state.observations),
-            starts: state.starts.iter().map(|&start| u8::from(start)).collect(),
-            outcomes: floats(&state.outcomes),
-            memory: floats(&state.memory),
-        }),
+        state: player.state().as_ref().map(Into::into),
     }
 }
 
@@ -179,61 +161,16 @@ pub fn for_server(policy: &proto::Policy, n_envs: usize) -> proto::Policy {
     policy
 }
 
-fn moments(moments: &RunningMoments) -> proto::Moments {
-    proto::Moments { count: moments.count(), mean: doubles(moments.mean()), squares: doubles(moments.squares()) }
-}
-
-/// `None` if something is missing. `observation_size` is that of the session, O, of which statistics may leave the end
+/// What is wrong if it is none. `observation_size` is that of the session, O, of which statistics may leave the end
 /// alone.
-fn saved_player(saved: &proto::PlayerSaved, observation_size: usize) -> Option<(PlayerState, Normalisers)> {
-    let (stream, state) = (saved.actions.as_ref()?, saved.state.as_ref()?);
-    let mut actions = ChaCha8Rng::from_seed(stream.key[..].try_into().ok()?);
-    actions.set_stream(stream.stream);
-    actions.set_word_pos(stream.position.into());
-    let moments = |it: &proto::Moments| {
-        Some(RunningMoments::from_parts(it.count, read_doubles(&it.mean)?, read_doubles(&it.squares)?))
+fn saved_player(saved: &proto::PlayerSaved, observation_size: usize) -> Result<(PlayerState, Normalisers), String> {
+    let (Some(actions), Some(state)) = (&saved.actions, &saved.state) else {
+        return Err("state or stream of actions is missing".into());
     };
-    let observations = match &saved.observations {
-        Some(it) => {
-            let moments = moments(it)?;
-            let left_alone = observation_size.checked_sub(moments.mean().len())?;
-            Some(ObservationNormaliser::from_moments(moments).leaving_alone(left_alone))
-        }
-        None => None,
-    };
-    let rewards = match &saved.rewards {
-        Some(it) => {
-            let statistics = moments(it.moments.as_ref()?)?;
-            Some(RewardNormaliser::from_parts(it.gamma, read_doubles(&it.returns)?, statistics).running_on(it.runs_on))
-        }
-        None => None,
-    };
-    let state = PlayerState {
-        observations: read_floats(&state.observations)?,
-        starts: state.starts.iter().map(|&start| start != 0).collect(),
-        outcomes: read_floats(&state.outcomes)?,
-        memory: read_floats(&state.memory)?,
-        actions,
-    };
-    Some((state, Normalisers { observations, rewards }))
-}
-
-/// Little-endian.
-pub fn floats(numbers: &[f32]) -> Bytes {
-    numbers.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>().into()
-}
-
-fn doubles(numbers: &[f64]) -> Bytes {
-    numbers.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>().into()
-}
-
-/// Little-endian numbers; `None` if bytes are left over.
-pub fn read_floats(bytes: &[u8]) -> Option<Vec<f32>> {
-    let (words, rest) = bytes.as_chunks::<4>();
-    rest.is_empty().then(|| words.iter().map(|word| f32::from_le_bytes(*word)).collect())
-}
-
-fn read_doubles(bytes: &[u8]) -> Option<Vec<f64>> {
-    let (words, rest) = bytes.as_chunks::<8>();
-    rest.is_empty().then(|| words.iter().map(|word| f64::from_le_bytes(*word)).collect())
+    let of = |field: &'static str| move |wrong: Unreadable| wrong.within(field).to_string();
+    let normaliser = |moments| observation_normaliser(moments, observation_size);
+    let observations = saved.observations.as_ref().map(normaliser).transpose().map_err(of("observations"))?;
+    let rewards = saved.rewards.as_ref().map(TryInto::try_into).transpose().map_err(of("rewards"))?;
+    let actions = actions.try_into().map_err(of("actions"))?;
+    Ok((player_state(state, actions).map_err(of("state"))?, Normalisers { observations, rewards }))
 }

@@ -45,6 +45,11 @@ impl Servers {
         self.wait
     }
 
+    /// Whether it is one of this process's own, which [`Servers::reconnect`] starts again.
+    pub(super) fn is_private(&self) -> bool {
+        self.local.is_some()
+    }
+
     /// Where actions are chosen.
     pub(super) fn act(&self) -> ActAt {
         self.act

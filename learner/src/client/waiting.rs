@@ -69,7 +69,9 @@ impl Waiting {
         if !self.is_passing(error) || self.waited >= limit {
             return After::GivenUp;
         }
-        tell(&format!("{error}; waiting for it, at most {}", duration((limit - self.waited).as_secs_f64())));
+        let wait = || format!("waiting for it, at most {}", duration((limit - self.waited).as_secs_f64()));
+        let remedy = if servers.is_private() { "starting it again".into() } else { wait() };
+        tell(&format!("{error}; {remedy}"));
         servers.block_on(async {
             tokio::select! {
                 biased;

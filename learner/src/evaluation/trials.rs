@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::ops::Range;
 
 use perturb_policy::{Ended, Player, Result as PolicyResult};
+use perturb_protocol::player::floats;
 
 use super::test::TestError;
 use crate::checkpoint::Checkpoint;
@@ -49,7 +50,7 @@ impl<'a> Trials<'a> {
 impl<'a> RemoteTrials<'a> {
     /// `player`, which plays the policy of `checkpoint`, begins trials in the environments of `session`.
     pub(super) fn new(session: Session<'a>, player: &Player, checkpoint: &Checkpoint) -> Self {
-        let policy = (acting::policy(&checkpoint.policy, player), acting::floats(&checkpoint.flat_weights()));
+        let policy = (acting::policy(&checkpoint.policy, player), floats(&checkpoint.flat_weights()));
         Self { session, policy: Some(policy), episodes_per_trial: player.episodes_per_trial() }
     }
 

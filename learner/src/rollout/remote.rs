@@ -5,6 +5,7 @@ use crate::algorithm::Experience;
 use crate::client::{EndedEpisode, Played, Session, acting};
 use crate::proto;
 use perturb_policy::{ActionKind, Normalisers, Player, PlayerState, PolicySpec, RolloutStep};
+use perturb_protocol::player::{floats, read_floats};
 
 /// Fills rollouts with what a player does that plays at the server, to the bytes of a
 /// [`Collector`](super::Collector).
@@ -57,7 +58,7 @@ impl RemoteCollector {
         (self.experience, self.begins) = (experience, true);
         proto::Act {
             policy: self.player.take().map(|player| acting::policy(&self.spec, &player)),
-            weights: acting::floats(weights),
+            weights: floats(weights),
             task: Some(match experience {
                 Experience::Steps(count) => proto::act::Task::Steps(count as u32),
                 Experience::Episodes(count) => proto::act::Task::Episodes(count as u32),
@@ -82,8 +83,8 @@ impl RemoteCollector {
         let Self { spec, experience, most_steps, begins, arrays, .. } = self;
         let mismatch = |got| session.misplayed(got);
         if std::mem::take(begins) {
-            let memory = acting::read_floats(&played.acted.memory);
-            rollout.begin(&memory.ok_or_else(|| mismatch("odd bytes of memory".into()))?);
+            let memory = read_floats("memory", &played.acted.memory);
+            rollout.begin(&memory.map_err(|wrong| mismatch(wrong.to_string()))?);
         }
         arrays.decode(&played.acted, spec).map_err(mismatch)?;
         let before = rollout.len();

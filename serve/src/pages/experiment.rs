@@ -27,6 +27,7 @@ pub(crate) fn update(root: &Root, relative: &Relative, path: &Path, experiment: 
                 ("working", working(status, experiment, relative)),
                 ("map", map(status, experiment, relative)),
                 ("failures", failures(status, experiment, relative)),
+                ("lag", lag(report != experiment.files())),
                 ("pictures", pictures::of_run(relative, path)),
             ];
             (title(&name, status, experiment), parts)
@@ -50,6 +51,7 @@ pub(crate) fn page(root: &Root, relative: &Relative, update: &Update) -> String 
         (update.part("pictures"))
         h2 { "Report as it stands" }
         p.note { a href=(report) { "The report alone" } ", as " code { "perturb report --html" } " writes it when all is done." }
+        (update.part("lag"))
         iframe.report src=(report) title="Report as it stands" loading="lazy" data-report=(format!("{:016x}", update.report)) {}
         p.note {
             "Files: " a href={ "/file/" (relative.join("plan.toml").encode()) } { "plan.toml" }
@@ -115,7 +117,7 @@ fn kinds(status: &ExperimentStatus) -> Markup {
     html! {
         h2 { "Success of what is done, %" }
         div.wide {
-            table {
+            table.rates {
                 thead {
                     tr {
                         th scope="col" { "environment, learner, trained on" }
@@ -185,6 +187,11 @@ fn one(cell: &Cell, experiment: &Experiment, relative: &Relative) -> Markup {
             td { (doing) }
         }
     }
+}
+
+/// Reports are made seldom, so that trainings do not notice.
+fn lag(lags: bool) -> Markup {
+    html! { @if lags { p.note { "Some results are newer than this report. It will be made again soon, and shown without a reload." } } }
 }
 
 /// Every cell as a square.

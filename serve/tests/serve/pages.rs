@@ -134,6 +134,21 @@ fn a_cell_in_work_is_shown_with_its_curve_until_it_is_done() {
 }
 
 #[test]
+fn a_report_that_is_older_than_the_results_says_so_until_it_is_made_again() {
+    let place = Place::new();
+    let folder = Folder::new(&place.path("study"));
+    let plan = Plan::load(&folder.plan_path()).unwrap();
+    assert!(place.get("/report/study").body.contains("1 of 2 cells are done"));
+    assert!(!place.get("/run/study").body.contains("newer than this report"));
+    folder.cell(&plan.cells[1].id).write_result(&crate::client::result(&plan.cells[1])).unwrap();
+    let older = place.until("/run/study", |page| page.body.contains("2 of 2 cells done"));
+    assert!(older.body.contains("Some results are newer than this report"), "{}", older.body);
+    assert!(place.get("/report/study").body.contains("1 of 2 cells are done"), "it rests");
+    place.until("/run/study", |page| !page.body.contains("newer than this report"));
+    assert!(!place.get("/report/study").body.contains("1 of 2 cells are done"));
+}
+
+#[test]
 fn what_is_broken_is_told_and_ends_nothing() {
     let place = Place::new();
     write(&place.path("one/config.toml"), "no = TOML =");

@@ -25,8 +25,14 @@ const MOST_KEPT: usize = 4 << 20;
 const REST: usize = 512;
 
 /// Has a conversation go on in a task, whose first stream takes responses from `line`.
-pub(super) fn begin<D: Dialogue>(conversation: Conversation<D>, grant: Grant<D::Response>, line: Line<D::Response>) {
+pub(super) fn begin<D: Dialogue>(
+    mut conversation: Conversation<D>,
+    grant: Grant<D::Response>,
+    line: Line<D::Response>,
+) {
     let kept = Kept::new(grant.most);
+    // What came ahead would be lost with its stream, and come again.
+    conversation.reads_ahead = false;
     tokio::spawn(Leased { conversation, grant, kept, sent: 0 }.run(line));
 }
 

@@ -24,7 +24,9 @@ pub(super) fn round_ticks(range: &Range<f64>, most: usize) -> Vec<(f64, String)>
         // Dividing by a whole number, the nearest to what is written.
         if power < 0 { multiple / 10_f64.powi(-power) } else { multiple * 10_f64.powi(power) }
     };
-    (0..=(last - first) as i32).map(|index| (value(index), written(value(index), power))).collect()
+    let values: Vec<f64> = (0..=(last - first) as i32).map(value).collect();
+    let largest = values.iter().fold(0.0, |largest: f64, value| largest.max(value.abs()));
+    values.into_iter().map(|value| (value, written(value, power, largest))).collect()
 }
 
 /// From a tick to a tick, so that all of `range` is between; a range that is none stays.
@@ -41,14 +43,15 @@ pub(super) fn rounded(range: &Range<f64>) -> Range<f64> {
     }
 }
 
-/// With as many digits as multiples of that power of ten need.
-fn written(value: f64, power: i32) -> String {
+/// With as many digits as multiples of that power of ten need, in the unit that suits the axis's largest value.
+fn written(value: f64, power: i32, largest: f64) -> String {
     // Adding 0 makes a negative zero positive.
     if power < 0 {
         return format!("{:.*}", power.unsigned_abs() as usize, value + 0.0);
     }
     let decimals = |of: i32| (of - power).max(0) as usize;
-    match value.abs() {
+    match largest {
+        _ if value == 0.0 => tick(value),
         1e6.. => format!("{:.*}M", decimals(6), value / 1e6),
         10_000.0.. => format!("{:.*}k", decimals(3), value / 1e3),
         _ => tick(value),
@@ -100,6 +103,8 @@ mod tests {
     #[case(-1613.2..-121.7, 5, &["-1500", "-1000", "-500"])]
     #[case(-0.31..0.29, 4, &["-0.2", "0.0", "0.2"])]
     #[case(-20000.0..20000.0, 5, &["-20k", "-10k", "0", "10k", "20k"])]
+    #[case(0.0..15_000.0, 4, &["0", "5k", "10k", "15k"])]
+    #[case(0.0..1.5e6, 4, &["0", "0.5M", "1.0M", "1.5M"])]
     #[case(1e6..1.2e6, 6, &["1.00M", "1.05M", "1.10M", "1.15M", "1.20M"])]
     #[case(101_000.0..101_250.0, 6, &["101.00k", "101.05k", "101.10k", "101.15k", "101.20k", "101.25k"])]
     #[case(0.0..2e6, 3, &["0", "1M", "2M"])]

@@ -38,6 +38,8 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
 
 const STATE: &[Channel] = &[Channel::new("x", "m", -100.0, 100.0), Channel::new("velocity", "m/s", -100.0, 100.0)];
 const DT: f64 = 0.1;
+/// What has a ball's step panic.
+pub const FATAL: f32 = 1e9;
 
 struct Ball {
     mass: f64,
@@ -86,6 +88,7 @@ impl Environment for Ball {
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
         let Action::Continuous(&[force]) = action else { unreachable!("the server checks actions") };
+        assert!(force != FATAL, "a defect, as wanted");
         let [x, velocity] = self.state;
         let velocity = velocity + DT * (f64::from(force).clamp(-1.0, 1.0) - self.drag * velocity) / self.mass;
         self.state = [x + DT * velocity, velocity];

@@ -1,6 +1,6 @@
 //! A server with one more environment, which has everything of it in this folder.
 
-mod ball;
+pub mod ball;
 
 use crate::{
     common::server::{self, Actor, Session, doubles, floats, open, parameters},

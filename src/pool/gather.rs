@@ -1,0 +1,100 @@
+//! What came of a step, out of the shards.
+
+use super::{
+    bytes::{put, put_wide},
+    shard::Shard,
+    told::Told,
+    workers::lock,
+};
+use crate::env::{EpisodeEnd, EpisodeStart};
+use bytes::{Bytes, BytesMut};
+use std::sync::Mutex;
+
+/// The outcome of a step; arrays are little-endian, as on the wire.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Stepped {
+    /// f32 `[N, O]`
+    pub observations: Bytes,
+    /// f32 `[N]`
+    pub rewards: Bytes,
+    /// u8 `[N]`
+    pub terminated: Bytes,
+    /// u8 `[N]`
+    pub truncated: Bytes,
+    /// f32 `[N, terms]`, or empty
+    pub reward_terms: Bytes,
+    /// f32 `[K, O]`
+    pub final_observations: Bytes,
+    /// `[K]`: slot and episode.
+    pub ended: Vec<(u32, EpisodeEnd)>,
+    /// Slot and episode; only with receipts.
+    pub started: Vec<(u32, EpisodeStart)>,
+    /// u64 `[M, 5]`, of what ended, then of what began; only with receipts as arrays: slot, indices of environment, trial
+    /// and episode, number in the trial.
+    pub receipt_episodes: Bytes,
+    /// f64 `[M, P + Q]`: requested and applied values.
+    pub receipt_values: Bytes,
+}
+
+/// Shards and the buffer that arrays are cut off.
+pub(super) struct Gather<'a> {
+    pub(super) shards: &'a [Mutex<Shard>],
+    pub(super) buffer: &'a mut BytesMut,
+}
+
+impl Gather<'_> {
+    /// Takes what the last step left in the shards, the reward's terms if they are wanted.
+    pub(super) fn stepped(mut self, reward_terms: bool) -> Stepped {
+        Stepped {
+            observations: self.observations(),
+            rewards: self.f32(|shard| &shard.rewards),
+            terminated: self.u8(|shard| &shard.terminated),
+            truncated: self.u8(|shard| &shard.truncated),
+            reward_terms: if reward_terms { self.f32(|shard| &shard.reward_terms) } else { Bytes::new() },
+            final_observations: self.f32(|shard| &shard.final_observations),
+            ended: collect(self.shards, |shard| &mut shard.ended),
+            started: collect(self.shards, |shard| &mut shard.started),
+            receipt_episodes: self.told(|told| &told.episodes, u64::to_le_bytes),
+            receipt_values: self.told(|told| &told.values, f64::to_le_bytes),
+        }
+    }
+
+    /// The present ones of all environments, f32 `[N, O]`.
+    pub(super) fn observations(&mut self) -> Bytes {
+        self.f32(|shard| &shard.observations)
+    }
+
+    fn f32(&mut self, field: impl Fn(&Shard) -> &Vec<f32>) -> Bytes {
+        for shard in self.shards {
+            put(self.buffer, field(&lock(shard)));
+        }
+        self.buffer.split().freeze()
+    }
+
+    /// Of what ended in all shards, then of what began.
+    fn told<T: Copy>(&mut self, column: fn(&Told) -> &Vec<T>, encode: fn(T) -> [u8; 8]) -> Bytes {
+        let parts: [fn(&Shard) -> &Told; 2] = [|shard| &shard.ended_told, |shard| &shard.started_told];
+        for told in parts {
+            for shard in self.shards {
+                put_wide(self.buffer, column(told(&lock(shard))), encode);
+            }
+        }
+        self.buffer.split().freeze()
+    }
+
+    fn u8(&mut self, field: impl Fn(&Shard) -> &Vec<u8>) -> Bytes {
+        for shard in self.shards {
+            self.buffer.extend_from_slice(field(&lock(shard)));
+        }
+        self.buffer.split().freeze()
+    }
+}
+
+/// One list of those of all shards.
+pub(super) fn collect<T>(shards: &[Mutex<Shard>], field: impl Fn(&mut Shard) -> &mut Vec<T>) -> Vec<T> {
+    let mut all = Vec::new();
+    for shard in shards {
+        all.append(field(&mut lock(shard)));
+    }
+    all
+}
