@@ -220,10 +220,12 @@ impl Batch {
         self.job.tally.meter.times(self.size).observe(end.saturating_duration_since(start));
     }
 
-    /// Where the step is left that follows the next one; none where a step needs to know what came of the one before.
+    /// Where the step is left that follows the next one; none where a step needs to know what came of the one before, and
+    /// where the session's own thread may take it.
     pub fn follower(&self) -> Option<Follower> {
         let (job, spec, size) = (Arc::clone(&self.job), self.settings.spec, self.size);
-        (self.settings.autoreset != Autoreset::Disabled).then_some(Follower { job, spec, size })
+        let follows = self.settings.autoreset != Autoreset::Disabled && job.is_for_workers();
+        follows.then_some(Follower { job, spec, size })
     }
 
     /// Has a policy play. Without a new one, that of before goes on; without a new task, with what is left of its own.

@@ -45,8 +45,8 @@ impl Follow {
             return false;
         };
         let stepped = Gather { shards, buffer: &mut self.buffer }.stepped(self.reward_terms);
-        self.stepped = Some((stepped, Instant::now()));
         put_actions(shards, &actions);
+        self.stepped = Some((stepped, Instant::now()));
         true
     }
 

@@ -423,6 +423,11 @@ impl Job {
         }
     }
 
+    /// Whether workers step it, whoever else steps.
+    pub(super) fn is_for_workers(&self) -> bool {
+        self.cost > TINY_ALONE
+    }
+
     /// Whether a worker panicked on it, now or earlier.
     pub(super) fn failed(&self) -> bool {
         self.failed.load(Ordering::Relaxed)
@@ -491,7 +496,11 @@ impl Job {
         let mut round = lock(&self.round);
         let Some(round) = round.as_mut() else {
             drop(round);
-            return self.unless_it_panics(Next::Request, || !closing && lock(&self.follow).go_on(&self.shards));
+            let mut follow = lock(&self.follow);
+            if closing {
+                follow.stop();
+            }
+            return self.unless_it_panics(Next::Request, || follow.go_on(&self.shards));
         };
         let halted = closing || self.halted.load(Ordering::Relaxed);
         self.unless_it_panics(Next::Step, || round.conduct(&self.shards, halted))

@@ -9,6 +9,9 @@ use perturb_study::runs::{RunSummary, no_folder, places};
 use perturb_study::table::Table;
 use perturb_study::words::grouped;
 
+/// Below the list.
+const SUCCESS: &str = "\nsuccess: a training's last 100 episodes, all tests of an experiment's done cells";
+
 pub(super) fn run(args: &LsArgs) -> Result<()> {
     args.json.check()?;
     if !args.dir.is_dir() {
@@ -38,7 +41,7 @@ pub(super) fn run(args: &LsArgs) -> Result<()> {
         .text("state", |found| found.state);
     let table = table.build().to_text();
     if terminal_width().is_none_or(|width| table.lines().all(|line| line.chars().count() <= width)) {
-        return Ok(writeln!(out, "{table}")?);
+        return Ok(writeln!(out, "{table}\n{SUCCESS}")?);
     }
     // A table would be broken where the terminal ends.
     for found in &found {
@@ -47,5 +50,5 @@ pub(super) fn run(args: &LsArgs) -> Result<()> {
         let words: Vec<String> = words.into_iter().filter(|words| !words.is_empty()).collect();
         writeln!(out, "{}\n  {}", found.path.display(), words.join(", "))?;
     }
-    Ok(())
+    Ok(writeln!(out, "{SUCCESS}")?)
 }

@@ -169,7 +169,9 @@ fn a_run_has_a_place_of_its_own_unless_one_is_given_and_all_are_listed() {
     assert!(table.contains("runs/group/b") && table.contains(" of 30 episodes"), "{table}");
     // Which is too wide for a terminal of 80 columns.
     let listed = lines(&on_a_terminal(folder.path(), "perturb ls"));
-    assert_eq!(listed.len(), 6, "{listed:#?}");
+    let listed: Vec<String> = listed.into_iter().filter(|line| !line.is_empty()).collect();
+    assert_eq!(listed.len(), 7, "{listed:#?}");
+    assert!(listed[6].starts_with("success: a training's last 100 episodes"), "{listed:#?}");
     assert_eq!(listed[0], format!("runs/{name}"));
     assert!(listed[1].starts_with("  CartPole D a2c ff, ") && listed[1].ends_with(" %, finished"), "{listed:#?}");
 }
