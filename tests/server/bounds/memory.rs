@@ -109,12 +109,12 @@ async fn pictures_that_nobody_reads_take_no_more_than_the_budget() {
 
 #[tokio::test]
 async fn a_session_for_which_there_is_no_room_is_refused_and_those_that_are_open_step_on() {
-    let server = Server::start(&["--max-memory", "6000000"]);
+    let server = Server::start(&["--max-memory", "9000000"]);
     let (mut first, _) = Session::open(server.tcp(), open("CartPole", 2_000, 1)).await;
     let mut second = Session::connect(server.tcp()).await;
     let (code, message) = second.refused(open("CartPole", 2_000, 1)).await;
     assert_eq!(code, Code::ResourceExhausted, "{message}");
-    assert!(message.contains("of the server's 6000000"), "{message}");
+    assert!(message.contains("of the server's 9000000"), "{message}");
     for _ in 0..10 {
         first.step(vec![0; 8_000].into()).await;
     }
