@@ -116,7 +116,7 @@ fn a_gif_is_shown_as_fast_as_was_asked_for() {
     let stdout = done(video(&out, &file, &["--episodes", "1", "--fps", "12.5", "--workers", "1"]));
     assert!(stdout.contains("at 0.25 × real time"), "{stdout}");
     let (_, delays, _) = decoded(&file);
-    assert_eq!((delays[0], delays.last()), (8, Some(&100)));
+    assert_eq!((delays[0], delays.last()), (8, Some(&200)));
 }
 
 /// Plays with the library, into a file that is thrown away.
