@@ -153,6 +153,7 @@ impl Sessions {
             dialogue,
             sessions,
             start,
+            answered: start,
             spent: 0,
             awake,
             ending,
@@ -241,6 +242,8 @@ struct Conversation<D: Dialogue> {
     /// What this one is subject to; it counts as running as long as it holds this.
     sessions: Sessions,
     start: Instant,
+    /// When a request was last granted, at first the start.
+    answered: Instant,
     /// Its steps that its token was told of.
     spent: u64,
     awake: Awake,
@@ -299,12 +302,14 @@ impl<D: Dialogue> Conversation<D> {
         };
         let limit =
             if self.dialogue.is_open() { idle } else { Some(idle.map_or(handshake, |idle| idle.min(handshake))) };
+        // Who is refused again and again has not begun.
+        let passed = if self.dialogue.is_open() { Duration::ZERO } else { self.answered.elapsed() };
         tokio::select! {
             biased; // the end comes first: a client that never pauses must not outlast it
             () = self.sessions.drain.closed() => Err(Stop::Refused(Refusal::Draining)),
             refusal = revoked(bearer.as_ref()) => Err(Stop::Refused(refusal)),
             request = next => request,
-            () = silence(limit) => {
+            () = silence(limit.map(|limit| limit.saturating_sub(passed))) => {
                 let seconds = limit.map_or(0, |limit| limit.as_secs());
                 Err(Stop::Refused(Refusal::Idle { seconds }))
             }
@@ -366,7 +371,10 @@ impl<D: Dialogue> Conversation<D> {
         self.spend();
         let count = |refusal: &Refusal| self.sessions.refusals.count(refusal, self.requests.bearer.as_ref());
         match answer {
-            Ok(Ok(response)) => Ok(response),
+            Ok(Ok(response)) => {
+                self.answered = Instant::now();
+                Ok(response)
+            }
             Ok(Err(refusal)) => {
                 count(&refusal);
                 Ok(D::refusal(refusal))

@@ -7,7 +7,7 @@ use super::{
     budget::{Budget, Outbox, Share},
     conversation::MOST_BYTES_BEFORE_OPEN,
     peers::Connection,
-    replies::Replies,
+    replies::{Patience, Replies},
     status::Refusal,
     tokens::Bearer,
 };
@@ -21,12 +21,15 @@ use std::{
     task::{Context, Poll},
     time::Duration,
 };
+use tokio::time::{Instant, timeout_at};
 use tonic::{Code, Status, body::Body, codegen::Service, codegen::http, server::NamedService};
 
 /// A frame's flag and its length.
 const HEADER: usize = 5;
 /// What a message may have before the budget is asked: as much as a session may send that is not open.
 const SMALL: usize = MOST_BYTES_BEFORE_OPEN;
+/// A message must come with so many bytes a second on average, after the time that a pause may take.
+const LEAST_RATE: usize = 64 << 10;
 /// A message of so many bytes is worth an allocation of its own.
 const LARGE: usize = 1 << 20;
 
@@ -56,6 +59,8 @@ pub struct Transit {
     pub budget: Budget,
     /// How long a client may leave a message unfinished, or a reply unread.
     pub limit: Option<Duration>,
+    /// How long it may leave the first reply unread.
+    pub handshake: Duration,
 }
 
 impl<S> Keeping<S> {
@@ -87,15 +92,16 @@ where
         let connection = request.extensions().get::<Connection>().cloned();
         let is_stream = request.uri().path() == self.path;
         // What is no stream is one small reply.
-        let limit = self.transit.limit.filter(|_| is_stream);
+        let patience = is_stream.then_some(Patience { first: self.transit.handshake, rest: self.transit.limit });
         if is_stream {
             let bearer = request.extensions_mut().remove::<Bearer>();
-            let transit = Transit { budget: self.transit.budget.of(bearer.clone()), limit };
+            let transit = Transit { budget: self.transit.budget.of(bearer.clone()), ..self.transit };
             let body = std::mem::take(request.body_mut());
             let frames = Frames {
                 body,
                 buffer: BytesMut::new(),
                 message: None,
+                due: None,
                 share: transit.budget.nothing(),
                 transit,
                 connection: connection.clone(),
@@ -106,7 +112,7 @@ where
         }
         let response = self.service.call(request);
         Box::pin(
-            async move { Ok(response.await?.map(|body| Body::new(Replies::new(body, outbox, connection, limit)))) },
+            async move { Ok(response.await?.map(|body| Body::new(Replies::new(body, outbox, connection, patience)))) },
         )
     }
 }
@@ -121,6 +127,8 @@ pub struct Frames {
     /// What has come and not been taken.
     buffer: BytesMut,
     message: Option<Begun>,
+    /// When the message that has begun must have ended.
+    due: Option<Instant>,
     /// Of the message that has begun.
     share: Share,
     transit: Transit,
@@ -186,6 +194,7 @@ impl Frames {
             body: Body::empty(),
             buffer: BytesMut::new(),
             message: None,
+            due: None,
             share: self.transit.budget.nothing(),
             transit: self.transit.clone(),
             connection: self.connection.clone(),
@@ -221,14 +230,17 @@ impl Frames {
         }
     }
 
-    /// The next frame of HTTP's; within a message it must come in time.
+    /// The next frame of HTTP's; within a message it must come in time, and not so late that the message would take for
+    /// ever.
     async fn frame(&mut self) -> Result<Option<Result<http_body::Frame<Bytes>, Status>>, Stop> {
         let next = self.body.frame();
         match self.transit.limit.filter(|_| self.message.is_some()) {
             None => Ok(next.await),
-            Some(limit) => tokio::time::timeout(limit, next)
-                .await
-                .map_err(|_| Stop::Refused(Refusal::Unfinished { seconds: limit.as_secs() })),
+            Some(limit) => {
+                let soon = Instant::now() + limit;
+                let unfinished = |_| Stop::Refused(Refusal::Unfinished { seconds: limit.as_secs(), rate: LEAST_RATE });
+                timeout_at(self.due.map_or(soon, |due| due.min(soon)), next).await.map_err(unfinished)
+            }
         }
     }
 
@@ -243,6 +255,8 @@ impl Frames {
         if length > allowance.bytes {
             return Err(Stop::Refused(Refusal::TooLarge { got: length, limit: allowance.bytes }));
         }
+        let longest = |limit| limit + Duration::from_secs((length / LEAST_RATE) as u64);
+        self.due = self.transit.limit.map(|limit| Instant::now() + longest(limit));
         Ok(Begun::Wanted(length))
     }
 

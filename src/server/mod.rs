@@ -134,7 +134,7 @@ pub async fn run(
         Sessions::new(places.clone(), limits, drain.clone(), refusals.clone(), access.clone(), leased.clone());
     let admission = Admission { places: Places::new(usize::MAX, of_a_peer.saturating_add(OTHER_STREAMS)), handshake };
     let stall = (config.stall_seconds > 0).then(|| Duration::from_secs(config.stall_seconds));
-    let transit = Transit { budget: Budget::new(config.max_memory), limit: stall };
+    let transit = Transit { budget: Budget::new(config.max_memory), limit: stall, handshake };
     let renderer = Renderer::new();
     let worlds = dm_env_rpc::service::Service::new(
         Arc::clone(&pool),

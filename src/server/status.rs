@@ -145,10 +145,15 @@ pub enum Refusal {
         limit: usize,
     },
     /// A message began and does not end.
-    #[error("a message began, and nothing more of it came for {seconds} s; send messages whole")]
+    #[error(
+        "a message began, and nothing more of it came for {seconds} s, or less than {rate} bytes a second in all; send \
+         messages whole"
+    )]
     Unfinished {
-        /// The limit.
+        /// The longest pause.
         seconds: u64,
+        /// The least bytes a second.
+        rate: usize,
     },
     /// A message is larger than its stream may send now.
     #[error("a message of {got} bytes came; at most {limit} are read here now")]

@@ -6,7 +6,7 @@ use std::{
     io::{Read, Write},
     net::TcpStream,
     os::unix::process::CommandExt,
-    time::Duration,
+    time::{Duration, Instant},
 };
 use tonic::Code;
 
@@ -44,6 +44,41 @@ async fn sessions_that_are_never_opened_give_their_places_back() {
     assert_eq!(code, Code::DeadlineExceeded as i32, "{message}");
     assert!(message.contains("5 s"), "{message}");
     opened.step(vec![0; 4].into()).await;
+}
+
+/// Each stream's first reply waits for a window that its client never opens, so that nothing else of it is looked at.
+#[tokio::test]
+async fn sessions_whose_first_reply_is_never_let_come_give_their_places_back() {
+    let server = Server::start(&["--handshake-seconds", "3", "--max-sessions", "20"]);
+    let mut connection = Connection::new(server.port(), 0).await;
+    let mut calls = Vec::new();
+    for _ in 0..20 {
+        let mut call = connection.call(SESSION).await.unwrap();
+        assert!(call.send_message(b"").await);
+        calls.push(call);
+    }
+    let mut other = client(server.unix()).await;
+    until("all places are taken", async || Session::start(&mut other).await.is_err()).await;
+    until("there is a place again", async || Session::start(&mut other).await.is_ok()).await;
+    until("the connection is closed", async || connection.is_closed()).await;
+}
+
+#[tokio::test]
+async fn who_is_refused_again_and_again_has_not_opened_a_session() {
+    let server = Server::start(&["--handshake-seconds", "3"]);
+    let mut session = Session::connect(server.tcp()).await;
+    let start = Instant::now();
+    let status = loop {
+        session.send(open("Nowhere", 1, 1)).await;
+        match session.receive().await {
+            Ok(Some(_)) => tokio::time::sleep(Duration::from_millis(500)).await,
+            Ok(None) => panic!("it ends with a status"),
+            Err(status) => break status,
+        }
+        assert!(start.elapsed() < Duration::from_secs(60), "it is kept");
+    };
+    assert_eq!(status.code(), Code::DeadlineExceeded, "{status:?}");
+    assert!(start.elapsed() >= Duration::from_secs(3));
 }
 
 #[tokio::test]
@@ -90,8 +125,6 @@ const SECONDS: &str = "PERTURB_TEST_FULL_SERVER_SECONDS";
 #[tokio::test]
 async fn every_place_can_be_taken_by_hoppers_and_one_more_is_refused_at_once() {
     use crate::common::server::{step, stepped};
-    use std::time::Instant;
-
     const SESSIONS: usize = 1024;
     let server = Server::start(&[]);
     let mut sessions = Vec::new();
