@@ -102,7 +102,7 @@ def test_what_is_no_checkpoint_is_refused_with_what_is_wrong(copied: Path, tmp_p
     with pytest.raises(perturb.InvalidArgumentError, match="path is 7"):
         perturb.load_policy(7)  # type: ignore[arg-type]
     spoil(copied, '"format_version": 2', '"format_version": 9')
-    with pytest.raises(perturb.PolicyError, match="it has format 9, this program reads 1 to 3"):
+    with pytest.raises(perturb.PolicyError, match="has format 9, and this program reads 1 to 3"):
         perturb.load_policy(copied)
 
 

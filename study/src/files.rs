@@ -75,6 +75,26 @@ pub fn read_if_there(path: &Path) -> Result<Option<Vec<u8>>> {
     read_plain(path, plain::MOST)
 }
 
+/// What is at a path; `None` if nothing is. That the system cannot tell is not taken for that nothing is there.
+///
+/// # Errors
+/// The operating system's.
+pub fn look(path: &Path) -> Result<Option<fs::Metadata>> {
+    match fs::metadata(path).map_err(io("look for", path)) {
+        Ok(metadata) => Ok(Some(metadata)),
+        Err(error) if error.is_fault() => Err(error),
+        Err(_) => Ok(None),
+    }
+}
+
+/// Whether a plain file is at a path.
+///
+/// # Errors
+/// As those of [`look`].
+pub fn has_file(path: &Path) -> Result<bool> {
+    Ok(look(path)?.is_some_and(|metadata| metadata.is_file()))
+}
+
 /// Creates a folder and those above it, unless they are there.
 ///
 /// # Errors
@@ -281,10 +301,39 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("nothing");
         assert_eq!(read_if_there(&path).unwrap(), None);
+        assert!(look(&path).unwrap().is_none() && !has_file(&path.join("file")).unwrap());
+        assert!(!has_file(directory.path()).unwrap(), "a folder");
         assert!(list(&path).unwrap().is_empty());
         delete(&path).unwrap();
         let error = read(&path).unwrap_err().to_string();
         assert!(error.starts_with("cannot read ") && error.contains("/nothing: No such file"), "{error}");
+    }
+
+    #[test]
+    fn that_the_system_cannot_tell_is_not_taken_for_nothing() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("loop");
+        std::os::unix::fs::symlink(&path, &path).unwrap();
+        let error = has_file(&path).unwrap_err();
+        assert!(error.is_fault() && error.to_string().starts_with("cannot look for "), "{error}");
+    }
+
+    #[rstest::rstest]
+    #[case::enospc(28, true)]
+    #[case::eio(5, true)]
+    #[case::edquot(122, true)]
+    #[case::estale(116, true)]
+    #[case::erofs(30, true)]
+    #[case::eperm(1, true)]
+    #[case::eacces(13, true)]
+    #[case::emfile(24, true)]
+    #[case::enoent(2, false)]
+    #[case::eexist(17, false)]
+    #[case::eisdir(21, false)]
+    #[case::enotdir(20, false)]
+    fn the_machines_faults_are_told_from_what_is_in_a_folder(#[case] code: i32, #[case] is_fault: bool) {
+        let error = io("read", Path::new("file"))(std::io::Error::from_raw_os_error(code));
+        assert_eq!(error.is_fault(), is_fault, "{error}");
     }
 
     #[test]

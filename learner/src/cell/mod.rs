@@ -212,10 +212,14 @@ impl<'a> Work<'a> {
         let over = |(_, checkpoint, state): &(RunDirectory, Checkpoint, ResumeState)| {
             is_over(&config.common, &checkpoint.state.counters, state.history.recent.iter())
         };
-        let earlier = earlier(&path)?.filter(|earlier @ (directory, checkpoint, _)| {
-            let past = |mark: &u64| over(earlier) || *mark <= checkpoint.state.counters.episodes;
-            checkpoint.state.config == *config && directory.has_kept(tests.marks.iter().copied().filter(past))
-        });
+        let mut earlier = earlier(&path)?;
+        if let Some(there @ (directory, checkpoint, _)) = &earlier {
+            let past = |mark: &u64| over(there) || *mark <= checkpoint.state.counters.episodes;
+            let has_kept = directory.has_kept(tests.marks.iter().copied().filter(past))?;
+            if checkpoint.state.config != *config || !has_kept {
+                earlier = None;
+            }
+        }
         let Counters { episodes, timesteps, .. } =
             earlier.as_ref().map_or_else(Counters::default, |(_, checkpoint, _)| checkpoint.state.counters);
         tell(self.order.cell, CellEvent::Training { episodes, timesteps, saved: timesteps });
@@ -323,6 +327,14 @@ mod tests {
         assert!(earlier(&training).unwrap().is_none(), "broken off before the first checkpoint");
         std::fs::write(checkpoint.join("checkpoint.json"), "{").unwrap();
         assert!(earlier(&training).unwrap().is_none(), "damaged");
+        let (newer, json) = (r#"{"format_version": 99, "unheard_of": 1}"#, checkpoint.join("checkpoint.json"));
+        std::fs::write(&json, newer).unwrap();
+        let Err(error) = earlier(&training) else { panic!("a newer program goes on with it") };
+        assert!(error.to_string().contains("has format 99"), "{error}");
+        std::fs::remove_file(&json).unwrap();
+        std::os::unix::fs::symlink(&json, &json).unwrap(); // which the system cannot follow
+        let Err(error) = earlier(&training) else { panic!("what cannot be seen may be there") };
+        assert!(error.to_string().starts_with("cannot look for "), "{error}");
         let lock = std::fs::File::open(&training).unwrap();
         lock.try_lock().unwrap();
         let Err(error) = earlier(&training) else { panic!("it is locked") };

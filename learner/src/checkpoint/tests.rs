@@ -165,5 +165,5 @@ fn damage_is_named() {
     let later = |bytes: Vec<u8>| {
         String::from_utf8(bytes).unwrap().replace("\"format_version\": 3", "\"format_version\": 9").into_bytes()
     };
-    assert!(spoil("checkpoint.json", &later).contains("it has format 9, this program reads 1 to 3"));
+    assert!(spoil("checkpoint.json", &later).contains("has format 9, and this program reads 1 to 3"));
 }

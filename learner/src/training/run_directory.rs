@@ -131,7 +131,7 @@ impl RunDirectory {
     /// If there is no run, no checkpoint, or one that cannot be resumed; if another process trains in it; the operating
     /// system's.
     pub fn resume(path: &Path) -> Result<(Self, Checkpoint, ResumeState)> {
-        if !path.is_dir() {
+        if !files::look(path)?.is_some_and(|metadata| metadata.is_dir()) {
             return Err(RunDirectoryError::Missing { path: path.to_owned() });
         }
         let directory = Self::of(path, false, true);
@@ -163,7 +163,7 @@ impl RunDirectory {
     /// Why there is no checkpoint.
     fn nothing_to_resume(&self) -> Result<RunDirectoryError> {
         let path = self.path.clone();
-        Ok(if path.join("checkpoint.json").is_file() {
+        Ok(if files::has_file(&path.join("checkpoint.json"))? {
             RunDirectoryError::IsCheckpoint { path }
         } else if files_of_a_run(&path)?.is_empty() {
             RunDirectoryError::NoRun { path }
@@ -226,8 +226,16 @@ impl RunDirectory {
     }
 
     /// Whether the policies of all `marks` are there.
-    pub fn has_kept(&self, mut marks: impl Iterator<Item = u64>) -> bool {
-        marks.all(|mark| self.mark(mark).join("checkpoint.json").is_file())
+    ///
+    /// # Errors
+    /// The operating system's.
+    pub fn has_kept(&self, marks: impl Iterator<Item = u64>) -> Result<bool> {
+        for mark in marks {
+            if !files::has_file(&self.mark(mark).join("checkpoint.json"))? {
+                return Ok(false);
+            }
+        }
+        Ok(true)
     }
 }
 

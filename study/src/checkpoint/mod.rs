@@ -22,7 +22,7 @@ pub use self::environment::{Changed, EnvironmentSummary};
 use self::files::remove_others;
 pub use self::files::{ArraysFile, damaged};
 use crate::Counters;
-use crate::files::{FileError, write_atomically};
+use crate::files::{FileError, has_file, read_if_there, write_atomically};
 use crate::seal::{self, Sealed};
 use crate::settings::{Architecture, TrainConfig};
 
@@ -115,13 +115,24 @@ pub enum CheckpointError {
         /// What begins so.
         names: Vec<String>,
     },
-    /// A file is damaged, or was written by a program that is too different.
+    /// A file is damaged.
     #[error("{} is not a usable checkpoint: {reason}", path.display())]
     Damaged {
         /// The file.
         path: PathBuf,
         /// What is wrong with it.
         reason: String,
+    },
+    /// Another program wrote it, which may go on with it.
+    #[error(
+        "{} has format {format}, and this program reads 1 to {FORMAT_VERSION}: use the version of perturb that wrote it",
+        path.display()
+    )]
+    Newer {
+        /// The file.
+        path: PathBuf,
+        /// Its format.
+        format: u64,
     },
     /// There is a policy, but not the state of its training.
     #[error(
@@ -342,21 +353,22 @@ impl State {
 impl Document {
     /// Reads `checkpoint.json` in `path`, or in its folder `checkpoint`; gives the folder, too.
     fn read(path: &Path) -> Result<(PathBuf, Self)> {
-        let directory = [path.to_owned(), path.join("checkpoint")]
-            .into_iter()
-            .find(|directory| directory.join(JSON).is_file())
-            .ok_or_else(|| CheckpointError::Missing { path: path.to_owned() })?;
+        let directory = match has_file(&path.join(JSON))? {
+            true => path.to_owned(),
+            false => path.join("checkpoint"),
+        };
         let json = directory.join(JSON);
-        let text = crate::files::read_if_there(&json)?;
+        let text = if has_file(&json)? { read_if_there(&json)? } else { None };
         let text = text.ok_or_else(|| CheckpointError::Missing { path: path.to_owned() })?;
         let not_understood = |error: serde_json::Error| damaged(&json, format!("it is not understood: {error}"));
         let mut value: serde_json::Value = serde_json::from_slice(&text).map_err(not_understood)?;
         let sealed = seal::open(&mut value);
-        let document: Self = serde_json::from_value(value).map_err(not_understood)?;
-        if !(1..=FORMAT_VERSION).contains(&document.format_version) {
-            let reason = format!("it has format {}, this program reads 1 to {FORMAT_VERSION}", document.format_version);
-            return Err(damaged(&json, reason));
+        // Another format may have other entries.
+        let format = value.get("format_version").and_then(serde_json::Value::as_u64);
+        if let Some(format) = format.filter(|format| !(1..=u64::from(FORMAT_VERSION)).contains(format)) {
+            return Err(CheckpointError::Newer { path: json, format });
         }
+        let document: Self = serde_json::from_value(value).map_err(not_understood)?;
         if sealed.is_err() || (document.format_version >= SEALED && sealed == Ok(false)) {
             return Err(damaged(&json, format!("{}; give a copy that is whole", seal::BROKEN)));
         }

@@ -1,6 +1,8 @@
-//! Policies by name: cells below `results/` whose trainings were kept.
+//! Policies by name, or by the folder of their cell: cells below `results/` whose trainings were kept.
 
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
+
+use perturb_protocol::names;
 
 use super::{CheckpointError, JSON, Result};
 use crate::files::list;
@@ -10,54 +12,83 @@ const FOLDER: &str = "results";
 const VARIABLE: &str = "PERTURB_RESULTS";
 /// Folders between it and `cells`, at most.
 const DEPTH: usize = 3;
+/// Letters that a name may have more or fewer than the one that it is taken for.
+const MOST_SLIPS: usize = 3;
 
-/// The checkpoint of the policy called `path`, if that is a name and no folder: a cell's id or its beginning, if no other
-/// cell's begins so.
+/// The checkpoint that `path` stands for, if it does not hold one itself: that in the folder of a cell, which may be given
+/// as it is found below `results/`, or that of the cell whose id is `path` or alone begins with it, in either case.
+///
+/// # Errors
+/// [`CheckpointError::Several`] with the cells whose ids begin so or, if none does, are much like it.
 pub(super) fn find(path: &Path) -> Result<Option<PathBuf>> {
     let folder = std::env::var_os(VARIABLE).filter(|folder| !folder.is_empty());
-    find_below(&folder.map_or_else(|| FOLDER.into(), PathBuf::from), path)
+    let found = find_below(&folder.map_or_else(|| FOLDER.into(), PathBuf::from), path);
+    if let Ok(Some(checkpoint)) = &found {
+        tracing::debug!("the policy {} is that in {}", path.display(), checkpoint.display());
+    }
+    found
 }
 
 fn find_below(folder: &Path, path: &Path) -> Result<Option<PathBuf>> {
-    let mut parts = path.components();
-    let (Some(std::path::Component::Normal(name)), None) = (parts.next(), parts.next()) else { return Ok(None) };
-    let Some(name) = name.to_str().filter(|_| !path.exists()) else { return Ok(None) };
-    let mut found = Vec::new();
-    collect(folder, name, DEPTH, &mut found);
-    let id = |checkpoint: &PathBuf| checkpoint.ancestors().nth(2).and_then(Path::file_name).map(ToOwned::to_owned);
-    let is_whole = |checkpoint: &&PathBuf| id(checkpoint).is_some_and(|id| id == name);
-    if let [whole] = found.iter().filter(is_whole).collect::<Vec<_>>()[..] {
-        return Ok(Some(whole.clone()));
+    if holds_checkpoint(path) {
+        return Ok(None);
     }
-    match &found[..] {
-        [] => Ok(None),
-        [one] => Ok(Some(one.clone())),
-        several => {
-            let shown = |checkpoint: &PathBuf| match checkpoint
-                .ancestors()
-                .nth(2)
-                .and_then(|cell| cell.strip_prefix(folder).ok())
-            {
-                Some(cell) => cell.display().to_string(),
-                None => checkpoint.display().to_string(),
-            };
-            let names = several.iter().map(shown).collect();
-            Err(CheckpointError::Several { name: name.to_owned(), folder: folder.to_owned(), names })
+    let mut places = vec![path.to_owned(), folder.join(path)];
+    places.extend(path.strip_prefix(FOLDER).ok().map(|rest| folder.join(rest)));
+    let cells = places.iter().flat_map(|place| [place.clone(), place.join("training")]);
+    if let Some(found) = cells.into_iter().find(|place| holds_checkpoint(place)) {
+        return Ok(Some(found));
+    }
+    let mut parts = path.components();
+    let (Some(Component::Normal(name)), None) = (parts.next(), parts.next()) else { return Ok(None) };
+    let Some(name) = name.to_str().filter(|_| !path.exists()) else { return Ok(None) };
+    let mut all = Vec::new();
+    collect(folder, DEPTH, &mut all);
+    let of = |is_meant: &dyn Fn(&str) -> bool| all.iter().filter(|kept| is_meant(&kept.id)).collect::<Vec<_>>();
+    let begins = |id: &str| id.get(..name.len()).is_some_and(|start| start.eq_ignore_ascii_case(name));
+    for found in [of(&|id| id == name), of(&|id| id.eq_ignore_ascii_case(name)), of(&begins)] {
+        if let [one] = found[..] {
+            return Ok(Some(one.checkpoint.clone()));
         }
     }
+    let mut meant = of(&begins);
+    if meant.is_empty() {
+        let nearest = names::closest(name, all.iter().map(|kept| kept.id.as_str()));
+        // The beginnings of all are alike: a folder that is not there, `hopper_run`, is no slip in an id.
+        meant = of(&|id| nearest == Some(id) && id.len().abs_diff(name.len()) <= MOST_SLIPS);
+    }
+    if meant.is_empty() {
+        return Ok(None);
+    }
+    let shown = |kept: &&Kept| kept.cell.strip_prefix(folder).unwrap_or(&kept.cell).display().to_string();
+    let names = meant.iter().map(shown).collect();
+    Err(CheckpointError::Several { name: name.to_owned(), folder: folder.to_owned(), names })
 }
 
-/// Adds the checkpoints of cells whose ids begin with `name`, in the order of their paths. What cannot be listed has none.
-fn collect(folder: &Path, name: &str, depth: usize, found: &mut Vec<PathBuf>) {
+/// Whether a path is one that a checkpoint is read from.
+fn holds_checkpoint(path: &Path) -> bool {
+    path.join(JSON).is_file() || path.join("checkpoint").join(JSON).is_file()
+}
+
+/// A cell whose training was kept.
+struct Kept {
+    id: String,
+    cell: PathBuf,
+    checkpoint: PathBuf,
+}
+
+/// Adds the cells that have a checkpoint, in the order of their paths. What cannot be listed has none.
+fn collect(folder: &Path, depth: usize, found: &mut Vec<Kept>) {
+    let kept = |cell: PathBuf| {
+        let id = cell.file_name()?.to_str()?.to_owned();
+        let checkpoint = cell.join("training/checkpoint");
+        checkpoint.join(JSON).is_file().then_some(Kept { id, cell, checkpoint })
+    };
     for path in list(folder).unwrap_or_default() {
-        let Some(file) = path.file_name().and_then(|file| file.to_str()) else { continue };
-        if file == "cells" {
-            let begins = |cell: &PathBuf| cell.file_name().is_some_and(|id| id.to_string_lossy().starts_with(name));
-            let checkpoints =
-                list(&path).unwrap_or_default().into_iter().filter(begins).map(|cell| cell.join("training/checkpoint"));
-            found.extend(checkpoints.filter(|checkpoint| checkpoint.join(JSON).is_file()));
+        if path.ends_with("cells") {
+            found.extend(list(&path).unwrap_or_default().into_iter().filter_map(kept));
         } else if depth > 0 && path.is_dir() {
-            collect(&path, name, depth - 1, found);
+            collect(&path, depth - 1, found);
         }
     }
 }
@@ -79,10 +110,12 @@ mod tests {
         assert_eq!(find("Hopper-R-1").unwrap(), place("a/cells/Hopper-R-1"), "another begins with it");
         assert_eq!(find("Hopper-D").unwrap(), place("b/c/cells/Hopper-D-2"));
         assert_eq!(find("Acro").unwrap(), place("cells/Acrobot-D-1"));
-        for none in ["Pendulum-D-1", "hopper", "a/cells/Hopper-R-1", "/Hopper-D", "..", ""] {
+        assert_eq!(find("hopper-r-10").unwrap(), place("a/cells/Hopper-R-10"), "in either case");
+        assert_eq!(find("hopper-d").unwrap(), place("b/c/cells/Hopper-D-2"), "in either case");
+        for none in ["Pendulum-D-1", "a/cells/Hopper-R-2", "/Hopper-D", "..", ""] {
             assert_eq!(find(none).unwrap(), None, "{none}");
         }
-        let several = find("Hopper").unwrap_err().to_string();
+        let several = find("hopper").unwrap_err().to_string();
         assert!(several.contains("a/cells/Hopper-R-1, a/cells/Hopper-R-10, b/c/cells/Hopper-D-2"), "{several}");
         std::fs::create_dir_all(folder.path().join("d/cells/Hopper-D-2/training/checkpoint")).unwrap();
         std::fs::write(folder.path().join("d/cells/Hopper-D-2/training/checkpoint").join(JSON), "{}").unwrap();
@@ -91,5 +124,36 @@ mod tests {
         std::fs::write(folder.path().join("cells/Acrobot-D-2"), "").unwrap();
         assert_eq!(find_below(&folder.path().join("cells/Acrobot-D-2"), Path::new("Acro")).unwrap(), None, "a file");
         assert_eq!(find_below(&folder.path().join("nowhere"), Path::new("Hopper-D")).unwrap(), None);
+    }
+
+    #[test]
+    fn the_folder_of_a_cell_stands_for_its_policy_with_and_without_what_is_before_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let cell = "a/cells/Hopper-R-1";
+        let training = folder.path().join(cell).join("training");
+        std::fs::create_dir_all(training.join("checkpoint")).unwrap();
+        std::fs::write(training.join("checkpoint").join(JSON), "{}").unwrap();
+        let find = |path: &Path| find_below(folder.path(), path).unwrap();
+        for written in [folder.path().join(cell), cell.into(), Path::new(FOLDER).join(cell)] {
+            assert_eq!(find(&written), Some(training.clone()), "{}", written.display());
+        }
+        assert_eq!(find(&Path::new(cell).join("training")), Some(training.clone()));
+        assert_eq!(find(&training), None, "it is where the checkpoint is looked for anyway");
+    }
+
+    #[test]
+    fn a_name_that_is_near_is_refused_with_the_one_that_was_probably_meant() {
+        let folder = tempfile::tempdir().unwrap();
+        for cell in ["CartPole-ppo-ff-D-9bd6546b-s7", "CartPole-ppo-ff-E-9bd6546b-s7"] {
+            std::fs::create_dir_all(folder.path().join("a/cells").join(cell).join("training/checkpoint")).unwrap();
+            let json = folder.path().join("a/cells").join(cell).join("training/checkpoint").join(JSON);
+            std::fs::write(json, "{}").unwrap();
+        }
+        let find = |name: &str| find_below(folder.path(), Path::new(name));
+        let near = find("CartPole-ppo-ff-D-9bd6546b-s77").unwrap_err().to_string();
+        assert!(near.ends_with("the path of one: a/cells/CartPole-ppo-ff-D-9bd6546b-s7"), "{near}");
+        for none in ["missing", "cart_pole", "CartPole-ppo-rc"] {
+            assert_eq!(find(none).unwrap(), None, "{none}");
+        }
     }
 }

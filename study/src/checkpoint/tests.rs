@@ -123,7 +123,7 @@ fn damage_is_named() {
     assert!(spoil("weights", &flip).contains("another checksum"));
     assert!(spoil("checkpoint", &|_, bytes| bytes[..bytes.len() / 2].to_vec()).contains("not understood"));
     let later = replaced("\"format_version\": 2", "\"format_version\": 9");
-    assert!(spoil("checkpoint", &later).contains("it has format 9, this program reads 1 to 3"));
+    assert!(spoil("checkpoint", &later).contains("has format 9, and this program reads 1 to 3"));
     // Another architecture has other weights, whatever their checksum.
     let other = replaced("\"architecture\": \"ff\"", "\"architecture\": \"rc\"");
     assert!(spoil("checkpoint", &other).contains("arrays, expected"));
