@@ -15,6 +15,11 @@ pub fn grouped(number: usize) -> String {
     text
 }
 
+/// "1 cell", "1 200 cells".
+pub fn counted(number: usize, what: &str) -> String {
+    format!("{} {what}{}", grouped(number), if number == 1 { "" } else { "s" })
+}
+
 /// A time in two of its units.
 pub fn duration(seconds: f64) -> String {
     let seconds = seconds.round() as u64;
@@ -55,6 +60,12 @@ mod tests {
     fn digits_stand_in_groups_of_three() {
         let shown = [0, 12, 183, 3294, 9882, 49_410, 1_234_567].map(grouped);
         assert_eq!(shown, ["0", "12", "183", "3 294", "9 882", "49 410", "1 234 567"]);
+    }
+
+    #[test]
+    fn one_thing_is_no_plural() {
+        let shown = [0, 1, 2, 1200].map(|number| counted(number, "cell"));
+        assert_eq!(shown, ["0 cells", "1 cell", "2 cells", "1 200 cells"]);
     }
 
     #[test]

@@ -113,13 +113,17 @@ impl<'a> Doing<'a> {
             note(format_args!("the report is in {} and {}", page.display(), tables.display()));
         }
         let Some(first) = failed.first() else {
-            note(format_args!("all {} cells are done; perturb report {}", plan.cells.len(), quoted(folder.path())));
+            let done = match plan.cells.len() {
+                1 => "the only cell is done".to_owned(),
+                cells => format!("all {cells} cells are done"),
+            };
+            note(format_args!("{done}; perturb report {}", quoted(folder.path())));
             return Ok(ExitCode::SUCCESS);
         };
         Err(CommandError::Failed(format!(
-            "{} of {} cells failed, the first is {first}: see {} for the reason, and use --retry-failed to try again",
+            "{} of {} failed, the first is {first}: see {} for the reason, and use --retry-failed to try again",
             failed.len(),
-            plan.cells.len(),
+            count(plan.cells.len(), "cell"),
             folder.path().join("cells").join(first).join("failure.json").display()
         )))
     }

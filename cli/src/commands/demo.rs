@@ -10,7 +10,7 @@ use std::time::Instant;
 use super::args::DemoArgs;
 use super::display::{Display, note};
 use super::error::{CommandError, Result, system};
-use super::{lasting_servers, signal_code, threads};
+use super::{lasting_servers, refuse_file, signal_code, threads};
 use crate::video::{VideoError, VideoFile, VideoOptions, film};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{ClientError, Servers};
@@ -60,6 +60,7 @@ pub(super) fn run(args: &DemoArgs) -> Result<ExitCode> {
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let usual = || PathBuf::from(format!("runs/demo-{}", chrono::Utc::now().format("%Y%m%d-%H%M%S")));
     let out = args.out.clone().unwrap_or_else(usual);
+    refuse_file(&out)?;
     if !perturb_study::files::list(&out)?.is_empty() {
         let message = format!("{} is not empty: give the demo another --out, or delete that", out.display());
         return Err(CommandError::Usage(message));

@@ -158,14 +158,22 @@ impl Display {
         let position = position.min(self.total);
         let unit = self.unit;
         let counted = format!("{}/{} {unit}", grouped(position as usize), grouped(self.total as usize));
-        let words = [&[counted], figures].concat().join(", ");
+        let words = [&[counted], figures].concat();
         if let Some(bar) = &mut self.bar {
-            bar.show(position, [vec![words], lines()].concat());
+            let width = usize::from(console::Term::stderr().size().1);
+            bar.show(position, [vec![fitting(&words, width)], lines()].concat());
         } else if !is_quiet() && self.last_line.is_none_or(|time| time.elapsed() >= LINE_INTERVAL) {
             self.last_line = Some(Instant::now());
-            say(format_args!("{}{words}", self.what));
+            say(format_args!("{}{}", self.what, words.join(", ")));
         }
     }
+}
+
+/// As many of these figures as fit a line, the first in any case: half a figure would be another one.
+fn fitting(figures: &[String], width: usize) -> String {
+    let fits = |n: &usize| console::measure_text_width(&figures[..*n].join(", ")) <= width;
+    let n = (1..=figures.len()).rev().find(fits).unwrap_or(1);
+    figures[..n].join(", ")
 }
 
 /// As many lines as are shown, and how many more there are.
@@ -212,5 +220,19 @@ impl Drop for Display {
             let _ = all.clear(); // the terminal is gone
             *shown() = None;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_has_whole_figures_as_many_as_fit() {
+        let figures = ["2 935/5 000 episodes", "1 min 1 s left", "27 529 steps/s"].map(String::from);
+        let whole = figures.join(", ");
+        assert_eq!(fitting(&figures, whole.len()), whole);
+        assert_eq!(fitting(&figures, whole.len() - 1), "2 935/5 000 episodes, 1 min 1 s left");
+        assert_eq!(fitting(&figures, 5), "2 935/5 000 episodes");
     }
 }

@@ -41,7 +41,7 @@ pub(super) enum CommandError {
     Assessed(#[from] AssessedError),
     #[error(transparent)]
     Audit(#[from] AuditError),
-    #[error(transparent)]
+    #[error("{}", with_place(.0))]
     Checkpoint(#[from] CheckpointError),
     #[error(transparent)]
     Client(#[from] ClientError),
@@ -145,6 +145,19 @@ impl CommandError {
     }
 }
 
+/// The error, which ends with results/ if nothing is found, and where that is; of one name that is near, a question.
+fn with_place(error: &CheckpointError) -> String {
+    match error {
+        CheckpointError::Missing { .. } => {
+            format!("{error} of the working directory, or in the folder that PERTURB_RESULTS names")
+        }
+        CheckpointError::Several { name, folder, names } if names.len() == 1 => {
+            format!("there is no policy `{name}` in {} (did you mean `{}`?)", folder.display(), names[0])
+        }
+        _ => error.to_string(),
+    }
+}
+
 /// Says what the operating system refused.
 pub(super) fn system(action: &'static str) -> impl FnOnce(std::io::Error) -> CommandError {
     move |source| CommandError::System { action, source }
@@ -187,4 +200,22 @@ fn is_wrong_file(error: &FileError) -> bool {
             | ErrorKind::ReadOnlyFilesystem
             | ErrorKind::InvalidFilename
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn that_there_is_no_policy_says_where_it_was_looked_for_and_which_was_meant() {
+        let missing = CommandError::from(CheckpointError::Missing { path: "nothing".into() }).to_string();
+        let place = "in results/ of the working directory, or in the folder that PERTURB_RESULTS names";
+        assert!(missing.starts_with("nothing holds no checkpoint: ") && missing.ends_with(place), "{missing}");
+        let of = |names: &[&str]| {
+            let names = names.iter().map(ToString::to_string).collect();
+            CommandError::from(CheckpointError::Several { name: "s77".into(), folder: "results".into(), names })
+        };
+        assert_eq!(of(&["a/cells/s7"]).to_string(), "there is no policy `s77` in results (did you mean `a/cells/s7`?)");
+        assert!(of(&["a", "b"]).to_string().contains("could be any of these policies"));
+    }
 }

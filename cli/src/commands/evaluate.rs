@@ -15,6 +15,7 @@ use perturb_study::files::require_writable;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::sets::TestSet;
 use perturb_study::settings::TrainConfig;
+use perturb_study::success::Criterion;
 use perturb_study::table::Table;
 
 pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
@@ -27,7 +28,13 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
     let servers = playing_servers(&args.play)?;
     let (state, config) = (&checkpoint.state, &checkpoint.state.config);
     let common = &config.common;
-    let options = TestOptions { episodes: args.episodes, seed, selects: args.selection, success: args.success.clone() };
+    let environment = servers.environment(&common.environment)?;
+    let spelled = |set| sets::spelled_set(set, &environment);
+    let sets = sets.into_iter().map(spelled).collect::<Result<Vec<_>, _>>()?;
+    let (text, code) = (Criterion::of(&environment), Criterion::of_code(&environment));
+    let success =
+        args.success.as_ref().map(|rule| sets::spelled_rule(rule, text.as_ref(), code.as_ref())).transpose()?;
+    let options = TestOptions { episodes: args.episodes, seed, selects: args.selection, success };
     let tester = Tester::new(&servers, &checkpoint, options)?;
     let mut display: Option<(String, Display)> = None;
     let mut report = |set: &TestSet, episodes| {

@@ -13,7 +13,7 @@ use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::Servers;
 use perturb_learner::evaluation::{heatmap, heatmap_again};
 use perturb_learner::proto;
-use perturb_protocol::{Distribution, Version};
+use perturb_protocol::{Distribution, Version, names};
 use perturb_study::files::{require_writable, write_atomically};
 use perturb_study::interrupt::StopFlag;
 use perturb_study::plot;
@@ -51,7 +51,7 @@ fn of_checkpoints(args: &HeatmapArgs) -> Result<()> {
     if let Some(base) = recorded.first().and_then(Heatmap::base_of) {
         kind.base = base;
     }
-    let fixed = fixed(args)?;
+    let fixed = sets::spelled("--parameters", fixed(args)?, &environment)?;
     let path = args.out.clone().unwrap_or_else(|| default_path(&checkpoints, &kind));
     require_writable(&path.with_added_extension("csv"))?;
     let mut out = std::io::stdout();
@@ -106,11 +106,21 @@ fn one_environment(paths: &[PathBuf], checkpoints: &[Checkpoint]) -> Result<Stri
 /// The two parameters that are asked for, or those over which an environment's heatmaps usually are.
 fn wanted_axes(args: &HeatmapArgs, environment: &proto::Environment) -> Result<[String; 2]> {
     if let (Some(x), Some(y)) = (&args.x, &args.y) {
-        return Ok([x.clone(), y.clone()]);
+        return Ok([axis(x, environment)?, axis(y, environment)?]);
     }
     environment.heatmap_axes.clone().try_into().map_err(|_| {
         let message = format!("give --x and --y: it is not known which of {}'s to show", environment.name);
         CommandError::Usage(message)
+    })
+}
+
+/// The parameter that is written so, however it is spelled.
+fn axis(written: &str, environment: &proto::Environment) -> Result<String> {
+    let known = environment.parameters.iter().map(|parameter| parameter.name.as_str());
+    names::find(written, known.clone()).map(|place| environment.parameters[place].name.clone()).ok_or_else(|| {
+        let (hint, name) = (names::did_you_mean(written, known.clone()), &environment.name);
+        let known = known.collect::<Vec<_>>().join(", ");
+        CommandError::Usage(format!("`{written}` cannot be an axis{hint}: expected two of {name}'s parameters {known}"))
     })
 }
 

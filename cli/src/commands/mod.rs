@@ -29,7 +29,8 @@ mod slurm;
 mod train;
 mod video;
 
-use std::io::IsTerminal;
+use std::io::{ErrorKind, IsTerminal};
+use std::path::Path;
 use std::process::ExitCode;
 
 use args::{Cli, Command, PlayArgs, ServerArgs, WaitArgs};
@@ -45,8 +46,9 @@ pub fn main() -> ExitCode {
     let usual = match (cli.quiet, cli.verbose) {
         (true, _) => "error",
         (_, 0) => "warn",
-        (_, 1) => "info",
-        _ => "debug",
+        // Targets that begin so are perturb's own; others are for RUST_LOG.
+        (_, 1) => "warn,perturb=debug",
+        _ => "warn,perturb=trace",
     };
     if cli.quiet {
         display::be_quiet();
@@ -102,11 +104,15 @@ fn signal_code(number: i32) -> ExitCode {
 
 /// The servers that were named, or one of our own.
 fn servers(args: &ServerArgs) -> Result<Servers> {
-    if args.server.is_empty() {
-        return Ok(Servers::local(args.workers)?);
-    }
-    refuse_workers(args)?;
-    Ok(Servers::connect(&args.server)?)
+    let servers = if args.server.is_empty() {
+        Servers::local(args.workers)?
+    } else {
+        refuse_workers(args)?;
+        Servers::connect(&args.server)?
+    };
+    let whose = if args.server.is_empty() { "a server of its own" } else { "a server that was named" };
+    servers.addresses().iter().for_each(|address| tracing::debug!("connected to {address}, {whose}"));
+    Ok(servers)
 }
 
 /// The same, for what goes on when they are lost and come back.
@@ -146,6 +152,41 @@ fn plan_in(folder: &Folder) -> Result<Plan> {
     Ok(Plan::load(&folder.require_plan()?)?.in_folder(folder)?)
 }
 
+/// Refuses a file that is not there, and a folder, with what to give; a pipe will do.
+fn require_file(path: &Path, remedy: &str) -> Result<()> {
+    let wrong = match path.metadata() {
+        Ok(metadata) if metadata.is_dir() => format!("{} is a folder", path.display()),
+        Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
+            format!("there is no file {}", path.display())
+        }
+        _ => return Ok(()), // whoever reads it says what else is wrong
+    };
+    Err(CommandError::Usage(format!("{wrong}: {remedy}")))
+}
+
+/// Refuses a place for results that is a file, or below one.
+fn refuse_file(out: &Path) -> Result<()> {
+    let file = out.ancestors().find(|place| place.exists()).filter(|place| !place.is_dir());
+    match file {
+        None => Ok(()),
+        Some(file) if file == out => {
+            Err(CommandError::Usage(format!("--out {} is a file; give a directory", out.display())))
+        }
+        Some(file) => Err(CommandError::Usage(format!(
+            "--out {} cannot be made, {} is a file; give another directory",
+            out.display(),
+            file.display()
+        ))),
+    }
+}
+
+/// The plan in a file that was given.
+fn load_plan(path: &Path) -> Result<Plan> {
+    require_file(path, "give an experiment file; docs/experiments.md says what is in one, experiments/ has some")?;
+    tracing::debug!("the plan is read from {}", path.display());
+    Ok(Plan::load(path)?)
+}
+
 /// One a core, if nothing is asked for.
 fn threads(wanted: Option<u16>) -> usize {
     wanted.map_or_else(cores, usize::from)
@@ -168,7 +209,31 @@ fn refuse_workers(args: &ServerArgs) -> Result<()> {
 mod tests {
     use rstest::rstest;
 
-    use super::workers_of_each;
+    use super::*;
+
+    #[test]
+    fn results_go_neither_to_a_file_nor_below_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("file");
+        std::fs::write(&file, "").unwrap();
+        let refused = |out: &Path| refuse_file(out).map_err(|error| error.to_string());
+        let named = |name: &str| folder.path().join(name);
+        assert_eq!((refused(&named("new/folder")), refused(folder.path())), (Ok(()), Ok(())));
+        assert!(refused(&file).unwrap_err().ends_with("file is a file; give a directory"));
+        assert!(refused(&named("file/run/deep")).unwrap_err().ends_with("file is a file; give another directory"));
+    }
+
+    #[test]
+    fn a_file_that_is_asked_for_is_there_and_no_folder() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("file");
+        let refused = |path: &Path| require_file(path, "give one").unwrap_err().to_string();
+        assert_eq!(refused(&file), format!("there is no file {}: give one", file.display()));
+        assert_eq!(refused(folder.path()), format!("{} is a folder: give one", folder.path().display()));
+        std::fs::write(&file, "").unwrap();
+        assert!(require_file(&file, "give one").is_ok());
+        assert!(refused(&file.join("below")).starts_with("there is no file "));
+    }
 
     #[rstest]
     #[case(1, 1, 1)]

@@ -8,19 +8,19 @@ use serde_json::json;
 
 use super::args::PlanArgs;
 use super::error::{CommandError, Result, system};
-use super::{cores, recurrent, servers_of_jobs};
+use super::{cores, load_plan, recurrent, servers_of_jobs};
 use perturb_learner::client::Servers;
 use perturb_learner::measure::measure;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::scheduler::count;
 use perturb_study::table::Table;
-use perturb_study::words::{duration, grouped};
+use perturb_study::words::{counted, duration, grouped};
 use perturb_study::{
     Cell, Estimate, Folder, Grouping, Measurement, Plan, Selection, Taken, estimates, representatives,
 };
 
 pub(super) fn run(args: &PlanArgs) -> Result<()> {
-    let plan = Plan::load(&args.file)?;
+    let plan = load_plan(&args.file)?;
     if args.measure > 0 && !args.json.is_printed() && args.missing.is_none() {
         recurrent::prepare_for(&plan)?;
     }
@@ -61,10 +61,10 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     let counts = plan.counts();
     writeln!(
         out,
-        "{} configurations, {} trainings, {} train/test pairs, {} with {}{}",
-        grouped(counts.configurations),
-        grouped(counts.trainings),
-        grouped(counts.pairs),
+        "{}, {}, {}, {} with {}{}",
+        counted(counts.configurations, "configuration"),
+        counted(counts.trainings, "training"),
+        counted(counts.pairs, "train/test pair"),
         grouped(counts.all_pairs),
         count(counts.runs as usize, "run"),
         if plan.selection == Selection::Clean { " to select from" } else { "" }
@@ -72,8 +72,9 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     let anew = &known.cells[plan.cells.len()..];
     if let Some(pairs) = anew.first().map(|cell| cell.tests.sets.len()) {
         let (cells, runs) = (anew.len(), plan.runs as usize);
-        let trained = format!("{} are selected and trained anew", grouped(cells / runs));
-        writeln!(out, "{trained}, {} train/test pairs with {}", grouped(cells * pairs), count(runs, "run"))?;
+        let are = if cells / runs == 1 { "is" } else { "are" };
+        let trained = format!("{} {are} selected and trained anew", grouped(cells / runs));
+        writeln!(out, "{trained}, {} with {}", counted(cells * pairs, "train/test pair"), count(runs, "run"))?;
     }
     writeln!(out, "{groups_shown}")?;
     let taken = from.map(|folder| (folder.clone(), Taken::read(&known, &folder)));
@@ -85,8 +86,8 @@ fn groups_line(groups: &[Vec<usize>], Grouping { at_a_time, .. }: Grouping) -> S
     let sizes = || groups.iter().map(Vec::len);
     let (least, most) = (sizes().min().unwrap_or_default(), sizes().max().unwrap_or_default());
     let sizes_shown = if least == most { most.to_string() } else { format!("{least} to {most}") };
-    let number = if groups.len() == 1 { "1 group".into() } else { format!("{} groups", grouped(groups.len())) };
-    format!("{} cells in {number} of {sizes_shown}, {} at a time", grouped(sizes().sum()), at_a_time.min(groups.len()))
+    let (cells, number) = (cells(sizes().sum()), counted(groups.len(), "group"));
+    format!("{cells} in {number} of {sizes_shown}, {} at a time", at_a_time.min(groups.len()))
 }
 
 /// Prints what the plan costs: as cells took that are done, otherwise at most, by measurements.
@@ -201,7 +202,7 @@ fn print_most(out: &mut impl Write, number: usize, estimate: &Estimate) -> std::
 
 /// "1 cell", "1 200 cells".
 fn cells(number: usize) -> String {
-    if number == 1 { "1 cell".into() } else { format!("{} cells", grouped(number)) }
+    counted(number, "cell")
 }
 
 #[cfg(test)]
@@ -216,5 +217,6 @@ mod tests {
         };
         assert_eq!(line(&[36, 35, 36, 1], 2), "108 cells in 4 groups of 1 to 36, 2 at a time");
         assert_eq!(line(&[3], 8), "3 cells in 1 group of 3, 1 at a time");
+        assert_eq!(line(&[1], 8), "1 cell in 1 group of 1, 1 at a time");
     }
 }

@@ -12,10 +12,17 @@ use perturb_study::table::Table;
 
 use super::args::RatesArgs;
 use super::error::{CommandError, Result};
+use super::require_file;
+use super::sets::spelled_rule;
+
+/// What to give.
+const REMEDY: &str = "give the --records of `perturb evaluate`, or a cell of `perturb run`";
 
 pub(super) fn run(args: &RatesArgs) -> Result<()> {
     args.json.check()?;
-    let records = Records::read(&file_in(&args.file))?;
+    let file = file_in(&args.file);
+    require_file(&file, REMEDY)?;
+    let records = Records::read(&file)?;
     let about = &records.about;
     let Some(own) = &about.success else {
         let message = format!("{} does not say what its episodes achieved: test again", args.file.display());
@@ -23,7 +30,11 @@ pub(super) fn run(args: &RatesArgs) -> Result<()> {
     };
     let criteria: Vec<Criterion> = match &args.success[..] {
         [] => vec![own.clone()],
-        rules => rules.iter().map(|rule| about.criterion(rule)).collect::<Result<_, _>>()?,
+        rules => {
+            let (text, code) = (about.text_success.as_ref().unwrap_or(own), about.code_success.as_ref());
+            let criterion = |rule| about.criterion(&spelled_rule(rule, Some(text), code)?);
+            rules.iter().map(criterion).collect::<Result<_, _>>()?
+        }
     };
     let mut rows: Vec<(&str, &Criterion, TestResult)> = Vec::new();
     for test in &about.tests {

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use super::args::{CurvesArgs, ReportArgs};
 use super::display::{note, terminal_width};
 use super::error::{CommandError, Result};
-use super::plan_in;
+use super::{plan_in, refuse_file};
 use perturb_study::files::{require_writable, write_atomically};
 use perturb_study::plot::{Quantity, draw_curves, save};
 use perturb_study::report::{Sources, save_heatmaps};
@@ -29,6 +29,7 @@ pub(super) fn write(sources: Sources, out: Option<PathBuf>, page: Option<&Path>)
         Some(out) => out,
         None => usual_place(&sources)?,
     };
+    refuse_file(&out)?;
     // The folder of the tables is made.
     let inside = |page: &Path| page.parent().is_some_and(|folder| folder.starts_with(&out));
     page.filter(|page| !inside(page)).map_or(Ok(()), require_writable)?;
@@ -66,6 +67,7 @@ pub(super) fn curves(args: &CurvesArgs) -> Result<()> {
     let results = Results::read(&plan, &folder)?;
     let all = read_curves(&results.select(), &folder)?;
     let out = args.out.clone().unwrap_or_else(|| args.dir.join("report"));
+    refuse_file(&out)?;
     write_atomically(&out.join("curves.csv"), &curves_table(&all).to_csv())?;
     let mut stdout = std::io::stdout();
     for curves in &all {

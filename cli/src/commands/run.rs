@@ -13,7 +13,7 @@ use super::cells::Doing;
 use super::display::{is_quiet, note, say};
 use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
-use super::{cores, recurrent, servers_of_jobs, slurm};
+use super::{cores, load_plan, recurrent, refuse_file, servers_of_jobs, slurm};
 use perturb_learner::cell::{CellOrder, run_cells};
 use perturb_learner::client::{Address, PrivateServer, Servers};
 use perturb_learner::measure::{MeasureError, measure};
@@ -32,14 +32,11 @@ pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
     if args.worker {
         return work(args, &folder, &stop);
     }
-    let plan = Plan::load(&args.plan)?;
-    let wrong = match Kind::of(&args.out) {
-        _ if args.out.is_file() => Some("is a file; give a directory"),
-        Some(Kind::Training) => Some("holds a training (config.toml): choose another directory"),
-        _ => None,
-    };
-    if let Some(wrong) = wrong {
-        return Err(CommandError::Usage(format!("--out {} {wrong}", args.out.display())));
+    let plan = load_plan(&args.plan)?;
+    refuse_file(&args.out)?;
+    if Kind::of(&args.out) == Some(Kind::Training) {
+        let message = format!("--out {} holds a training (config.toml): choose another directory", args.out.display());
+        return Err(CommandError::Usage(message));
     }
     // What is in the folder of the results, or beside it, has its folder when it is written.
     let is_made = |page: &Path| {

@@ -1,11 +1,17 @@
 //! The sets of parameters that are typed.
 
-use perturb_study::Version;
+use std::collections::BTreeMap;
+
+use perturb_learner::proto::Environment;
+use perturb_protocol::names;
 use perturb_study::files::read;
 use perturb_study::sets::{Assignment, Contexts, TestSet, set_of, set_of_csv};
+use perturb_study::success::{Criterion, Rule, Threshold};
+use perturb_study::{ValueError, Version};
 
 use super::args::SetArgs;
 use super::error::{CommandError, Result};
+use super::require_file;
 
 /// What a set that is typed is called.
 const NAME: &str = "parameters";
@@ -25,6 +31,7 @@ pub(super) fn tested(versions: &[Version], args: &SetArgs) -> Result<Vec<TestSet
             let message = format!("{}: call the file otherwise, {name} is a version", path.display());
             return Err(CommandError::Usage(message));
         }
+        require_file(path, "give a CSV file whose header names parameters, with a row for each context")?;
         sets.push(set_of_csv(&name, args.base, &read(path)?)?);
     }
     Ok(if sets.is_empty() { Version::ALL.map(TestSet::from).to_vec() } else { sets })
@@ -41,5 +48,120 @@ pub(super) fn drawn(version: Version, parameters: &[Assignment]) -> Result<TestS
         Contexts::Listed(_) => Err(CommandError::Usage(
             "--parameters has the points of a grid here; give values or intervals, as length=0.8..0.9".into(),
         )),
+    }
+}
+
+/// The parameter of `environment` that is written so, however it is spelled; `option` is where it was written.
+///
+/// # Errors
+/// It has no such parameter; the one that was probably meant is said.
+pub(super) fn parameter<'a>(option: &str, written: &str, environment: &'a Environment) -> Result<&'a str, ValueError> {
+    let known = environment.parameters.iter().map(|parameter| parameter.name.as_str());
+    names::find(written, known.clone()).and_then(|place| known.clone().nth(place)).ok_or_else(|| {
+        let hint = names::did_you_mean(written, known.clone());
+        ValueError {
+            what: format!("{option}: a parameter of {}", environment.name),
+            got: format!("`{written}`"),
+            expected: format!("one of {}{hint}", known.collect::<Vec<_>>().join(", ")),
+        }
+    })
+}
+
+/// The `values` of parameters by the names that `environment` has for them.
+///
+/// # Errors
+/// Those of [`parameter`]; one that is there in two spellings.
+pub(super) fn spelled<T>(
+    option: &str,
+    values: BTreeMap<String, T>,
+    environment: &Environment,
+) -> Result<BTreeMap<String, T>, ValueError> {
+    let mut spelled = BTreeMap::new();
+    for (written, value) in values {
+        let name = parameter(option, &written, environment)?;
+        if spelled.insert(name.to_owned(), value).is_some() {
+            let (got, expected) = ("given twice".into(), "given once".into());
+            return Err(ValueError { what: format!("{option}: {name}"), got, expected });
+        }
+    }
+    Ok(spelled)
+}
+
+/// The same of a set's parameters.
+pub(super) fn spelled_set(set: TestSet, environment: &Environment) -> Result<TestSet, ValueError> {
+    let TestSet { name, version, contexts } = set;
+    let contexts = match contexts {
+        Contexts::Drawn(parameters) => Contexts::Drawn(spelled(&name, parameters, environment)?),
+        Contexts::Listed(contexts) => {
+            let spelled = contexts.into_iter().map(|context| spelled(&name, context, environment));
+            Contexts::Listed(spelled.collect::<Result<_, _>>()?)
+        }
+    };
+    Ok(TestSet { name, version, contexts })
+}
+
+/// The rule with its quantity as `text` or `code`, the criteria of an environment, have it.
+///
+/// # Errors
+/// Those of [`Rule::of`], with the quantity that was probably meant.
+pub(super) fn spelled_rule(
+    rule: &Rule,
+    text: Option<&Criterion>,
+    code: Option<&Criterion>,
+) -> Result<Rule, ValueError> {
+    let Rule::At(Threshold { quantity, value }) = rule else { return Ok(rule.clone()) };
+    let known = text.into_iter().chain(code).map(|criterion| criterion.quantity.as_str());
+    if let Some(name) = names::find(quantity, known.clone()).and_then(|place| known.clone().nth(place)) {
+        return Ok(Rule::At(Threshold { quantity: name.to_owned(), value: *value }));
+    }
+    let hint = names::did_you_mean(quantity, known);
+    let with_hint = |error: ValueError| ValueError { expected: format!("{}{hint}", error.expected), ..error };
+    rule.of(text, code).map(|_| rule.clone()).map_err(with_hint)
+}
+
+#[cfg(test)]
+mod tests {
+    use perturb_learner::proto::Parameter;
+    use perturb_study::success::Side;
+
+    use super::*;
+
+    fn cart_pole() -> Environment {
+        let parameters = ["force", "length", "mass"].map(|name| Parameter { name: name.into(), ..Default::default() });
+        Environment { name: "CartPole".into(), parameters: parameters.into(), ..Default::default() }
+    }
+
+    #[test]
+    fn parameters_are_spelled_as_one_likes() {
+        let set = |texts: &[&str]| {
+            let assignments = texts.iter().map(|text| text.parse().unwrap()).collect();
+            spelled_set(set_of("own", Version::D, assignments).unwrap(), &cart_pole())
+        };
+        assert_eq!(set(&["Length=0.5", "MASS=1,2"]).unwrap(), set(&["length=0.5", "mass=1,2"]).unwrap());
+        assert_eq!(set(&["Length=0.5..1"]).unwrap(), set(&["length=0.5..1"]).unwrap());
+        let refused = set(&["lenght=1"]).unwrap_err().to_string();
+        let words = "own: a parameter of CartPole is `lenght`, but must be one of force, length, mass";
+        assert_eq!(refused, format!("{words} (did you mean `length`?)"));
+        let twice = set(&["Length=1", "length=2"]).unwrap_err().to_string();
+        assert_eq!(twice, "own: length is given twice, but must be given once");
+    }
+
+    #[test]
+    fn a_threshold_is_spelled_as_one_likes() {
+        let (quantity, unit, side) = ("steps".to_owned(), "1".into(), Side::AtLeast);
+        let text = Criterion { quantity, unit, side, threshold: 100.0, most: None };
+        let code = Criterion { quantity: "steps_in_a_row".into(), ..text.clone() };
+        let read =
+            |rule: &str| spelled_rule(&rule.parse().unwrap(), Some(&text), Some(&code)).map(|rule| rule.to_string());
+        for (written, rule) in [("STEPS=90", "steps=90"), ("Steps-in-a-row=9", "steps_in_a_row=9"), ("code", "code")] {
+            assert_eq!(read(written).unwrap(), rule);
+        }
+        let refused = read("step=3").unwrap_err().to_string();
+        assert_eq!(
+            refused,
+            "the success threshold is step=3, but must be one of steps, e.g. steps=100 (did you mean `steps`?)"
+        );
+        let unknown = spelled_rule(&"steps=3".parse().unwrap(), None, None).unwrap_err().to_string();
+        assert!(unknown.contains("does not say what its success rule compares"), "{unknown}");
     }
 }

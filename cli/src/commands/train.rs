@@ -11,7 +11,7 @@ use super::again::{explain, resume_command};
 use super::args::TrainArgs;
 use super::display::{Display, note};
 use super::error::{CommandError, Result, system};
-use super::{playing_servers, recurrent, sets, signal_code, threads};
+use super::{playing_servers, recurrent, refuse_file, require_file, sets, signal_code, threads};
 use perturb_learner::checkpoint::{Checkpoint, State};
 use perturb_learner::logging::{EpisodeFigures, Progress, TimeShares};
 use perturb_learner::training::{Outcome, RunDirectory, TrainError, is_over, resume, train};
@@ -39,8 +39,11 @@ fn begin(args: &TrainArgs) -> Result<ExitCode> {
         let message = "--extend is for a run that is there: give --resume DIR with it, or --episodes for a new one";
         return Err(CommandError::Usage(message.into()));
     }
+    let remedy = "give a TOML file of settings, e.g. the config.toml of an earlier run";
+    args.config.iter().try_for_each(|path| require_file(path, remedy))?;
     let mut config = TrainConfig::load(args.config.as_deref(), &args.set, flags(args)?)?;
     recurrent::prepare(config.common.architecture, false)?;
+    args.out.iter().try_for_each(|out| refuse_file(out))?;
     if let Some(out) = args.out.as_deref().filter(|out| Kind::of(out) == Some(Kind::Experiment)) {
         let message = format!("--out {} holds an experiment (plan.toml): choose another directory", out.display());
         return Err(CommandError::Usage(message));
@@ -50,6 +53,8 @@ fn begin(args: &TrainArgs) -> Result<ExitCode> {
     let servers = playing_servers(&args.play)?;
     let environment = servers.environment_seen(&config.common)?; // its refusal lists the names
     config.common.environment = environment.name.clone(); // however it was spelled
+    config.common.parameters =
+        sets::spelled("--parameters", std::mem::take(&mut config.common.parameters), &environment)?;
     perturb_study::sets::check("--parameters", &config.common.parameters, &environment)?;
     let directory = match chosen {
         Some(directory) => directory,
@@ -67,12 +72,13 @@ fn go_on(args: &TrainArgs, path: &Path) -> Result<ExitCode> {
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let (directory, mut checkpoint, state) = RunDirectory::resume(path)?;
     recurrent::prepare(checkpoint.state.config.common.architecture, false)?;
+    let done = checkpoint.state.counters.episodes;
     if let Some(more) = args.extend {
         let budget = &mut checkpoint.state.config.common.episodes;
-        *budget = budget.saturating_add(more).min(MOST_EPISODES);
+        *budget = extended(*budget, done, more);
     }
     let config = checkpoint.state.config.clone();
-    let (done, budget) = (checkpoint.state.counters.episodes, config.common.episodes);
+    let budget = config.common.episodes;
     if is_over(&config.common, &checkpoint.state.counters, state.history.recent.iter()) {
         let finished = format!("the training in {} is finished: it has {done} of {budget} episodes", path.display());
         let rate = config.common.stop_at_success;
@@ -88,7 +94,8 @@ fn go_on(args: &TrainArgs, path: &Path) -> Result<ExitCode> {
         say(args, &directory, &checkpoint.state, recent, None)?;
         return Ok(ExitCode::SUCCESS);
     }
-    note(format_args!("{config}: going on after {done} of {budget} episodes"));
+    let new = if args.extend.is_some() { ", the new budget" } else { "" };
+    note(format_args!("{config}: going on after {done} of {budget} episodes{new}"));
     let servers = playing_servers(&args.play)?;
     let mut display = Display::of_training(config.to_string(), &config, done, checkpoint.state.counters.timesteps);
     let report = |progress: &Progress| display.training(progress);
@@ -100,6 +107,11 @@ fn go_on(args: &TrainArgs, path: &Path) -> Result<ExitCode> {
         write_atomically(&path.join("config.toml"), config.to_toml().as_bytes())?;
     }
     end(args, &config, &directory, outcome)
+}
+
+/// The budget after `more` episodes beyond the one before, or beyond those that are done: the last iteration goes past it.
+fn extended(budget: u64, done: u64, more: u64) -> u64 {
+    budget.max(done).saturating_add(more).min(MOST_EPISODES)
 }
 
 /// Says what a training came to.
@@ -227,4 +239,16 @@ fn flags(args: &TrainArgs) -> Result<Table> {
         ("episodes_per_trial", number("episodes-per-trial", args.episodes_per_trial)?),
     ];
     Ok(settings.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_budget_is_extended_from_itself_or_from_what_is_done_beyond_it() {
+        assert_eq!(extended(40, 25, 20), 60);
+        assert_eq!(extended(10, 44, 30), 74);
+        assert_eq!(extended(10, 44, u64::MAX), MOST_EPISODES);
+    }
 }

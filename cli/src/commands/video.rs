@@ -3,7 +3,7 @@
 use std::io::Write;
 
 use super::args::VideoArgs;
-use super::display::Display;
+use super::display::{Display, note};
 use super::error::{CommandError, Result, system};
 use super::{servers, sets};
 use crate::video::{Footage, Format, VideoFile, VideoOptions, film};
@@ -26,7 +26,11 @@ pub(super) fn run(args: &VideoArgs) -> Result<()> {
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = servers(&args.server)?;
     let width = args.width.unwrap_or(if is_sheet { 240 } else { 480 });
-    let sets = args.version.iter().map(|&version| sets::drawn(version, &args.parameters));
+    let environment = servers.environment(&checkpoint.state.config.common.environment)?;
+    let sets = args
+        .version
+        .iter()
+        .map(|&version| -> Result<_> { Ok(sets::spelled_set(sets::drawn(version, &args.parameters)?, &environment)?) });
     let options = VideoOptions {
         sets: sets.collect::<Result<_>>()?,
         episodes: args.episodes,
@@ -40,6 +44,9 @@ pub(super) fn run(args: &VideoArgs) -> Result<()> {
     let mut display = Display::of_episodes(format!("filming on {}", names.join(", ")), total);
     let footage = film(&servers, &checkpoint, &options, file, &stop, &mut |episodes| display.episodes(episodes))?;
     drop(display);
+    if let Some(sentence) = footage.thinning() {
+        note(sentence);
+    }
     let mut out = std::io::stdout();
     let episodes: Vec<_> = footage.episodes.iter().enumerate().collect();
     let table = Table::of("", &episodes)

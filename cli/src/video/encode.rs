@@ -11,6 +11,6 @@ pub(super) trait Encode {
     /// The frames that came are an episode.
     fn end_episode(&mut self) {}
 
-    /// Completes the file.
-    fn finish(self: Box<Self>) -> std::io::Result<()>;
+    /// Completes the file, which shows one frame of so many: 1 if it shows all.
+    fn finish(self: Box<Self>) -> std::io::Result<u16>;
 }

@@ -16,7 +16,7 @@ use perturb_study::files::{io, require_writable};
 /// How a video is encoded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
-    /// `.gif`: 256 colours a frame, and needs nothing.
+    /// `.gif`: 256 colours, at most 2 MB, and needs nothing.
     Gif,
     /// `.mp4`: H.264, by the program ffmpeg.
     Mp4,
@@ -120,15 +120,15 @@ impl VideoWriter {
         self.encoder.end_episode();
     }
 
-    /// Completes the video and puts it into its place.
+    /// Completes the video and puts it into its place. Returns of how many frames it shows one: 1 if it shows all.
     ///
     /// # Errors
     /// [`VideoError::Encode`] and [`VideoError::File`]; a video that was there before is then still there.
-    pub fn finish(self) -> Result<(), VideoError> {
+    pub fn finish(self) -> Result<u16, VideoError> {
         let VideoFile { path, temporary, .. } = self.file;
-        self.encoder.finish().map_err(encoding(&path))?;
+        let shown_every = self.encoder.finish().map_err(encoding(&path))?;
         temporary.persist(&path).map_err(|error| io("rename a file to", &path)(error.error))?;
-        Ok(())
+        Ok(shown_every)
     }
 }
 

@@ -55,6 +55,8 @@ pub struct Footage {
     pub episodes: Vec<Filmed>,
     /// One for each step, or for some of them, and one for each episode's start.
     pub frames: u64,
+    /// Of so many of them the video shows one: 1 if it shows all.
+    pub shown_every: u16,
     /// Of the video, width and height in pixels.
     pub size: (u32, u32),
     /// Simulated seconds that pass in one second of the video: 1 is real time.
@@ -65,6 +67,19 @@ pub struct Footage {
     pub waiting: Duration,
     /// The part of it that passed with drawing text, encoding and writing.
     pub writing: Duration,
+}
+
+impl Footage {
+    /// What is to be said of a video that does not show all frames.
+    pub fn thinning(&self) -> Option<String> {
+        (self.shown_every > 1).then(|| {
+            format!(
+                "one frame of {} is shown, so that the GIF has at most 2 MB: a smaller --width or fewer --episodes show \
+                 more of them, and an .mp4 all",
+                self.shown_every
+            )
+        })
+    }
 }
 
 /// Plays `options.episodes` episodes on each set with the policy of `checkpoint`, sampled actions and frozen statistics,
@@ -94,7 +109,7 @@ pub fn film(
     }
     if let Place::Begun(writer) = place {
         let completing = Instant::now();
-        writer.finish()?;
+        footage.shown_every = writer.finish()?;
         footage.writing += completing.elapsed();
     }
     footage.total = start.elapsed();

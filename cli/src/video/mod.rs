@@ -1,14 +1,15 @@
 //! Videos of a policy that acts: `perturb video`.
 //!
 //! [`film`] plays the episodes and asks the server for a picture of every state; `panel` writes below it which episode
-//! it is and how it goes; [`VideoFile`] is where the frames end up, through `gif`, `mp4` or, some of them side by side,
-//! `sheet`.
+//! it is and how it goes; [`VideoFile`] is where the frames end up, through `gif` with its `palette`, `mp4` or, some of
+//! them side by side, `sheet`.
 
 mod encode;
 mod file;
 mod film;
 mod gif;
 mod mp4;
+mod palette;
 mod panel;
 mod sheet;
 

@@ -91,10 +91,10 @@ impl Encode for Mp4Encoder {
         Ok(())
     }
 
-    fn finish(mut self: Box<Self>) -> io::Result<()> {
+    fn finish(mut self: Box<Self>) -> io::Result<u16> {
         drop(self.child.stdin.take());
         match self.child.wait() {
-            Ok(status) if status.success() => Ok(()),
+            Ok(status) if status.success() => Ok(1),
             _ => Err(self.failure()),
         }
     }

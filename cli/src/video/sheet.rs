@@ -127,14 +127,15 @@ impl Encode for SheetEncoder {
         (self.stride, self.count) = (1, 0);
     }
 
-    fn finish(self: Box<Self>) -> io::Result<()> {
+    fn finish(self: Box<Self>) -> io::Result<u16> {
         let (width, height) = self.size();
         let mut encoder = png::Encoder::new(BufWriter::new(File::create(&self.path)?), width, height);
         encoder.set_color(png::ColorType::Rgb);
         encoder.set_depth(png::BitDepth::Eight);
         let mut writer = encoder.write_header().map_err(io::Error::other)?;
         writer.write_image_data(&self.pixels).map_err(io::Error::other)?;
-        writer.finish().map_err(io::Error::other)
+        writer.finish().map_err(io::Error::other)?;
+        Ok(1)
     }
 }
 

@@ -46,17 +46,25 @@ fn lengths(stdout: &str) -> Vec<u64> {
     rows.map(|row| row.split_whitespace().nth(2).and_then(|steps| steps.parse().ok()).expect("a number")).collect()
 }
 
-/// Size, delays in hundredths of a second, and the decoded pixels of each frame.
+/// Size, delays in hundredths of a second, and what is seen at each frame: those before it, and on them its rectangle.
 fn decoded(path: &Path) -> ((u16, u16), Vec<u16>, Vec<Vec<u8>>) {
     let mut options = DecodeOptions::new();
     options.set_color_output(ColorOutput::RGBA);
     let mut decoder = options.read_info(File::open(path).expect("a file")).expect("a GIF");
     let size = (decoder.width(), decoder.height());
     let (mut delays, mut frames) = (Vec::new(), Vec::new());
+    let mut seen = vec![0; usize::from(size.0) * usize::from(size.1) * 4];
     while let Some(frame) = decoder.read_next_frame().expect("a whole GIF") {
-        assert_eq!((frame.width, frame.height), size);
+        for (row, pixels) in frame.buffer.chunks(4 * usize::from(frame.width)).enumerate() {
+            let start = (usize::from(frame.top) + row) * usize::from(size.0) + usize::from(frame.left);
+            for (seen, pixel) in seen[4 * start..].chunks_mut(4).zip(pixels.chunks(4)) {
+                if pixel[3] > 0 {
+                    seen.copy_from_slice(pixel);
+                }
+            }
+        }
         delays.push(frame.delay);
-        frames.push(frame.buffer.to_vec());
+        frames.push(seen.clone());
     }
     (size, delays, frames)
 }
@@ -76,6 +84,7 @@ fn a_gif_has_a_frame_for_each_start_and_each_step() {
         let more = ["--server", &address, "--version", "E", "--episodes", "2"];
         let stdout = done(video(&out, &file, &more));
         assert_eq!(names(&folder), std::slice::from_ref(&file));
+        assert!(file.metadata().expect("a file").len() <= 2_000_000);
 
         let lengths = lengths(&stdout);
         assert_eq!(lengths.len(), 2, "{stdout}");
@@ -117,6 +126,28 @@ fn a_gif_is_shown_as_fast_as_was_asked_for() {
     assert!(stdout.contains("at 0.25 × real time"), "{stdout}");
     let (_, delays, _) = decoded(&file);
     assert_eq!((delays[0], delays.last()), (8, Some(&200)));
+}
+
+#[test]
+fn a_gif_that_would_be_too_large_shows_fewer_frames_for_as_long() {
+    let server = server(1);
+    let (out, _) = trained(&server, PENDULUM);
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("a.gif");
+    let more = ["--server", &server.address().to_string(), "--episodes", "20", "--fps", "50"];
+    let output = video(&out, &file, &more).output().expect("perturb");
+    assert!(output.status.success(), "{}", stderr(&output));
+    let words = stderr(&output);
+    assert!(words.contains("is shown, so that the GIF has at most 2 MB"), "{words}");
+    assert!((1_000_000..=2_000_000).contains(&file.metadata().expect("a file").len()));
+    let mut decoder = DecodeOptions::new().read_info(File::open(&file).expect("a file")).expect("a GIF");
+    let mut delays = Vec::new();
+    while let Some(frame) = decoder.next_frame_info().expect("a whole GIF") {
+        delays.push(u32::from(frame.delay));
+    }
+    assert_eq!(delays.iter().sum::<u32>(), 20 * (200 * 2 + 200), "as long as with all frames");
+    assert!(delays.len() < 20 * 201);
+    assert_eq!(delays.iter().filter(|&&delay| delay >= 200).count(), 20, "the end of each episode");
 }
 
 /// Plays with the library, into a file that is thrown away.
@@ -340,7 +371,15 @@ fn a_server_that_cannot_draw_says_why() {
     assert!(names(&folder).is_empty());
 }
 
-/// Begins a long video, calls `end` when some of it is written, and returns what `perturb` says then.
+/// Seconds of processor time that a process took.
+fn processor_seconds(id: u32) -> f64 {
+    let stat = std::fs::read_to_string(format!("/proc/{id}/stat")).expect("a process");
+    let (_, fields) = stat.rsplit_once(')').expect("a name in brackets");
+    let ticks = fields.split_whitespace().skip(11).take(2).map(|ticks| ticks.parse::<f64>().expect("a number"));
+    ticks.sum::<f64>() / 100.0
+}
+
+/// Begins a long video, calls `end` when some of it is made, and returns what `perturb` says then.
 fn broken_off(ending: &str, server: Option<&str>, end: impl FnOnce(u32)) -> (Output, Vec<PathBuf>) {
     let training = crate::common::server(1);
     let (out, _) = trained(&training, PENDULUM);
@@ -351,8 +390,8 @@ fn broken_off(ending: &str, server: Option<&str>, end: impl FnOnce(u32)) -> (Out
         command.args(["--server", address]);
     }
     let child = command.spawn().expect("perturb");
-    let written = || names(&folder).iter().any(|path| path.metadata().is_ok_and(|file| file.len() > 0));
-    wait_for("the first frames", written);
+    // A GIF is written at its end; the start alone takes a fraction of this.
+    wait_for("the first frames", || processor_seconds(child.id()) > 0.5);
     end(child.id());
     (ended(child), names(&folder))
 }

@@ -19,6 +19,8 @@ from pathlib import Path
 # CSS pixels: a desktop, a window as narrow as half of one, and a telephone.
 WIDTHS = (1280, 700, 400)
 HEIGHT = 1600
+# And A4 within its margins.
+PAPER = 703
 
 # What the page shows, by its own account.
 LOOK = """
@@ -110,6 +112,8 @@ PRINTED = """
     paper: getComputedStyle(document.body).backgroundColor,
     widths: [...new Set([...document.querySelectorAll('main svg')].map(svg =>
       Math.round(millimetres(svg.getBoundingClientRect().width))))],
+    // What is wider than the paper makes the browser print all of it smaller.
+    overflow: document.documentElement.scrollWidth - document.documentElement.clientWidth,
     // A page of A4 has 269 mm within its margins.
     cut: figures.filter(figure => millimetres(figure.getBoundingClientRect().height) > 269
       || getComputedStyle(figure).breakInside !== 'avoid').length,
@@ -290,11 +294,19 @@ def main():
                 check(f"{what}, {scheme}", texts[what], 0)
         browser.resize(WIDTHS[0])
         browser.shoot(screenshots, "dark", WIDTHS[0], browser.look()["height"])
+        browser.resize(PAPER)
         browser.show(media="print", scheme="dark")  # paper is light by night, too
         printed = browser.look(PRINTED)
-        expected_print = {"contents": "none", "paper": "rgb(255, 255, 255)", "widths": [85], "cut": 0}
+        expected_print = {
+            "contents": "none",
+            "paper": "rgb(255, 255, 255)",
+            "widths": [85],
+            "overflow": 0,
+            "cut": 0,
+        }
         check("printed", printed, expected_print)
         browser.show()
+        browser.resize(WIDTHS[0])
         pdf = browser.call("Page.printToPDF", preferCSSPageSize=True, printBackground=False)
         (screenshots / "print.pdf").write_bytes(base64.b64decode(pdf["data"]))
         said = {"Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded"}

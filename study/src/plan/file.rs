@@ -3,16 +3,17 @@
 use std::collections::BTreeMap;
 
 use perturb_protocol::names::{self, EnvironmentName};
-use serde::Deserialize;
+use serde::de::{DeserializeOwned, Error, IntoDeserializer};
+use serde::{Deserialize, Deserializer};
 use toml::Table;
 
 use super::SELECTION_TEST;
 use super::{Selection, distinct};
-use crate::Version;
 use crate::paper::ENVIRONMENTS;
-use crate::settings::Preset;
+use crate::settings::{Preset, spelled};
 use crate::success::Rule;
 use crate::value_error::{ValueError, require};
+use crate::{AnyError, Version};
 
 /// Settings that the plan itself decides for each cell.
 const OWN_KEYS: [&str; 7] = ["preset", "environment", "version", "parameters", "algorithm", "architecture", "seed"];
@@ -28,6 +29,7 @@ pub(super) struct File {
     /// What reports say its date is, `2026-11-23`: they depend on no clock (default: none).
     pub(super) date: Option<toml::value::Datetime>,
     /// Whose defaults settings have: "perturb" or "paper" (default: `"perturb"`).
+    #[serde(default, deserialize_with = "preset")]
     preset: Option<Preset>,
     /// Names of the catalogue.
     pub(super) environments: Vec<String>,
@@ -36,7 +38,7 @@ pub(super) struct File {
     pub(super) versions: Vec<String>,
     /// Who selects of a grid: "paper", the tests that are reported, or "clean", trainings and episodes of their own
     /// (default: `"paper"`).
-    #[serde(default)]
+    #[serde(default, deserialize_with = "selection")]
     pub(super) selection: Selection,
     /// With "clean" alone: seeds that select, from `seed` on (default: `1`).
     tuning_runs: Option<u32>,
@@ -93,6 +95,7 @@ impl Default for Success {
 #[serde(deny_unknown_fields)]
 pub(super) struct Block {
     /// In place of the file's.
+    #[serde(default, deserialize_with = "preset")]
     preset: Option<Preset>,
     /// An algorithm, as of `perturb train --algorithm`.
     pub(super) name: String,
@@ -110,6 +113,24 @@ pub(super) struct Block {
     pub(super) grid: Table,
 }
 
+fn preset<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Preset>, D::Error> {
+    one_of(deserializer, &Preset::NAMES).map(Some)
+}
+
+fn selection<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Selection, D::Error> {
+    one_of(deserializer, &Selection::NAMES)
+}
+
+/// What one of `known` names stands for, however it is spelled.
+fn one_of<'de, T: DeserializeOwned, D: Deserializer<'de>>(
+    deserializer: D,
+    known: &'static [&'static str],
+) -> Result<T, D::Error> {
+    let written = String::deserialize(deserializer)?;
+    let place = names::find(&written, known.iter().copied());
+    T::deserialize(known[place.ok_or_else(|| D::Error::unknown_variant(&written, known))?].into_deserializer())
+}
+
 fn all_versions() -> Vec<String> {
     Version::ALL.map(|version| version.to_string()).to_vec()
 }
@@ -125,7 +146,14 @@ fn a_thousand() -> u64 {
 impl File {
     /// Spells names as they are spelled everywhere, and gives the revisions of environments that are asked for. An
     /// environment that is not of the paper is one that a server has by just this name.
-    pub(super) fn spell(&mut self) -> Result<BTreeMap<String, u32>, ValueError> {
+    pub(super) fn spell(&mut self) -> Result<BTreeMap<String, u32>, AnyError> {
+        self.settings = spelled("[settings]", std::mem::take(&mut self.settings))?;
+        for (index, block) in self.algorithm.iter_mut().enumerate() {
+            let name = format!("[[algorithm]] {} ({})", index + 1, block.name);
+            let place = |table: &str| format!("{name}: [algorithm.{table}]");
+            block.settings = spelled(&place("settings"), std::mem::take(&mut block.settings))?;
+            block.grid = spelled(&place("grid"), std::mem::take(&mut block.grid))?;
+        }
         let mut revisions = BTreeMap::new();
         let blocks = || self.algorithm.iter().flat_map(|block| block.environments.iter().flatten());
         for written in self.environments.iter().chain(blocks()) {

@@ -13,7 +13,7 @@ mod sets;
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::Path;
 
-use perturb_protocol::proto;
+use perturb_protocol::{names, proto};
 use serde::{Deserialize, Serialize};
 
 use crate::files::{self, FileError};
@@ -63,12 +63,14 @@ pub enum Selection {
     Clean,
 }
 
+impl Selection {
+    /// As they are typed.
+    pub const NAMES: [&'static str; 2] = ["paper", "clean"];
+}
+
 impl std::fmt::Display for Selection {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.pad(match self {
-            Selection::Paper => "paper",
-            Selection::Clean => "clean",
-        })
+        f.pad(Self::NAMES[*self as usize])
     }
 }
 
@@ -76,7 +78,8 @@ impl std::str::FromStr for Selection {
     type Err = ValueError;
 
     fn from_str(text: &str) -> Result<Self, ValueError> {
-        let known = [Selection::Paper, Selection::Clean].into_iter().find(|rule| rule.to_string() == text);
+        let known =
+            [Selection::Paper, Selection::Clean].into_iter().find(|rule| names::is_spelled(text, &rule.to_string()));
         known.ok_or_else(|| ValueError::new("selection", format!("`{text}`"), "\"paper\" or \"clean\""))
     }
 }
@@ -361,12 +364,18 @@ pub(crate) fn distinct<T: Eq + std::hash::Hash + Clone>(items: impl Iterator<Ite
     items.filter(|item| seen.insert(item.clone())).collect()
 }
 
-/// What is wrong with a file, without the names that numbers have in this program.
+/// What is wrong with a file, without the names that numbers have in this program, and with the key that was probably
+/// meant.
 fn words(error: &toml::de::Error) -> String {
     let whole = "expected a whole number that is not negative, in digits";
-    ["expected u32", "expected u64"]
+    let text = ["expected u32", "expected u64"]
         .iter()
-        .fold(error.to_string().trim().to_owned(), |text, word| text.replace(word, whole))
+        .fold(error.to_string().trim().to_owned(), |text, word| text.replace(word, whole));
+    const UNKNOWN_KEY: &str = "unknown field `";
+    let Some((before, names)) = text.split_once(UNKNOWN_KEY) else { return text };
+    let Some((key, known)) = names.split_once('`') else { return text };
+    let hint = names::did_you_mean(key, known.split('`').skip(1).step_by(2)); // between them stand commas
+    format!("{before}{UNKNOWN_KEY}{key}`{hint}{known}")
 }
 
 #[cfg(test)]

@@ -49,10 +49,16 @@ fn names_are_spelled_as_one_likes_and_cells_are_the_same() {
         .replace("['CartPole', 'Pendulum']", "['perturb/cart-pole-v1', 'PENDULUM']")
         .replace("['D', 'E']", "['d', 'e']")
         .replace("'a2c'", "'A2C'")
-        .replace("'rc'", "'RC'");
+        .replace("'rc'", "'RC'")
+        .replace("{ episodes = 50 }", "{ Episodes = 50 }")
+        .replace("num_envs", "num-envs")
+        .replace("n_steps = [5, 10], learning_rate", "N-Steps = [5, 10], Learning-Rate");
     let spelled = parse(&text).unwrap();
     assert_eq!(ids(&spelled), ids(&plan));
     assert_eq!(spelled.environments(), ["CartPole", "Pendulum"]);
+    let of = |lines: &str| parse(&SMALL.replacen("runs = 2", lines, 1)).unwrap();
+    assert_eq!(ids(&of("runs = 2\npreset = 'Paper'")), ids(&of("runs = 2\npreset = 'paper'")));
+    assert_eq!(of("runs = 2\nselection = 'Clean'").selection, Selection::Clean);
     let mut served = proto::Environment { name: "CartPole".into(), revision: 1, ..Default::default() };
     assert!(spelled.check(&served).is_ok());
     served.revision = 2;
@@ -201,7 +207,14 @@ fn an_invalid_cell_is_refused_with_its_table_and_key() {
 fn an_invalid_plan_is_refused_with_its_key() {
     for (from, to, part) in [
         ("runs = 2", "runs = 0", "runs is 0, but must be at least 1"),
-        ("runs = 2", "run = 2", "unknown field `run`"),
+        ("runs = 2", "run = 2", "unknown field `run` (did you mean `runs`?), expected one of `title`, "),
+        ("test_episodes = 30", "test_episode = 30", "unknown field `test_episode` (did you mean `test_episodes`?)"),
+        ("seed = 7", "colour = 7", "unknown field `colour`, expected one of `title`, "),
+        (
+            "{ episodes = 50 }",
+            "{ episodes = 50, Episodes = 50 }",
+            "[settings]: Episodes and episodes contradict each other",
+        ),
         ("seed = 7", "seed = -7", "seed"),
         ("seed = 7", "seed = 9223372036854775807", "seed is 9223372036854775807, but must be at most"),
         ("test_episodes = 30", "test_episodes = 0", "test_episodes is 0"),

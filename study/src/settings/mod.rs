@@ -20,7 +20,9 @@ pub use error::{ConfigError, SettingError};
 pub use observe::Observe;
 pub use preset::Preset;
 
+use std::collections::{BTreeSet, HashMap};
 use std::path::Path;
+use std::sync::LazyLock;
 
 use config::{Config, File, FileFormat};
 use serde::{Deserialize, Serialize};
@@ -129,15 +131,19 @@ impl TrainConfig {
         let mut layers: Vec<(String, Table)> = Vec::new();
         if let Some(path) = file {
             let shown = path.display().to_string();
+            tracing::debug!("settings are read from {shown}");
             let table = files::read_text(path)?.parse::<Table>().map_err(|error| ConfigError::Syntax {
                 origin: shown.clone(),
                 reason: error.to_string().trim().to_owned(),
             })?;
+            let table = spelled(&shown, table)?;
             layers.push((shown, table));
         }
         let mut typed: Vec<(String, Table)> = Vec::new();
         for set in sets {
-            typed.push((format!("--set {set}"), parse_set(set)?));
+            let origin = format!("--set {set}");
+            let table = spelled(&origin, parse_set(set)?)?;
+            typed.push((origin, table));
         }
         typed.extend(flags.into_iter().map(|(key, value)| (flag(&key, &value), Table::from_iter([(key, value)]))));
         refuse_contradictions(&typed)?;
@@ -173,7 +179,7 @@ impl TrainConfig {
     /// # Errors
     /// [`ConfigError`], which names the key and what is accepted.
     pub fn from_table(origin: &str, table: Table) -> Result<Self, ConfigError> {
-        resolve(vec![(origin.to_owned(), table)])
+        resolve(vec![(origin.to_owned(), spelled(origin, table)?)])
     }
 
     /// What trains.
@@ -260,6 +266,42 @@ fn refuse_contradictions(typed: &[(String, Table)]) -> Result<(), ConfigError> {
     Ok(())
 }
 
+/// A table with its keys as they are usually spelled. Those that no algorithm has stay as they are.
+///
+/// # Errors
+/// [`ConfigError::Contradiction`] for a key that is there in two spellings.
+pub(crate) fn spelled(origin: &str, table: Table) -> Result<Table, ConfigError> {
+    let known = &*ALL_KEYS;
+    let mut spelled = Table::new();
+    let mut written: HashMap<String, String> = HashMap::new();
+    for (key, value) in table {
+        let name =
+            names::find(&key, known.iter().map(String::as_str)).map_or_else(|| key.clone(), |i| known[i].clone());
+        if let Some(first) = written.insert(name.clone(), key.clone()) {
+            return Err(ConfigError::Contradiction { first: format!("{origin}: {first}"), second: key });
+        }
+        spelled.insert(name, value);
+    }
+    Ok(spelled)
+}
+
+/// The keys of all algorithms.
+static ALL_KEYS: LazyLock<Vec<String>> = LazyLock::new(|| {
+    let of = |settings| defaults_of(&defaults::of(settings, Architecture::Rc, Preset::default()));
+    let keys: BTreeSet<String> = Settings::all().into_iter().flat_map(of).map(|(key, _)| key).collect();
+    keys.into_iter().collect()
+});
+
+/// Every key that a configuration of this kind may have, with its default.
+fn defaults_of(config: &TrainConfig) -> Table {
+    let mut defaults = config.full_table();
+    // By default they are not written.
+    defaults.insert(PARAMETERS.into(), Value::Table(Table::new()));
+    defaults.insert("stop_at_success".into(), 0.0.into());
+    defaults.insert(OBSERVE.into(), Observe::default().to_string().into());
+    defaults
+}
+
 /// The names that the setting `key` may have; `None` if it is no choice between names.
 fn choices(key: &str) -> Option<Vec<&'static str>> {
     Some(match key {
@@ -296,11 +338,7 @@ fn resolve(mut layers: Vec<(String, Table)>) -> Result<TrainConfig, ConfigError>
         Some(value) => Preset::ALL[choice(PRESET, value, &Preset::NAMES)?],
     };
     let config = defaults::of(algorithm, architecture, preset);
-    let mut defaults = config.full_table();
-    // By default they are not written.
-    defaults.insert(PARAMETERS.into(), Value::Table(Table::new()));
-    defaults.insert("stop_at_success".into(), 0.0.into());
-    defaults.insert(OBSERVE.into(), Observe::default().to_string().into());
+    let defaults = defaults_of(&config);
     for (origin, table) in &layers {
         for (key, value) in table {
             check(origin, key, value, &defaults, name)?;

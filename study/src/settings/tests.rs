@@ -58,6 +58,19 @@ fn names_are_spelled_as_one_likes() {
 }
 
 #[test]
+fn keys_are_spelled_as_one_likes_and_stand_once() {
+    let config =
+        load(Some("Environment = 'CartPole'\nN-Steps = 64"), &["Learning-Rate=1e-3", "GAMMA=0.9"], "").unwrap();
+    assert_eq!((ppo(&config).learning_rate, ppo(&config).gamma, ppo(&config).n_steps), (1e-3, 0.9, 64));
+    let refused = refusal(None, &["n_steps=64", "n-steps=32"]);
+    assert_eq!(refused, "--set n_steps=64 and --set n-steps=32 contradict each other: give one of them");
+    let twice = refusal(Some("n_steps = 64\nn-steps = 64"), &[]);
+    assert!(twice.ends_with(": n-steps and n_steps contradict each other: give one of them"), "{twice}");
+    let others = refusal(None, &["Rms-Alpha=0.9"]);
+    assert!(others.contains("unknown key `rms_alpha`; it is a setting of a2c"), "{others}");
+}
+
+#[test]
 fn an_algorithm_brings_its_own_defaults_and_keys() {
     let config = load(None, &["algorithm=a2c", "rms_alpha=0.9"], "environment = 'Pendulum'").unwrap();
     let own = A2cConfig { learning_rate: 7e-3, n_steps: 15, ent_coef: 1e-3, ..A2cConfig::default() };

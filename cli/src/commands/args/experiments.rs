@@ -9,6 +9,10 @@ use perturb_study::{Grouping, Selection};
 use super::{JsonArgs, ServerArgs, WaitArgs, at_least_one, natural};
 
 #[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  perturb plan experiments/quick.toml                # measures for some seconds what it costs
+  perturb plan experiments/paper.toml --measure 0    # only says what it asks for
+  perturb plan experiments/quick.toml --missing runs/quick")]
 pub struct PlanArgs {
     /// An experiment file, e.g. experiments/paper.toml.
     pub file: PathBuf,
@@ -84,7 +88,7 @@ pub struct RunArgs {
 pub struct EngineArgs {
     /// Submit the cells as jobs of this engine, watch them, and submit again what it lost. DIR and this program must be
     /// at the same place on all its machines. --jobs and --workers are those of each of its jobs.
-    #[arg(long, value_name = "NAME", conflicts_with = "cell")]
+    #[arg(long, value_name = "NAME", ignore_case = true, conflicts_with = "cell")]
     pub engine: Option<Engine>,
     /// Slurm's partition [default: Slurm's].
     #[arg(long, value_name = "NAME", requires = "engine")]
@@ -108,6 +112,10 @@ pub enum Engine {
 }
 
 #[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  perturb report runs/quick
+  perturb report runs/quick --html quick.html        # one page with everything
+  perturb report runs/quick assessed/mine --out report")]
 pub struct ReportArgs {
     /// The --out of `perturb run`, folders of `Assessment.save` in Python, or one of the former and any number of the latter,
     /// whose agents then stand in the same tables and pictures.
@@ -127,6 +135,9 @@ pub struct ReportArgs {
 }
 
 #[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  perturb curves runs/quick
+  perturb curves runs/quick --out pictures")]
 pub struct CurvesArgs {
     /// The --out of `perturb run`.
     pub dir: PathBuf,

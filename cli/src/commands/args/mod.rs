@@ -4,16 +4,19 @@ mod experiments;
 mod testing;
 mod training;
 
+use std::ffi::OsStr;
 use std::fmt::Display;
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::Duration;
 
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Arg, ArgAction, Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 
 pub use experiments::{CurvesArgs, Engine, PlanArgs, ReportArgs, RunArgs};
 use perturb_learner::client::Address;
+use perturb_protocol::names;
 pub use testing::{AuditArgs, EvaluateArgs, HeatmapArgs, RatesArgs, SetArgs, VideoArgs};
 pub use training::{CompletionsArgs, DemoArgs, EnvsArgs, LsArgs, ManArgs, ServeArgs, TrainArgs};
 
@@ -35,7 +38,8 @@ pub struct Cli {
     /// Say nothing on standard error but warnings and errors.
     #[arg(short, long, global = true, conflicts_with = "verbose")]
     pub quiet: bool,
-    /// Say more on standard error; twice: much more. RUST_LOG, a filter of tracing's, says exactly what.
+    /// Say on standard error what perturb does; twice: all that it can say of it. RUST_LOG, a filter of tracing's, says
+    /// exactly what, also of its libraries.
     #[arg(short, long, global = true, action = ArgAction::Count)]
     pub verbose: u8,
     #[command(subcommand)]
@@ -148,8 +152,32 @@ pub struct PlayArgs {
     pub wait: WaitArgs,
     /// Where actions are chosen, which changes no byte: at the server, if it can, for a whole rollout at a time; or here, at
     /// every step.
-    #[arg(long, value_name = "WHERE", default_value = "server", value_parser = ["server", "client"])]
+    #[arg(long, value_name = "WHERE", default_value = "server", value_parser = OneOf::new(&["server", "client"]))]
     pub act: String,
+}
+
+/// A parser of one of a few names, however it is spelled; --help and completions list them.
+#[derive(Clone)]
+struct OneOf(Vec<&'static str>);
+
+impl OneOf {
+    fn new(names: &[&'static str]) -> Self {
+        Self(names.to_vec())
+    }
+}
+
+impl TypedValueParser for OneOf {
+    type Value = String;
+
+    fn parse_ref(&self, command: &clap::Command, arg: Option<&Arg>, value: &OsStr) -> Result<String, clap::Error> {
+        let place = value.to_str().and_then(|written| names::find(written, self.0.iter().copied()));
+        let name = place.map_or(value, |place| OsStr::new(self.0[place]));
+        PossibleValuesParser::new(&self.0).parse_ref(command, arg, name)
+    }
+
+    fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
+        Some(Box::new(self.0.iter().map(PossibleValue::new)))
+    }
 }
 
 fn within<T: FromStr + PartialOrd + Display>(text: &str, range: RangeInclusive<T>) -> Result<T, String> {
@@ -187,6 +215,21 @@ mod tests {
     #[test]
     fn the_parser_is_sound() {
         Cli::parser().debug_assert();
+    }
+
+    #[test]
+    fn names_are_spelled_as_one_likes() {
+        let words = ["perturb", "train", "--algorithm", "EPOpt_PPO", "--architecture", "FF", "--preset", "Paper"];
+        let Command::Train(train) = Cli::try_parse_from(words).unwrap().command else { panic!("another command") };
+        assert_eq!(train.algorithm.as_deref(), Some("epopt-ppo"));
+        assert_eq!((train.architecture.as_deref(), train.preset.as_deref()), (Some("ff"), Some("paper")));
+        let refused = Cli::try_parse_from(["perturb", "train", "--algorithm", "pppo"]).unwrap_err().to_string();
+        assert!(refused.contains("a similar value exists: 'ppo'"), "{refused}");
+        for (rule, meant) in [("TEXT", "text"), ("Code", "code"), ("steps=9", "steps=9")] {
+            let words = ["perturb", "rates", "file", "--success", rule];
+            let Command::Rates(rates) = Cli::try_parse_from(words).unwrap().command else { panic!("another command") };
+            assert_eq!(rates.success, [meant.parse().unwrap()]);
+        }
     }
 
     #[test]

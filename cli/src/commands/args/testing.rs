@@ -3,12 +3,19 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use perturb_protocol::names;
 use perturb_study::sets::Assignment;
 use perturb_study::success::Rule;
-use perturb_study::{MOST_POINTS, Version};
+use perturb_study::{MOST_POINTS, ValueError, Version};
 
 use super::{JsonArgs, PlayArgs, ServerArgs, WaitArgs, at_least_one, natural, within};
 use crate::video::PIXELS;
+
+/// A rule of success, whose name may be spelled in any way.
+fn success_rule(text: &str) -> Result<Rule, ValueError> {
+    let known = ["text", "code"];
+    names::find(text.trim(), known.into_iter()).map_or(text, |place| known[place]).parse()
+}
 
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
@@ -16,7 +23,8 @@ use crate::video::PIXELS;
   perturb evaluate --checkpoint runs/mine --versions E --episodes 200 --json -
   perturb evaluate --checkpoint runs/mine --parameters length=0.1..2.0/20 --records long.parquet")]
 pub struct EvaluateArgs {
-    /// The --out of a training, the checkpoint folder in it, or the name of a policy in results/.
+    /// The --out of a training, the checkpoint folder in it, the folder of a cell, or the name of a policy: the id of a cell
+    /// in results/ of the working directory, or in the folder that PERTURB_RESULTS names.
     #[arg(long, value_name = "DIR")]
     pub checkpoint: PathBuf,
     /// Versions to test on, separated by commas [default: D,R,E; none with --parameters or --contexts].
@@ -26,7 +34,7 @@ pub struct EvaluateArgs {
     pub set: SetArgs,
     /// What decides about success: the rule of the paper's text, that of its published code, or a threshold of one's own for
     /// what either compares, e.g. steps=90; `perturb envs` tells them [default: text].
-    #[arg(long, value_name = "text|code|QUANTITY=NUMBER")]
+    #[arg(long, value_name = "text|code|QUANTITY=NUMBER", value_parser = success_rule)]
     pub success: Option<Rule>,
     /// Keep every test episode in this file, as Parquet: `perturb audit` plays them again, `perturb rates` judges them by
     /// other thresholds, pandas and polars read it.
@@ -66,11 +74,16 @@ pub struct SetArgs {
 }
 
 #[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  perturb audit runs/quick                           # of each policy 30 episodes, spread over all of its tests
+  perturb audit long.parquet --checkpoint runs/long --all
+  perturb audit runs/quick --ledger ledger.jsonl     # plays nothing: which environments trained what")]
 pub struct AuditArgs {
     /// The --out of `perturb run`, the folder of one of its cells, the --records of `perturb evaluate`, or a folder of
     /// `Assessment.save` in Python.
     pub dir: PathBuf,
-    /// The checkpoint that was tested, for a file of records: the --out of its training, the checkpoint folder in it, or a name in results/; for
+    /// The checkpoint that was tested, for a file of records: the --out of its training, the checkpoint folder in it, the
+    /// folder of its cell, or a name in results/ of the working directory, or in the folder that PERTURB_RESULTS names; for
     /// the folder of an assessment those of all its policies that are perturb's.
     #[arg(long, value_name = "DIR", num_args = 1..)]
     pub checkpoint: Vec<PathBuf>,
@@ -97,12 +110,15 @@ pub struct AuditArgs {
 }
 
 #[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  perturb rates long.parquet                         # the --records of perturb evaluate
+  perturb rates long.parquet --success text code steps=85")]
 pub struct RatesArgs {
     /// The folder of a cell of `perturb run`, or the --records of `perturb evaluate`.
     pub file: PathBuf,
     /// Rules of success to judge the recorded episodes by, e.g. --success text code steps=85 [default: the one that they were
     /// tested with].
-    #[arg(long, value_name = "text|code|QUANTITY=NUMBER", num_args = 1..)]
+    #[arg(long, value_name = "text|code|QUANTITY=NUMBER", num_args = 1.., value_parser = success_rule)]
     pub success: Vec<Rule>,
     #[command(flatten)]
     pub json: JsonArgs,
@@ -121,8 +137,9 @@ pub struct HeatmapArgs {
         conflicts_with_all = ["checkpoint", "parameters", "records", "out"]
     )]
     pub dir: Option<PathBuf>,
-    /// Policies instead, of one environment: the --out of each training, the checkpoint folder in it, or a name in results/. The picture shows
-    /// the mean over those of a method that were trained on the same, side by side with others.
+    /// Policies instead, of one environment: the --out of each training, the checkpoint folder in it, the folder of a cell, or
+    /// a name in results/ of the working directory, or in the folder that PERTURB_RESULTS names. The picture shows the mean
+    /// over those of a method that were trained on the same, side by side with others.
     #[arg(long, value_name = "DIR", num_args = 1..)]
     pub checkpoint: Vec<PathBuf>,
     /// Test the policies of the first N runs only, and draw what is there of the others [default: of all runs].
@@ -173,7 +190,8 @@ pub struct HeatmapArgs {
   perturb video --checkpoint runs/mine --version E --episodes 3 --out mine.gif
   perturb video --checkpoint runs/mine --version D,E --episodes 4 --out sheet.png")]
 pub struct VideoArgs {
-    /// The --out of a training, the checkpoint folder in it, or the name of a policy in results/.
+    /// The --out of a training, the checkpoint folder in it, the folder of a cell, or the name of a policy: the id of a cell
+    /// in results/ of the working directory, or in the folder that PERTURB_RESULTS names.
     #[arg(long, value_name = "DIR")]
     pub checkpoint: PathBuf,
     /// Where the environment's parameters come from; of several, separated by commas, one after the other, in a contact

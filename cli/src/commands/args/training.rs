@@ -9,9 +9,13 @@ use perturb_study::Version;
 use perturb_study::sets::Assignment;
 use perturb_study::settings::{Architecture, Observe, Preset, Settings};
 
-use super::{JsonArgs, PlayArgs, ServerArgs, WaitArgs, at_least_one, natural, within};
+use super::{JsonArgs, OneOf, PlayArgs, ServerArgs, WaitArgs, at_least_one, natural, within};
 
 #[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  perturb envs
+  perturb envs --server 127.0.0.1:7447               # those of a running perturb-server
+  perturb envs --json envs.json")]
 pub struct EnvsArgs {
     #[command(flatten)]
     pub server: ServerArgs,
@@ -39,17 +43,17 @@ pub struct TrainArgs {
     #[arg(long, value_name = "PARAMETER=VALUES", num_args = 1..)]
     pub parameters: Vec<Assignment>,
     /// Whose defaults settings have: those that we recommend, or those of the paper's authors [default: perturb].
-    #[arg(long, ignore_case = true, value_parser = Preset::NAMES)]
+    #[arg(long, value_parser = OneOf::new(&Preset::NAMES))]
     pub preset: Option<String>,
     /// What learns [default: ppo].
-    #[arg(long, ignore_case = true, value_parser = Settings::names())]
+    #[arg(long, value_parser = OneOf::new(&Settings::names()))]
     pub algorithm: Option<String>,
     /// What acts [default: ff; with RL², which has no other, rc].
-    #[arg(long, ignore_case = true, value_parser = Architecture::NAMES)]
+    #[arg(long, value_parser = OneOf::new(&Architecture::NAMES))]
     pub architecture: Option<String>,
     /// What the policy sees: the environment's observation, or the parameters that the episode runs with, too [default:
     /// state].
-    #[arg(long, ignore_case = true, value_parser = Observe::NAMES)]
+    #[arg(long, value_parser = OneOf::new(&Observe::NAMES))]
     pub observe: Option<String>,
     /// RL² only: episodes in a trial [default: 2].
     #[arg(long, value_name = "N", value_parser = at_least_one::<u64>)]
@@ -86,7 +90,7 @@ pub struct TrainArgs {
         ]
     )]
     pub resume: Option<PathBuf>,
-    /// Go on past the budget of the run, for so many more episodes. With learning_rate_schedule = "constant" it comes to
+    /// Go on past the budget of the run, or past what it has if that is more, for so many more episodes. With learning_rate_schedule = "constant" it comes to
     /// what a training with the larger budget comes to; another schedule goes on from where that one would be.
     #[arg(long, value_name = "EPISODES", value_parser = at_least_one::<u64>)]
     pub extend: Option<u64>,
@@ -125,6 +129,9 @@ pub struct DemoArgs {
 }
 
 #[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  perturb ls                                         # what is in runs/
+  perturb ls results --json results.json")]
 pub struct LsArgs {
     /// Where to look, however deep.
     #[arg(value_name = "DIR", default_value = "runs")]

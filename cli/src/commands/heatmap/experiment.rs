@@ -11,6 +11,7 @@ use crate::commands::{plan_in, playing_servers};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::Servers;
 use perturb_learner::proto;
+use perturb_protocol::names;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::report::{heatmap_pictures, save_heatmaps};
 use perturb_study::{
@@ -88,9 +89,11 @@ pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
 
 /// What an environment lacks of the parameters that are asked for.
 fn lack(args: &HeatmapArgs, environment: &proto::Environment) -> Option<String> {
-    let names: Vec<&str> = environment.parameters.iter().map(|parameter| parameter.name.as_str()).collect();
-    let lacking = args.x.iter().chain(&args.y).find(|name| !names.contains(&name.as_str()))?;
-    Some(format!("{} has no parameter `{lacking}`, only {}", environment.name, names.join(", ")))
+    let known = environment.parameters.iter().map(|parameter| parameter.name.as_str());
+    let lacking = args.x.iter().chain(&args.y).find(|name| names::find(name, known.clone()).is_none())?;
+    let hint = names::did_you_mean(lacking, known.clone());
+    let known = known.collect::<Vec<_>>().join(", ");
+    Some(format!("{} has no parameter `{lacking}`{hint}, only {known}", environment.name))
 }
 
 /// Makes a heatmap, unless it is there; whether it is there then.
