@@ -225,7 +225,7 @@ docs: build $(DOCS)/installed ## build the site in target/docs/site; a link to n
 	@$(call install,$(FFMPEG))
 	$(DOCS)/venv/bin/python docs/site/build.py $(PROGRAMS) $(DOCS)
 
-docs-test: docs $(VENV)/installed ## run the tutorials' blocks, follow all links, look at the site in Chromium; minutes
+docs-test: docs $(VENV)/installed ## run README's and the tutorials' blocks, follow all links, look at the site in Chromium; minutes
 	@$(call install,chromium)
 	failed=; \
 	$(VENV)/bin/ruff check --config python/pyproject.toml --extend-ignore ANN,D101,D102,D103 docs/site && \

@@ -22,7 +22,7 @@ cat >"$work/runs/plan.toml" <<'PLAN'
 environments = ["CartPole", "Hopper"]
 versions = ["D", "R"]
 test_episodes = 50
-settings = { episodes = 150, checkpoint_interval = 5 }
+settings = { episodes = 2000, checkpoint_interval = 20 }
 [[algorithm]]
 name = "a2c"
 architectures = ["ff"]

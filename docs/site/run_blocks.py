@@ -2,8 +2,8 @@
 
     run_blocks.py PROGRAMS [PAGE …]
 
-PROGRAMS is where `perturb` and `perturb-server` are; pages are the tutorials and others of docs/ that say how something
-is done. To be called from the repository's root, with a Python that can import perturb.
+PROGRAMS is where `perturb` and `perturb-server` are; pages are README.md, the tutorials and others of docs/ that say
+how something is done. To be called from the repository's root, with a Python that can import perturb.
 
 Blocks of sh run in bash, which ends at the first error; those of python share one namespace in a page. A block of text
 that follows one is what it prints: each of its lines must be there. A comment `<!-- not run: REASON -->` above a block
@@ -23,7 +23,7 @@ import time
 import traceback
 from pathlib import Path
 
-PAGES = ["docs/index.md", *sorted(map(str, Path("docs/tutorials").glob("*.md"))), "docs/checkpoints.md"]
+PAGES = ["README.md", "docs/index.md", *sorted(map(str, Path("docs/tutorials").glob("*.md"))), "docs/checkpoints.md"]
 BLOCK = re.compile(r"^(?:<!-- not run: (.*?) -->\n)?```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 

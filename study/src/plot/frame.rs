@@ -11,6 +11,8 @@ use super::ticks::round_ticks;
 
 /// Between two numbers along an axis, at least.
 const BETWEEN: f64 = 6.0;
+/// Between the first and the last, where those between have no number: a space.
+const SPACE: f64 = 4.6;
 /// A number goes so far beyond its frame, which may have a neighbour.
 const BEYOND: f64 = 2.0;
 /// The most ticks at an axis.
@@ -54,25 +56,43 @@ impl Frame {
         self.bottom() - self.height * share(&self.y, value)
     }
 
-    fn x_ticks(&self) -> Vec<(f64, String)> {
-        let ends = |tick: &(f64, String)| {
-            let (middle, half) = (self.number(tick), text_width(&tick.1) / 2.0);
-            [middle - half, middle + half]
-        };
-        let fit =
-            |ticks: &Vec<(f64, String)>| ticks.windows(2).all(|pair| ends(&pair[1])[0] - ends(&pair[0])[1] >= BETWEEN);
-        (1..=MOST).rev().map(|most| round_ticks(&self.x, most)).find(fit).unwrap_or_default()
+    /// With their numbers, all or as many as have room: the first and the last, or the last alone.
+    fn x_ticks(&self) -> Vec<(f64, Option<String>)> {
+        let sets: Vec<_> = (2..=MOST).rev().map(|most| round_ticks(&self.x, most)).collect();
+        // A single number would not say how far it is to the next.
+        let several = || sets.iter().filter(|ticks| ticks.len() > 1);
+        let mut all = several().filter(|ticks| ticks.windows(2).all(|pair| self.gap(&pair[0], &pair[1]) >= BETWEEN));
+        if let Some(ticks) = all.next() {
+            return numbered(ticks, |_| true);
+        }
+        let mut ends = several().filter(|ticks| self.gap(&ticks[0], &ticks[ticks.len() - 1]) >= SPACE);
+        if let Some(ticks) = ends.next() {
+            return numbered(ticks, |index| index == 0 || index + 1 == ticks.len());
+        }
+        let ticks = round_ticks(&self.x, 2);
+        numbered(&ticks, |index| index + 1 == ticks.len())
+    }
+
+    /// Between the numbers of two ticks.
+    fn gap(&self, left: &(f64, String), right: &(f64, String)) -> f64 {
+        let middle = |(value, number): &(f64, String)| self.number(*value, number);
+        middle(right) - middle(left) - (text_width(&left.1) + text_width(&right.1)) / 2.0
     }
 
     /// The middle of the number below a tick.
-    fn number(&self, (value, number): &(f64, String)) -> f64 {
+    fn number(&self, value: f64, number: &str) -> f64 {
         let half = text_width(number) / 2.0 - BEYOND;
-        self.x(*value).clamp(self.left + half, (self.right() - half).max(self.left + half))
+        self.x(value).clamp(self.left + half, (self.right() - half).max(self.left + half))
     }
 
     fn y_ticks(&self) -> Vec<(f64, String)> {
         round_ticks(&self.y, ((self.height / (LINE + 2.0)) as usize).clamp(2, MOST))
     }
+}
+
+fn numbered(ticks: &[(f64, String)], has_number: impl Fn(usize) -> bool) -> Vec<(f64, Option<String>)> {
+    let of = |(index, (value, number)): (usize, &(f64, String))| (*value, has_number(index).then(|| number.clone()));
+    ticks.iter().enumerate().map(of).collect()
 }
 
 /// How much the numbers of a y axis of this height take.
@@ -105,16 +125,11 @@ impl<DB: DrawingBackend> Canvas<'_, DB> {
     /// Below the frame, with numbers if they are wanted.
     pub(super) fn x_ticks(&self, frame: &Frame, numbers: bool) -> Result<(), PlotError> {
         let bottom = frame.bottom();
-        let tick = |x: f64| self.line(&[(x, bottom), (x, bottom + 4.0)], TICK);
-        let ticks = frame.x_ticks();
-        if ticks.len() < 2 {
-            // A single number would not say how far it is to the next.
-            round_ticks(&frame.x, 2).into_iter().try_for_each(|(value, _)| tick(frame.x(value)))?;
-        }
-        for written in ticks {
-            tick(frame.x(written.0))?;
-            if numbers {
-                self.text(&written.1, (frame.number(&written), bottom + 5.0 + LINE / 2.0), Side::Middle)?;
+        for (value, number) in frame.x_ticks() {
+            let x = frame.x(value);
+            self.line(&[(x, bottom), (x, bottom + 4.0)], TICK)?;
+            if let Some(number) = number.filter(|_| numbers) {
+                self.text(&number, (frame.number(value, &number), bottom + 5.0 + LINE / 2.0), Side::Middle)?;
             }
         }
         Ok(())
@@ -130,5 +145,25 @@ impl<DB: DrawingBackend> Canvas<'_, DB> {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rstest::rstest;
+
+    use super::*;
+
+    /// MountainCar's force: in a row of one panel, of three and of four.
+    #[rstest]
+    #[case(210.0, &["0.005", "0.010"])]
+    #[case(85.0, &["0.002", "", "", "", "0.010"])]
+    #[case(61.0, &["", "0.010"])]
+    fn an_x_axis_has_two_numbers_where_they_fit_and_all_of_one_style(#[case] width: f64, #[case] expected: &[&str]) {
+        let frame = Frame { left: 76.0, top: 0.0, width, height: 96.0, x: 0.0001..0.01, y: 0.0001..0.01 };
+        let ticks = frame.x_ticks();
+        let numbers: Vec<&str> = ticks.iter().map(|(_, number)| number.as_deref().unwrap_or_default()).collect();
+        assert_eq!(numbers, expected);
+        assert!(frame.y_ticks().iter().all(|(_, number)| number.len() == "0.010".len()), "{:?}", frame.y_ticks());
     }
 }

@@ -8,7 +8,7 @@ use crate::plot::intervals::{Group, IntervalRow};
 use crate::plot::{Intervals, panels};
 use crate::statistics::Bootstrapped;
 use crate::table::Table;
-use crate::{Metric, scheduler::count};
+use crate::{Metric, Scenario, scheduler::count};
 
 impl<'a> Report<'a> {
     /// What the page opens with: all environments together; where nothing can be said of these, or there is one alone, each.
@@ -118,36 +118,71 @@ impl<'a> Report<'a> {
     }
 }
 
-/// Who extrapolates best, by how much, and what Extrapolation is beside Default; `None` if no method has it. Of the random
-/// policy, which has learned nothing that could be lost, nothing is said.
+/// Who extrapolates best, by how much, and what Extrapolation is beside Default; `None` if no method has it. Those whose
+/// numbers are written alike are first together, and none is best. Of the random policy, which has learned nothing that
+/// could be lost, nothing is said.
 fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
     let learned: Vec<_> = rows.iter().filter(|row| !row.method.is_random()).collect();
     let mean = |row: &MethodMetrics<'_>, metric| row.means.get(&metric).copied();
-    let shown = |mean: Bootstrapped| match mean.interval_95 {
-        Some([low, high]) => format!("{:.1} % [{:.1}, {:.1}]", mean.point, low + 0.0, high + 0.0), // no negative zero
-        None => format!("{:.1} %", mean.point),
-    };
     let both = |row: &MethodMetrics<'_>| Some((mean(row, Metric::Default)?, mean(row, Metric::Extrapolation)?));
     let mut ranked: Vec<_> =
-        learned.iter().filter_map(|row| both(row).map(|(default, its)| (&row.method, default, its))).collect();
+        learned.iter().filter_map(|row| both(row).map(|(default, its)| (*row, default, its))).collect();
     ranked.sort_by(|(.., a), (.., b)| b.point.total_cmp(&a.point));
     let &(best, default, extrapolation) = ranked.first()?;
     let numbers = format!("Extrapolation of {} and Default of {}", shown(extrapolation), shown(default));
-    let Some(&(next, _, its)) = ranked.get(1) else { return Some(format!("{best} comes to {numbers}.")) };
-    let of = if ranked.len() < learned.len() { format!(" of {}", learned.len()) } else { String::new() };
-    let intervals = match (extrapolation.interval_95, its.interval_95) {
-        (Some([low, _]), Some([_, high])) if high < low => ", and their intervals are apart",
-        (Some(_), Some(_)) => ", and their intervals overlap",
-        _ => "",
+    let zeros = zero_sentence(ranked.iter().filter(|(.., its)| its.point == 0.0).map(|(row, ..)| *row));
+    if ranked.len() == 1 {
+        return Some(format!("{} comes to {numbers}.{zeros}", best.method));
+    }
+    let written = |its: &Bootstrapped| format!("{:.1}", its.point);
+    let number = written(&extrapolation);
+    let (first, others) = ranked.split_at(ranked.partition_point(|(.., its)| written(its) == number));
+    let found = match first {
+        _ if number == "0.0" => "none extrapolates: each has Extrapolation of 0.0 %".to_owned(),
+        [_] => format!("{} generalises best, with {numbers}", best.method),
+        _ => format!(
+            "none generalises best: {} come to the same Extrapolation, {}",
+            listed(&first.iter().map(|(row, ..)| row.method.to_string()).collect::<Vec<_>>()),
+            listed(&distinct(first.iter().map(|(.., its)| shown(*its)))),
+        ),
     };
+    let next = others.first().map(|(row, _, its)| {
+        let lowest = first.iter().map(|(.., its)| Some(its.interval_95?[0])).reduce(|a, b| Some(a?.min(b?)));
+        let intervals = match (lowest.flatten(), its.interval_95) {
+            (Some(low), Some([_, high])) if high < low => ", and their intervals are apart",
+            (Some(_), Some(_)) => ", and their intervals overlap",
+            _ => "",
+        };
+        format!("; next is {}, with Extrapolation of {}{intervals}", row.method, shown(*its))
+    });
+    let of = if ranked.len() < learned.len() { format!(" of {}", learned.len()) } else { String::new() };
     let differences: Vec<f64> = ranked.iter().map(|(_, default, its)| rounded(its.point - default.point)).collect();
     let [least, most] = [f64::min, f64::max].map(|of| differences.iter().copied().reduce(of).unwrap_or_default());
     Some(format!(
-        "of {}{of} methods {best} generalises best, with {numbers}; next is {next}, with Extrapolation of \
-         {}{intervals}. Extrapolation less Default is {least:+.1} to {most:+.1} points.",
+        "of {}{of} methods {found}{}. Extrapolation less Default is {least:+.1} to {most:+.1} points.{zeros}",
         ranked.len(),
-        shown(its),
+        next.unwrap_or_default(),
     ))
+}
+
+/// Whose Extrapolation is 0 although it has successes elsewhere, and by what; empty if it is so of none.
+fn zero_sentence<'a, 'm: 'a>(rows: impl Iterator<Item = &'a MethodMetrics<'m>>) -> String {
+    let by = |row: &MethodMetrics<'_>| {
+        let zeros: Vec<String> = row.zeros.iter().map(Scenario::to_string).collect();
+        format!("for {} {}", row.method, listed(&zeros))
+    };
+    let methods: Vec<String> = rows.filter(|row| !row.zeros.is_empty()).map(by).collect();
+    if methods.is_empty() {
+        return String::new();
+    }
+    format!(" Extrapolation is a geometric mean, and 0 in a run where one of its three is: {}.", methods.join(", "))
+}
+
+fn shown(mean: Bootstrapped) -> String {
+    match mean.interval_95 {
+        Some([low, high]) => format!("{:.1} % [{:.1}, {:.1}]", mean.point, low + 0.0, high + 0.0), // no negative zero
+        None => format!("{:.1} %", mean.point),
+    }
 }
 
 /// As it is shown, without a negative zero.

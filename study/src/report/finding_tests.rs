@@ -1,8 +1,9 @@
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use rstest::rstest;
 
 use super::*;
+use crate::Version;
 use crate::fixture;
 use crate::outcomes::Recorded;
 use crate::paper::Method;
@@ -113,6 +114,7 @@ fn said_of(rows: &[(&str, f64, f64, Option<[f64; 2]>)], missing: usize) -> Optio
         ours: BTreeMap::new(),
         papers: BTreeMap::new(),
         means,
+        zeros: BTreeSet::new(),
         iqms: BTreeMap::new(),
         gaps: BTreeMap::new(),
         reselected: BTreeMap::new(),
@@ -139,15 +141,44 @@ fn said_of(rows: &[(&str, f64, f64, Option<[f64; 2]>)], missing: usize) -> Optio
 #[case::apart(&[("ppo", 9.0, 5.0, Some([3.0, 6.0])), ("a2c", 9.0, 8.0, Some([6.5, 9.0]))], 0, Some(
     "of 2 methods a2c ff (paper) generalises best, with Extrapolation of 8.0 % [6.5, 9.0] and Default of 9.0 %; next is ppo ff \
      (paper), with Extrapolation of 5.0 % [3.0, 6.0], and their intervals are apart. Extrapolation less Default is -4.0 to -1.0 points."))]
-#[case::overlapping_and_random(&[("ppo", 9.0, 8.0, Some([6.0, 9.0])), ("a2c", 8.0, 8.0, Some([6.5, 9.0])), ("random", 1.0, 99.0, None)], 0,
+#[case::alike_and_random(&[("ppo", 9.0, 8.0, Some([6.0, 9.0])), ("a2c", 8.0, 8.0, Some([6.5, 9.0])), ("random", 1.0, 99.0, None)], 0,
+    Some("of 2 methods none generalises best: ppo ff (paper) and a2c ff (paper) come to the same Extrapolation, 8.0 % [6.0, 9.0] \
+     and 8.0 % [6.5, 9.0]. Extrapolation less Default is -1.0 to +0.0 points."))]
+#[case::overlapping(&[("ppo", 9.0, 8.0, Some([6.0, 9.0])), ("a2c", 8.0, 7.9, Some([6.5, 9.0]))], 0,
     Some("of 2 methods ppo ff (paper) generalises best, with Extrapolation of 8.0 % [6.0, 9.0] and Default of 9.0 %; next is a2c ff \
-     (paper), with Extrapolation of 8.0 % [6.5, 9.0], and their intervals overlap. Extrapolation less Default is -1.0 to +0.0 points."))]
+     (paper), with Extrapolation of 7.9 % [6.5, 9.0], and their intervals overlap. Extrapolation less Default is -1.0 to -0.1 points."))]
+#[case::written_alike_before_another(&[("ppo", 9.0, 8.04, None), ("a2c", 8.0, 7.96, None), ("late", 9.0, 1.0, None)], 0,
+    Some("of 3 methods none generalises best: ppo ff (paper) and a2c ff (paper) come to the same Extrapolation, 8.0 %; next is late \
+     ff (paper), with Extrapolation of 1.0 %. Extrapolation less Default is -8.0 to +0.0 points."))]
+#[case::none_extrapolates(&[("ppo", 95.3, 0.0, None), ("a2c", 0.0, 0.04, None)], 1,
+    Some("of 2 of 3 methods none extrapolates: each has Extrapolation of 0.0 %. Extrapolation less Default is -95.3 to +0.0 points."))]
 fn the_finding_in_words(
     #[case] rows: &[(&str, f64, f64, Option<[f64; 2]>)],
     #[case] missing: usize,
     #[case] said: Option<&str>,
 ) {
     assert_eq!(said_of(rows, missing).as_deref(), said);
+}
+
+/// PPO's rates on D, R and E, of what was trained on D and of the others; A2C has none.
+#[rstest]
+#[case::by_one([[90.0, 20.0, 0.0], [90.0, 60.0, 2.0]], "CartPole: of 2 methods none extrapolates: each has Extrapolation of 0.0 %. \
+    Extrapolation less Default is -90.0 to +0.0 points. Extrapolation is a geometric mean, and 0 in a run where one of its three \
+    is: for ppo ff (paper) DE.")]
+#[case::by_two([[90.0, 20.0, 0.0], [90.0, 60.0, 0.0]], "CartPole: of 2 methods none extrapolates: each has Extrapolation of 0.0 %. \
+    Extrapolation less Default is -90.0 to +0.0 points. Extrapolation is a geometric mean, and 0 in a run where one of its three \
+    is: for ppo ff (paper) DE and RE.")]
+#[case::by_all([[90.0, 0.0, 0.0], [90.0, 60.0, 0.0]], "CartPole: of 2 methods none extrapolates: each has Extrapolation of 0.0 %. \
+    Extrapolation less Default is -90.0 to +0.0 points.")]
+fn a_geometric_mean_that_is_0_because_one_of_its_three_is_says_so(#[case] rates: [[f64; 3]; 2], #[case] said: &str) {
+    let [on_d, on_r] = rates;
+    let plan = plan("'CartPole'", 2);
+    let results = fixture::results(&plan, |cell| {
+        let of_ppo = if cell.config.common.version == Version::D { on_d } else { on_r };
+        Some((if cell.config.settings.name() == "ppo" { of_ppo } else { [0.0; 3] }, 1.0))
+    });
+    let (selections, recorded) = (results.select(), Recorded::default());
+    assert_eq!(Report::new(&results, &selections, &recorded, &[]).finding_sentences(), [said]);
 }
 
 #[test]

@@ -32,6 +32,7 @@ use super::assessed::elsewhere as elsewhere_in;
 use super::folder::Failure;
 use super::plan::{Cell, Plan, Selection};
 use super::reselection::Reselection;
+use super::scheduler::count;
 use super::selection::{MethodResults, Reported, Results, Selected};
 use super::table::Table;
 use super::tuning::Tuned;
@@ -173,14 +174,17 @@ fn overview(
     lines.extend(elsewhere::overview(results, selections));
     let incomplete = selections.iter().filter(|selection| selection.done < selection.cells).count();
     if incomplete > 0 {
-        lines.push(format!(
-            "{incomplete} of {} rows lack cells{}; the column `cells` says which.",
-            selections.iter().filter(|row| !row.method.elsewhere).count(),
-            match results.plan.selection {
-                Selection::Paper if results.plan.selects() =>
-                    ", so that their configurations were selected among fewer than the plan has",
-                Selection::Paper | Selection::Clean => "",
+        let rows = selections.iter().filter(|row| !row.method.elsewhere).count();
+        let (lack, their) = if incomplete == 1 { ("lacks", "its") } else { ("lack", "their") };
+        let selected = match results.plan.selection {
+            Selection::Paper if results.plan.selects() => {
+                format!(", so that {their} configurations were selected among fewer than the plan has")
             }
+            Selection::Paper | Selection::Clean => String::new(),
+        };
+        lines.push(format!(
+            "{incomplete} of {} {lack} cells{selected}; the column `cells` says which.",
+            count(rows, "row")
         ));
     }
     let commits: BTreeSet<&str> = results.done().flat_map(|result| result.commits()).collect();

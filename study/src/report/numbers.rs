@@ -7,7 +7,7 @@ use crate::outcomes::Counted;
 use crate::paper;
 use crate::plan::TrainedOn;
 use crate::reselection::Reselection;
-use crate::selection::{MethodResults, average, interquartile, scores};
+use crate::selection::{MethodResults, SelectedRun, average, interquartile, scores};
 use crate::statistics::{Bootstrapped, Summary, are_enough, interquartile_mean, optimality_gap};
 use crate::{Method, Metric, Scenario, TestResult, mean};
 
@@ -30,6 +30,8 @@ pub(super) struct MethodMetrics<'a> {
     pub(super) papers: BTreeMap<Metric, Summary>,
     /// The means of `ours` again, with intervals where there are enough runs for one.
     pub(super) means: BTreeMap<Metric, Bootstrapped>,
+    /// Of the three that Extrapolation is the geometric mean of, those that alone make it 0 in a run.
+    pub(super) zeros: BTreeSet<Scenario>,
     /// Of all environments only.
     pub(super) iqms: BTreeMap<Metric, Bootstrapped>,
     /// Likewise.
@@ -75,6 +77,7 @@ pub(super) fn metrics<'a>(selections: &[MethodResults<'a>]) -> Vec<MethodMetrics
         ours: known(|metric| selection.summary(metric)),
         papers: known(|metric| paper::number(selection.environment, &selection.method, metric)),
         means: known(|metric| mean_with_interval(&[selection], metric)),
+        zeros: zeros(&[selection]),
         iqms: BTreeMap::new(),
         gaps: BTreeMap::new(),
         reselected: BTreeMap::new(),
@@ -108,6 +111,7 @@ pub(super) fn averages<'a>(
             ours: known(|metric| average(&found, metric).filter(|_| everywhere)),
             papers: known(|metric| paper::average(environments, &method, metric)),
             means: known(|metric| mean_with_interval(&found, metric).filter(|_| everywhere)),
+            zeros: zeros(&found),
             iqms: known(|metric| interquartile(&found, metric, RESAMPLES).filter(|_| everywhere)),
             gaps: known(|metric| gap(metric).filter(|_| everywhere)),
             reselected: known(|metric| reselected(metric).filter(|_| everywhere && !method.elsewhere)),
@@ -174,6 +178,17 @@ fn mean_with_interval(selections: &[&MethodResults<'_>], metric: Metric) -> Opti
     let strata = scores(selections, metric);
     let mean = Bootstrapped::of(&strata, MEANS, 1, |strata| mean(strata.concat().into_iter()))?;
     Some(Bootstrapped { interval_95: mean.interval_95.filter(|_| are_enough(&strata)), ..mean })
+}
+
+/// What has no success in a run where another of the three has.
+fn zeros(selections: &[&MethodResults<'_>]) -> BTreeSet<Scenario> {
+    let of_run = |run: &SelectedRun<'_>| {
+        let zero = |scenario: &Scenario| Some((*scenario, run.rate(*scenario)? == 0.0));
+        let three: Option<Vec<(Scenario, bool)>> = Metric::EXTRAPOLATION.iter().map(zero).collect();
+        let three = three.filter(|three| !three.iter().all(|(_, is_zero)| *is_zero)).unwrap_or_default();
+        three.into_iter().filter_map(|(scenario, is_zero)| is_zero.then_some(scenario))
+    };
+    selections.iter().flat_map(|selection| selection.runs.values()).flat_map(of_run).collect()
 }
 
 fn least(runs: impl Fn(Metric) -> Option<usize>) -> usize {

@@ -252,6 +252,22 @@ fn other_budgets_than_the_papers_are_told(#[case] given: &str, #[case] told: Opt
 }
 
 #[test]
+fn a_single_row_lacks_cells_and_several_lack_them() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let told = |missing: &[&str]| {
+        let results = fixture::results(&plan, |cell| {
+            let Cell { config, .. } = cell;
+            let is_missing = config.settings.name() == "a2c" && missing.contains(&config.common.environment.as_str());
+            (!is_missing).then_some(([50.0; 3], 1.0))
+        });
+        let selections = results.select();
+        Report::new(&results, &selections, &Recorded::default(), &[]).overview.join("\n")
+    };
+    assert!(told(&["Pendulum"]).contains("1 of 4 rows lacks cells; the column"));
+    assert!(told(&["Pendulum", "CartPole"]).contains("2 of 4 rows lack cells; the column"));
+}
+
+#[test]
 fn what_is_not_done_is_missing_and_has_no_colour() {
     let plan = Plan::parse("test", PLAN.into()).unwrap();
     let results = fixture::results(&plan, |_| None);
