@@ -174,9 +174,11 @@ async fn a_message_that_drips_for_ever_is_ended() {
     let server = Server::start(&["--stall-seconds", "3"]);
     let mut connection = Connection::new(server.port(), 1 << 16).await;
     let mut call = connection.call(SESSION).await.unwrap();
-    assert!(call.send(framed(10_000, &[])).await);
+    assert!(call.send_message(&message(open("CartPole", 1, 1))).await);
+    assert!(call.receive().await.is_some());
+    assert!(call.send(framed(1000, &[])).await);
     let start = Instant::now();
-    // Each byte comes in time, and all of them would take an hour.
+    // Each byte comes in time, and all of them would take minutes.
     while call.send(Bytes::from_static(&[0])).await {
         assert!(start.elapsed() < Duration::from_secs(60), "it is waited for");
         tokio::time::sleep(Duration::from_millis(400)).await;
