@@ -153,7 +153,8 @@ impl Sessions {
             dialogue,
             sessions,
             start,
-            answered: start,
+            was_open: false,
+            known_open: start,
             spent: 0,
             awake,
             ending,
@@ -242,8 +243,10 @@ struct Conversation<D: Dialogue> {
     /// What this one is subject to; it counts as running as long as it holds this.
     sessions: Sessions,
     start: Instant,
-    /// When a request was last granted, at first the start.
-    answered: Instant,
+    /// Whether its dialogue was open when it began to wait for the present request.
+    was_open: bool,
+    /// When it was last known to be open, at first the start: who is only refused does not begin.
+    known_open: Instant,
     /// Its steps that its token was told of.
     spent: u64,
     awake: Awake,
@@ -292,6 +295,7 @@ impl<D: Dialogue> Conversation<D> {
         let Limits { handshake, idle, .. } = self.sessions.limits;
         let allowance = self.allowance();
         let bearer = self.requests.bearer.clone();
+        self.was_open = self.dialogue.is_open();
         let Self { requests, ahead, came_ahead, awake, .. } = self;
         *came_ahead = ahead.is_some();
         let next = async {
@@ -300,19 +304,22 @@ impl<D: Dialogue> Conversation<D> {
                 None => awake.until(requests.next(allowance)).await,
             }
         };
-        let limit =
-            if self.dialogue.is_open() { idle } else { Some(idle.map_or(handshake, |idle| idle.min(handshake))) };
-        // Who is refused again and again has not begun.
-        let passed = if self.dialogue.is_open() { Duration::ZERO } else { self.answered.elapsed() };
+        let limit = if self.was_open { idle } else { Some(idle.map_or(handshake, |idle| idle.min(handshake))) };
+        let passed = if self.was_open { Duration::ZERO } else { self.known_open.elapsed() };
+        let late = || {
+            let seconds = limit.map_or(0, |limit| limit.as_secs());
+            Err(Stop::Refused(Refusal::Idle { seconds }))
+        };
+        // Also where the next request is there already.
+        if limit.is_some_and(|limit| passed > limit) {
+            return late();
+        }
         tokio::select! {
             biased; // the end comes first: a client that never pauses must not outlast it
             () = self.sessions.drain.closed() => Err(Stop::Refused(Refusal::Draining)),
             refusal = revoked(bearer.as_ref()) => Err(Stop::Refused(refusal)),
             request = next => request,
-            () = silence(limit.map(|limit| limit.saturating_sub(passed))) => {
-                let seconds = limit.map_or(0, |limit| limit.as_secs());
-                Err(Stop::Refused(Refusal::Idle { seconds }))
-            }
+            () = silence(limit.map(|limit| limit.saturating_sub(passed))) => late(),
         }
     }
 
@@ -369,12 +376,12 @@ impl<D: Dialogue> Conversation<D> {
     /// The response that an answer is; an error ends the stream.
     fn told(&mut self, answer: Result<Result<D::Response, Refusal>, Stop>) -> Result<D::Response, Status> {
         self.spend();
+        if self.was_open || self.dialogue.is_open() {
+            self.known_open = Instant::now();
+        }
         let count = |refusal: &Refusal| self.sessions.refusals.count(refusal, self.requests.bearer.as_ref());
         match answer {
-            Ok(Ok(response)) => {
-                self.answered = Instant::now();
-                Ok(response)
-            }
+            Ok(Ok(response)) => Ok(response),
             Ok(Err(refusal)) => {
                 count(&refusal);
                 Ok(D::refusal(refusal))

@@ -164,7 +164,9 @@ pub enum Refusal {
         limit: usize,
     },
     /// The session sent nothing for too long.
-    #[error("the session was idle for {seconds} s, the most this server allows; start a new one")]
+    #[error(
+        "the session was idle for {seconds} s, or was not opened in them, the most this server allows; start a new one"
+    )]
     Idle {
         /// The limit.
         seconds: u64,

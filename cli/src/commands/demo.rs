@@ -224,7 +224,9 @@ impl Demo<'_> {
     fn film(&self, checkpoint: &Checkpoint, version: Version, seed: u64, path: &Path) -> Result<(), VideoError> {
         let options =
             VideoOptions { sets: vec![version.into()], episodes: 1, seed, size: PIXELS, fps: None, every: EVERY };
-        film(&self.servers, checkpoint, &options, VideoFile::create(path)?, &self.stop, &mut |_| {}).map(drop)
+        let footage = film(&self.servers, checkpoint, &options, VideoFile::create(path)?, &self.stop, &mut |_| {})?;
+        footage.thinning().into_iter().for_each(note);
+        Ok(())
     }
 }
 

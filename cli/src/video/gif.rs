@@ -101,8 +101,10 @@ impl Encode for GifEncoder {
 /// A film of every `stride`-th frame.
 struct Thinned {
     stride: u16,
-    /// The frame is shown that is seen at each multiple of it, in hundredths of a second: so are all that are held long.
+    /// The frame is shown that is seen at each multiple of it, in hundredths of a second, and any that is held.
     interval: u64,
+    /// What a frame takes that is not.
+    usual: u16,
     /// Compressed.
     frames: Vec<Frame<'static>>,
     /// Of the file, so far.
@@ -114,12 +116,12 @@ struct Thinned {
 impl Thinned {
     fn new(stride: u16, delay: u16) -> Self {
         let interval = u64::from(stride) * u64::from(delay);
-        Self { stride, interval, frames: Vec::new(), bytes: FRAME_FREE, seen: Vec::new() }
+        Self { stride, interval, usual: delay, frames: Vec::new(), bytes: FRAME_FREE, seen: Vec::new() }
     }
 
     /// Adds a frame that is to be seen from `time` on, or shows the one before it longer.
     fn add(&mut self, indices: &[u8], width: usize, time: u64, delay: u16) {
-        if time.next_multiple_of(self.interval) < time + u64::from(delay) {
+        if delay > self.usual || time.next_multiple_of(self.interval) < time + u64::from(delay) {
             let frame = changes(&mut self.seen, indices, width);
             self.bytes += FRAME_HEAD + frame.buffer.len() + frame.buffer.len().div_ceil(255);
             self.frames.push(frame);
@@ -264,6 +266,22 @@ mod tests {
         }
         assert!(frames.iter().all(|(seen, ..)| drawn.contains(seen)));
         assert!(frames.len().abs_diff(297 / usize::from(stride) + 3) <= 3, "{} of 300", frames.len());
+    }
+
+    #[test]
+    fn a_frame_that_is_held_is_shown_however_few_others_are() {
+        let mut film = Thinned::new(256, 2);
+        for frame in 0..200_u64 {
+            let held = frame == 150;
+            film.add(
+                &[frame as u8 + 1; 4],
+                2,
+                2 * frame + if frame > 150 { 198 } else { 0 },
+                if held { 200 } else { 2 },
+            );
+        }
+        let delays: Vec<u16> = film.frames.iter().map(|frame| frame.delay).collect();
+        assert_eq!(delays, [300, 212, 86], "the first, the held one, and that at the first multiple");
     }
 
     #[test]

@@ -125,7 +125,8 @@ pub enum CheckpointError {
     },
     /// Another program wrote it, which may go on with it.
     #[error(
-        "{} has format {format}, and this program reads 1 to {FORMAT_VERSION}: use the version of perturb that wrote it",
+        "{} has format {format}, and this program reads 1 to {FORMAT_VERSION}: use the version of perturb that wrote it, or \
+         a copy that is whole",
         path.display()
     )]
     Newer {

@@ -5,7 +5,7 @@ use std::path::{Component, Path, PathBuf};
 use perturb_protocol::names;
 
 use super::{CheckpointError, JSON, Result};
-use crate::files::list;
+use crate::files::{has_file, list, look};
 
 /// Where they are, unless this variable says otherwise.
 const FOLDER: &str = "results";
@@ -30,14 +30,15 @@ pub(super) fn find(path: &Path) -> Result<Option<PathBuf>> {
 }
 
 fn find_below(folder: &Path, path: &Path) -> Result<Option<PathBuf>> {
-    if holds_checkpoint(path) {
-        return Ok(None);
+    let mut places = vec![path.to_owned(), path.join("training")];
+    if look(path)?.is_none() {
+        let below = [Some(path), path.strip_prefix(FOLDER).ok()].into_iter().flatten().map(|rest| folder.join(rest));
+        places.extend(below.flat_map(|place| [place.clone(), place.join("training")]));
     }
-    let mut places = vec![path.to_owned(), folder.join(path)];
-    places.extend(path.strip_prefix(FOLDER).ok().map(|rest| folder.join(rest)));
-    let cells = places.iter().flat_map(|place| [place.clone(), place.join("training")]);
-    if let Some(found) = cells.into_iter().find(|place| holds_checkpoint(place)) {
-        return Ok(Some(found));
+    for place in places {
+        if holds_checkpoint(&place)? {
+            return Ok((place != path).then_some(place));
+        }
     }
     let mut parts = path.components();
     let (Some(Component::Normal(name)), None) = (parts.next(), parts.next()) else { return Ok(None) };
@@ -66,8 +67,8 @@ fn find_below(folder: &Path, path: &Path) -> Result<Option<PathBuf>> {
 }
 
 /// Whether a path is one that a checkpoint is read from.
-fn holds_checkpoint(path: &Path) -> bool {
-    path.join(JSON).is_file() || path.join("checkpoint").join(JSON).is_file()
+fn holds_checkpoint(path: &Path) -> Result<bool> {
+    Ok(has_file(&path.join(JSON))? || has_file(&path.join("checkpoint").join(JSON))?)
 }
 
 /// A cell whose training was kept.

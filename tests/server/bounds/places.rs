@@ -81,6 +81,24 @@ async fn who_is_refused_again_and_again_has_not_opened_a_session() {
     assert!(start.elapsed() >= Duration::from_secs(3));
 }
 
+/// Its next request is always there already.
+#[tokio::test]
+async fn who_is_refused_without_a_pause_has_not_opened_a_session_either() {
+    let server = Server::start(&["--handshake-seconds", "2"]);
+    let mut session = Session::connect(server.tcp()).await;
+    let sender = session.sender();
+    let wrong = || perturb::proto::SessionRequest { request: Some(open("Nowhere", 1, 1).into()) };
+    tokio::spawn(async move { while sender.send(wrong()).await.is_ok() {} });
+    let start = Instant::now();
+    let status = loop {
+        if let Err(status) = session.receive().await {
+            break status;
+        }
+        assert!(start.elapsed() < Duration::from_secs(60), "it is kept");
+    };
+    assert_eq!(status.code(), Code::DeadlineExceeded, "{status:?}");
+}
+
 #[tokio::test]
 async fn a_peer_has_no_more_sessions_and_connections_than_its_quota() {
     let server = Server::start(&["--max-peer-sessions", "2"]);
