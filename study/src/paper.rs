@@ -12,7 +12,14 @@ use super::statistics::Summary;
 const TABLE: &str = include_str!("../data/paper_results.csv");
 /// Its environments, as they are spelled here.
 pub const ENVIRONMENTS: [&str; 6] = ["CartPole", "MountainCar", "Acrobot", "Pendulum", "HalfCheetah", "Hopper"];
+/// Of these, those whose physics is another engine's than the paper's: its numbers are no measure of ours.
+const OTHER_ENGINE: [&str; 2] = ["HalfCheetah", "Hopper"];
 const RUNS: usize = 5;
+
+/// Whether numbers of an environment can be compared with the paper's.
+pub fn is_comparable(environment: &str) -> bool {
+    !OTHER_ENGINE.contains(&environment)
+}
 
 /// An algorithm with its architecture and, of RL², the episodes in a trial: a row of the paper's tables.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]

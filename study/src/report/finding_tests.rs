@@ -113,6 +113,7 @@ fn said_of(rows: &[(&str, f64, f64, Option<[f64; 2]>)], missing: usize) -> Optio
         method,
         ours: BTreeMap::new(),
         papers: BTreeMap::new(),
+        comparable: true,
         means,
         zeros: BTreeSet::new(),
         iqms: BTreeMap::new(),

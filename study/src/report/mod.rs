@@ -202,7 +202,7 @@ fn overview(
     lines.push(
         "Numbers are success rates in percent: mean ± standard deviation over runs; one run has none. The paper's are \
          those of its five runs; a difference is ours less the paper's. Hopper and HalfCheetah run on another physics \
-         engine than the paper's."
+         engine than the paper's, and have none."
             .into(),
     );
     lines

@@ -28,6 +28,8 @@ pub(super) struct MethodMetrics<'a> {
     pub(super) method: Method,
     pub(super) ours: BTreeMap<Metric, Summary>,
     pub(super) papers: BTreeMap<Metric, Summary>,
+    /// Whether one can be compared with the other.
+    pub(super) comparable: bool,
     /// The means of `ours` again, with intervals where there are enough runs for one.
     pub(super) means: BTreeMap<Metric, Bootstrapped>,
     /// Of the three that Extrapolation is the geometric mean of, those that alone make it 0 in a run.
@@ -53,8 +55,9 @@ pub(super) struct SetTest<'a> {
 }
 
 impl MethodMetrics<'_> {
-    /// Ours less the paper's.
+    /// Ours less the paper's, if that says something.
     pub(super) fn difference(&self, metric: Metric) -> Option<f64> {
+        self.comparable.then_some(())?;
         Some(self.ours.get(&metric)?.mean - self.papers.get(&metric)?.mean)
     }
 
@@ -76,6 +79,7 @@ pub(super) fn metrics<'a>(selections: &[MethodResults<'a>]) -> Vec<MethodMetrics
         method: selection.method.clone(),
         ours: known(|metric| selection.summary(metric)),
         papers: known(|metric| paper::number(selection.environment, &selection.method, metric)),
+        comparable: paper::is_comparable(selection.environment),
         means: known(|metric| mean_with_interval(&[selection], metric)),
         zeros: zeros(&[selection]),
         iqms: BTreeMap::new(),
@@ -110,6 +114,7 @@ pub(super) fn averages<'a>(
             environment: AVERAGE,
             ours: known(|metric| average(&found, metric).filter(|_| everywhere)),
             papers: known(|metric| paper::average(environments, &method, metric)),
+            comparable: environments.iter().all(|environment| paper::is_comparable(environment)),
             means: known(|metric| mean_with_interval(&found, metric).filter(|_| everywhere)),
             zeros: zeros(&found),
             iqms: known(|metric| interquartile(&found, metric, RESAMPLES).filter(|_| everywhere)),

@@ -5,7 +5,7 @@ use crate::fixture;
 use crate::folder::{CellState, Failure, Folder, MarkResult};
 use crate::plan::SELECTION_TEST;
 use crate::records::{Agreement, Difference};
-use crate::{TestResult, Version};
+use crate::{Metric, TestResult, Version};
 
 const PLAN: &str = "
 environments = ['CartPole', 'Pendulum']
@@ -352,4 +352,27 @@ fn every_rule_of_the_style_is_closed() {
         .collect();
     assert_eq!(depths.last(), Some(&0));
     assert!(depths.iter().all(|depth| (0..=2).contains(depth)), "only a medium has rules inside");
+}
+
+#[test]
+fn robots_of_another_engine_have_the_papers_numbers_beside_them_and_no_difference() {
+    let plan = |environments: &str| {
+        let rest = "runs = 2\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\n";
+        Plan::parse("test", format!("environments = {environments}\n{rest}")).unwrap()
+    };
+    for (environments, expected) in [
+        ("['CartPole', 'Pendulum']", [true, true, true]),
+        ("['CartPole', 'Hopper']", [true, false, false]),
+        ("['HalfCheetah', 'Hopper']", [false, false, false]),
+    ] {
+        let plan = plan(environments);
+        let results = fixture::results(&plan, |_| Some(([90.0, 70.0, 50.0], 1.0)));
+        let selections = results.select();
+        let recorded = crate::outcomes::Recorded::of(&selections);
+        let report = Report::new(&results, &selections, &recorded, &[]);
+        let rows: Vec<_> = report.metrics.iter().chain(&report.averages).collect();
+        assert!(rows.iter().all(|row| row.papers.contains_key(&Metric::Default)));
+        let has_difference: Vec<bool> = rows.iter().map(|row| row.difference(Metric::Default).is_some()).collect();
+        assert_eq!(has_difference, expected, "{environments}");
+    }
 }
