@@ -280,6 +280,7 @@ def test_an_interrupt_leaves_no_reply_behind(start_server: Callable[..., Any]) -
 
 INTERRUPTED = """
 import os, signal, threading, time, numpy as np, perturb
+signal.signal(signal.SIGINT, signal.default_int_handler)  # who runs the tests in the background may have it ignored
 envs = perturb.PerturbVectorEnv("CartPole", 4, server={address!r}, timeout=float("inf"))
 envs.reset(seed=1)
 os.kill({server}, signal.SIGSTOP)
