@@ -33,7 +33,7 @@ fn main() -> ExitCode {
                 ExitCode::SUCCESS
             }
             Err(error) => {
-                eprintln!("perturb-server: --new-token {name:?}: {error}");
+                complain(format_args!("--new-token {name:?}: {error}"));
                 ExitCode::from(2)
             }
         };
@@ -41,7 +41,7 @@ fn main() -> ExitCode {
     let config = match Config::load(&arguments) {
         Ok(config) => config,
         Err(error) => {
-            eprintln!("perturb-server: {error}");
+            complain(error);
             return ExitCode::from(2);
         }
     };
@@ -50,12 +50,13 @@ fn main() -> ExitCode {
         .with_writer(io::stderr)
         .with_ansi(io::IsTerminal::is_terminal(&io::stderr()))
         .with_env_filter(tracing_subscriber::EnvFilter::new(config.filter()))
+        .log_internal_errors(false) // they would go to standard error, which is what fails, and end the program
         .init();
     #[cfg(feature = "otel")]
     let _traces = match perturb::traces::init(&config.filter()) {
         Ok(traces) => traces,
         Err(error) => {
-            eprintln!("perturb-server: traces cannot be sent: {error}; correct the variables OTEL_…");
+            complain(format_args!("traces cannot be sent: {error}; correct the variables OTEL_…"));
             return ExitCode::from(2);
         }
     };
@@ -73,14 +74,19 @@ fn main() -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(Failure::Address(error)) => {
-            eprintln!("perturb-server: {error}");
+            complain(error);
             ExitCode::from(2)
         }
         Err(Failure::Other(error)) => {
-            eprintln!("perturb-server: {error}");
+            complain(error);
             ExitCode::FAILURE
         }
     }
+}
+
+/// Says what is wrong. That nobody reads it is no reason to end otherwise.
+fn complain(words: impl std::fmt::Display) {
+    let _ = writeln!(io::stderr(), "perturb-server: {words}");
 }
 
 /// What shells and manuals say of the program, if it is asked for.

@@ -34,3 +34,4 @@ mod success;
 mod toy;
 #[cfg(feature = "otel")]
 mod traces;
+mod unheard;

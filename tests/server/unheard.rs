@@ -1,0 +1,42 @@
+//! Servers whose log cannot be written: its disk is full, or whoever read it is gone.
+
+use crate::common::server::{Server, Session, command, open};
+use std::process::Command;
+
+/// The server with these flags, whose standard error takes nothing.
+fn unheard(flags: &[&str]) -> Command {
+    let mut shell = Command::new("sh");
+    shell.args(["-c", "exec \"$@\" 2>/dev/full", "sh"]).arg(command().get_program()).args(flags);
+    shell
+}
+
+#[tokio::test]
+async fn a_server_that_cannot_log_serves_and_ends_in_order() {
+    let flags = ["--listen", "tcp://127.0.0.1:0", "--log", "info", "--grace-seconds", "1"];
+    let mut server = Server::spawn(unheard(&flags), tempfile::tempdir().unwrap(), 1);
+    let (mut lasting, _) = Session::open(server.tcp(), open("CartPole", 1, 1)).await;
+    for seed in 0..3 {
+        // Its end has a line in the log.
+        let (mut session, _) = Session::open(server.tcp(), open("CartPole", 1, seed)).await;
+        session.close();
+        assert_eq!(session.end().await.code(), tonic::Code::Ok);
+        lasting.step(vec![0; 4].into()).await;
+    }
+    server.signal("TERM");
+    assert_eq!(server.ended().await.code(), Some(0));
+}
+
+/// Whoever started it was killed, and somebody else's session goes on: it warns of that before it ends.
+#[tokio::test]
+async fn a_private_server_that_cannot_warn_removes_its_folder_all_the_same() {
+    let directory = tempfile::tempdir().unwrap();
+    let folder = directory.path().join("own");
+    std::fs::create_dir(&folder).unwrap();
+    let address = format!("unix:{}", folder.join("socket").display());
+    let flags = ["--private", "--log", "warn", "--listen", &address];
+    let mut server = Server::spawn(unheard(&flags), directory, 1);
+    let (_lasting, _) = Session::open(server.unix(), open("CartPole", 1, 1)).await;
+    server.stdin = None;
+    assert_eq!(server.ended().await.code(), Some(0));
+    assert!(!folder.exists());
+}
