@@ -1,7 +1,8 @@
 //! Hopper and HalfCheetah: physics, task, determinism.
 
+use crate::common::{episodes, step};
 use perturb::{
-    env::{Action, ActionSpace, Environment, Purpose, Stream},
+    env::{Action, ActionSpace, Environment, Purpose, Stream, Version},
     tasks::{half_cheetah::half_cheetah, hopper::hopper, locomotion::Walker},
 };
 use perturb_mujoco::{Kind, Model, Simulation};
@@ -323,6 +324,49 @@ fn observation_and_reward_follow_from_the_state(
         before = after;
     }
     assert!(touched && fell, "{touched} {fell}");
+}
+
+/// A state in the air at `place`, leaning forward by `pitch` and moving on at `speed`.
+fn thrown(walker: &Walker, place: f64, pitch: f64, speed: f64) -> Vec<f64> {
+    let n = walker.spec().state.len();
+    let mut state = vec![0.0; n];
+    (state[0], state[1], state[2], state[n / 2]) = (place, 1.0, pitch, speed);
+    state
+}
+
+#[test]
+fn a_robot_that_was_20_m_ahead_in_any_step_succeeds_wherever_it_is_later() {
+    for make in ROBOTS {
+        let mut walker = make();
+        let action = vec![0.0; n_actions(&walker)];
+        let succeeds = |walker: &mut Walker| walker.step(Action::Continuous(&action), &mut [0.0; 5]).goal;
+        walker.reset_to(&thrown(&walker, 19.7, 0.0, 0.0));
+        assert!(!succeeds(&mut walker) && walker.achieved() < Some(20.0));
+        walker.reset_to(&thrown(&walker, 19.7, 0.0, 40.0));
+        assert!(succeeds(&mut walker));
+        let (achieved, mut state) = (walker.achieved(), saved(&walker));
+        assert!(achieved >= Some(20.0));
+        state[2 + walker.spec().state.len() / 2] = -80.0;
+        walker.load(&state).unwrap();
+        assert!(succeeds(&mut walker) && saved(&walker)[2] < 19.5, "it is back: {state:?}");
+        assert_eq!(walker.achieved(), achieved);
+    }
+}
+
+/// The reference asks after the reset, and so never about the step that ends an episode.
+#[test]
+fn a_robot_that_comes_to_20_m_in_the_step_in_which_it_falls_succeeds() {
+    for make in ROBOTS {
+        let walker = make();
+        let action = vec![0; 4 * n_actions(&walker)];
+        for (speed, success) in [(40.0, true), (0.0, false)] {
+            let mut e = episodes(walker.spec(), Version::D, 0, 0, 1);
+            e.begin(Some(&thrown(&walker, 19.7, 1.1, speed)));
+            assert!(step(&mut e, &action).0.terminated);
+            let end = e.finished(false);
+            assert_eq!((end.length, end.success), (1, success), "{end:?}");
+        }
+    }
 }
 
 /// Runs 1000-step episodes whether or not the robot has fallen.

@@ -7,6 +7,7 @@ mod memory;
 mod messages;
 mod pictures;
 mod places;
+mod streams;
 
 use crate::common::server::{Session, environment, open, step, within};
 use std::{

@@ -3,6 +3,7 @@
 mod counts;
 mod endpoint;
 mod health;
+mod lag;
 mod log;
 mod page;
 
