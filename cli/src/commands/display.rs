@@ -34,20 +34,43 @@ pub(super) fn is_quiet() -> bool {
     QUIET.load(Ordering::Relaxed)
 }
 
-/// A sentence on standard error, beside the bar that is shown there, unless nobody wants to hear it.
+/// A sentence on standard error, unless nobody wants to hear it.
 pub(super) fn note(sentence: impl std::fmt::Display) {
-    if is_quiet() {
-        return;
-    }
-    match &*shown() {
-        Some(bar) => bar.suspend(|| say(&sentence)),
-        None => say(&sentence),
+    if !is_quiet() {
+        say(sentence);
     }
 }
 
 /// A line on standard error, even for those who want to hear nothing. That nobody reads it is no reason to stop.
 pub(super) fn say(line: impl std::fmt::Display) {
-    let _ = writeln!(std::io::stderr(), "{line}");
+    let _ = writeln!(BesideBar, "{line}");
+}
+
+/// Standard error, where lines go above the bar that is shown there.
+pub(super) struct BesideBar;
+
+impl Write for BesideBar {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.write_all(bytes)?;
+        Ok(bytes.len())
+    }
+
+    fn write_all(&mut self, bytes: &[u8]) -> std::io::Result<()> {
+        match &*shown() {
+            // Its `suspend` would panic where the terminal is gone.
+            Some(bar) => bar.println(String::from_utf8_lossy(bytes).trim_end_matches('\n')),
+            None => std::io::stderr().write_all(bytes),
+        }
+    }
+
+    /// A line that came in pieces would be several.
+    fn write_fmt(&mut self, words: std::fmt::Arguments<'_>) -> std::io::Result<()> {
+        self.write_all(words.to_string().as_bytes())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        std::io::stderr().flush()
+    }
 }
 
 fn shown() -> MutexGuard<'static, Option<MultiProgress>> {

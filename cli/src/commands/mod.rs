@@ -34,7 +34,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use args::{Cli, Command, PlayArgs, ServerArgs, WaitArgs};
-use display::note;
+use display::{BesideBar, note};
 use error::{CommandError, Result};
 use perturb_learner::client::{ActAt, Address, PrivateServer, ServerWait, Servers};
 use perturb_study::interrupt::end_on_signals;
@@ -60,9 +60,10 @@ pub fn main() -> ExitCode {
     tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_ansi(colours)
-        .with_writer(std::io::stderr)
+        .with_writer(|| BesideBar)
         .log_internal_errors(false) // they would go to standard error, which is what fails, and end the program
         .init();
+    PrivateServer::have_heard(display::say);
     if matches!(cli.command, Command::Envs(_) | Command::Report(_) | Command::Curves(_) | Command::Serve(_)) {
         // They have nothing to finish; the others look at a flag.
         let _ = end_on_signals(); // without it they end as any program does

@@ -81,6 +81,10 @@ fn screen(drawn: &str) -> Vec<String> {
                 }
             }
             c => {
+                if column == 80 {
+                    (row, column) = (row + 1, 0);
+                    rows.resize(rows.len().max(row + 1), Vec::new());
+                }
                 let line: &mut Vec<char> = &mut rows[row];
                 line.resize(line.len().max(column + 1), ' ');
                 line[column] = c;
@@ -111,6 +115,26 @@ fn a_bar_fits_80_columns_and_tells_the_time_that_is_left() {
     }
     assert!(count > 4, "{drawn:#?}");
     assert!(drawn.iter().any(|row| row.contains(" s left, success ")), "{drawn:#?}");
+}
+
+#[test]
+fn what_a_private_server_says_stands_in_lines_of_its_own_above_the_bar() {
+    let folder = folder();
+    let server = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/cli/fixtures/talking_server.sh");
+    let program = Path::new(env!("CARGO_BIN_EXE_perturb")).with_file_name("perturb-server");
+    let drawn = on_a_terminal(
+        folder.path(),
+        &format!(
+            "PERTURB_SERVER={} TALKING_PROGRAM={} perturb train --env CartPole --algorithm a2c --episodes 10000 --out run",
+            server.display(),
+            program.display()
+        ),
+    );
+    assert!(drawn.contains('█'), "{drawn}");
+    let left = screen(&drawn);
+    let said: Vec<_> = left.iter().filter(|row| row.contains("word")).collect();
+    assert!(said.len() > 2 && said.iter().all(|row| **row == "a word of the server's"), "{left:#?}");
+    assert!(!left.iter().any(|row| row.contains(['█', '░'])), "nothing is left of the bar: {left:#?}");
 }
 
 #[test]

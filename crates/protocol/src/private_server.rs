@@ -5,8 +5,9 @@ use std::io::{BufRead, BufReader, ErrorKind};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::process::{Child, ChildStderr, ChildStdout, Command, ExitStatus, Stdio};
+use std::sync::OnceLock;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -22,6 +23,11 @@ const VARIABLE: &str = "PERTURB_SERVER";
 const START_LIMIT: Duration = Duration::from_secs(20);
 /// How long a server may take to end before it is killed.
 const END_LIMIT: Duration = Duration::from_secs(5);
+/// How long its last words are waited for.
+const HEARING_LIMIT: Duration = Duration::from_secs(1);
+
+/// Is told the lines that private servers write to standard error.
+static HEARD: OnceLock<fn(String)> = OnceLock::new();
 
 /// A `perturb-server` that lives no longer than this value, and no longer than this process: it holds the other end of
 /// the server's standard input, whose closing ends the server even if this process is killed.
@@ -29,7 +35,7 @@ const END_LIMIT: Duration = Duration::from_secs(5);
 /// It runs in a process group of its own, so that Ctrl-C reaches this process alone, which can then finish what it does.
 #[derive(Debug)]
 pub struct PrivateServer {
-    child: Child,
+    process: Process,
     address: Address,
     workers: Option<usize>,
     /// Holds the socket; only its owner may enter.
@@ -55,8 +61,15 @@ impl PrivateServer {
             .parse()
             .map_err(|error| ClientError::Start { program: program.clone(), reason: format!("{error}; set TMPDIR") })?;
 
-        let child = spawn(&program, &address, workers)?;
-        Ok(Self { child, address, workers, directory })
+        let process = spawn(&program, &address, workers)?;
+        Ok(Self { process, address, workers, directory })
+    }
+
+    /// Has `hear` told what all servers that this process starts from now on have to say, line by line; without it they
+    /// write to this process's standard error themselves, through whatever is shown there. What they say after this process
+    /// was killed is lost. The first call counts.
+    pub fn have_heard(hear: fn(String)) {
+        let _ = HEARD.set(hear);
     }
 
     /// Ends it, if it still runs, and starts it again at the same address.
@@ -64,10 +77,10 @@ impl PrivateServer {
     /// # Errors
     /// Those of [`PrivateServer::start`].
     pub fn restart(&mut self) -> Result<(), ClientError> {
-        self.end();
+        self.process.end();
         let again = |source| ClientError::System { action: "create the server's private directory again", source };
         own_directory(self.directory.path()).map_err(again)?;
-        self.child = spawn(&find_program()?, &self.address, self.workers)?;
+        self.process = spawn(&find_program()?, &self.address, self.workers)?;
         Ok(())
     }
 
@@ -78,33 +91,45 @@ impl PrivateServer {
 
     /// The operating system's number of the process.
     pub fn process_id(&self) -> u32 {
-        self.child.id()
+        self.process.child.id()
     }
 
     /// How it ended; `None` while it runs.
     pub fn exit_status(&mut self) -> Option<ExitStatus> {
-        self.child.try_wait().ok().flatten()
-    }
-
-    /// Closes its standard input, and waits until it has ended.
-    fn end(&mut self) {
-        drop(self.child.stdin.take());
-        let deadline = Instant::now() + END_LIMIT;
-        while Instant::now() < deadline {
-            match self.child.try_wait() {
-                Ok(None) => thread::sleep(Duration::from_millis(5)),
-                _ => return,
-            }
-        }
-        // It had its time; an error means that it ended in this very moment.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
+        self.process.child.try_wait().ok().flatten()
     }
 }
 
 impl Drop for PrivateServer {
     fn drop(&mut self) {
-        self.end();
+        self.process.end();
+    }
+}
+
+#[derive(Debug)]
+struct Process {
+    child: Child,
+    /// Hangs up once all is told that it said; nothing if nobody hears.
+    hearing: Option<Receiver<()>>,
+}
+
+impl Process {
+    /// Closes its standard input, and waits until it has ended.
+    fn end(&mut self) {
+        drop(self.child.stdin.take());
+        let deadline = Instant::now() + END_LIMIT;
+        while Instant::now() < deadline && matches!(self.child.try_wait(), Ok(None)) {
+            thread::sleep(Duration::from_millis(5));
+        }
+        self.kill();
+    }
+
+    fn kill(&mut self) {
+        // An error means that it has ended.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        // Whoever inherited its standard error may live on.
+        self.hearing.take().map(|hearing| hearing.recv_timeout(HEARING_LIMIT));
     }
 }
 
@@ -121,7 +146,7 @@ fn own_directory(path: &Path) -> std::io::Result<()> {
 }
 
 /// Starts `program`, and waits until it listens.
-fn spawn(program: &Path, address: &Address, workers: Option<usize>) -> Result<Child, ClientError> {
+fn spawn(program: &Path, address: &Address, workers: Option<usize>) -> Result<Process, ClientError> {
     let mut command = Command::new(program);
     command.arg("--listen").arg(address.to_string()).args(["--private", "--log", "warn"]);
     if let Some(workers) = workers {
@@ -131,16 +156,30 @@ fn spawn(program: &Path, address: &Address, workers: Option<usize>) -> Result<Ch
     let mut child = command
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
+        .stderr(if HEARD.get().is_some() { Stdio::piped() } else { Stdio::inherit() })
         .process_group(0)
         .spawn()
         .map_err(|error| fail(error.to_string()))?;
-    match wait_until_ready(&mut child) {
-        Ok(()) => Ok(child),
+    let hearing = HEARD.get().zip(child.stderr.take()).map(|(hear, words)| {
+        let (told, hearing) = channel();
+        thread::spawn(move || pass_on(words, hear, &told));
+        hearing
+    });
+    let ready = wait_until_ready(&mut child);
+    let mut process = Process { child, hearing };
+    match ready {
+        Ok(()) => Ok(process),
         Err(reason) => {
-            let _ = child.kill(); // an error means that it has ended
-            let _ = child.wait();
+            process.kill();
             Err(fail(reason))
         }
+    }
+}
+
+/// Tells `hear` the lines of `words` to their end, so that the server never waits for a reader.
+fn pass_on(words: ChildStderr, hear: &fn(String), _told: &Sender<()>) {
+    for line in BufReader::new(words).split(b'\n').map_while(Result::ok) {
+        hear(String::from_utf8_lossy(&line).into_owned());
     }
 }
 
