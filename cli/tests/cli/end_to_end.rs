@@ -291,20 +291,6 @@ fn a_server_that_is_killed_ends_the_training_soon_and_leaves_a_checkpoint() {
     assert!(message.contains(&kept), "{message}");
 }
 
-#[test]
-fn a_learner_that_is_killed_takes_its_server_along() {
-    let out = tempfile::tempdir().expect("a directory");
-    let path = out.path().to_str().expect("a path");
-    let arguments = ["train", "--env", "CartPole", "--episodes", "1000000", "--out", path];
-    let mut child = perturb(&arguments).spawn().expect("perturb");
-    wait_for("a checkpoint", || out.path().join("checkpoint/checkpoint.json").exists());
-    let server = child_server(child.id()).expect("a private server");
-    child.kill().expect("kill -9");
-    child.wait().expect("it ends");
-    wait_for("the server's end", || !is_running(server));
-    Checkpoint::load(out.path()).expect("a whole checkpoint");
-}
-
 #[rstest]
 #[case::interrupt("-INT", 130)]
 #[case::terminate("-TERM", 143)]

@@ -146,27 +146,34 @@ fn a_server_whose_certificate_has_expired_is_not_trusted() {
     assert!(words.contains("has expired") && !words.contains("waiting for it"), "{words}");
 }
 
-#[test]
-fn a_changed_byte_never_changes_what_is_learnt() {
+#[rstest]
+#[case::of_the_server(true, [100, 1_000, 5_000, 10_000, 20_000, 40_000])]
+#[case::of_the_client(false, [100, 400, 2_000, 5_000, 20_000, 100_000])]
+fn a_changed_byte_never_changes_what_is_learnt(#[case] is_servers: bool, #[case] places: [usize; 6]) {
     let guarded = Guarded::start();
     let trained = guarded.train(&guarded.address, "truth", "R", ALL);
     assert!(trained.status.success(), "{}", stderr(&trained));
     let truth = weights(&guarded.file("truth"));
-    let mut reached = 0;
-    for place in [100, 1_000, 2_000, 5_000, 10_000, 20_000] {
-        // Of the first connection.
+    let (mut reached, mut outlived) = (0, 0);
+    for place in places {
         let fault = Some(Fault { at: place, kind: Kind::Change });
-        let course = move |number| Course { from_server: fault.filter(|_| number == 0), ..Course::default() };
+        let course = move |number| {
+            let fault = fault.filter(|_| number == 0); // of the first connection
+            let [from_server, from_client] = if is_servers { [fault, None] } else { [None, fault] };
+            Course { from_server, from_client, ..Course::default() }
+        };
         let line = Line::start(&guarded.address, course).expect("a port");
         let out = format!("at-{place}");
         let trained = guarded.train(&format!("https://{}", line.address()), &out, "R", ALL);
         println!("a byte changed at {place}: status {}, {}", trained.status, stderr(&trained).trim());
         if trained.status.success() {
             assert!(weights(&guarded.file(&out)) == truth, "the byte at {place} was believed");
+            outlived += line.faults();
         } else {
             assert!(line.faults() > 0, "nothing was wrong: {}", stderr(&trained));
         }
         reached += line.faults();
     }
     assert!(reached >= 3, "only {reached} of the bytes ever came");
+    assert!(outlived > 0, "no training went on after one");
 }

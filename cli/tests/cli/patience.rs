@@ -17,8 +17,8 @@ use perturb_learner::client::Servers;
 
 pub const PPO_CART_POLE: &str = "environment = 'CartPole'\nversion = 'R'\nalgorithm = 'ppo'\narchitecture = 'ff'\n\
                              episodes = 800\nnum_envs = 8\nn_steps = 64\ncheckpoint_interval = 20";
-const A2C_PENDULUM: &str = "environment = 'Pendulum'\nversion = 'R'\nalgorithm = 'a2c'\narchitecture = 'ff'\n\
-                            episodes = 400\nnum_envs = 8\ncheckpoint_interval = 8";
+pub const A2C_PENDULUM: &str = "environment = 'Pendulum'\nversion = 'R'\nalgorithm = 'a2c'\narchitecture = 'ff'\n\
+                                episodes = 400\nnum_envs = 8\ncheckpoint_interval = 8";
 
 /// Whose servers are killed.
 #[derive(Clone, Copy, Debug)]
@@ -32,13 +32,13 @@ enum Victim {
 }
 
 /// A server at a socket, which can be killed and started again.
-struct Named {
+pub struct Named {
     socket: PathBuf,
     child: Child,
 }
 
 impl Named {
-    fn new(folder: &Path, name: &str) -> Self {
+    pub fn new(folder: &Path, name: &str) -> Self {
         let socket = folder.join(name);
         let child = Self::start(&socket);
         Self { socket, child }
@@ -54,15 +54,20 @@ impl Named {
         child
     }
 
-    fn address(&self) -> String {
+    pub fn address(&self) -> String {
         format!("unix:{}", self.socket.display())
     }
 
-    fn kill(&mut self) {
+    /// Its process.
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
+    pub fn kill(&mut self) {
         self.child.kill().and_then(|()| self.child.wait()).expect("killed");
     }
 
-    fn restart(&mut self) {
+    pub fn restart(&mut self) {
         self.child = Self::start(&self.socket);
     }
 }
@@ -75,13 +80,13 @@ impl Drop for Named {
 }
 
 /// The name of the policy's weights, and what the training counted.
-fn result(run: &Path) -> (String, u64, u64) {
+pub fn result(run: &Path) -> (String, u64, u64) {
     let checkpoint = Checkpoint::load(run).expect("a checkpoint");
     let counters = checkpoint.state.counters;
     (checkpoint.id().expect("a name"), counters.episodes, counters.timesteps)
 }
 
-fn undisturbed(text: &str) -> (String, u64, u64) {
+pub fn undisturbed(text: &str) -> (String, u64, u64) {
     let local = server(1);
     let servers = Servers::connect(std::slice::from_ref(local.address())).expect("a connection");
     let (out, _) = run(&servers, text);
@@ -89,7 +94,7 @@ fn undisturbed(text: &str) -> (String, u64, u64) {
 }
 
 /// Starts a training, whose words go to a file.
-fn train(folder: &TempDir, text: &str, arguments: &[&str]) -> (Child, PathBuf, PathBuf) {
+pub fn train(folder: &TempDir, text: &str, arguments: &[&str]) -> (Child, PathBuf, PathBuf) {
     let (settings, out, said) =
         (folder.path().join("settings.toml"), folder.path().join("run"), folder.path().join("said"));
     std::fs::write(&settings, text).expect("written");

@@ -37,7 +37,7 @@ LOOK = """
     curves: [...document.querySelectorAll('#curves svg')].filter(seen).length,
     findings: [...document.querySelectorAll('#finding svg, #metrics svg')].filter(seen).length,
     first: document.querySelector('main svg').closest('section').id,
-    pictures: [...document.querySelectorAll('#profiles svg, #parameters svg, #thresholds svg')].filter(seen).length,
+    pictures: [...document.querySelectorAll('#profiles svg, #gains svg, #parameters svg, #thresholds svg')].filter(seen).length,
     heatmaps: [...document.querySelectorAll('#heatmaps svg')].filter(seen).length,
     without_heatmap: [...document.querySelectorAll('#heatmaps figure.missing')].filter(seen).length,
     without_curves: document.querySelectorAll('#curves li').length,
@@ -228,7 +228,7 @@ def expectations(directory):
         if any((directory / "heatmaps").glob(f"{line['cell']}-*.csv"))
     }
     environments = len({line["environment"] for line in scenarios})
-    compared = (report / "comparisons.csv").exists()
+    compared = sum((report / f"{name}.csv").exists() for name in ("comparisons", "gains"))
     settings = (report / "settings.csv").exists()
     files = [path for path in (report / "worst.csv", report / "footing.csv") if path.exists()]
     detailed = sum(len({line["environment"] for line in lines(path)}) for path in files)
@@ -239,12 +239,14 @@ def expectations(directory):
             "scenarios": len(scenarios) // 3,  # three tests in a row
             "cells": len(selected) + len(failures),
         },
-        # Metrics, two over all environments, comparisons, Extrapolation and scenarios, worst and footing, settings, cells.
+        # Metrics, two over all environments, methods and versions compared, Extrapolation and scenarios, worst and footing, settings, cells.
         "tables": environments + several + 2 + compared + 2 * environments + detailed + settings + 1 + bool(failures),
         "findings": len(list(report.glob("*finding.svg"))),
         "first": "finding",
         "curves": 4 * len(with_curves),
-        "pictures": sum(len(list(report.glob(f"*{name}.svg"))) for name in ("profiles", "-parameters", "-thresholds")),
+        "pictures": sum(
+            len(list(report.glob(f"*{name}.svg"))) for name in ("profiles", "gains", "-parameters", "-thresholds")
+        ),
         "without_curves": environments - len(with_curves),
         "heatmaps": len(tested),
         "without_heatmap": len(scenarios) // 9 - len(tested),

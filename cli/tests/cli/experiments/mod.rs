@@ -7,6 +7,7 @@ mod reference;
 mod reports;
 mod running;
 mod selection;
+mod servers;
 mod stopping;
 
 use std::collections::BTreeMap;

@@ -1,0 +1,85 @@
+//! Servers that are stopped under a training, say nothing for a while, and go on.
+
+use rstest::rstest;
+
+use crate::common::{ended, kill, wait_for};
+use crate::patience::{A2C_PENDULUM, Named, PPO_CART_POLE, result, train, undisturbed};
+use perturb_faults::{Course, Dice, Line};
+
+/// Stops every thread of a server, which may answer until the last one has stopped.
+fn freeze(server: &Named) {
+    kill("-STOP", server.id());
+    let is_stopped = |task: std::io::Result<std::fs::DirEntry>| {
+        let stat = task.and_then(|task| std::fs::read_to_string(task.path().join("stat")));
+        stat.is_ok_and(|stat| stat.contains(") T "))
+    };
+    let tasks = format!("/proc/{}/task", server.id());
+    wait_for("a server that does nothing", || std::fs::read_dir(&tasks).expect("a process").all(is_stopped));
+}
+
+fn thaw(server: &Named) {
+    kill("-CONT", server.id());
+}
+
+#[rstest]
+#[case::the_only_one(PPO_CART_POLE, &["a"])]
+#[case::one_of_two(A2C_PENDULUM, &["a", "b"])]
+fn a_server_that_says_nothing_for_a_moment_is_waited_for(#[case] text: &str, #[case] names: &[&str]) {
+    let (folder, mut dice) = (tempfile::tempdir().expect("a directory"), Dice::new());
+    let named: Vec<Named> = names.iter().map(|name| Named::new(folder.path(), name)).collect();
+    let list = named.iter().map(Named::address).collect::<Vec<_>>().join(",");
+    let (mut child, out, said) = train(&folder, text, &["--server", &list]);
+    wait_for("a training", || out.join("progress.csv").exists());
+    let mut stops = 0;
+    while stops < 5 && child.try_wait().expect("a child").is_none() {
+        let server = &named[dice.below(named.len() as u64) as usize];
+        freeze(server);
+        dice.wait(0, 300);
+        thaw(server);
+        stops += 1;
+        dice.wait(0, 100);
+    }
+    let status = ended(child).status;
+    let said = std::fs::read_to_string(said).expect("words");
+    assert!(status.success(), "{status}: {said}");
+    assert!(stops > 0, "it ended before anything was stopped");
+    assert!(!said.contains("lost the server"), "{said}");
+    assert_eq!(result(&out), undisturbed(text), "after {stops} stops");
+}
+
+/// By TCP, where sessions have leases.
+#[test]
+fn a_server_that_speaks_again_after_it_was_taken_for_dead_has_its_session_taken_up() {
+    let folder = tempfile::tempdir().expect("a directory");
+    let server = Named::new(folder.path(), "a");
+    let line = Line::start(&server.address(), |_| Course::default()).expect("a port");
+    let (child, out, said) = train(&folder, A2C_PENDULUM, &["--server", &line.address()]);
+    wait_for("a checkpoint", || out.join("checkpoint/checkpoint.json").exists());
+    freeze(&server);
+    let before = line.connections();
+    wait_for("the end of the learner's patience", || line.connections() > before);
+    thaw(&server);
+    let status = ended(child).status;
+    let said = std::fs::read_to_string(said).expect("words");
+    assert!(status.success(), "{status}: {said}");
+    assert!(said.contains("took the session up again") && !said.contains("waiting for it"), "{said}");
+    assert_eq!(result(&out), undisturbed(A2C_PENDULUM));
+}
+
+#[test]
+fn a_server_of_two_that_says_nothing_for_long_is_done_without_and_harms_nobody_when_it_goes_on() {
+    let folder = tempfile::tempdir().expect("a directory");
+    let two = ["a", "b"].map(|name| Named::new(folder.path(), name));
+    let list = two.iter().map(Named::address).collect::<Vec<_>>().join(",");
+    let (child, out, said) = train(&folder, A2C_PENDULUM, &["--server", &list]);
+    wait_for("a checkpoint", || out.join("checkpoint/checkpoint.json").exists());
+    freeze(&two[0]);
+    let alone = format!("going on with {} alone", two[1].address());
+    let words = || std::fs::read_to_string(&said).expect("words");
+    wait_for("the end of the learner's patience", || words().contains(&alone));
+    thaw(&two[0]);
+    let status = ended(child).status;
+    assert!(status.success(), "{status}: {}", words());
+    assert!(words().contains(&format!("lost the server at {} ", two[0].address())), "{}", words());
+    assert_eq!(result(&out), undisturbed(A2C_PENDULUM));
+}
