@@ -1,4 +1,4 @@
-"""Clients and servers that die, hang, fork or are interrupted: errors within seconds, and nothing is left behind."""
+"""Clients and servers that die, hang or fork: errors within seconds, and nothing is left behind."""
 
 from __future__ import annotations
 
@@ -22,64 +22,10 @@ import pytest
 import perturb
 from perturb import local_server, session
 
+from .processes import SECONDS, freeze, output_of, python, runs, wait_until, within
+
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-# What "within seconds" means here: the rest is for a machine that is busy. Less than a reply may take unless told
-# otherwise, a minute.
-SECONDS = 30.0
-
-
-@contextlib.contextmanager
-def within(seconds: float) -> Iterator[None]:
-    start = time.monotonic()
-    yield
-    assert time.monotonic() - start < seconds
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + SECONDS
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
-def runs(pid: int) -> bool:
-    """Whether there is such a process that has not ended."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except FileNotFoundError:
-        return False
-
-
-def python(code: str) -> subprocess.Popen[str]:
-    """Run code in another Python, in a group of its own, for it may fork."""
-    # Python 3.12 and later warn of every fork beside threads.
-    return subprocess.Popen(
-        [sys.executable, "-W", "ignore::DeprecationWarning", "-c", code],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-
-
-def output_of(code: str) -> tuple[str, str]:
-    """What the code writes to its output and as errors, if it ends in time."""
-    process = python(code)
-    try:
-        return process.communicate(timeout=60)
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
-
-
-def freeze(process: subprocess.Popen[str]) -> None:
-    """Stop every thread of the process; SIGCONT lets it go on."""
-    process.send_signal(signal.SIGSTOP)
-    threads = [thread / "stat" for thread in Path(f"/proc/{process.pid}/task").iterdir()]
-    wait_until(lambda: all(thread.read_text().rpartition(")")[2].split()[0] == "T" for thread in threads))
+    from collections.abc import Callable
 
 
 def step_forever(envs: perturb.PerturbVectorEnv, actions: Any) -> None:
@@ -100,7 +46,7 @@ while True:
 
 def test_a_client_killed_in_mid_step_leaves_its_room(start_server: Callable[..., Any]) -> None:
     address = start_server("--max-envs", "64").address
-    client = python(STEPPING.format(address=address))
+    client = python("-c", STEPPING.format(address=address))
     assert client.stdout is not None
     assert client.stdout.readline() == "stepping\n"
     envs = perturb.PerturbVectorEnv("Hopper", 64, server=address)
@@ -202,7 +148,7 @@ def test_a_server_that_hangs_is_given_up(start_server: Callable[..., Any]) -> No
     running = start_server()
     env = perturb.PerturbEnv("CartPole", server=running.address)
     env.reset(seed=1)
-    freeze(running.process)
+    freeze(running.process.pid)
     usual, env._client._timeout, env._client.session._timeout = env._client._timeout, 1.0, 1.0
     with within(SECONDS), pytest.raises(perturb.ServerTimeoutError, match="did not answer step within 1 s") as caught:
         env.step(0)
@@ -223,7 +169,7 @@ def test_a_server_that_answers_no_pings_is_given_up(
     running = start_server(listen="tcp://127.0.0.1:0")
     env = perturb.PerturbEnv("CartPole", server=running.address)
     env.reset(seed=1)
-    freeze(running.process)
+    freeze(running.process.pid)
     with within(SECONDS), pytest.raises(perturb.ServerConnectionError, match="lost the server"):
         env.step(0)
 
@@ -246,69 +192,6 @@ def test_a_server_that_shuts_down_ends_sessions_with_its_sentence(start_server: 
     running.process.wait()
     with within(SECONDS), pytest.raises(perturb.ServerConnectionError, match="lost the server"):
         env.step(0)
-
-
-def test_an_interrupt_leaves_no_reply_behind(start_server: Callable[..., Any]) -> None:
-    running = start_server()
-    envs = perturb.PerturbVectorEnv("Hopper", 4, server=running.address)
-    expected = envs.reset(seed=2)[0].tobytes()
-    actions = np.zeros((4, 3), dtype=np.float32)
-    freeze(running.process)  # so that the step still waits when the interrupt comes
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    def interrupt_the_step() -> None:
-        wait_until(lambda: envs._client.session.waits)
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGUSR1)
-
-    before = signal.signal(signal.SIGUSR1, interrupt)
-    interrupter = threading.Thread(target=interrupt_the_step, daemon=True)
-    try:
-        interrupter.start()
-        with within(SECONDS), pytest.raises(KeyboardInterrupt):
-            envs.step(actions)
-    finally:
-        interrupter.join()
-        signal.signal(signal.SIGUSR1, before)
-    with pytest.raises(perturb.OutOfOrderError, match="interrupted"):
-        envs.step(actions)
-    running.process.send_signal(signal.SIGCONT)
-    assert envs.reset(seed=2)[0].tobytes() == expected
-    envs.close()
-
-
-INTERRUPTED = """
-import os, signal, threading, time, numpy as np, perturb
-signal.signal(signal.SIGINT, signal.default_int_handler)  # who runs the tests in the background may have it ignored
-envs = perturb.PerturbVectorEnv("CartPole", 4, server={address!r}, timeout=float("inf"))
-envs.reset(seed=1)
-os.kill({server}, signal.SIGSTOP)
-tasks = "/proc/{server}/task"
-while any(open(f"{{tasks}}/{{task}}/stat").read().rsplit(")", 1)[1].split()[0] != "T" for task in os.listdir(tasks)):
-    time.sleep(0.01)  # until then it may still answer
-
-def interrupt():
-    while not envs._client.session.waits:
-        time.sleep(0.01)
-    os.kill(os.getpid(), signal.SIGINT)
-    sent.append(time.monotonic())
-
-sent = []
-threading.Thread(target=interrupt).start()
-try:
-    envs.step(np.zeros(4, dtype=np.int64))
-except KeyboardInterrupt:
-    print("interrupted", time.monotonic() - sent[0] < 10)
-"""
-
-
-def test_ctrl_c_interrupts_a_step_at_once_and_the_process_ends(start_server: Callable[..., Any]) -> None:
-    running = start_server()
-    code = INTERRUPTED.format(address=running.address, server=running.process.pid)
-    with within(SECONDS):
-        out, errors = output_of(code)
-        assert (out, errors) == ("interrupted True\n", ""), errors
 
 
 def test_a_session_that_nobody_uses_tells_the_server_that_it_lives(start_server: Callable[..., Any]) -> None:
@@ -335,14 +218,14 @@ print("went on")
 
 
 def test_the_keeper_is_in_nobodys_way(server: str) -> None:
-    assert output_of(TENDING.format(address=server)) == ("went on\n", "")
+    assert output_of("-c", TENDING.format(address=server)) == ("went on\n", "")
 
 
 def test_a_wait_ends_when_another_thread_closes_the_environment(start_server: Callable[..., Any]) -> None:
     running = start_server()
     envs = perturb.PerturbVectorEnv("CartPole", 4, server=running.address)
     envs.reset(seed=1)
-    freeze(running.process)
+    freeze(running.process.pid)
     caught: list[BaseException] = []
 
     def step() -> None:
@@ -399,7 +282,7 @@ print("ends")
 
 def test_a_process_may_end_while_a_thread_of_it_steps(server: str) -> None:
     for _ in range(3):
-        process = python(ENDING.format(address=server))
+        process = python("-c", ENDING.format(address=server))
         assert process.communicate(timeout=60) == ("ends\n", "")
         assert process.returncode == 0
 
@@ -481,7 +364,7 @@ print("went on")
 
 
 def test_an_environment_may_be_collected_while_another_asks_for_the_private_server() -> None:
-    assert output_of(FORGETTING) == ("went on\n", "")
+    assert output_of("-c", FORGETTING) == ("went on\n", "")
 
 
 def test_a_process_that_ends_closes_its_sessions_before_its_server() -> None:
@@ -501,7 +384,7 @@ def say_and_end(server):
 
 local_server.LocalServer.end = say_and_end
 """
-    assert output_of(ending) == ("it was closed None\n0 False\n" + "it was closed 0\n0 False\n", "")
+    assert output_of("-c", ending) == ("it was closed None\n0 False\n" + "it was closed 0\n0 False\n", "")
 
 
 def test_a_private_server_that_is_killed_is_told_and_replaced() -> None:
@@ -663,7 +546,7 @@ if child:
 
 
 def test_a_forked_process_goes_on_beside_its_parent(server: str) -> None:
-    assert output_of(FORKING.format(address=server)) == ("both went on\n", "")
+    assert output_of("-c", FORKING.format(address=server)) == ("both went on\n", "")
 
 
 @pytest.mark.parametrize("own", [False, True])

@@ -164,6 +164,7 @@ def test_a_defect_of_the_server_costs_the_session(fake: FakeServer) -> None:
     [
         (3, perturb.InvalidArgumentError),
         (5, perturb.UnknownNameError),
+        (7, perturb.NotAllowedError),
         (8, perturb.ServerFullError),
         (9, perturb.OutOfOrderError),
         (2, perturb.ProtocolError),

@@ -18,6 +18,7 @@ from .env import PerturbEnv
 from .environments import Environment, Parameter, environments
 from .errors import (
     InvalidArgumentError,
+    NotAllowedError,
     OutOfOrderError,
     PerturbError,
     PolicyError,
@@ -46,6 +47,7 @@ __all__ = [
     "Context",
     "Environment",
     "InvalidArgumentError",
+    "NotAllowedError",
     "OutOfOrderError",
     "Parameter",
     "Part",

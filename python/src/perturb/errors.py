@@ -21,6 +21,10 @@ class PolicyError(PerturbError, ValueError):
     """A policy cannot be loaded, does not fit the environment, or gives what is no action."""
 
 
+class NotAllowedError(PerturbError, PermissionError):
+    """The token's role does not allow what was to be drawn."""
+
+
 class ServerFullError(PerturbError, RuntimeError):
     """The server has no room for so many environments or sessions."""
 
@@ -60,6 +64,7 @@ class ServerStartError(PerturbError, RuntimeError):
 _BY_CODE: dict[int, type[PerturbError]] = {
     3: InvalidArgumentError,
     5: UnknownNameError,
+    7: NotAllowedError,
     8: ServerFullError,
     9: OutOfOrderError,
     13: ServerDefectError,

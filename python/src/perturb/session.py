@@ -100,7 +100,7 @@ class Session:
 
     def usable(self) -> bool:
         """Whether requests can be sent: it is neither lost nor another process's."""
-        return self._lost is None and os.getpid() == self._owner
+        return os.getpid() == self._owner and self._gone() is None
 
     def require_usable(self) -> None:
         """Raise, unless requests can be sent.
@@ -113,8 +113,13 @@ class Session:
                 f"process {self._owner} opened this environment's session, and process {os.getpid()} was forked from "
                 "it: call reset() to open one here, or make the environment after the fork"
             )
-        if self._lost is not None:
-            raise OutOfOrderError(f"call reset() to begin anew, this environment is gone: {self._lost}")
+        gone = self._gone()
+        if gone is not None:
+            raise OutOfOrderError(f"call reset() to begin anew, this environment is gone: {gone}")
+
+    def _gone(self) -> str | None:
+        """Why it is of no more use, if so. A second Ctrl-C may have come before the first was noted."""
+        return self._lost or ("it was interrupted, or its connection ended" if self._native.ended else None)
 
     def open(self, **request: Any) -> _native.Opened:
         """Create the environments and begin their first episodes."""
@@ -222,6 +227,8 @@ class Session:
                 f"the server at {self.address} refused {kind}, which is too large for it: {words}; "
                 "start it with a larger --max-message-bytes, or use fewer environments"
             )
+        if code == UNAUTHENTICATED and what == "unreachable":  # certificates, or the files that variables name
+            return ServerConnectionError(f"no safe connection to the server at {self.address}: {words}")
         if code == UNAUTHENTICATED:
             return ServerConnectionError(f"the server at {self.address} does not let this process in: {words}")
         if code == UNIMPLEMENTED:

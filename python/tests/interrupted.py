@@ -1,0 +1,122 @@
+"""A program whose steps Ctrl-C interrupts, again and again; test_interrupts.py runs it.
+
+    python -m tests.interrupted ADDRESS PID TIMES
+
+with a server's address and process, which is stopped and continued. After each interrupt the environments go on where
+they were, or say that they are gone and begin anew. Anything else ends the program with an error, as does a round that
+takes too long. Prints, as JSON, how often they did either, and the longest time in which an interrupt had not come, s.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import json
+import os
+import random
+import re
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+
+import perturb
+
+from .processes import SECONDS, freeze, wait_until
+
+# Always the same actions, so that observations follow from how many steps there were.
+ACTIONS = np.zeros(4, dtype=np.int64)
+# After so many steps the environments begin anew.
+STEPS = 500
+
+
+class Stepping:
+    """Environments that are stepped, and what has to come of it."""
+
+    def __init__(self, address: str) -> None:
+        self.envs = perturb.PerturbVectorEnv(
+            "CartPole", len(ACTIONS), server=address, autoreset_mode="SameStep", timeout=float("inf")
+        )
+        # What is observed after 0, 1, 2, … steps; the last few only where an interrupt came in the way of a reset.
+        self.truth = [self.envs.reset(seed=1)[0].tobytes()]
+        self.truth += [self._step() for _ in range(STEPS + 5)]
+        self.place = 0
+        self._begin()
+
+    def go(self) -> None:
+        """Step, for ever."""
+        while True:
+            if self.place >= STEPS:
+                self._begin()
+            observed = self._step()
+            self.place += 1
+            assert observed == self.truth[self.place]
+
+    def goes_on(self) -> bool:
+        """Step once after an interrupt. Whether the environments were still there; if not, they begin anew."""
+        try:
+            observed = self._step()
+        except perturb.OutOfOrderError as gone:
+            if not re.search(r"call reset\(\) to begin anew.* interrupted", str(gone)):
+                raise
+            self._begin()
+            return False
+        place = self.truth.index(observed)
+        # The interrupt may have come between a reply and its count, or before a reset was sent.
+        assert place - self.place in (1, 2) or (self.place == 0 and place > STEPS), (self.place, place)
+        self.place = place
+        return True
+
+    def _begin(self) -> None:
+        self.place = 0
+        assert self.envs.reset(seed=1)[0].tobytes() == self.truth[0]
+
+    def _step(self) -> bytes:
+        return self.envs.step(ACTIONS)[0].tobytes()
+
+
+def interrupt(way: str, envs: perturb.PerturbVectorEnv, server: int, chance: random.Random, sent: list[float]) -> None:
+    """Send Ctrl-C to this process."""
+    time.sleep(chance.uniform(0, 0.005))
+    if way != "anywhere":
+        freeze(server)
+        wait_until(lambda: envs._client.session.waits)
+    sent.append(time.monotonic())
+    os.kill(os.getpid(), signal.SIGINT)
+    if way == "as the reply comes":  # before or after the wait looks for signals, which is every 20 ms
+        time.sleep(chance.uniform(0, 0.03))
+        os.kill(server, signal.SIGCONT)
+
+
+def descriptors() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def main(address: str, server: int, times: int) -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # who runs the tests in the background may have it ignored
+    stepping = Stepping(address)
+    chance, sent, went_on, slowest = random.Random(times), list[float](), 0, 0.0
+    before = descriptors()
+    for number in range(times):
+        faulthandler.dump_traceback_later(SECONDS, exit=True)
+        way = ("anywhere", "in a wait", "as the reply comes")[number % 3]
+        sender = threading.Thread(target=interrupt, args=(way, stepping.envs, server, chance, sent), daemon=True)
+        try:
+            sender.start()
+            stepping.go()
+        except KeyboardInterrupt:
+            slowest = max(slowest, time.monotonic() - sent[-1])
+        sender.join()
+        os.kill(server, signal.SIGCONT)
+        went_on += stepping.goes_on()
+    assert len(sent) == times
+    assert descriptors() <= before + 4, "sessions were left behind"
+    stepping.envs.close()
+    faulthandler.cancel_dump_traceback_later()
+    print(json.dumps({"went on": went_on, "gone": times - went_on, "slowest": round(slowest, 4)}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))

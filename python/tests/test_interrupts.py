@@ -1,0 +1,130 @@
+"""Ctrl-C in the middle of a step: it comes at once, and no reply is taken for another's."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import threading
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+import perturb
+from perturb import session
+
+from .processes import SECONDS, freeze, output_of, wait_until, within
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+# `make interrupts-test` sets a thousand.
+TIMES = int(os.environ.get("PERTURB_TEST_INTERRUPTS", "50"))
+
+
+@contextlib.contextmanager
+def interrupting(envs: perturb.PerturbVectorEnv) -> Iterator[None]:
+    """Interrupt the step inside once it waits, by a signal that means nothing to pytest."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def interrupt_the_step() -> None:
+        wait_until(lambda: envs._client.session.waits)
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGUSR1)
+
+    before = signal.signal(signal.SIGUSR1, interrupt)
+    interrupter = threading.Thread(target=interrupt_the_step, daemon=True)
+    try:
+        interrupter.start()
+        with within(SECONDS), pytest.raises(KeyboardInterrupt):
+            yield
+    finally:
+        interrupter.join()
+        signal.signal(signal.SIGUSR1, before)
+
+
+def test_an_interrupt_leaves_no_reply_behind(start_server: Callable[..., Any]) -> None:
+    running = start_server()
+    envs = perturb.PerturbVectorEnv("Hopper", 4, server=running.address)
+    expected = envs.reset(seed=2)[0].tobytes()
+    actions = np.zeros((4, 3), dtype=np.float32)
+    freeze(running.process.pid)  # so that the step still waits when the interrupt comes
+    with interrupting(envs):
+        envs.step(actions)
+    with pytest.raises(perturb.OutOfOrderError, match="interrupted"):
+        envs.step(actions)
+    running.process.send_signal(signal.SIGCONT)
+    assert envs.reset(seed=2)[0].tobytes() == expected
+    envs.close()
+
+
+def test_a_second_interrupt_in_the_wake_of_the_first_costs_no_more(
+    start_server: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may come before it is noted that the session is gone; a reset must open another one all the same."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    running = start_server()
+    envs = perturb.PerturbVectorEnv("CartPole", 4, server=running.address)
+    expected = envs.reset(seed=2)[0].tobytes()
+    actions = np.zeros(4, dtype=np.int64)
+    freeze(running.process.pid)
+    with monkeypatch.context() as patched, interrupting(envs):
+        patched.setattr(session.Session, "_failed", interrupt)
+        envs.step(actions)
+    with pytest.raises(perturb.OutOfOrderError, match=r"call reset\(\) to begin anew.* interrupted"):
+        envs.step(actions)
+    running.process.send_signal(signal.SIGCONT)
+    assert envs.reset(seed=2)[0].tobytes() == expected
+    envs.close()
+
+
+INTERRUPTED = """
+import os, signal, threading, time, numpy as np, perturb
+signal.signal(signal.SIGINT, signal.default_int_handler)  # who runs the tests in the background may have it ignored
+envs = perturb.PerturbVectorEnv("CartPole", 4, server={address!r}, timeout=float("inf"))
+envs.reset(seed=1)
+os.kill({server}, signal.SIGSTOP)
+tasks = "/proc/{server}/task"
+while any(open(f"{{tasks}}/{{task}}/stat").read().rsplit(")", 1)[1].split()[0] != "T" for task in os.listdir(tasks)):
+    time.sleep(0.01)  # until then it may still answer
+
+def interrupt():
+    while not envs._client.session.waits:
+        time.sleep(0.01)
+    os.kill(os.getpid(), signal.SIGINT)
+    sent.append(time.monotonic())
+
+sent = []
+threading.Thread(target=interrupt).start()
+try:
+    envs.step(np.zeros(4, dtype=np.int64))
+except KeyboardInterrupt:
+    print("interrupted", time.monotonic() - sent[0] < 10)
+"""
+
+
+def test_ctrl_c_interrupts_a_step_at_once_and_the_process_ends(start_server: Callable[..., Any]) -> None:
+    running = start_server()
+    code = INTERRUPTED.format(address=running.address, server=running.process.pid)
+    with within(SECONDS):
+        out, errors = output_of("-c", code)
+        assert (out, errors) == ("interrupted True\n", ""), errors
+
+
+def test_ctrl_c_again_and_again_never_hangs_and_no_reply_is_taken_for_another(start_server: Callable[..., Any]) -> None:
+    running = start_server("--max-sessions", "8")  # sessions that were left behind would fill it
+    arguments = (running.address, str(running.process.pid), str(TIMES))
+    out, errors = output_of("-m", "tests.interrupted", *arguments, seconds=SECONDS + TIMES)
+    assert errors == "", errors
+    print(out)
+    told = json.loads(out)
+    assert told["went on"] > 0, told
+    assert told["gone"] > 0, told
+    assert told["went on"] + told["gone"] == TIMES, told
+    assert told["slowest"] < 10, told
