@@ -3,6 +3,7 @@
 use std::fmt;
 use std::str::FromStr;
 
+use perturb_protocol::names::find;
 use perturb_protocol::proto;
 use serde::{Deserialize, Serialize};
 
@@ -159,10 +160,10 @@ impl FromStr for Rule {
     type Err = ValueError;
 
     fn from_str(text: &str) -> Result<Self, ValueError> {
-        match text.trim() {
-            "text" => Ok(Self::Text),
-            "code" => Ok(Self::Code),
-            text => text.parse().map(Self::At),
+        match find(text.trim(), ["text", "code"].into_iter()) {
+            Some(0) => Ok(Self::Text),
+            Some(_) => Ok(Self::Code),
+            None => text.parse().map(Self::At),
         }
     }
 }
@@ -185,6 +186,7 @@ impl FromStr for Threshold {
     type Err = ValueError;
 
     fn from_str(text: &str) -> Result<Self, ValueError> {
+        let text = text.trim();
         let wrong = || ValueError::new(THRESHOLD, format!("`{text}`"), "text, code, or QUANTITY=NUMBER, e.g. steps=90");
         let (quantity, value) = text.split_once('=').ok_or_else(wrong)?;
         let value = value.trim().parse::<f64>().ok().filter(|value| value.is_finite()).ok_or_else(wrong)?;
@@ -228,6 +230,7 @@ mod tests {
         for rule in ["text", "code", "steps=90"] {
             assert_eq!(rule.parse::<Rule>().unwrap().to_string(), rule);
         }
+        assert_eq!(" Code".parse::<Rule>().unwrap(), Rule::Code, "as other names are spelled");
     }
 
     #[test]

@@ -18,6 +18,7 @@ impl Report<'_> {
         let marks = (!self.marks.is_empty()).then(|| self.marks_file());
         let more = [
             self.comparisons_file(),
+            self.gains_file(),
             self.profiles_file(),
             self.footing_file(),
             self.worst_file(),

@@ -17,6 +17,8 @@ pub struct Figures {
     pub metrics: Vec<Figure>,
     /// Of all environments together.
     pub profiles: Vec<Figure>,
+    /// Of all environments together.
+    pub gains: Vec<Figure>,
     /// One for each environment and version that was trained on.
     pub parameters: Vec<Figure>,
     /// One for each environment.
@@ -79,6 +81,7 @@ impl Figures {
             finding: drawn(report.finding_pictures())?,
             metrics: drawn(report.environment_pictures())?,
             profiles: drawn(report.profiles_picture().into_iter().collect())?,
+            gains: drawn(report.gains_picture().into_iter().collect())?,
             parameters: drawn(report.parameter_pictures())?,
             thresholds: drawn(report.threshold_pictures())?,
             settings: drawn(report.settings_pictures())?,

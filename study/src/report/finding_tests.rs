@@ -220,7 +220,7 @@ fn every_figure_has_its_svg_and_its_csv_within_the_page() {
     });
     let figures: Vec<&str> =
         page.split("<figure>").skip(1).map(|rest| rest.split_once("</figure>").unwrap().0).collect();
-    assert_eq!(figures.len(), 4, "the average, two environments, profiles");
+    assert_eq!(figures.len(), 5, "the average, two environments, profiles, gains");
     let decoded = |figure: &str, ending: &str| {
         let (_, rest) = figure.split_once(&format!(".{ending}\" href=\"data:")).unwrap();
         let (_, content) = rest.split_once(',').unwrap();

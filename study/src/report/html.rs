@@ -18,6 +18,8 @@ const HEATMAPS: &str = "How the selected policies do over two parameters: means 
 const COMPARISONS: &str = "Runs of two methods with the same seed, in each of the environments. P(X > Y) is the probability that \
                            a run of X is better than one of Y, where equal ones count half. Corrected p-values up to 0.05 \
                            are, all together, wrong with a probability of 5 % at most.";
+const GAINS: &str = "Policies of the same method and seed, one trained on R and one on D, each with the configuration that was \
+                     selected for what it was trained on, both tested on E, where neither was trained.";
 const WORST: &str = "Mean return of the worst tenth of a test's episodes, and success in those parts of the parameter space that \
                      hold the worst tenth of contexts: half of the episodes say which these are, the other half their \
                      success. From recorded episodes; mean and deviation over runs.";
@@ -57,6 +59,7 @@ pub fn html(report: &Report<'_>, figures: &Figures) -> String {
     let scenarios = report.scenario_tables().into_iter().map(shaded).collect();
     let worst = report.worst_tables().into_iter().map(shaded).collect();
     let comparisons = report.comparisons_table().into_iter().collect();
+    let gains = report.gains_table().into_iter().map(plain).chain(by_environment(&figures.gains)).collect();
     let sets = report.set_table().into_iter().collect();
     let heatmap_notes = html! { p { (HEATMAPS) } (list(&figures.no_heatmaps)) };
     let sections = [
@@ -64,6 +67,7 @@ pub fn html(report: &Report<'_>, figures: &Figures) -> String {
         section("iqm", "Interquartile means", html! {}, report.iqm_table().into_iter().map(plain).collect()),
         section("profiles", "Optimality gap and performance profiles", html! {}, gap_and_profiles),
         section("comparisons", "Methods in pairs", said(COMPARISONS), tables(comparisons)),
+        section("gains", "What training on R brings", said(GAINS), gains),
         section("extrapolation", "What Extrapolation is made of", html! {}, tables(report.extrapolation_tables())),
         section("scenarios", "The nine scenarios", said(SCENARIOS), scenarios),
         section("worst", "The worst tenth", said(WORST), worst),

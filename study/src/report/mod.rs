@@ -10,6 +10,7 @@ mod facts;
 mod figures;
 mod finding;
 mod footing;
+mod gains;
 mod heatmap_pictures;
 mod html;
 mod links;
@@ -41,6 +42,7 @@ use crate::outcomes::Recorded;
 use comparisons::Comparison;
 use elsewhere::Elsewhere;
 use footing::Trainings;
+use gains::Gain;
 use numbers::{MethodMetrics, SetTest};
 use profiles::Profile;
 use scope::Scope;
@@ -70,6 +72,7 @@ pub struct Report<'a> {
     metrics: Vec<MethodMetrics<'a>>,
     averages: Vec<MethodMetrics<'a>>,
     comparisons: Vec<Comparison>,
+    gains: Vec<Gain<'a>>,
     profiles: Vec<Profile>,
     worst: Vec<Worst<'a>>,
     over_parameters: Vec<Swept<'a, AtParameter<'a>>>,
@@ -105,6 +108,7 @@ impl<'a> Report<'a> {
             overview: overview(results, selections, recorded, &tuned),
             metrics: numbers::metrics(selections),
             comparisons: comparisons::comparisons(&scope, selections),
+            gains: gains::gains(&scope, selections),
             profiles: profiles::profiles(&scope, selections, &averages),
             averages,
             worst: worst::worst(&scope, selections, recorded),
@@ -130,7 +134,8 @@ impl<'a> Report<'a> {
 
     /// For GitHub and the like.
     pub fn markdown(&self) -> String {
-        let details = self.comparisons_table().into_iter().chain(self.worst_tables()).chain(self.footing_tables());
+        let compared = self.comparisons_table().into_iter().chain(self.gains_table());
+        let details = compared.chain(self.worst_tables()).chain(self.footing_tables());
         let cells = self.settings_table().into_iter().chain(self.tuned_table()).chain(self.selected_table());
         let others = self.failure_table().into_iter().chain(self.elsewhere_table());
         let tables = self.number_tables().chain(details).chain(cells).chain(others);

@@ -72,11 +72,11 @@ impl Picture {
 }
 
 impl Report<'_> {
-    /// All of them: what the page opens with, performance profiles, success over parameters and over the threshold, what settings do, as far as there
-    /// are numbers.
+    /// All of them: what the page opens with, performance profiles, what training on R brings, success over parameters and
+    /// over the threshold, what settings do, as far as there are numbers.
     pub fn pictures(&self) -> Vec<Picture> {
         let finding = self.finding_pictures().into_iter().chain(self.environment_pictures());
-        let profiles = finding.chain(self.profiles_picture());
+        let profiles = finding.chain(self.profiles_picture()).chain(self.gains_picture());
         let swept = self.parameter_pictures().into_iter().chain(self.threshold_pictures());
         profiles.chain(swept).chain(self.settings_pictures()).collect()
     }

@@ -207,9 +207,8 @@ fn pictures_have_their_files() {
     with_report(|report| {
         let pictures = report.pictures();
         let files: Vec<&str> = pictures.iter().map(|picture| picture.file.as_str()).collect();
-        let named =
-            ["CartPole-finding", "profiles", "CartPole-D-parameters", "CartPole-R-parameters", "CartPole-thresholds"];
-        assert_eq!(files, named);
+        let of_environment = ["CartPole-D-parameters", "CartPole-R-parameters", "CartPole-thresholds"];
+        assert_eq!(files, [&["CartPole-finding", "profiles", "gains"], &of_environment[..]].concat());
         for picture in &pictures {
             let drawn = svg(&picture.drawing).unwrap();
             assert!(drawn.contains("a2c ff") && drawn.contains("ppo ff"), "{}", picture.file);
@@ -217,7 +216,7 @@ fn pictures_have_their_files() {
             picture.save(out.path()).unwrap();
             let read = |ending: &str| std::fs::read(out.path().join(format!("{}.{ending}", picture.file))).unwrap();
             assert_eq!((read("svg"), read("csv")), (drawn.into_bytes(), picture.data.to_csv()));
-            assert!(picture.data.rows.len() > 3, "numbers: {}", picture.file);
+            assert!(picture.data.rows.len() >= 2, "numbers: {}", picture.file);
         }
     });
 }

@@ -126,6 +126,45 @@ fn the_presets_differ_in_named_settings_and_in_nothing_else() {
     }
 }
 
+/// Both columns of that table: which settings differ does not say by what.
+#[test]
+fn each_preset_has_the_documents_values() {
+    let (ff, rc) = (Architecture::Ff, Architecture::Rc);
+    // Environments of ours; epochs and iterations between two lines of the log, of ours and of the paper's.
+    for (algorithm, architecture, num_envs, n_epochs, log_interval) in [
+        ("a2c", ff, 16, None, [100, 100]),
+        ("a2c", rc, 16, None, [100, 100]),
+        ("ppo", ff, 8, Some([10, 10]), [1, 10]),
+        ("ppo", rc, 16, Some([4, 10]), [1, 10]),
+        ("epopt-a2c", ff, 25, None, [1, 1]),
+        ("epopt-a2c", rc, 25, None, [1, 1]),
+        ("epopt-ppo", ff, 25, Some([10, 10]), [1, 1]),
+        ("epopt-ppo", rc, 25, Some([4, 10]), [1, 1]),
+        ("rl2-a2c", rc, 16, None, [100, 100]),
+        ("rl2-ppo", rc, 16, Some([4, 10]), [1, 10]),
+    ] {
+        let tables = ["perturb", "paper"].map(|preset| of(preset, algorithm, architecture, &[]).full_table());
+        let has = |key: &str, expected: Option<[Value; 2]>| {
+            let got = tables.each_ref().map(|table| table.get(key).cloned());
+            let expected = expected.map_or([None, None], |values| values.map(Some));
+            assert_eq!(got, expected, "{algorithm} {architecture} {key}");
+        };
+        let numbers = |values: [i64; 2]| values.map(Value::from);
+        has("num_envs", Some(numbers([num_envs, 1])));
+        has("n_epochs", n_epochs.map(numbers));
+        has("log_interval", Some(numbers(log_interval)));
+        has("bootstrap_truncation", Some([true, false].map(Value::from)));
+        has("vf_coef", Some([0.5, 0.25].map(Value::from)));
+        has("reward_return_runs_on", Some([false, true].map(Value::from)));
+        let of_epopt = |values: [Value; 2]| algorithm.starts_with("epopt").then_some(values);
+        has("rank_by", of_epopt(["raw", "normalized"].map(Value::from)));
+        has("update_per_episode", of_epopt([false, architecture == rc].map(Value::from)));
+        // A penalty that the reference has and does not apply.
+        let penalty = if algorithm == "rl2-ppo" { 0.2 } else { 0.0 };
+        has("kl_coef", n_epochs.map(|_| [penalty, penalty].map(Value::from)));
+    }
+}
+
 #[test]
 fn a_preset_gives_defaults_that_every_layer_beats() {
     let config = of("paper", "epopt-ppo", Architecture::Rc, &["num_envs=7", "update_per_episode=false", "rank_by=raw"]);
@@ -139,6 +178,15 @@ fn a_preset_gives_defaults_that_every_layer_beats() {
     let config = load(Some(file), &["architecture=rc"], "environment = 'CartPole'").unwrap();
     assert_eq!((config.common.num_envs, ppo(&config).n_epochs), (1, 3));
     assert!(refusal(None, &["preset=ours"]).contains("preset is \"ours\", but must be one of \"perturb\", \"paper\""));
+}
+
+#[test]
+fn the_command_lines_preset_beats_the_files() {
+    let file = "environment = 'CartPole'\nalgorithm = 'epopt-ppo'\narchitecture = 'rc'";
+    let paper = format!("{file}\npreset = 'paper'");
+    let loaded = |file: &str, flags: &str| load(Some(file), &[], flags).unwrap();
+    assert_eq!(loaded(&paper, "preset = 'perturb'"), loaded(file, ""));
+    assert_eq!(loaded(&format!("{file}\npreset = 'perturb'"), "preset = 'paper'"), loaded(&paper, ""));
 }
 
 /// Results of earlier programs are found by what cells are named by.
