@@ -262,6 +262,29 @@ mod tests {
         }
     }
 
+    /// Five steps by numpy (`crates/torch/tests/fixtures/make_losses.py`), with an ε so large that its place matters.
+    #[test]
+    fn steps_agree_with_numpy() {
+        let cases: serde_json::Value =
+            serde_json::from_str(include_str!("../../torch/tests/fixtures/losses.json")).expect("JSON");
+        let numbers = |name: &str| -> Vec<f32> {
+            let numbers = cases["optimisers"][name].as_array().expect("an array");
+            numbers.iter().map(|x| x.as_f64().expect("a number") as f32).collect()
+        };
+        for (optimiser, name) in [(Optimiser::adam(0.25, 3), "adam"), (Optimiser::rms_prop(0.99, 0.25, 3), "rms_prop")]
+        {
+            let mut descent = Descent::new(optimiser, f64::INFINITY);
+            let mut weights = numbers("weights");
+            for gradient in numbers("gradients").chunks_exact(3) {
+                descent.step(1.0, gradient, &mut weights, 0.01).expect("a step");
+            }
+            assert_eq!(descent.n_updates(), 5);
+            for (got, expected) in weights.iter().zip(numbers(name)) {
+                assert!((got - expected).abs() < 5e-7, "{name}: {got} {expected}; f32 rounding of five steps");
+            }
+        }
+    }
+
     #[test]
     fn what_is_not_finite_changes_nothing() {
         for (loss, entry) in [(f64::NAN, 1.0), (1.0, f32::INFINITY), (1.0, f32::NAN)] {

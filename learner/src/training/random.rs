@@ -77,7 +77,11 @@ mod tests {
     use crate::proto::{ActionSpace, Continuous, Discrete};
 
     fn checkpoint_for(kind: Kind) -> Result<Checkpoint> {
-        let table = "environment = 'Test'\nalgorithm = 'random'".parse().unwrap();
+        checkpoint_with("", kind)
+    }
+
+    fn checkpoint_with(settings: &str, kind: Kind) -> Result<Checkpoint> {
+        let table = format!("environment = 'Test'\nalgorithm = 'random'\n{settings}").parse().unwrap();
         let observation = vec![Channel::default(); 3];
         let action = Some(ActionSpace { kind: Some(kind) });
         let environment = Environment { observation, action, ..Environment::default() };
@@ -119,6 +123,21 @@ mod tests {
             }
             // Four standard deviations: √(9000 · ¼ · ¾).
             assert!(quarters.iter().all(|count| (f64::from(*count) - 2250.0).abs() < 165.0), "{quarters:?}");
+        }
+    }
+
+    #[test]
+    fn statistics_of_rewards_are_the_presets_where_they_are_asked_for() {
+        let choices = || Kind::Discrete(Discrete { names: vec![String::new(); 3] });
+        assert!(checkpoint_with("preset = 'paper'", choices()).unwrap().state.reward_normaliser.is_none());
+        for (preset, num_envs, runs_on) in [("perturb", 1, false), ("paper", 1, true)] {
+            let settings = format!("preset = '{preset}'\nnormalize_rewards = true");
+            let made = checkpoint_with(&settings, choices()).unwrap();
+            let rewards = made.state.reward_normaliser.as_ref().unwrap();
+            assert_eq!((rewards.returns().len(), rewards.runs_on()), (num_envs, runs_on));
+            let directory = tempfile::tempdir().unwrap();
+            made.save(directory.path(), None).unwrap();
+            assert_eq!(Checkpoint::load(directory.path()).unwrap(), made);
         }
     }
 

@@ -7,6 +7,7 @@ mod epopt;
 mod gradients;
 mod learning;
 mod losses;
+mod presets;
 mod recurrent;
 mod rl2;
 mod together;

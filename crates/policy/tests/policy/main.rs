@@ -4,3 +4,4 @@
 mod acting;
 mod gradient;
 mod normaliser;
+mod player;

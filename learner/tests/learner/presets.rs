@@ -1,0 +1,163 @@
+//! What the presets differ in, as trainings and updates do it. docs/algorithms.md has the table, the tests of settings its
+//! values.
+
+use crate::common::{connect, moved, server};
+use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
+use perturb_learner::checkpoint::Checkpoint;
+use perturb_learner::logging::Progress;
+use perturb_learner::rollout::{Rollout, RolloutStep};
+use perturb_learner::training::{RunDirectory, train};
+use perturb_policy::random::{Purpose, normal, stream};
+use perturb_policy::{ActionKind, PolicySpec};
+use perturb_study::interrupt::StopFlag;
+use perturb_study::settings::{A2cConfig, PpoConfig, TrainConfig};
+use rstest::rstest;
+use tempfile::TempDir;
+
+/// Trains on CartPole; gives the run and all its figures.
+fn trained(settings: &str) -> (TempDir, Vec<Progress>) {
+    let private = [server()];
+    let text = format!("environment = 'CartPole'\n{settings}");
+    let config = TrainConfig::from_table("the test", text.parse().expect("TOML")).expect("a configuration");
+    let out = tempfile::tempdir().expect("a directory");
+    let directory = RunDirectory::choose(out.path(), false).expect("an empty directory");
+    let mut progress = Vec::new();
+    let report = |it: &Progress| progress.push(*it);
+    train(&connect(&private), &config, &directory, 1, &StopFlag::default(), report).expect("a training");
+    (out, progress)
+}
+
+const N_STEPS: usize = 6;
+const N_ENVS: usize = 3;
+/// With it, of numbers like 1.5 a half is exact.
+const GAMMA: f64 = 0.5;
+
+/// How the task's time limit is told.
+#[derive(Clone, Copy)]
+enum Limit {
+    /// As what it is.
+    Truncation,
+    /// As an end of the task, which pays so much more.
+    Termination { bonus: f32 },
+}
+
+/// Noise in which the time limit ends an episode in the middle and one in the last step. Final observations are worth 1.5.
+fn rollout(spec: &PolicySpec, limit: Limit) -> Rollout {
+    let mut rng = stream(7, Purpose::Actions);
+    let mut numbers = |count: usize| (0..count).map(|_| normal(&mut rng) as f32).collect::<Vec<f32>>();
+    let mut rollout = Rollout::new(N_STEPS, N_ENVS, spec.observation_size, spec.action.width());
+    rollout.begin(&vec![0.0; N_ENVS * spec.memory_size()]);
+    let is_limit = |t: usize, n: usize| (t, n) == (2, 1) || (t, n) == (N_STEPS - 1, 2);
+    for t in 0..N_STEPS {
+        let ended: [bool; N_ENVS] = std::array::from_fn(|n| is_limit(t, n));
+        let starts: [bool; N_ENVS] = std::array::from_fn(|n| t == 0 || is_limit(t - 1, n));
+        let (truncated, terminated, bonus) = match limit {
+            Limit::Truncation => (ended, [false; N_ENVS], 0.0),
+            Limit::Termination { bonus } => ([false; N_ENVS], ended, bonus),
+        };
+        // Quarters, so that the bonus is added without rounding.
+        let reward = |n: usize| (t * N_ENVS + n) as f32 / 4.0 - 2.0 + if ended[n] { bonus } else { 0.0 };
+        let step = RolloutStep {
+            observations: &numbers(N_ENVS * spec.observation_size),
+            starts: &starts,
+            actions: &[0.0, 1.0, 1.0],
+            log_probs: &[-0.7; N_ENVS],
+            values: &numbers(N_ENVS),
+            rewards: &std::array::from_fn::<f32, N_ENVS, _>(reward),
+            terminated: &terminated,
+            truncated: &truncated,
+            truncation_values: &[1.5; N_ENVS],
+        };
+        rollout.push(step).expect("a step that fits");
+    }
+    rollout.finish(&numbers(N_ENVS)).expect("a full rollout");
+    rollout
+}
+
+fn a2c(bootstrap_truncation: bool, spec: &PolicySpec) -> Box<dyn Algorithm> {
+    let config = A2cConfig { n_steps: N_STEPS, gamma: GAMMA, bootstrap_truncation, ..A2cConfig::default() };
+    Box::new(A2c::new(config, &moved(spec)).expect("valid settings"))
+}
+
+fn ppo(bootstrap_truncation: bool, spec: &PolicySpec) -> Box<dyn Algorithm> {
+    let config = PpoConfig { n_steps: N_STEPS, gamma: GAMMA, bootstrap_truncation, ..PpoConfig::default() };
+    Box::new(Ppo::new(config, &moved(spec), 5).expect("valid settings"))
+}
+
+#[rstest]
+fn an_update_takes_a_time_limit_for_the_tasks_end_or_goes_on_with_the_final_observations_value(
+    #[values(a2c, ppo)] algorithm: fn(bool, &PolicySpec) -> Box<dyn Algorithm>,
+    #[values(None, Some(8))] lstm: Option<usize>,
+) {
+    let spec = PolicySpec { observation_size: 3, action: ActionKind::Discrete { n: 2 }, hidden: vec![8], lstm };
+    let weights = |bootstrap_truncation, limit| {
+        let mut policy = moved(&spec);
+        let mut algorithm = algorithm(bootstrap_truncation, &spec);
+        algorithm.update(&mut policy, &rollout(&spec, limit), 1.0).expect("an update");
+        policy.weights()
+    };
+    let end = |bonus| Limit::Termination { bonus };
+    assert_eq!(weights(false, Limit::Truncation), weights(false, end(0.0)));
+    assert_eq!(weights(true, Limit::Truncation), weights(true, end(0.75)), "γ times the value follows");
+    assert_ne!(weights(true, Limit::Truncation), weights(false, Limit::Truncation));
+}
+
+/// What the reference counts as training is what it learns from: by steps, or with an update for each episode by episodes,
+/// which it fills up to the step limit.
+#[rstest]
+fn epopts_linear_learning_rate_falls_by_the_kept_episodes(#[values(true, false)] update_per_episode: bool) {
+    let settings = "preset = 'paper'\nalgorithm = 'epopt-a2c'\nepisodes = 9\nepisodes_per_iteration = 4\nepsilon = 0.4\n\
+                    full_iterations = 0\nlearning_rate = 1e-3";
+    let (_, progress) = trained(&format!("{settings}\nupdate_per_episode = {update_per_episode}"));
+    let (mut episodes, mut steps) = (0, 0);
+    for it in &progress {
+        let done = if update_per_episode { episodes as f64 / 9.0 } else { steps as f64 / (9.0 * 200.0) };
+        let expected = 1e-3 * (1.0 - done);
+        assert!((it.update.learning_rate - expected).abs() < 1e-15, "f64 rounding: {it:?} {expected}");
+        let selection = it.update.selection.expect("EPOpt's");
+        episodes += selection.kept;
+        steps += selection.kept_steps;
+        assert_eq!((it.episodes, it.generated_episodes), (episodes, 4 * it.iterations));
+    }
+    assert!(progress.len() > 2 && episodes < 4 * progress.len() as u64, "some are not kept: {progress:?}");
+}
+
+/// A rollout of one environment is an eighth of one of eight.
+#[rstest]
+#[case("perturb", 8, 1)]
+#[case("paper", 1, 10)]
+fn ppos_log_has_a_line_for_so_many_rollouts_and_for_the_last(
+    #[case] preset: &str,
+    #[case] num_envs: u64,
+    #[case] log_interval: u64,
+) {
+    let settings = "algorithm = 'ppo'\nn_steps = 16\nn_epochs = 1\nepisodes = 30";
+    let (out, progress) = trained(&format!("preset = '{preset}'\n{settings}"));
+    let last = progress.len() as u64;
+    assert!(last > log_interval);
+    for (it, iteration) in progress.iter().zip(1..) {
+        assert_eq!((it.iterations, it.timesteps), (iteration, 16 * num_envs * iteration));
+    }
+    let log = std::fs::read_to_string(out.path().join("progress.csv")).expect("a log");
+    let mut lines = log.lines().map(|line| line.split(',').collect::<Vec<_>>());
+    let column = lines.next().and_then(|names| names.iter().position(|name| *name == "time/iterations"));
+    let logged: Vec<u64> = lines.map(|line| line[column.expect("a column")].parse().expect("a whole number")).collect();
+    let due = |iteration: &u64| iteration.is_multiple_of(log_interval) || *iteration == last;
+    assert_eq!(logged, (1..=last).filter(due).collect::<Vec<_>>());
+}
+
+/// The reference tests those that it saved last, up to a hundred updates before.
+#[test]
+fn what_is_tested_has_the_weights_after_the_last_update() {
+    let checkpoint = |checkpoint_interval: u64| {
+        let settings = "preset = 'paper'\nalgorithm = 'a2c'\nepisodes = 5";
+        let (out, progress) = trained(&format!("{settings}\ncheckpoint_interval = {checkpoint_interval}"));
+        let checkpoint = Checkpoint::load(out.path()).expect("a checkpoint");
+        assert_eq!(Some(checkpoint.state.counters.iterations), progress.last().map(|it| it.iterations));
+        checkpoint
+    };
+    let (rarely, often) = (checkpoint(500), checkpoint(1));
+    assert_eq!(rarely.weights, often.weights);
+    assert_eq!(rarely.state.reward_normaliser, often.state.reward_normaliser);
+    assert!(rarely.state.reward_normaliser.is_some_and(|rewards| rewards.runs_on()));
+}
