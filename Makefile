@@ -73,8 +73,8 @@ endef
 .DEFAULT_GOAL := help
 .PHONY: help deps opengl toolchain build install demo all-pairs report-check serve-test test slurm-test kill-test \
 	load-test bounds-test attack-test faults-test asan-test qemu-test slurm-acceptance lint bench fuzz bench-peers \
-	audit cargo-deny metrics-test otel-test python-test wheel wheel-test python-acceptance bench-python python-venv \
-	docs docs-test docker docker-base docker-test
+	audit cargo-deny metrics-test otel-test python-test interrupts-test wheel wheel-test python-acceptance \
+	bench-python python-venv docs docs-test docker docker-base docker-test
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -183,7 +183,7 @@ cargo-deny: toolchain
 		cargo install --locked --version $(CARGO_DENY_VERSION) cargo-deny; \
 	}
 
-python-test wheel python-acceptance bench-python: export PERTURB_SERVER := $(abspath $(PROGRAMS))/perturb-server
+python-test interrupts-test wheel python-acceptance bench-python: export PERTURB_SERVER := $(abspath $(PROGRAMS))/perturb-server
 
 python-test: $(VENV)/installed opengl ## lint, type-check and test the Python package
 	cd python && $(abspath $(VENV))/bin/ruff check . && $(abspath $(VENV))/bin/ruff format --check .
@@ -191,6 +191,10 @@ python-test: $(VENV)/installed opengl ## lint, type-check and test the Python pa
 	$(VENV)/bin/ruff format --check --config python/pyproject.toml benches/peers docker/grafana
 	cd python && $(abspath $(VENV))/bin/mypy
 	cd python && $(abspath $(VENV))/bin/pytest -q
+
+interrupts-test: $(VENV)/installed ## interrupt steps of the Python package by a thousand Ctrl-C; under a minute
+	cd python && PERTURB_TEST_INTERRUPTS=$(INTERRUPTS) $(abspath $(VENV))/bin/pytest -q -rP -o faulthandler_timeout=1200 \
+		tests/test_interrupts.py
 
 wheel: build $(VENV)/installed ## build the Python package's wheel, with both programs and MuJoCo inside, in python/dist
 	rm -rf python/dist $(TARGET)/wheel
@@ -221,7 +225,7 @@ bench-python: $(VENV)/installed ## measure the Python package beside EnvPool, in
 	$(VENV)/bin/pip install -q --disable-pip-version-check -r python/requirements-bench.txt
 	$(VENV)/bin/python -W ignore python/benchmarks/throughput.py $(BENCH_PYTHON_ARGS)
 
-docs: build $(DOCS)/installed ## build the site in target/docs/site; a link to nowhere fails
+docs: build opengl $(DOCS)/installed ## build the site in target/docs/site; a link to nowhere fails
 	@$(call install,$(FFMPEG))
 	$(DOCS)/venv/bin/python docs/site/build.py $(PROGRAMS) $(DOCS)
 
@@ -286,8 +290,9 @@ docker-base:
 		}; \
 	done
 
-# How often `make faults-test` tries, and how long `make load-test` steps.
+# How often `make faults-test` tries and `make interrupts-test` interrupts, and how long `make load-test` steps.
 FAULTS_ROUNDS ?= 5
+INTERRUPTS ?= 1000
 LOAD_SECONDS ?= 300
 
 # AddressSanitizer needs a nightly compiler. What the compiler of C makes of the shim is not looked into, but every
@@ -297,7 +302,8 @@ asan-test: deps opengl ## run crates/mujoco's tests under AddressSanitizer; nigh
 	RUSTFLAGS=-Zsanitizer=address LSAN_OPTIONS=suppressions=$(abspath fuzz/leaks.txt) \
 		cargo +nightly test --package perturb-mujoco --locked --target $$(rustc -vV | sed -n 's/^host: //p') --target-dir $(TARGET)/asan
 
-# Seconds for each of eight targets, and what is mutated from one time to the next.
+# Seconds for each of eight targets, and what is mutated from one time to the next. Inputs are short, for speed, but for
+# recorded episodes, whose seed is a whole file.
 FUZZ_SECONDS ?= 38
 FUZZ = $(TARGET)/fuzz-corpus
 FUZZ_TARGETS = requests snapshots worlds connections checkpoints records plans ledgers
@@ -307,8 +313,9 @@ fuzz: deps ## attack the server and the readers of files with mutated bytes, und
 	cargo run --release --locked --manifest-path fuzz/Cargo.toml --target-dir $(TARGET)/fuzz --bin seeds -- $(FUZZ)
 	@set -e; for target in $(FUZZ_TARGETS); do \
 		mkdir -p fuzz/corpus/$$target; \
+		case $$target in records) longest=200000;; *) longest=65536;; esac; \
 		LSAN_OPTIONS=suppressions=$(abspath fuzz/leaks.txt) cargo +nightly fuzz run --fuzz-dir fuzz --target-dir $(TARGET)/fuzz --features libfuzzer $$target $(FUZZ)/$$target fuzz/corpus/$$target -- \
-			-max_total_time=$(FUZZ_SECONDS) -timeout=60 -rss_limit_mb=4096 -max_len=65536 -print_final_stats=1; \
+			-max_total_time=$(FUZZ_SECONDS) -timeout=60 -rss_limit_mb=4096 -max_len=$$longest -print_final_stats=1; \
 	done
 
 attack-test: export PERTURB_FUZZ_MOST_GROWN_MB = 20

@@ -17,8 +17,12 @@ PAIRS = [(a, r) for a in ("a2c", "ppo", "epopt-a2c", "epopt-ppo") for r in ("ff"
 PAIRS += [("rl2-a2c", "rc"), ("rl2-ppo", "rc")]
 # What the training whose defaults are asked for is told.
 GIVEN = {"environment", "architecture"}
-# Trained policies of results/ that can be filmed, by environment. A step of MountainCar simulates a second.
-FILMED = "results/beyond/confirm-2/cells/{}-ppo-ff-D-9bd6546b-s7/training"
+# Policies of results/ that were trained with PPO on D and can be filmed, by where their study is told of. A step of
+# MountainCar simulates a second.
+FILMED = {
+    "beyond-the-paper": "results/beyond/confirm-2/cells/{}-ppo-ff-D-9bd6546b-s7/training",
+    "hopper-and-halfcheetah": "results/locomotion/cells/{}-ppo-ff-D-348d15d9-s2/training",
+}
 FASTER = {"MountainCar": ["--fps", "30"]}
 
 
@@ -56,15 +60,15 @@ def environments(programs, folder):
     catalogue = json.loads(told(programs / "perturb-server", "--catalogue"))["environments"]
     pages = {}
     for entry in catalogue:
-        pages[f"environments/{entry['name']}.md"] = environment(entry, film(programs, entry["name"], folder))
+        name = entry["name"]
+        studies = [study for study, path in FILMED.items() if Path(path.format(name)).exists()]
+        filmed = [(study, film(programs, name, FILMED[study].format(name), folder)) for study in studies]
+        pages[f"environments/{name}.md"] = environment(entry, filmed)
     return pages
 
 
-def film(programs, name, folder):
-    """Two episodes on E of a policy that was trained on D, if there is one; what the program printed of them."""
-    checkpoint = Path(FILMED.format(name))
-    if not checkpoint.exists():
-        return None
+def film(programs, name, checkpoint, folder):
+    """Two episodes on E of a policy that was trained on D; what the program printed of them."""
     target = folder / f"environments/{name}.mp4"
     target.parent.mkdir(parents=True, exist_ok=True)
     command = [programs / "perturb", "video", "--checkpoint", checkpoint, "--version", "E", "--episodes", "2"]
@@ -76,12 +80,12 @@ def environment(entry, filmed):
     name, action, success = entry["name"], entry["action"], entry["success"]
     anchor = f"../environments.md#{name.lower()}"
     page = f"# {name}\n\n{entry['description']} Dynamics, start, endings and the exact state: [{name}]({anchor}).\n\n"
-    if filmed:
-        ends = ["a success" if episode[3] == "yes" else "no success" for episode in filmed]
+    for study, episodes in filmed:
+        ends = ["a success" if episode[3] == "yes" else "no success" for episode in episodes]
         page += f'<video controls muted loop preload="metadata" src="{name}.mp4"></video>\n\n'
         page += "PPO, trained on D, in two episodes with parameters of E: " + ", then ".join(ends) + ". "
-        page += "The policy is one of [results](../results.md#beyond-the-paper); the film shows its parameters.\n\n"
-    else:
+        page += f"The policy is one of [results](../results.md#{study}); the film shows its parameters.\n\n"
+    if not filmed:
         page += f"![{name}](../pictures/{name}.png)\n\n"
     page += "## Facts\n\n"
     facts = [
