@@ -1,6 +1,7 @@
 //! How many streams a connection may have at a time.
 
 use crate::common::server::{Server, Session, channel, open, until, within};
+use std::time::Duration;
 use tokio::{
     io::{AsyncReadExt, AsyncWriteExt},
     net::TcpStream,
@@ -138,7 +139,9 @@ async fn who_heeds_a_connections_limit_waits_until_a_stream_is_over() {
     let mut health = HealthClient::new(channel(server.tcp()).await);
     let mut watches = Vec::new();
     for _ in 0..STREAMS {
-        watches.push(within(health.watch(HealthCheckRequest::default())).await.unwrap().into_inner());
+        let mut watch = within(health.watch(HealthCheckRequest::default())).await.unwrap().into_inner();
+        assert!(within(watch.message()).await.unwrap().is_some(), "it begins with how things are");
+        watches.push(watch);
     }
     let waiting = tokio::spawn(async move { health.check(HealthCheckRequest::default()).await });
     can_step(server.tcp()).await;
@@ -146,6 +149,7 @@ async fn who_heeds_a_connections_limit_waits_until_a_stream_is_over() {
     drop(watches.pop());
     within(waiting).await.unwrap().unwrap();
     for watch in &mut watches {
-        assert!(within(watch.message()).await.unwrap().is_some(), "the others are still there");
+        let next = tokio::time::timeout(Duration::from_millis(1), watch.message()).await;
+        assert!(next.is_err(), "the others are still there, and nothing has changed: {next:?}");
     }
 }

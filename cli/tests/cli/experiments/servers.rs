@@ -14,7 +14,7 @@ environments = ['CartPole', 'Pendulum']
 versions = ['E']
 test_versions = ['D', 'E']
 test_episodes = 12
-settings = { episodes = 1000, num_envs = 8, checkpoint_interval = 20 }
+settings = { episodes = 4000, num_envs = 8, checkpoint_interval = 20 }
 
 [[algorithm]]
 name = 'a2c'
@@ -54,7 +54,7 @@ fn a_run_outlives_its_named_server_and_comes_to_the_same_results_and_weights() {
 
 #[test]
 fn a_run_that_is_killed_leaves_no_folder_of_a_server() {
-    let experiment = Experiment::new(&PLAN.replace("episodes = 1000,", "episodes = 1000000,"));
+    let experiment = Experiment::new(&PLAN.replace("episodes = 4000,", "episodes = 1000000,"));
     let own = experiment.out("tmp");
     std::fs::create_dir(&own).expect("a folder");
     let mut command = experiment.command("out", &["--jobs", "2"]);
