@@ -1,5 +1,6 @@
 //! What several tests need to run the programs.
 
+use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::mpsc::{RecvTimeoutError, channel};
@@ -55,6 +56,11 @@ pub fn refusal(arguments: &[&str], names: &[(&str, &str)]) -> String {
 
 pub fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// Waits until somebody listens at `socket`, which is there a moment before.
+pub fn wait_for_server(socket: &Path) {
+    wait_for("a server", || UnixStream::connect(socket).is_ok());
 }
 
 /// Waits until `condition` holds.

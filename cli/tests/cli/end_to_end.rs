@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use crate::common::{
     addresses, child_server, config, ended, is_running, kill, perturb, read, run, server, stderr, wait_for,
+    wait_for_server,
 };
 use perturb_learner::algorithm::Experience;
 use perturb_learner::checkpoint::Checkpoint;
@@ -403,7 +404,7 @@ fn a_server_keeps_a_learner_that_computes_for_long() {
         .stdout(Stdio::null())
         .spawn()
         .expect("perturb-server");
-    wait_for("the socket", || socket.exists());
+    wait_for_server(&socket);
     let servers = Servers::connect(&[address]).expect("a connection");
     let options = OpenOptions {
         environment: "CartPole".into(),

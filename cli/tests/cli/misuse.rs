@@ -10,7 +10,7 @@ use insta::assert_snapshot;
 use rstest::rstest;
 use tempfile::TempDir;
 
-use crate::common::{child_server, ended, kill, stderr, wait_for};
+use crate::common::{child_server, ended, kill, stderr, wait_for, wait_for_server};
 
 /// Two cells of a few seconds.
 const PLAN: &str = "environments = ['CartPole']\nversions = ['D']\nruns = 2\ntest_episodes = 12
@@ -297,7 +297,7 @@ fn a_lost_server_is_a_sentence_with_the_command_that_goes_on() {
     let address = format!("unix:{}", place.path("socket").display());
     let mut server = place.command(&["perturb-server", "--listen", &address, "--log", "error"]);
     let mut server = server.stdout(Stdio::null()).spawn().expect("a server");
-    wait_for("the server", || place.path("socket").exists());
+    wait_for_server(&place.path("socket"));
     let train = ["perturb", "train", "--env", "CartPole", "--episodes", "1000000", "--out", "my run"];
     let words = [&train[..], &["--server", &address, "--server-wait", "0"]].concat();
     let child = place.start(&words);

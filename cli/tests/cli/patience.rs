@@ -10,7 +10,7 @@ use std::time::Instant;
 use rstest::rstest;
 use tempfile::TempDir;
 
-use crate::common::{child_server, ended, kill, perturb, run, server, stderr, wait_for};
+use crate::common::{child_server, ended, kill, perturb, run, server, stderr, wait_for, wait_for_server};
 use perturb_faults::{Course, Dice, Fault, Kind, Line};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::Servers;
@@ -50,7 +50,7 @@ impl Named {
         command.arg("--listen").arg(format!("unix:{}", socket.display()));
         command.args(["--log", "error", "--workers", "1", "--exit-with-stdin"]);
         let child = command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn().expect("perturb-server");
-        wait_for("a server", || std::os::unix::net::UnixStream::connect(socket).is_ok());
+        wait_for_server(socket);
         child
     }
 

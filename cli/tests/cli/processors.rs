@@ -6,7 +6,7 @@ use std::process::{Child, Command, Stdio};
 
 use rstest::rstest;
 
-use crate::common::{stderr, wait_for};
+use crate::common::{stderr, wait_for_server};
 
 /// Set to 1, qemu must be there.
 const REQUIRED: &str = "PERTURB_QEMU_REQUIRED";
@@ -39,7 +39,7 @@ fn weights(processor: Option<&str>, arguments: &[&str]) -> Vec<u8> {
     let mut server = on(processor, &learner.with_file_name("perturb-server"));
     server.args(["--workers", "1", "--listen", &address]).stdout(Stdio::null()).stderr(Stdio::null());
     let _server = Server(server.spawn().expect("a server"));
-    wait_for("the server", || socket.exists());
+    wait_for_server(&socket);
     let mut train = on(processor, learner);
     train.args(["train", "--seed", "3", "--threads", "2", "--server", &address, "--out"]).arg(&out).args(arguments);
     let output = train.output().expect("a training");
