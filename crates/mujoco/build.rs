@@ -10,8 +10,9 @@ const VERSION: &str = "222";
 const INSTALL: &str = "apt-get install libmujoco-dev libclang-dev";
 
 fn main() {
-    println!("cargo:rerun-if-changed=src/shim.c");
-    println!("cargo:rerun-if-changed=src/shim.h");
+    for file in ["shim.c", "shim.h", "kinematics.c", "kinematics.h"] {
+        println!("cargo:rerun-if-changed=src/{file}");
+    }
     println!("cargo:rerun-if-env-changed=MUJOCO_PREFIX");
     let prefix = PathBuf::from(env::var_os("MUJOCO_PREFIX").unwrap_or_else(|| "/usr".into()));
     let include = prefix.join("include");
@@ -20,7 +21,12 @@ fn main() {
     check_version(&header);
     println!("cargo:rustc-link-search=native={}", library_folder(&prefix).display());
     generate_bindings(&include);
-    cc::Build::new().file("src/shim.c").include(&include).std("c11").opt_level(2).compile("perturb_mujoco_shim");
+    cc::Build::new()
+        .files(["src/shim.c", "src/kinematics.c"])
+        .include(&include)
+        .std("c11")
+        .opt_level(2)
+        .compile("perturb_mujoco_shim");
     // After the shim, which needs it.
     println!("cargo:rustc-link-lib=dylib=mujoco");
 }

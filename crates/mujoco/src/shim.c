@@ -1,12 +1,15 @@
 // MuJoCo answers a fatal error by printing, waiting for a key and ending the process. Here each call that may fail runs
-// under a handler of its own thread, which jumps back into the shim: only frames of MuJoCo's C engine lie between.
+// under a handler of its own thread, which jumps back into the shim: only frames in C lie between.
 #include "shim.h"
 
+#include <math.h>
 #include <mujoco/mjxmacro.h>
 #include <setjmp.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+
+#include "kinematics.h"
 
 // Exported, but in no header; MuJoCo's Python bindings use them in the same way.
 typedef void (*Handler)(const char*);
@@ -112,7 +115,7 @@ static int can_touch(const mjModel* m, int a, int b) {
 }
 
 perturb_mj_pairs* perturb_mj_make_pairs(const mjModel* m) {
-  if (m->npair || m->nexclude || m->opt.collision != mjCOL_ALL || m->opt.integrator != mjINT_EULER ||
+  if (m->npair || m->nexclude || m->ntendon || m->opt.collision != mjCOL_ALL || m->opt.integrator != mjINT_EULER ||
       m->opt.enableflags) {
     return NULL;
   }
@@ -179,19 +182,37 @@ static void collide(const mjModel* model, perturb_mj_pairs* pairs, mjData* data)
   mj_collision(&pairs->view, data);
 }
 
+// mj_checkPos and mj_checkVel, which look at each number by a call.
+static void check(const mjModel* m, mjData* d) {
+  int good = 1;
+  for (int i = 0; i < m->nq; i++) good &= fabs(d->qpos[i]) <= mjMAXVAL;
+  for (int i = 0; i < m->nv; i++) good &= fabs(d->qvel[i]) <= mjMAXVAL;
+  if (good) return;
+  mj_checkPos(m, d);
+  mj_checkVel(m, d);
+}
+
+// mj_fwdVelocity where there are no tendons.
+static void velocity(const mjModel* m, mjData* d) {
+  mju_mulMatVec(d->actuator_velocity, d->actuator_moment, d->qvel, m->nu, m->nv);
+  perturb_com_vel(m, d);
+  mj_passive(m, d);
+  mj_referenceConstraint(m, d);
+  mj_rne(m, d, 0, d->qfrc_bias);
+}
+
 int perturb_mj_step_pairs(const mjModel* model, perturb_mj_pairs* pairs, mjData* data) {
-  // mj_step1 by its parts, of which mj_collision is another.
-  GUARDED(mj_checkPos(model, data); mj_checkVel(model, data); mj_kinematics(model, data); mj_comPos(model, data);
-          mj_camlight(model, data); mj_tendon(model, data); mj_crb(model, data); mj_factorM(model, data);
-          collide(model, pairs, data); mj_makeConstraint(model, data); mj_transmission(model, data);
-          mj_projectConstraint(model, data); mj_sensorPos(model, data); mj_fwdVelocity(model, data);
-          mj_sensorVel(model, data); mj_step2(model, data))
+  // mj_step1 by its parts, some of which are others.
+  GUARDED(check(model, data); perturb_kinematics(model, data); perturb_com_pos(model, data); mj_camlight(model, data);
+          mj_crb(model, data); mj_factorM(model, data); collide(model, pairs, data); mj_makeConstraint(model, data);
+          mj_transmission(model, data); mj_projectConstraint(model, data); mj_sensorPos(model, data);
+          velocity(model, data); mj_sensorVel(model, data); mj_step2(model, data))
   return failed;
 }
 
 int perturb_mj_motion(const mjModel* model, mjData* data) {
-  GUARDED(mj_checkPos(model, data); mj_checkVel(model, data); mj_kinematics(model, data); mj_comPos(model, data);
-          mj_comVel(model, data))
+  GUARDED(check(model, data); perturb_kinematics(model, data); perturb_com_pos(model, data);
+          perturb_com_vel(model, data))
   return failed;
 }
 

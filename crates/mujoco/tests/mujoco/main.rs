@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod faults;
+mod kinematics;
 mod pairs;
 mod render;
 mod states;

@@ -97,7 +97,20 @@ fn what_needs_the_search_has_it() {
 
 #[test]
 fn a_bad_state_is_divergence() {
+    for bad in [f64::NAN, f64::INFINITY, 1.1e10, -1.1e10] {
+        for (put, warning) in [
+            (Simulation::qpos_mut as fn(&mut Simulation) -> &mut [f64], Warning::BadPosition),
+            (Simulation::qvel_mut, Warning::BadVelocity),
+        ] {
+            let mut hopper = simulation(HOPPER);
+            put(&mut hopper)[5] = bad;
+            let mut mujoco = simulation(HOPPER);
+            put(&mut mujoco)[5] = bad;
+            assert_eq!(hopper.step_without_search(), Err(Error::Diverged { warning }), "{bad}");
+            assert_eq!(mujoco.step(), Err(Error::Diverged { warning }), "{bad}");
+        }
+    }
     let mut hopper = simulation(HOPPER);
-    hopper.qvel_mut()[0] = f64::NAN;
-    assert_eq!(hopper.step_without_search(), Err(Error::Diverged { warning: Warning::BadVelocity }));
+    hopper.qpos_mut()[5] = 1e10;
+    assert_eq!(hopper.motion(), Ok(()), "just good");
 }
