@@ -1,6 +1,7 @@
 //! What serving Hopper and HalfCheetah costs beside physics: the server's CPU time an environment step, and its steps in
 //! a second, against the bare loop: MuJoCo's timesteps (mj_step) of the same environments with the same actions, one
-//! environment after the other, and nothing else. The environments' own timesteps are shorter, for they leave out a search.
+//! environment after the other, and nothing else. The environments' own timesteps are shorter, for they leave out a search
+//! and walk over bodies in one piece.
 //!
 //! A server of two workers is asked in a closed loop, where each request waits for the reply to the last and the
 //! workers wait with it, and with two requests in flight, where they do not. Server and bare loops take turns, in rounds

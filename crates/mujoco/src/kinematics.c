@@ -9,7 +9,7 @@
 
 #ifdef __x86_64__
 
-// Larger models are MuJoCo's.
+// The centres of mass of more are MuJoCo's.
 enum { MOST_BODIES = 32 };
 
 static inline int is_identity(const mjtNum* q) { return q[0] == 1 && q[1] == 0 && q[2] == 0 && q[3] == 0; }
@@ -125,7 +125,7 @@ static inline void attach(const mjData* d, int body, mjtByte same, const mjtNum*
   matrix(rotation, turned);
 }
 
-static int has_only_hinges_and_slides(const mjModel* m) {
+static int is_walked(const mjModel* m) {
   if (m->nsite || m->nmocap) return 0;
   for (int joint = 0; joint < m->njnt; joint++) {
     if (m->jnt_type[joint] != mjJNT_HINGE && m->jnt_type[joint] != mjJNT_SLIDE) return 0;
@@ -134,7 +134,7 @@ static int has_only_hinges_and_slides(const mjModel* m) {
 }
 
 void perturb_kinematics(const mjModel* m, mjData* d) {
-  if (!has_only_hinges_and_slides(m)) {
+  if (!is_walked(m)) {
     mj_kinematics(m, d);
     return;
   }
@@ -187,7 +187,7 @@ static inline void inertia(mjtNum* to, const mjtNum* diagonal, const mjtNum* m, 
 }
 
 void perturb_com_pos(const mjModel* m, mjData* d) {
-  if (!has_only_hinges_and_slides(m) || m->nbody > MOST_BODIES) {
+  if (!is_walked(m) || m->nbody > MOST_BODIES) {
     mj_comPos(m, d);
     return;
   }
@@ -230,7 +230,7 @@ void perturb_com_pos(const mjModel* m, mjData* d) {
 }
 
 void perturb_com_vel(const mjModel* m, mjData* d) {
-  if (!has_only_hinges_and_slides(m)) {
+  if (!is_walked(m)) {
     mj_comVel(m, d);
     return;
   }
@@ -252,7 +252,7 @@ void perturb_com_vel(const mjModel* m, mjData* d) {
   }
 }
 
-#else  // elsewhere compilers fuse products and sums, each in its own way
+#else  // elsewhere Debian's MuJoCo itself has products and sums that its compiler fused
 
 void perturb_kinematics(const mjModel* m, mjData* d) { mj_kinematics(m, d); }
 void perturb_com_pos(const mjModel* m, mjData* d) { mj_comPos(m, d); }

@@ -115,7 +115,7 @@ static int can_touch(const mjModel* m, int a, int b) {
 }
 
 perturb_mj_pairs* perturb_mj_make_pairs(const mjModel* m) {
-  if (m->npair || m->nexclude || m->ntendon || m->opt.collision != mjCOL_ALL || m->opt.integrator != mjINT_EULER ||
+  if (m->npair || m->nexclude || m->opt.collision != mjCOL_ALL || m->opt.integrator != mjINT_EULER ||
       m->opt.enableflags) {
     return NULL;
   }
@@ -192,8 +192,12 @@ static void check(const mjModel* m, mjData* d) {
   mj_checkVel(m, d);
 }
 
-// mj_fwdVelocity where there are no tendons.
+// mj_fwdVelocity.
 static void velocity(const mjModel* m, mjData* d) {
+  if (m->ntendon) {
+    mj_fwdVelocity(m, d);
+    return;
+  }
   mju_mulMatVec(d->actuator_velocity, d->actuator_moment, d->qvel, m->nu, m->nv);
   perturb_com_vel(m, d);
   mj_passive(m, d);
@@ -204,9 +208,9 @@ static void velocity(const mjModel* m, mjData* d) {
 int perturb_mj_step_pairs(const mjModel* model, perturb_mj_pairs* pairs, mjData* data) {
   // mj_step1 by its parts, some of which are others.
   GUARDED(check(model, data); perturb_kinematics(model, data); perturb_com_pos(model, data); mj_camlight(model, data);
-          mj_crb(model, data); mj_factorM(model, data); collide(model, pairs, data); mj_makeConstraint(model, data);
-          mj_transmission(model, data); mj_projectConstraint(model, data); mj_sensorPos(model, data);
-          velocity(model, data); mj_sensorVel(model, data); mj_step2(model, data))
+          mj_tendon(model, data); mj_crb(model, data); mj_factorM(model, data); collide(model, pairs, data);
+          mj_makeConstraint(model, data); mj_transmission(model, data); mj_projectConstraint(model, data);
+          mj_sensorPos(model, data); velocity(model, data); mj_sensorVel(model, data); mj_step2(model, data))
   return failed;
 }
 

@@ -27,8 +27,8 @@ int perturb_mj_forward(const mjModel* model, mjData* data);
 
 // The pairs of geoms of a model that can touch, where the world has one of each.
 typedef struct perturb_mj_pairs perturb_mj_pairs;
-// NULL if other pairs can touch, too, if their contacts take after both geoms, if the model has tendons or steps otherwise
-// than by Euler's method, or without memory. The model must outlive the result, which belongs to the caller.
+// NULL if other pairs can touch, too, if their contacts take after both geoms, if the model steps otherwise than by
+// Euler's method, or without memory. The model must outlive the result, which belongs to the caller.
 perturb_mj_pairs* perturb_mj_make_pairs(const mjModel* model);
 void perturb_mj_free_pairs(perturb_mj_pairs* pairs);
 // perturb_mj_step, to the same bytes, without the search for geoms that are near each other. Nonzero on failure.

@@ -110,7 +110,4 @@ fn a_bad_state_is_divergence() {
             assert_eq!(mujoco.step(), Err(Error::Diverged { warning }), "{bad}");
         }
     }
-    let mut hopper = simulation(HOPPER);
-    hopper.qpos_mut()[5] = 1e10;
-    assert_eq!(hopper.motion(), Ok(()), "just good");
 }
