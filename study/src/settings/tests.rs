@@ -165,6 +165,34 @@ fn each_preset_has_the_documents_values() {
     }
 }
 
+/// What was found on seed 1, and what each algorithm has of its own, in both presets.
+#[test]
+fn each_algorithm_has_the_rates_and_lengths_that_were_chosen_for_it() {
+    let (ff, rc) = (Architecture::Ff, Architecture::Rc);
+    for (algorithm, architecture, learning_rate, n_steps, ent_coef, gae_lambda) in [
+        ("a2c", ff, 7e-3, Some(15), 1e-3, None),
+        ("a2c", rc, 7e-3, Some(15), 1e-3, None),
+        ("ppo", ff, 3e-4, Some(128), 0.0, Some(0.95)),
+        ("ppo", rc, 3e-4, Some(128), 0.0, Some(0.95)),
+        ("epopt-a2c", ff, 7e-2, None, 1e-4, None),
+        ("epopt-a2c", rc, 7e-3, None, 1e-4, None),
+        ("epopt-ppo", ff, 3e-3, None, 0.0, Some(0.95)),
+        ("epopt-ppo", rc, 3e-3, None, 0.0, Some(0.95)),
+        ("rl2-a2c", rc, 7e-3, Some(15), 1e-4, None),
+        ("rl2-ppo", rc, 3e-4, Some(128), 0.0, Some(0.97)),
+    ] {
+        for preset in ["perturb", "paper"] {
+            let table = of(preset, algorithm, architecture, &[]).full_table();
+            let number = |key: &str| table.get(key).and_then(Value::as_float);
+            let got = (number("learning_rate"), table.get("n_steps").and_then(Value::as_integer), number("ent_coef"));
+            assert_eq!(got, (Some(learning_rate), n_steps, Some(ent_coef)), "{algorithm} {architecture} {preset}");
+            assert_eq!(number("gae_lambda"), gae_lambda, "{algorithm} {architecture} {preset}");
+            assert_eq!((table["seed"].as_integer(), table["episodes"].as_integer()), (Some(1), Some(15_000)));
+        }
+    }
+    assert_eq!(of("perturb", "random", ff, &[]).common.num_envs, 1);
+}
+
 #[test]
 fn a_preset_gives_defaults_that_every_layer_beats() {
     let config = of("paper", "epopt-ppo", Architecture::Rc, &["num_envs=7", "update_per_episode=false", "rank_by=raw"]);
