@@ -41,9 +41,13 @@ fn attack(name: &str) {
     let number = |name: &str, usual| std::env::var(name).map_or(usual, |text| text.parse().expect("a number"));
     let (count, first) = (number("PERTURB_FUZZ_INPUTS", INPUTS), number("PERTURB_FUZZ_SEED", 1));
     let (start, mut at_first) = (Instant::now(), 0);
+    let tenth = (count / 10).max(1);
     for seed in first..first + count {
-        if seed == first + count / 10 {
+        if seed == first + tenth {
             at_first = memory();
+        }
+        if count > INPUTS && (seed - first).is_multiple_of(tenth) {
+            eprintln!("{name}: {} of {count} inputs in {:.0?}", seed - first, start.elapsed());
         }
         SEEDS.lock().unwrap_or_else(PoisonError::into_inner).insert(name.to_owned(), seed);
         run(&mutated(&inputs, &mut ChaCha8Rng::seed_from_u64(seed)));
