@@ -137,6 +137,12 @@ impl Stream {
         Ok((stream, opened))
     }
 
+    /// From now on waits for replies [awake](Awake) less where other threads want the core: for one of several programs that
+    /// keep all cores busy.
+    pub fn be_considerate(&mut self) {
+        self.awake.be_considerate();
+    }
+
     /// Where the server is.
     pub fn address(&self) -> &Address {
         self.connection.address()

@@ -66,7 +66,10 @@ impl<'a> Session<'a> {
             // A Unix socket is lost with its server alone.
             let lease = if matches!(connection.address(), Address::Tcp { .. }) { WAITING } else { 0 };
             let opening = Part::open(connection, options, range, AutoresetMode::SameStep, lease);
-            let (part, opened) = servers.runtime().block_on(opening).map_err(|error| servers.explain(error))?;
+            let (mut part, opened) = servers.runtime().block_on(opening).map_err(|error| servers.explain(error))?;
+            if let [_, _, ..] = options {
+                part.stream.be_considerate(); // groups often run beside others
+            }
             let described = opened.environment.unwrap_or_default();
             session.acts &= opened.acts;
             let expected = part.range.len() * described.observation.len();
