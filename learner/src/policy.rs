@@ -110,8 +110,8 @@ impl Policy {
         }
     }
 
-    /// Exchanges the room for another one. Policies of one shape that learn by turns in the same room find its activations
-    /// and its gradient in the processor's caches.
+    /// Exchanges the room for another one. Policies of one shape that learn by turns in the same room find its gradient, and
+    /// what leads to it, in the processor's caches.
     pub fn change_room(&mut self, other: &mut Room) {
         if let Calculus::FeedForward(networks, is_current) = &mut self.calculus {
             std::mem::swap(networks, &mut other.networks);
@@ -120,7 +120,8 @@ impl Policy {
         }
     }
 
-    /// Takes over the networks of a player that has played with the weights as they are: they need not be loaded again.
+    /// Takes over the networks of a player that has played with the weights as they are, with what it has kept: they need
+    /// not be loaded again.
     /// It must load weights before it plays on.
     pub fn take_networks(&mut self, player: &mut Player) {
         if let Calculus::FeedForward(networks, is_current) = &mut self.calculus {

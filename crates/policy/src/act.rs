@@ -5,10 +5,10 @@
 
 use rand_chacha::ChaCha8Rng;
 
-use crate::act_ff::{FeedForward, Networks};
+use crate::act_ff::{BLOCK, FeedForward};
 use crate::act_rc::Recurrent;
 use crate::error::{Error, Result, check_length};
-use crate::kernel::Rows;
+use crate::kernel::RowsFrom;
 use crate::sample::{sample_categorical, sample_gaussian, sample_uniform};
 use crate::spec::{ActionKind, PolicySpec};
 use crate::weights::Weights;
@@ -107,7 +107,7 @@ impl Actor {
         check_length("weights [P]", weights.len(), self.spec.n_weights())?;
         let mut rest = weights;
         match &mut self.network {
-            Network::FeedForward(network) => network.networks_mut().load(&mut rest),
+            Network::FeedForward(network) => network.load(&mut rest),
             Network::Recurrent(network) => network.load(&mut rest),
         }
         self.log_std.copy_from_slice(rest);
@@ -115,13 +115,25 @@ impl Actor {
         Ok(())
     }
 
-    /// The networks of a feed-forward policy of shape `spec`, to be exchanged for others, and log σ `[A]` of its actions.
-    /// Until weights are loaded it refuses to act.
-    pub(crate) fn give_networks(&mut self, spec: &PolicySpec) -> Option<(&mut Networks, &[f32])> {
+    /// From now on keeps what a feed-forward policy's networks compute while it acts for `n_steps` with the same weights, for
+    /// [`Differentiator::load_from`](crate::Differentiator::load_from). No effect if these and values of one batch more are
+    /// over 64 observations.
+    pub fn keep_activations(&mut self, n_steps: usize) {
+        match &mut self.network {
+            Network::FeedForward(network) if self.max_batch.saturating_mul(n_steps.saturating_add(1)) <= BLOCK => {
+                network.keep(&self.spec);
+            }
+            _ => {}
+        }
+    }
+
+    /// What acts for a feed-forward policy of shape `spec`, whose networks are to be exchanged for others, and log σ `[A]` of
+    /// its actions. Until weights are loaded it refuses to act.
+    pub(crate) fn give_networks(&mut self, spec: &PolicySpec) -> Option<(&mut FeedForward, &[f32])> {
         match &mut self.network {
             Network::FeedForward(network) if self.spec == *spec => {
                 self.is_stale = true;
-                Some((network.networks_mut(), &self.log_std))
+                Some((network, &self.log_std))
             }
             _ => None,
         }
@@ -227,7 +239,7 @@ impl Actor {
 }
 
 /// Replaces `out` by the first numbers of the first `n` rows of a value head.
-fn replace_by_first_column(out: &mut Vec<f32>, rows: &Rows, n: usize) {
+fn replace_by_first_column(out: &mut Vec<f32>, rows: RowsFrom<'_>, n: usize) {
     out.clear();
     out.extend((0..n).map(|n| rows.row(n)[0]));
 }

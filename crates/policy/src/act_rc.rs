@@ -2,7 +2,7 @@
 
 use pulp::Simd;
 
-use crate::kernel::{Kernel, Rows, run};
+use crate::kernel::{Kernel, Rows, RowsFrom, run};
 use crate::math::{sigmoid, tanh};
 use crate::perceptron::{Layer, Perceptron, take};
 use crate::spec::PolicySpec;
@@ -74,18 +74,22 @@ impl Recurrent {
     }
 
     /// One step of environments 0 … `n_envs`-1, which remember it: rows of the policy's outputs and of the values.
-    pub(crate) fn advance(&mut self, observations: &[f32], n_envs: usize) -> (&Rows, &Rows) {
+    pub(crate) fn advance(&mut self, observations: &[f32], n_envs: usize) -> (RowsFrom<'_>, RowsFrom<'_>) {
         self.step(observations, 0..n_envs);
         for (n, memory) in self.memory.chunks_exact_mut(2 * self.width).take(n_envs).enumerate() {
             memory.copy_from_slice(&self.next.row(n)[..2 * self.width]);
         }
-        (&self.outputs, &self.values)
+        (self.outputs.from(0), self.values.from(0))
     }
 
     /// Rows of the values of `observations` in `environments`; memories stay.
-    pub(crate) fn values(&mut self, observations: &[f32], environments: impl ExactSizeIterator<Item = usize>) -> &Rows {
+    pub(crate) fn values(
+        &mut self,
+        observations: &[f32],
+        environments: impl ExactSizeIterator<Item = usize>,
+    ) -> RowsFrom<'_> {
         self.step(observations, environments);
-        &self.values
+        self.values.from(0)
     }
 
     pub(crate) fn forget(&mut self, environment: usize) {
@@ -104,7 +108,7 @@ impl Recurrent {
     /// Computes `next`, outputs and values from `observations` and the memories of `environments`.
     fn step(&mut self, observations: &[f32], environments: impl ExactSizeIterator<Item = usize>) {
         let n = environments.len();
-        self.observations.copy(observations, self.observation_size);
+        self.observations.copy(0, observations, self.observation_size);
         for (row, environment) in environments.enumerate() {
             let memory = &self.memory[environment * 2 * self.width..][..2 * self.width];
             self.inputs.row_mut(row)[self.hidden_size..][..self.width].copy_from_slice(&memory[..self.width]);
@@ -124,18 +128,18 @@ impl Kernel for Step<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let (network, n) = (self.network, self.n);
-        network.hidden.forward(simd, &network.observations, n, &mut network.hidden_layers);
+        network.hidden.forward(simd, &network.observations, 0..n, &mut network.hidden_layers);
         let x = network.hidden_layers.last().unwrap_or(&network.observations);
         for row in 0..n {
             network.inputs.row_mut(row)[..network.hidden_size].copy_from_slice(&x.row(row)[..network.hidden_size]);
         }
-        network.gates.apply(simd, &network.inputs, n, &mut network.sums);
+        network.gates.apply(simd, &network.inputs, 0..n, &mut network.sums);
         for row in 0..n {
             let (h, c) = network.next.row_mut(row)[..2 * network.width].split_at_mut(network.width);
             cell(&mut network.sums.row_mut(row)[..4 * network.width], h, c);
         }
-        network.policy.apply(simd, &network.next, n, &mut network.outputs);
-        network.value.apply(simd, &network.next, n, &mut network.values);
+        network.policy.apply(simd, &network.next, 0..n, &mut network.outputs);
+        network.value.apply(simd, &network.next, 0..n, &mut network.values);
     }
 }
 

@@ -5,15 +5,13 @@ use rayon::{ThreadPool, ThreadPoolBuilder};
 use pulp::Simd;
 
 use crate::act::Actor;
-use crate::act_ff::Networks;
+use crate::act_ff::{Activations, BLOCK, Networks};
 use crate::error::{Error, Result, check_length};
-use crate::kernel::{Kernel, Rows, run};
+use crate::kernel::{Kernel, run};
 use crate::objective::{Acting, Gaussian, Losses, Objective, Outputs, Sample};
 use crate::perceptron::{Backward, Forward};
 use crate::spec::{ActionKind, PolicySpec};
 
-/// Samples whose activations are kept at once: those of both networks stay in the processor's second cache.
-const BLOCK: usize = 64;
 /// The most parts of a minibatch, and so the most threads that work on one.
 const MOST_PARTS: usize = 16;
 
@@ -48,6 +46,8 @@ pub struct Differentiator {
     networks: Networks,
     gaussian: Gaussian,
     parts: Vec<Part>,
+    /// Rows of the first part that hold what the networks compute of the observations in them.
+    computed: usize,
     /// None: the calling thread does everything.
     threads: Option<ThreadPool>,
 }
@@ -61,12 +61,10 @@ struct Part {
     losses: Losses,
 }
 
-/// Activations of a block.
+/// A block of samples on the way there and back.
 #[derive(Debug)]
 struct Block {
-    observations: Rows,
-    policy_layers: Vec<Rows>,
-    value_layers: Vec<Rows>,
+    activations: Activations,
     through_policy: Backward,
     through_value: Backward,
 }
@@ -74,9 +72,7 @@ struct Block {
 impl Block {
     fn new(spec: &PolicySpec, networks: &Networks) -> Self {
         Block {
-            observations: Rows::new(BLOCK, spec.observation_size),
-            policy_layers: networks.policy.room(BLOCK),
-            value_layers: networks.value.room(BLOCK),
+            activations: Activations::new(spec, networks, BLOCK),
             through_policy: Backward::new(&networks.policy, BLOCK),
             through_value: Backward::new(&networks.value, BLOCK),
         }
@@ -102,6 +98,7 @@ impl Differentiator {
             networks: Networks::new(spec),
             gaussian: Gaussian::new(n_log_std),
             parts: Vec::new(),
+            computed: 0,
             threads: threads.map_err(|error| Error::Threads { wanted: others, reason: error.to_string() })?,
         })
     }
@@ -115,18 +112,40 @@ impl Differentiator {
         let mut rest = weights;
         self.networks.load(&mut rest);
         self.gaussian.load(rest);
+        self.computed = 0;
         Ok(())
     }
 
     /// Takes over the networks of an actor that has the weights, which is quicker than to load them, and says whether it
     /// did: they must be of this shape. The actor has others then, and refuses to act until it has loaded weights
-    /// ([`Error::NoWeights`]).
+    /// ([`Error::NoWeights`]). What [it has kept](Actor::keep_activations) need not be computed again.
     #[must_use]
     pub fn load_from(&mut self, actor: &mut Actor) -> bool {
-        let Some((networks, log_std)) = actor.give_networks(&self.spec) else { return false };
-        std::mem::swap(networks, &mut self.networks);
+        self.make_parts(1);
+        let Some((acted, log_std)) = actor.give_networks(&self.spec) else { return false };
+        self.computed = acted.exchange(&mut self.networks, &mut self.parts[0].block.activations);
         self.gaussian.load(log_std);
         true
+    }
+
+    /// Makes room for so many parts.
+    fn make_parts(&mut self, n: usize) {
+        while self.parts.len() < n {
+            let length = if self.parts.is_empty() { 0 } else { self.n_weights };
+            let block = Block::new(&self.spec, &self.networks);
+            self.parts.push(Part { block, gradient: vec![0.0; length], losses: Losses::default() });
+        }
+    }
+
+    /// Whether the first part has the activations of just the samples at `indices`: whoever acted kept them.
+    fn has_computed(&self, samples: &Samples<'_>, indices: &[u32]) -> bool {
+        let size = self.spec.observation_size;
+        let are_all = indices.len() == self.computed && indices.iter().enumerate().all(|(b, &i)| i as usize == b);
+        are_all
+            && samples.observations.chunks_exact(size).take(self.computed).enumerate().all(|(b, observation)| {
+                let computed = &self.parts[0].block.activations.observations.row(b)[..size];
+                computed.iter().zip(observation).all(|(a, b)| a.to_bits() == b.to_bits())
+            })
     }
 
     /// The losses of the samples at `indices`, and in `gradient` `[P]` the derivatives of their total by `weights` `[P]`,
@@ -152,10 +171,10 @@ impl Differentiator {
             return Err(Error::NoSamples);
         }
         let n_parts = indices.len().div_ceil(BLOCK).min(MOST_PARTS);
-        while self.parts.len() < n_parts {
-            let length = if self.parts.is_empty() { 0 } else { self.n_weights };
-            let block = Block::new(&self.spec, &self.networks);
-            self.parts.push(Part { block, gradient: vec![0.0; length], losses: Losses::default() });
+        self.make_parts(n_parts);
+        let is_computed = self.has_computed(samples, indices);
+        if !is_computed {
+            self.computed = 0; // from here on the rows are others
         }
         let (mean, scale) =
             if objective.normalize_advantages { mean_and_scale(samples.advantages, indices) } else { (0.0, 1.0) };
@@ -166,7 +185,7 @@ impl Differentiator {
             let Part { block, gradient: own, losses } = part;
             let (sums, first) = (gradient.unwrap_or(own), place * size);
             let indices = &indices[first..n.min(first + size)];
-            let shared = Shared { spec, networks, gaussian, weights, samples, objective, mean, scale, n };
+            let shared = Shared { spec, networks, gaussian, weights, samples, is_computed, objective, mean, scale, n };
             run(Differentiation { shared, indices, block, sums, losses });
         };
         let parts = &mut parts[..n.div_ceil(size)];
@@ -209,18 +228,16 @@ impl Differentiator {
     pub fn outputs(&mut self, observations: &[f32], outputs: &mut Vec<f32>) -> Result<()> {
         let size = self.spec.observation_size;
         check_length("observations [B, O]", observations.len(), observations.len() / size * size)?;
-        if self.parts.is_empty() {
-            let block = Block::new(&self.spec, &self.networks);
-            self.parts.push(Part { block, gradient: Vec::new(), losses: Losses::default() });
-        }
-        let (room, networks) = (&mut self.parts[0].block, &self.networks);
+        self.make_parts(1);
+        self.computed = 0;
+        let (activations, networks) = (&mut self.parts[0].block.activations, &self.networks);
+        let Activations { observations: rows, policy_layers, .. } = activations;
         outputs.clear();
         for block in observations.chunks(BLOCK * size) {
             let n = block.len() / size;
-            room.observations.copy(block, size);
-            let Block { observations, policy_layers, .. } = room;
-            run(Forward { network: &networks.policy, inputs: observations, n, outputs: policy_layers });
-            let head = &room.policy_layers[room.policy_layers.len() - 1];
+            rows.copy(0, block, size);
+            run(Forward { network: &networks.policy, inputs: rows, rows: 0..n, outputs: policy_layers });
+            let head = &policy_layers[policy_layers.len() - 1];
             outputs.extend((0..n).flat_map(|b| &head.row(b)[..self.spec.action.outputs()]));
         }
         Ok(())
@@ -271,6 +288,8 @@ struct Shared<'a> {
     gaussian: &'a Gaussian,
     weights: &'a [f32],
     samples: &'a Samples<'a>,
+    /// Whether their activations are there.
+    is_computed: bool,
     objective: &'a Objective,
     /// Of the advantages, and what the distance from it is multiplied with.
     mean: f32,
@@ -303,14 +322,18 @@ impl Differentiation<'_> {
     /// The samples at `indices`; with `ADD` the sums go on.
     #[inline(always)]
     fn block<S: Simd, const ADD: bool>(&mut self, simd: S, indices: &[u32]) {
-        let Block { observations, policy_layers, value_layers, through_policy, through_value } = &mut *self.block;
-        let Shared { spec, networks, gaussian, weights, samples, objective, mean, scale, n: of } = &self.shared;
+        let Block { activations, through_policy, through_value } = &mut *self.block;
+        let Activations { observations, policy_layers, value_layers } = activations;
+        let Shared { spec, networks, gaussian, weights, samples, is_computed, objective, mean, scale, n: of } =
+            &self.shared;
         let (size, n) = (spec.observation_size, indices.len());
-        for (b, &i) in indices.iter().enumerate() {
-            observations.row_mut(b)[..size].copy_from_slice(&samples.observations[i as usize * size..][..size]);
+        if !is_computed {
+            for (b, &i) in indices.iter().enumerate() {
+                observations.row_mut(b)[..size].copy_from_slice(&samples.observations[i as usize * size..][..size]);
+            }
+            networks.policy.forward(simd, observations, 0..n, policy_layers);
+            networks.value.forward(simd, observations, 0..n, value_layers);
         }
-        networks.policy.forward(simd, observations, n, policy_layers);
-        networks.value.forward(simd, observations, n, value_layers);
         let (heads, values) = (&policy_layers[policy_layers.len() - 1], &value_layers[value_layers.len() - 1]);
         let (n_outputs, width) = (spec.action.outputs(), spec.action.width());
         let (policy_sums, rest) = self.sums.split_at_mut(through_policy.n_weights());
@@ -344,3 +367,6 @@ impl Differentiation<'_> {
         through_value.sum::<S, ADD>(simd, value_weights, value_sums, observations, value_layers, n);
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,5 +1,7 @@
 //! Work on rows of numbers that is compiled for every kind of vector unit.
 
+use std::ops::Range;
+
 use pulp::{Arch, Scalar128b, Simd, WithSimd};
 
 use crate::math::tanh;
@@ -44,6 +46,20 @@ pub(crate) struct Rows {
     pub(crate) data: Vec<Lane>,
 }
 
+/// The rows of a matrix from one of them on.
+#[derive(Clone, Copy)]
+pub(crate) struct RowsFrom<'a> {
+    rows: &'a Rows,
+    first: usize,
+}
+
+impl<'a> RowsFrom<'a> {
+    /// Row `n` of these.
+    pub(crate) fn row(&self, n: usize) -> &'a [f32] {
+        self.rows.row(self.first + n)
+    }
+}
+
 impl Rows {
     /// Zeros, `n` rows of `length` numbers.
     pub(crate) fn new(n: usize, length: usize) -> Self {
@@ -62,10 +78,16 @@ impl Rows {
         self.data[n * self.width..][..self.width].as_flattened_mut()
     }
 
-    /// Copies rows of `length` numbers to the front of the first ones.
-    pub(crate) fn copy(&mut self, rows: &[f32], length: usize) {
+    /// The rows from `first` on.
+    #[inline(always)]
+    pub(crate) fn from(&self, first: usize) -> RowsFrom<'_> {
+        RowsFrom { rows: self, first }
+    }
+
+    /// Copies `rows` of `length` numbers to the front of row `first` and those after it.
+    pub(crate) fn copy(&mut self, first: usize, rows: &[f32], length: usize) {
         for (n, row) in rows.chunks_exact(length).enumerate() {
-            self.row_mut(n)[..length].copy_from_slice(row);
+            self.row_mut(first + n)[..length].copy_from_slice(row);
         }
     }
 
@@ -81,10 +103,10 @@ impl Rows {
         &mut self.data[..n * self.width]
     }
 
-    /// tanh of the first `n` rows.
+    /// tanh of `rows`.
     #[inline(always)]
-    pub(crate) fn squash(&mut self, n: usize) {
-        for lane in self.lanes_mut(n) {
+    pub(crate) fn squash(&mut self, rows: Range<usize>) {
+        for lane in &mut self.data[rows.start * self.width..rows.end * self.width] {
             for x in lane {
                 *x = tanh(*x);
             }

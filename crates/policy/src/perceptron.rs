@@ -1,5 +1,7 @@
 //! A multilayer perceptron, forward and backward.
 
+use std::ops::Range;
+
 use pulp::Simd;
 
 use crate::kernel::{Kernel, LANES, Lane, Rows, lanes};
@@ -36,10 +38,10 @@ impl Layer {
         self.load_biases(take(numbers, self.outputs));
     }
 
-    /// bias + Σ_i input_i weight_i of the first `n` rows, added up in order of i.
+    /// bias + Σ_i input_i weight_i of `rows`, added up in order of i.
     #[inline(always)]
-    pub(crate) fn apply<S: Simd>(&self, simd: S, from: &Rows, n: usize, to: &mut Rows) {
-        self.matrix.factor().apply(simd, from, n, Some(&self.biases), to);
+    pub(crate) fn apply<S: Simd>(&self, simd: S, from: &Rows, rows: Range<usize>, to: &mut Rows) {
+        self.matrix.factor().apply(simd, from, rows, Some(&self.biases), to);
     }
 }
 
@@ -77,14 +79,14 @@ impl Perceptron {
         self.layers.iter_mut().for_each(|layer| layer.load(numbers));
     }
 
-    /// Computes every layer's outputs, one of `outputs` each, for the first `n` rows of `inputs`.
+    /// Computes every layer's outputs, one of `outputs` each, for `rows` of `inputs`.
     #[inline(always)]
-    pub(crate) fn forward<S: Simd>(&self, simd: S, inputs: &Rows, n: usize, outputs: &mut [Rows]) {
+    pub(crate) fn forward<S: Simd>(&self, simd: S, inputs: &Rows, rows: Range<usize>, outputs: &mut [Rows]) {
         for (i, layer) in self.layers.iter().enumerate() {
             let (below, own) = outputs.split_at_mut(i);
-            layer.apply(simd, below.last().unwrap_or(inputs), n, &mut own[0]);
+            layer.apply(simd, below.last().unwrap_or(inputs), rows.clone(), &mut own[0]);
             if self.squash_last || i + 1 < self.layers.len() {
-                own[0].squash(n);
+                own[0].squash(rows.clone());
             }
         }
     }
@@ -94,14 +96,14 @@ impl Perceptron {
 pub(crate) struct Forward<'a> {
     pub(crate) network: &'a Perceptron,
     pub(crate) inputs: &'a Rows,
-    pub(crate) n: usize,
+    pub(crate) rows: Range<usize>,
     pub(crate) outputs: &'a mut [Rows],
 }
 
 impl Kernel for Forward<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        self.network.forward(simd, self.inputs, self.n, self.outputs);
+        self.network.forward(simd, self.inputs, self.rows, self.outputs);
     }
 }
 
@@ -167,7 +169,7 @@ impl Backward {
             sum_rows::<ADD>(by_biases, deltas, n);
             if let Some(below) = below.last_mut() {
                 let matrix = &weights[first..][..by_weights.len()];
-                Factor::rows(matrix, *size).apply(simd, deltas, n, None, &mut below.deltas);
+                Factor::rows(matrix, *size).apply(simd, deltas, 0..n, None, &mut below.deltas);
                 below.deltas.differentiate_tanh(inputs, n);
             }
             (weights, sums) = (&weights[..first], rest);

@@ -217,6 +217,13 @@ impl Player {
         self
     }
 
+    /// The same, see [`Actor::keep_activations`].
+    #[must_use]
+    pub fn keeping_activations(mut self, n_steps: usize) -> Self {
+        self.actor.keep_activations(n_steps);
+        self
+    }
+
     /// N.
     pub fn n_envs(&self) -> usize {
         self.starts.len()

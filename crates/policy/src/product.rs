@@ -8,6 +8,8 @@
 //! and their calls took a third of a small gradient.
 #![allow(clippy::needless_range_loop)]
 
+use std::ops::Range;
+
 use pulp::Simd;
 
 use crate::kernel::{LANES, Lane, Rows, lanes};
@@ -68,19 +70,27 @@ impl<'a> Factor<'a> {
         Factor { numbers: matrix, inputs: matrix.len() / outputs, outputs, per_column: LANES, per_input: outputs }
     }
 
-    /// The first `n` rows of `from` times this: to_b = start + Σ_i from_bi weights_i, added up in order of i. `start` has one
-    /// lane for each of outputs.
+    /// `rows` of `from` times this: to_b = start + Σ_i from_bi weights_i, added up in order of i. `start` has one lane for
+    /// each of outputs.
     #[inline(always)]
-    pub(crate) fn apply<S: Simd>(self, simd: S, from: &Rows, n: usize, start: Option<&[Lane]>, to: &mut Rows) {
+    pub(crate) fn apply<S: Simd>(
+        self,
+        simd: S,
+        from: &Rows,
+        rows: Range<usize>,
+        start: Option<&[Lane]>,
+        to: &mut Rows,
+    ) {
         let whole = self.outputs / LANES;
-        let few = if n % 8 < 4 { n % 8 } else { 0 };
+        let few = if rows.len() % 8 < 4 { rows.len() % 8 } else { 0 };
+        let (many, few) = (rows.start..rows.end - few, rows.end - few..rows.end);
         for column in 0..whole {
-            self.columns::<S, true>(simd, from, n - few, start, to, column);
+            self.columns::<S, true>(simd, from, many.clone(), start, to, column);
         }
         let mut column = 0;
-        while column < whole && few > 0 {
+        while column < whole && !few.is_empty() {
             let step = if column + 4 <= whole { 4 } else { 1 };
-            for row in n - few..n {
+            for row in few.clone() {
                 if step == 4 {
                     self.row_product::<S, 4, true>(simd, from, row, start, to, column);
                 } else {
@@ -90,30 +100,30 @@ impl<'a> Factor<'a> {
             column += step;
         }
         if whole * LANES < self.outputs {
-            self.columns::<S, false>(simd, from, n - few, start, to, whole);
-            for row in n - few..n {
+            self.columns::<S, false>(simd, from, many, start, to, whole);
+            for row in few {
                 self.row_product::<S, 1, false>(simd, from, row, start, to, whole);
             }
         }
     }
 
-    /// A lane of outputs of `n` rows, eight and at last four to seven of them at once. `WHOLE`: the lane is.
+    /// A lane of outputs of `rows`, eight and at last four to seven of them at once. `WHOLE`: the lane is.
     #[inline(always)]
     fn columns<S: Simd, const WHOLE: bool>(
         self,
         simd: S,
         from: &Rows,
-        n: usize,
+        rows: Range<usize>,
         start: Option<&[Lane]>,
         to: &mut Rows,
         column: usize,
     ) {
-        let mut row = 0;
-        while row + 8 <= n {
+        let mut row = rows.start;
+        while row + 8 <= rows.end {
             self.product::<S, 8, WHOLE>(simd, from, row, start, to, column);
             row += 8;
         }
-        match n - row {
+        match rows.end - row {
             4 => self.product::<S, 4, WHOLE>(simd, from, row, start, to, column),
             5 => self.product::<S, 5, WHOLE>(simd, from, row, start, to, column),
             6 => self.product::<S, 6, WHOLE>(simd, from, row, start, to, column),
@@ -122,15 +132,23 @@ impl<'a> Factor<'a> {
         }
     }
 
-    /// Vector number `vector` of a lane of outputs at `weights`, those of one input on.
+    /// From the first input's numbers of a lane of outputs to the last one's. All whole lanes are as long as each other: so an
+    /// index that was checked for one need not be checked for the next.
     #[inline(always)]
-    fn vector<S: Simd, const WHOLE: bool>(self, weights: &[f32], vector: usize) -> S::f32s {
+    fn column<const WHOLE: bool>(self, column: usize) -> &'a [f32] {
+        let last = if WHOLE { LANES } else { self.outputs % LANES };
+        &self.numbers[column * self.per_column..][..(self.inputs - 1) * self.per_input + last]
+    }
+
+    /// Vector number `vector` of input `i` in a [`Factor::column`].
+    #[inline(always)]
+    fn vector<S: Simd, const WHOLE: bool>(self, column: &[f32], i: usize, vector: usize) -> S::f32s {
         if WHOLE {
-            return S::as_simd_f32s(&weights[vector * S::F32_LANES..][..S::F32_LANES]).0[0];
+            return S::as_simd_f32s(&column[i * self.per_input + vector * S::F32_LANES..][..S::F32_LANES]).0[0];
         }
         let mut lane = ZERO;
         let left = self.outputs % LANES;
-        lane[..left].copy_from_slice(&weights[..left]);
+        lane[..left].copy_from_slice(&column[i * self.per_input..][..left]);
         S::as_simd_f32s(&lane).0[vector]
     }
 
@@ -145,16 +163,18 @@ impl<'a> Factor<'a> {
         to: &mut Rows,
         column: usize,
     ) {
-        let width = from.width * LANES;
-        let inputs = &from.data.as_flattened()[row * width..][..R * width];
-        let weights = &self.numbers[column * self.per_column..];
+        let weights = self.column::<WHOLE>(column);
+        let mut inputs = [&from.row(row)[..self.inputs]; R];
+        for r in 1..R {
+            inputs[r] = &from.row(row + r)[..self.inputs];
+        }
         let (start, _) = S::as_simd_f32s(start.map_or(&ZERO, |start| &start[column]));
         for vector in 0..start.len() {
             let mut sums = [start[vector]; R];
-            for (i, weights) in weights.chunks(self.per_input).take(self.inputs).enumerate() {
-                let weights = self.vector::<S, WHOLE>(weights, vector);
+            for i in 0..self.inputs {
+                let weights = self.vector::<S, WHOLE>(weights, i, vector);
                 for r in 0..R {
-                    sums[r] = simd.add_f32s(sums[r], simd.mul_f32s(simd.splat_f32s(inputs[r * width + i]), weights));
+                    sums[r] = simd.add_f32s(sums[r], simd.mul_f32s(simd.splat_f32s(inputs[r][i]), weights));
                 }
             }
             for r in 0..R {
@@ -175,7 +195,10 @@ impl<'a> Factor<'a> {
         column: usize,
     ) {
         let inputs = &from.row(row)[..self.inputs];
-        let weights = &self.numbers[column * self.per_column..];
+        let mut weights = [self.column::<WHOLE>(column); C];
+        for c in 1..C {
+            weights[c] = self.column::<WHOLE>(column + c);
+        }
         for vector in 0..LANES / S::F32_LANES {
             let mut sums = [simd.splat_f32s(0.0); C];
             if let Some(start) = start {
@@ -186,8 +209,7 @@ impl<'a> Factor<'a> {
             for (i, input) in inputs.iter().enumerate() {
                 let input = simd.splat_f32s(*input);
                 for c in 0..C {
-                    let weights = &weights[c * self.per_column + i * self.per_input..];
-                    let weights = self.vector::<S, WHOLE>(weights, vector);
+                    let weights = self.vector::<S, WHOLE>(weights[c], i, vector);
                     sums[c] = simd.add_f32s(sums[c], simd.mul_f32s(input, weights));
                 }
             }
@@ -353,9 +375,9 @@ mod tests {
     impl Kernel for Products<'_> {
         fn run<S: Simd>(self, simd: S) {
             let Products { matrix, flat, from, n, start, to, back, outer: products, sum } = self;
-            matrix.factor().apply(simd, from, n, Some(start), to);
-            to.squash(n);
-            Factor::rows(flat, INPUTS).apply(simd, to, n, None, back);
+            matrix.factor().apply(simd, from, 0..n, Some(start), to);
+            to.squash(0..n);
+            Factor::rows(flat, INPUTS).apply(simd, to, 0..n, None, back);
             outer::<S, false>(simd, products, INPUTS, to, from, n);
             outer::<S, true>(simd, products, INPUTS, to, from, n);
             sum_rows::<false>(sum, to, n);
@@ -374,7 +396,7 @@ mod tests {
         let mut matrix = Matrix::new(INPUTS, OUTPUTS);
         matrix.load(0, &flat, OUTPUTS);
         let (mut from, mut to, mut back) = (Rows::new(n, INPUTS), Rows::new(n, OUTPUTS), Rows::new(n, INPUTS));
-        from.copy(&numbers(n * INPUTS, 2), INPUTS);
+        from.copy(0, &numbers(n * INPUTS, 2), INPUTS);
         let mut start = [[0.0; LANES]; lanes(OUTPUTS)];
         start.as_flattened_mut()[..OUTPUTS].copy_from_slice(&numbers(OUTPUTS, 3));
         let (mut outer, mut sum) = (vec![f32::NAN; INPUTS * OUTPUTS], vec![f32::NAN; OUTPUTS]);

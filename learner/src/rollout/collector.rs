@@ -70,19 +70,17 @@ impl Collector {
         &mut self.player
     }
 
-    /// Begins a rollout under the policy of `weights`. For complete episodes `reset` breaks off what runs: it resets all
-    /// environments and writes their observations `[N, O]`.
+    /// Begins a rollout under the policy of the weights that the player has loaded. For complete episodes `reset` breaks off
+    /// what runs: it resets all environments and writes their observations `[N, O]`.
     ///
     /// # Errors
     /// [`CollectError`].
     pub fn begin(
         &mut self,
-        weights: &[f32],
         experience: Experience,
         rollout: &mut Rollout,
         reset: impl FnOnce(&mut [f32]) -> Result<(), ClientError>,
     ) -> Result<(), CollectError> {
-        self.player.load(weights)?;
         self.task = experience.task(self.player.n_envs());
         if let Task::Episodes(_) = self.task {
             let mut observations = vec![0.0; self.player.n_envs() * self.player.observation_size()];
@@ -138,7 +136,7 @@ impl Collector {
         Ok(rollout.finish(self.player.last_values(&self.task)?)?)
     }
 
-    /// A whole rollout from a session of this collector's environments alone.
+    /// A whole rollout under the policy of `weights`, from a session of this collector's environments alone.
     ///
     /// # Errors
     /// [`CollectError`]; what was collected of this rollout is lost.
@@ -151,7 +149,8 @@ impl Collector {
         mut on_episode: impl FnMut(&EndedEpisode),
     ) -> Result<(), CollectError> {
         let mut reply = StepReply::default();
-        self.begin(weights, experience, rollout, |observations| session.reset(0..session.num_envs(), observations))?;
+        self.player.load(weights)?;
+        self.begin(experience, rollout, |observations| session.reset(0..session.num_envs(), observations))?;
         while !self.is_done() {
             session.step(self.act()?, &mut reply)?;
             self.take(&reply.all(), rollout, &mut on_episode)?;

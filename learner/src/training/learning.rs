@@ -17,7 +17,7 @@ use perturb_study::Counters;
 use perturb_study::files::write_atomically;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::Comparison;
-use perturb_study::settings::{Common, EpoptConfig, TrainConfig, Wrapper};
+use perturb_study::settings::{Base, Common, EpoptConfig, Settings, TrainConfig, Wrapper};
 
 /// During longer updates the connections are kept alive; servers wait for seconds at least.
 const LONG_UPDATE: Duration = Duration::from_millis(100);
@@ -110,6 +110,7 @@ impl<'a> Learning<'a> {
         };
         let mut player = player(&state, normalisers);
         player.begin(observations, None).map_err(crate::error::Error::from)?;
+        player.load(policy.flat_weights()).map_err(crate::error::Error::from)?;
         let weights = policy.weights();
         let checkpoint = Checkpoint { state, policy: spec, weights };
         directory.prepare()?; // from here on an earlier run is gone
@@ -143,6 +144,7 @@ impl<'a> Learning<'a> {
         let mut player = player(state, normalisers);
         let played = player.restore(&resume.collector.player).map_err(crate::error::Error::from);
         played.map_err(|error| not_restored("environments", error.into()))?;
+        player.load(policy.flat_weights()).map_err(crate::error::Error::from)?;
         restore()?;
         let clock = Clock::start(resume.history.elapsed);
         let mut algorithm = algorithm::build(&state.config.settings, &policy, state.config.common.seed)?;
@@ -212,9 +214,14 @@ impl<'a> Learning<'a> {
         self.algorithm.experience()
     }
 
-    /// What a rollout is collected with: the weights, and where it and its episodes go.
-    pub(super) fn collecting(&mut self) -> (&[f32], &mut Rollout, &mut Tally) {
-        (self.policy.flat_weights(), &mut self.rollout, &mut self.tally)
+    /// `[P]` the weights.
+    pub(super) fn weights(&self) -> &[f32] {
+        self.policy.flat_weights()
+    }
+
+    /// Where a rollout and its episodes go.
+    pub(super) fn collecting(&mut self) -> (&mut Rollout, &mut Tally) {
+        (&mut self.rollout, &mut self.tally)
     }
 
     /// Whether connections should be kept alive during the next update. A thread for it would cost more than the shortest
@@ -230,20 +237,24 @@ impl<'a> Learning<'a> {
     }
 
     /// Learns from the rollout, which took so long to collect, and notes what came of it. A `player` that collected it here
-    /// must load weights before it plays on.
+    /// has the new weights then.
     pub(super) fn learn(
         &mut self,
-        player: Option<&mut Player>,
+        mut player: Option<&mut Player>,
         acting: Duration,
         waiting: Duration,
     ) -> Result<Progress> {
         let (ended, steps) = self.note_rollout()?;
         let updating = Instant::now();
-        if let Some(player) = player {
+        if let Some(player) = player.as_deref_mut() {
             self.policy.take_networks(player);
         }
         let remaining = self.progress_remaining();
         let update = self.algorithm.update(&mut self.policy, &self.rollout, remaining)?;
+        if let Some(player) = player {
+            // At once, while they are in the processor's caches.
+            player.load(self.policy.flat_weights()).map_err(crate::error::Error::from)?;
+        }
         let elapsed = updating.elapsed();
         self.last_update = Some(elapsed);
         self.shares.acting += acting.as_secs_f64();
@@ -414,7 +425,14 @@ fn player(state: &State, normalisers: Normalisers) -> Player {
     let Common { num_envs, seed, .. } = state.config.common;
     let (spec, inputs) = (state.policy(), state.inputs(num_envs));
     let episodes_per_trial = state.config.settings.episodes_per_trial();
-    Player::new(&spec, inputs, num_envs, episodes_per_trial, normalisers, Role::training(seed))
+    let player = Player::new(&spec, inputs, num_envs, episodes_per_trial, normalisers, Role::training(seed));
+    match &state.config.settings {
+        // Its one update of a rollout needs just what acting has computed.
+        Settings { base: Base::A2c(a2c), wrapper: Wrapper::Plain | Wrapper::Rl2(_) } => {
+            player.keeping_activations(a2c.n_steps)
+        }
+        _ => player,
+    }
 }
 
 /// Runs `work`, which takes about so long, and keeps the connections alive meanwhile if it is long.

@@ -18,6 +18,8 @@ use perturb_study::interrupt::StopFlag;
 pub(super) struct Lockstep<'a> {
     session: Session<'a>,
     seats: Vec<Seat<'a>>,
+    /// Whether they take their turns in reverse order, until all have learned.
+    backwards: bool,
     actions: Vec<u8>,
     reply: StepReply,
     times: Times,
@@ -56,7 +58,7 @@ impl<'a> Lockstep<'a> {
     pub(super) fn new(session: Session<'a>, seats: Vec<Seat<'a>>) -> Result<Self> {
         let room = if let [first, _, ..] = seats.as_slice() { first.learning.room()? } else { None };
         let (reply, times) = (StepReply::default(), Times::default());
-        Ok(Self { session, seats, actions: Vec::new(), reply, times, room })
+        Ok(Self { session, seats, backwards: false, actions: Vec::new(), reply, times, room })
     }
 
     /// Trains until every training has ended, and tells how each did.
@@ -91,15 +93,15 @@ impl<'a> Lockstep<'a> {
 
     /// A step of all environments, and the updates that follow.
     fn advance(&mut self, servers: &Servers, stop: &StopFlag, report: &mut dyn FnMut(usize, &Progress)) -> Result<()> {
-        let Self { session, seats, actions, reply, times, room } = self;
+        let Self { session, seats, backwards, actions, reply, times, room } = self;
         let start = Instant::now();
-        actions.clear();
-        for seat in seats.iter_mut() {
+        for seat in in_order(seats, *backwards) {
             let acted = seat.act(session, *times);
             seat.settle(acted)?;
-            // Of one that has failed: for the last time, and nobody sees what comes of it.
-            actions.extend_from_slice(seat.collector.player().actions());
         }
+        actions.clear();
+        // Of one that has failed: for the last time, and nobody sees what comes of it.
+        seats.iter().for_each(|seat| actions.extend_from_slice(seat.collector.player().actions()));
         let sent = Instant::now();
         session.step(actions, reply)?;
         let came = Instant::now();
@@ -111,13 +113,16 @@ impl<'a> Lockstep<'a> {
         times.acting += (sent - start) + came.elapsed();
         let due = |seat: &Seat<'_>| seat.end.is_none() && seat.collector.is_done();
         let expected = seats.iter().filter(|seat| due(seat)).map(|seat| seat.learning.last_update()).sum();
+        let learning = seats.iter().any(due);
         keep_alive(servers, expected, || {
-            for seat in seats.iter_mut().filter(|seat| due(seat)) {
+            for seat in in_order(seats, *backwards).filter(|seat| due(seat)) {
                 let learned = seat.learn(room.as_mut(), *times);
                 seat.settle(learned)?;
             }
             Ok::<(), TrainError>(())
         })?;
+        // Who has learned last comes first: the processor's caches, too small for all, still have what it needs.
+        *backwards ^= learning;
         for seat in seats.iter_mut() {
             if let Some(progress) = seat.learned.take() {
                 let concluded = seat.conclude(session, progress, stop, report);
@@ -143,6 +148,11 @@ impl<'a> Lockstep<'a> {
     }
 }
 
+fn in_order<'s, 'a>(seats: &'s mut [Seat<'a>], backwards: bool) -> impl Iterator<Item = &'s mut Seat<'a>> {
+    let mut seats = seats.iter_mut();
+    std::iter::from_fn(move || if backwards { seats.next_back() } else { seats.next() })
+}
+
 impl<'a> Seat<'a> {
     /// Training number `index` in `slots` of the session.
     pub(super) fn new(index: usize, slots: Range<usize>, collector: Collector, learning: Learning<'a>) -> Self {
@@ -154,10 +164,10 @@ impl<'a> Seat<'a> {
         if !self.collecting {
             (self.collecting, self.begun) = (true, times);
             let experience = self.learning.experience();
-            let (weights, rollout, _) = self.learning.collecting();
+            let (rollout, _) = self.learning.collecting();
             let slots = self.slots.clone();
             let reset = |observations: &mut [f32]| session.reset(slots, observations);
-            self.collector.begin(weights, experience, rollout, reset)?;
+            self.collector.begin(experience, rollout, reset)?;
         }
         self.collector.act()?;
         Ok(())
@@ -165,7 +175,7 @@ impl<'a> Seat<'a> {
 
     /// Takes what came of the actions.
     fn take(&mut self, reply: &StepReply) -> Result<()> {
-        let (_, rollout, tally) = self.learning.collecting();
+        let (rollout, tally) = self.learning.collecting();
         let slice = reply.slice(self.slots.clone());
         self.collector.take(&slice, rollout, |episode| tally.note(episode))?;
         if self.collector.is_done() {

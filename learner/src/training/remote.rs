@@ -79,7 +79,7 @@ impl<'a> Remote<'a> {
     fn ask(&mut self, waited: Duration) -> Result<()> {
         self.waited = waited;
         let experience = self.learning.experience();
-        let (weights, _, _) = self.learning.collecting();
+        let weights = self.learning.weights();
         Ok(self.session.ask_to_play(self.collector.begin(weights, experience))?)
     }
 
@@ -97,7 +97,7 @@ impl<'a> Remote<'a> {
         report: &mut dyn FnMut(usize, &Progress),
     ) -> Result<Option<Outcome>> {
         let Self { index, session, collector, learning, waited } = self;
-        let (_, rollout, tally) = learning.collecting();
+        let (rollout, tally) = learning.collecting();
         if let Some(rest) = collector.take(session, &played?, rollout, |episode| tally.note(episode))? {
             session.ask_to_play(rest)?;
             return Ok(None);

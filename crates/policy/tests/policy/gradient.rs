@@ -64,6 +64,58 @@ fn the_number_of_threads_changes_no_byte(
     }
 }
 
+/// In N environments for T steps: few, as many as are kept, more; values come between.
+#[rstest]
+fn what_an_actor_has_kept_gives_the_same_gradient(
+    #[values(ActionKind::Discrete { n: 2 }, ActionKind::Continuous { size: 3 })] action: ActionKind,
+    #[values((1, 5), (3, 4), (1, 63), (8, 7), (1, 64), (8, 8), (70, 1))] (n_envs, n_steps): (usize, usize),
+) {
+    let spec = PolicySpec::feed_forward(O, action);
+    let n = n_envs * n_steps;
+    let mut actor = Actor::new(&spec, n_envs);
+    actor.keep_activations(n_steps);
+    let mut network = Differentiator::new(&spec, 1).expect("threads");
+    for round in 0..3 {
+        let weights: Vec<f32> = numbers(spec.n_weights(), 10 + round).iter().map(|x| 0.1 * x).collect();
+        let (observations, others) = (numbers(n * O, 20 + round), numbers(n_envs * O, 30 + round));
+        let samples = Samples {
+            observations: &observations,
+            actions: &vec![1.0; n * action.width()],
+            old_log_probs: &numbers(n, 4),
+            old_values: &numbers(n, 5),
+            advantages: &numbers(n, 6),
+            returns: &numbers(n, 7),
+            acting: None,
+        };
+        let expect_same = |network: &mut Differentiator, weights: &[f32], indices: &[u32]| {
+            let gradient = |network: &mut Differentiator| {
+                let mut gradient = vec![f32::NAN; spec.n_weights()];
+                network.gradient(weights, &samples, indices, &OBJECTIVE, &mut gradient).expect("a gradient");
+                gradient.iter().map(|g| g.to_bits()).collect::<Vec<_>>()
+            };
+            let mut fresh = Differentiator::new(&spec, 1).expect("threads");
+            fresh.load(weights).expect("weights that fit");
+            assert_eq!(gradient(network), gradient(&mut fresh), "round {round}, {} samples", indices.len());
+        };
+        let (mut acts, mut values) = (Acts::new(action, n_envs), Vec::new());
+        actor.load_flat(&weights).expect("weights that fit");
+        for observations in observations.chunks(n_envs * O) {
+            actor.act(observations, &mut stream(1, Purpose::Actions), &mut acts).expect("acts");
+            actor.values(&others, &mut values).expect("values");
+            actor.values_in(&others[..O], &[0], &mut values).expect("a value");
+        }
+        assert!(network.load_from(&mut actor));
+        let all: Vec<u32> = (0..n as u32).collect();
+        expect_same(&mut network, &weights, &all);
+        expect_same(&mut network, &weights, &all);
+        expect_same(&mut network, &weights, &all[1..]);
+        expect_same(&mut network, &weights, &all.iter().rev().copied().collect::<Vec<_>>());
+        expect_same(&mut network, &weights, &all);
+        assert!(!network.load_from(&mut Actor::new(&PolicySpec::feed_forward(O + 1, action), 1)), "of another shape");
+        expect_same(&mut network, &weights, &all);
+    }
+}
+
 #[rstest]
 fn an_actors_networks_give_the_same_gradient(
     #[values(ActionKind::Discrete { n: 2 }, ActionKind::Continuous { size: 3 })] action: ActionKind,
