@@ -12,6 +12,7 @@ use super::{
     tokens::Bearer,
 };
 use bytes::{Buf, Bytes, BytesMut};
+use http_body::Body as _;
 use http_body_util::BodyExt;
 use std::{
     convert::Infallible,
@@ -223,6 +224,8 @@ impl Frames {
                     }
                 }
                 Some(Err(status)) if status.code() == Code::Cancelled => return Err(Stop::Cancelled),
+                // The body of a connection that said nothing for too long ends as if its client had ended it.
+                None if !self.body.is_end_stream() => return Err(Stop::Cancelled),
                 Some(Err(status)) => return Err(status.into()),
                 None if self.buffer.is_empty() && self.message.is_none() => return Ok(None),
                 None => return Err(Status::internal("the stream ended within a message").into()),

@@ -2,7 +2,10 @@
 
 use super::{begin, leased, not_resumed, resume};
 use crate::{
-    common::server::{Actor, Server, Session, open, until},
+    common::{
+        proxy::Proxy,
+        server::{Actor, Server, Session, open, until},
+    },
     metrics::Watched,
 };
 use perturb::proto::session_response::Response;
@@ -49,6 +52,20 @@ async fn it_ends_at_once_when_its_client_closes_it() {
     until("its environments are free", async || has_room(&server, 4).await).await;
     assert_eq!(not_resumed(server.tcp(), &opened.lease, 3).await.0, Code::NotFound);
     assert!(server.log().contains(r#"ending="closed""#), "{}", server.log());
+}
+
+#[tokio::test]
+async fn a_connection_that_says_nothing_any_more_is_lost_and_not_its_clients_end() {
+    let watched = Watched::start(&["--keepalive-seconds", "1", "--lease-seconds", "60"]);
+    let server = &watched.server;
+    let proxy = Proxy::start(server.port(), |_| usize::MAX);
+    let (mut session, opened, environment) = begin(&format!("http://{}", proxy.address()), 1).await;
+    let actor = session.play(Actor::new(&environment, 4), 0, 3).await;
+    proxy.silence();
+    watched.until("perturb_sessions_detached", 1.0).await;
+    let (mut session, resumed) = resume(server.tcp(), &opened.lease, 3).await;
+    assert_eq!((actor.len(), resumed.last_reply), (3, 3));
+    session.play(Actor::new(&environment, 4), 3, 3).await;
 }
 
 #[tokio::test]
