@@ -72,7 +72,7 @@ endef
 
 .DEFAULT_GOAL := help
 .PHONY: help deps opengl toolchain build install demo all-pairs report-check serve-test test slurm-test kill-test \
-	load-test bounds-test attack-test faults-test asan-test qemu-test slurm-acceptance lint bench fuzz bench-peers \
+	load-test bounds-test attack-test faults-test asan-test qemu-test simulation-test slurm-acceptance lint bench fuzz bench-peers \
 	audit cargo-deny metrics-test otel-test python-test interrupts-test wheel wheel-test python-acceptance \
 	bench-python python-venv docs docs-test docker docker-base docker-test
 
@@ -290,10 +290,16 @@ docker-base:
 		}; \
 	done
 
-# How often `make faults-test` tries and `make interrupts-test` interrupts, and how long `make load-test` steps.
+# How often `make faults-test` tries and `make interrupts-test` interrupts, how long `make load-test` steps, and
+# how many lines `make simulation-test` simulates for each test.
 FAULTS_ROUNDS ?= 5
 INTERRUPTS ?= 1000
 LOAD_SECONDS ?= 300
+SIMULATIONS ?= 50
+
+# A tokio whose clock can be stopped is not what programs have, so that all that stands on it is compiled for this alone.
+simulation-test: deps ## sessions and their leases in simulated time, over a line that is cut at random; minutes to compile
+	PERTURB_SIMULATIONS=$(SIMULATIONS) cargo test --release --locked --package perturb-simulation --features turmoil -- --nocapture
 
 # AddressSanitizer needs a nightly compiler. What the compiler of C makes of the shim is not looked into, but every
 # allocation of MuJoCo's is. Debian's OpenGL in software keeps what it allocated for a thread that draws.

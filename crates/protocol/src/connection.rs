@@ -1,15 +1,20 @@
 //! Making one connection: which machine stands for a name, and whether it takes sessions.
 
+use std::io;
 use std::net::{IpAddr, SocketAddr};
 use std::time::Duration;
 
+use hyper_util::rt::TokioIo;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::time::timeout;
 use tonic::Code;
+use tonic::codegen::http::Uri;
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Channel, Endpoint};
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
 use tonic_health::pb::health_client::HealthClient;
+use tower::service_fn;
 
 use crate::address::Address;
 use crate::credentials::{Credentials, WithToken};
@@ -109,6 +114,24 @@ impl Connection {
             (ClientError::NotPerturb { .. } | ClientError::Connect { .. }, Some(reason)) => refuse(reason),
             (error, _) => error,
         })
+    }
+
+    /// The same, without credentials, by streams that `connect` makes.
+    ///
+    /// # Errors
+    /// [`ClientError::Connect`].
+    pub async fn open_by<C, F, S>(address: &Address, patience: Patience, connect: C) -> Result<Self, ClientError>
+    where
+        C: Fn() -> F + Send + 'static,
+        F: Future<Output = io::Result<S>> + Send + 'static,
+        S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
+    {
+        let connector = service_fn(move |_: Uri| {
+            let stream = connect();
+            async { stream.await.map(TokioIo::new) }
+        });
+        let channel = Self::endpoint(address, patience)?.connect_with_connector(connector).await;
+        Self::opened(address, patience, WithToken(None), channel).await
     }
 
     fn endpoint(address: &Address, patience: Patience) -> Result<Endpoint, ClientError> {

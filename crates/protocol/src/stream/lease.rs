@@ -4,10 +4,10 @@ use std::collections::VecDeque;
 use std::error::Error;
 use std::fmt;
 use std::io::ErrorKind;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bytes::Bytes;
-use tokio::time::sleep;
+use tokio::time::{Instant, sleep};
 use tonic::{Code, Status};
 
 use super::{Ask, Line};

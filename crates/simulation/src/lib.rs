@@ -1,0 +1,155 @@
+//! A server whose sessions count, for clients in a simulation: the transport of sessions and their leases are the real
+//! ones, at both ends, and so is all of gRPC. Time and the network are those of [turmoil](https://docs.rs/turmoil), and
+//! there is no physics, whose threads would be in another time.
+#![cfg(feature = "turmoil")]
+
+mod counting;
+
+use std::io;
+use std::net::Ipv4Addr;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use futures_util::stream;
+use perturb::proto::{self, perturb_server::PerturbServer};
+use perturb::server::access::Access;
+use perturb::server::budget::Budget;
+use perturb::server::conversation::{Limits, Responses, Sessions};
+use perturb::server::drain::Controller;
+use perturb::server::frames::{Frames, Keeping, Transit};
+use perturb::server::leases::{Leases, Numbers};
+use perturb::server::peers::{Guarded, Peer, Places};
+use perturb::server::refusals::Refusals;
+use perturb_protocol::{Address, ClientError, Connection, Patience};
+use tonic::transport::Server;
+use tonic::{Request, Response, Status, Streaming};
+
+use counting::Counting;
+
+/// What the server's machine is called.
+pub const SERVER: &str = "server";
+/// How long a session is held without a stream.
+pub const LEASE: Duration = Duration::from_secs(60);
+
+const PORT: u16 = 7471;
+/// How long either side says nothing before it is asked whether it lives, and how long that may take.
+const KEEPALIVE: Duration = Duration::from_secs(1);
+/// How long a client waits for an answer to its connection.
+const SILENCE: Duration = Duration::from_secs(3);
+const HANDSHAKE: Duration = Duration::from_secs(10);
+const MOST_SESSIONS: usize = 4;
+const MOST_BYTES: usize = 1 << 20;
+
+/// What the server's sessions have done, and what is left of them. Clones see the same.
+#[derive(Clone)]
+pub struct Ledger {
+    /// The steps, in their order.
+    done: Arc<Mutex<Vec<u64>>>,
+    numbers: Numbers,
+    places: Places,
+}
+
+impl Default for Ledger {
+    fn default() -> Self {
+        Self { done: Arc::default(), numbers: Numbers::default(), places: Places::new(MOST_SESSIONS, MOST_SESSIONS) }
+    }
+}
+
+impl Ledger {
+    /// The numbers that clients stepped with, in the order in which the server did the steps.
+    pub fn done(&self) -> Vec<u64> {
+        self.done.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// How often a session was taken up.
+    pub fn resumed(&self) -> u64 {
+        self.numbers.resumed()
+    }
+
+    /// Whether no session is left, with or without a stream.
+    pub fn is_idle(&self) -> bool {
+        self.places.taken() == 0 && self.numbers.detached() == 0
+    }
+
+    fn add(&self, step: u64) {
+        self.done.lock().unwrap_or_else(PoisonError::into_inner).push(step);
+    }
+}
+
+/// Serves on this machine of the simulation, until that ends.
+///
+/// # Errors
+/// If the port is taken, or the transport fails.
+pub async fn serve(ledger: Ledger) -> turmoil::Result {
+    let (_controller, drain) = Controller::new();
+    let budget = Budget::new(MOST_BYTES);
+    let limits = Limits { bytes: MOST_BYTES, handshake: HANDSHAKE, idle: None };
+    let (places, numbers) = (ledger.places.clone(), ledger.numbers.clone());
+    let sessions = Sessions::new(places, limits, drain, Refusals::default(), Access::default(), numbers.clone());
+    let service = Service { sessions, leases: Leases::new(LEASE, numbers), ledger };
+    let transit = Transit { budget, limit: Some(LEASE), handshake: HANDSHAKE };
+    let listener = turmoil::net::TcpListener::bind((Ipv4Addr::UNSPECIFIED, PORT)).await?;
+    let connections = Places::new(usize::MAX, usize::MAX);
+    let incoming = stream::unfold((listener, connections), |(listener, connections)| async {
+        let (stream, address) = listener.accept().await.ok()?;
+        let peer = Peer::at(address.ip());
+        let place = connections.take(Some(peer)).ok()?;
+        let guarded = Guarded::new(stream, peer, place, HANDSHAKE);
+        Some((Ok::<_, io::Error>(guarded), (listener, connections)))
+    });
+    Server::builder()
+        .http2_keepalive_interval(Some(KEEPALIVE))
+        .http2_keepalive_timeout(Some(KEEPALIVE))
+        .add_service(Keeping::new(PerturbServer::new(service), "/perturb.v1.Perturb/Session", transit))
+        .serve_with_incoming(incoming)
+        .await?;
+    Ok(())
+}
+
+/// Connects to the server from another machine of the simulation.
+///
+/// # Errors
+/// [`ClientError::Connect`].
+pub async fn connect() -> Result<Connection, ClientError> {
+    let address = Address::Tcp { host: SERVER.into(), port: PORT, tls: None };
+    let patience = Patience { keepalive_interval: KEEPALIVE, keepalive_limit: KEEPALIVE, ..Patience::default() };
+    Connection::open_by(&address, patience, stream).await
+}
+
+/// A cut line refuses connections at once in the simulation; in the world it says nothing.
+async fn stream() -> io::Result<turmoil::net::TcpStream> {
+    let stream = turmoil::net::TcpStream::connect((SERVER, PORT)).await;
+    if stream.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::ConnectionRefused) {
+        tokio::time::sleep(SILENCE).await;
+        return Err(io::ErrorKind::TimedOut.into());
+    }
+    stream
+}
+
+/// The service of `perturb.v1`, with sessions that count.
+#[derive(Clone)]
+struct Service {
+    sessions: Sessions,
+    leases: Leases<proto::SessionResponse>,
+    ledger: Ledger,
+}
+
+#[tonic::async_trait]
+impl proto::perturb_server::Perturb for Service {
+    type SessionStream = Responses<proto::SessionResponse>;
+
+    async fn list_environments(
+        &self,
+        _: Request<proto::ListEnvironmentsRequest>,
+    ) -> Result<Response<proto::ListEnvironmentsResponse>, Status> {
+        Ok(Response::new(proto::ListEnvironmentsResponse::default()))
+    }
+
+    async fn session(
+        &self,
+        mut request: Request<Streaming<proto::SessionRequest>>,
+    ) -> Result<Response<Self::SessionStream>, Status> {
+        let counting = Counting::new(self.leases.clone(), self.ledger.clone());
+        Ok(Response::new(self.sessions.begin(Frames::of(&mut request)?, counting)?))
+    }
+}
