@@ -165,6 +165,7 @@ lint: deps cargo-deny ## check formatting, clippy, documentation and dependencie
 	cargo fmt --all --check
 	cargo clippy $(ALL) --all-targets -- -D warnings
 	cargo clippy $(WITHOUT_MUJOCO) --all-targets -- -D warnings
+	cargo clippy --release --locked --package perturb-simulation --features turmoil --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc $(ALL) --no-deps --lib
 	cargo deny --locked check bans licenses sources
 

@@ -163,7 +163,7 @@ pub enum Stop {
     Refused(Refusal),
     /// What came is not to be understood, the connection broke, or the server has a defect.
     Broken(Status),
-    /// The client wants no more of it, or something in between.
+    /// The client wants no more of it, or something in between, or nothing comes from there any more.
     Cancelled,
 }
 

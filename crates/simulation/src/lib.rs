@@ -22,7 +22,7 @@ use perturb::server::peers::{Guarded, Peer, Places};
 use perturb::server::refusals::Refusals;
 use perturb_protocol::{Address, ClientError, Connection, Patience};
 use tonic::transport::Server;
-use tonic::{Request, Response, Status, Streaming};
+use tonic::{Code, Request, Response, Status, Streaming};
 
 use counting::Counting;
 
@@ -47,11 +47,13 @@ pub struct Ledger {
     done: Arc<Mutex<Vec<u64>>>,
     numbers: Numbers,
     places: Places,
+    refusals: Refusals,
 }
 
 impl Default for Ledger {
     fn default() -> Self {
-        Self { done: Arc::default(), numbers: Numbers::default(), places: Places::new(MOST_SESSIONS, MOST_SESSIONS) }
+        let places = Places::new(MOST_SESSIONS, MOST_SESSIONS);
+        Self { done: Arc::default(), numbers: Numbers::default(), places, refusals: Refusals::default() }
     }
 }
 
@@ -64,6 +66,12 @@ impl Ledger {
     /// How often a session was taken up.
     pub fn resumed(&self) -> u64 {
         self.numbers.resumed()
+    }
+
+    /// How often a session was asked for that there was not, or no more.
+    pub fn unknown(&self) -> u64 {
+        let counts = self.refusals.counts();
+        counts.iter().filter(|(code, ..)| *code == Code::NotFound).map(|(.., count)| count).sum()
     }
 
     /// Whether no session is left, with or without a stream.
@@ -84,8 +92,8 @@ pub async fn serve(ledger: Ledger) -> turmoil::Result {
     let (_controller, drain) = Controller::new();
     let budget = Budget::new(MOST_BYTES);
     let limits = Limits { bytes: MOST_BYTES, handshake: HANDSHAKE, idle: None };
-    let (places, numbers) = (ledger.places.clone(), ledger.numbers.clone());
-    let sessions = Sessions::new(places, limits, drain, Refusals::default(), Access::default(), numbers.clone());
+    let (places, numbers, refusals) = (ledger.places.clone(), ledger.numbers.clone(), ledger.refusals.clone());
+    let sessions = Sessions::new(places, limits, drain, refusals, Access::default(), numbers.clone());
     let service = Service { sessions, leases: Leases::new(LEASE, numbers), ledger };
     let transit = Transit { budget, limit: Some(LEASE), handshake: HANDSHAKE };
     let listener = turmoil::net::TcpListener::bind((Ipv4Addr::UNSPECIFIED, PORT)).await?;
