@@ -167,6 +167,7 @@ def test_a_defect_of_the_server_costs_the_session(fake: FakeServer) -> None:
         (7, perturb.NotAllowedError),
         (8, perturb.ServerFullError),
         (9, perturb.OutOfOrderError),
+        (14, perturb.ServerUnavailableError),
         (2, perturb.ProtocolError),
     ],
 )

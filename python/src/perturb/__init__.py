@@ -29,6 +29,7 @@ from .errors import (
     ServerFullError,
     ServerStartError,
     ServerTimeoutError,
+    ServerUnavailableError,
     UnknownNameError,
 )
 from .policy import Actor, Policy, load_policy
@@ -64,6 +65,7 @@ __all__ = [
     "ServerFullError",
     "ServerStartError",
     "ServerTimeoutError",
+    "ServerUnavailableError",
     "UnknownNameError",
     "Version",
     "assess",

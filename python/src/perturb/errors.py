@@ -29,6 +29,10 @@ class ServerFullError(PerturbError, RuntimeError):
     """The server has no room for so many environments or sessions."""
 
 
+class ServerUnavailableError(PerturbError, RuntimeError):
+    """The server cannot do it now, and may later: it cannot write down what would be drawn. Nothing has changed."""
+
+
 class RenderError(PerturbError, RuntimeError):
     """The server cannot draw the environment, which is unharmed.
 
@@ -68,6 +72,7 @@ _BY_CODE: dict[int, type[PerturbError]] = {
     8: ServerFullError,
     9: OutOfOrderError,
     13: ServerDefectError,
+    14: ServerUnavailableError,
 }
 
 
