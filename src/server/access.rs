@@ -13,6 +13,15 @@ const MOST_LINES: u64 = 20;
 /// … this time; then one that says how many were left out.
 const WINDOW: Duration = Duration::from_secs(1);
 
+/// How a session ends whose client or connection is gone; …
+pub const GONE: &str = "gone";
+/// … one whose client has ended it; …
+pub const CLOSED: &str = "closed";
+/// … one whose requests were not to be understood; …
+pub const BROKEN: &str = "broken";
+/// … one whose lease is over. The others end with the reason of a refusal.
+pub const LEASE_OVER: &str = "lease_over";
+
 /// What a session came to.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct About {
@@ -55,6 +64,14 @@ struct State {
 }
 
 impl Access {
+    /// Has [`endings`](Self::endings) tell of sessions of this protocol before the first one ends.
+    pub fn tell_of(&self, protocol: &'static str) {
+        let mut state = self.lock();
+        for ending in [GONE, CLOSED, BROKEN, LEASE_OVER] {
+            state.endings.entry((protocol, ending)).or_default();
+        }
+    }
+
     /// Adds a session's end.
     pub fn ended(&self, ended: &Ended<'_>) {
         if !self.has_room(ended.protocol, ended.ending) {

@@ -4,14 +4,14 @@
 mod leased;
 
 use super::{
-    access::{About, Access, Ended},
+    access::{About, Access, BROKEN, CLOSED, Ended, GONE},
     budget::Outbox,
     drain::{Drain, Phase},
     fields::{Decoder, Field, decoded_at_once},
     frames::{Allowance, Frames, Message, Stop},
     leases::{Arrived, Grant, Numbers, One, Ticket},
     peers::{Full, Place, Places},
-    refusals::{self, Refusals},
+    refusals::Refusals,
     status::Refusal,
     tokens::{Bearer, Held, Token},
 };
@@ -204,13 +204,6 @@ impl Sessions {
     }
 }
 
-/// How a session ends whose client or connection is gone.
-const GONE: &str = "gone";
-/// One whose client has ended it.
-const CLOSED: &str = "closed";
-/// One whose requests were not to be understood.
-const BROKEN: &str = "broken";
-
 /// A stream that goes on with another session, and leaves nothing to be told of.
 const MOVED: &str = "moved";
 
@@ -388,7 +381,7 @@ impl<D: Dialogue> Conversation<D> {
             }
             Err(Stop::Refused(refusal)) => {
                 count(&refusal);
-                self.ending = refusals::reason(&refusal);
+                self.ending = refusal.kind().reason();
                 Err(refusal.into())
             }
             Err(Stop::Broken(status)) => {

@@ -119,7 +119,7 @@ pub async fn run(
     let listing = listing(&catalogue, config)?;
     let catalogue = Arc::new(catalogue);
     let pool = Arc::new(Pool::new(config.workers, config.max_envs)?);
-    // Told from the beginning: who watches a rate needs its zero.
+    // Told from the beginning, as are sessions' ends: who watches a rate needs its zero.
     catalogue.names().for_each(|name| _ = pool.meter(name));
     let (controller, drain) = Controller::new();
     let idle = (config.idle_seconds > 0).then(|| Duration::from_secs(config.idle_seconds));
@@ -147,6 +147,7 @@ pub async fn run(
     let shared = Shared { pool: Arc::clone(&pool), catalogue, listing, renderer, ledger, leases };
     let service = Service::new(shared, sessions);
     let requests = [("perturb.v1", service.counts()), ("dm_env_rpc.v1", worlds.counts())];
+    requests.iter().for_each(|(protocol, _)| access.tell_of(protocol));
     let sources = Arc::new(Sources {
         pool: Arc::clone(&pool),
         sessions: places.clone(),

@@ -1,85 +1,167 @@
-//! How many requests and calls were refused, and why.
+//! The kinds of refusals, and how often each happened.
 
 use super::{leases, status::Refusal, tokens::Bearer};
 use crate::{env, pool, render};
-use std::{
-    collections::BTreeMap,
-    sync::{Arc, Mutex, PoisonError},
+use std::sync::{
+    Arc,
+    atomic::{AtomicU64, Ordering},
 };
 use tonic::Code;
 
-/// Refusals since the server began, by their code and [`reason`].
-#[derive(Clone, Default)]
-pub struct Refusals(Arc<Mutex<BTreeMap<(i32, &'static str), u64>>>);
+/// Refusals since the server began, by their kind.
+#[derive(Clone)]
+pub struct Refusals(Arc<[AtomicU64]>);
+
+impl Default for Refusals {
+    fn default() -> Self {
+        Self(Kind::ALL.iter().map(|_| AtomicU64::new(0)).collect())
+    }
+}
 
 impl Refusals {
     /// Adds one, to who has this token.
     pub fn count(&self, refusal: &Refusal, bearer: Option<&Bearer>) {
-        let key = (refusal.code() as i32, reason(refusal));
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner).entry(key).or_default() += 1;
+        self.0[refusal.kind() as usize].fetch_add(1, Ordering::Relaxed);
         if let Some(bearer) = bearer {
             bearer.refused();
         }
     }
 
-    /// Each code and reason that there was, and how often.
-    pub fn counts(&self) -> Vec<(Code, &'static str, u64)> {
-        let counts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        counts.iter().map(|((code, reason), count)| (Code::from_i32(*code), *reason, *count)).collect()
+    /// How often each kind happened, those that never did among them: who watches a counter sees its first event by
+    /// the 0 before.
+    pub fn counts(&self) -> impl Iterator<Item = (Kind, u64)> {
+        Kind::ALL.iter().zip(&*self.0).map(|(kind, count)| (*kind, count.load(Ordering::Relaxed)))
     }
 }
 
-/// The kind of a refusal, of which there are so many as stand here: nothing that a client sent is in it.
-pub fn reason(refusal: &Refusal) -> &'static str {
-    match refusal {
-        Refusal::Environment(error) | Refusal::Pool(pool::Error::Environment(error)) => match error {
-            env::Error::UnknownEnvironment(_) => "unknown_environment",
-            env::Error::UnknownParameter { .. } => "unknown_parameter",
-            env::Error::Snapshot { .. } => "bad_snapshot",
-            env::Error::Model { .. } => "model",
-            _ => "bad_parameter",
-        },
-        Refusal::Pool(pool::Error::Full { .. }) => "environments_full",
-        Refusal::Pool(pool::Error::Ended { .. }) => "episode_ended",
-        Refusal::Pool(pool::Error::Policy(_)) => "bad_policy",
-        Refusal::Pool(pool::Error::Defect) | Refusal::Render(render::Error::Defect) => "defect",
-        Refusal::Render(render::Error::NoThread { .. }) => "no_thread",
-        Refusal::Render(render::Error::Missing { .. }) => "no_opengl",
-        Refusal::Render(render::Error::Failed { .. }) => "drawing_failed",
-        Refusal::Lease(error) => match error {
-            leases::Error::Unknown => "unknown_lease",
-            leases::Error::OtherToken => "other_token",
-            leases::Error::NoReply { .. } => "no_such_reply",
-            leases::Error::Forgotten { .. } => "reply_not_kept",
-            leases::Error::TakenUp => "taken_up",
-        },
-        Refusal::NothingToDraw { .. } => "nothing_to_draw",
-        Refusal::Value { .. } => "bad_value",
-        Refusal::NotOpen { .. } => "not_open",
-        Refusal::AlreadyOpen => "already_open",
-        Refusal::Order { .. } => "wrong_order",
-        Refusal::TooManySessions { .. } => "sessions_full",
-        Refusal::TooManyOfAPeer { .. } => "peer_quota",
-        Refusal::NoToken => "no_token",
-        Refusal::WrongToken => "wrong_token",
-        Refusal::RevokedToken { .. } => "revoked_token",
-        Refusal::TooManyOfAToken { .. } => "token_quota",
-        Refusal::TooFast { .. } => "token_rate",
-        Refusal::NotAllowed { .. } => "role",
-        Refusal::NoLedger { .. } => "no_ledger",
-        Refusal::NoMemory { .. } => "memory_full",
-        Refusal::Unfinished { .. } => "unfinished_message",
-        Refusal::TooLarge { .. } => "too_large",
-        Refusal::Idle { .. } => "idle",
-        Refusal::Draining => "draining",
-        Refusal::Unknown { .. } => "unknown_name",
-        Refusal::NotJoined { .. } => "not_joined",
-        Refusal::AlreadyJoined { .. } => "already_joined",
-        Refusal::Occupied { .. } => "occupied",
-        Refusal::NotYours { .. } => "not_yours",
-        Refusal::Taken { .. } => "name_taken",
-        Refusal::NoRandomness => "no_randomness",
-        Refusal::Forbidden { .. } => "forbidden_property",
-        Refusal::UnknownExtension { .. } => "unknown_extension",
+macro_rules! kinds {
+    ($($kind:ident = $code:ident, $reason:literal;)*) => {
+        /// What kind a refusal is of: nothing that a client sent is in it.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+        #[allow(missing_docs, reason = "each has its word in metrics and logs")]
+        pub enum Kind { $($kind,)* }
+
+        impl Kind {
+            /// All that there are, in the order of their numbers.
+            const ALL: &[Self] = &[$(Self::$kind,)*];
+
+            /// The gRPC code.
+            pub fn code(self) -> Code {
+                match self { $(Self::$kind => Code::$code,)* }
+            }
+
+            /// The word of metrics and logs; no two kinds share it and the code.
+            pub fn reason(self) -> &'static str {
+                match self { $(Self::$kind => $reason,)* }
+            }
+        }
+    };
+}
+
+kinds! {
+    UnknownEnvironment = NotFound, "unknown_environment";
+    UnknownParameter = NotFound, "unknown_parameter";
+    BadSnapshot = InvalidArgument, "bad_snapshot";
+    Model = Internal, "model";
+    BadParameter = InvalidArgument, "bad_parameter";
+    EnvironmentsFull = ResourceExhausted, "environments_full";
+    EpisodeEnded = FailedPrecondition, "episode_ended";
+    BadPolicy = InvalidArgument, "bad_policy";
+    Defect = Internal, "defect";
+    NoThread = ResourceExhausted, "no_thread";
+    NoOpenGl = FailedPrecondition, "no_opengl";
+    DrawingFailed = Internal, "drawing_failed";
+    NothingToDraw = FailedPrecondition, "nothing_to_draw";
+    UnknownLease = NotFound, "unknown_lease";
+    OtherToken = PermissionDenied, "other_token";
+    NoSuchReply = OutOfRange, "no_such_reply";
+    ReplyNotKept = FailedPrecondition, "reply_not_kept";
+    TakenUp = Aborted, "taken_up";
+    BadValue = InvalidArgument, "bad_value";
+    NotOpen = FailedPrecondition, "not_open";
+    AlreadyOpen = FailedPrecondition, "already_open";
+    WrongOrder = FailedPrecondition, "wrong_order";
+    SessionsFull = ResourceExhausted, "sessions_full";
+    PeerQuota = ResourceExhausted, "peer_quota";
+    NoToken = Unauthenticated, "no_token";
+    WrongToken = Unauthenticated, "wrong_token";
+    RevokedToken = Unauthenticated, "revoked_token";
+    // More than the token may ever have, which is not to be tried again, and more than is left.
+    MoreThanTokenQuota = InvalidArgument, "token_quota";
+    TokenQuota = ResourceExhausted, "token_quota";
+    TokenRate = ResourceExhausted, "token_rate";
+    Role = PermissionDenied, "role";
+    NoLedger = Unavailable, "no_ledger";
+    MemoryFull = ResourceExhausted, "memory_full";
+    UnfinishedMessage = DeadlineExceeded, "unfinished_message";
+    TooLarge = OutOfRange, "too_large";
+    Idle = DeadlineExceeded, "idle";
+    Draining = Unavailable, "draining";
+    UnknownName = NotFound, "unknown_name";
+    NotJoined = FailedPrecondition, "not_joined";
+    AlreadyJoined = FailedPrecondition, "already_joined";
+    Occupied = FailedPrecondition, "occupied";
+    NotYours = PermissionDenied, "not_yours";
+    NameTaken = AlreadyExists, "name_taken";
+    NoRandomness = Unavailable, "no_randomness";
+    ForbiddenProperty = PermissionDenied, "forbidden_property";
+    UnknownExtension = Unimplemented, "unknown_extension";
+}
+
+impl Refusal {
+    /// What kind this refusal is of.
+    pub fn kind(&self) -> Kind {
+        match self {
+            Self::Environment(error) | Self::Pool(pool::Error::Environment(error)) => match error {
+                env::Error::UnknownEnvironment(_) => Kind::UnknownEnvironment,
+                env::Error::UnknownParameter { .. } => Kind::UnknownParameter,
+                env::Error::Snapshot { .. } => Kind::BadSnapshot,
+                env::Error::Model { .. } => Kind::Model,
+                _ => Kind::BadParameter,
+            },
+            Self::Pool(pool::Error::Full { .. }) => Kind::EnvironmentsFull,
+            Self::Pool(pool::Error::Ended { .. }) => Kind::EpisodeEnded,
+            Self::Pool(pool::Error::Policy(_)) => Kind::BadPolicy,
+            Self::Pool(pool::Error::Defect) | Self::Render(render::Error::Defect) => Kind::Defect,
+            Self::Render(render::Error::NoThread { .. }) => Kind::NoThread,
+            Self::Render(render::Error::Missing { .. }) => Kind::NoOpenGl,
+            Self::Render(render::Error::Failed { .. }) => Kind::DrawingFailed,
+            Self::NothingToDraw { .. } => Kind::NothingToDraw,
+            Self::Lease(error) => match error {
+                leases::Error::Unknown => Kind::UnknownLease,
+                leases::Error::OtherToken => Kind::OtherToken,
+                leases::Error::NoReply { .. } => Kind::NoSuchReply,
+                leases::Error::Forgotten { .. } => Kind::ReplyNotKept,
+                leases::Error::TakenUp => Kind::TakenUp,
+            },
+            Self::Value { .. } => Kind::BadValue,
+            Self::NotOpen { .. } => Kind::NotOpen,
+            Self::AlreadyOpen => Kind::AlreadyOpen,
+            Self::Order { .. } => Kind::WrongOrder,
+            Self::TooManySessions { .. } => Kind::SessionsFull,
+            Self::TooManyOfAPeer { .. } => Kind::PeerQuota,
+            Self::NoToken => Kind::NoToken,
+            Self::WrongToken => Kind::WrongToken,
+            Self::RevokedToken { .. } => Kind::RevokedToken,
+            Self::TooManyOfAToken { wanted, limit, .. } if wanted > limit => Kind::MoreThanTokenQuota,
+            Self::TooManyOfAToken { .. } => Kind::TokenQuota,
+            Self::TooFast { .. } => Kind::TokenRate,
+            Self::NotAllowed { .. } => Kind::Role,
+            Self::NoLedger { .. } => Kind::NoLedger,
+            Self::NoMemory { .. } => Kind::MemoryFull,
+            Self::Unfinished { .. } => Kind::UnfinishedMessage,
+            Self::TooLarge { .. } => Kind::TooLarge,
+            Self::Idle { .. } => Kind::Idle,
+            Self::Draining => Kind::Draining,
+            Self::Unknown { .. } => Kind::UnknownName,
+            Self::NotJoined { .. } => Kind::NotJoined,
+            Self::AlreadyJoined { .. } => Kind::AlreadyJoined,
+            Self::Occupied { .. } => Kind::Occupied,
+            Self::NotYours { .. } => Kind::NotYours,
+            Self::Taken { .. } => Kind::NameTaken,
+            Self::NoRandomness => Kind::NoRandomness,
+            Self::Forbidden { .. } => Kind::ForbiddenProperty,
+            Self::UnknownExtension { .. } => Kind::UnknownExtension,
+        }
     }
 }

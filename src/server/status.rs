@@ -1,4 +1,4 @@
-//! Every refusal, and the only place that turns one into a gRPC code.
+//! Every refusal, and how a client is told of it; [`refusals`](super::refusals) has the code of each.
 
 use super::leases;
 use crate::{env, pool, proto, render};
@@ -250,49 +250,7 @@ impl Refusal {
 
     /// The gRPC code of this refusal.
     pub fn code(&self) -> Code {
-        match self {
-            Self::Environment(error) | Self::Pool(pool::Error::Environment(error)) => match error {
-                env::Error::UnknownEnvironment(_) | env::Error::UnknownParameter { .. } => Code::NotFound,
-                env::Error::Model { .. } => Code::Internal,
-                _ => Code::InvalidArgument,
-            },
-            Self::Pool(pool::Error::Full { .. })
-            | Self::TooManySessions { .. }
-            | Self::TooManyOfAPeer { .. }
-            | Self::NoMemory { .. }
-            | Self::Render(render::Error::NoThread { .. }) => Code::ResourceExhausted,
-            // What is more than it may ever have is not to be tried again.
-            Self::TooManyOfAToken { wanted, limit, .. } if wanted > limit => Code::InvalidArgument,
-            Self::TooManyOfAToken { .. } | Self::TooFast { .. } => Code::ResourceExhausted,
-            Self::Pool(pool::Error::Ended { .. })
-            | Self::NotOpen { .. }
-            | Self::AlreadyOpen
-            | Self::Order { .. }
-            | Self::Render(render::Error::Missing { .. })
-            | Self::NothingToDraw { .. } => Code::FailedPrecondition,
-            Self::Pool(pool::Error::Policy(_)) => Code::InvalidArgument,
-            Self::Pool(pool::Error::Defect) | Self::Render(render::Error::Failed { .. } | render::Error::Defect) => {
-                Code::Internal
-            }
-            Self::NotJoined { .. } | Self::AlreadyJoined { .. } | Self::Occupied { .. } => Code::FailedPrecondition,
-            Self::Value { .. } => Code::InvalidArgument,
-            Self::TooLarge { .. } => Code::OutOfRange,
-            Self::Idle { .. } | Self::Unfinished { .. } => Code::DeadlineExceeded,
-            Self::Lease(error) => match error {
-                leases::Error::Unknown => Code::NotFound,
-                leases::Error::OtherToken => Code::PermissionDenied,
-                leases::Error::NoReply { .. } => Code::OutOfRange,
-                leases::Error::Forgotten { .. } => Code::FailedPrecondition,
-                leases::Error::TakenUp => Code::Aborted,
-            },
-            Self::NoToken | Self::WrongToken | Self::RevokedToken { .. } => Code::Unauthenticated,
-            Self::Draining => Code::Unavailable,
-            Self::Unknown { .. } => Code::NotFound,
-            Self::Forbidden { .. } | Self::NotYours { .. } | Self::NotAllowed { .. } => Code::PermissionDenied,
-            Self::Taken { .. } => Code::AlreadyExists,
-            Self::NoRandomness | Self::NoLedger { .. } => Code::Unavailable,
-            Self::UnknownExtension { .. } => Code::Unimplemented,
-        }
+        self.kind().code()
     }
 }
 

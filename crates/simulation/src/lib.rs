@@ -19,10 +19,10 @@ use perturb::server::drain::Controller;
 use perturb::server::frames::{Frames, Keeping, Transit};
 use perturb::server::leases::{Leases, Numbers};
 use perturb::server::peers::{Guarded, Peer, Places};
-use perturb::server::refusals::Refusals;
+use perturb::server::refusals::{Kind, Refusals};
 use perturb_protocol::{Address, ClientError, Connection, Patience};
 use tonic::transport::Server;
-use tonic::{Code, Request, Response, Status, Streaming};
+use tonic::{Request, Response, Status, Streaming};
 
 use counting::Counting;
 
@@ -70,8 +70,7 @@ impl Ledger {
 
     /// How often a session was asked for that there was not, or no more.
     pub fn unknown(&self) -> u64 {
-        let counts = self.refusals.counts();
-        counts.iter().filter(|(code, ..)| *code == Code::NotFound).map(|(.., count)| count).sum()
+        self.refusals.counts().filter(|(kind, _)| *kind == Kind::UnknownLease).map(|(_, count)| count).sum()
     }
 
     /// Whether no session is left, with or without a stream.

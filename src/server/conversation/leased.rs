@@ -1,12 +1,12 @@
 //! A conversation with a lease: a task of its own, which streams come to and are lost from. What was asked for is done
 //! whether or not anybody waits for it, and the last replies are kept.
 
-use super::{Conversation, Dialogue, GONE, Line, revoked};
+use super::{Conversation, Dialogue, Line, revoked};
 use crate::server::{
+    access::{CLOSED, GONE, LEASE_OVER},
     budget::{Outbox, Share},
     frames::Stop,
     leases::{self, Arrived, Ask, Grant, Ticket, kept::Kept},
-    refusals,
     status::Refusal,
 };
 use prost::Message;
@@ -16,8 +16,6 @@ use tokio::{
 };
 use tonic::Status;
 
-/// How a session ends whose lease is over.
-const OVER: &str = "lease_over";
 /// The most bytes that the replies of one session keep, unless the last one alone has more: a client that has not heard of
 /// that much is better off with a snapshot.
 const MOST_KEPT: usize = 4 << 20;
@@ -110,7 +108,7 @@ impl<D: Dialogue> Leased<D> {
                         }
                     }
                     Ok(None) => {
-                        self.conversation.ending = super::CLOSED;
+                        self.conversation.ending = CLOSED;
                         return None;
                     }
                     Err(stop) => return self.stopped(line, stop),
@@ -129,8 +127,8 @@ impl<D: Dialogue> Leased<D> {
             let Self { conversation, grant, .. } = self;
             let ending = tokio::select! {
                 biased;
-                () = conversation.sessions.drain.draining() => refusals::reason(&Refusal::Draining),
-                refusal = revoked(bearer.as_ref()) => refusals::reason(&refusal),
+                () = conversation.sessions.drain.draining() => Refusal::Draining.kind().reason(),
+                refusal = revoked(bearer.as_ref()) => refusal.kind().reason(),
                 arrived = arrival(&mut coming) => {
                     coming = None;
                     match arrived {
@@ -149,7 +147,7 @@ impl<D: Dialogue> Leased<D> {
                     coming = self.agree(ask).or(coming);
                     continue;
                 }
-                () = sleep_until(over) => OVER,
+                () = sleep_until(over) => LEASE_OVER,
             };
             self.conversation.ending = ending;
             return None;

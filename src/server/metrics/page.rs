@@ -84,8 +84,7 @@ impl Numbers {
             })
         });
         page.counters("perturb_requests", "Requests of sessions that were answered", each)?;
-        let counts = refusals.counts();
-        let named: Vec<_> = counts.iter().map(|(code, reason, count)| (written(*code), *reason, *count)).collect();
+        let named: Vec<_> = refusals.counts().map(|(kind, n)| (written(kind.code()), kind.reason(), n)).collect();
         let each = named.iter().map(|(code, reason, n)| ([("code", code.as_str()), ("reason", reason)], *n as f64));
         page.counters("perturb_refusals", "Requests, calls and sessions that were refused or ended, by reason", each)?;
         let endings = access.endings();

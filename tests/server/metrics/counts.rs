@@ -7,7 +7,7 @@ use crate::{
     dm_env_rpc::client::{self as worlds, Agent},
 };
 use perturb::proto::{Open, act::Task, dm_env_rpc::v1::environment_client::EnvironmentClient};
-use std::path::Path;
+use std::{collections::HashSet, path::Path};
 use tonic::Code;
 
 const ANN: &str = "correct-horse-battery";
@@ -111,6 +111,27 @@ async fn the_other_protocol_is_counted_too() {
     agent.close();
     agent.end().await;
     watched.until(r#"perturb_sessions_ended_total{protocol="dm_env_rpc.v1",ending="closed"}"#, 1.0).await;
+}
+
+#[tokio::test]
+async fn what_may_happen_is_told_before_it_does() {
+    // A rate is of two numbers: without the 0 before, nobody sees the first event of its kind.
+    const ALREADY_OPEN: &str = r#"perturb_refusals_total{code="FAILED_PRECONDITION",reason="already_open"}"#;
+    let watched = Watched::start(&[]);
+    let page = watched.page();
+    let refusals: Vec<_> = page.text.lines().filter(|line| line.starts_with("perturb_refusals_total{")).collect();
+    assert!(refusals.len() > 40 && refusals.iter().all(|line| line.ends_with(" 0.0")), "{refusals:#?}");
+    let names: HashSet<_> = refusals.iter().collect();
+    assert_eq!(names.len(), refusals.len(), "a series is there once: {refusals:#?}");
+    for protocol in ["perturb.v1", "dm_env_rpc.v1"] {
+        for ending in ["closed", "gone", "broken", "lease_over"] {
+            let series = format!("perturb_sessions_ended_total{{protocol=\"{protocol}\",ending=\"{ending}\"}}");
+            assert_eq!(page.number(&series), 0.0, "{series}");
+        }
+    }
+    let (mut session, _) = Session::open(watched.server.tcp(), open("CartPole", 1, 1)).await;
+    session.refused(open("CartPole", 1, 1)).await;
+    assert_eq!(watched.page().number(ALREADY_OPEN), page.number(ALREADY_OPEN) + 1.0);
 }
 
 #[tokio::test]
