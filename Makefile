@@ -306,7 +306,7 @@ simulation-test: deps ## sessions and their leases in simulated time, over a lin
 # allocation of MuJoCo's is. Debian's OpenGL in software keeps what it allocated for a thread that draws.
 asan-test: deps opengl ## run crates/mujoco's tests under AddressSanitizer; nightly Rust
 	@cargo +nightly --version >/dev/null || { echo "a nightly toolchain is missing: rustup toolchain install nightly" >&2; exit 1; }
-	RUSTFLAGS=-Zsanitizer=address LSAN_OPTIONS=suppressions=$(abspath fuzz/leaks.txt) \
+	RUSTFLAGS=-Zsanitizer=address RUSTDOCFLAGS=-Zsanitizer=address LSAN_OPTIONS=suppressions=$(abspath fuzz/leaks.txt) \
 		cargo +nightly test --package perturb-mujoco --locked --target $$(rustc -vV | sed -n 's/^host: //p') --target-dir $(TARGET)/asan
 
 # Seconds for each of eight targets, and what is mutated from one time to the next. Inputs are short, for speed, but for

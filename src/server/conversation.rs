@@ -372,16 +372,14 @@ impl<D: Dialogue> Conversation<D> {
         if self.was_open || self.dialogue.is_open() {
             self.known_open = Instant::now();
         }
-        let count = |refusal: &Refusal| self.sessions.refusals.count(refusal, self.requests.bearer.as_ref());
         match answer {
             Ok(Ok(response)) => Ok(response),
             Ok(Err(refusal)) => {
-                count(&refusal);
+                self.count(&refusal);
                 Ok(D::refusal(refusal))
             }
             Err(Stop::Refused(refusal)) => {
-                count(&refusal);
-                self.ending = refusal.kind().reason();
+                self.end_by(&refusal);
                 Err(refusal.into())
             }
             Err(Stop::Broken(status)) => {
@@ -393,6 +391,16 @@ impl<D: Dialogue> Conversation<D> {
                 Err(Status::cancelled("the client has cancelled the stream"))
             }
         }
+    }
+
+    fn count(&self, refusal: &Refusal) {
+        self.sessions.refusals.count(refusal, self.requests.bearer.as_ref());
+    }
+
+    /// The server ends it.
+    fn end_by(&mut self, refusal: &Refusal) {
+        self.count(refusal);
+        self.ending = refusal.kind().reason();
     }
 
     fn undecoded(&self, refusal: Refusal) -> Result<D::Response, Refusal> {

@@ -119,7 +119,7 @@ pub async fn run(
     let listing = listing(&catalogue, config)?;
     let catalogue = Arc::new(catalogue);
     let pool = Arc::new(Pool::new(config.workers, config.max_envs)?);
-    // Told from the beginning, as are sessions' ends: who watches a rate needs its zero.
+    // Told from the beginning, as are refusals and ends of sessions: who watches a rate needs its zero.
     catalogue.names().for_each(|name| _ = pool.meter(name));
     let (controller, drain) = Controller::new();
     let idle = (config.idle_seconds > 0).then(|| Duration::from_secs(config.idle_seconds));

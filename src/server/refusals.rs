@@ -165,3 +165,26 @@ impl Refusal {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::HashSet;
+
+    #[test]
+    fn no_two_kinds_share_code_and_reason() {
+        let kinds: HashSet<_> = Kind::ALL.iter().map(|kind| (kind.code() as i32, kind.reason())).collect();
+        assert_eq!(kinds.len(), Kind::ALL.len());
+    }
+
+    #[test]
+    fn kinds_are_counted_by_themselves() {
+        let refusals = Refusals::default();
+        let of_a_token = |wanted| Refusal::TooManyOfAToken { name: "ann".into(), wanted, limit: 4, what: "sessions" };
+        for refusal in [of_a_token(5), of_a_token(1), of_a_token(4), Refusal::NoToken] {
+            refusals.count(&refusal, None);
+        }
+        let counted: Vec<_> = refusals.counts().filter(|(_, count)| *count > 0).collect();
+        assert_eq!(counted, [(Kind::NoToken, 1), (Kind::MoreThanTokenQuota, 1), (Kind::TokenQuota, 2)]);
+    }
+}

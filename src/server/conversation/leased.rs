@@ -125,10 +125,10 @@ impl<D: Dialogue> Leased<D> {
         let bearer = self.conversation.requests.bearer.clone();
         loop {
             let Self { conversation, grant, .. } = self;
-            let ending = tokio::select! {
+            let refusal = tokio::select! {
                 biased;
-                () = conversation.sessions.drain.draining() => Refusal::Draining.kind().reason(),
-                refusal = revoked(bearer.as_ref()) => refusal.kind().reason(),
+                () = conversation.sessions.drain.draining() => Some(Refusal::Draining),
+                refusal = revoked(bearer.as_ref()) => Some(refusal),
                 arrived = arrival(&mut coming) => {
                     coming = None;
                     match arrived {
@@ -147,9 +147,12 @@ impl<D: Dialogue> Leased<D> {
                     coming = self.agree(ask).or(coming);
                     continue;
                 }
-                () = sleep_until(over) => LEASE_OVER,
+                () = sleep_until(over) => None,
             };
-            self.conversation.ending = ending;
+            match refusal {
+                Some(refusal) => self.conversation.end_by(&refusal),
+                None => self.conversation.ending = LEASE_OVER,
+            }
             return None;
         }
     }

@@ -37,7 +37,8 @@ async fn a_session_is_taken_up_by_the_token_that_opened_it_and_its_quota_is_kept
     let file = directory.path().join("tokens.toml");
     let entry = |name, token| format!("[[token]]\nname = \"{name}\"\ntoken = \"{token}\"\nmax_sessions = 1\n");
     std::fs::write(&file, entry("ann", ANN) + &entry("bob", BOB)).unwrap();
-    let server = Server::start(&["--tokens", file.to_str().unwrap()]);
+    let watched = Watched::start(&["--tokens", file.to_str().unwrap()]);
+    let server = &watched.server;
     let mut connection = client(server.tcp()).await;
     let mut session = Session::show(&mut connection, Some(ANN)).await.unwrap();
     let opened = session.ask(leased(1)).await;
@@ -53,6 +54,7 @@ async fn a_session_is_taken_up_by_the_token_that_opened_it_and_its_quota_is_kept
     // Without a stream, too, it ends with its token.
     std::fs::write(&file, entry("bob", BOB)).unwrap();
     until("it has ended", async || server.log().contains(r#"ending="revoked_token""#)).await;
+    watched.until(r#"perturb_refusals_total{code="UNAUTHENTICATED",reason="revoked_token"}"#, 1.0).await;
 }
 
 #[tokio::test]

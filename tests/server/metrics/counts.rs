@@ -7,7 +7,7 @@ use crate::{
     dm_env_rpc::client::{self as worlds, Agent},
 };
 use perturb::proto::{Open, act::Task, dm_env_rpc::v1::environment_client::EnvironmentClient};
-use std::{collections::HashSet, path::Path};
+use std::path::Path;
 use tonic::Code;
 
 const ANN: &str = "correct-horse-battery";
@@ -120,13 +120,12 @@ async fn what_may_happen_is_told_before_it_does() {
     let watched = Watched::start(&[]);
     let page = watched.page();
     let refusals: Vec<_> = page.text.lines().filter(|line| line.starts_with("perturb_refusals_total{")).collect();
-    assert!(refusals.len() > 40 && refusals.iter().all(|line| line.ends_with(" 0.0")), "{refusals:#?}");
-    let names: HashSet<_> = refusals.iter().collect();
-    assert_eq!(names.len(), refusals.len(), "a series is there once: {refusals:#?}");
+    assert!(refusals.len() > 40, "docs/operations.md says some forty: {refusals:#?}");
+    assert!(refusals.iter().all(|line| line.ends_with(" 0.0")), "{refusals:#?}");
     for protocol in ["perturb.v1", "dm_env_rpc.v1"] {
         for ending in ["closed", "gone", "broken", "lease_over"] {
             let series = format!("perturb_sessions_ended_total{{protocol=\"{protocol}\",ending=\"{ending}\"}}");
-            assert_eq!(page.number(&series), 0.0, "{series}");
+            assert!(page.tells(&series) && page.number(&series) == 0.0, "{series} in\n{}", page.text);
         }
     }
     let (mut session, _) = Session::open(watched.server.tcp(), open("CartPole", 1, 1)).await;
