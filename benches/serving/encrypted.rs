@@ -12,12 +12,10 @@ use perturb_protocol::{Address, Connection, Patience, credentials::Credentials};
 pub(crate) async fn stepped(batch: usize) -> Result<(), Failure> {
     const TRIPS: usize = 400;
     let directory = tempfile::tempdir()?;
-    let authority = Authority::new("the bench's authority");
-    let known = authority.file(directory.path(), "ca.pem");
-    let Pair { cert, key } = authority.issue(directory.path(), "server", &["127.0.0.1"], 2200);
+    let Pair { cert, key } = Authority::new("bench").issue(directory.path(), "server", &["127.0.0.1"], 2200);
     let (plain, encrypted) = (Process::tcp(&[])?, Process::tcp(&[("--tls-cert", &cert), ("--tls-key", &key)])?);
     let mut bare = Client::on(&connected(&plain.address, Credentials::default()).await?, "CartPole", batch).await?;
-    let credentials = Credentials::knowing(&known)?;
+    let credentials = Credentials::knowing(&cert)?;
     let mut hidden = Client::on(&connected(&encrypted.address, credentials).await?, "CartPole", batch).await?;
     let (mut plains, mut ratios) = (Vec::new(), Vec::new());
     for _ in 0..ROUNDS {
