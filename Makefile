@@ -72,8 +72,8 @@ endef
 
 .DEFAULT_GOAL := help
 .PHONY: help deps opengl toolchain build install demo all-pairs report-check serve-test test slurm-test kill-test \
-	load-test bounds-test attack-test faults-test asan-test qemu-test simulation-test slurm-acceptance lint bench fuzz bench-peers \
-	audit cargo-deny metrics-test otel-test python-test interrupts-test wheel wheel-test python-acceptance \
+	load-test bounds-test attack-test faults-test asan-test qemu-test simulation-test slurm-acceptance lint bench fuzz fuzz-keep \
+	bench-peers audit cargo-deny metrics-test otel-test python-test interrupts-test wheel wheel-test python-acceptance \
 	bench-python python-venv docs docs-test docker docker-base docker-test
 
 help: ## this list
@@ -313,6 +313,9 @@ asan-test: deps opengl ## run crates/mujoco's tests under AddressSanitizer; nigh
 # recorded episodes, whose seed is a whole file.
 FUZZ_SECONDS ?= 38
 FUZZ = $(TARGET)/fuzz-corpus
+FUZZ_RUN = LSAN_OPTIONS=suppressions=$(abspath fuzz/leaks.txt) cargo +nightly fuzz run --fuzz-dir fuzz \
+	--target-dir $(TARGET)/fuzz --features libfuzzer
+FUZZ_BOUNDS = -timeout=60 -rss_limit_mb=4096
 FUZZ_TARGETS = requests snapshots worlds connections checkpoints records plans ledgers
 fuzz: deps ## attack the server and the readers of files with mutated bytes, under AddressSanitizer; five minutes, nightly Rust
 	@cargo +nightly --version >/dev/null || { echo "a nightly toolchain is missing: rustup toolchain install nightly" >&2; exit 1; }
@@ -321,8 +324,14 @@ fuzz: deps ## attack the server and the readers of files with mutated bytes, und
 	@set -e; for target in $(FUZZ_TARGETS); do \
 		mkdir -p fuzz/corpus/$$target; \
 		case $$target in records) longest=200000;; *) longest=65536;; esac; \
-		LSAN_OPTIONS=suppressions=$(abspath fuzz/leaks.txt) cargo +nightly fuzz run --fuzz-dir fuzz --target-dir $(TARGET)/fuzz --features libfuzzer $$target $(FUZZ)/$$target fuzz/corpus/$$target -- \
-			-max_total_time=$(FUZZ_SECONDS) -timeout=60 -rss_limit_mb=4096 -max_len=$$longest -print_final_stats=1; \
+		$(FUZZ_RUN) $$target $(FUZZ)/$$target fuzz/corpus/$$target -- \
+			-max_total_time=$(FUZZ_SECONDS) $(FUZZ_BOUNDS) -max_len=$$longest -print_final_stats=1; \
+	done
+
+fuzz-keep: ## keep, of what fuzz found that clients may send, as few inputs in fuzz/corpus as cover what those there do not
+	@set -e; for target in requests snapshots worlds connections; do \
+		$(FUZZ_RUN) $$target fuzz/corpus/$$target $(FUZZ)/$$target -- \
+			-set_cover_merge=1 $(FUZZ_BOUNDS) -max_len=4096; \
 	done
 
 attack-test: export PERTURB_FUZZ_MOST_GROWN_MB = 20
