@@ -33,7 +33,7 @@ pub const LEASE: Duration = Duration::from_secs(60);
 
 const PORT: u16 = 7471;
 /// How long either side says nothing before it is asked whether it lives, and how long that may take.
-const KEEPALIVE: Duration = Duration::from_secs(1);
+pub const KEEPALIVE: Duration = Duration::from_secs(1);
 /// How long a client waits for an answer to its connection.
 const SILENCE: Duration = Duration::from_secs(3);
 const HANDSHAKE: Duration = Duration::from_secs(10);
