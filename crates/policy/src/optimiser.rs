@@ -64,11 +64,11 @@ impl Optimiser {
         Optimiser::Adam(Adam { epsilon: epsilon as f32, mean, mean_square })
     }
 
-    /// One step on `weights` `[P]` against `scale` times `gradient` `[P]`; `update` counts the steps before this one.
-    fn step(&mut self, update: u64, learning_rate: f64, weights: &mut [f32], gradient: &[f32], scale: f32) {
+    /// One step on `weights` `[P]` against a gradient; `update` counts the steps before this one.
+    fn step(&mut self, update: u64, step: Step<'_>) {
         match self {
-            Optimiser::RmsProp(state) => run(RmsPropStep { state, learning_rate, weights, gradient, scale }),
-            Optimiser::Adam(state) => run(AdamStep { state, update, learning_rate, weights, gradient, scale }),
+            Optimiser::RmsProp(state) => run(RmsPropStep { state, step }),
+            Optimiser::Adam(state) => run(AdamStep { state, update, step }),
         }
     }
 
@@ -97,23 +97,34 @@ impl Optimiser {
     }
 }
 
+/// What both optimisers need of a step.
+struct Step<'a> {
+    learning_rate: f64,
+    /// `[P]`
+    weights: &'a mut [f32],
+    /// `[P]`
+    gradient: &'a [f32],
+    /// What clipping leaves of the gradient, 0 … 1.
+    scale: f32,
+    /// What decay leaves of each weight, 0 … 1.
+    keep: f32,
+}
+
 struct RmsPropStep<'a> {
     state: &'a mut RmsProp,
-    learning_rate: f64,
-    weights: &'a mut [f32],
-    gradient: &'a [f32],
-    scale: f32,
+    step: Step<'a>,
 }
 
 impl Kernel for RmsPropStep<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
         let RmsProp { alpha, epsilon, mean_square } = self.state;
-        let (alpha, epsilon, learning_rate) = (*alpha, *epsilon, self.learning_rate as f32);
-        for ((w, s), g) in self.weights.iter_mut().zip(mean_square).zip(self.gradient) {
-            let g = self.scale * g;
+        let Step { learning_rate, weights, gradient, scale, keep } = self.step;
+        let (alpha, epsilon, learning_rate) = (*alpha, *epsilon, learning_rate as f32);
+        for ((w, s), g) in weights.iter_mut().zip(mean_square).zip(gradient) {
+            let g = scale * g;
             *s = alpha * *s + (1.0 - alpha) * g * g;
-            *w -= learning_rate * g / (*s + epsilon).sqrt();
+            *w = keep * *w - learning_rate * g / (*s + epsilon).sqrt();
         }
     }
 }
@@ -121,43 +132,53 @@ impl Kernel for RmsPropStep<'_> {
 struct AdamStep<'a> {
     state: &'a mut Adam,
     update: u64,
-    learning_rate: f64,
-    weights: &'a mut [f32],
-    gradient: &'a [f32],
-    scale: f32,
+    step: Step<'a>,
 }
 
 impl Kernel for AdamStep<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
+        let Step { learning_rate, weights, gradient, scale, keep } = self.step;
         let t = (self.update + 1) as f64;
-        let step_size = (self.learning_rate / (1.0 - libm::pow(BETA_1, t))) as f32;
+        let step_size = (learning_rate / (1.0 - libm::pow(BETA_1, t))) as f32;
         let root_correction = (1.0 / (1.0 - libm::pow(BETA_2, t)).sqrt()) as f32;
         let (beta_1, rest_1) = (BETA_1 as f32, (1.0 - BETA_1) as f32);
         let (beta_2, rest_2) = (BETA_2 as f32, (1.0 - BETA_2) as f32);
         let Adam { epsilon, mean, mean_square } = self.state;
         let epsilon = *epsilon;
-        for ((w, (m, v)), g) in self.weights.iter_mut().zip(mean.iter_mut().zip(mean_square)).zip(self.gradient) {
-            let g = self.scale * g;
+        for ((w, (m, v)), g) in weights.iter_mut().zip(mean.iter_mut().zip(mean_square)).zip(gradient) {
+            let g = scale * g;
             *m = beta_1 * *m + rest_1 * g;
             *v = beta_2 * *v + rest_2 * g * g;
-            *w -= step_size * *m / (v.sqrt() * root_correction + epsilon);
+            *w = keep * *w - step_size * *m / (v.sqrt() * root_correction + epsilon);
         }
     }
 }
 
-/// Takes gradient steps: clipping by global norm, then the optimiser.
+/// Takes gradient steps: clipping by global norm, then the optimiser, and beside it the decay of all weights,
+///
+/// w_i ← (1 - η λ) w_i - the optimiser's step,
+///
+/// Loshchilov and Hutter (2019), arXiv:1711.05101, as libtorch's AdamW: what the optimiser divides gradients by does not
+/// divide the decay.
 #[derive(Clone, Debug)]
 pub struct Descent {
     optimiser: Optimiser,
     max_grad_norm: f64,
+    weight_decay: f64,
     n_updates: u64,
 }
 
 impl Descent {
-    /// Fresh; gradients longer than `max_grad_norm` are scaled down to it.
+    /// Fresh; gradients longer than `max_grad_norm` are scaled down to it, and no weight decays.
     pub fn new(optimiser: Optimiser, max_grad_norm: f64) -> Self {
-        Descent { optimiser, max_grad_norm, n_updates: 0 }
+        Descent { optimiser, max_grad_norm, weight_decay: 0.0, n_updates: 0 }
+    }
+
+    /// The same with a decay λ = `weight_decay`, at least 0.
+    #[must_use]
+    pub fn decaying(self, weight_decay: f64) -> Self {
+        Descent { weight_decay, ..self }
     }
 
     /// Gradient steps so far.
@@ -181,7 +202,8 @@ impl Descent {
         run(Norm { gradient, norm: &mut norm });
         self.check_finite("the norm of the gradient", norm)?;
         let scale = if norm > self.max_grad_norm { (self.max_grad_norm / norm) as f32 } else { 1.0 };
-        self.optimiser.step(self.n_updates, learning_rate, weights, gradient, scale);
+        let keep = (1.0 - learning_rate * self.weight_decay) as f32;
+        self.optimiser.step(self.n_updates, Step { learning_rate, weights, gradient, scale, keep });
         self.n_updates += 1;
         Ok(norm)
     }
@@ -252,7 +274,7 @@ mod tests {
         for (largest, scale) in [(0.5, 0.1), (5.0, 1.0), (10.0, 1.0)] {
             let step = |largest, gradient: [f32; 3]| {
                 // With α 0 and a large ε a step is the gradient over 1000, but for ε's share.
-                let mut descent = Descent::new(Optimiser::rms_prop(0.0, 1e6, 3), largest);
+                let mut descent = Descent::new(Optimiser::rms_prop(0.0, 1e6, 3), largest).decaying(0.25);
                 let mut weights = WEIGHTS;
                 (descent.step(1.0, &gradient, &mut weights, 1.0).expect("a step"), weights)
             };
@@ -271,9 +293,14 @@ mod tests {
             let numbers = cases["optimisers"][name].as_array().expect("an array");
             numbers.iter().map(|x| x.as_f64().expect("a number") as f32).collect()
         };
-        for (optimiser, name) in [(Optimiser::adam(0.25, 3), "adam"), (Optimiser::rms_prop(0.99, 0.25, 3), "rms_prop")]
-        {
-            let mut descent = Descent::new(optimiser, f64::INFINITY);
+        let (adam, rms_prop) = (|| Optimiser::adam(0.25, 3), || Optimiser::rms_prop(0.99, 0.25, 3));
+        for (optimiser, weight_decay, name) in [
+            (adam(), 0.0, "adam"),
+            (rms_prop(), 0.0, "rms_prop"),
+            (adam(), 5.0, "adam_decaying"),
+            (rms_prop(), 5.0, "rms_prop_decaying"),
+        ] {
+            let mut descent = Descent::new(optimiser, f64::INFINITY).decaying(weight_decay);
             let mut weights = numbers("weights");
             for gradient in numbers("gradients").chunks_exact(3) {
                 descent.step(1.0, gradient, &mut weights, 0.01).expect("a step");

@@ -7,7 +7,7 @@ use crate::differentiator::Differentiator;
 use crate::error::{Result, check_length};
 use crate::inputs::Inputs;
 use crate::normalisers::{Normalisers, Statistics};
-use crate::random::{Purpose, stream, trial_stream};
+use crate::random::{Purpose, normal, stream, trial_stream};
 use crate::spec::PolicySpec;
 use crate::task::Task;
 
@@ -19,7 +19,8 @@ use crate::task::Task;
 /// (RL²) the policy's inputs tell it of the ends in between, and to whoever learns the trial is one episode: flags of
 /// ends in between are left out, and the discounted returns that rewards are divided by run on.
 ///
-/// Final observations are normalised with the statistics that have taken in the observations after them.
+/// Final observations are normalised with the statistics that have taken in the observations after them. Noise is on what
+/// actions are chosen on alone: neither on final observations nor in statistics.
 #[derive(Clone, Debug)]
 pub struct Player {
     actor: Actor,
@@ -28,6 +29,8 @@ pub struct Player {
     normalisers: Normalisers,
     observation_size: usize,
     episodes_per_trial: u32,
+    /// Standard deviation of what is added to observations in training, after normalisation.
+    noise: f64,
     /// `[N, O]` normalised observations that the next actions are chosen on.
     observations: Vec<f32>,
     /// `[N]` whether those are the first of a trial.
@@ -44,7 +47,7 @@ pub struct Player {
 #[derive(Clone, Debug)]
 #[allow(clippy::large_enum_variant)] // a player has one, and its stream is read at every action
 pub enum Role {
-    /// Statistics run, and one stream gives all actions, in the environments' order.
+    /// Statistics run, and one stream gives all noise and all actions, in the environments' order.
     Training(ChaCha8Rng),
     /// Statistics are frozen, and each trial has a stream of its own, see [`trial_stream`].
     Testing(TrialStreams),
@@ -70,7 +73,7 @@ pub struct PlayerState {
     pub outcomes: Vec<f32>,
     /// `[N, S]` what the policy remembers; empty for a feed-forward policy.
     pub memory: Vec<f32>,
-    /// The stream of sampled actions.
+    /// The stream of sampled actions and of noise.
     pub actions: ChaCha8Rng,
 }
 
@@ -202,6 +205,7 @@ impl Player {
             normalisers,
             observation_size,
             episodes_per_trial,
+            noise: 0.0,
             observations: vec![0.0; n_envs * observation_size],
             starts: vec![true; n_envs],
             last: Last::new(spec, n_envs),
@@ -215,6 +219,13 @@ impl Player {
     pub fn uniformly(mut self) -> Self {
         self.actor.act_uniformly();
         self
+    }
+
+    /// The same, seeing observations, normalised if there is a normaliser, with normal noise of this standard deviation, at
+    /// least 0, in training. What stands beside them has none.
+    #[must_use]
+    pub fn with_noise(self, noise: f64) -> Self {
+        Self { noise, ..self }
     }
 
     /// The same, see [`Actor::keep_activations`].
@@ -272,6 +283,7 @@ impl Player {
             self.actor.forget(slot);
             self.inputs.forget(slot);
         }
+        self.add_noise();
         Ok(())
     }
 
@@ -355,7 +367,14 @@ impl Player {
             }
         }
         self.starts.copy_from_slice(&self.last.trial_ended);
+        self.add_noise();
         Ok(())
+    }
+
+    fn add_noise(&mut self) {
+        if let (Role::Training(stream), true) = (&mut self.role, self.noise > 0.0) {
+            self.observations.iter_mut().for_each(|x| *x += (self.noise * normal(stream)) as f32);
+        }
     }
 
     /// What was played last: the actions of [`Player::act`] and what [`Player::observe`] took.

@@ -14,7 +14,7 @@ pub enum Purpose {
     Weights = 1,
     /// Order of the samples in PPO's minibatches.
     Minibatches = 2,
-    /// Actions in training.
+    /// Actions in training, and noise on what they are chosen on.
     Actions = 3,
     /// Actions in testing.
     TestActions = 4,

@@ -26,7 +26,7 @@ impl A2c {
         config.validate()?;
         let n_weights = policy.flat_weights().len();
         let optimiser = Optimiser::rms_prop(config.rms_alpha, config.rms_eps, n_weights);
-        let descent = Descent::new(optimiser, config.max_grad_norm);
+        let descent = Descent::new(optimiser, config.max_grad_norm).decaying(config.weight_decay);
         Ok(A2c { config, descent })
     }
 }

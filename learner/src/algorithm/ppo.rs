@@ -28,7 +28,8 @@ impl Ppo {
     pub fn new(config: PpoConfig, policy: &Policy, seed: u64) -> Result<Self> {
         config.validate()?;
         let n_weights = policy.flat_weights().len();
-        let descent = Descent::new(Optimiser::adam(config.adam_eps, n_weights), config.max_grad_norm);
+        let descent = Descent::new(Optimiser::adam(config.adam_eps, n_weights), config.max_grad_norm)
+            .decaying(config.weight_decay);
         Ok(Ppo { config, descent, rng: stream(seed, Purpose::Minibatches) })
     }
 

@@ -15,7 +15,7 @@ use crate::proto;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ActAt {
     /// At the server, if it can: a line's delay is then paid once a rollout, not at each step. Trainings over several
-    /// servers, and several together whose rollouts are [short](perturb_study::settings::Rollouts),
+    /// servers, several together whose rollouts are [short](perturb_study::settings::Rollouts), and those that see noise
     /// choose theirs at the client all the same.
     #[default]
     Server,

@@ -422,10 +422,11 @@ pub(super) fn not_restored(what: &'static str, source: TrainError) -> TrainError
 
 /// The player of a training.
 fn player(state: &State, normalisers: Normalisers) -> Player {
-    let Common { num_envs, seed, .. } = state.config.common;
+    let Common { num_envs, seed, observation_noise, .. } = state.config.common;
     let (spec, inputs) = (state.policy(), state.inputs(num_envs));
     let episodes_per_trial = state.config.settings.episodes_per_trial();
     let player = Player::new(&spec, inputs, num_envs, episodes_per_trial, normalisers, Role::training(seed));
+    let player = player.with_noise(observation_noise);
     match &state.config.settings {
         // Its one update of a rollout needs just what acting has computed.
         Settings { base: Base::A2c(a2c), wrapper: Wrapper::Plain | Wrapper::Rl2(_) } => {

@@ -182,8 +182,8 @@ fn once(
 }
 
 /// Trains several policies in one environment as [`train`] and [`resume`] do each alone, to the same bytes: in lockstep over
-/// one session, but for those with long rollouts where servers act, which have a session each. `report` and `ended` are
-/// told the place among `entries`. One that fails ends; the others go on.
+/// one session, but for those with long rollouts where servers act, which have a session each. What adds noise to
+/// observations acts here. `report` and `ended` are told the place among `entries`. One that fails ends; the others go on.
 ///
 /// # Errors
 /// Those of opening sessions, and the lockstep's, which ends all that have not ended yet; their last checkpoints stay as
@@ -204,12 +204,14 @@ pub fn train_together(
     let is_one = entries.len() == 1;
     let (mut remotes, mut in_lockstep) = (Vec::new(), Vec::new());
     for (index, entry) in entries {
-        if !is_one && entry.start.config().settings.rollouts() != Rollouts::Long {
+        let config = entry.start.config();
+        let rollouts = config.rollouts();
+        if rollouts == Rollouts::Noisy || (!is_one && rollouts != Rollouts::Long) {
             in_lockstep.push((index, entry));
             continue;
         }
         let mut observations = Vec::new();
-        let mut session = Session::open(servers, &learning::options(entry.start.config()), &mut observations)?;
+        let mut session = Session::open(servers, &learning::options(config), &mut observations)?;
         if !session.plays_together() {
             in_lockstep.push((index, entry));
             continue;

@@ -372,6 +372,7 @@ fn assert_refused(result: Result<(), SettingError>, setting: &str) {
 #[case("ent_coef", |config: &mut A2cConfig, bad| config.ent_coef = bad)]
 #[case("vf_coef", |config: &mut A2cConfig, bad| config.vf_coef = bad)]
 #[case("max_grad_norm", |config: &mut A2cConfig, bad| config.max_grad_norm = bad)]
+#[case("weight_decay", |config: &mut A2cConfig, bad| config.weight_decay = bad)]
 #[case("rms_alpha", |config: &mut A2cConfig, bad| config.rms_alpha = bad)]
 #[case("rms_eps", |config: &mut A2cConfig, bad| config.rms_eps = bad)]
 fn a2cs_settings_outside_their_ranges_are_refused_by_name(
@@ -395,6 +396,7 @@ fn a2cs_settings_outside_their_ranges_are_refused_by_name(
 #[case("kl_coef", |config: &mut PpoConfig, bad| config.kl_coef = bad)]
 #[case("vf_coef", |config: &mut PpoConfig, bad| config.vf_coef = bad)]
 #[case("max_grad_norm", |config: &mut PpoConfig, bad| config.max_grad_norm = bad)]
+#[case("weight_decay", |config: &mut PpoConfig, bad| config.weight_decay = bad)]
 #[case("adam_eps", |config: &mut PpoConfig, bad| config.adam_eps = bad)]
 fn ppos_settings_outside_their_ranges_are_refused_by_name(
     #[case] name: &str,

@@ -161,3 +161,18 @@ fn what_is_tested_has_the_weights_after_the_last_update() {
     assert_eq!(rarely.state.reward_normaliser, often.state.reward_normaliser);
     assert!(rarely.state.reward_normaliser.is_some_and(|rewards| rewards.runs_on()));
 }
+
+#[rstest]
+fn regularisation_reaches_the_weights(
+    #[values("a2c", "ppo", "epopt-a2c", "epopt-ppo")] algorithm: &str,
+    #[values("observation_noise", "weight_decay")] setting: &str,
+) {
+    let weights = |value: f64| {
+        let sizes = if algorithm.starts_with("epopt") { "episodes_per_iteration = 4" } else { "n_steps = 16" };
+        let text = format!("algorithm = '{algorithm}'\nnum_envs = 2\nepisodes = 8\n{sizes}\n{setting} = {value:?}");
+        let (out, _) = trained(&text);
+        Checkpoint::load(out.path()).expect("a checkpoint").weights
+    };
+    assert_eq!(weights(0.0), weights(0.0));
+    assert_ne!(weights(0.5), weights(0.0));
+}

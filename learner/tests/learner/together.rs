@@ -15,7 +15,7 @@ use rstest::rstest;
 use crate::common::{connect, server};
 
 /// Algorithms of all kinds, with batches of different sizes, versions and parameters, and long rollouts and short ones.
-const TRAININGS: [&str; 9] = [
+const TRAININGS: [&str; 11] = [
     "algorithm = 'a2c'\nnum_envs = 1\nn_steps = 5\nseed = 3",
     "algorithm = 'ppo'\nversion = 'R'\nnum_envs = 3\nn_steps = 16\nn_minibatches = 2\nn_epochs = 2\nseed = 3",
     "algorithm = 'epopt-ppo'\nversion = 'E'\nnum_envs = 2\nepisodes_per_iteration = 3\nepsilon = 0.5\nfull_iterations = 1
@@ -27,6 +27,11 @@ const TRAININGS: [&str; 9] = [
      full_iterations = 1\nseed = 4",
     "preset = 'paper'\nalgorithm = 'epopt-ppo'\narchitecture = 'rc'\nepisodes_per_iteration = 3\nepsilon = 0.5
      full_iterations = 1\nn_epochs = 2\nseed = 4",
+    // What sees noise acts at the learner.
+    "algorithm = 'ppo'\nversion = 'R'\nnum_envs = 3\nn_steps = 64\nn_epochs = 2\nobservation_noise = 0.5
+     weight_decay = 0.1\nseed = 8",
+    "algorithm = 'epopt-a2c'\nversion = 'E'\nnum_envs = 2\nepisodes_per_iteration = 3\nepsilon = 0.5
+     full_iterations = 1\nobservation_noise = 0.5\nweight_decay = 0.1\nseed = 4",
     // A rollout that comes in pieces, if others wait for the server too.
     "algorithm = 'ppo'\nversion = 'R'\nnum_envs = 65\nn_steps = 64\nn_minibatches = 2\nn_epochs = 1\nseed = 7",
 ];
@@ -116,18 +121,18 @@ fn the_bytes_of_a_training_are_its_own(#[values(CART_POLE, PENDULUM, SEEN_PENDUL
 
     let base = tempfile::tempdir().expect("a directory");
     let all = |base: &Path, count| (0..count).map(|number| kept(&base.join(number.to_string()))).collect::<Vec<_>>();
-    together(&one, base.path(), task, &[0, 1, 2, 3, 4, 5, 6, 7, 8], u64::MAX);
+    together(&one, base.path(), task, &[0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10], u64::MAX);
     assert!(all(base.path(), TRAININGS.len()) == expected, "together");
 
     let base = tempfile::tempdir().expect("a directory");
     together(&one, base.path(), task, &[3, 1, 7, 0], 1);
-    together(&connect(&private), base.path(), task, &[2, 6, 4, 5], 1);
-    let expected = &expected[..8]; // the last one has ended after its first iteration
-    assert!(all(base.path(), 8) != expected, "all are stopped before their ends");
+    together(&connect(&private), base.path(), task, &[2, 6, 4, 5, 8, 9], 1);
+    let expected = &expected[..10]; // the last one has ended after its first iteration
+    assert!(all(base.path(), 10) != expected, "all are stopped before their ends");
     together(&connect(&private), base.path(), task, &[0, 4, 3, 6], u64::MAX);
-    together(&one, base.path(), task, &[1, 5], u64::MAX);
-    together(&one, base.path(), task, &[2, 7], u64::MAX);
-    assert!(all(base.path(), 8) == expected, "resumed in other groups");
+    together(&one, base.path(), task, &[1, 5, 8], u64::MAX);
+    together(&one, base.path(), task, &[2, 7, 9], u64::MAX);
+    assert!(all(base.path(), 10) == expected, "resumed in other groups");
 }
 
 /// The reference fills each kept episode up to the step limit, and counts all steps.

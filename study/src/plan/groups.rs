@@ -33,11 +33,11 @@ impl Grouping {
 }
 
 impl Cell {
-    /// Environment, architecture, what is observed, and how long rollouts are: cells that have all in common may be in
+    /// Environment, architecture, what is observed, and what rollouts are like: cells that have all in common may be in
     /// one group.
     pub fn kind(&self) -> (&str, Architecture, Observe, Rollouts) {
-        let TrainConfig { common, settings } = &self.config;
-        (&common.environment, common.architecture, common.observe, settings.rollouts())
+        let TrainConfig { common, .. } = &self.config;
+        (&common.environment, common.architecture, common.observe, self.config.rollouts())
     }
 }
 

@@ -28,7 +28,7 @@ struct Grid<'a> {
 
 struct GridCell<'a> {
     cell: &'a Cell,
-    /// As settings are written, without the seed.
+    /// All as they are written, without the seed.
     settings: BTreeMap<String, String>,
     result: Option<&'a CellResult>,
 }
@@ -89,7 +89,7 @@ fn grids<'a>(results: &'a Results<'a>) -> Vec<Grid<'a>> {
         let is_of = |grid: &&mut Grid<'a>| {
             (grid.environment, &grid.method, grid.trained_on) == (environment, &method, trained_on)
         };
-        let settings = cell.config.table().into_iter().filter(|(name, _)| name != "seed");
+        let settings = cell.config.complete_table().into_iter().filter(|(name, _)| name != "seed");
         let settings = settings.map(|(name, value)| (name, value.to_string())).collect();
         let result = if let CellState::Done(result) = state { Some(&**result) } else { None };
         let cell = GridCell { cell, settings, result };

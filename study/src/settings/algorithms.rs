@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::SettingError;
+use super::{SettingError, is_zero};
 
 /// How a learning rate moves.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -51,6 +51,11 @@ pub struct A2cConfig {
     pub vf_coef: f64,
     /// Global norm that longer gradients are scaled down to, above 0 (default: `0.5`).
     pub max_grad_norm: f64,
+    /// λ: each gradient step takes learning rate · λ of every weight, not negative and below 1 / `learning_rate` (default:
+    /// `0`). Larger keeps outputs closer to 0, and the deviations of continuous actions closer to 1. It is written only
+    /// where it is not the default: settings from before it stay what they were.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub weight_decay: f64,
     /// Decay per update of RMSProp's average of squared gradients, 0 … 1 (default: `0.99`).
     pub rms_alpha: f64,
     /// RMSProp's ε, added to that average inside the root, above 0 (default: `1e-5`). Limits the step of weights with
@@ -71,6 +76,7 @@ impl Default for A2cConfig {
             ent_coef: 0.01,
             vf_coef: 0.5,
             max_grad_norm: 0.5,
+            weight_decay: 0.0,
             rms_alpha: 0.99,
             rms_eps: 1e-5,
             bootstrap_truncation: true,
@@ -90,6 +96,7 @@ impl A2cConfig {
         check_not_negative("ent_coef", self.ent_coef)?;
         check_not_negative("vf_coef", self.vf_coef)?;
         check_positive("max_grad_norm", self.max_grad_norm)?;
+        check_weight_decay(self.weight_decay, self.learning_rate)?;
         check("rms_alpha", self.rms_alpha, (0.0..1.0).contains(&self.rms_alpha), "at least 0 and below 1")?;
         check_positive("rms_eps", self.rms_eps)
     }
@@ -132,6 +139,11 @@ pub struct PpoConfig {
     pub vf_coef: f64,
     /// Global norm that longer gradients are scaled down to, above 0 (default: `0.5`).
     pub max_grad_norm: f64,
+    /// λ: each gradient step takes learning rate · λ of every weight, not negative and below 1 / `learning_rate` (default:
+    /// `0`). Larger keeps outputs closer to 0, and the deviations of continuous actions closer to 1. It is written only
+    /// where it is not the default: settings from before it stay what they were.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub weight_decay: f64,
     /// Adam's ε, above 0 (default: `1e-5`). Limits the step of weights with small gradients.
     pub adam_eps: f64,
     /// Whether V(final observation) follows the last reward of a truncated episode (default: `true`; paper: `false`).
@@ -156,6 +168,7 @@ impl Default for PpoConfig {
             kl_coef: 0.0,
             vf_coef: 0.5,
             max_grad_norm: 0.5,
+            weight_decay: 0.0,
             adam_eps: 1e-5,
             bootstrap_truncation: true,
         }
@@ -180,6 +193,7 @@ impl PpoConfig {
         check_not_negative("kl_coef", self.kl_coef)?;
         check_not_negative("vf_coef", self.vf_coef)?;
         check_positive("max_grad_norm", self.max_grad_norm)?;
+        check_weight_decay(self.weight_decay, self.learning_rate)?;
         check_positive("adam_eps", self.adam_eps)
     }
 }
@@ -294,6 +308,12 @@ fn check_positive(name: &'static str, value: f64) -> Result<(), SettingError> {
 /// `Ok` if `value` is a number that is not negative.
 fn check_not_negative(name: &'static str, value: f64) -> Result<(), SettingError> {
     check(name, value, value >= 0.0, "a number that is not negative")
+}
+
+/// `Ok` if a gradient step leaves something of a weight.
+fn check_weight_decay(weight_decay: f64, learning_rate: f64) -> Result<(), SettingError> {
+    let is_decay = weight_decay >= 0.0 && weight_decay * learning_rate < 1.0;
+    check("weight_decay", weight_decay, is_decay, "a number that is not negative, and below 1 / learning_rate")
 }
 
 /// `Ok` if `value` is between 0 and 1.

@@ -58,6 +58,8 @@ pub enum Rollouts {
     Short,
     /// Many steps, or complete episodes: a server can be sent the weights for each.
     Long,
+    /// Any that are seen with noise, which the learner adds where it acts.
+    Noisy,
 }
 
 impl Settings {
@@ -84,7 +86,7 @@ impl Settings {
     }
 
     /// How long rollouts are.
-    pub fn rollouts(&self) -> Rollouts {
+    pub(super) fn rollouts(&self) -> Rollouts {
         let n_steps = match (&self.wrapper, &self.base) {
             (_, Base::Random) => return Rollouts::None,
             (Wrapper::Epopt(_), _) => return Rollouts::Long,

@@ -35,6 +35,7 @@ pub(super) fn of(mut settings: Settings, architecture: Architecture, preset: Pre
         log_interval,
         checkpoint_interval: 500,
         stop_at_success: 0.0,
+        observation_noise: 0.0,
     };
     let mut config = TrainConfig { common, settings };
     if preset == Preset::Paper {

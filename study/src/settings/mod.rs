@@ -100,6 +100,11 @@ pub struct Common {
     pub num_envs: usize,
     /// Whether observations are normalised by their running mean and variance (default: `true`).
     pub normalize_observations: bool,
+    /// Standard deviation of normal noise that is added to every number of an observation in training, after normalisation
+    /// if there is any, 0 … 100 (default: `0`). Tests have none. It is written only where it is not the default: settings
+    /// from before it stay what they were.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub observation_noise: f64,
     /// Whether rewards are divided by the running deviation of the discounted return (default: `true`).
     pub normalize_rewards: bool,
     /// Whether that discounted return runs on over the ends of episodes, as in the reference, instead of starting again from 0
@@ -182,6 +187,18 @@ impl TrainConfig {
         resolve(vec![(origin.to_owned(), spelled(origin, table)?)])
     }
 
+    /// The configuration with every key that one of its algorithm may have, as reports compare them.
+    pub(crate) fn complete_table(&self) -> Table {
+        let mut table = defaults_of(self);
+        table.extend(self.full_table());
+        table
+    }
+
+    /// What it learns from.
+    pub fn rollouts(&self) -> Rollouts {
+        if self.common.observation_noise > 0.0 { Rollouts::Noisy } else { self.settings.rollouts() }
+    }
+
     /// What trains.
     pub fn method(&self) -> Method {
         let Self { common, settings } = self;
@@ -209,6 +226,8 @@ impl TrainConfig {
             let expected = if most == u64::MAX { "at least 1".to_owned() } else { format!("between 1 and {most}") };
             require((1..=most).contains(&value), key, value, expected)?;
         }
+        let noise = self.common.observation_noise;
+        require((0.0..=100.0).contains(&noise), "observation_noise", noise, "a standard deviation, 0 … 100")?;
         let rate = self.common.stop_at_success;
         require((0.0..=100.0).contains(&rate), "stop_at_success", rate, "a success rate, 0 … 100 %")?;
         let architecture = self.common.architecture;
@@ -298,6 +317,10 @@ fn defaults_of(config: &TrainConfig) -> Table {
     // By default they are not written.
     defaults.insert(PARAMETERS.into(), Value::Table(Table::new()));
     defaults.insert("stop_at_success".into(), 0.0.into());
+    if !config.settings.is_random() {
+        defaults.insert("observation_noise".into(), 0.0.into());
+        defaults.insert("weight_decay".into(), 0.0.into());
+    }
     defaults.insert(OBSERVE.into(), Observe::default().to_string().into());
     defaults
 }
@@ -406,7 +429,10 @@ fn check(origin: &str, key: &str, value: &Value, defaults: &Table, algorithm: &'
 
 /// "; it is a setting of rl2-a2c, rl2-ppo", if it is one of some algorithms.
 fn others_setting(key: &str) -> Option<String> {
-    let having = Settings::all().into_iter().filter(|settings| settings.table().contains_key(key));
+    let has = |settings: &Settings| {
+        defaults_of(&defaults::of(settings.clone(), Architecture::Rc, Preset::default())).contains_key(key)
+    };
+    let having = Settings::all().into_iter().filter(has);
     let names: Vec<&str> = having.map(|settings| settings.name()).collect();
     (!names.is_empty()).then(|| format!("; it is a setting of {}", names.join(", ")))
 }

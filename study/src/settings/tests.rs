@@ -248,6 +248,30 @@ fn a_success_rate_to_stop_at_is_written_only_where_there_is_one() {
 }
 
 #[test]
+fn regularisation_is_written_only_where_there_is_some() {
+    for (algorithm, preset) in [("ppo", "perturb"), ("ppo", "paper"), ("epopt-a2c", "perturb"), ("rl2-ppo", "paper")] {
+        let architecture = if algorithm == "rl2-ppo" { Architecture::Rc } else { Architecture::Ff };
+        let config = |sets: &[&str]| of(preset, algorithm, architecture, sets);
+        for (key, set) in [("observation_noise", "observation_noise=0.25"), ("weight_decay", "weight_decay=0.25")] {
+            let (plain, regularised) = (config(&[]), config(&[set]));
+            assert_eq!(plain, config(&[&format!("{key}=0")]));
+            assert!(!plain.full_table().contains_key(key), "what cells are named by stays");
+            assert_eq!(regularised.table().get(key), Some(&0.25.into()));
+            assert_eq!(load(Some(&regularised.to_toml()), &[], "").unwrap(), regularised);
+        }
+    }
+    for (wrong, expected) in [
+        ("observation_noise=-1", "a standard deviation, 0 … 100"),
+        ("observation_noise=nan", "a standard deviation, 0 … 100"),
+        ("weight_decay=-1", "not negative, and below 1 / learning_rate"),
+        ("weight_decay=1e6", "not negative, and below 1 / learning_rate"),
+    ] {
+        let message = refusal(None, &[wrong]);
+        assert!(message.contains(expected), "{message}");
+    }
+}
+
+#[test]
 fn what_is_observed_is_written_only_where_it_is_not_the_default() {
     for preset in ["perturb", "paper"] {
         let config = |sets: &[&str]| of(preset, "ppo", Architecture::Ff, sets);

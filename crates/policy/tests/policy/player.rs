@@ -61,6 +61,80 @@ fn the_return_that_rewards_are_divided_by_runs_over(
     assert_eq!(returns, expected);
 }
 
+/// Of an environment that always shows 3 where mean and deviation are 1 and 2, N(1, 0.25²).
+#[test]
+fn a_training_sees_noise_beside_normalised_observations_and_a_test_does_not() {
+    let played = |noise: f64, role: Role| {
+        let moments = RunningMoments::from_parts(1 << 40, vec![1.0], vec![4.0 * (1u64 << 40) as f64]);
+        let observations = Some(ObservationNormaliser::from_moments(moments));
+        let mut player = player(1, false, Normalisers { observations, rewards: None }, role).with_noise(noise);
+        player.begin(&[3.0], None).expect("an observation");
+        let seen = |t: u64| {
+            step(&mut player, t, 1, 1.0);
+            player.played().observations[0]
+        };
+        let seen: Vec<f32> = (0..10_000).map(seen).collect();
+        (seen, player)
+    };
+    let (seen, player) = played(0.25, Role::training(1));
+    assert_eq!(seen, played(0.25, Role::training(1)).0);
+    let mean = seen.iter().sum::<f32>() / 1e4;
+    let deviation = (seen.iter().map(|x| (x - mean).powi(2)).sum::<f32>() / 1e4).sqrt();
+    assert!((mean - 1.0).abs() < 0.01 && (deviation - 0.25).abs() < 0.01, "{mean} {deviation}, four standard errors");
+    let (clean, without) = played(0.0, Role::training(1));
+    assert!(clean.iter().all(|x| (x - 1.0).abs() < 1e-4), "no noise");
+    assert_eq!(player.normalisers(), without.normalisers(), "statistics are of what was observed");
+    assert!(played(0.25, Role::testing(1, 0, 1)).0.iter().all(|x| (x - 1.0).abs() < 1e-4));
+}
+
+/// Two environments with two numbers each, all of which are 3, and whose first episodes the step limit ends at once.
+#[test]
+fn each_number_has_noise_of_its_own_from_the_first_step_on_and_final_observations_none() {
+    let played = |noise: f64| {
+        let spec = PolicySpec { observation_size: 2, action: DISCRETE, hidden: vec![], lstm: None };
+        let (inputs, none) = (Inputs::new(2, DISCRETE, 2, false), Normalisers::default());
+        let mut player = Player::new(&spec, inputs, 2, 1, none, Role::training(1)).with_noise(noise);
+        player.load(&(0..spec.n_weights()).map(|i| i as f32 / 8.0).collect::<Vec<_>>()).expect("weights that fit");
+        player.begin(&[3.0; 4], None).expect("observations");
+        player.act().expect("actions");
+        let ended: Vec<_> = (0..2).map(|slot| Ended { slot, trial_index: 0, episode_in_trial: 0 }).collect();
+        let outcome = Outcome {
+            observations: &[3.0; 4],
+            rewards: &[1.0; 2],
+            terminated: &[false; 2],
+            truncated: &[true; 2],
+            final_observations: &[3.0; 4],
+            ended: &ended,
+        };
+        player.observe(&outcome, None).expect("numbers that fit");
+        let first = (player.played().observations.to_vec(), player.played().truncation_values.to_vec());
+        player.act().expect("actions");
+        ([first.0, player.played().observations.to_vec()].concat(), first.1)
+    };
+    let ((clean, value_of_clean), (seen, values)) = (played(0.0), played(0.5));
+    assert_eq!(clean, [3.0; 8]);
+    for (i, x) in seen.iter().enumerate() {
+        assert!(*x != 3.0 && !seen[..i].contains(x), "{seen:?}");
+    }
+    assert!(values == value_of_clean && values[0] != 0.0, "{values:?}");
+}
+
+/// Neither what follows the noise nor the noise that follows depends on where a training was interrupted.
+#[test]
+fn noise_goes_on_where_a_state_was_saved() {
+    let none = || Normalisers::default();
+    let mut expected = player(1, false, none(), Role::training(1)).with_noise(1.0);
+    step(&mut expected, 0, 1, 1.0);
+    let mut resumed = player(1, false, none(), Role::training(2)).with_noise(1.0);
+    resumed.restore(&expected.state().expect("a training's")).expect("a state that fits");
+    for t in 1..4 {
+        step(&mut expected, t, 1, 1.0);
+        step(&mut resumed, t, 1, 1.0);
+        assert_eq!(resumed.played().observations, expected.played().observations);
+        assert_eq!(resumed.state(), expected.state());
+    }
+}
+
 /// The reference gives a policy of RL² raw rewards in tests.
 #[test]
 fn a_test_has_the_statistics_of_the_training_and_leaves_them_as_they_are() {
