@@ -17,16 +17,20 @@ async fn a_small_picture_does_not_wait_for_all_the_large_ones() {
         sessions.push(Session::open(server.tcp(), open("MountainCar", 1, seed as u64)).await.0);
     }
     let (mut small, _) = Session::open(server.tcp(), open("MountainCar", 1, 1)).await;
+    for session in &sessions {
+        session.send(Render { slot: 0, width: 2048, height: 2048 }).await;
+    }
+    // Asked for before this thread is busy with reading the large ones.
+    small.send(Render { slot: 0, width: 64, height: 64 }).await;
     let mut reading = tokio::task::JoinSet::new();
     for mut session in sessions {
-        session.send(Render { slot: 0, width: 2048, height: 2048 }).await;
         let drawn = Arc::clone(&drawn);
         reading.spawn(async move {
             session.receive().await.unwrap().unwrap();
             drawn.fetch_add(1, Ordering::Relaxed);
         });
     }
-    small.render(0, (64, 64)).await;
+    small.receive().await.unwrap().unwrap();
     let before = drawn.load(Ordering::Relaxed);
     println!("{before} large pictures came before the small one");
     assert!(before < LARGE / 2, "{before} large pictures came before the small one");
