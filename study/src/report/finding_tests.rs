@@ -103,11 +103,14 @@ fn too_few_seeds_have_no_interval_and_it_says_so(#[case] runs: u32, #[case] said
     });
 }
 
-/// A method's Default and Extrapolation, with the ends of the latter's interval.
+/// What is said of five runs of each; a row is a method's Default and Extrapolation, with the ends of the latter's interval.
 fn said_of(rows: &[(&str, f64, f64, Option<[f64; 2]>)], missing: usize) -> Option<String> {
+    said_of_runs(rows, &vec![5; rows.len()], missing)
+}
+
+fn said_of_runs(rows: &[(&str, f64, f64, Option<[f64; 2]>)], runs: &[usize], missing: usize) -> Option<String> {
     let plan = plan("'CartPole'", 1);
     let method = |name: &str| Method { algorithm: name.into(), ..plan.cells[0].method() };
-    let bootstrapped = |point, interval_95| Bootstrapped { point, interval_95, runs: 5 };
     let of = |method: Method, means: BTreeMap<Metric, Bootstrapped>| MethodMetrics {
         environment: "CartPole",
         method,
@@ -122,10 +125,10 @@ fn said_of(rows: &[(&str, f64, f64, Option<[f64; 2]>)], missing: usize) -> Optio
         done: 5,
         cells: 5,
     };
-    let known = rows.iter().map(|&(name, default, extrapolation, interval)| {
+    let known = rows.iter().zip(runs).map(|(&(name, default, extrapolation, interval_95), &runs)| {
         let means = [
-            (Metric::Default, bootstrapped(default, None)),
-            (Metric::Extrapolation, bootstrapped(extrapolation, interval)),
+            (Metric::Default, Bootstrapped { point: default, interval_95: None, runs }),
+            (Metric::Extrapolation, Bootstrapped { point: extrapolation, interval_95, runs }),
         ];
         of(method(name), means.into())
     });
@@ -159,6 +162,25 @@ fn the_finding_in_words(
     #[case] said: Option<&str>,
 ) {
     assert_eq!(said_of(rows, missing).as_deref(), said);
+}
+
+#[rstest]
+#[case::one(&[("ppo", 90.0, 8.0)], &[1], "ppo ff (paper) (1 run) comes to Extrapolation of 8.0 % and Default of 90.0 %.")]
+#[case::the_first(&[("ppo", 9.0, 8.0), ("a2c", 9.0, 5.0)], &[1, 3], "of 2 methods ppo ff (paper) (1 run) comes out first, with \
+    Extrapolation of 8.0 % and Default of 9.0 %; next is a2c ff (paper), with Extrapolation of 5.0 %. Extrapolation less Default \
+    is -4.0 to -1.0 points.")]
+#[case::the_next(&[("ppo", 9.0, 8.0), ("a2c", 9.0, 5.0)], &[3, 1], "of 2 methods ppo ff (paper) comes out first, with \
+    Extrapolation of 8.0 % and Default of 9.0 %; next is a2c ff (paper) (1 run), with Extrapolation of 5.0 %. Extrapolation less \
+    Default is -4.0 to -1.0 points.")]
+#[case::neither(&[("ppo", 9.0, 8.0), ("a2c", 9.0, 5.0), ("late", 9.0, 1.0)], &[2, 2, 1], "of 3 methods ppo ff (paper) generalises \
+    best, with Extrapolation of 8.0 % and Default of 9.0 %; next is a2c ff (paper), with Extrapolation of 5.0 %. Extrapolation \
+    less Default is -8.0 to -1.0 points.")]
+#[case::alike(&[("ppo", 9.0, 8.0), ("a2c", 9.0, 8.0)], &[3, 1], "of 2 methods none comes out first: ppo ff (paper) and a2c ff \
+    (paper) (1 run) come to the same Extrapolation, 8.0 %. Extrapolation less Default is -1.0 to -1.0 points.")]
+fn of_one_run_nothing_is_claimed(#[case] rows: &[(&str, f64, f64)], #[case] runs: &[usize], #[case] said: &str) {
+    let rows: Vec<_> =
+        rows.iter().map(|&(name, default, extrapolation)| (name, default, extrapolation, None)).collect();
+    assert_eq!(said_of_runs(&rows, runs, 0).as_deref(), Some(said));
 }
 
 /// PPO's rates on D, R and E, of what was trained on D and of the others; A2C has none.
