@@ -119,8 +119,8 @@ impl<'a> Report<'a> {
 }
 
 /// Who extrapolates best, by how much, and what Extrapolation is beside Default; `None` if no method has it. Those whose
-/// numbers are written alike are first together, and none is best. What has one run alone says so, and is not called
-/// best, nor is another beside it. Of the random policy, which has learned nothing that could be lost, nothing is said.
+/// numbers are written alike are first together, and none is best. A number of one run alone says so, and where
+/// there is one, nothing is called best. Of the random policy, which has learned nothing that could be lost, nothing is said.
 fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
     let learned: Vec<_> = rows.iter().filter(|row| !row.method.is_random()).collect();
     let mean = |row: &MethodMetrics<'_>, metric| row.means.get(&metric).copied();
@@ -132,20 +132,19 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
     let numbers = format!("Extrapolation of {} and Default of {}", shown(extrapolation), shown(default));
     let zeros = zero_sentence(ranked.iter().filter(|(.., its)| its.point == 0.0).map(|(row, ..)| *row));
     if ranked.len() == 1 {
-        return Some(format!("{} comes to {numbers}.{zeros}", named(best)));
+        return Some(format!("{} comes to {numbers}.{zeros}", best.method));
     }
     let written = |its: &Bootstrapped| format!("{:.1}", its.point);
     let number = written(&extrapolation);
     let (first, others) = ranked.split_at(ranked.partition_point(|(.., its)| written(its) == number));
-    let compared = first.iter().chain(others.first());
-    let claimed =
-        if compared.into_iter().any(|(row, ..)| has_one_run(row)) { "comes out first" } else { "generalises best" };
+    let some_of_one_run = ranked.iter().any(|(.., its)| its.runs == 1);
+    let claimed = if some_of_one_run { "comes out first" } else { "generalises best" };
     let found = match first {
         _ if number == "0.0" => "none extrapolates: each has Extrapolation of 0.0 %".to_owned(),
-        [_] => format!("{} {claimed}, with {numbers}", named(best)),
+        [_] => format!("{} {claimed}, with {numbers}", best.method),
         _ => format!(
             "none {claimed}: {} come to the same Extrapolation, {}",
-            listed(&first.iter().map(|(row, ..)| named(row)).collect::<Vec<_>>()),
+            listed(&first.iter().map(|(row, ..)| row.method.to_string()).collect::<Vec<_>>()),
             listed(&distinct(first.iter().map(|(.., its)| shown(*its)))),
         ),
     };
@@ -156,7 +155,7 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
             (Some(_), Some(_)) => ", and their intervals overlap",
             _ => "",
         };
-        format!("; next is {}, with Extrapolation of {}{intervals}", named(row), shown(*its))
+        format!("; next is {}, with Extrapolation of {}{intervals}", row.method, shown(*its))
     });
     let of = if ranked.len() < learned.len() { format!(" of {}", learned.len()) } else { String::new() };
     let differences: Vec<f64> = ranked.iter().map(|(_, default, its)| rounded(its.point - default.point)).collect();
@@ -166,15 +165,6 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
         ranked.len(),
         next.unwrap_or_default(),
     ))
-}
-
-/// Whether Extrapolation is that of a single run, of which nothing can be claimed.
-fn has_one_run(row: &MethodMetrics<'_>) -> bool {
-    row.means.get(&Metric::Extrapolation).is_some_and(|mean| mean.runs == 1)
-}
-
-fn named(row: &MethodMetrics<'_>) -> String {
-    if has_one_run(row) { format!("{} (1 run)", row.method) } else { row.method.to_string() }
 }
 
 /// Whose Extrapolation is 0 although it has successes elsewhere, and by what; empty if it is so of none.
@@ -193,6 +183,7 @@ fn zero_sentence<'a, 'm: 'a>(rows: impl Iterator<Item = &'a MethodMetrics<'m>>) 
 fn shown(mean: Bootstrapped) -> String {
     match mean.interval_95 {
         Some([low, high]) => format!("{:.1} % [{:.1}, {:.1}]", mean.point, low + 0.0, high + 0.0), // no negative zero
+        None if mean.runs == 1 => format!("{:.1} % (1 run)", mean.point),
         None => format!("{:.1} %", mean.point),
     }
 }
