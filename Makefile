@@ -1,7 +1,9 @@
 # perturb's commands; `make` alone lists them. Each installs what it lacks and can be run again.
 
-# Debian 12's packages: a compiler, libclang for bindgen, MuJoCo, libtorch, and a BLAS that is not the slow reference one.
-PACKAGES := build-essential pkg-config libclang-dev libmujoco-dev libtorch-dev libopenblas0-pthread
+# Debian 12's packages: a compiler, libclang for bindgen, MuJoCo.
+PACKAGES := build-essential pkg-config libclang-dev libmujoco-dev
+# perturb-recurrent needs libtorch and a BLAS that is not the slow reference one.
+TORCH_PACKAGES := libtorch-dev libopenblas0-pthread
 # What draws Hopper and HalfCheetah: OpenGL without a display, in software. The server runs without it.
 OPENGL := libegl1 libgl1-mesa-dri
 # A whole Slurm on one machine, for its test.
@@ -46,8 +48,9 @@ BASE_IMAGES := debian:bookworm-slim rust:1.95-bookworm
 # The learner's threads are its own; more inside libtorch's matrix products only get in their way.
 export OPENBLAS_NUM_THREADS := 1
 
-# One profile and one selection of packages for programs, tests, lints and benches: libtorch's bindings, which take
-# minutes, are compiled once. The second form is the server without MuJoCo.
+# One profile and one selection of packages for programs, tests, lints and benches. Cargo chooses the features of
+# dependencies by the selection of packages, so that what `make build` compiles is not compiled again for tests. The second
+# form is the server without MuJoCo.
 ALL := --workspace --release --locked
 WITHOUT_MUJOCO := --package perturb --no-default-features --release --locked
 
@@ -71,7 +74,7 @@ missing=; \
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help deps opengl toolchain build install demo all-pairs report-check serve-test test slurm-test kill-test \
+.PHONY: help deps torch-deps opengl toolchain build recurrent build-all install install-recurrent demo all-pairs report-check serve-test test slurm-test kill-test \
 	load-test bounds-test attack-test faults-test asan-test qemu-test simulation-test slurm-acceptance lint bench fuzz fuzz-keep \
 	bench-peers audit cargo-deny metrics-test otel-test python-test interrupts-test wheel wheel-test python-acceptance \
 	bench-python python-venv docs docs-test docker docker-base docker-test
@@ -82,17 +85,26 @@ help: ## this list
 deps: toolchain ## install the missing Debian packages, with sudo if need be
 	@$(call install,$(PACKAGES))
 
+torch-deps: deps
+	@$(call install,$(TORCH_PACKAGES))
+
 opengl:
 	@$(call install,$(OPENGL))
 
 toolchain:
 	@command -v cargo >/dev/null || { echo "cargo is missing; install Rust 1.95 or later, see https://rustup.rs" >&2; exit 1; }
 
-build: deps ## compile the programs perturb-server, perturb and perturb-recurrent
+build: deps ## compile the programs perturb-server and perturb
+	cargo build $(ALL) --bin perturb-server --bin perturb
+
+recurrent: torch-deps ## compile perturb-recurrent too, which trains recurrent policies with libtorch; minutes
+	cargo build $(ALL) --bin perturb-server --bin perturb --bin perturb-recurrent
+
+build-all: torch-deps
 	cargo build $(ALL)
 
 install: build ## copy the programs, manual pages and completions to PREFIX, by default ~/.local
-	install -D --target-directory $(PREFIX)/bin $(addprefix $(PROGRAMS)/,perturb perturb-recurrent perturb-server)
+	install -D --target-directory $(PREFIX)/bin $(addprefix $(PROGRAMS)/,perturb perturb-server)
 	mkdir -p $(PREFIX)/share/man/man1 $(PREFIX)/share/bash-completion/completions $(PREFIX)/share/zsh/site-functions \
 		$(PREFIX)/share/fish/vendor_completions.d
 	$(PROGRAMS)/perturb --quiet man $(PREFIX)/share/man/man1
@@ -104,11 +116,15 @@ install: build ## copy the programs, manual pages and completions to PREFIX, by 
 	$(PROGRAMS)/perturb completions fish > $(PREFIX)/share/fish/vendor_completions.d/perturb.fish
 	$(PROGRAMS)/perturb-server --completions fish > $(PREFIX)/share/fish/vendor_completions.d/perturb-server.fish
 	@echo "installed in $(PREFIX)/bin; if it is not on your PATH: export PATH=$(PREFIX)/bin:\$$PATH"
+	@echo "To train recurrent policies too: make install-recurrent"
+
+install-recurrent: recurrent install ## install perturb-recurrent too, which trains recurrent policies with libtorch
+	install -D --target-directory $(PREFIX)/bin $(PROGRAMS)/perturb-recurrent
 
 demo: build opengl ## train Hopper on default and on random physics, and see what still works; some three minutes
 	$(PROGRAMS)/perturb demo $(DEMO_ARGS)
 
-all-pairs: build ## train and test every algorithm and architecture on every environment, shortly
+all-pairs: recurrent ## train and test every algorithm and architecture on every environment, shortly
 	PROGRAMS=$(PROGRAMS) cli/tests/all_pairs.sh $(ALL_PAIRS_ARGS)
 
 report-check: build ## make the report of a small experiment and look at it in Chromium, which it installs; minutes
@@ -123,27 +139,27 @@ metrics-test: build opengl ## have a Prometheus, which it installs, watch a serv
 	@$(call install,prometheus python3)
 	python3 docker/grafana/check.py $(PROGRAMS)
 
-otel-test: deps ## build the server with traces, and test that they come to a collector
+otel-test: torch-deps ## build the server with traces, and test that they come to a collector
 	cargo test $(ALL) --features perturb/otel --test server traces::
 
 test: export PERTURB_TEST_DM_ENV_RPC_PYTHON := $(abspath $(DM_ENV_RPC))/bin/python
-test: deps opengl $(DM_ENV_RPC)/installed ## run all tests, then those of the server without MuJoCo
+test: torch-deps opengl $(DM_ENV_RPC)/installed ## run all tests, then those of the server without MuJoCo
 	@$(call install,$(FFMPEG))
 	cargo test $(ALL)
 	cargo test $(WITHOUT_MUJOCO)
 
-slurm-test: build ## do a plan on a real Slurm of two nodes, started for it, one of which dies
+slurm-test: build-all ## do a plan on a real Slurm of two nodes, started for it, one of which dies
 	@$(call install,$(SLURM_PACKAGES))
 	PERTURB_SLURM_REQUIRED=1 cargo test $(ALL) --test cli slurm::
 
-load-test: build ## a server full of Hoppers for five minutes: 1024 sessions of 16, and one more that is refused
+load-test: build-all ## a server full of Hoppers for five minutes: 1024 sessions of 16, and one more that is refused
 	PERTURB_TEST_FULL_SERVER_SECONDS=$(LOAD_SECONDS) cargo test $(ALL) --test server -- --nocapture every_place_can_be_taken
 
-bounds-test: build opengl ## attack a server beside a neighbour, who waits 50 ms at most (p99); on an idle machine
+bounds-test: build-all opengl ## attack a server beside a neighbour, who waits 50 ms at most (p99); on an idle machine
 	PERTURB_TEST_NEIGHBOUR_P99_MS=50 cargo test $(ALL) --package perturb --test server -- --nocapture \
 		--test-threads 1 bounds::
 
-faults-test: build ## lines, disks and clocks with faults, again and again, by a seed that PERTURB_SEED repeats; minutes
+faults-test: build-all ## lines, disks and clocks with faults, again and again, by a seed that PERTURB_SEED repeats; minutes
 	@$(call install,$(FAKETIME))
 	for round in $$(seq $(FAULTS_ROUNDS)); do \
 		PERTURB_FAKETIME_REQUIRED=1 cargo test $(ALL) --package perturb-cli --test cli -- --nocapture lines:: clocks:: \
@@ -151,17 +167,17 @@ faults-test: build ## lines, disks and clocks with faults, again and again, by a
 		cargo test $(ALL) --package perturb --test server -- --nocapture faults::lines || exit 1; \
 	done
 
-kill-test: build ## kill servers a hundred times while policies are trained, and compare their weights; minutes
+kill-test: build-all ## kill servers a hundred times while policies are trained, and compare their weights; minutes
 	cargo test $(ALL) --test cli -- --ignored --nocapture a_hundred_kills
 
-qemu-test: build ## train on emulated processors, to the same weights as on this one
+qemu-test: build-all ## train on emulated processors, to the same weights as on this one
 	@$(call install,$(QEMU))
 	PERTURB_QEMU_REQUIRED=1 cargo test $(ALL) --test cli processors::
 
 slurm-acceptance: ## the same with experiments/quick.toml
 	PERTURB_SLURM_PLAN=$(CURDIR)/experiments/quick.toml $(MAKE) slurm-test
 
-lint: deps cargo-deny ## check formatting, clippy, documentation and dependencies
+lint: torch-deps cargo-deny ## check formatting, clippy, documentation and dependencies
 	cargo fmt --all --check
 	cargo clippy $(ALL) --all-targets -- -D warnings
 	cargo clippy $(WITHOUT_MUJOCO) --all-targets -- -D warnings
@@ -169,7 +185,7 @@ lint: deps cargo-deny ## check formatting, clippy, documentation and dependencie
 	RUSTDOCFLAGS="-D warnings" cargo doc $(ALL) --no-deps --lib
 	cargo deny --locked check bans licenses sources
 
-bench: build opengl ## measure throughput, latency and memory
+bench: build-all opengl ## measure throughput, latency and memory
 	cargo bench --workspace --locked --bench '*' -- $(BENCH_ARGS)
 
 bench-peers: build $(PEERS)/installed ## measure training beside PureJaxRL and stable-baselines3; gigabytes, minutes
@@ -335,7 +351,7 @@ fuzz-keep: ## keep, of what fuzz found that clients may send, as few inputs in f
 	done
 
 attack-test: export PERTURB_FUZZ_MOST_GROWN_MB = 20
-attack-test: deps ## a million mutated requests and a hundred thousand snapshots, which may take no memory along; minutes
+attack-test: torch-deps ## a million mutated requests and a hundred thousand snapshots, which may take no memory along; minutes
 	PERTURB_FUZZ_INPUTS=1000000 cargo test $(ALL) --package perturb-fuzz --test corpus -- --nocapture --exact requests
 	PERTURB_FUZZ_INPUTS=100000 cargo test $(ALL) --package perturb-fuzz --test corpus -- --nocapture --exact snapshots
 

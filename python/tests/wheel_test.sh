@@ -53,7 +53,7 @@ if "$work/venv/bin/perturb" train --env CartPole --architecture rc --out recurre
     echo "a recurrent policy was trained without libtorch" >&2
     exit 1
 fi
-grep "make install" "$work/output"
+grep "make recurrent" "$work/output"
 took=$(seconds "$python" "$here/../examples/ten_lines.py")
 echo "README's loop, eight Hoppers: $took"
 grep -q "ended:" "$work/output"

@@ -33,8 +33,10 @@ pub(super) fn prepare(architecture: Architecture, one_thread: bool) -> Result<()
     if has_recurrent() {
         let started_by = std::env::var(STARTED_BY).unwrap_or_else(|_| VERSION.into());
         if started_by != VERSION {
-            let message = format!("perturb is {started_by}, but {PROGRAM} is {VERSION}: install both from one build");
-            return Err(CommandError::Usage(message));
+            return Err(CommandError::Usage(format!(
+                "perturb is {started_by}, but {PROGRAM} is {VERSION}: install both from one clone with `make \
+                 install-recurrent`"
+            )));
         }
     }
     let threads = std::env::var_os(THREADS);
@@ -53,9 +55,9 @@ pub(super) fn prepare(architecture: Architecture, one_thread: bool) -> Result<()
     let source = command.exec();
     let shown = program.display();
     Err(CommandError::Usage(format!(
-        "recurrent policies are trained by the program {PROGRAM}, which cannot be started: {shown}: {source}; it \
-         needs libtorch, so the Python wheel is without it: `make install` in a clone of perturb installs both, or \
-         train with --architecture ff"
+        "recurrent policies are trained by the program {PROGRAM}, which cannot be started: {shown}: {source}. It needs \
+         libtorch, so `make build`, `make install` and the Python wheel leave it out. In a clone of perturb, `make \
+         recurrent` builds it with libtorch, and `make install-recurrent` installs it. Or train with --architecture ff"
     )))
 }
 

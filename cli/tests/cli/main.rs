@@ -14,7 +14,6 @@ mod patience;
 mod private;
 mod processors;
 mod programs;
-mod recurrent;
 mod resume;
 mod serve;
 mod servers;

@@ -1,4 +1,4 @@
-//! The program `perturb-recurrent`: `perturb` with libtorch, which `perturb` becomes where a recurrent policy is trained.
+//! The program `perturb-recurrent`: `perturb` with libtorch. `perturb` becomes this program to train recurrent policies.
 #![forbid(unsafe_code)]
 
 use std::process::ExitCode;

@@ -1,20 +1,23 @@
-//! The program that has libtorch: who becomes it, who does not, and what is said where it is missing.
+//! The tests of the program `perturb-recurrent`: which program loads libtorch, and the error where the other one is missing.
+//! They need the programs `perturb` and `perturb-server`: run `cargo build --workspace --release` first.
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use crate::common::{perturb, stderr};
-
-const PERTURB: &str = env!("CARGO_BIN_EXE_perturb");
 const RECURRENT: &str = env!("CARGO_BIN_EXE_perturb-recurrent");
+
+/// The program `perturb`, which must have been built before: `cargo build --workspace --release`.
+fn perturb() -> PathBuf {
+    Path::new(RECURRENT).with_file_name("perturb")
+}
 
 fn train(program: &Path, architecture: &str, out: &Path) -> Command {
     let mut command = Command::new(program);
     let options = ["--env", "CartPole", "--algorithm", "a2c", "--episodes", "20", "--architecture", architecture];
     command.arg("train").args(options).arg("--out").arg(out);
     // A copy of the program has no server beside it.
-    command.env("PERTURB_SERVER", Path::new(PERTURB).with_file_name("perturb-server"));
+    command.env("PERTURB_SERVER", Path::new(RECURRENT).with_file_name("perturb-server"));
     command
 }
 
@@ -24,12 +27,12 @@ fn run(command: &mut Command) -> Output {
 
 #[test]
 fn only_one_of_the_programs_loads_libtorch() {
-    let libraries = |program| {
+    let libraries = |program: &Path| {
         let output = run(Command::new("ldd").arg(program));
         String::from_utf8(output.stdout).expect("text")
     };
-    assert!(libraries(RECURRENT).contains("libtorch_cpu"));
-    let of_perturb = libraries(PERTURB);
+    assert!(libraries(Path::new(RECURRENT)).contains("libtorch_cpu"));
+    let of_perturb = libraries(&perturb());
     assert!(of_perturb.contains("libc.so") && !of_perturb.contains("libtorch"), "{of_perturb}");
 }
 
@@ -37,7 +40,7 @@ fn only_one_of_the_programs_loads_libtorch() {
 fn a_program_without_the_other_one_trains_what_needs_no_libtorch_and_says_what_the_rest_needs() {
     let folder = tempfile::tempdir().expect("a directory");
     let alone = folder.path().join("perturb");
-    fs::copy(PERTURB, &alone).expect("copied");
+    fs::copy(perturb(), &alone).expect("copied");
     let trained = run(&mut train(&alone, "ff", &folder.path().join("ff")));
     assert!(trained.status.success(), "{}", stderr(&trained));
 
@@ -46,8 +49,9 @@ fn a_program_without_the_other_one_trains_what_needs_no_libtorch_and_says_what_t
     assert_eq!(refused.status.code(), Some(2));
     let said = stderr(&refused).replace(&folder.path().display().to_string(), "DIR");
     let expected = "perturb: recurrent policies are trained by the program perturb-recurrent, which cannot be started: \
-                    DIR/perturb-recurrent: No such file or directory (os error 2); it needs libtorch, so the \
-                    Python wheel is without it: `make install` in a clone of perturb installs both, or train with --architecture ff\n";
+                    DIR/perturb-recurrent: No such file or directory (os error 2). It needs libtorch, so `make build`, \
+                    `make install` and the Python wheel leave it out. In a clone of perturb, `make recurrent` builds it \
+                    with libtorch, and `make install-recurrent` installs it. Or train with --architecture ff\n";
     assert_eq!(said, expected);
     assert!(!out.exists());
 
@@ -62,7 +66,7 @@ fn a_program_without_the_other_one_trains_what_needs_no_libtorch_and_says_what_t
     let evaluate = |program: &Path| {
         let mut command = Command::new(program);
         command.arg("evaluate").arg("--checkpoint").arg(&out).args(["--episodes", "5"]);
-        run(command.env("PERTURB_SERVER", Path::new(PERTURB).with_file_name("perturb-server")))
+        run(command.env("PERTURB_SERVER", Path::new(RECURRENT).with_file_name("perturb-server")))
     };
     fs::remove_file(folder.path().join("perturb-recurrent")).expect("removed");
     let (tested, tested_there) = (evaluate(&alone), evaluate(Path::new(RECURRENT)));
@@ -87,8 +91,12 @@ fn programs_of_two_builds_are_refused() {
     assert_eq!(output.status.code(), Some(2));
     let said = stderr(&output);
     assert!(said.contains("perturb is 0.0.1 (other), but perturb-recurrent is "), "{said}");
-    assert!(said.contains("install both from one build"), "{said}");
+    assert!(said.contains("install both from one clone with `make install-recurrent`"), "{said}");
     // Without a recurrent policy it does not matter.
-    let output = run(perturb(&["--version"]).env("PERTURB_STARTED_BY", "0.0.1 (other)"));
+    let output = run(Command::new(perturb()).arg("--version").env("PERTURB_STARTED_BY", "0.0.1 (other)"));
     assert!(output.status.success());
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
 }
