@@ -177,8 +177,9 @@ qemu-test: build-all ## train on emulated processors, to the same weights as on 
 slurm-acceptance: ## the same with experiments/quick.toml
 	PERTURB_SLURM_PLAN=$(CURDIR)/experiments/quick.toml $(MAKE) slurm-test
 
-lint: torch-deps cargo-deny ## check formatting, clippy, documentation and dependencies
+lint: torch-deps cargo-deny ## check formatting, names, import cycles, clippy, documentation and dependencies
 	cargo fmt --all --check
+	cargo run --quiet --release --locked --package perturb-lint
 	cargo clippy $(ALL) --all-targets -- -D warnings
 	cargo clippy $(WITHOUT_MUJOCO) --all-targets -- -D warnings
 	cargo clippy --release --locked --package perturb-simulation --features turmoil --all-targets -- -D warnings

@@ -1,0 +1,63 @@
+//! Doc comments that open without a subject.
+//!
+//! A comment such as "What became of the request" has to be read to its end before one knows what it describes. A doc comment
+//! opens with its subject, or with a verb whose subject is the documented item: "Returns the result of the request".
+
+use crate::source::{SourceTree, folder_of, is_test};
+
+/// Openings that leave the subject open.
+pub const OPENINGS: [&str; 22] = [
+    "What", "Whatever", "Who", "Whoever", "Whose", "Which", "Of", "That", "Those", "The same", "So many", "As many",
+    "Where", "When", "How", "Its", "None", "It", "One", "As", "So", "Likewise",
+];
+
+/// A doc comment's first line.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DocComment {
+    /// The folder for which it is counted.
+    pub folder: String,
+    /// File of the comment.
+    pub file: String,
+    /// Line of the file, counted from 1.
+    pub line: usize,
+    /// The comment's first line.
+    pub text: String,
+    /// Whether it opens without a subject.
+    pub lacks_subject: bool,
+}
+
+/// Reads the first line of every doc comment of Rust code, without tests.
+pub fn read(tree: &SourceTree) -> Vec<DocComment> {
+    let mut comments = Vec::new();
+    for (file, source) in tree.with_extension(".rs").filter(|(path, _)| !is_test(path)) {
+        let mut lines = source.lines().map(str::trim_start).enumerate().peekable();
+        let mut is_continued = false;
+        while let Some((index, line)) = lines.next() {
+            if line == "#[cfg(test)]"
+                && lines.peek().is_some_and(|(_, next)| next.starts_with("mod ") && next.ends_with('{'))
+            {
+                break;
+            }
+            let comment = line.strip_prefix("///").or_else(|| line.strip_prefix("//!"));
+            let text = comment.map(|text| text.strip_prefix(' ').unwrap_or(text));
+            if let Some(text) = text.filter(|text| !is_continued && !text.is_empty()) {
+                comments.push(DocComment {
+                    folder: folder_of(file).to_owned(),
+                    file: file.to_owned(),
+                    line: index + 1,
+                    text: text.to_owned(),
+                    lacks_subject: lacks_subject(text),
+                });
+            }
+            is_continued = comment.is_some();
+        }
+    }
+    comments
+}
+
+/// Tells whether a comment opens with one of [`OPENINGS`] as a whole word.
+pub fn lacks_subject(text: &str) -> bool {
+    OPENINGS.into_iter().any(|opening| {
+        text.strip_prefix(opening).is_some_and(|rest| !rest.starts_with(|c: char| c.is_alphanumeric() || c == '_'))
+    })
+}

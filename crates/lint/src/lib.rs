@@ -1,0 +1,15 @@
+//! Checks of the workspace's source text that neither rustc nor clippy makes.
+//!
+//! - [`cycles`]: import cycles between sibling modules, in each crate and in the Python package;
+//! - [`doc_comments`]: doc comments that open without a subject;
+//! - [`names`]: type names defined twice, superlative constants, constructors called `of`, long test names.
+//!
+//! [`limits`] compares the counts with the file `crates/lint/limits.toml`.
+
+pub mod cycles;
+pub mod doc_comments;
+pub mod imports;
+pub mod lexer;
+pub mod limits;
+pub mod names;
+pub mod source;

@@ -1,0 +1,184 @@
+//! Names: types defined twice, superlative constants, constructors called `of`, and long test names.
+
+use std::collections::BTreeMap;
+
+use crate::lexer::{Token, TokenKind, is_test_attribute, tokens};
+use crate::source::{SourceTree, is_benchmark_or_example, is_test};
+
+/// Longest name of a test, in characters.
+pub const MAX_TEST_NAME: usize = 60;
+
+/// First words of constants that have a standard name: `MAX_*`, `MIN_*`, `*_TIMEOUT` or `*_INTERVAL`.
+pub const SUPERLATIVES: [&str; 12] =
+    ["MOST", "LEAST", "LONGEST", "SHORTEST", "GREATEST", "FEW", "MANY", "TINY", "LITTLE", "REST", "LOOK", "AGAIN"];
+
+/// A name with the place of its definition.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Definition {
+    /// The name that is defined.
+    pub name: String,
+    /// File of the definition.
+    pub file: String,
+    /// Line of the file, counted from 1.
+    pub line: usize,
+}
+
+/// Every name that the checks look at.
+#[derive(Clone, Debug, Default)]
+pub struct Names {
+    /// Structs, enums, traits, classes and type aliases of modules, without tests, benchmarks and examples.
+    pub types: Vec<Definition>,
+    /// Constants and statics whose first word is one of [`SUPERLATIVES`], without tests.
+    pub superlatives: Vec<Definition>,
+    /// Functions called `of`, without tests.
+    pub called_of: Vec<Definition>,
+    /// Test functions with names of more than [`MAX_TEST_NAME`] characters.
+    pub long_tests: Vec<Definition>,
+}
+
+/// Reads the names of all Rust and Python files.
+pub fn read(tree: &SourceTree) -> Names {
+    let mut names = Names::default();
+    for (file, source) in tree.with_extension(".rs") {
+        read_rust(file, source, &mut names);
+    }
+    for (file, source) in tree.with_extension(".py") {
+        read_python(file, source, &mut names);
+    }
+    names
+}
+
+/// Returns the types that are defined in more than one file of the same language, by name, with all their definitions.
+///
+/// Names of Rust and Python are not compared, because a class often stands for the struct of the same name.
+pub fn defined_twice(types: &[Definition]) -> BTreeMap<&str, Vec<&Definition>> {
+    let mut by_name: BTreeMap<(&str, bool), Vec<&Definition>> = BTreeMap::new();
+    for definition in types {
+        by_name.entry((&definition.name, definition.file.ends_with(".py"))).or_default().push(definition);
+    }
+    by_name.retain(|_, definitions| definitions.iter().any(|definition| definition.file != definitions[0].file));
+    let mut twice: BTreeMap<&str, Vec<&Definition>> = BTreeMap::new();
+    for ((name, _), definitions) in by_name {
+        twice.entry(name).or_default().extend(definitions);
+    }
+    twice
+}
+
+fn is_superlative(name: &str) -> bool {
+    name.chars().all(|c| c.is_ascii_uppercase() || c.is_ascii_digit() || c == '_')
+        && name.split('_').next().is_some_and(|first| SUPERLATIVES.contains(&first))
+}
+
+fn read_rust(file: &str, source: &str, names: &mut Names) {
+    let tokens = tokens(source);
+    let is_test_code = is_test(file);
+    let mut is_test_function = false;
+    // For each open brace: whether items of a module stand in it.
+    let mut braces: Vec<bool> = Vec::new();
+    // For a test module: the number of braces that are open around it.
+    let mut test_module = None;
+    let mut opens_module = false;
+    let mut position = 0;
+    while position < tokens.len() {
+        let token = &tokens[position];
+        let next = tokens.get(position + 1).and_then(Token::word);
+        let define = |name: &str| Definition { name: name.to_owned(), file: file.to_owned(), line: token.line };
+        match &token.kind {
+            TokenKind::Symbol('#') => {
+                let content = attribute(&tokens[position..]);
+                is_test_function |= is_test_attribute(content);
+                let words: Vec<_> = content.iter().filter_map(Token::word).collect();
+                if words == ["cfg", "test"]
+                    && tokens.get(position + content.len()).is_some_and(|token| token.is_word("mod"))
+                {
+                    test_module.get_or_insert(braces.len());
+                }
+                position += content.len().max(1);
+                continue;
+            }
+            TokenKind::Symbol('{') => {
+                braces.push(opens_module);
+                opens_module = false;
+            }
+            TokenKind::Symbol('}') => {
+                braces.pop();
+            }
+            TokenKind::Symbol(';') => opens_module = false,
+            TokenKind::Word(word) => match (word.as_str(), next) {
+                ("mod", Some(_)) => opens_module = true,
+                ("fn", Some(name)) => {
+                    if is_test_function && name.chars().count() > MAX_TEST_NAME {
+                        names.long_tests.push(define(name));
+                    }
+                    if name == "of" && !is_test_code && test_module.is_none() {
+                        names.called_of.push(define(name));
+                    }
+                    is_test_function = false;
+                }
+                ("struct" | "enum" | "trait" | "type", Some(name))
+                    if braces.iter().all(|is_module| *is_module)
+                        && !is_test_code
+                        && test_module.is_none()
+                        && !is_benchmark_or_example(file) =>
+                {
+                    names.types.push(define(name));
+                }
+                ("const" | "static", Some(name)) if is_superlative(name) && !is_test_code && test_module.is_none() => {
+                    names.superlatives.push(define(name));
+                }
+                _ => {}
+            },
+            _ => {}
+        }
+        if (token.is_symbol('}') || token.is_symbol(';')) && test_module == Some(braces.len()) {
+            test_module = None;
+        }
+        position += 1;
+    }
+}
+
+/// Returns the tokens of an attribute, from its `#` to its `]`; only the `#` if it is none.
+fn attribute(tokens: &[Token]) -> &[Token] {
+    let mut depth = 0;
+    for (index, token) in tokens.iter().enumerate() {
+        match token.kind {
+            TokenKind::Symbol('[') => depth += 1,
+            TokenKind::Symbol(']') if depth == 1 => return &tokens[..=index],
+            TokenKind::Symbol(']') => depth -= 1,
+            TokenKind::Symbol('#' | '!') if depth == 0 && index < 2 => {}
+            _ if depth == 0 => return &tokens[..1],
+            _ => {}
+        }
+    }
+    &tokens[..1]
+}
+
+fn read_python(file: &str, source: &str, names: &mut Names) {
+    for (index, line) in source.lines().enumerate() {
+        let define = |name: &str| Definition { name: name.to_owned(), file: file.to_owned(), line: index + 1 };
+        let start = line.trim_start();
+        if let Some(name) = start.strip_prefix("def ").or_else(|| start.strip_prefix("async def ")).map(first_word) {
+            if name.starts_with("test_") && name.chars().count() > MAX_TEST_NAME {
+                names.long_tests.push(define(name));
+            }
+            if name == "of" && !is_test(file) {
+                names.called_of.push(define(name));
+            }
+        }
+        let constant = first_word(line);
+        let after = line[constant.len()..].trim_start();
+        if (after.starts_with('=') || after.starts_with(':')) && is_superlative(constant) && !is_test(file) {
+            names.superlatives.push(define(constant));
+        }
+        if let Some(name) =
+            line.strip_prefix("class ").map(first_word).filter(|_| !is_test(file) && !is_benchmark_or_example(file))
+        {
+            names.types.push(define(name));
+        }
+    }
+}
+
+/// Returns the identifier at the start of `text`.
+fn first_word(text: &str) -> &str {
+    text.split(|c: char| !(c.is_alphanumeric() || c == '_')).next().unwrap_or_default()
+}
