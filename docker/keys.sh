@@ -31,7 +31,7 @@ cat >server/tokens.toml <<TOKENS
 name = "learner"
 sha256 = "$(printf %s "$token" | sha256sum | cut -d ' ' -f 1)"
 
-# What tokens may have, and draw parameters from: docs/operations.md#tokens.
+# What tokens may have, and draw parameters from: docs/access.md#tokens.
 TOKENS
 chmod 644 server/* learner/*
 echo "made $PWD: server for servers, learner for learners, authority for nobody"

@@ -120,7 +120,7 @@ async fn what_may_happen_is_told_before_it_does() {
     let watched = Watched::start(&[]);
     let page = watched.page();
     let refusals: Vec<_> = page.text.lines().filter(|line| line.starts_with("perturb_refusals_total{")).collect();
-    assert!(refusals.len() > 40, "docs/operations.md says some forty: {refusals:#?}");
+    assert!(refusals.len() > 40, "docs/monitoring.md says some forty: {refusals:#?}");
     assert!(refusals.iter().all(|line| line.ends_with(" 0.0")), "{refusals:#?}");
     for protocol in ["perturb.v1", "dm_env_rpc.v1"] {
         for ending in ["closed", "gone", "broken", "lease_over"] {
@@ -236,11 +236,11 @@ async fn nothing_that_a_client_sends_is_told_or_logged() {
 async fn every_metric_is_described_and_every_environment_told_from_the_beginning() {
     let watched = Watched::start(&[]);
     let page = watched.page();
-    let described = include_str!("../../../docs/operations.md");
+    let described = include_str!("../../../docs/monitoring.md");
     for line in page.text.lines().filter_map(|line| line.strip_prefix("# TYPE ")) {
         let (name, kind) = line.split_once(' ').unwrap();
         let total = if kind == "counter" { "_total" } else { "" };
-        assert!(described.contains(&format!("`{name}{total}`")), "docs/operations.md does not tell of {name}{total}");
+        assert!(described.contains(&format!("`{name}{total}`")), "docs/monitoring.md does not tell of {name}{total}");
     }
     for environment in perturb::tasks::catalogue().names() {
         assert!(page.tells(&format!("perturb_steps_total{{environment=\"{environment}\"}}")), "{environment}");
