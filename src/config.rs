@@ -1,6 +1,6 @@
 //! The server's configuration: defaults, then a TOML file, then environment variables, then flags.
 
-use crate::server::tls::Files;
+use crate::server::net::tls::Files;
 use clap::Parser;
 use config::{Environment, File, FileFormat};
 use perturb_protocol::limits::{DEFAULT_MAX_ENVS, DEFAULT_MAX_MESSAGE_BYTES, DEFAULT_PORT};

@@ -10,7 +10,7 @@ use bytes::Bytes;
 use perturb::config::{Config, ListenAddress};
 use perturb::proto::session_request::Request;
 use perturb::proto::{AutoresetMode, Open, Restore, SessionRequest, Step, Version};
-use perturb::server::{self, guards::Guards, listen::Listener};
+use perturb::server::{self, net::listener::Listener, security::Guards};
 use perturb::tasks;
 use prost::Message;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};

@@ -4,7 +4,12 @@
 use clap::{CommandFactory, Parser};
 use perturb::{
     config::{Arguments, Config, ListenAddress},
-    server::{self, guards::Guards, listen::Listener, probe::probe, tokens::new_token},
+    server::{
+        self,
+        auth::new_token,
+        net::{listener::Listener, probe::probe},
+        security::Guards,
+    },
     tasks,
 };
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};

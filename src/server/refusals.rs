@@ -1,6 +1,6 @@
 //! The kinds of refusals, and how often each happened.
 
-use super::{leases, status::Refusal, tokens::Bearer};
+use super::{auth::Bearer, session::lease, status::Refusal};
 use crate::{env, pool, render};
 use std::sync::{
     Arc,
@@ -128,11 +128,11 @@ impl Refusal {
             Self::Render(render::Error::Failed { .. }) => Kind::DrawingFailed,
             Self::NothingToDraw { .. } => Kind::NothingToDraw,
             Self::Lease(error) => match error {
-                leases::Error::Unknown => Kind::UnknownLease,
-                leases::Error::OtherToken => Kind::OtherToken,
-                leases::Error::NoReply { .. } => Kind::NoSuchReply,
-                leases::Error::Forgotten { .. } => Kind::ReplyNotKept,
-                leases::Error::TakenUp => Kind::TakenUp,
+                lease::Error::Unknown => Kind::UnknownLease,
+                lease::Error::OtherToken => Kind::OtherToken,
+                lease::Error::NoReply { .. } => Kind::NoSuchReply,
+                lease::Error::Forgotten { .. } => Kind::ReplyNotKept,
+                lease::Error::TakenUp => Kind::TakenUp,
             },
             Self::Value { .. } => Kind::BadValue,
             Self::NotOpen { .. } => Kind::NotOpen,

@@ -1,6 +1,6 @@
 //! Every refusal, and how a client is told of it; [`refusals`](super::refusals) has the code of each.
 
-use super::leases;
+use super::session::lease;
 use crate::{env, pool, proto, render};
 use std::borrow::Cow;
 use tonic::{Code, Status};
@@ -20,7 +20,7 @@ pub enum Refusal {
     Render(#[from] render::Error),
     /// A session cannot be taken up, or was.
     #[error(transparent)]
-    Lease(#[from] leases::Error),
+    Lease(#[from] lease::Error),
     /// The environment to be drawn has no state.
     #[error("the physics of slot {slot} diverged and left no state to draw; reset it first")]
     NothingToDraw {

@@ -547,7 +547,9 @@ async fn requests_are_counted_by_kind_and_told_at_the_end() {
     assert!(log.contains("open 1 (0 refused), step 4 (1 refused), reset 0 (0 refused)"), "{log}");
     assert!(log.contains("create_world 0 (0 refused)"), "{log}");
     assert!(
-        log.contains(r#"request{kind="step"}: perturb::server::requests: refused refusal="step.actions is 1 bytes"#),
+        log.contains(
+            r#"request{kind="step"}: perturb::server::session::instrumented: refused refusal="step.actions is 1 bytes"#
+        ),
         "{log}"
     );
 }

@@ -8,7 +8,7 @@ use std::thread::{self, JoinHandle};
 use perturb::config::{Arguments, Config};
 use perturb::env::{Action, Catalogue, Environment, EnvironmentSpec, Error, Stream, Transition};
 use perturb::scene::Scene;
-use perturb::server::{guards::Guards, listen::Listener};
+use perturb::server::{net::listener::Listener, security::Guards};
 use perturb::tasks::cart_pole;
 use perturb_study::records::{FILE, Records};
 use perturb_study::{CellResult, CellState, Folder, Plan};

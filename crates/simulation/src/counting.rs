@@ -2,12 +2,12 @@
 
 use bytes::Bytes;
 use perturb::proto::{self, session_request::Request, session_response::Response};
-use perturb::server::access::About;
-use perturb::server::conversation::{Dialogue, Turn};
-use perturb::server::fields::{self, Field};
-use perturb::server::frames::Allowance;
-use perturb::server::leases::Leases;
+use perturb::server::net::access_log::About;
+use perturb::server::session::driver::{Dialogue, Turn};
+use perturb::server::session::lease::Leases;
 use perturb::server::status::Refusal;
+use perturb::server::transport::message_reader::Allowance;
+use perturb::server::transport::precheck::{self, Field};
 
 use super::{Ledger, MOST_BYTES};
 
@@ -56,7 +56,7 @@ impl Counting {
 impl Dialogue for Counting {
     type Request = proto::SessionRequest;
     type Response = proto::SessionResponse;
-    const FIELDS: &'static [Field] = fields::SESSION_REQUEST;
+    const FIELDS: &'static [Field] = precheck::SESSION_REQUEST;
     const TAKES_UP: bool = true;
     const PROTOCOL: &'static str = "perturb.v1";
 

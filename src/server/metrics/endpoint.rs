@@ -1,7 +1,7 @@
 //! HTTP, for whoever scrapes: one page, small requests, few connections at a time.
 
 use super::{Sources, page};
-use crate::server::listen::Listener;
+use crate::server::net::listener::Listener;
 use bytes::Bytes;
 use http_body_util::Full;
 use hyper::{

@@ -9,8 +9,11 @@ pub mod page;
 pub mod process;
 
 use super::{
-    access::Access, budget::Budget, leases::Numbers, peers::Places, refusals::Refusals, requests::Counts,
-    tokens::Tokens,
+    auth::Tokens,
+    net::{access_log::Access, peers::Places},
+    refusals::Refusals,
+    session::{instrumented::Counts, lease::Numbers},
+    transport::budget::Budget,
 };
 use crate::{meters::Histogram, pool::Pool};
 use std::{sync::Arc, time::Duration};

@@ -115,7 +115,7 @@ impl Numbers {
 
     fn tokens(&self, page: &mut Page<'_>) -> Written {
         let tokens = self.0.tokens.as_ref().map(|tokens| tokens.used()).unwrap_or_default();
-        let each = |number: fn(&super::super::tokens::Used) -> f64| {
+        let each = |number: fn(&crate::server::auth::Used) -> f64| {
             tokens.iter().map(move |used| ([("token", used.name.as_str())], number(used)))
         };
         page.gauges("perturb_token_sessions", "Sessions of a token now", each(|used| used.sessions as f64))?;

@@ -1,7 +1,7 @@
 //! Health tells load balancers whether there is room.
 
 use crate::common::server::{Server, Session, channel, open, until, within};
-use perturb::server::fullness::NEW_SESSIONS;
+use perturb::server::net::capacity_health::NEW_SESSIONS;
 use tonic_health::pb::{HealthCheckRequest, health_check_response::ServingStatus, health_client::HealthClient};
 
 async fn health(server: &Server, service: &str) -> ServingStatus {

@@ -9,7 +9,7 @@ use crate::{
 use perturb::{
     config::{Arguments, Config},
     proto::{Comparison, Open, Release, Reset, Version},
-    server::{guards::Guards, listen::Listener, run},
+    server::{net::listener::Listener, run, security::Guards},
     tasks,
 };
 use std::{

@@ -1,0 +1,204 @@
+//! One stream: the legal order of its requests, each answered once.
+
+use super::{
+    properties,
+    runner::Runner,
+    settings, specs,
+    world::Joined,
+    worlds::{Caller, Worlds},
+};
+use crate::{
+    proto::dm_env_rpc::v1::{
+        self as rpc, environment_request::Payload as Request, environment_response::Payload as Response,
+    },
+    server::{
+        auth::Bearer,
+        net::access_log::About,
+        session::{
+            driver::{Dialogue, MOST_BYTES_BEFORE_OPEN, Sessions},
+            instrumented::Observed,
+        },
+        shutdown::Phase,
+        status::Refusal,
+        transport::{
+            message_reader::Allowance,
+            precheck::{self, Field},
+        },
+    },
+};
+use std::sync::Arc;
+
+/// The most bytes of a request: a world is one environment, and mistakes deserve an answer.
+const MOST_BYTES: usize = 1 << 20;
+
+/// A client's stream. When it is dropped it leaves its world, and the worlds that it made go unless an agent is in them.
+pub(super) struct Agent {
+    worlds: Arc<Worlds>,
+    caller: Caller,
+    sessions: Sessions,
+    joined: Option<Joined>,
+    about: About,
+}
+
+impl Agent {
+    /// A stream that has joined no world.
+    pub(super) fn new(worlds: Arc<Worlds>, bearer: Option<Bearer>, sessions: Sessions) -> Self {
+        let caller = worlds.caller(bearer);
+        Self { worlds, caller, sessions, joined: None, about: About::default() }
+    }
+
+    async fn create_world(&mut self, request: rpc::CreateWorldRequest) -> Result<rpc::CreateWorldResponse, Refusal> {
+        if self.sessions.phase() != Phase::Running {
+            return Err(Refusal::Draining);
+        }
+        let (settings, version, own) = settings::create(self.worlds.catalogue(), &request.settings)?;
+        self.worlds.is_free(&self.caller, &own)?;
+        let held = self.caller.envs(1)?;
+        let runner = Runner::open(self.worlds.pool(), settings, version, self.worlds.draws(&self.caller)).await?;
+        Ok(rpc::CreateWorldResponse { world_name: self.worlds.add(&self.caller, runner, own, held)? })
+    }
+
+    async fn join_world(&mut self, request: rpc::JoinWorldRequest) -> Result<rpc::JoinWorldResponse, Refusal> {
+        if let Some(joined) = &self.joined {
+            return Err(Refusal::AlreadyJoined { world: joined.world.name().into() });
+        }
+        settings::none("join_world", &request.settings)?;
+        let (world, runner) = self.worlds.join(&self.caller, &request.world_name)?;
+        // Before anything is awaited: if the client goes now, the world is left and not lost.
+        let joined = self.joined.insert(Joined { world, runner });
+        self.about = About { environment: Some(joined.world.spec().name), envs: 1, ..self.about };
+        joined.runner.settle().await;
+        Ok(rpc::JoinWorldResponse { specs: Some(specs::of(joined.world.spec())) })
+    }
+
+    async fn step(&mut self, request: rpc::StepRequest) -> Result<rpc::StepResponse, Refusal> {
+        let Joined { world, runner } = self.joined("step")?;
+        specs::check_requested(&request.requested_observations)?;
+        let outcome = if runner.is_running() {
+            let actions = specs::actions(world.spec(), &request.actions)?;
+            let outcome = runner.step(&actions, world.take_interruption()).await?;
+            self.about.steps += 1;
+            outcome
+        } else {
+            let changes = world.take_changes();
+            let begun = runner.begin(changes.clone()).await;
+            begun.inspect_err(|_| world.keep(changes))?
+        };
+        Ok(specs::response(&outcome, &request.requested_observations))
+    }
+
+    fn reset(&mut self, request: rpc::ResetRequest) -> Result<rpc::ResetResponse, Refusal> {
+        let Joined { world, runner } = self.joined("reset")?;
+        world.change(settings::change(world.spec(), "reset", &request.settings)?)?;
+        runner.stop();
+        Ok(rpc::ResetResponse { specs: Some(specs::of(world.spec())) })
+    }
+
+    fn reset_world(&mut self, request: rpc::ResetWorldRequest) -> Result<rpc::ResetWorldResponse, Refusal> {
+        let world = self.worlds.of(&self.caller, &request.world_name, "reset_world")?;
+        world.change(settings::change(world.spec(), "reset_world", &request.settings)?)?;
+        match &mut self.joined {
+            Some(joined) if joined.world.name() == world.name() => joined.runner.stop(),
+            _ => world.interrupt(),
+        }
+        Ok(rpc::ResetWorldResponse {})
+    }
+
+    fn destroy_world(&mut self, request: &rpc::DestroyWorldRequest) -> Result<rpc::DestroyWorldResponse, Refusal> {
+        self.worlds.destroy(&self.caller, &request.world_name)?;
+        Ok(rpc::DestroyWorldResponse {})
+    }
+
+    fn leave(&mut self) {
+        if let Some(Joined { world, mut runner }) = self.joined.take() {
+            runner.stop();
+            self.worlds.leave(&self.caller, &world, runner);
+        }
+    }
+
+    fn joined(&mut self, request: &'static str) -> Result<&mut Joined, Refusal> {
+        self.joined.as_mut().ok_or(Refusal::NotJoined { request })
+    }
+}
+
+impl Drop for Agent {
+    fn drop(&mut self) {
+        self.leave();
+        self.worlds.stream_ended(&self.caller);
+    }
+}
+
+impl Dialogue for Agent {
+    type Request = rpc::EnvironmentRequest;
+    type Response = rpc::EnvironmentResponse;
+    const FIELDS: &'static [Field] = precheck::ENVIRONMENT_REQUEST;
+    const PROTOCOL: &'static str = "dm_env_rpc.v1";
+
+    fn allowance(&self) -> Allowance {
+        Allowance { bytes: if self.is_open() { MOST_BYTES } else { MOST_BYTES_BEFORE_OPEN }, entries: 1, covered: 0 }
+    }
+
+    /// Whether it keeps a world alive.
+    fn is_open(&self) -> bool {
+        self.joined.is_some() || self.worlds.are_made_by(&self.caller)
+    }
+
+    fn about(&self) -> About {
+        self.about
+    }
+
+    async fn answer(&mut self, request: Self::Request) -> Result<Self::Response, Refusal> {
+        let response = match request.payload {
+            Some(Request::CreateWorld(create)) => self.create_world(create).await.map(Response::CreateWorld),
+            Some(Request::JoinWorld(join)) => self.join_world(join).await.map(Response::JoinWorld),
+            Some(Request::Step(step)) => self.step(step).await.map(Response::Step),
+            Some(Request::Reset(reset)) => self.reset(reset).map(Response::Reset),
+            Some(Request::ResetWorld(reset)) => self.reset_world(reset).map(Response::ResetWorld),
+            Some(Request::LeaveWorld(_)) => {
+                self.leave();
+                Ok(Response::LeaveWorld(rpc::LeaveWorldResponse {}))
+            }
+            Some(Request::DestroyWorld(destroy)) => self.destroy_world(&destroy).map(Response::DestroyWorld),
+            Some(Request::Extension(any)) => {
+                properties::answer(self.worlds.catalogue(), self.joined.as_ref(), &any).map(Response::Extension)
+            }
+            None => {
+                let expected = "create_world, join_world, step, …";
+                Err(Refusal::value("request", "empty or of a kind this server does not know", expected))
+            }
+        };
+        response.map(|payload| rpc::EnvironmentResponse { payload: Some(payload) })
+    }
+
+    fn refusal(refusal: Refusal) -> Self::Response {
+        rpc::EnvironmentResponse { payload: Some(Response::Error(refusal.into())) }
+    }
+}
+
+impl Observed for Agent {
+    const KINDS: &'static [&'static str] = &[
+        "create_world",
+        "join_world",
+        "step",
+        "reset",
+        "reset_world",
+        "leave_world",
+        "destroy_world",
+        "extension",
+        "unknown",
+    ];
+
+    fn kind(request: &Self::Request) -> &'static str {
+        match request.payload {
+            Some(Request::CreateWorld(_)) => "create_world",
+            Some(Request::JoinWorld(_)) => "join_world",
+            Some(Request::Step(_)) => "step",
+            Some(Request::Reset(_)) => "reset",
+            Some(Request::ResetWorld(_)) => "reset_world",
+            Some(Request::LeaveWorld(_)) => "leave_world",
+            Some(Request::DestroyWorld(_)) => "destroy_world",
+            Some(Request::Extension(_)) => "extension",
+            None => "unknown",
+        }
+    }
+}

@@ -1,0 +1,201 @@
+//! A world's episodes, one after the other, on the pool: a batch of one environment.
+
+use crate::{
+    env::{Distribution, EnvironmentSpec, EpisodeStart, Settings, Version},
+    pool::{Batch, BatchSettings, Pool, ResetEntry, Stepped},
+    proto::dm_env_rpc::v1::EnvironmentStateType as State,
+    server::{audit::draws::Draws, status::Refusal},
+};
+use bytes::Bytes;
+use std::sync::Arc;
+
+/// An environment and where its episode stands.
+pub(super) struct Runner {
+    batch: Batch,
+    draws: Draws,
+    phase: Phase,
+    /// The first observation of the episode that was begun last, f32 `[O]`.
+    first: Bytes,
+    start: Option<EpisodeStart>,
+    seed: u64,
+    version: Version,
+}
+
+/// Where the episode stands.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    /// It has begun, and nobody has seen it: the first episode of a new world.
+    Unseen,
+    /// It runs.
+    Running,
+    /// It has ended or was broken off.
+    Over,
+}
+
+/// What an agent may observe after a step.
+pub(super) struct Outcome {
+    /// Where the agent's sequence stands.
+    pub(super) state: State,
+    /// f32 `[O]`, little-endian.
+    pub(super) observation: Bytes,
+    /// 0 where an episode begins.
+    pub(super) reward: f32,
+    /// The step limit ended the episode.
+    pub(super) truncated: bool,
+    /// The episode has ended and was a success.
+    pub(super) success: bool,
+    /// The physics diverged.
+    pub(super) diverged: bool,
+}
+
+/// What begins with the next episode.
+#[derive(Clone)]
+pub(super) struct Changes {
+    /// The version in force.
+    pub(super) version: Version,
+    /// A new seed.
+    pub(super) seed: Option<u64>,
+    /// New distributions, one for each parameter.
+    pub(super) distributions: Option<Arc<[Distribution]>>,
+}
+
+impl Runner {
+    /// Makes the environment.
+    ///
+    /// # Errors
+    /// If the pool is full or a model cannot be loaded, or the token may not draw from there.
+    pub(super) async fn open(
+        pool: &Pool,
+        settings: BatchSettings,
+        version: Version,
+        draws: Draws,
+    ) -> Result<Self, Refusal> {
+        let (begun, spec) = (draws.open(&settings).await?, settings.spec);
+        let opened = Batch::open(pool, settings).await;
+        let (mut batch, first, started) = opened.inspect_err(|_| draws.not_opened(spec, begun))?;
+        draws.follow(&mut batch);
+        let seed = batch.settings().groups[0].episodes.seed;
+        Ok(Self { batch, draws, phase: Phase::Unseen, first, start: only(started), seed, version })
+    }
+
+    /// What its episodes were fixed by when it was made.
+    pub(super) fn episodes(&self) -> &Settings {
+        &self.batch.settings().groups[0].episodes
+    }
+
+    /// What it may draw from.
+    pub(super) fn draws(&self) -> &Draws {
+        &self.draws
+    }
+
+    /// Its environment.
+    pub(super) fn spec(&self) -> &'static EnvironmentSpec {
+        self.batch.settings().spec
+    }
+
+    /// The episode that was begun last, with its receipt.
+    pub(super) fn start(&self) -> Option<&EpisodeStart> {
+        self.start.as_ref()
+    }
+
+    /// The seed of that episode.
+    pub(super) fn seed(&self) -> u64 {
+        self.seed
+    }
+
+    /// The version of that episode.
+    pub(super) fn version(&self) -> Version {
+        self.version
+    }
+
+    /// Whether an episode runs, so that the next step advances it.
+    pub(super) fn is_running(&self) -> bool {
+        self.phase == Phase::Running
+    }
+
+    /// Breaks a running episode off: the next step begins another.
+    pub(super) fn stop(&mut self) {
+        if self.is_running() {
+            self.phase = Phase::Over;
+        }
+    }
+
+    /// Waits for a step whose agent went away meanwhile.
+    pub(super) async fn settle(&mut self) {
+        self.batch.settle().await;
+    }
+
+    /// Begins an episode: the next, or that of a world that is new. With changes a new trial begins, as in `perturb.v1`.
+    ///
+    /// # Errors
+    /// If the server has a defect.
+    pub(super) async fn begin(&mut self, changes: Changes) -> Result<Outcome, Refusal> {
+        let Changes { version, seed, distributions } = changes;
+        if self.phase != Phase::Unseen || seed.is_some() || distributions.is_some() {
+            let entries = vec![ResetEntry { slot: 0, seed, distributions, state: None }];
+            self.draws.reset(&self.batch, &entries).await?;
+            (self.phase, self.version, self.seed) = (Phase::Over, version, seed.unwrap_or(self.seed));
+            let (first, started) = self.batch.reset(entries).await?;
+            (self.first, self.start) = (first, only(started));
+        }
+        self.phase = Phase::Running;
+        Ok(Outcome {
+            state: State::Running,
+            observation: self.first.clone(),
+            reward: 0.0,
+            truncated: false,
+            success: false,
+            diverged: false,
+        })
+    }
+
+    /// Advances the running episode by a step, and ends it if it is to be interrupted.
+    ///
+    /// # Errors
+    /// If the server has a defect.
+    pub(super) async fn step(&mut self, actions: &[u8], interrupted: bool) -> Result<Outcome, Refusal> {
+        let Stepped { observations, rewards, terminated, truncated, ended, .. } = self.batch.step(actions).await?;
+        let is_set = |flags: &Bytes| flags.first().is_some_and(|flag| *flag == 1);
+        let truncated = is_set(&truncated);
+        let state = state(is_set(&terminated), truncated || interrupted);
+        if state != State::Running {
+            self.phase = Phase::Over;
+        }
+        let end = ended.first().map(|(_, end)| end);
+        Ok(Outcome {
+            state,
+            observation: observations,
+            reward: rewards.first_chunk().map_or(0.0, |word| f32::from_le_bytes(*word)),
+            truncated,
+            success: end.is_some_and(|end| end.success),
+            diverged: end.is_some_and(|end| end.diverged),
+        })
+    }
+}
+
+/// An end by the task comes before one from outside: the state that it leaves has no value, as in Gymnasium.
+fn state(terminated: bool, interrupted: bool) -> State {
+    match (terminated, interrupted) {
+        (true, _) => State::Terminated,
+        (false, true) => State::Interrupted,
+        (false, false) => State::Running,
+    }
+}
+
+/// The only environment's.
+fn only(started: Vec<(u32, EpisodeStart)>) -> Option<EpisodeStart> {
+    started.into_iter().next().map(|(_, start)| start)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_end_by_the_task_and_by_the_step_limit_at_once_is_terminated() {
+        assert_eq!(state(true, true), State::Terminated);
+        assert_eq!(state(true, false), State::Terminated);
+        assert_eq!(state(false, true), State::Interrupted);
+        assert_eq!(state(false, false), State::Running);
+    }
+}

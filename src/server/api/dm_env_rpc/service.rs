@@ -1,0 +1,52 @@
+//! The gRPC service of `dm_env_rpc.v1`: one stream for each agent.
+
+use super::{agent::Agent, worlds::Worlds};
+use crate::{
+    env::Catalogue,
+    pool::Pool,
+    proto::dm_env_rpc::v1::{EnvironmentRequest, EnvironmentResponse, environment_server::Environment},
+    server::{
+        audit::ledger::Ledger,
+        session::{
+            driver::{Responses, Sessions},
+            instrumented::{Counted, Counts},
+        },
+        transport::message_reader::Frames,
+    },
+};
+use std::sync::Arc;
+use tonic::{Request, Response, Status, Streaming};
+
+/// Serves worlds, which all streams share.
+#[derive(Clone)]
+pub struct Service {
+    worlds: Arc<Worlds>,
+    sessions: Sessions,
+    counts: Arc<Counts>,
+}
+
+impl Service {
+    /// A service over a pool, without worlds, whose draws the ledger has.
+    pub fn new(pool: Arc<Pool>, catalogue: Arc<Catalogue>, sessions: Sessions, ledger: Option<Ledger>) -> Self {
+        Self { worlds: Arc::new(Worlds::new(pool, catalogue, ledger)), sessions, counts: Counts::of::<Agent>() }
+    }
+
+    /// The requests so far.
+    pub fn counts(&self) -> Arc<Counts> {
+        Arc::clone(&self.counts)
+    }
+}
+
+#[tonic::async_trait]
+impl Environment for Service {
+    type ProcessStream = Responses<EnvironmentResponse>;
+
+    async fn process(
+        &self,
+        mut request: Request<Streaming<EnvironmentRequest>>,
+    ) -> Result<Response<Self::ProcessStream>, Status> {
+        let frames = Frames::of(&mut request)?;
+        let agent = Agent::new(Arc::clone(&self.worlds), frames.bearer.clone(), self.sessions.clone());
+        Ok(Response::new(self.sessions.begin(frames, Counted::new(agent, &self.counts))?))
+    }
+}

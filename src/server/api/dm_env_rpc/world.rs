@@ -1,0 +1,115 @@
+//! What requests of any stream may change about a world. The physics follows when the next episode begins.
+
+use super::{
+    runner::{Changes, Runner},
+    settings::Change,
+};
+use crate::{
+    env::{Distribution, EnvironmentSpec, Version, resolve},
+    server::{audit::draws::Draws, status::Refusal},
+};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// A world, as all streams see it.
+pub(super) struct World {
+    name: String,
+    spec: &'static EnvironmentSpec,
+    draws: Draws,
+    wanted: Mutex<Wanted>,
+}
+
+/// What the next episode begins with.
+struct Wanted {
+    version: Version,
+    /// One for each parameter.
+    distributions: Vec<Distribution>,
+    /// Whether they are other than the running episode's.
+    new_distributions: bool,
+    seed: Option<u64>,
+    /// Another stream has reset the world: the running episode ends with its next step.
+    interruption: bool,
+}
+
+/// A world and its agent's episodes in it.
+pub(super) struct Joined {
+    pub(super) world: Arc<World>,
+    pub(super) runner: Runner,
+}
+
+impl World {
+    /// The world of an environment that has just been made.
+    pub(super) fn new(name: String, runner: &Runner) -> Self {
+        let wanted = Wanted {
+            version: runner.version(),
+            distributions: runner.episodes().distributions.clone(),
+            new_distributions: false,
+            seed: None,
+            interruption: false,
+        };
+        Self { name, spec: runner.spec(), draws: runner.draws().clone(), wanted: Mutex::new(wanted) }
+    }
+
+    /// Its name, unique on the server.
+    pub(super) fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Its environment.
+    pub(super) fn spec(&self) -> &'static EnvironmentSpec {
+        self.spec
+    }
+
+    /// Notes a change for the next episode.
+    ///
+    /// # Errors
+    /// If a parameter is out of its bounds, or the token may not draw from there; nothing is noted then.
+    pub(super) fn change(&self, change: Change) -> Result<(), Refusal> {
+        let mut wanted = self.lock();
+        let version = change.version.unwrap_or(wanted.version);
+        if change.version.is_some() || !change.parameters.is_empty() {
+            let mut distributions = match change.version {
+                Some(version) => self.spec.distributions(version),
+                None => wanted.distributions.clone(),
+            };
+            resolve(self.spec, &mut distributions, change.parameters)?;
+            self.draws.check(self.spec, &distributions)?;
+            (wanted.distributions, wanted.new_distributions) = (distributions, true);
+        }
+        wanted.version = version;
+        wanted.seed = change.seed.or(wanted.seed);
+        Ok(())
+    }
+
+    /// What the episode that begins now is to begin with.
+    pub(super) fn take_changes(&self) -> Changes {
+        let mut wanted = self.lock();
+        wanted.interruption = false;
+        let new = std::mem::take(&mut wanted.new_distributions);
+        Changes {
+            version: wanted.version,
+            seed: wanted.seed.take(),
+            distributions: new.then(|| wanted.distributions.clone().into()),
+        }
+    }
+
+    /// Takes back the changes of an episode that could not begin, but for what was changed since.
+    pub(super) fn keep(&self, changes: Changes) {
+        let mut wanted = self.lock();
+        wanted.seed = wanted.seed.or(changes.seed);
+        wanted.new_distributions |= changes.distributions.is_some();
+    }
+
+    /// Has the running episode end with its next step.
+    pub(super) fn interrupt(&self) {
+        self.lock().interruption = true;
+    }
+
+    /// Whether the running episode is to end with the step that is now.
+    pub(super) fn take_interruption(&self) -> bool {
+        std::mem::take(&mut self.lock().interruption)
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Wanted> {
+        self.wanted.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}

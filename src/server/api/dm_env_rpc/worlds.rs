@@ -1,0 +1,237 @@
+//! All worlds of the server, by name. A world lives as long as the stream that made it or an agent that is in it. Names
+//! cannot be guessed, unless they were asked for: whoever is told one may join, with the token that the world was made
+//! with.
+
+use super::{runner::Runner, settings::Ownership, world::World};
+use crate::{
+    env::{Catalogue, shorten},
+    pool::Pool,
+    server::{
+        audit::{draws::Draws, ledger::Ledger},
+        auth::{Bearer, Held},
+        session::lease,
+        status::Refusal,
+    },
+};
+use std::{
+    collections::BTreeMap,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+};
+
+/// Tells streams apart.
+type StreamId = u64;
+
+/// A stream.
+pub(super) struct Caller {
+    stream: StreamId,
+    bearer: Option<Bearer>,
+}
+
+impl Caller {
+    /// So many environments of its token.
+    ///
+    /// # Errors
+    /// [`Refusal::TooManyOfAToken`].
+    pub(super) fn envs(&self, count: usize) -> Result<Option<Held>, Refusal> {
+        self.bearer.as_ref().map(|bearer| bearer.envs(count)).transpose()
+    }
+
+    /// What it calls so.
+    fn key(&self, name: &str) -> Key {
+        (self.bearer.as_ref().map(|bearer| bearer.name().to_owned()), name.to_owned())
+    }
+}
+
+/// A world's name, with that of the token which it was made with: others do not see it, and may use the name too.
+type Key = (Option<String>, String);
+
+/// The registry that all streams share.
+pub(super) struct Worlds {
+    pool: Arc<Pool>,
+    catalogue: Arc<Catalogue>,
+    ledger: Option<Ledger>,
+    registry: Mutex<Registry>,
+}
+
+#[derive(Default)]
+struct Registry {
+    worlds: BTreeMap<Key, Entry>,
+    streams: StreamId,
+}
+
+struct Entry {
+    world: Arc<World>,
+    /// The stream that made it, until it ends.
+    maker: Option<StreamId>,
+    /// The stream whose agent is in it.
+    agent: Option<StreamId>,
+    /// Whether every stream may reset and destroy it.
+    shared: bool,
+    /// None while an agent has it.
+    runner: Option<Runner>,
+    /// Of the environments that its maker's token may have.
+    _held: Option<Held>,
+}
+
+impl Worlds {
+    /// No worlds yet.
+    pub(super) fn new(pool: Arc<Pool>, catalogue: Arc<Catalogue>, ledger: Option<Ledger>) -> Self {
+        Self { pool, catalogue, ledger, registry: Mutex::default() }
+    }
+
+    /// What a new world of a stream draws from.
+    pub(super) fn draws(&self, maker: &Caller) -> Draws {
+        Draws::new(maker.bearer.clone(), self.ledger.clone())
+    }
+
+    /// Where worlds' environments run.
+    pub(super) fn pool(&self) -> &Pool {
+        &self.pool
+    }
+
+    /// The environments that there may be worlds of.
+    pub(super) fn catalogue(&self) -> &Catalogue {
+        &self.catalogue
+    }
+
+    /// A new stream.
+    pub(super) fn caller(&self, bearer: Option<Bearer>) -> Caller {
+        let mut registry = self.lock();
+        registry.streams += 1;
+        Caller { stream: registry.streams, bearer }
+    }
+
+    /// Whether there is no world of the name that is asked for.
+    ///
+    /// # Errors
+    /// [`Refusal::Taken`].
+    pub(super) fn is_free(&self, maker: &Caller, own: &Ownership) -> Result<(), Refusal> {
+        match own.name.as_ref().filter(|name| self.lock().worlds.contains_key(&maker.key(name))) {
+            Some(name) => Err(Refusal::Taken { world: name.clone() }),
+            None => Ok(()),
+        }
+    }
+
+    /// Takes a world that a stream has made, and what it holds of its token's. Returns its name.
+    ///
+    /// # Errors
+    /// [`Refusal::Taken`] if another has the name that was asked for, [`Refusal::NoRandomness`].
+    pub(super) fn add(
+        &self,
+        maker: &Caller,
+        runner: Runner,
+        own: Ownership,
+        held: Option<Held>,
+    ) -> Result<String, Refusal> {
+        let name = match own.name {
+            Some(name) => name,
+            None => random_name(runner.spec().name)?,
+        };
+        let (key, mut registry) = (maker.key(&name), self.lock());
+        if registry.worlds.contains_key(&key) {
+            return Err(Refusal::Taken { world: name });
+        }
+        let world = Arc::new(World::new(name.clone(), &runner));
+        let entry = Entry {
+            world,
+            maker: Some(maker.stream),
+            agent: None,
+            shared: own.shared,
+            runner: Some(runner),
+            _held: held,
+        };
+        registry.worlds.insert(key, entry);
+        Ok(name)
+    }
+
+    /// The world of that name, for a stream that wants to change it.
+    ///
+    /// # Errors
+    /// [`Refusal::Unknown`], [`Refusal::NotYours`].
+    pub(super) fn of(&self, caller: &Caller, name: &str, request: &'static str) -> Result<Arc<World>, Refusal> {
+        Ok(Arc::clone(&self.lock().of(caller, name, request)?.world))
+    }
+
+    /// Gives a world to a stream's agent.
+    ///
+    /// # Errors
+    /// [`Refusal::Unknown`], [`Refusal::Occupied`].
+    pub(super) fn join(&self, caller: &Caller, name: &str) -> Result<(Arc<World>, Runner), Refusal> {
+        let mut registry = self.lock();
+        let entry = registry.find(caller, name)?;
+        let occupied = || Refusal::Occupied { world: name.into(), request: "join_world" };
+        let runner = entry.runner.take().ok_or_else(occupied)?;
+        entry.agent = Some(caller.stream);
+        Ok((Arc::clone(&entry.world), runner))
+    }
+
+    /// Takes a world back from its agent.
+    pub(super) fn leave(&self, agent: &Caller, world: &World, runner: Runner) {
+        let mut registry = self.lock();
+        if let Some(entry) = registry.worlds.get_mut(&agent.key(world.name())) {
+            (entry.agent, entry.runner) = (None, Some(runner));
+        }
+        registry.reap();
+    }
+
+    /// Frees a world.
+    ///
+    /// # Errors
+    /// [`Refusal::Unknown`], [`Refusal::NotYours`], [`Refusal::Occupied`].
+    pub(super) fn destroy(&self, caller: &Caller, name: &str) -> Result<(), Refusal> {
+        let mut registry = self.lock();
+        if registry.of(caller, name, "destroy_world")?.runner.is_none() {
+            return Err(Refusal::Occupied { world: name.into(), request: "destroy_world" });
+        }
+        registry.worlds.remove(&caller.key(name));
+        Ok(())
+    }
+
+    /// Whether there are worlds that this stream has made.
+    pub(super) fn are_made_by(&self, caller: &Caller) -> bool {
+        self.lock().worlds.values().any(|entry| entry.maker == Some(caller.stream))
+    }
+
+    /// A stream is gone, and with it those of its worlds that have no agent.
+    pub(super) fn stream_ended(&self, caller: &Caller) {
+        let mut registry = self.lock();
+        for entry in registry.worlds.values_mut().filter(|entry| entry.maker == Some(caller.stream)) {
+            entry.maker = None;
+        }
+        registry.reap();
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Registry> {
+        self.registry.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Registry {
+    /// The world of that name, if the stream has made it, is its agent's, or may do as if.
+    fn of(&mut self, caller: &Caller, name: &str, request: &'static str) -> Result<&Entry, Refusal> {
+        let entry = self.find(caller, name)?;
+        let is_its = entry.shared || [entry.maker, entry.agent].contains(&Some(caller.stream));
+        if is_its { Ok(entry) } else { Err(Refusal::NotYours { world: name.into(), request }) }
+    }
+
+    /// The world of that name, if there is one for streams with this token.
+    fn find(&mut self, caller: &Caller, name: &str) -> Result<&mut Entry, Refusal> {
+        self.worlds.get_mut(&caller.key(name)).ok_or_else(|| unknown(name))
+    }
+
+    /// Frees the worlds that have neither maker nor agent.
+    fn reap(&mut self) {
+        self.worlds.retain(|_, entry| entry.maker.is_some() || entry.runner.is_none());
+    }
+}
+
+/// One that nobody guesses.
+fn random_name(environment: &str) -> Result<String, Refusal> {
+    Ok(format!("{environment}-{:032x}", u128::from_ne_bytes(lease::random()?)))
+}
+
+fn unknown(name: &str) -> Refusal {
+    let known = "send the name that create_world returned; a world goes when it has neither an agent nor the stream \
+                 that made it";
+    Refusal::Unknown { what: "world", name: format!("{:?}", shorten(name)), known: known.into() }
+}

@@ -1,0 +1,4 @@
+//! The protocols that the server speaks.
+
+pub mod dm_env_rpc;
+pub mod perturb_v1;

@@ -1,0 +1,386 @@
+//! Between the protocol and the domain. All validation of what clients send is here: what leaves this file is legal.
+
+use crate::{
+    env::{
+        self, Achievement, ActionSpace, Catalogue, Channel, Comparison, Distribution, EnvironmentSpec, EpisodeEnd,
+        EpisodeId, EpisodeStart, Parameter, Receipt, Settings, Success, Version, resolve,
+    },
+    pool::{Autoreset, Batch, BatchSettings, ResetEntry, SlotGroup, Stepped},
+    proto,
+    render::Size,
+    server::status::Refusal,
+};
+use bytes::Bytes;
+use perturb_protocol::limits::{PICTURE_PIXELS, USUAL_PICTURE_PIXELS};
+use std::{collections::HashMap, sync::Arc};
+
+/// Checks an `open` of at most `most` environments.
+pub fn open(catalogue: &Catalogue, most: usize, request: proto::Open) -> Result<BatchSettings, Refusal> {
+    let spec = catalogue.find(&request.environment)?;
+    let autoreset = match request.autoreset_mode() {
+        proto::AutoresetMode::NextStep => Autoreset::NextStep,
+        proto::AutoresetMode::SameStep => Autoreset::SameStep,
+        proto::AutoresetMode::Disabled => Autoreset::Disabled,
+        proto::AutoresetMode::Unspecified => {
+            let expected = "AUTORESET_MODE_NEXT_STEP (1), _SAME_STEP (2) or _DISABLED (3)";
+            return Err(Refusal::value("open.autoreset_mode", request.autoreset_mode, expected));
+        }
+    };
+    let proto::Open { receipts, receipt_arrays, reward_terms, observe_parameters, .. } = request;
+    let groups = if request.groups.is_empty() {
+        vec![group(spec, "open", "open.batch_size", single(request))?]
+    } else {
+        check_no_single(&request)?;
+        // Before anything is made of them: each has one environment at least.
+        if request.groups.len() > most {
+            let got = format!("{} groups", request.groups.len());
+            return Err(Refusal::value("open.groups", got, format!("at most {most}, as this server has environments")));
+        }
+        let numbered = request.groups.into_iter().enumerate();
+        let named = |i, slots| group(spec, &format!("open.groups[{i}]"), &format!("open.groups[{i}].size"), slots);
+        numbered.map(|(i, slots)| named(i, slots)).collect::<Result<_, _>>()?
+    };
+    Ok(BatchSettings { spec, groups, autoreset, receipts, receipt_arrays, reward_terms, observe_parameters })
+}
+
+/// An `open` without groups as one group.
+fn single(request: proto::Open) -> proto::SlotGroup {
+    let proto::Open { version, parameters, batch_size, seed, first_environment_index, episodes_per_trial, .. } =
+        request;
+    proto::SlotGroup { size: batch_size, version, parameters, seed, first_environment_index, episodes_per_trial }
+}
+
+/// Refuses groups beside what they are in place of.
+fn check_no_single(request: &proto::Open) -> Result<(), Refusal> {
+    let given = [
+        ("open.version", request.version != 0),
+        ("open.parameters", !request.parameters.is_empty()),
+        ("open.batch_size", request.batch_size != 0),
+        ("open.seed", request.seed != 0),
+        ("open.first_environment_index", request.first_environment_index != 0),
+        ("open.episodes_per_trial", request.episodes_per_trial != 0),
+    ];
+    match given.into_iter().find(|(_, given)| *given) {
+        Some((field, _)) => Err(Refusal::value(field, "given beside open.groups", "it in each group alone")),
+        None => Ok(()),
+    }
+}
+
+/// Checks a group, whose fields are those of `path`.
+fn group(
+    spec: &'static EnvironmentSpec,
+    path: &str,
+    size_field: &str,
+    group: proto::SlotGroup,
+) -> Result<SlotGroup, Refusal> {
+    let version = Version::from_proto(group.version()).ok_or_else(|| {
+        let expected = "VERSION_DEFAULT (1), VERSION_RANDOM (2), VERSION_EXTREME (3) or VERSION_RANDOM_OR_EXTREME (4)";
+        Refusal::value(format!("{path}.version"), group.version, expected)
+    })?;
+    if group.size == 0 {
+        return Err(Refusal::value(size_field.to_owned(), 0, "at least 1"));
+    }
+    let first = group.first_environment_index;
+    if first.checked_add(group.size - 1).is_none() {
+        let (field, got) =
+            (format!("{path}.first_environment_index"), format!("{first} for a batch of {}", group.size));
+        return Err(Refusal::value(field, got, "the last environment's index below 2^32"));
+    }
+    let mut distributions = spec.distributions(version);
+    override_parameters(spec, &mut distributions, &group.parameters)?;
+    let episodes = Settings {
+        seed: group.seed,
+        environment_index: first,
+        distributions,
+        episodes_per_trial: group.episodes_per_trial.max(1),
+    };
+    Ok(SlotGroup { size: group.size as usize, episodes })
+}
+
+/// Replaces the distributions of the parameters that are named.
+fn override_parameters(
+    spec: &'static EnvironmentSpec,
+    base: &mut [Distribution],
+    parameters: &HashMap<String, proto::Distribution>,
+) -> Result<(), Refusal> {
+    // In order of names, so that the same request always gets the same refusal.
+    let mut parameters: Vec<_> = parameters.iter().collect();
+    parameters.sort_by_key(|(name, _)| *name);
+    let mut overrides = Vec::with_capacity(parameters.len());
+    for (name, distribution) in parameters {
+        overrides.push((name.as_str(), Distribution::try_from(distribution).map_err(env::Error::of(name))?));
+    }
+    Ok(resolve(spec, base, overrides)?)
+}
+
+/// Checks a step's actions for a batch of `size` environments.
+pub fn actions(spec: &EnvironmentSpec, size: usize, actions: &Bytes) -> Result<(), Refusal> {
+    const FIELD: &str = "step.actions";
+    let (element, width) = match spec.action {
+        ActionSpace::Discrete(_) => ("int32 [N]", 1),
+        ActionSpace::Continuous(channels) => ("float32 [N, A]", channels.len()),
+    };
+    if actions.len() != 4 * width * size {
+        let expected = format!("{} bytes: {element} with N = {size}, A = {width}", 4 * width * size);
+        return Err(Refusal::value(FIELD, format!("{} bytes", actions.len()), expected));
+    }
+    let words = actions.as_chunks::<4>().0;
+    match spec.action {
+        ActionSpace::Discrete(names) => {
+            let legal = |word: &[u8; 4]| (0..names.len() as i32).contains(&i32::from_le_bytes(*word));
+            if let Some(slot) = words.iter().position(|word| !legal(word)) {
+                let got = format!("{} in slot {slot}", i32::from_le_bytes(words[slot]));
+                return Err(Refusal::value(FIELD, got, format!("a choice in 0 … {}", names.len() - 1)));
+            }
+        }
+        ActionSpace::Continuous(_) => {
+            if let Some(i) = words.iter().position(|word| !f32::from_le_bytes(*word).is_finite()) {
+                let got = format!("{} in slot {}, entry {}", f32::from_le_bytes(words[i]), i / width, i % width);
+                return Err(Refusal::value(FIELD, got, "finite numbers"));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The slots that a mask selects.
+pub fn mask(field: &'static str, size: usize, mask: &[u8]) -> Result<Vec<usize>, Refusal> {
+    if mask.is_empty() {
+        return Ok((0..size).collect());
+    }
+    if mask.len() != size {
+        let expected = format!("one byte for each of the {size} environments, or none for all");
+        return Err(Refusal::value(field, format!("{} bytes", mask.len()), expected));
+    }
+    if let Some(slot) = mask.iter().position(|&byte| byte > 1) {
+        return Err(Refusal::value(field, format!("{} in slot {slot}", mask[slot]), "0 or 1"));
+    }
+    Ok((0..size).filter(|&slot| mask[slot] == 1).collect())
+}
+
+/// Checks a `reset` of a batch.
+pub fn reset(batch: &Batch, request: proto::Reset) -> Result<Vec<ResetEntry>, Refusal> {
+    let spec = batch.settings().spec;
+    let slots = mask("reset.mask", batch.size(), &request.mask)?;
+    if !request.seeds.is_empty() && request.seeds.len() != slots.len() {
+        let expected = format!("one for each of the {} selected environments, or none", slots.len());
+        return Err(Refusal::value("reset.seeds", format!("{} seeds", request.seeds.len()), expected));
+    }
+    let mut states = states(spec, &request.states, slots.len())?.into_iter();
+    // Neighbours mostly share their distributions, which are then overridden once.
+    let mut edited: (Vec<Distribution>, Arc<[Distribution]>) = (Vec::new(), Arc::new([]));
+    let mut entries = Vec::with_capacity(slots.len());
+    for (i, slot) in slots.into_iter().enumerate() {
+        let mut distributions = None;
+        if !request.parameters.is_empty() {
+            let old = batch.distributions(slot);
+            if old != edited.0 {
+                let mut new = old.clone();
+                override_parameters(spec, &mut new, &request.parameters)?;
+                edited = (old, new.into());
+            }
+            distributions = Some(Arc::clone(&edited.1));
+        }
+        entries.push(ResetEntry { slot, seed: request.seeds.get(i).copied(), distributions, state: states.next() });
+    }
+    Ok(entries)
+}
+
+fn states(spec: &EnvironmentSpec, bytes: &Bytes, selected: usize) -> Result<Vec<Vec<f64>>, Refusal> {
+    const FIELD: &str = "reset.states";
+    if bytes.is_empty() {
+        return Ok(Vec::new());
+    }
+    let n = spec.state.len();
+    if bytes.len() != 8 * n * selected {
+        let expected = format!("{} bytes: float64 [M, S] with M = {selected}, S = {n}", 8 * n * selected);
+        return Err(Refusal::value(FIELD, format!("{} bytes", bytes.len()), expected));
+    }
+    let numbers: Vec<f64> = bytes.as_chunks::<8>().0.iter().map(|word| f64::from_le_bytes(*word)).collect();
+    for (i, &x) in numbers.iter().enumerate() {
+        let Channel { name, unit, low, high } = spec.state[i % n];
+        if !x.is_finite() || x < low || x > high {
+            let got = format!("{x} {unit} for {name} in row {}", i / n);
+            return Err(Refusal::value(FIELD, got, format!("a finite number within [{low}, {high}]")));
+        }
+    }
+    Ok(numbers.chunks_exact(n).map(<[f64]>::to_vec).collect())
+}
+
+/// The slots that a `release` frees.
+pub fn release(size: usize, request: &proto::Release) -> Result<Vec<usize>, Refusal> {
+    const FIELD: &str = "release.mask";
+    let slots = mask(FIELD, size, &request.mask)?;
+    let expected = "at least one environment that goes and one that stays; end the stream to free all";
+    match slots.len() {
+        0 => Err(Refusal::value(FIELD, "without a selected environment", expected)),
+        all if all == size => Err(Refusal::value(FIELD, format!("all of the {size} environments"), expected)),
+        _ => Ok(slots),
+    }
+}
+
+/// Pairs a restore's snapshots with their slots.
+pub fn restore(size: usize, request: proto::Restore) -> Result<Vec<(usize, Bytes)>, Refusal> {
+    let slots = mask("restore.mask", size, &request.mask)?;
+    if request.snapshots.len() != slots.len() {
+        let got = format!("{} snapshots", request.snapshots.len());
+        let expected = format!("one for each of the {} selected environments", slots.len());
+        return Err(Refusal::value("restore.snapshots", got, expected));
+    }
+    Ok(slots.into_iter().zip(request.snapshots).collect())
+}
+
+/// The slot of a batch of `n` that a `render` asks for, and the picture's size.
+pub fn render(n: usize, request: proto::Render) -> Result<(usize, Size), Refusal> {
+    let slot = request.slot as usize;
+    if slot >= n {
+        return Err(Refusal::value("render.slot", request.slot, format!("a slot of the batch, 0 … {}", n - 1)));
+    }
+    let pixels = |field, value| match u16::try_from(value) {
+        Ok(0) => Ok(USUAL_PICTURE_PIXELS),
+        Ok(pixels) if PICTURE_PIXELS.contains(&pixels) => Ok(pixels),
+        _ => {
+            let (least, most) = (PICTURE_PIXELS.start(), PICTURE_PIXELS.end());
+            let expected = format!("{least} … {most} pixels, or 0 for {USUAL_PICTURE_PIXELS}");
+            Err(Refusal::value(field, value, expected))
+        }
+    };
+    let (width, height) = (pixels("render.width", request.width)?, pixels("render.height", request.height)?);
+    Ok((slot, Size { width, height }))
+}
+
+/// An environment's entry in the catalogue.
+pub fn environment(spec: &EnvironmentSpec, model_hash: &str) -> proto::Environment {
+    let quantity = |q: &env::Quantity| proto::Quantity { name: q.name.into(), unit: q.unit.into() };
+    let term = |t: &env::RewardTerm| proto::RewardTerm { name: t.name.into(), description: t.description.into() };
+    proto::Environment {
+        name: spec.name.into(),
+        revision: spec.revision,
+        description: spec.description.into(),
+        parameters: spec.parameters.iter().map(parameter).collect(),
+        observation: channels(spec.observation),
+        action: Some(action_space(spec.action)),
+        state: channels(spec.state),
+        reward_terms: spec.reward_terms.iter().map(term).collect(),
+        applied: spec.applied.iter().map(quantity).collect(),
+        step_limit: spec.step_limit,
+        control_timestep: spec.control_timestep,
+        success: Some(success(&spec.success, spec.step_limit)),
+        code_success: Some(success(spec.code_success.as_ref().unwrap_or(&spec.success), spec.step_limit)),
+        model_hash: model_hash.into(),
+        heatmap_axes: spec.heatmap_axes.iter().flatten().map(|name| (*name).into()).collect(),
+        parameter_observations: spec.parameters.iter().map(parameter_observation).collect(),
+    }
+}
+
+fn success(rule: &Success, step_limit: u32) -> proto::Success {
+    let Success { description, achievement, comparison, threshold } = *rule;
+    let env::Quantity { name, unit } = rule.quantity();
+    let comparison = match comparison {
+        Comparison::AtLeast => proto::Comparison::AtLeast,
+        Comparison::AtMost => proto::Comparison::AtMost,
+    };
+    proto::Success {
+        description: description.into(),
+        steps: if let Achievement::Own(_) = achievement { step_limit } else { threshold as u32 },
+        quantity: name.into(),
+        unit: unit.into(),
+        comparison: comparison.into(),
+        threshold,
+    }
+}
+
+fn channels(channels: &[Channel]) -> Vec<proto::Channel> {
+    let channel = |c: &Channel| proto::Channel { name: c.name.into(), unit: c.unit.into(), low: c.low, high: c.high };
+    channels.iter().map(channel).collect()
+}
+
+fn parameter(p: &Parameter) -> proto::Parameter {
+    proto::Parameter {
+        name: p.name.into(),
+        unit: p.unit.into(),
+        description: p.description.into(),
+        default_value: p.default,
+        low: p.bounds.low,
+        high: p.bounds.high,
+        random: Some((&p.distribution(Version::R)).into()),
+        extreme: Some((&p.distribution(Version::E)).into()),
+        applied: p.applied.into(),
+    }
+}
+
+fn parameter_observation(p: &Parameter) -> proto::ParameterObservation {
+    let whole = p.whole();
+    let bound = |value| f64::from(p.observed(value));
+    proto::ParameterObservation {
+        entry: Some(proto::Channel {
+            name: format!("parameter_{}", p.name),
+            unit: "1".into(),
+            low: bound(p.bounds.low),
+            high: bound(p.bounds.high),
+        }),
+        at_minus_one: whole.low,
+        at_plus_one: whole.high,
+    }
+}
+
+fn action_space(space: ActionSpace) -> proto::ActionSpace {
+    use proto::action_space::Kind;
+    let kind = match space {
+        ActionSpace::Discrete(names) => {
+            Kind::Discrete(proto::Discrete { names: names.iter().map(|name| (*name).into()).collect() })
+        }
+        ActionSpace::Continuous(list) => Kind::Continuous(proto::Continuous { channels: channels(list) }),
+    };
+    proto::ActionSpace { kind: Some(kind) }
+}
+
+/// A step's outcome.
+pub fn stepped(stepped: Stepped) -> proto::Stepped {
+    proto::Stepped {
+        observations: stepped.observations,
+        rewards: stepped.rewards,
+        terminated: stepped.terminated,
+        truncated: stepped.truncated,
+        final_observations: stepped.final_observations,
+        ended: stepped.ended.into_iter().map(ended).collect(),
+        started: started(stepped.started),
+        reward_terms: stepped.reward_terms,
+        receipt_episodes: stepped.receipt_episodes,
+        receipt_values: stepped.receipt_values,
+    }
+}
+
+/// Episodes that began.
+pub fn started(episodes: Vec<(u32, EpisodeStart)>) -> Vec<proto::EpisodeStart> {
+    let start = |(slot, start): (u32, EpisodeStart)| proto::EpisodeStart {
+        slot,
+        episode: Some(episode(start.id)),
+        receipt: start.receipt.map(receipt),
+    };
+    episodes.into_iter().map(start).collect()
+}
+
+pub(super) fn ended((slot, end): (u32, EpisodeEnd)) -> proto::EpisodeEnd {
+    proto::EpisodeEnd {
+        slot,
+        episode: Some(episode(end.id)),
+        r#return: end.total_reward,
+        length: end.length,
+        success: end.success,
+        diverged: end.diverged,
+        receipt: end.receipt.map(receipt),
+        achieved: end.achieved,
+        code_achieved: end.code_achieved,
+    }
+}
+
+fn episode(id: EpisodeId) -> proto::Episode {
+    let EpisodeId { environment_index, trial_index, episode_index, episode_in_trial } = id;
+    proto::Episode { environment_index, trial_index, episode_index, episode_in_trial }
+}
+
+fn receipt(receipt: Receipt) -> proto::Receipt {
+    let Receipt { requested, applied, model_hash } = receipt;
+    proto::Receipt { requested, applied, model_hash }
+}

@@ -1,0 +1,12 @@
+//! `perturb.v1`: batches of environments whose parameters clients choose.
+//!
+//! - [`service`]: one short method for each call.
+//! - [`session`]: the legal order of a session's requests.
+//! - [`convert`]: the protocol to the domain and back, with all validation; [`policy`]: that of policies.
+//! - [`sizes`]: how many bytes requests and replies have.
+
+pub mod convert;
+pub mod policy;
+pub mod service;
+pub mod session;
+pub mod sizes;

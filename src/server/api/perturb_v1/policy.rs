@@ -1,0 +1,265 @@
+//! Policies and what they played, between the protocol and the domain, with all validation.
+
+use super::convert;
+use crate::{
+    env::ActionSpace,
+    pool::{Autoreset, Batch, EndedAt, Play, Played, Policy, PolicyRole, Turn},
+    proto,
+    server::status::Refusal,
+};
+use bytes::Bytes;
+use perturb_policy::{ActionKind, Inputs, Normalisers, ObservationNormaliser, PlayerState, PolicySpec, Task};
+use perturb_protocol::player::{Unreadable, player_state, read_floats};
+use rand_chacha::ChaCha8Rng;
+
+/// The most hidden layers of a policy …
+const MOST_LAYERS: usize = 8;
+/// … and the greatest width of each and of the LSTM.
+const GREATEST_WIDTH: u32 = 1024;
+/// The most numbers between the layers of a policy, in all environments together.
+const MOST_NUMBERS: usize = 1 << 25;
+/// A reply is cut when its steps cost about so many µs, so that a client is never left without an answer for long …
+const MOST_COST: f64 = 1e6;
+/// … where a policy computes so many weights in a µs.
+const WEIGHTS_A_MICROSECOND: f64 = 5000.0;
+
+/// Numbers of each kind in a batch.
+#[derive(Clone, Copy)]
+struct Sizes {
+    /// N.
+    envs: usize,
+    /// O.
+    observation: usize,
+    /// How many of these are parameters.
+    parameters: usize,
+    action: ActionKind,
+}
+
+/// Checks an `act` against the batch and the policy at play, of a client whose environments may take so many steps a
+/// second, if that is bounded.
+pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<Turn, Refusal> {
+    let (settings, n_envs) = (batch.settings(), batch.size());
+    let order = |when: &'static str, advice| Refusal::Order { request: "act", when: when.into(), advice };
+    if settings.autoreset != Autoreset::SameStep {
+        let advice = "open one with AUTORESET_MODE_SAME_STEP (2)";
+        return Err(order("in a session of another autoreset mode than same-step", advice));
+    }
+    let Some(episodes_per_trial) = settings.episodes_per_trial() else {
+        let advice = "open groups that agree in episodes_per_trial, or a session for each number";
+        return Err(order("in a session whose groups have trials of different lengths", advice));
+    };
+    let action = match settings.spec.action {
+        ActionSpace::Discrete(names) => ActionKind::Discrete { n: names.len() },
+        ActionSpace::Continuous(channels) => ActionKind::Continuous { size: channels.len() },
+    };
+    let observation = settings.observation_size();
+    let parameters = observation - settings.spec.observation.len();
+    let sizes = Sizes { envs: n_envs, observation, parameters, action };
+    let proto::Act { policy: given, weights: given_weights, task: given_task, most_steps, only_ended } = request;
+    let task = task(given_task, n_envs)?;
+    let (policy, given_weights) = match (given, batch.play()) {
+        (Some(_), _) if given_weights.is_empty() => {
+            return Err(order("with a new policy but without its weights", "send both together"));
+        }
+        (Some(given), _) => (Some(policy(given, &given_weights, sizes, episodes_per_trial)?), None),
+        (None, None) => {
+            let advice = "send a policy with its weights, also after a step, reset, restore or release";
+            return Err(order("without a policy while none plays", advice));
+        }
+        (None, Some(play)) => {
+            let own = (!given_weights.is_empty()).then(|| weights(&given_weights, play.spec()));
+            (None, own.transpose()?)
+        }
+    };
+    let unfinished = policy.is_none() && batch.play().is_some_and(|play| !play.task().is_done());
+    match (&task, unfinished) {
+        (None, false) => return Err(order("without a task and none is unfinished", "name steps or episodes")),
+        (Some(_), true) => {
+            let advice = "finish it by requests without a task, or send another policy";
+            return Err(order("with a task while the one before is unfinished", advice));
+        }
+        _ => {}
+    }
+    if unfinished && given_weights.is_some() {
+        let advice = "finish it by requests without weights, or send another policy";
+        return Err(order("with weights while a task is unfinished", advice));
+    }
+    let spec = policy.as_ref().map(|policy| &policy.spec).or_else(|| batch.play().map(Play::spec));
+    let computed = spec.map_or(0.0, |spec| spec.n_weights() as f64 / WEIGHTS_A_MICROSECOND);
+    if computed * n_envs as f64 > MOST_COST {
+        let got = format!("with {} weights in {n_envs} environments", spec.map_or(0, PolicySpec::n_weights));
+        return Err(Refusal::value("act.policy", got, "fewer, so that a step takes less than about a second"));
+    }
+    let affordable = (MOST_COST / ((settings.spec.step_cost + computed) * n_envs as f64)).max(1.0) as usize;
+    // Of a second, so that none waits long for the next.
+    let allowed = rate.map_or(usize::MAX, |rate| (rate as usize / n_envs.max(1)).max(1));
+    let affordable = affordable.min(allowed);
+    let most_steps = if most_steps == 0 { affordable } else { affordable.min(most_steps as usize) };
+    Ok(Turn { policy, weights: given_weights, task, most_steps, only_ended })
+}
+
+fn task(task: Option<proto::act::Task>, n_envs: usize) -> Result<Option<Task>, Refusal> {
+    use proto::act::Task::{Episodes, Steps};
+    match task {
+        None => Ok(None),
+        Some(Steps(0)) => Err(Refusal::value("act.steps", 0, "at least 1")),
+        Some(Episodes(0)) => Err(Refusal::value("act.episodes", 0, "at least 1")),
+        Some(Steps(count)) => Ok(Some(Task::steps(count as usize))),
+        Some(Episodes(count)) => Ok(Some(Task::episodes(count as usize, n_envs))),
+    }
+}
+
+fn policy(policy: proto::Policy, given: &Bytes, sizes: Sizes, episodes_per_trial: u32) -> Result<Policy, Refusal> {
+    let inputs = Inputs::new(sizes.observation, sizes.action, sizes.envs, policy.outcomes);
+    let spec = spec(&policy, inputs.size(), sizes)?;
+    let weights = weights(given, &spec)?;
+    let normalisers = Normalisers {
+        observations: read("act.policy.observations", &policy.observations)?
+            .map(|moments| ObservationNormaliser::from_moments(moments).leaving_alone(sizes.parameters)),
+        rewards: read("act.policy.rewards", &policy.rewards)?,
+    };
+    normalisers.check(sizes.envs, sizes.observation, sizes.parameters).map_err(|error| {
+        Refusal::value("act.policy", format!("with statistics that do not fit: {error}"), "those of this session")
+    })?;
+    let role = match policy.role {
+        Some(proto::policy::Role::Training(stream)) => {
+            PolicyRole::Training((&stream).try_into().map_err(within("act.policy.training"))?)
+        }
+        Some(proto::policy::Role::Testing(proto::TestStreams { seed })) => PolicyRole::Testing { seed },
+        None => return Err(Refusal::value("act.policy.role", "missing", "training or testing")),
+    };
+    let state = match (policy.state, &role) {
+        (None, _) => None,
+        (Some(given), PolicyRole::Training(stream)) => {
+            Some(state(&given, sizes, inputs.size() - sizes.observation, spec.memory_size(), stream.clone())?)
+        }
+        (Some(_), PolicyRole::Testing { .. }) => {
+            return Err(Refusal::value("act.policy.state", "given in testing", "none: each trial begins anew"));
+        }
+    };
+    Ok(Policy { spec, inputs, normalisers, role, state, weights, episodes_per_trial })
+}
+
+/// The shape of a policy whose inputs have `input_size` numbers.
+fn spec(policy: &proto::Policy, input_size: usize, sizes: Sizes) -> Result<PolicySpec, Refusal> {
+    const FIELD: &str = "act.policy.hidden";
+    if policy.hidden.len() > MOST_LAYERS {
+        let got = format!("{} layers", policy.hidden.len());
+        return Err(Refusal::value(FIELD, got, format!("at most {MOST_LAYERS}")));
+    }
+    let widths = 1..=GREATEST_WIDTH;
+    if let Some(width) = policy.hidden.iter().find(|width| !widths.contains(width)) {
+        return Err(Refusal::value(
+            FIELD,
+            format!("with a width of {width}"),
+            format!("widths of 1 … {GREATEST_WIDTH}"),
+        ));
+    }
+    if policy.lstm > GREATEST_WIDTH {
+        let expected = format!("a width of 1 … {GREATEST_WIDTH}, or 0 for a feed-forward policy");
+        return Err(Refusal::value("act.policy.lstm", policy.lstm, expected));
+    }
+    let hidden: Vec<usize> = policy.hidden.iter().map(|&width| width as usize).collect();
+    let lstm = (policy.lstm > 0).then_some(policy.lstm as usize);
+    let width = hidden.iter().sum::<usize>() + lstm.unwrap_or(0);
+    if width * sizes.envs > MOST_NUMBERS {
+        let got = format!("of widths whose sum is {width}, in {} environments", sizes.envs);
+        return Err(Refusal::value("act.policy", got, format!("a product of at most {MOST_NUMBERS}")));
+    }
+    Ok(PolicySpec { observation_size: input_size, action: sizes.action, hidden, lstm })
+}
+
+fn weights(given: &Bytes, spec: &PolicySpec) -> Result<Vec<f32>, Refusal> {
+    has_floats("act.weights", given, spec.n_weights(), "float32 [P]")?;
+    read_floats("weights", given).map_err(within("act"))
+}
+
+/// What is there of it.
+fn read<'a, M, T: TryFrom<&'a M, Error = Unreadable>>(
+    field: &'static str,
+    given: &'a Option<M>,
+) -> Result<Option<T>, Refusal> {
+    given.as_ref().map(T::try_from).transpose().map_err(within(field))
+}
+
+/// Names the message that a field is of.
+fn within(message: &'static str) -> impl Fn(Unreadable) -> Refusal {
+    move |wrong| {
+        let Unreadable { field, got, expected } = wrong.within(message);
+        Refusal::value(field, got, expected)
+    }
+}
+
+fn state(
+    given: &proto::PlayerState,
+    sizes: Sizes,
+    extra: usize,
+    memory_size: usize,
+    actions: ChaCha8Rng,
+) -> Result<PlayerState, Refusal> {
+    let n = sizes.envs;
+    if given.starts.len() != n {
+        let got = format!("{} bytes", given.starts.len());
+        return Err(Refusal::value("act.policy.state.starts", got, format!("{n} bytes: uint8 [N] with N = {n}")));
+    }
+    let has = |field, bytes, size, shape| has_floats(field, bytes, n * size, shape);
+    has("act.policy.state.observations", &given.observations, sizes.observation, "float32 [N, O]")?;
+    has("act.policy.state.outcomes", &given.outcomes, extra, "float32 [N, E]")?;
+    has("act.policy.state.memory", &given.memory, memory_size, "float32 [N, S]")?;
+    player_state(given, actions).map_err(within("act.policy.state"))
+}
+
+/// Whether there are bytes for exactly `count` numbers.
+fn has_floats(field: &'static str, bytes: &Bytes, count: usize, shape: &str) -> Result<(), Refusal> {
+    let expected = || format!("{} bytes: {shape}, {count} numbers", 4 * count);
+    let got = || format!("{} bytes", bytes.len());
+    if bytes.len() == 4 * count { Ok(()) } else { Err(Refusal::value(field, got(), expected())) }
+}
+
+/// What was played.
+pub fn acted(played: Played) -> proto::Acted {
+    proto::Acted {
+        steps: played.steps as u32,
+        observations: played.observations.freeze(),
+        starts: played.starts.freeze(),
+        actions: played.actions.freeze(),
+        log_probs: played.log_probs.freeze(),
+        values: played.values.freeze(),
+        rewards: played.rewards.freeze(),
+        terminated: played.terminated.freeze(),
+        truncated: played.truncated.freeze(),
+        truncation_values: played.truncation_values.freeze(),
+        ended: played.ended.into_iter().map(ended_at).collect(),
+        finished: played.finished,
+        last_values: played.last_values.freeze(),
+        memory: played.memory.freeze(),
+    }
+}
+
+fn ended_at(EndedAt { step, slot, end, terminated, truncated }: EndedAt) -> proto::EndedAt {
+    proto::EndedAt { step: step as u32, end: Some(convert::ended((slot, end))), terminated, truncated }
+}
+
+/// What stands beside the weights of the policy that plays.
+pub fn saved(batch: &Batch) -> Result<proto::PlayerSaved, Refusal> {
+    let order = |when: &'static str, advice| Err(Refusal::Order { request: "save_player", when: when.into(), advice });
+    let Some(play) = batch.play() else {
+        return order("while no policy plays", "send act with a policy first; step, reset, restore and release end it");
+    };
+    if !play.task().is_done() {
+        return order("in the middle of a task", "finish it by act without a task");
+    }
+    let Some(state) = play.player().state() else {
+        return order("in a test, which has nothing to save", "save in training");
+    };
+    if state.actions.get_word_pos() > u64::MAX.into() {
+        return order("after 2^64 words of the stream of actions", "begin another stream");
+    }
+    let Normalisers { observations, rewards } = play.player().normalisers();
+    Ok(proto::PlayerSaved {
+        observations: observations.as_ref().map(|it| it.moments().into()),
+        rewards: rewards.as_ref().map(Into::into),
+        actions: Some((&state.actions).into()),
+        state: Some((&state).into()),
+    })
+}

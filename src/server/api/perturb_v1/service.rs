@@ -1,0 +1,57 @@
+//! The gRPC service of `perturb.v1`: one short method for each call.
+
+use super::session::{Session, Shared};
+use crate::{
+    proto::{self, perturb_server::Perturb},
+    server::{
+        session::{
+            driver::{Responses, Sessions},
+            instrumented::{Counted, Counts},
+        },
+        transport::message_reader::Frames,
+    },
+};
+use std::sync::Arc;
+use tonic::{Request, Response, Status, Streaming};
+
+/// Serves the catalogue and sessions.
+#[derive(Clone)]
+pub struct Service {
+    shared: Arc<Shared>,
+    sessions: Sessions,
+    counts: Arc<Counts>,
+}
+
+impl Service {
+    /// A service of sessions that share this.
+    pub fn new(shared: Shared, sessions: Sessions) -> Self {
+        Self { shared: Arc::new(shared), sessions, counts: Counts::of::<Session>() }
+    }
+
+    /// The requests so far.
+    pub fn counts(&self) -> Arc<Counts> {
+        Arc::clone(&self.counts)
+    }
+}
+
+#[tonic::async_trait]
+impl Perturb for Service {
+    type SessionStream = Responses<proto::SessionResponse>;
+
+    async fn list_environments(
+        &self,
+        _: Request<proto::ListEnvironmentsRequest>,
+    ) -> Result<Response<proto::ListEnvironmentsResponse>, Status> {
+        Ok(Response::new(self.shared.listing.clone()))
+    }
+
+    async fn session(
+        &self,
+        mut request: Request<Streaming<proto::SessionRequest>>,
+    ) -> Result<Response<Self::SessionStream>, Status> {
+        let frames = Frames::of(&mut request)?;
+        let (budget, outbox) = (frames.budget().clone(), frames.outbox.clone());
+        let session = Session::new(Arc::clone(&self.shared), frames.bearer.clone(), budget, outbox);
+        Ok(Response::new(self.sessions.begin(frames, Counted::new(session, &self.counts))?))
+    }
+}

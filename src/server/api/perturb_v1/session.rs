@@ -1,0 +1,335 @@
+//! One session: the legal order of its requests, each answered once.
+
+use super::{convert, policy, sizes};
+use crate::{
+    env::Catalogue,
+    pool::{Batch, Follower, Pool},
+    proto::{self, session_request::Request, session_response::Response},
+    render::Renderer,
+    server::{
+        audit::{draws::Draws, ledger::Ledger},
+        auth::{Bearer, Held},
+        net::access_log::About,
+        session::{
+            driver::{Dialogue, MOST_BYTES_BEFORE_OPEN, Turn},
+            instrumented::Observed,
+            lease::{Leases, MOST_KEPT},
+        },
+        status::Refusal,
+        transport::{
+            budget::{Budget, Outbox, Share},
+            message_reader::Allowance,
+            precheck::{self, Field},
+        },
+    },
+};
+use bytes::Bytes;
+use std::sync::Arc;
+
+/// A step's bytes beside its actions.
+const LITTLE: usize = 32;
+
+/// What all sessions of a server share.
+pub struct Shared {
+    /// Where environments run.
+    pub pool: Arc<Pool>,
+    /// Which there are.
+    pub catalogue: Arc<Catalogue>,
+    /// The same, as the protocol tells it.
+    pub listing: proto::ListEnvironmentsResponse,
+    /// What draws them.
+    pub renderer: Renderer,
+    /// Has what is drawn.
+    pub ledger: Option<Ledger>,
+    /// Sessions that outlive their streams.
+    pub leases: Leases<proto::SessionResponse>,
+}
+
+/// A client's session. Dropping it frees its environments.
+pub struct Session {
+    shared: Arc<Shared>,
+    batch: Option<Batch>,
+    bearer: Option<Bearer>,
+    /// Its environments, of those that its token may have.
+    held: Option<Held>,
+    draws: Draws,
+    budget: Budget,
+    /// What replies take beyond `kept`.
+    outbox: Outbox,
+    /// What steps need.
+    kept: Option<Share>,
+    /// What the policy needs that plays.
+    playing: Option<Share>,
+    /// What becomes of its stream after this reply.
+    turn: Option<Turn<proto::SessionResponse>>,
+}
+
+impl Session {
+    /// A session that is not open yet, whose replies' bytes are taken from the budget until they leave the outbox.
+    pub fn new(shared: Arc<Shared>, bearer: Option<Bearer>, budget: Budget, outbox: Outbox) -> Self {
+        let draws = Draws::new(bearer.clone(), shared.ledger.clone());
+        Self { shared, batch: None, bearer, held: None, draws, budget, outbox, kept: None, playing: None, turn: None }
+    }
+
+    async fn open(&mut self, request: proto::Open) -> Result<proto::Opened, Refusal> {
+        if self.batch.is_some() {
+            return Err(Refusal::AlreadyOpen);
+        }
+        let (autoreset_mode, unanswered) = (request.autoreset_mode, request.lease);
+        if unanswered > MOST_KEPT {
+            return Err(Refusal::value(
+                "open.lease",
+                unanswered,
+                format!("requests that wait at a time, 0 … {MOST_KEPT}"),
+            ));
+        }
+        let most = self.shared.listing.max_batch_size as usize;
+        let settings = convert::open(&self.shared.catalogue, most, request)?;
+        let (observes_parameters, receipt_arrays) = (settings.observe_parameters, settings.receipt_arrays);
+        let environment = self.shared.listing.environments.iter().find(|entry| entry.name == settings.spec.name);
+        let environment = environment.map(|entry| entry.observed(observes_parameters));
+        let envs = settings.size();
+        // More than there can be is for the pool to refuse.
+        let kept = (envs <= most).then(|| self.budget.take(sizes::session(&settings, envs))).transpose()?;
+        let held = self.bearer.as_ref().map(|bearer| bearer.envs(envs)).transpose()?;
+        let (begun, spec) = (self.draws.open(&settings).await?, settings.spec);
+        let opened = Batch::open(&self.shared.pool, settings).await;
+        let (mut batch, observations, started) = opened.inspect_err(|_| self.draws.not_opened(spec, begun))?;
+        self.draws.follow(&mut batch);
+        let grant = match unanswered {
+            0 => None,
+            most => self.shared.leases.give(self.bearer.clone(), most as usize)?,
+        };
+        let lease = grant.as_ref().map_or_else(Bytes::new, |grant| Bytes::copy_from_slice(&grant.name));
+        let lease_seconds = grant.as_ref().map_or(0, |grant| grant.time().as_secs() as u32);
+        self.turn = grant.map(Turn::Leased);
+        (self.batch, self.kept, self.held) = (Some(batch), kept, held);
+        let started = convert::started(started);
+        let acts = true;
+        Ok(proto::Opened {
+            environment,
+            observations,
+            started,
+            autoreset_mode,
+            acts,
+            observes_parameters,
+            receipt_arrays,
+            lease,
+            lease_seconds,
+        })
+    }
+
+    async fn step(&mut self, request: proto::Step) -> Result<proto::Stepped, Refusal> {
+        let batch = self.opened("step")?;
+        convert::actions(batch.settings().spec, batch.size(), &request.actions)?;
+        let stepped = batch.step(&request.actions).await?;
+        self.playing = None;
+        Ok(convert::stepped(stepped))
+    }
+
+    async fn reset(&mut self, request: proto::Reset) -> Result<proto::ResetDone, Refusal> {
+        let batch = self.batch.as_mut().ok_or(Refusal::NotOpen { request: "reset" })?;
+        let entries = convert::reset(batch, request)?;
+        self.draws.reset(batch, &entries).await?;
+        let (observations, started) = batch.reset(entries).await?;
+        self.playing = None;
+        Ok(proto::ResetDone { observations, started: convert::started(started) })
+    }
+
+    async fn snapshot(&mut self, request: proto::Snapshot) -> Result<proto::Snapshotted, Refusal> {
+        let batch = self.opened("snapshot")?;
+        let slots = convert::mask("snapshot.mask", batch.size(), &request.mask)?;
+        let mut share = self.budget.take(sizes::snapshots(slots.len()))?;
+        let batch = self.opened("snapshot")?;
+        let snapshots = batch.snapshot(slots).await?;
+        share.set(sizes::taken(&snapshots));
+        self.outbox.put(share);
+        Ok(proto::Snapshotted { snapshots })
+    }
+
+    async fn restore(&mut self, request: proto::Restore) -> Result<proto::Restored, Refusal> {
+        let batch = self.batch.as_mut().ok_or(Refusal::NotOpen { request: "restore" })?;
+        let entries = convert::restore(batch.size(), request)?;
+        let begun = self.draws.restore(batch, &entries).await?;
+        let slots: Vec<usize> = entries.iter().map(|(slot, _)| *slot).collect();
+        let observations = match batch.restore(entries).await {
+            Ok(observations) => observations,
+            Err(error) => {
+                self.draws.not_restored(batch, &slots, begun);
+                return Err(error.into());
+            }
+        };
+        self.playing = None;
+        Ok(proto::Restored { observations })
+    }
+
+    async fn render(&mut self, request: proto::Render) -> Result<proto::Rendered, Refusal> {
+        let batch = self.opened("render")?;
+        let (slot, size) = convert::render(batch.size(), request)?;
+        let scene = batch.scene(slot)?.ok_or(Refusal::NothingToDraw { slot })?;
+        let share = self.budget.take(sizes::picture(size))?;
+        let pixels = self.shared.renderer.draw(scene, size).await?;
+        self.outbox.put(share);
+        Ok(proto::Rendered { pixels, width: size.width.into(), height: size.height.into() })
+    }
+
+    async fn release(&mut self, request: proto::Release) -> Result<proto::Released, Refusal> {
+        let batch = self.batch.as_mut().ok_or(Refusal::NotOpen { request: "release" })?;
+        let slots = convert::release(batch.size(), &request)?;
+        self.draws.release(batch, &slots);
+        batch.release(&slots).await?;
+        if let Some(held) = &mut self.held {
+            held.give_back(slots.len());
+        }
+        Ok(proto::Released {})
+    }
+
+    async fn act(&mut self, request: proto::Act) -> Result<proto::Acted, Refusal> {
+        let batch = self.batch.as_mut().ok_or(Refusal::NotOpen { request: "act" })?;
+        let policy = sizes::policy(&request, batch.size());
+        let policy = (policy > 0).then(|| self.budget.take(policy)).transpose()?;
+        let turn = policy::turn(batch, self.bearer.as_ref().and_then(|bearer| bearer.rate()), request)?;
+        let share = self.budget.take(sizes::reply_to(&turn, batch))?;
+        self.playing = policy.or(self.playing.take());
+        let acted = policy::acted(batch.act(turn).await?);
+        self.outbox.put(share);
+        Ok(acted)
+    }
+
+    fn save_player(&mut self) -> Result<proto::PlayerSaved, Refusal> {
+        policy::saved(self.opened("save_player")?)
+    }
+
+    async fn resume(&mut self, request: proto::Resume) -> Result<proto::Resumed, Refusal> {
+        if self.batch.is_some() {
+            return Err(Refusal::Order {
+                request: "resume",
+                when: "on a session that is open".into(),
+                advice: "send it on a stream of its own",
+            });
+        }
+        let proto::Resume { lease, last_reply } = request;
+        let ticket = self.shared.leases.ask(&lease, self.bearer.as_ref(), last_reply).await?;
+        let last_reply = ticket.last_reply;
+        self.turn = Some(Turn::TakesUp(ticket));
+        Ok(proto::Resumed { last_reply })
+    }
+
+    fn opened(&mut self, request: &'static str) -> Result<&mut Batch, Refusal> {
+        self.batch.as_mut().ok_or(Refusal::NotOpen { request })
+    }
+}
+
+impl Dialogue for Session {
+    type Request = proto::SessionRequest;
+    type Response = proto::SessionResponse;
+    const FIELDS: &'static [Field] = precheck::SESSION_REQUEST;
+    const TAKES_UP: bool = true;
+    const PROTOCOL: &'static str = "perturb.v1";
+
+    fn allowance(&self) -> Allowance {
+        match &self.batch {
+            None => {
+                let entries = self.shared.listing.max_batch_size as usize;
+                Allowance { bytes: MOST_BYTES_BEFORE_OPEN, entries, covered: 0 }
+            }
+            Some(batch) => Allowance {
+                bytes: sizes::most_of_a_request(batch),
+                entries: batch.size(),
+                covered: sizes::step_request(batch.settings(), batch.size()) + LITTLE,
+            },
+        }
+    }
+
+    fn is_open(&self) -> bool {
+        self.batch.is_some()
+    }
+
+    fn about(&self) -> About {
+        self.batch.as_ref().map_or_else(About::default, |batch| About {
+            environment: Some(batch.settings().spec.name),
+            envs: batch.settings().size(),
+            steps: batch.steps(),
+        })
+    }
+
+    async fn answer(&mut self, request: Self::Request) -> Result<Self::Response, Refusal> {
+        let response = match request.request {
+            Some(Request::Open(open)) => self.open(open).await.map(Response::Opened),
+            Some(Request::Step(step)) => self.step(step).await.map(Response::Stepped),
+            Some(Request::Reset(reset)) => self.reset(reset).await.map(Response::Reset),
+            Some(Request::Snapshot(snapshot)) => self.snapshot(snapshot).await.map(Response::Snapshot),
+            Some(Request::Restore(restore)) => self.restore(restore).await.map(Response::Restore),
+            Some(Request::Render(render)) => self.render(render).await.map(Response::Render),
+            Some(Request::Release(release)) => self.release(release).await.map(Response::Release),
+            Some(Request::Act(act)) => self.act(act).await.map(Response::Act),
+            Some(Request::SavePlayer(_)) => self.save_player().map(Response::SavePlayer),
+            Some(Request::Resume(resume)) => self.resume(resume).await.map(Response::Resumed),
+            None => Err(Refusal::value("request", "empty or of a kind this server does not know", "open, step, …")),
+        };
+        response.map(|response| proto::SessionResponse { response: Some(response) })
+    }
+
+    /// Steps follow steps, unless a token has to wait between them.
+    fn follower(&self, request: &Self::Request) -> Option<Follower> {
+        let batch = self.batch.as_ref().filter(|_| matches!(request.request, Some(Request::Step(_))))?;
+        let is_free = self.bearer.as_ref().is_none_or(|bearer| bearer.rate().is_none());
+        batch.follower().filter(|_| is_free)
+    }
+
+    fn follow(follower: &Follower, request: Self::Request) {
+        if let Some(Request::Step(proto::Step { actions })) = request.request
+            && convert::actions(follower.spec, follower.size, &actions).is_ok()
+        {
+            follower.follow(actions);
+        }
+    }
+
+    fn takes_up(request: &Self::Request) -> bool {
+        matches!(request.request, Some(Request::Resume(_)))
+    }
+
+    fn turn(&mut self) -> Option<Turn<Self::Response>> {
+        self.turn.take()
+    }
+
+    fn attach(&mut self, outbox: Outbox) {
+        self.outbox = outbox;
+    }
+
+    fn refusal(refusal: Refusal) -> Self::Response {
+        proto::SessionResponse { response: Some(Response::Error(refusal.into())) }
+    }
+}
+
+impl Observed for Session {
+    const KINDS: &'static [&'static str] = &[
+        "open",
+        "step",
+        "reset",
+        "snapshot",
+        "restore",
+        "render",
+        "release",
+        "act",
+        "save_player",
+        "resume",
+        "unknown",
+    ];
+
+    fn kind(request: &Self::Request) -> &'static str {
+        match request.request {
+            Some(Request::Open(_)) => "open",
+            Some(Request::Step(_)) => "step",
+            Some(Request::Reset(_)) => "reset",
+            Some(Request::Snapshot(_)) => "snapshot",
+            Some(Request::Restore(_)) => "restore",
+            Some(Request::Render(_)) => "render",
+            Some(Request::Release(_)) => "release",
+            Some(Request::Act(_)) => "act",
+            Some(Request::SavePlayer(_)) => "save_player",
+            Some(Request::Resume(_)) => "resume",
+            None => "unknown",
+        }
+    }
+}

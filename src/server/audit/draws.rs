@@ -1,0 +1,255 @@
+//! What a session draws from: whether its token's role allows it, and that it stands in the ledger before it happens.
+
+use super::ledger::Ledger;
+use crate::{
+    env::{Distribution, Draw, EnvironmentSpec, Error, saved_draw},
+    pool::{Batch, BatchSettings, ResetEntry},
+    server::{auth::Bearer, status::Refusal},
+};
+use bytes::Bytes;
+use perturb_protocol::{
+    ledger::{self, Begin, End, Event, Who},
+    region::Region,
+};
+use std::sync::{
+    Arc,
+    atomic::{AtomicU32, Ordering},
+};
+
+/// Of one session, or one world.
+#[derive(Clone)]
+pub struct Draws {
+    bearer: Option<Bearer>,
+    ledger: Option<Ledger>,
+    session: u64,
+    /// What was refused so far.
+    refused: Arc<AtomicU32>,
+}
+
+/// So many refusals of a session are written down: it may ask for ever.
+const MOST_REFUSED: u32 = 100;
+
+/// What was written down, until it is known whether it happens.
+#[derive(Default)]
+pub struct Begun(Vec<Begin>);
+
+impl Begun {
+    /// Nothing of it was drawn.
+    fn withdrawn(self) -> Vec<End> {
+        self.0.into_iter().map(|Begin { seed, index, count, .. }| End { seed, index, count, episode: None }).collect()
+    }
+}
+
+/// An environment that begins to draw.
+#[derive(Clone, Copy)]
+struct Next<'a> {
+    draw: Draw,
+    distributions: &'a [Distribution],
+}
+
+impl Draws {
+    /// Of a new session with this token.
+    pub fn new(bearer: Option<Bearer>, ledger: Option<Ledger>) -> Self {
+        let session = ledger.as_ref().map_or(0, Ledger::session);
+        Self { bearer, ledger, session, refused: Arc::default() }
+    }
+
+    /// Before environments are made.
+    ///
+    /// # Errors
+    /// [`Refusal::NotAllowed`], [`Refusal::NoLedger`]; so the others.
+    pub async fn open(&self, settings: &BatchSettings) -> Result<Begun, Refusal> {
+        if self.is_free() {
+            return Ok(Begun::default());
+        }
+        let begins = settings.groups.iter().map(|group| {
+            let draw = Draw {
+                seed: group.episodes.seed,
+                environment_index: group.episodes.environment_index,
+                episode_index: 0,
+            };
+            (Next { draw, distributions: &group.episodes.distributions }, group.size)
+        });
+        self.begin(settings.spec, begins, Vec::new()).await
+    }
+
+    /// Before environments are reset.
+    pub async fn reset(&self, batch: &Batch, entries: &[ResetEntry]) -> Result<Begun, Refusal> {
+        if self.is_free() {
+            return Ok(Begun::default());
+        }
+        let (mut befores, mut nows) = (Vec::new(), Vec::new());
+        for ResetEntry { slot, seed, distributions, .. } in entries {
+            if seed.is_none() && distributions.is_none() {
+                continue; // it goes on as before
+            }
+            let before = batch.draw(*slot);
+            let next = match *seed {
+                Some(seed) => Draw { seed, episode_index: 0, ..before },
+                None => Draw { episode_index: before.episode_index + 1, ..before },
+            };
+            befores.push(before);
+            let same = || batch.distributions(*slot);
+            nows.push((next, distributions.as_ref().map_or_else(same, |new| new.to_vec())));
+        }
+        if befores.is_empty() {
+            return Ok(Begun::default());
+        }
+        let begins = nows.iter().map(|(draw, distributions)| (Next { draw: *draw, distributions }, 1));
+        self.begin(batch.settings().spec, begins, befores).await
+    }
+
+    /// Before environments are restored.
+    pub async fn restore(&self, batch: &Batch, entries: &[(usize, Bytes)]) -> Result<Begun, Refusal> {
+        if self.is_free() || entries.is_empty() {
+            return Ok(Begun::default());
+        }
+        let spec = batch.settings().spec;
+        let saved: Result<Vec<_>, Error> = entries.iter().map(|(_, snapshot)| saved_draw(spec, snapshot)).collect();
+        let mut nows = Vec::new();
+        for saved in saved? {
+            let boxes = saved.distributions.chunks(spec.parameters.len().max(1));
+            let are_drawn =
+                |of_box: &[Distribution]| of_box.iter().zip(&saved.values).all(|(set, value)| set.contains(*value));
+            if !boxes.clone().any(are_drawn) {
+                // A client wrote them into the snapshot: they hold until the trial ends.
+                nows.push((saved.draw, saved.values.iter().copied().map(Distribution::fixed).collect()));
+            }
+            nows.push((saved.draw, saved.distributions));
+        }
+        let befores = entries.iter().map(|(slot, _)| batch.draw(*slot)).collect();
+        let begins = nows.iter().map(|(draw, distributions)| (Next { draw: *draw, distributions }, 1));
+        self.begin(spec, begins, befores).await
+    }
+
+    /// After environments could not be made.
+    pub fn not_opened(&self, spec: &EnvironmentSpec, begun: Begun) {
+        self.note(spec, Vec::new(), Vec::new(), begun.withdrawn());
+    }
+
+    /// After environments could not be restored: those of these slots go on as before.
+    pub fn not_restored(&self, batch: &Batch, slots: &[usize], begun: Begun) {
+        let spec = batch.settings().spec;
+        let befores: Vec<_> = slots.iter().map(|slot| (batch.draw(*slot), batch.distributions(*slot))).collect();
+        let begins = befores.iter().map(|(draw, distributions)| (Next { draw: *draw, distributions }, 1));
+        let (regions, begins) = gathered(spec, begins);
+        self.note(spec, regions, begins, begun.withdrawn());
+    }
+
+    /// Before environments are freed that a session gives back.
+    pub fn release(&self, batch: &Batch, slots: &[usize]) {
+        if self.ledger.is_some() {
+            let befores = slots.iter().map(|slot| batch.draw(*slot));
+            self.note(batch.settings().spec, Vec::new(), Vec::new(), ended(befores));
+        }
+    }
+
+    /// Has a batch's end written down.
+    pub fn follow(&self, batch: &mut Batch) {
+        if self.ledger.is_some() {
+            let (own, spec) = (self.clone(), batch.settings().spec);
+            let tell = move |befores: Vec<Draw>| own.note(spec, Vec::new(), Vec::new(), ended(befores));
+            batch.when_freed(Box::new(tell));
+        }
+    }
+
+    /// Whether a token may draw from there; what is refused is written down.
+    pub fn check(&self, spec: &EnvironmentSpec, distributions: &[Distribution]) -> Result<(), Refusal> {
+        let Some(role) = self.bearer.as_ref().and_then(|bearer| bearer.role()) else { return Ok(()) };
+        let region = spec.region(distributions);
+        let Err(reason) = role.check(spec, &region) else { return Ok(()) };
+        if let Some(ledger) = &self.ledger
+            && self.refused.fetch_add(1, Ordering::Relaxed) < MOST_REFUSED
+        {
+            ledger.note(Event::Refused { who: self.who(spec), region: region.clone(), reason: reason.clone() });
+        }
+        Err(Refusal::NotAllowed {
+            role: role.name().into(),
+            environment: spec.name,
+            region: region.to_string(),
+            reason,
+        })
+    }
+
+    /// Whether nothing is asked or written.
+    fn is_free(&self) -> bool {
+        self.ledger.is_none() && self.bearer.as_ref().is_none_or(|bearer| bearer.role().is_none())
+    }
+
+    /// Checks what begins, each for so many environments, and writes it down, with what ends for it.
+    async fn begin<'a>(
+        &self,
+        spec: &EnvironmentSpec,
+        begins: impl Iterator<Item = (Next<'a>, usize)> + Clone,
+        ends: Vec<Draw>,
+    ) -> Result<Begun, Refusal> {
+        let mut last: Option<&[Distribution]> = None;
+        for (Next { distributions, .. }, _) in begins.clone() {
+            if last.replace(distributions) != Some(distributions) {
+                self.check(spec, distributions)?;
+            }
+        }
+        let Some(ledger) = &self.ledger else { return Ok(Begun::default()) };
+        let (regions, begins) = gathered(spec, begins);
+        let begun = Begun(begins.clone());
+        ledger.write(self.event(spec, regions, begins, ended(ends))).await?;
+        Ok(begun)
+    }
+
+    fn note(&self, spec: &EnvironmentSpec, regions: Vec<Region>, begins: Vec<Begin>, ends: Vec<End>) {
+        if let Some(ledger) = &self.ledger {
+            ledger.note(self.event(spec, regions, begins, ends));
+        }
+    }
+
+    fn who(&self, spec: &EnvironmentSpec) -> Who {
+        Who {
+            session: self.session,
+            token: self.bearer.as_ref().map(|bearer| bearer.name().into()),
+            environment: spec.name.into(),
+            revision: spec.revision,
+        }
+    }
+
+    fn event(&self, spec: &EnvironmentSpec, regions: Vec<Region>, begins: Vec<Begin>, ends: Vec<End>) -> Event {
+        Event::Draws(ledger::Draws { who: self.who(spec), regions, begins, ends })
+    }
+}
+
+/// What begins, neighbours that draw alike as one, and the regions that they draw from.
+fn gathered<'a>(spec: &EnvironmentSpec, begins: impl Iterator<Item = (Next<'a>, usize)>) -> (Vec<Region>, Vec<Begin>) {
+    let mut last: Option<&[Distribution]> = None;
+    let (mut regions, mut gathered): (Vec<Region>, Vec<Begin>) = (Vec::new(), Vec::new());
+    for (Next { draw, distributions }, count) in begins {
+        if last.replace(distributions) != Some(distributions) {
+            regions.push(spec.region(distributions));
+        }
+        let Draw { seed, environment_index: index, episode_index: episode } = draw;
+        let region = regions.len() as u32 - 1;
+        match gathered.last_mut() {
+            Some(last)
+                if (last.seed, last.region, last.episode) == (seed, region, episode)
+                    && last.index.wrapping_add(last.count) == index =>
+            {
+                last.count += count as u32;
+            }
+            _ => gathered.push(Begin { seed, index, count: count as u32, region, episode }),
+        }
+    }
+    (regions, gathered)
+}
+
+/// What ends, likewise.
+fn ended(draws: impl IntoIterator<Item = Draw>) -> Vec<End> {
+    let mut ended: Vec<End> = Vec::new();
+    for Draw { seed, environment_index: index, episode_index } in draws {
+        let episode = Some(episode_index);
+        match ended.last_mut() {
+            Some(last) if (last.seed, last.episode, last.index.wrapping_add(last.count)) == (seed, episode, index) => {
+                last.count += 1;
+            }
+            _ => ended.push(End { seed, index, count: 1, episode }),
+        }
+    }
+    ended
+}

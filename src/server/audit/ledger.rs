@@ -1,0 +1,163 @@
+//! Writes the ledger: what every token drew, before it draws it. See [`perturb_protocol::ledger`].
+
+use crate::server::status::Refusal;
+use perturb_protocol::ledger::{Chain, Event, LONGEST, read};
+use std::{
+    fs::{File, OpenOptions},
+    io::{self, Write},
+    os::unix::fs::OpenOptionsExt,
+    path::{Path, PathBuf},
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+        mpsc::{Receiver, Sender, channel},
+    },
+    time::SystemTime,
+};
+use tokio::sync::oneshot;
+
+/// A line to be written, and who waits until it is.
+type Line = (Event, Option<oneshot::Sender<Result<(), String>>>);
+
+/// A server's ledger. A thread of its own writes it.
+#[derive(Clone)]
+pub struct Ledger {
+    lines: Sender<Line>,
+    sessions: Arc<AtomicU64>,
+}
+
+impl Ledger {
+    /// Goes on with a ledger, whose chain is checked, or begins one.
+    ///
+    /// # Errors
+    /// If the file is no whole ledger, another server writes it, or it cannot be written.
+    pub fn open(path: &Path) -> io::Result<Self> {
+        let file = OpenOptions::new().read(true).append(true).create(true).mode(0o600).open(path)?;
+        if !file.metadata()?.is_file() {
+            return Err(io::Error::other("that is no file, and a ledger is read again when the server begins"));
+        }
+        file.try_lock().map_err(|_| io::Error::other("another server writes it"))?;
+        let there = read(path, |_, _| {}).map_err(io::Error::other)?;
+        if there.chain.lines() == 0 && there.unfinished > 0 {
+            return Err(io::Error::other("that is no ledger, and not empty: give another name"));
+        }
+        let mut book = Book {
+            file,
+            path: path.to_owned(),
+            bytes: there.bytes,
+            chain: there.chain,
+            kept: Vec::new(),
+            is_torn: true,
+        };
+        let (version, commit) = (env!("CARGO_PKG_VERSION").into(), env!("PERTURB_COMMIT").into());
+        let began = Event::Began { version, commit, unfinished: there.unfinished };
+        book.write([&began]).map_err(io::Error::other)?;
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        File::open(folder)?.sync_all()?; // the name of a new file, too
+        let (lines, received) = channel();
+        std::thread::Builder::new().name("ledger".into()).spawn(move || book.keep(&received))?;
+        Ok(Self { lines, sessions: Arc::default() })
+    }
+
+    /// A number for a session.
+    pub fn session(&self) -> u64 {
+        self.sessions.fetch_add(1, Ordering::Relaxed)
+    }
+
+    /// Writes a line, and waits until it is on the disk.
+    ///
+    /// # Errors
+    /// [`Refusal::NoLedger`].
+    pub async fn write(&self, event: Event) -> Result<(), Refusal> {
+        // What a session asks for is bounded, but numbers are longer as text.
+        let size = serde_json::to_vec(&event).map_or(usize::MAX, |json| json.len());
+        if size as u64 > LONGEST / 2 {
+            let got = format!("{size} bytes as a line of this server's ledger");
+            return Err(Refusal::value(
+                "what is to be drawn",
+                got,
+                format!("at most {}: ask for less at a time", LONGEST / 2),
+            ));
+        }
+        let (done, written) = oneshot::channel();
+        let _ = self.lines.send((event, Some(done))); // nobody is there only if the thread is gone, and then nobody answers
+        let reason = match written.await {
+            Ok(Ok(())) => return Ok(()),
+            Ok(Err(reason)) => reason,
+            Err(_) => "its thread is gone".into(),
+        };
+        Err(Refusal::NoLedger { reason })
+    }
+
+    /// Has a line written, sooner or later.
+    pub fn note(&self, event: Event) {
+        let _ = self.lines.send((event, None));
+    }
+
+    /// Writes that the server ends, after all lines before.
+    pub async fn close(&self) {
+        if let Err(error) = self.write(Event::Ended).await {
+            tracing::error!("{error}");
+        }
+    }
+}
+
+/// The file, as far as it is whole.
+struct Book {
+    file: File,
+    path: PathBuf,
+    bytes: u64,
+    chain: Chain,
+    /// Whether there may be more in the file.
+    is_torn: bool,
+    /// What nobody waits for and could not be written yet.
+    kept: Vec<Line>,
+}
+
+impl Book {
+    /// Writes what comes, whatever has come meanwhile at once.
+    fn keep(mut self, received: &Receiver<Line>) {
+        while let Ok(first) = received.recv() {
+            let mut lines = std::mem::take(&mut self.kept);
+            lines.push(first);
+            lines.extend(received.try_iter());
+            let written = self.write(lines.iter().map(|(event, _)| event));
+            if let Err(reason) = &written {
+                tracing::error!("{} cannot be written: {reason}", self.path.display());
+            }
+            if lines.iter().any(|(event, _)| matches!(event, Event::Ended)) {
+                let (lines, head) = (self.chain.lines(), self.chain.head());
+                tracing::info!(lines, head, "the ledger {}", self.path.display());
+            }
+            for (event, done) in lines {
+                match done {
+                    Some(done) => drop(done.send(written.clone())),
+                    None if written.is_err() => self.kept.push((event, None)),
+                    None => {}
+                }
+            }
+        }
+    }
+
+    /// Writes lines and waits for the disk; all, or none.
+    fn write<'a>(&mut self, events: impl IntoIterator<Item = &'a Event>) -> Result<(), String> {
+        #[expect(clippy::disallowed_methods, reason = "lines have their time; what is drawn does not depend on it")]
+        let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+        let unix_ms = u64::try_from(now.as_millis()).unwrap_or(u64::MAX);
+        let mut chain = self.chain.clone();
+        let lines: Result<String, _> = events.into_iter().map(|event| chain.add(event, unix_ms)).collect();
+        let lines = lines.map_err(|error| error.to_string())?;
+        if self.is_torn {
+            self.file.set_len(self.bytes).map_err(|error| error.to_string())?;
+            self.is_torn = false;
+        }
+        if let Err(error) = self.file.write_all(lines.as_bytes()).and_then(|()| self.file.sync_data()) {
+            // What is there of them is no line.
+            self.is_torn = self.file.set_len(self.bytes).is_err();
+            return Err(error.to_string());
+        }
+        self.bytes += lines.len() as u64;
+        self.chain = chain;
+        Ok(())
+    }
+}

@@ -1,0 +1,339 @@
+//! Who may call: tokens, of which a file has names, digests, quotas and roles, and the gate that asks for them.
+
+pub mod file_watcher;
+mod layer;
+mod quota;
+mod rate_limiter;
+mod role;
+mod token_file;
+
+pub use layer::Gated;
+pub use quota::Held;
+pub use role::Role;
+pub use token_file::{Wrong, new_token};
+
+use super::{
+    net::peers::{Connection, Peer},
+    status::Refusal,
+};
+use crate::env::Catalogue;
+use quota::{Kind, Quota};
+use rate_limiter::{Pace, TooFast};
+use sha2::{Digest, Sha256};
+use std::{
+    sync::{
+        Arc, PoisonError, RwLock,
+        atomic::{AtomicBool, AtomicU64, Ordering},
+    },
+    time::Duration,
+};
+use subtle::ConstantTimeEq;
+use token_file::{Entry, Known, listed};
+use tokio::sync::Notify;
+use tonic::{body::Body, codegen::http};
+
+/// What a client shows, and what whoever shows it may have.
+pub struct Token {
+    name: String,
+    /// SHA-256 of the token.
+    digest: [u8; 32],
+    role: Option<Arc<Role>>,
+    revoked: AtomicBool,
+    /// Wakes who waits for that.
+    told: Notify,
+    /// Of all tokens that have had its name.
+    quotas: Arc<Quotas>,
+}
+
+/// What a token may have and do, and what it did.
+#[derive(Default)]
+struct Quotas {
+    sessions: Quota,
+    envs: Quota,
+    bytes: Quota,
+    pace: Pace,
+    steps: AtomicU64,
+    refusals: AtomicU64,
+}
+
+/// What a token has, and what was done with it.
+pub struct Used {
+    /// What it is called.
+    pub name: String,
+    /// Sessions now.
+    pub sessions: usize,
+    /// Environments now.
+    pub envs: usize,
+    /// Bytes in flight now.
+    pub bytes: usize,
+    /// Steps of an environment so far.
+    pub steps: u64,
+    /// How long its requests waited for its rate so far.
+    pub waited: Duration,
+    /// What was refused so far.
+    pub refusals: u64,
+}
+
+/// The token of a call.
+pub type Bearer = Arc<Token>;
+
+impl Token {
+    /// What it is called.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Counts steps of its environments, which are all known only when they were done.
+    pub fn stepped(&self, steps: u64) {
+        self.quotas.steps.fetch_add(steps, Ordering::Relaxed);
+        self.quotas.pace.add(steps);
+    }
+
+    /// Counts something that was refused to it.
+    pub fn refused(&self) {
+        self.quotas.refusals.fetch_add(1, Ordering::Relaxed);
+    }
+
+    fn used(&self) -> Used {
+        let Quotas { sessions, envs, bytes, pace, steps, refusals } = &*self.quotas;
+        Used {
+            name: self.name.clone(),
+            sessions: sessions.taken(),
+            envs: envs.taken(),
+            bytes: bytes.taken(),
+            steps: steps.load(Ordering::Relaxed),
+            waited: pace.waited(),
+            refusals: refusals.load(Ordering::Relaxed),
+        }
+    }
+
+    /// The most steps a second that its environments may take together; none: as many as there can be.
+    pub fn rate(&self) -> Option<u32> {
+        self.quotas.pace.rate()
+    }
+
+    /// Waits until its environments may step again.
+    ///
+    /// # Errors
+    /// [`Refusal::TooFast`], at once, if that would be too long.
+    pub async fn turn(&self) -> Result<(), Refusal> {
+        let turn = self.quotas.pace.turn().await;
+        turn.map_err(|TooFast { rate, ahead }| Refusal::TooFast {
+            name: self.name.clone(),
+            rate,
+            seconds: ahead.as_secs(),
+        })
+    }
+
+    /// What it may draw from; none: from anything.
+    pub fn role(&self) -> Option<&Role> {
+        self.role.as_deref()
+    }
+
+    /// Whether it is in the file no more, or with another role.
+    fn is_revoked(&self) -> bool {
+        self.revoked.load(Ordering::Acquire)
+    }
+
+    /// Waits until it is in the file no more, or with another role, and gives the refusal of what comes then.
+    pub async fn revoked(&self) -> Refusal {
+        loop {
+            let told = self.told.notified();
+            if self.is_revoked() {
+                return Refusal::RevokedToken { name: self.name.clone() };
+            }
+            told.await;
+        }
+    }
+
+    fn revoke(&self) {
+        self.revoked.store(true, Ordering::Release);
+        self.told.notify_waiters();
+    }
+
+    /// A session of it.
+    ///
+    /// # Errors
+    /// [`Refusal::TooManyOfAToken`].
+    pub fn session(self: &Arc<Self>) -> Result<Held, Refusal> {
+        self.take(1, Kind::Sessions)
+    }
+
+    /// So many environments of it.
+    ///
+    /// # Errors
+    /// [`Refusal::TooManyOfAToken`].
+    pub fn envs(self: &Arc<Self>, count: usize) -> Result<Held, Refusal> {
+        self.take(count, Kind::Environments)
+    }
+
+    /// No bytes of it in flight, to be grown.
+    pub fn no_bytes(self: &Arc<Self>) -> Held {
+        Held::nothing(Arc::clone(self), Kind::Bytes)
+    }
+
+    fn take(self: &Arc<Self>, count: usize, kind: Kind) -> Result<Held, Refusal> {
+        let mut held = Held::nothing(Arc::clone(self), kind);
+        held.grow(count)?;
+        Ok(held)
+    }
+}
+
+/// The tokens that are good now.
+#[derive(Clone, Default)]
+pub struct Tokens {
+    good: Arc<RwLock<Vec<Bearer>>>,
+    /// The environments that sets are of.
+    catalogue: Arc<Catalogue>,
+}
+
+impl Tokens {
+    /// None yet, on a server of these environments.
+    pub fn new(catalogue: Catalogue) -> Self {
+        Self { good: Arc::default(), catalogue: Arc::new(catalogue) }
+    }
+
+    /// How many there are.
+    pub fn count(&self) -> usize {
+        self.good.read().unwrap_or_else(PoisonError::into_inner).len()
+    }
+
+    /// What each has and has done.
+    pub fn used(&self) -> Vec<Used> {
+        self.good.read().unwrap_or_else(PoisonError::into_inner).iter().map(|token| token.used()).collect()
+    }
+
+    /// Takes the file's new text: tokens that stay, with the same role, keep what they have, others are revoked.
+    ///
+    /// # Errors
+    /// [`Wrong`]; then all stays as it is.
+    pub fn renew(&self, text: &str) -> Result<(), Wrong> {
+        let listed = listed(&self.catalogue, text)?;
+        let mut tokens = self.good.write().unwrap_or_else(PoisonError::into_inner);
+        let mut renewed = Vec::with_capacity(listed.len());
+        for Known { digest, entry, role } in listed {
+            let Entry { name, max_sessions, max_envs, max_steps_per_second, max_bytes, .. } = entry;
+            // Another token of the same name has what was taken with the one before, too.
+            let before = tokens.iter().find(|token| token.name == name);
+            let quotas = before.map_or_else(Default::default, |token| Arc::clone(&token.quotas));
+            quotas.sessions.bound(max_sessions);
+            quotas.envs.bound(max_envs);
+            quotas.bytes.bound(max_bytes);
+            quotas.pace.bound(max_steps_per_second);
+            renewed.push(match before.filter(|token| token.digest == digest && token.role == role) {
+                Some(token) => Arc::clone(token),
+                None => {
+                    Arc::new(Token { name, digest, role, revoked: AtomicBool::new(false), told: Notify::new(), quotas })
+                }
+            });
+        }
+        let gone = |token: &&Bearer| !renewed.iter().any(|kept| Arc::ptr_eq(kept, token));
+        tokens.iter().filter(gone).for_each(|token| token.revoke());
+        *tokens = renewed;
+        Ok(())
+    }
+
+    /// The token that a call shows. All are compared, each in constant time.
+    fn find(&self, shown: &[u8]) -> Option<Bearer> {
+        let digest: [u8; 32] = Sha256::digest(shown).into();
+        let tokens = self.good.read().unwrap_or_else(PoisonError::into_inner);
+        let fits = |token: &Bearer| bool::from(token.digest.ct_eq(&digest));
+        tokens.iter().fold(None, |found, token| if fits(token) { Some(token) } else { found }).cloned()
+    }
+
+    /// Whose call it is; none for one by a Unix socket, which needs no token.
+    ///
+    /// # Errors
+    /// [`Refusal::NoToken`] or [`Refusal::WrongToken`].
+    fn admit(&self, request: &http::Request<Body>) -> Result<Option<Bearer>, Refusal> {
+        let peer = request.extensions().get::<Connection>().map(|connection| connection.peer);
+        if matches!(peer, Some(Peer::User(_))) {
+            return Ok(None);
+        }
+        let header = request.headers().get(http::header::AUTHORIZATION).ok_or(Refusal::NoToken)?.as_bytes();
+        let (scheme, token) = header.split_at_checked("Bearer ".len()).ok_or(Refusal::NoToken)?;
+        if !scheme.eq_ignore_ascii_case(b"Bearer ") {
+            return Err(Refusal::NoToken);
+        }
+        let bearer = self.find(token).ok_or(Refusal::WrongToken)?;
+        tracing::debug!(token = bearer.name(), path = request.uri().path(), ?peer, "a call");
+        Ok(Some(bearer))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rstest::rstest;
+
+    const SECRET: &str = "correct-horse-battery";
+
+    fn tokens_of(text: &str) -> Result<Tokens, Wrong> {
+        let tokens = Tokens::new(crate::tasks::catalogue());
+        tokens.renew(text).map(|()| tokens)
+    }
+
+    fn file(token: &str, more: &str) -> String {
+        format!("[[token]]\nname = \"ann\"\ntoken = \"{token}\"\n{more}")
+    }
+
+    #[test]
+    fn a_token_is_found_by_itself_or_by_its_digest() {
+        let (token, entry) = new_token("bob \"the\" builder").unwrap();
+        let tokens = tokens_of(&(entry + &file(SECRET, ""))).unwrap();
+        let name = |shown: &str| tokens.find(shown.as_bytes()).map(|token| token.name().to_owned());
+        assert_eq!(name(SECRET).as_deref(), Some("ann"));
+        assert_eq!(name(&token).as_deref(), Some("bob \"the\" builder"));
+        assert_eq!(name(&SECRET[1..]), None);
+        assert_eq!(name(""), None);
+        assert_eq!(tokens.count(), 2);
+    }
+
+    #[rstest]
+    #[case::not_toml("[[token]]\nname =", 2, "cannot be read")]
+    #[case::unknown_key("# a\n[[token]]\nname = \"ann\"\ntokn = \"x\"", 4, "unknown field `tokn`")]
+    #[case::no_name("[[token]]\ntoken = \"correct-horse-battery\"", 1, "missing field `name`")]
+    #[case::neither("\n\n[[token]]\nname = \"ann\"", 3, "neither")]
+    #[case::both(&file(SECRET, "sha256 = \"00\""), 1, "both")]
+    #[case::no_digest("[[token]]\nname = \"ann\"\nsha256 = \"correct-horse-battery\"", 1, "64 hexadecimal")]
+    #[case::short(&file("correct-horse", ""), 1, "fewer than 16")]
+    #[case::spaces(&file("correct horse battery", ""), 1, "visible")]
+    #[case::no_number(&file(SECRET, "max_envs = \"correct-horse-battery\""), 4, "cannot be read")]
+    #[case::nothing(&file(SECRET, "max_envs = 0"), 1, "leave the token out")]
+    #[case::no_bytes(&file(SECRET, "max_bytes = 0"), 1, "leave the token out")]
+    #[case::no_steps(&file(SECRET, "max_steps_per_second = 0"), 1, "leave the token out")]
+    #[case::too_many_steps(&file(SECRET, "max_steps_per_second = 5000000000"), 4, "cannot be read")]
+    #[case::twice(&(file(SECRET, "") + &file("another-horse-battery", "")), 4, "two tokens called \"ann\"")]
+    #[case::shared(&(file(SECRET, "") + &file(SECRET, "").replace("ann", "bob")), 4, "another one's")]
+    fn a_wrong_file_is_refused_with_its_line_and_no_token(#[case] text: &str, #[case] line: usize, #[case] part: &str) {
+        let wrong = tokens_of(text).err().unwrap();
+        assert_eq!(wrong.line, line, "{wrong}");
+        let words = wrong.to_string();
+        assert!(words.contains(part) && words.contains("expected [[token]]"), "{words}");
+        assert!(!words.contains("correct"), "it tells the token: {words}");
+    }
+
+    #[test]
+    fn a_new_file_revokes_and_a_broken_one_changes_nothing() {
+        let tokens = tokens_of(&file(SECRET, "max_envs = 8\nmax_sessions = 1")).unwrap();
+        let ann = tokens.find(SECRET.as_bytes()).unwrap();
+        let mut held = ann.envs(6).unwrap();
+        assert!(ann.envs(3).is_err());
+        held.give_back(1);
+        assert!(ann.envs(3).is_ok());
+        assert!(tokens.renew("[[token]]").is_err());
+        assert!(tokens.find(SECRET.as_bytes()).is_some() && !ann.is_revoked());
+        tokens.renew(&file(SECRET, "max_envs = 10")).unwrap();
+        assert!(!ann.is_revoked() && ann.envs(6).is_err() && ann.envs(5).is_ok(), "what it has is remembered");
+        let first = ann.session().unwrap();
+        assert!(ann.session().is_ok(), "that quota is gone");
+        let renewed = file("another-horse-battery", "max_envs = 10");
+        tokens.renew(&renewed).unwrap();
+        let new = tokens.find(b"another-horse-battery").unwrap();
+        assert!(ann.is_revoked() && new.envs(6).is_err() && new.envs(5).is_ok(), "the quota is the name's");
+        tokens.renew("").unwrap();
+        assert!(new.is_revoked() && tokens.find(SECRET.as_bytes()).is_none());
+        drop((first, held));
+        assert_eq!((ann.used().envs, ann.used().sessions), (0, 0));
+    }
+}

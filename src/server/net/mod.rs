@@ -1,0 +1,8 @@
+//! Connections: who they are from, how they begin and end, and what is logged of their sessions.
+
+pub mod access_log;
+pub mod capacity_health;
+pub mod listener;
+pub mod peers;
+pub mod probe;
+pub mod tls;

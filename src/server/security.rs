@@ -1,0 +1,76 @@
+//! What keeps strangers out, and what is written down of those who came in, of the files that the settings name.
+
+use super::{
+    audit::ledger::Ledger,
+    auth::{
+        Tokens,
+        file_watcher::{self, Watch},
+    },
+    net::tls::{Files, Tls},
+};
+use crate::{config::Config, env::Catalogue};
+use std::{io, path::PathBuf};
+
+/// What keeps strangers out and writes down what others do; by default nothing does.
+#[derive(Default)]
+pub struct Guards {
+    /// What callers must show.
+    pub tokens: Option<Tokens>,
+    /// How TCP connections are encrypted.
+    pub tls: Option<Tls>,
+    /// Has what is drawn.
+    pub ledger: Option<Ledger>,
+    /// Has the files read again when they change.
+    watches: Vec<Watch>,
+}
+
+impl Guards {
+    /// Those of the settings of a server of these environments: its files are read, and again when they change.
+    ///
+    /// # Errors
+    /// If a file is wrong: it is named, with what was expected.
+    pub fn load(config: &Config, catalogue: &Catalogue) -> io::Result<Self> {
+        let mut guards = Self::default();
+        if let Some(path) = &config.tokens {
+            guards.tokens = Some(guards.load_tokens(path.clone(), catalogue)?);
+        }
+        if let Some(files) = config.tls() {
+            guards.tls = Some(guards.load_tls(files)?);
+        }
+        if let Some(path) = &config.ledger {
+            let wrong = |error| io::Error::other(format!("the ledger {}: {error}; correct --ledger", path.display()));
+            guards.ledger = Some(Ledger::open(path).map_err(wrong)?);
+        }
+        Ok(guards)
+    }
+
+    fn load_tokens(&mut self, path: PathBuf, catalogue: &Catalogue) -> io::Result<Tokens> {
+        let wrong = |reason: String| io::Error::other(format!("{reason}; correct --tokens"));
+        let before = file_watcher::read(std::slice::from_ref(&path)).map_err(wrong)?;
+        let tokens = Tokens::new(catalogue.clone());
+        let renewed = tokens.clone();
+        let name = path.display().to_string();
+        let renew = move |contents: &[Vec<u8>]| {
+            let text = contents.first().map(|text| String::from_utf8_lossy(text)).unwrap_or_default();
+            renewed.renew(&text).map_err(|wrong| format!("{name}, {wrong}"))
+        };
+        renew(&before).map_err(wrong)?;
+        if tokens.count() == 0 {
+            tracing::warn!("{} has no token: nobody can call by TCP", path.display());
+        }
+        self.watches.push(Watch::start("tokens", vec![path], before, renew)?);
+        Ok(tokens)
+    }
+
+    fn load_tls(&mut self, files: Files) -> io::Result<Tls> {
+        let flags = "--tls-cert, --tls-key or --tls-client-ca";
+        let wrong = |reason: String| io::Error::other(format!("{reason}; correct {flags}"));
+        let paths = files.paths();
+        let before = file_watcher::read(&paths).map_err(wrong)?;
+        let tls = Tls::new(files, &before).map_err(wrong)?;
+        let renewed = tls.clone();
+        let renew = move |contents: &[Vec<u8>]| renewed.renew(contents);
+        self.watches.push(Watch::start("the files of TLS", paths, before, renew)?);
+        Ok(tls)
+    }
+}

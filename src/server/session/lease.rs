@@ -1,0 +1,253 @@
+//! Leases: sessions that outlive the loss of their stream for a while, and go on in another.
+//!
+//! - Here: which there are, and how a new stream asks for one.
+//! - [`replay_buffer`](super::replay_buffer): replies that may not have been received.
+//! - [`driver`](super::driver): who runs such a session, and waits for its streams.
+
+use super::driver::Line;
+use crate::server::{auth::Bearer, status::Refusal, transport::message_reader::Frames};
+use std::{
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicU64, AtomicUsize, Ordering},
+    },
+    time::Duration,
+};
+use subtle::ConstantTimeEq;
+use tokio::sync::{mpsc, oneshot};
+
+/// The most replies that are kept for a client which sends requests ahead.
+pub const MOST_KEPT: u32 = 64;
+
+/// What a session is named by: nobody guesses it.
+pub type Name = [u8; 16];
+
+/// Why a session cannot be taken up.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// Nobody has this lease.
+    #[error("no session here has the lease that came: it is over, or its session has ended; open another session")]
+    Unknown,
+    /// The session belongs to another token.
+    #[error("the session was opened with another token; show the one that it was opened with, or open another session")]
+    OtherToken,
+    /// A number beyond the last reply.
+    #[error(
+        "last_reply is {got}, but {last} is the last that there is; opened is 0, and each response after it one more"
+    )]
+    NoReply {
+        /// What came.
+        got: u64,
+        /// The last one.
+        last: u64,
+    },
+    /// Replies after this one are not kept.
+    #[error(
+        "last_reply is {got}, but replies up to {first} are kept no more: open.lease said that so many requests would not \
+         wait, or there was no memory for them; open another session"
+    )]
+    Forgotten {
+        /// What came.
+        got: u64,
+        /// The least that can be gone on from.
+        first: u64,
+    },
+    /// Its session goes on elsewhere.
+    #[error("another stream has taken up this session by its lease; go on there")]
+    TakenUp,
+}
+
+/// The leases of a server, of sessions with these responses.
+pub struct Leases<R>(Arc<State<R>>);
+
+impl<R> Clone for Leases<R> {
+    fn clone(&self) -> Self {
+        Self(Arc::clone(&self.0))
+    }
+}
+
+struct State<R> {
+    time: Duration,
+    numbers: Numbers,
+    leases: Mutex<Vec<Lease<R>>>,
+}
+
+/// One that holds.
+struct Lease<R> {
+    name: Name,
+    bearer: Option<Bearer>,
+    asks: mpsc::Sender<Ask<R>>,
+}
+
+/// How many leases there are.
+#[derive(Clone, Default)]
+pub struct Numbers(Arc<Counts>);
+
+#[derive(Default)]
+struct Counts {
+    held: AtomicUsize,
+    detached: AtomicUsize,
+    resumed: AtomicU64,
+    spares: AtomicUsize,
+}
+
+impl Numbers {
+    /// Sessions without a stream now.
+    pub fn detached(&self) -> usize {
+        self.0.detached.load(Ordering::Relaxed)
+    }
+
+    /// How often a session was taken up so far.
+    pub fn resumed(&self) -> u64 {
+        self.0.resumed.load(Ordering::Relaxed)
+    }
+
+    /// Adds one to those.
+    pub fn add_resumed(&self) {
+        self.0.resumed.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// A session that has no stream, until it is dropped.
+    pub fn detach(&self) -> One {
+        self.0.detached.fetch_add(1, Ordering::Relaxed);
+        One { numbers: self.clone(), of: |counts| &counts.detached }
+    }
+
+    /// Room for a stream that may do nothing but take up a session, where there is none for another session: there is as
+    /// much as there are leases.
+    pub fn spare(&self) -> Option<One> {
+        let held = self.0.held.load(Ordering::Relaxed);
+        let taken = |spares: usize| (spares < held).then_some(spares + 1);
+        self.0.spares.fetch_update(Ordering::Relaxed, Ordering::Relaxed, taken).ok()?;
+        Some(One { numbers: self.clone(), of: |counts| &counts.spares })
+    }
+}
+
+/// One of something that is counted, until it is dropped.
+pub struct One {
+    numbers: Numbers,
+    of: fn(&Counts) -> &AtomicUsize,
+}
+
+impl Drop for One {
+    fn drop(&mut self) {
+        (self.of)(&self.numbers.0).fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+/// A stream asks for a session.
+pub struct Ask<R> {
+    /// The number of the last reply that its client received.
+    pub last_reply: u64,
+    /// Whoever runs the session answers here.
+    pub answer: oneshot::Sender<Result<Ticket<R>, Error>>,
+}
+
+/// A session that is about to go on in the stream which asked for it.
+pub struct Ticket<R> {
+    /// The number of the last reply that there is.
+    pub last_reply: u64,
+    /// Where the stream is to go.
+    pub arrival: oneshot::Sender<Arrived<R>>,
+}
+
+/// A stream that came to take up a session.
+pub struct Arrived<R> {
+    /// Its requests.
+    pub requests: Frames,
+    /// Where its replies go.
+    pub line: Line<R>,
+}
+
+/// A lease that was given, and holds until it is dropped.
+pub struct Grant<R> {
+    leases: Leases<R>,
+    /// What the session is named by.
+    pub name: Name,
+    /// The most requests of its client that wait.
+    pub most: usize,
+    /// Streams that ask for it.
+    pub asks: mpsc::Receiver<Ask<R>>,
+}
+
+impl<R> Leases<R> {
+    /// None yet; they hold so long without a stream.
+    pub fn new(time: Duration, numbers: Numbers) -> Self {
+        Self(Arc::new(State { time, numbers, leases: Mutex::default() }))
+    }
+
+    /// Gives a session a lease, unless they hold no time.
+    ///
+    /// # Errors
+    /// [`Refusal::NoRandomness`].
+    pub fn give(&self, bearer: Option<Bearer>, most: usize) -> Result<Option<Grant<R>>, Refusal> {
+        if self.0.time.is_zero() {
+            return Ok(None);
+        }
+        let name = random()?;
+        // One at a time is answered.
+        let (sender, asks) = mpsc::channel(1);
+        self.lock().push(Lease { name, bearer, asks: sender });
+        self.0.numbers.0.held.fetch_add(1, Ordering::Relaxed);
+        Ok(Some(Grant { leases: self.clone(), name, most, asks }))
+    }
+
+    /// Asks for the session of this name, for a client that received replies up to a number.
+    ///
+    /// # Errors
+    /// [`Error`].
+    pub async fn ask(&self, name: &[u8], bearer: Option<&Bearer>, last_reply: u64) -> Result<Ticket<R>, Error> {
+        let (answer, answered) = oneshot::channel();
+        let asks = self.find(name, bearer)?;
+        asks.send(Ask { last_reply, answer }).await.map_err(|_| Error::Unknown)?;
+        answered.await.map_err(|_| Error::Unknown)?
+    }
+
+    fn find(&self, name: &[u8], bearer: Option<&Bearer>) -> Result<mpsc::Sender<Ask<R>>, Error> {
+        let leases = self.lock();
+        // All of them are looked at, each in a time that does not depend on the name.
+        let found = leases
+            .iter()
+            .fold(None, |found, lease| if lease.name[..].ct_eq(name).into() { Some(lease) } else { found });
+        let Lease { bearer: own, asks, .. } = found.ok_or(Error::Unknown)?;
+        // A name that has another token now has lost its sessions.
+        if own.as_ref().map(|own| own.name()) != bearer.map(|bearer| bearer.name()) {
+            return Err(Error::OtherToken);
+        }
+        Ok(asks.clone())
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Vec<Lease<R>>> {
+        self.0.leases.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl<R> Grant<R> {
+    /// How long it holds without a stream.
+    pub fn time(&self) -> Duration {
+        self.leases.0.time
+    }
+
+    /// How many leases there are.
+    pub fn numbers(&self) -> &Numbers {
+        &self.leases.0.numbers
+    }
+}
+
+impl<R> Drop for Grant<R> {
+    fn drop(&mut self) {
+        self.leases.lock().retain(|lease| lease.name != self.name);
+        self.numbers().0.held.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+/// 128 bits of the system's, which no seed has anything to do with.
+///
+/// # Errors
+/// [`Refusal::NoRandomness`].
+pub fn random() -> Result<Name, Refusal> {
+    let mut bytes = Name::default();
+    let got = rustix::rand::getrandom(&mut bytes, rustix::rand::GetRandomFlags::empty());
+    if got.is_ok_and(|n| n == bytes.len()) { Ok(bytes) } else { Err(Refusal::NoRandomness) }
+}

@@ -1,0 +1,6 @@
+//! Sessions: one response for each request, in order, and leases that outlive a stream.
+
+pub mod driver;
+pub mod instrumented;
+pub mod lease;
+pub mod replay_buffer;

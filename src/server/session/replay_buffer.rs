@@ -1,0 +1,119 @@
+//! The last replies of a session, by number, until its client is known to have received them.
+
+use super::lease::Error;
+use std::collections::VecDeque;
+
+/// Replies 1, 2, 3, …, of which the last few are here.
+pub struct Kept<R> {
+    last: u64,
+    most: usize,
+    replies: VecDeque<R>,
+}
+
+impl<R> Kept<R> {
+    /// None yet. Their client has at most so many requests without replies, at least 1.
+    pub fn new(most: usize) -> Self {
+        Self { last: 0, most, replies: VecDeque::new() }
+    }
+
+    /// The number of the last one.
+    pub fn last(&self) -> u64 {
+        self.last
+    }
+
+    /// A request came: it waits for a reply, with others so many, and those before them were received.
+    pub fn asked(&mut self) {
+        let received = (self.replies.len() + 1).saturating_sub(self.most);
+        self.replies.drain(..received);
+    }
+
+    /// The next reply.
+    pub fn made(&mut self, reply: R) {
+        self.last += 1;
+        self.replies.push_back(reply);
+    }
+
+    /// Those that are here.
+    pub fn replies(&self) -> impl Iterator<Item = &R> {
+        self.replies.iter()
+    }
+
+    /// Lets go of all of them.
+    pub fn clear(&mut self) {
+        self.replies.clear();
+    }
+
+    /// Whether all replies after this number are here.
+    ///
+    /// # Errors
+    /// [`Error::NoReply`], [`Error::Forgotten`].
+    pub fn check(&self, number: u64) -> Result<(), Error> {
+        let (last, first) = (self.last, self.last - self.replies.len() as u64);
+        if number > last {
+            return Err(Error::NoReply { got: number, last });
+        }
+        if number < first {
+            return Err(Error::Forgotten { got: number, first });
+        }
+        Ok(())
+    }
+
+    /// The reply of this number, if it is here.
+    pub fn get(&self, number: u64) -> Option<&R> {
+        let behind = usize::try_from(self.last.checked_sub(number)?).ok()?;
+        self.replies.get(self.replies.len().checked_sub(behind + 1)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn a_request_says_that_what_its_client_does_not_wait_for_was_received() {
+        let mut kept = Kept::new(1);
+        kept.asked();
+        kept.made('a');
+        assert_eq!((kept.check(0), kept.check(1), kept.get(1)), (Ok(()), Ok(()), Some(&'a')));
+        assert_eq!(kept.check(2), Err(Error::NoReply { got: 2, last: 1 }));
+        kept.asked();
+        assert_eq!(kept.check(0), Err(Error::Forgotten { got: 0, first: 1 }));
+        assert_eq!((kept.check(1), kept.get(1)), (Ok(()), None), "that one was received, and is not wanted");
+        kept.made('b');
+        assert_eq!((kept.get(1), kept.get(2), kept.get(3)), (None, Some(&'b'), None));
+        kept.clear();
+        assert_eq!((kept.check(1), kept.check(2)), (Err(Error::Forgotten { got: 1, first: 2 }), Ok(())));
+    }
+
+    proptest! {
+        /// A client that keeps its word about how many requests wait finds all that it has not received, and the server
+        /// never holds more.
+        #[test]
+        fn nothing_that_was_not_received_is_let_go_and_no_more_is_held(
+            most in 1_usize..8,
+            moves in prop::collection::vec(0_u8..3, 0..200),
+        ) {
+            let mut kept = Kept::new(most);
+            let (mut sent, mut received) = (0, 0);
+            for what in moves {
+                match what {
+                    0 if sent - received < most as u64 => sent += 1,
+                    1 if kept.last() < sent => {
+                        kept.asked();
+                        kept.made(kept.last() + 1);
+                    }
+                    2 if received < kept.last() => received += 1,
+                    _ => {}
+                }
+                prop_assert_eq!(kept.check(received), Ok(()));
+                for number in received + 1..=kept.last() {
+                    prop_assert_eq!(kept.get(number), Some(&number));
+                }
+                prop_assert_eq!(kept.get(kept.last() + 1), None);
+                prop_assert!(kept.replies.len() <= most);
+                prop_assert!(kept.check(kept.last() + 1).is_err());
+            }
+        }
+    }
+}

@@ -1,0 +1,183 @@
+//! The bytes in flight: one budget for requests, replies, pictures and policies, over all sessions, of which a token may
+//! have a part.
+
+use crate::server::{
+    auth::{Bearer, Held, Token},
+    status::Refusal,
+};
+use bytes::Bytes;
+use std::sync::{
+    Arc, Mutex, PoisonError,
+    atomic::{AtomicUsize, Ordering},
+};
+
+/// The server's bytes, as who has a token may take of them.
+#[derive(Clone)]
+pub struct Budget {
+    state: Arc<State>,
+    bearer: Option<Bearer>,
+}
+
+struct State {
+    used: AtomicUsize,
+    limit: usize,
+}
+
+impl Budget {
+    /// Of so many bytes, which are nobody's.
+    pub fn new(limit: usize) -> Self {
+        Self { state: Arc::new(State { used: AtomicUsize::new(0), limit }), bearer: None }
+    }
+
+    /// The same bytes, of which this token, if there is one, takes no more than it may.
+    pub fn of(&self, bearer: Option<Bearer>) -> Self {
+        Self { state: Arc::clone(&self.state), bearer }
+    }
+
+    /// Bytes in flight.
+    pub fn used(&self) -> usize {
+        self.state.used.load(Ordering::Relaxed)
+    }
+
+    /// The most there may be.
+    pub fn limit(&self) -> usize {
+        self.state.limit
+    }
+
+    /// Nothing yet, to be grown.
+    pub fn nothing(&self) -> Share {
+        Share { state: Arc::clone(&self.state), bytes: 0, held: self.bearer.as_ref().map(Token::no_bytes) }
+    }
+
+    /// So many bytes, until the share is dropped.
+    ///
+    /// # Errors
+    /// [`Refusal::NoMemory`], [`Refusal::TooManyOfAToken`].
+    pub fn take(&self, bytes: usize) -> Result<Share, Refusal> {
+        let mut share = self.nothing();
+        share.grow(bytes)?;
+        Ok(share)
+    }
+}
+
+/// A part of the budget.
+pub struct Share {
+    state: Arc<State>,
+    bytes: usize,
+    /// As many, of those that the token may have.
+    held: Option<Held>,
+}
+
+impl Share {
+    /// How many they are.
+    pub fn bytes(&self) -> usize {
+        self.bytes
+    }
+
+    /// Takes so many bytes more.
+    ///
+    /// # Errors
+    /// [`Refusal::NoMemory`], [`Refusal::TooManyOfAToken`]; then it is as before.
+    pub fn grow(&mut self, bytes: usize) -> Result<(), Refusal> {
+        if bytes == 0 {
+            return Ok(());
+        }
+        self.held.as_mut().map(|held| held.grow(bytes)).transpose()?;
+        let State { used, limit } = &*self.state;
+        let fits = |used: usize| used.checked_add(bytes).filter(|sum| sum <= limit);
+        match used.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits) {
+            Ok(_) => {
+                self.bytes += bytes;
+                Ok(())
+            }
+            Err(used) => {
+                if let Some(held) = &mut self.held {
+                    held.give_back(bytes);
+                }
+                Err(Refusal::NoMemory { wanted: bytes, used, limit: *limit })
+            }
+        }
+    }
+
+    /// Makes it as large as what was made in the end, which may be more than was expected.
+    pub fn set(&mut self, bytes: usize) {
+        if let Some(held) = &mut self.held {
+            held.set(bytes);
+        }
+        let used = &self.state.used;
+        used.fetch_add(bytes, Ordering::Relaxed);
+        used.fetch_sub(std::mem::replace(&mut self.bytes, bytes), Ordering::Relaxed);
+    }
+}
+
+impl Drop for Share {
+    fn drop(&mut self) {
+        self.state.used.fetch_sub(self.bytes, Ordering::Relaxed);
+    }
+}
+
+/// Shares of replies on their way to the wire: whoever makes a reply puts its share here, and the transport takes it along
+/// with the bytes.
+#[derive(Clone, Default)]
+pub struct Outbox(Arc<Mutex<Vec<Share>>>);
+
+impl Outbox {
+    /// Adds a reply's share.
+    pub fn put(&self, share: Share) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(share);
+    }
+
+    /// The bytes with the shares that are theirs, which are held until the last of the bytes is written or dropped, and so
+    /// is what `hold` makes. Bytes without shares are left as they are.
+    pub fn send<H: Send + 'static>(&self, bytes: Bytes, hold: impl FnOnce() -> H) -> Bytes {
+        let shares = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
+        if shares.is_empty() { bytes } else { Bytes::from_owner(Sent { bytes, _held: (shares, hold()) }) }
+    }
+}
+
+struct Sent<H> {
+    bytes: Bytes,
+    _held: (Vec<Share>, H),
+}
+
+impl<H> AsRef<[u8]> for Sent<H> {
+    fn as_ref(&self) -> &[u8] {
+        &self.bytes
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_does_not_fit_is_refused_and_what_is_dropped_is_free_again() {
+        let budget = Budget::new(100);
+        let mut first = budget.take(60).unwrap();
+        assert_eq!(budget.take(41).err(), Some(Refusal::NoMemory { wanted: 41, used: 60, limit: 100 }));
+        first.grow(40).unwrap();
+        assert!(first.grow(1).is_err() && budget.take(usize::MAX).is_err());
+        first.set(150);
+        assert!(budget.take(1).is_err() && budget.take(0).is_ok());
+        first.set(10);
+        let second = budget.take(90).unwrap();
+        drop(first);
+        assert!(budget.take(11).is_err());
+        drop(second);
+        assert!(budget.take(100).is_ok());
+    }
+
+    #[test]
+    fn a_share_is_held_until_the_last_of_its_bytes_is_dropped() {
+        let (budget, outbox) = (Budget::new(10), Outbox::default());
+        outbox.put(budget.take(10).unwrap());
+        let mut sent = outbox.send(Bytes::from_static(b"reply"), || ());
+        let rest = sent.split_off(2);
+        drop(sent);
+        assert!(budget.take(1).is_err());
+        assert_eq!(rest, "ply");
+        drop(rest);
+        assert!(budget.take(10).is_ok());
+        assert_eq!(outbox.send(Bytes::from_static(b"small"), || ()), "small");
+    }
+}

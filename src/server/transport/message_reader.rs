@@ -1,0 +1,311 @@
+//! Messages off the wire: gRPC's frames, each bounded by what its stream may send now, before anything of it is kept.
+//!
+//! tonic has one limit for all messages of a service, and decodes them on the transport's thread. So the streams of both
+//! protocols keep their bodies from it (`Kept`) and read them here.
+
+use super::{
+    budget::{Budget, Outbox, Share},
+    watched_body::{Patience, Replies},
+};
+use crate::server::{auth::Bearer, net::peers::Connection, session::driver::MOST_BYTES_BEFORE_OPEN, status::Refusal};
+use bytes::{Buf, Bytes, BytesMut};
+use http_body::Body as _;
+use http_body_util::BodyExt;
+use std::{
+    convert::Infallible,
+    future::Future,
+    pin::Pin,
+    sync::{Arc, Mutex, PoisonError},
+    task::{Context, Poll},
+    time::Duration,
+};
+use tokio::time::{Instant, timeout_at};
+use tonic::{Code, Status, body::Body, codegen::Service, codegen::http, server::NamedService};
+
+/// A frame's flag and its length.
+const HEADER: usize = 5;
+/// What a message may have before the budget is asked: as much as a session may send that is not open.
+const SMALL: usize = MOST_BYTES_BEFORE_OPEN;
+/// A message must come with so many bytes a second on average, after the time that a pause may take.
+const LEAST_RATE: usize = 64 << 10;
+/// A message of so many bytes is worth an allocation of its own.
+const LARGE: usize = 1 << 20;
+
+/// What a stream may send now.
+#[derive(Debug, Clone, Copy)]
+pub struct Allowance {
+    /// The most bytes of a message.
+    pub bytes: usize,
+    /// The most entries of fields that have one for each environment.
+    pub entries: usize,
+    /// The bytes of a message for which the budget was asked already.
+    pub covered: usize,
+}
+
+/// A service one of whose methods, that at `path`, reads its requests from `Kept` and not from tonic.
+#[derive(Clone)]
+pub struct Keeping<S> {
+    service: S,
+    path: &'static str,
+    transit: Transit,
+}
+
+/// What requests and replies are subject to on their way.
+#[derive(Clone)]
+pub struct Transit {
+    /// What they take their bytes from.
+    pub budget: Budget,
+    /// How long a client may leave a message unfinished, or a reply unread.
+    pub limit: Option<Duration>,
+    /// How long it may leave the first reply unread.
+    pub handshake: Duration,
+}
+
+impl<S> Keeping<S> {
+    /// Keeps the bodies of calls of this path.
+    pub fn new(service: S, path: &'static str, transit: Transit) -> Self {
+        Self { service, path, transit }
+    }
+}
+
+impl<S: NamedService> NamedService for Keeping<S> {
+    const NAME: &'static str = S::NAME;
+}
+
+impl<S> Service<http::Request<Body>> for Keeping<S>
+where
+    S: Service<http::Request<Body>, Response = http::Response<Body>, Error = Infallible>,
+    S::Future: Send + 'static,
+{
+    type Response = http::Response<Body>;
+    type Error = Infallible;
+    type Future = Pin<Box<dyn Future<Output = Result<Self::Response, Infallible>> + Send>>;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Infallible>> {
+        self.service.poll_ready(context)
+    }
+
+    fn call(&mut self, mut request: http::Request<Body>) -> Self::Future {
+        let outbox = Outbox::default();
+        let connection = request.extensions().get::<Connection>().cloned();
+        let is_stream = request.uri().path() == self.path;
+        // What is no stream is one small reply.
+        let patience = is_stream.then_some(Patience { first: self.transit.handshake, rest: self.transit.limit });
+        if is_stream {
+            let bearer = request.extensions_mut().remove::<Bearer>();
+            let transit = Transit { budget: self.transit.budget.of(bearer.clone()), ..self.transit };
+            let body = std::mem::take(request.body_mut());
+            let frames = Frames {
+                body,
+                buffer: BytesMut::new(),
+                message: None,
+                due: None,
+                share: transit.budget.nothing(),
+                transit,
+                connection: connection.clone(),
+                bearer,
+                outbox: outbox.clone(),
+            };
+            request.extensions_mut().insert(Kept(Arc::new(Mutex::new(Some(frames)))));
+        }
+        let response = self.service.call(request);
+        Box::pin(
+            async move { Ok(response.await?.map(|body| Body::new(Replies::new(body, outbox, connection, patience)))) },
+        )
+    }
+}
+
+/// A request's frames, as an extension of the request, which must be one that could be cloned.
+#[derive(Clone)]
+struct Kept(Arc<Mutex<Option<Frames>>>);
+
+/// The messages of a request's body, as they come.
+pub struct Frames {
+    body: Body,
+    /// What has come and not been taken.
+    buffer: BytesMut,
+    message: Option<Begun>,
+    /// When the message that has begun must have ended.
+    due: Option<Instant>,
+    /// Of the message that has begun.
+    share: Share,
+    transit: Transit,
+    /// Whom they are from.
+    pub connection: Option<Connection>,
+    /// The token that came with them.
+    pub bearer: Option<Bearer>,
+    /// Where the shares of their replies go.
+    pub outbox: Outbox,
+}
+
+/// A message that has begun.
+enum Begun {
+    /// It has so many bytes.
+    Wanted(usize),
+    /// There was no room for it. So many of its bytes have not come yet, and are thrown away.
+    Refused(usize, Refusal),
+}
+
+/// A message.
+pub enum Message {
+    /// Its bytes, with their share of the budget.
+    Whole(Bytes, Share),
+    /// The budget has no room for it.
+    Refused(Refusal),
+}
+
+/// Why a stream ends before its client's end.
+pub enum Stop {
+    /// The server wants no more of it.
+    Refused(Refusal),
+    /// What came is not to be understood, the connection broke, or the server has a defect.
+    Broken(Status),
+    /// The client wants no more of it, or something in between, or nothing comes from there any more.
+    Cancelled,
+}
+
+impl From<Status> for Stop {
+    fn from(status: Status) -> Self {
+        Self::Broken(status)
+    }
+}
+
+impl Frames {
+    /// Those of a request whose body was kept.
+    ///
+    /// # Errors
+    /// Where it was not: a defect.
+    pub fn of<T>(request: &mut tonic::Request<T>) -> Result<Self, Status> {
+        let kept = request.extensions_mut().remove::<Kept>();
+        let frames = kept.and_then(|kept| kept.0.lock().unwrap_or_else(PoisonError::into_inner).take());
+        frames.ok_or_else(|| Status::internal("the request's body is not there: a defect of the server"))
+    }
+
+    /// What they take their bytes from.
+    pub fn budget(&self) -> &Budget {
+        &self.transit.budget
+    }
+
+    /// Their place, when they go elsewhere: nothing comes there any more.
+    pub fn leave(&mut self) -> Self {
+        let left = Self {
+            body: Body::empty(),
+            buffer: BytesMut::new(),
+            message: None,
+            due: None,
+            share: self.transit.budget.nothing(),
+            transit: self.transit.clone(),
+            connection: self.connection.clone(),
+            bearer: self.bearer.clone(),
+            outbox: Outbox::default(),
+        };
+        std::mem::replace(self, left)
+    }
+
+    /// The next message; none at the client's end. To be called again if its future was dropped: nothing is lost.
+    ///
+    /// # Errors
+    /// What ends the stream: the message is too large, or never ends, or what came is not gRPC.
+    pub async fn next(&mut self, allowance: Allowance) -> Result<Option<Message>, Stop> {
+        loop {
+            if self.message.is_none() && self.buffer.len() >= HEADER {
+                self.message = Some(self.begin(allowance)?);
+            }
+            if let Some(whole) = self.taken() {
+                return Ok(Some(whole));
+            }
+            match self.frame().await? {
+                Some(Ok(frame)) => {
+                    if let Ok(data) = frame.into_data() {
+                        self.take(&data, allowance);
+                    }
+                }
+                Some(Err(status)) if status.code() == Code::Cancelled => return Err(Stop::Cancelled),
+                // The body of a connection that said nothing for too long ends as if its client had ended it.
+                None if !self.body.is_end_stream() => return Err(Stop::Cancelled),
+                Some(Err(status)) => return Err(status.into()),
+                None if self.buffer.is_empty() && self.message.is_none() => return Ok(None),
+                None => return Err(Status::internal("the stream ended within a message").into()),
+            }
+        }
+    }
+
+    /// The next frame of HTTP's; within a message it must come in time, and not so late that the message would take for
+    /// ever.
+    async fn frame(&mut self) -> Result<Option<Result<http_body::Frame<Bytes>, Status>>, Stop> {
+        let next = self.body.frame();
+        match self.transit.limit.filter(|_| self.message.is_some()) {
+            None => Ok(next.await),
+            Some(limit) => {
+                let soon = Instant::now() + limit;
+                let unfinished = |_| Stop::Refused(Refusal::Unfinished { seconds: limit.as_secs(), rate: LEAST_RATE });
+                timeout_at(self.due.map_or(soon, |due| due.min(soon)), next).await.map_err(unfinished)
+            }
+        }
+    }
+
+    /// Reads a frame's header.
+    fn begin(&mut self, allowance: Allowance) -> Result<Begun, Stop> {
+        match self.buffer.get_u8() {
+            0 => {}
+            1 => return Err(Status::internal("a message came compressed; send it as it is").into()),
+            flag => return Err(Status::internal(format!("a frame began with {flag}; expected 0: is it gRPC?")).into()),
+        }
+        let length = self.buffer.get_u32() as usize;
+        if length > allowance.bytes {
+            return Err(Stop::Refused(Refusal::TooLarge { got: length, limit: allowance.bytes }));
+        }
+        let longest = |limit| limit + Duration::from_secs((length / LEAST_RATE) as u64);
+        self.due = self.transit.limit.map(|limit| Instant::now() + longest(limit));
+        Ok(Begun::Wanted(length))
+    }
+
+    /// The message that has begun, if it is there.
+    fn taken(&mut self) -> Option<Message> {
+        match &mut self.message {
+            Some(Begun::Wanted(length)) if self.buffer.len() >= *length => {
+                let bytes = if *length < LARGE {
+                    self.buffer.split_to(*length).freeze()
+                } else {
+                    // Its memory goes with it; a part would keep the whole.
+                    let rest = BytesMut::from(&self.buffer[*length..]);
+                    let mut whole = std::mem::replace(&mut self.buffer, rest);
+                    whole.truncate(*length);
+                    whole.freeze()
+                };
+                self.message = None;
+                Some(Message::Whole(bytes, std::mem::replace(&mut self.share, self.transit.budget.nothing())))
+            }
+            Some(Begun::Refused(left, refusal)) => {
+                let come = (*left).min(self.buffer.len());
+                self.buffer.advance(come);
+                *left -= come;
+                let refused = (*left == 0).then(|| Message::Refused(refusal.clone()))?;
+                self.message = None;
+                Some(refused)
+            }
+            _ => None,
+        }
+    }
+
+    /// Takes bytes that came, with their share of the budget.
+    fn take(&mut self, data: &[u8], allowance: Allowance) {
+        if let Some(Begun::Wanted(length)) = self.message {
+            let free = allowance.covered.max(SMALL);
+            let beyond = |bytes: usize| bytes.min(length).saturating_sub(free);
+            let (before, after) = (beyond(self.buffer.len()), beyond(self.buffer.len() + data.len()));
+            if let Err(refusal) = self.share.grow(after - before) {
+                self.share = self.transit.budget.nothing();
+                // What has come of it goes with its memory.
+                let come = std::mem::take(&mut self.buffer).len();
+                self.message = Some(Begun::Refused(length - come, refusal));
+            }
+            if self.buffer.capacity() - self.buffer.len() < data.len() {
+                // By doubling, and not all that was announced: a client that announces much need not send it.
+                let rest = length.saturating_sub(self.buffer.len());
+                self.buffer.reserve(rest.min(self.buffer.len()).max(data.len()));
+            }
+        }
+        self.buffer.extend_from_slice(data);
+    }
+}

@@ -1,0 +1,298 @@
+//! Requests from their bytes. The encoding lets two bytes stand for an entry of a hundred, so entries are counted before
+//! anything is made of them, and what has many fields is decoded by other threads than the transport's.
+
+use self::Inside::{Fields, Numbers, Opaque};
+use super::message_reader::Allowance;
+use crate::{priority::lower, server::status::Refusal};
+use bytes::Bytes;
+use prost::Message;
+use std::sync::Arc;
+use tokio::sync::Semaphore;
+use tonic::Status;
+
+/// A request of at most so many fields is decoded at once: that takes less than to hand it over.
+const FEW_FIELDS: usize = 1000;
+/// Requests that are decoded at a time by other threads.
+const AT_A_TIME: usize = 2;
+/// What those threads' niceness is raised to: the transport and physics come first.
+const NICENESS: i32 = 5;
+/// Most parts that a message has wherever their number does not follow from the environments'. Where fewer are legal the
+/// refusal that names them is to come from those who know.
+const MANY: usize = 1024;
+/// Bytes of numbers in a row that are counted in the time of a field.
+const NUMBERS_A_FIELD: usize = 64;
+/// Room for the counts of a message's fields, of which no list here has more.
+const MOST_FIELDS: usize = 8;
+
+/// A field whose entries are counted.
+pub struct Field {
+    number: u64,
+    name: &'static str,
+    most: Most,
+    inside: Inside,
+}
+
+/// What a field's entries are.
+enum Inside {
+    /// Messages.
+    Fields(&'static [Field]),
+    /// Numbers, which may stand in a row.
+    Numbers,
+    /// Anything else.
+    Opaque,
+}
+
+/// How many entries a field may have.
+enum Most {
+    One,
+    Many,
+    /// As many as there are environments, and no fewer than [`MANY`].
+    Environments,
+}
+
+impl Most {
+    fn entries(&self, allowance: Allowance) -> usize {
+        match self {
+            Self::One => 1,
+            Self::Many => MANY,
+            Self::Environments => allowance.entries.max(MANY),
+        }
+    }
+}
+
+const fn field(number: u64, name: &'static str, most: Most, inside: Inside) -> Field {
+    Field { number, name, most, inside }
+}
+
+const DISTRIBUTION: &[Field] = &[field(1, "intervals", Most::Many, Opaque)];
+const PARAMETER: &[Field] = &[field(2, "a distribution", Most::One, Fields(DISTRIBUTION))];
+const GROUP: &[Field] = &[field(3, "open.groups.parameters", Most::Many, Fields(PARAMETER))];
+const OPEN: &[Field] = &[
+    field(3, "open.parameters", Most::Many, Fields(PARAMETER)),
+    field(11, "open.groups", Most::Environments, Fields(GROUP)),
+];
+const RESET: &[Field] = &[
+    field(2, "reset.seeds", Most::Environments, Numbers),
+    field(3, "reset.parameters", Most::Many, Fields(PARAMETER)),
+];
+const RESTORE: &[Field] = &[field(2, "restore.snapshots", Most::Environments, Opaque)];
+const POLICY: &[Field] = &[field(1, "act.policy.hidden", Most::Many, Numbers)];
+const ACT: &[Field] = &[field(1, "act.policy", Most::One, Fields(POLICY))];
+/// Those of `perturb.v1.SessionRequest`.
+pub const SESSION_REQUEST: &[Field] = &[
+    field(1, "open", Most::One, Fields(OPEN)),
+    field(2, "step", Most::One, Opaque),
+    field(3, "reset", Most::One, Fields(RESET)),
+    field(5, "restore", Most::One, Fields(RESTORE)),
+    field(8, "act", Most::One, Fields(ACT)),
+];
+
+const SETTINGS_FIRST: &[Field] = &[field(1, "settings", Most::Many, Opaque)];
+const SETTINGS_SECOND: &[Field] = &[field(2, "settings", Most::Many, Opaque)];
+const AGENT_STEP: &[Field] =
+    &[field(1, "step.actions", Most::Many, Opaque), field(2, "step.requested_observations", Most::Many, Numbers)];
+/// Those of `dm_env_rpc.v1.EnvironmentRequest`.
+pub const ENVIRONMENT_REQUEST: &[Field] = &[
+    field(1, "create_world", Most::One, Fields(SETTINGS_FIRST)),
+    field(2, "join_world", Most::One, Fields(SETTINGS_SECOND)),
+    field(3, "step", Most::One, Fields(AGENT_STEP)),
+    field(4, "reset", Most::One, Fields(SETTINGS_FIRST)),
+    field(5, "reset_world", Most::One, Fields(SETTINGS_SECOND)),
+];
+
+/// Decodes requests, the large ones elsewhere.
+#[derive(Clone)]
+pub struct Decoder(Arc<Semaphore>);
+
+impl Default for Decoder {
+    fn default() -> Self {
+        Self(Arc::new(Semaphore::new(AT_A_TIME)))
+    }
+}
+
+/// The request of these bytes, if it is a good one and decoded at once.
+pub fn decoded_at_once<T: Message + Default>(
+    bytes: Bytes,
+    fields: &'static [Field],
+    allowance: Allowance,
+) -> Option<T> {
+    check(&bytes, fields, allowance, FEW_FIELDS).ok()?;
+    decoded(bytes).ok()
+}
+
+impl Decoder {
+    /// The request of these bytes, or why it is refused.
+    ///
+    /// # Errors
+    /// If they are none: a status that ends the stream.
+    pub async fn decode<T: Message + Default + 'static>(
+        &self,
+        bytes: Bytes,
+        fields: &'static [Field],
+        allowance: Allowance,
+    ) -> Result<Result<T, Refusal>, Status> {
+        match check(&bytes, fields, allowance, FEW_FIELDS) {
+            Ok(()) => return decoded(bytes).map(Ok),
+            Err(Stop::Refused(refusal)) => return Ok(Err(refusal)),
+            Err(Stop::Work) => {}
+        }
+        let defect = || Status::internal("a request could not be decoded: a defect of the server");
+        let _turn = self.0.acquire().await.map_err(|_| defect())?;
+        let decoding = tokio::task::spawn_blocking(move || {
+            lower(NICENESS);
+            match check(&bytes, fields, allowance, usize::MAX) {
+                Err(Stop::Refused(refusal)) => Ok(Err(refusal)),
+                _ => decoded(bytes).map(Ok),
+            }
+        });
+        decoding.await.map_err(|_| defect())?
+    }
+}
+
+fn decoded<T: Message + Default>(bytes: Bytes) -> Result<T, Status> {
+    T::decode(bytes).map_err(|error| Status::internal(error.to_string()))
+}
+
+/// Why a message was not looked through.
+#[derive(Debug, PartialEq)]
+enum Stop {
+    /// It has more fields than were to be looked at.
+    Work,
+    Refused(Refusal),
+}
+
+/// Counts a message's fields and entries, at most `work` of them. What is not well-formed ends the count, as it ends the
+/// decoding.
+fn check(message: &[u8], fields: &[Field], allowance: Allowance, mut work: usize) -> Result<(), Stop> {
+    count(message, fields, allowance, &mut work).map(|_| ())
+}
+
+/// The same of a part of a message; whether it is well-formed.
+fn count(mut message: &[u8], fields: &[Field], allowance: Allowance, work: &mut usize) -> Result<bool, Stop> {
+    let mut counts = [0; MOST_FIELDS];
+    while !message.is_empty() {
+        *work = work.checked_sub(1).ok_or(Stop::Work)?;
+        let Some(tag) = varint(&mut message) else { return Ok(false) };
+        let part = match tag & 7 {
+            0 => varint(&mut message).map(|_| &[][..]),
+            1 => message.split_off(..8),
+            2 => varint(&mut message).and_then(|length| message.split_off(..usize::try_from(length).ok()?)),
+            5 => message.split_off(..4),
+            // Groups of fields, which are no part of this version of the encoding.
+            kind => {
+                let got = format!("with a field of the encoding's kind {kind}");
+                return Err(Stop::Refused(Refusal::value("request", got, "kinds 0, 1, 2 and 5")));
+            }
+        };
+        let Some(part) = part else { return Ok(false) };
+        let Some((field, counted)) = fields.iter().zip(&mut counts).find(|(field, _)| field.number == tag >> 3) else {
+            continue;
+        };
+        *counted += match field.inside {
+            Numbers if tag & 7 == 2 => {
+                *work = work.checked_sub(part.len() / NUMBERS_A_FIELD).ok_or(Stop::Work)?;
+                part.iter().filter(|byte| **byte < 0x80).count() // each number's last byte
+            }
+            _ => 1,
+        };
+        let most = field.most.entries(allowance);
+        if *counted > most {
+            let got = format!("there more than {most} times");
+            return Err(Stop::Refused(Refusal::value(field.name, got, "no more than can be needed")));
+        }
+        if let Fields(fields) = field.inside
+            && !count(part, fields, allowance, work)?
+        {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
+/// A number of variable length.
+fn varint(message: &mut &[u8]) -> Option<u64> {
+    let mut value = 0;
+    for shift in (0..64).step_by(7) {
+        let (&byte, rest) = message.split_first()?;
+        *message = rest;
+        value |= u64::from(byte & 0x7F) << shift;
+        if byte < 0x80 {
+            return Some(value);
+        }
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::proto::{self, session_request::Request};
+
+    const ALLOWANCE: Allowance = Allowance { bytes: 0, entries: 2000, covered: 0 };
+
+    fn checked(request: impl Into<Request>, work: usize) -> Result<(), Stop> {
+        let message = proto::SessionRequest { request: Some(request.into()) }.encode_to_vec();
+        check(&message, SESSION_REQUEST, ALLOWANCE, work)
+    }
+
+    fn refused(request: impl Into<Request>) -> String {
+        match checked(request, usize::MAX) {
+            Err(Stop::Refused(refusal)) => refusal.to_string(),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn entries_are_counted_whether_or_not_they_stand_in_a_row() {
+        let reset = |seeds| proto::Reset { seeds, ..proto::Reset::default() };
+        assert_eq!(checked(reset(vec![u64::MAX; 2000]), usize::MAX), Ok(()));
+        assert!(refused(reset(vec![1; 2001])).contains("reset.seeds is there more than 2000 times"));
+        let unpacked = [&[0x1A, 0xA2, 0x1F][..], &[0x10, 1].repeat(2001)].concat();
+        assert!(matches!(check(&unpacked, SESSION_REQUEST, ALLOWANCE, usize::MAX), Err(Stop::Refused(_))));
+        let policy = proto::Policy { hidden: vec![1; 1025], ..proto::Policy::default() };
+        assert!(refused(proto::Act { policy: Some(policy), ..proto::Act::default() }).contains("act.policy.hidden"));
+        let restore = proto::Restore { snapshots: vec![Bytes::new(); 2001], ..proto::Restore::default() };
+        assert!(refused(restore).contains("restore.snapshots"));
+    }
+
+    #[test]
+    fn entries_within_entries_are_counted() {
+        let intervals = vec![proto::Interval::default(); 1025];
+        let parameters = [("force".to_owned(), proto::Distribution { intervals })].into();
+        let group = proto::SlotGroup { parameters, ..proto::SlotGroup::default() };
+        let open = proto::Open { groups: vec![proto::SlotGroup::default(), group], ..proto::Open::default() };
+        assert!(refused(open).contains("intervals"));
+        assert!(
+            refused(proto::Open { groups: vec![Default::default(); 2001], ..Default::default() }).contains("groups")
+        );
+    }
+
+    #[test]
+    fn a_request_comes_once_in_a_message() {
+        let twice = [0x12, 0].repeat(2);
+        assert!(matches!(check(&twice, SESSION_REQUEST, ALLOWANCE, usize::MAX), Err(Stop::Refused(_))));
+    }
+
+    #[test]
+    fn many_fields_are_not_counted_at_once_and_many_bytes_are() {
+        let restore = |n| proto::Restore { snapshots: vec![Bytes::new(); n], ..proto::Restore::default() };
+        assert_eq!(checked(restore(FEW_FIELDS), FEW_FIELDS), Err(Stop::Work));
+        let seeds = proto::Reset { seeds: vec![1; 1 << 20], ..proto::Reset::default() };
+        assert_eq!(checked(seeds, FEW_FIELDS), Err(Stop::Work));
+        assert_eq!(checked(proto::Step { actions: vec![0; 1 << 20].into() }, FEW_FIELDS), Ok(()));
+    }
+
+    #[test]
+    fn what_is_not_well_formed_ends_the_count_and_never_panics() {
+        let whole = proto::SessionRequest {
+            request: Some(Request::Reset(proto::Reset { seeds: vec![300; 3], ..proto::Reset::default() })),
+        }
+        .encode_to_vec();
+        for length in 0..whole.len() {
+            assert_eq!(check(&whole[..length], SESSION_REQUEST, ALLOWANCE, usize::MAX), Ok(()));
+        }
+        for message in [&[0xFF; 30][..], &[0x1A, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0x7F], &[0x0D, 1]] {
+            let _ = check(message, SESSION_REQUEST, ALLOWANCE, usize::MAX);
+        }
+    }
+}

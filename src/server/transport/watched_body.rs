@@ -1,0 +1,176 @@
+//! Replies on their way to the wire: their shares of the budget go with their bytes, and a client that does not read
+//! loses its connection.
+
+use super::budget::Outbox;
+use crate::server::net::peers::Connection;
+use bytes::Bytes;
+use http_body::{Body as HttpBody, Frame, SizeHint};
+use std::{
+    pin::Pin,
+    sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak},
+    task::{Context, Poll},
+    time::Duration,
+};
+use tokio::{
+    task::AbortHandle,
+    time::{Instant, sleep},
+};
+use tonic::{Status, body::Body};
+
+/// How often a stalled stream is looked after within its time.
+const LOOKS: u32 = 4;
+
+/// How long a stream's client may leave its replies unread.
+#[derive(Debug, Clone, Copy)]
+pub struct Patience {
+    /// The first of them.
+    pub first: Duration,
+    /// Any other; none: for ever.
+    pub rest: Option<Duration>,
+}
+
+/// A response's body.
+pub struct Replies {
+    body: Body,
+    outbox: Outbox,
+    waiting: Arc<Waiting>,
+}
+
+/// The replies that wait for the client to read.
+struct Waiting {
+    state: Mutex<State>,
+    /// Who looks after them, up to their end: as long as that waits it holds what it needs of the connection.
+    watch: OnceLock<AbortHandle>,
+}
+
+struct State {
+    /// The replies with shares, and since when the client has read none of them to its end.
+    unread: usize,
+    since: Instant,
+    /// Since when a reply waits for the client to let any of it come. The session is not asked for more meanwhile, so that
+    /// none of its own limits would end it.
+    held: Option<Instant>,
+    /// It has let none come yet.
+    is_first: bool,
+}
+
+impl State {
+    fn new() -> Self {
+        Self { unread: 0, since: Instant::now(), held: None, is_first: true }
+    }
+
+    /// The limit that the client has passed.
+    fn passed(&self, patience: Patience) -> Option<Duration> {
+        let held = self.held.map_or(Duration::ZERO, |since| since.elapsed());
+        let unread = if self.unread == 0 { Duration::ZERO } else { self.since.elapsed() };
+        let first = Some(patience.first).filter(|&limit| self.is_first && held > limit);
+        first.or(patience.rest.filter(|&limit| held.max(unread) > limit))
+    }
+}
+
+impl Waiting {
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// One with a share more, or one less.
+    fn change(&self, change: impl FnOnce(usize) -> usize) {
+        let mut state = self.state();
+        let (before, after) = (state.unread, change(state.unread));
+        state.unread = after;
+        if before == 0 || after < before {
+            state.since = Instant::now();
+        }
+    }
+
+    /// The transport asks for a reply: what it had is on its way.
+    fn asked(&self) {
+        let mut state = self.state();
+        if state.held.take().is_some() {
+            state.is_first = false;
+        }
+    }
+
+    /// The transport has one.
+    fn hold(&self) {
+        self.state().held = Some(Instant::now());
+    }
+}
+
+impl Drop for Waiting {
+    fn drop(&mut self) {
+        self.watch.get().into_iter().for_each(AbortHandle::abort);
+    }
+}
+
+/// A reply that waits, until it is dropped.
+struct Unread(Arc<Waiting>);
+
+impl Unread {
+    fn new(waiting: &Arc<Waiting>) -> Self {
+        waiting.change(|replies| replies + 1);
+        Self(Arc::clone(waiting))
+    }
+}
+
+impl Drop for Unread {
+    fn drop(&mut self) {
+        self.0.change(|replies| replies - 1);
+    }
+}
+
+impl Replies {
+    /// A body whose replies' shares are in the outbox. If its client's patience for them, if it has any, is over, its
+    /// connection ends.
+    pub fn new(body: Body, outbox: Outbox, connection: Option<Connection>, patience: Option<Patience>) -> Self {
+        let waiting = Arc::new(Waiting { state: Mutex::new(State::new()), watch: OnceLock::new() });
+        if let (Some(connection), Some(patience)) = (connection, patience) {
+            let watch = tokio::spawn(watch(Arc::downgrade(&waiting), connection, patience));
+            waiting.watch.get_or_init(|| watch.abort_handle());
+        }
+        Self { body, outbox, waiting }
+    }
+}
+
+/// Ends the connection when its client has read nothing for too long.
+async fn watch(waiting: Weak<Waiting>, connection: Connection, patience: Patience) {
+    let mut limit = Some(patience.rest.map_or(patience.first, |rest| rest.min(patience.first)));
+    while let Some(looked_after) = limit {
+        sleep(looked_after / LOOKS).await;
+        let Some(waiting) = waiting.upgrade() else { return };
+        let state = waiting.state();
+        if let Some(passed) = state.passed(patience) {
+            let seconds = passed.as_secs();
+            tracing::warn!(peer = ?connection.peer, seconds, "ended a connection that did not read its replies");
+            return connection.end();
+        }
+        if !state.is_first {
+            limit = patience.rest;
+        }
+    }
+}
+
+impl HttpBody for Replies {
+    type Data = Bytes;
+    type Error = Status;
+
+    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        let Self { body, outbox, waiting } = &mut *self;
+        waiting.asked();
+        let polled = Pin::new(body).poll_frame(context);
+        if let Poll::Ready(Some(Ok(frame))) = &polled
+            && frame.data_ref().is_some_and(|bytes| !bytes.is_empty())
+        {
+            waiting.hold();
+        }
+        polled.map_ok(|frame| frame.map_data(|bytes| outbox.send(bytes, || Unread::new(waiting))))
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
