@@ -1,6 +1,5 @@
 //! The server's configuration: defaults, then a TOML file, then environment variables, then flags.
 
-use crate::server::net::tls::Files;
 use clap::Parser;
 use config::{Environment, File, FileFormat};
 use perturb_protocol::limits::{DEFAULT_MAX_ENVS, DEFAULT_MAX_MESSAGE_BYTES, DEFAULT_PORT};
@@ -495,14 +494,32 @@ impl Config {
     }
 
     /// The files of TLS, if it is asked for.
-    pub fn tls(&self) -> Option<Files> {
+    pub fn tls(&self) -> Option<TlsFiles> {
         let (cert, key) = self.tls_cert.clone().zip(self.tls_key.clone())?;
-        Some(Files { cert, key, client_ca: self.tls_client_ca.clone() })
+        Some(TlsFiles { cert, key, client_ca: self.tls_client_ca.clone() })
     }
 
     /// The grace period.
     pub fn grace(&self) -> Duration {
         Duration::from_secs(self.grace_seconds)
+    }
+}
+
+/// The files of TLS, in PEM.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TlsFiles {
+    /// The server's certificate, and those between it and its authority's.
+    pub cert: PathBuf,
+    /// Its private key.
+    pub key: PathBuf,
+    /// The authorities one of which must have signed a client's certificate; none: clients need none.
+    pub client_ca: Option<PathBuf>,
+}
+
+impl TlsFiles {
+    /// In the order in which the server reads them.
+    pub fn paths(&self) -> Vec<PathBuf> {
+        [Some(&self.cert), Some(&self.key), self.client_ca.as_ref()].into_iter().flatten().cloned().collect()
     }
 }
 

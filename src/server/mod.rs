@@ -8,19 +8,20 @@
 //! - [`audit`]: what a session draws from, by its token's role, and the ledger that has it.
 //! - [`auth`]: tokens, their quotas and roles.
 //! - [`net`]: connections.
-//! - [`shutdown`]: how far the shutdown is; [`status`] and [`refusals`]: every refusal, and its gRPC code.
+//! - [`shutdown`]: how far the shutdown is; [`error`]: the classes of errors, with their gRPC codes; [`limits`], [`id`].
 
 pub mod api;
 pub mod audit;
 pub mod auth;
+pub mod error;
+pub mod id;
+pub mod limits;
 pub mod metrics;
 pub mod net;
-pub mod refusals;
 pub mod security;
 pub mod session;
 pub mod shutdown;
 mod startup;
-pub mod status;
 pub mod transport;
 
 pub use startup::{Error, listing, run};

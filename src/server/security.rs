@@ -6,9 +6,12 @@ use super::{
         Tokens,
         file_watcher::{self, Watch},
     },
-    net::tls::{Files, Tls},
+    net::tls::Tls,
 };
-use crate::{config::Config, env::Catalogue};
+use crate::{
+    config::{Config, TlsFiles},
+    env::Catalogue,
+};
 use std::{io, path::PathBuf};
 
 /// What keeps strangers out and writes down what others do; by default nothing does.
@@ -62,7 +65,7 @@ impl Guards {
         Ok(tokens)
     }
 
-    fn load_tls(&mut self, files: Files) -> io::Result<Tls> {
+    fn load_tls(&mut self, files: TlsFiles) -> io::Result<Tls> {
         let flags = "--tls-cert, --tls-key or --tls-client-ca";
         let wrong = |reason: String| io::Error::other(format!("{reason}; correct {flags}"));
         let paths = files.paths();

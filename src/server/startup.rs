@@ -3,27 +3,29 @@
 use super::{
     api::{
         dm_env_rpc,
-        perturb_v1::{convert, service::Service, session::Shared},
+        perturb_v1::{
+            convert,
+            service::{ENDPOINT, Service},
+            session::Shared,
+        },
     },
-    auth::Gated,
-    metrics::{self, Sources},
+    auth::{AuthLayer, Tokens},
+    error::ErrorCounters,
+    metrics::{self, RequestCounts, Sources},
     net::{
         access_log::Access,
         capacity_health,
         listener::{self, Admission, Listener},
-        peers::Places,
+        peer_limiter::Places,
+        tls::Tls,
     },
-    refusals::Refusals,
     security::Guards,
     session::{
         driver::{Limits, Sessions},
         lease::{self, Leases},
     },
-    shutdown::{Controller, Phase},
-    transport::{
-        budget::Budget,
-        message_reader::{Keeping, Transit},
-    },
+    shutdown::{Controller, Drain, Phase},
+    transport::{budget::Budget, message_reader::Transit, raw_body::RawBodyLayer},
 };
 use crate::{
     config::Config,
@@ -34,8 +36,17 @@ use crate::{
     render::Renderer,
 };
 use std::{future::Future, io, sync::Arc, time::Duration};
-use tonic::transport::Server;
-use tonic_health::ServingStatus;
+use tokio::{task::JoinSet, time::timeout};
+use tonic::{
+    server::NamedService,
+    transport::{Server, server::Router},
+};
+use tonic_health::{
+    ServingStatus,
+    pb::health_server::{Health, HealthServer},
+    server::HealthReporter,
+};
+use tower::{Layer, ServiceBuilder};
 
 /// What a stream's client may send before it is read: the actions of ten thousand robots.
 const STREAM_WINDOW: u32 = 1 << 20;
@@ -49,6 +60,8 @@ const UNARY_LIMIT: Duration = Duration::from_secs(10);
 const UNARY_BYTES: usize = 1 << 10;
 /// How long connections may take to notice the end.
 const FAREWELL: Duration = Duration::from_secs(1);
+/// The services whose health is told by name.
+const SERVICES: [&str; 2] = [PerturbServer::<Service>::NAME, EnvironmentServer::<dm_env_rpc::service::Service>::NAME];
 
 /// Why the server stopped.
 #[derive(Debug, thiserror::Error)]
@@ -68,9 +81,9 @@ pub enum Error {
     Reflection(#[from] tonic_reflection::server::Error),
 }
 
-/// Serves these environments on the listeners, to whom the guards let in, and metrics on another, if there is one, until `shutdown` resolves; then drains: new
-/// sessions are refused, running ones may go on for the grace period, and connections are closed. Must run on a tokio
-/// runtime; a current-thread one is fastest.
+/// Serves these environments on the listeners, to whom the guards let in, and metrics on another, if there is one, until
+/// `shutdown` resolves; then drains: new sessions are refused, running ones may go on for the grace period, and
+/// connections are closed. Must run on a tokio runtime; a current-thread one is fastest.
 ///
 /// # Errors
 /// [`Error`], before anything is served, or when a listener fails.
@@ -83,140 +96,27 @@ pub async fn run(
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), Error> {
     let listing = listing(&catalogue, config)?;
-    let catalogue = Arc::new(catalogue);
-    let pool = Arc::new(Pool::new(config.workers, config.max_envs)?);
-    // Told from the beginning, as are refusals and ends of sessions: who watches a rate needs its zero.
-    catalogue.names().for_each(|name| _ = pool.meter(name));
     let (controller, drain) = Controller::new();
-    let idle = (config.idle_seconds > 0).then(|| Duration::from_secs(config.idle_seconds));
-    let handshake = Duration::from_secs(config.handshake_seconds);
-    let limits = Limits { bytes: config.max_message_bytes, handshake, idle };
-    let of_a_peer = if config.max_peer_sessions > 0 { config.max_peer_sessions } else { usize::MAX };
-    let (refusals, access) = (Refusals::default(), Access::default());
-    let places = Places::new(config.max_sessions, of_a_peer);
-    let leased = lease::Numbers::default();
-    let leases = Leases::new(Duration::from_secs(config.lease_seconds), leased.clone());
-    let sessions =
-        Sessions::new(places.clone(), limits, drain.clone(), refusals.clone(), access.clone(), leased.clone());
-    let admission = Admission { places: Places::new(usize::MAX, of_a_peer.saturating_add(OTHER_STREAMS)), handshake };
-    let stall = (config.stall_seconds > 0).then(|| Duration::from_secs(config.stall_seconds));
-    let transit = Transit { budget: Budget::new(config.max_memory), limit: stall, handshake };
+    let state = State::new(config, catalogue, drain.clone())?;
     let renderer = Renderer::new();
-    let worlds = dm_env_rpc::service::Service::new(
-        Arc::clone(&pool),
-        Arc::clone(&catalogue),
-        sessions.clone(),
-        guards.ledger.clone(),
-    );
     let pictures = renderer.times();
-    let ledger = guards.ledger.clone();
-    let shared = Shared { pool: Arc::clone(&pool), catalogue, listing, renderer, ledger, leases };
-    let service = Service::new(shared, sessions);
+    let worlds = state.worlds(guards);
+    let service = state.service(listing, renderer, guards);
     let requests = [("perturb.v1", service.counts()), ("dm_env_rpc.v1", worlds.counts())];
-    requests.iter().for_each(|(protocol, _)| access.tell_of(protocol));
-    let sources = Arc::new(Sources {
-        pool: Arc::clone(&pool),
-        sessions: places.clone(),
-        leases: leased,
-        connections: admission.places.clone(),
-        budget: transit.budget.clone(),
-        requests,
-        refusals: refusals.clone(),
-        access,
-        tokens: guards.tokens.clone(),
-        pictures,
-        lag: Histogram::default(),
-    });
-    let worlds = EnvironmentServer::new(worlds).max_encoding_message_size(usize::MAX);
-    let worlds = Keeping::new(worlds, "/dm_env_rpc.v1.Environment/Process", transit.clone());
-    let service = PerturbServer::new(service)
-        .max_decoding_message_size(UNARY_BYTES) // of all but sessions
-        .max_encoding_message_size(usize::MAX);
-    let service = Keeping::new(service, "/perturb.v1.Perturb/Session", transit);
+    let sources = Arc::new(state.sources(requests, guards, pictures));
     let (health, health_service) = tonic_health::server::health_reporter();
-    health.set_serving::<PerturbServer<Service>>().await;
-    health.set_serving::<EnvironmentServer<dm_env_rpc::service::Service>>().await;
-    let reflection = || {
-        tonic_reflection::server::Builder::configure()
-            .register_encoded_file_descriptor_set(proto::DESCRIPTORS)
-            .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
-    };
-    let keepalive = Duration::from_secs(config.keepalive_seconds);
-    let tokens = || guards.tokens.clone();
-    let router = Server::builder()
-        .http2_keepalive_interval(Some(keepalive))
-        .http2_keepalive_timeout(Some(keepalive))
-        .initial_stream_window_size(STREAM_WINDOW)
-        .initial_connection_window_size(CONNECTION_WINDOW)
-        .max_concurrent_streams(u32::try_from(config.max_sessions.saturating_add(OTHER_STREAMS)).unwrap_or(u32::MAX))
-        .timeout(UNARY_LIMIT) // until an answer begins, which that of a stream does at once
-        .add_service(Gated::new(service, tokens(), refusals.clone()))
-        .add_service(Gated::new(worlds, tokens(), refusals.clone()))
-        // Health is for everybody: whoever watches over servers need not be able to use them.
-        .add_service(health_service.max_decoding_message_size(UNARY_BYTES))
-        .add_service(Gated::new(
-            reflection().build_v1()?.max_decoding_message_size(UNARY_BYTES),
-            tokens(),
-            refusals.clone(),
-        ))
-        .add_service(Gated::new(
-            reflection().build_v1alpha()?.max_decoding_message_size(UNARY_BYTES),
-            tokens(),
-            refusals.clone(),
-        ));
+    set_health(&health, ServingStatus::Serving).await;
+    let router = router(config, &state, guards.tokens.clone(), service, worlds, health_service)?;
 
-    // They end with this function.
-    let mut watching = tokio::task::JoinSet::new();
-    if let Some(listener) = metrics {
-        let watched = Arc::clone(&sources);
-        watching.spawn(async move { watched.watch_lag().await });
-        watching.spawn(metrics::endpoint::serve(listener, Arc::clone(&sources)));
-    }
-    let mut servers = tokio::task::JoinSet::new();
-    for listener in listeners {
-        let (router, mut closed, admission, tls) =
-            (router.clone(), drain.clone(), admission.clone(), guards.tls.clone());
-        servers.spawn(async move {
-            let end = async move { closed.closed().await };
-            match (listener, tls) {
-                (Listener::Tcp(listener), Some(tls)) => {
-                    router.serve_with_incoming_shutdown(listener::tls_connections(listener, admission, tls), end).await
-                }
-                (Listener::Tcp(listener), None) => {
-                    router.serve_with_incoming_shutdown(listener::tcp_connections(listener, admission), end).await
-                }
-                (Listener::Unix(listener, file), _) => {
-                    router
-                        .serve_with_incoming_shutdown(listener::unix_connections(listener, file, admission), end)
-                        .await
-                }
-            }
-        });
-    }
+    let _watching = metrics.map(|listener| watch(listener, &sources)); // ends with this function
+    let mut servers = serve(listeners, &router, &state.admission, guards.tls.as_ref(), &drain);
     tokio::select! {
         () = shutdown => {}
-        () = capacity_health::watch(&health, &places, &pool) => {}
+        () = capacity_health::watch(&health, &state.places, &state.pool) => {}
         // A listener ends by itself only if it fails.
         Some(ended) = servers.join_next() => return Ok(ended.map_err(io::Error::other)??),
     }
-
-    tracing::info!(grace_seconds = config.grace_seconds, "shutting down: no new sessions");
-    controller.set(Phase::Draining);
-    health.set_not_serving::<PerturbServer<Service>>().await;
-    health.set_not_serving::<EnvironmentServer<dm_env_rpc::service::Service>>().await;
-    health.set_service_status(capacity_health::NEW_SESSIONS, ServingStatus::NotServing).await;
-    health.set_service_status("", ServingStatus::NotServing).await;
-    if tokio::time::timeout(config.grace(), controller.idle()).await.is_err() {
-        tracing::warn!("the grace period is over: ending the sessions that still run");
-    }
-    controller.set(Phase::Closed);
-    for (protocol, counts) in &sources.requests {
-        tracing::info!(protocol, "requests: {counts}");
-    }
-    let farewell = async { while servers.join_next().await.is_some() {} };
-    if tokio::time::timeout(FAREWELL, farewell).await.is_err() {
-        tracing::debug!("some connections did not close by themselves");
-    }
+    shut_down(config, &controller, &health, &sources.requests, servers).await;
     if let Some(ledger) = &guards.ledger {
         ledger.close().await;
     }
@@ -235,4 +135,205 @@ pub fn listing(catalogue: &Catalogue, config: &Config) -> Result<proto::ListEnvi
         server_version: env!("CARGO_PKG_VERSION").into(),
         max_batch_size: u32::try_from(config.max_envs).unwrap_or(u32::MAX),
     })
+}
+
+/// The parts of a server that several services share, or the metrics tell of.
+struct State {
+    pool: Arc<Pool>,
+    catalogue: Arc<Catalogue>,
+    places: Places,
+    admission: Admission,
+    transit: Transit,
+    sessions: Sessions,
+    leases: Leases<proto::SessionResponse>,
+    leased: lease::Numbers,
+    errors: ErrorCounters,
+    access: Access,
+}
+
+impl State {
+    fn new(config: &Config, catalogue: Catalogue, drain: Drain) -> io::Result<Self> {
+        let pool = Arc::new(Pool::new(config.workers, config.max_envs)?);
+        // Told from the beginning, as are errors and ends of sessions: who watches a rate needs its zero.
+        catalogue.names().for_each(|name| _ = pool.meter(name));
+        let seconds = |count: u64| (count > 0).then(|| Duration::from_secs(count));
+        let handshake = Duration::from_secs(config.handshake_seconds);
+        let limits = Limits { bytes: config.max_message_bytes, handshake, idle: seconds(config.idle_seconds) };
+        let of_a_peer = if config.max_peer_sessions > 0 { config.max_peer_sessions } else { usize::MAX };
+        let connections = Places::new(usize::MAX, of_a_peer.saturating_add(OTHER_STREAMS));
+        let (errors, access, leased) = (ErrorCounters::default(), Access::default(), lease::Numbers::default());
+        let places = Places::new(config.max_sessions, of_a_peer);
+        let sessions = Sessions::new(places.clone(), limits, drain, errors.clone(), access.clone(), leased.clone());
+        Ok(Self {
+            pool,
+            catalogue: Arc::new(catalogue),
+            places,
+            admission: Admission { places: connections, handshake },
+            transit: Transit {
+                budget: Budget::new(config.max_memory),
+                limit: seconds(config.stall_seconds),
+                handshake,
+            },
+            sessions,
+            leases: Leases::new(Duration::from_secs(config.lease_seconds), leased.clone()),
+            leased,
+            errors,
+            access,
+        })
+    }
+
+    /// The service of `perturb.v1`.
+    fn service(&self, listing: proto::ListEnvironmentsResponse, renderer: Renderer, guards: &Guards) -> Service {
+        let shared = Shared {
+            pool: Arc::clone(&self.pool),
+            catalogue: Arc::clone(&self.catalogue),
+            listing,
+            renderer,
+            ledger: guards.ledger.clone(),
+            leases: self.leases.clone(),
+        };
+        Service::new(shared, self.sessions.clone())
+    }
+
+    /// The service of `dm_env_rpc.v1`.
+    fn worlds(&self, guards: &Guards) -> dm_env_rpc::service::Service {
+        let (pool, catalogue) = (Arc::clone(&self.pool), Arc::clone(&self.catalogue));
+        dm_env_rpc::service::Service::new(pool, catalogue, self.sessions.clone(), guards.ledger.clone())
+    }
+
+    /// Where the metrics' numbers are.
+    fn sources(&self, requests: [RequestCounts; 2], guards: &Guards, pictures: Arc<Histogram>) -> Sources {
+        requests.iter().for_each(|(protocol, _)| self.access.tell_of(protocol));
+        Sources {
+            pool: Arc::clone(&self.pool),
+            sessions: self.places.clone(),
+            leases: self.leased.clone(),
+            connections: self.admission.places.clone(),
+            budget: self.transit.budget.clone(),
+            requests,
+            errors: self.errors.clone(),
+            access: self.access.clone(),
+            tokens: guards.tokens.clone(),
+            pictures,
+            lag: Histogram::default(),
+        }
+    }
+}
+
+/// All services, with what stands before each.
+fn router<H: Health>(
+    config: &Config,
+    state: &State,
+    tokens: Option<Tokens>,
+    service: Service,
+    worlds: dm_env_rpc::service::Service,
+    health: HealthServer<H>,
+) -> Result<Router, Error> {
+    let auth = AuthLayer::new(tokens, state.errors.clone());
+    let perturb = PerturbServer::new(service)
+        .max_decoding_message_size(UNARY_BYTES) // of all but sessions
+        .max_encoding_message_size(usize::MAX);
+    let perturb = ServiceBuilder::new()
+        .layer(auth.clone())
+        .layer(RawBodyLayer::new(ENDPOINT, state.transit.clone()))
+        .service(perturb);
+    let worlds = ServiceBuilder::new()
+        .layer(auth.clone())
+        .layer(RawBodyLayer::new(dm_env_rpc::service::ENDPOINT, state.transit.clone()))
+        .service(EnvironmentServer::new(worlds).max_encoding_message_size(usize::MAX));
+    let (reflection_v1, reflection_v1alpha) = (reflection().build_v1()?, reflection().build_v1alpha()?);
+    let keepalive = Duration::from_secs(config.keepalive_seconds);
+    let streams = u32::try_from(config.max_sessions.saturating_add(OTHER_STREAMS)).unwrap_or(u32::MAX);
+    Ok(Server::builder()
+        .http2_keepalive_interval(Some(keepalive))
+        .http2_keepalive_timeout(Some(keepalive))
+        .initial_stream_window_size(STREAM_WINDOW)
+        .initial_connection_window_size(CONNECTION_WINDOW)
+        .max_concurrent_streams(streams)
+        .timeout(UNARY_LIMIT) // until an answer begins, which that of a stream does at once
+        .add_service(perturb)
+        .add_service(worlds)
+        // Health is for everybody: whoever watches over servers need not be able to use them.
+        .add_service(health.max_decoding_message_size(UNARY_BYTES))
+        .add_service(auth.layer(reflection_v1.max_decoding_message_size(UNARY_BYTES)))
+        .add_service(auth.layer(reflection_v1alpha.max_decoding_message_size(UNARY_BYTES))))
+}
+
+fn reflection() -> tonic_reflection::server::Builder<'static> {
+    tonic_reflection::server::Builder::configure()
+        .register_encoded_file_descriptor_set(proto::DESCRIPTORS)
+        .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+}
+
+/// Serves metrics, until the set of tasks is dropped.
+fn watch(listener: Listener, sources: &Arc<Sources>) -> JoinSet<()> {
+    let mut tasks = JoinSet::new();
+    let watched = Arc::clone(sources);
+    tasks.spawn(async move { watched.watch_lag().await });
+    tasks.spawn(metrics::endpoint::serve(listener, Arc::clone(sources)));
+    tasks
+}
+
+/// Serves on each listener, in a task of its own, until the drain is closed.
+fn serve(
+    listeners: Vec<Listener>,
+    router: &Router,
+    admission: &Admission,
+    tls: Option<&Tls>,
+    drain: &Drain,
+) -> JoinSet<Result<(), tonic::transport::Error>> {
+    let mut servers = JoinSet::new();
+    for listener in listeners {
+        let (router, mut closed, admission) = (router.clone(), drain.clone(), admission.clone());
+        let tls = tls.cloned();
+        servers.spawn(async move {
+            let end = async move { closed.closed().await };
+            match (listener, tls) {
+                (Listener::Tcp(listener), Some(tls)) => {
+                    router.serve_with_incoming_shutdown(listener::tls_connections(listener, admission, tls), end).await
+                }
+                (Listener::Tcp(listener), None) => {
+                    router.serve_with_incoming_shutdown(listener::tcp_connections(listener, admission), end).await
+                }
+                (Listener::Unix(listener, file), _) => {
+                    let connections = listener::unix_connections(listener, file, admission);
+                    router.serve_with_incoming_shutdown(connections, end).await
+                }
+            }
+        });
+    }
+    servers
+}
+
+/// Refuses new sessions, lets running ones go on for the grace period, and closes connections.
+async fn shut_down(
+    config: &Config,
+    controller: &Controller,
+    health: &HealthReporter,
+    requests: &[RequestCounts],
+    mut servers: JoinSet<Result<(), tonic::transport::Error>>,
+) {
+    tracing::info!(grace_seconds = config.grace_seconds, "shutting down: no new sessions");
+    controller.set(Phase::Draining);
+    set_health(health, ServingStatus::NotServing).await;
+    health.set_service_status(capacity_health::NEW_SESSIONS, ServingStatus::NotServing).await;
+    health.set_service_status("", ServingStatus::NotServing).await;
+    if timeout(config.grace(), controller.idle()).await.is_err() {
+        tracing::warn!("the grace period is over: ending the sessions that still run");
+    }
+    controller.set(Phase::Closed);
+    for (protocol, counts) in requests {
+        tracing::info!(protocol, "requests: {counts}");
+    }
+    let farewell = async { while servers.join_next().await.is_some() {} };
+    if timeout(FAREWELL, farewell).await.is_err() {
+        tracing::debug!("some connections did not close by themselves");
+    }
+}
+
+/// Tells the health of the services of both protocols.
+async fn set_health(health: &HealthReporter, status: ServingStatus) {
+    for service in SERVICES {
+        health.set_service_status(service, status).await;
+    }
 }

@@ -2,12 +2,12 @@
 
 use bytes::Bytes;
 use perturb::proto::{self, session_request::Request, session_response::Response};
+use perturb::server::api::perturb_v1::{Error, fields::SESSION_REQUEST};
+use perturb::server::limits::Allowance;
 use perturb::server::net::access_log::About;
-use perturb::server::session::driver::{Dialogue, Turn};
+use perturb::server::session::handler::{Dialogue, Turn};
 use perturb::server::session::lease::Leases;
-use perturb::server::status::Refusal;
-use perturb::server::transport::message_reader::Allowance;
-use perturb::server::transport::precheck::{self, Field};
+use perturb::server::transport::precheck::Field;
 
 use super::{Ledger, MOST_BYTES};
 
@@ -26,7 +26,7 @@ impl Counting {
         Self { leases, ledger, is_open: false, steps: 0, turn: None }
     }
 
-    fn open(&mut self, open: &proto::Open) -> Result<Response, Refusal> {
+    fn open(&mut self, open: &proto::Open) -> Result<Response, Error> {
         self.is_open = true;
         let grant = self.leases.give(None, open.lease as usize)?;
         let (lease, time) = grant.as_ref().map(|grant| (grant.name.to_vec(), grant.time())).unwrap_or_default();
@@ -36,16 +36,16 @@ impl Counting {
     }
 
     /// The number that came, and how many steps there are now.
-    fn step(&mut self, step: &proto::Step) -> Result<Response, Refusal> {
+    fn step(&mut self, step: &proto::Step) -> Result<Response, Error> {
         let number = step.actions[..].try_into().map(u64::from_le_bytes);
-        let number = number.map_err(|_| Refusal::value("step.actions", step.actions.len(), "8 bytes"))?;
+        let number = number.map_err(|_| Error::value("step.actions", step.actions.len(), "8 bytes"))?;
         self.ledger.add(number);
         self.steps += 1;
         let numbers = [number, self.steps].map(u64::to_le_bytes).concat();
         Ok(Response::Stepped(proto::Stepped { observations: Bytes::from(numbers), ..Default::default() }))
     }
 
-    async fn resume(&mut self, resume: &proto::Resume) -> Result<Response, Refusal> {
+    async fn resume(&mut self, resume: &proto::Resume) -> Result<Response, Error> {
         let ticket = self.leases.ask(&resume.lease, None, resume.last_reply).await?;
         let last_reply = ticket.last_reply;
         self.turn = Some(Turn::TakesUp(ticket));
@@ -56,7 +56,8 @@ impl Counting {
 impl Dialogue for Counting {
     type Request = proto::SessionRequest;
     type Response = proto::SessionResponse;
-    const FIELDS: &'static [Field] = precheck::SESSION_REQUEST;
+    type Error = Error;
+    const FIELDS: &'static [Field] = SESSION_REQUEST;
     const TAKES_UP: bool = true;
     const PROTOCOL: &'static str = "perturb.v1";
 
@@ -72,12 +73,12 @@ impl Dialogue for Counting {
         About { steps: self.steps, ..About::default() }
     }
 
-    async fn answer(&mut self, request: Self::Request) -> Result<Self::Response, Refusal> {
+    async fn answer(&mut self, request: Self::Request) -> Result<Self::Response, Error> {
         let response = match request.request {
             Some(Request::Open(open)) => self.open(&open),
             Some(Request::Step(step)) => self.step(&step),
             Some(Request::Resume(resume)) => self.resume(&resume).await,
-            _ => Err(Refusal::value("request", "another", "open, step or resume")),
+            _ => Err(Error::value("request", "another", "open, step or resume")),
         };
         response.map(|response| proto::SessionResponse { response: Some(response) })
     }
@@ -90,7 +91,7 @@ impl Dialogue for Counting {
         self.turn.take()
     }
 
-    fn refusal(refusal: Refusal) -> Self::Response {
-        proto::SessionResponse { response: Some(Response::Error(refusal.into())) }
+    fn refusal(error: Error) -> Self::Response {
+        proto::SessionResponse { response: Some(Response::Error(error.into())) }
     }
 }

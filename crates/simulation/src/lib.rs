@@ -12,14 +12,17 @@ use std::time::Duration;
 
 use futures_util::stream;
 use perturb::proto::{self, perturb_server::PerturbServer};
+use perturb::server::api::perturb_v1::service::ENDPOINT;
+use perturb::server::error::{ErrorCounters, ErrorKind};
 use perturb::server::net::access_log::Access;
-use perturb::server::net::peers::{Guarded, Peer, Places};
-use perturb::server::refusals::{Kind, Refusals};
+use perturb::server::net::managed_io::Guarded;
+use perturb::server::net::peer_limiter::{Peer, Places};
 use perturb::server::session::driver::{Limits, Responses, Sessions};
 use perturb::server::session::lease::{Leases, Numbers};
 use perturb::server::shutdown::Controller;
 use perturb::server::transport::budget::Budget;
-use perturb::server::transport::message_reader::{Frames, Keeping, Transit};
+use perturb::server::transport::message_reader::Transit;
+use perturb::server::transport::raw_body::{self, RawBodyService};
 use perturb_protocol::{Address, ClientError, Connection, Patience};
 use tonic::transport::Server;
 use tonic::{Request, Response, Status, Streaming};
@@ -47,13 +50,13 @@ pub struct Ledger {
     done: Arc<Mutex<Vec<u64>>>,
     numbers: Numbers,
     places: Places,
-    refusals: Refusals,
+    counters: ErrorCounters,
 }
 
 impl Default for Ledger {
     fn default() -> Self {
         let places = Places::new(MOST_SESSIONS, MOST_SESSIONS);
-        Self { done: Arc::default(), numbers: Numbers::default(), places, refusals: Refusals::default() }
+        Self { done: Arc::default(), numbers: Numbers::default(), places, counters: ErrorCounters::default() }
     }
 }
 
@@ -70,7 +73,7 @@ impl Ledger {
 
     /// How often a session was asked for that there was not, or no more.
     pub fn unknown(&self) -> u64 {
-        self.refusals.counts().filter(|(kind, _)| *kind == Kind::UnknownLease).map(|(_, count)| count).sum()
+        self.counters.counts().filter(|(kind, _)| *kind == ErrorKind::UnknownLease).map(|(_, count)| count).sum()
     }
 
     /// Whether no session is left, with or without a stream.
@@ -91,8 +94,8 @@ pub async fn serve(ledger: Ledger) -> turmoil::Result {
     let (_controller, drain) = Controller::new();
     let budget = Budget::new(MOST_BYTES);
     let limits = Limits { bytes: MOST_BYTES, handshake: HANDSHAKE, idle: None };
-    let (places, numbers, refusals) = (ledger.places.clone(), ledger.numbers.clone(), ledger.refusals.clone());
-    let sessions = Sessions::new(places, limits, drain, refusals, Access::default(), numbers.clone());
+    let (places, numbers, counters) = (ledger.places.clone(), ledger.numbers.clone(), ledger.counters.clone());
+    let sessions = Sessions::new(places, limits, drain, counters, Access::default(), numbers.clone());
     let service = Service { sessions, leases: Leases::new(LEASE, numbers), ledger };
     let transit = Transit { budget, limit: Some(LEASE), handshake: HANDSHAKE };
     let listener = turmoil::net::TcpListener::bind((Ipv4Addr::UNSPECIFIED, PORT)).await?;
@@ -107,7 +110,7 @@ pub async fn serve(ledger: Ledger) -> turmoil::Result {
     Server::builder()
         .http2_keepalive_interval(Some(KEEPALIVE))
         .http2_keepalive_timeout(Some(KEEPALIVE))
-        .add_service(Keeping::new(PerturbServer::new(service), "/perturb.v1.Perturb/Session", transit))
+        .add_service(RawBodyService::new(PerturbServer::new(service), ENDPOINT, transit))
         .serve_with_incoming(incoming)
         .await?;
     Ok(())
@@ -157,6 +160,6 @@ impl proto::perturb_server::Perturb for Service {
         mut request: Request<Streaming<proto::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
         let counting = Counting::new(self.leases.clone(), self.ledger.clone());
-        Ok(Response::new(self.sessions.begin(Frames::of(&mut request)?, counting)?))
+        Ok(Response::new(self.sessions.begin(raw_body::messages(&mut request)?, counting)?))
     }
 }

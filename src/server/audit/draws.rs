@@ -1,10 +1,10 @@
 //! What a session draws from: whether its token's role allows it, and that it stands in the ledger before it happens.
 
-use super::ledger::Ledger;
+use super::{Error, ledger::Ledger};
 use crate::{
-    env::{Distribution, Draw, EnvironmentSpec, Error, saved_draw},
+    env::{self, Distribution, Draw, EnvironmentSpec, saved_draw},
     pool::{Batch, BatchSettings, ResetEntry},
-    server::{auth::Bearer, status::Refusal},
+    server::auth::Bearer,
 };
 use bytes::Bytes;
 use perturb_protocol::{
@@ -57,8 +57,8 @@ impl Draws {
     /// Before environments are made.
     ///
     /// # Errors
-    /// [`Refusal::NotAllowed`], [`Refusal::NoLedger`]; so the others.
-    pub async fn open(&self, settings: &BatchSettings) -> Result<Begun, Refusal> {
+    /// [`Error::NotAllowed`], [`Error::NoLedger`]; so the others.
+    pub async fn open(&self, settings: &BatchSettings) -> Result<Begun, Error> {
         if self.is_free() {
             return Ok(Begun::default());
         }
@@ -74,7 +74,7 @@ impl Draws {
     }
 
     /// Before environments are reset.
-    pub async fn reset(&self, batch: &Batch, entries: &[ResetEntry]) -> Result<Begun, Refusal> {
+    pub async fn reset(&self, batch: &Batch, entries: &[ResetEntry]) -> Result<Begun, Error> {
         if self.is_free() {
             return Ok(Begun::default());
         }
@@ -100,12 +100,13 @@ impl Draws {
     }
 
     /// Before environments are restored.
-    pub async fn restore(&self, batch: &Batch, entries: &[(usize, Bytes)]) -> Result<Begun, Refusal> {
+    pub async fn restore(&self, batch: &Batch, entries: &[(usize, Bytes)]) -> Result<Begun, Error> {
         if self.is_free() || entries.is_empty() {
             return Ok(Begun::default());
         }
         let spec = batch.settings().spec;
-        let saved: Result<Vec<_>, Error> = entries.iter().map(|(_, snapshot)| saved_draw(spec, snapshot)).collect();
+        let saved: Result<Vec<_>, env::Error> =
+            entries.iter().map(|(_, snapshot)| saved_draw(spec, snapshot)).collect();
         let mut nows = Vec::new();
         for saved in saved? {
             let boxes = saved.distributions.chunks(spec.parameters.len().max(1));
@@ -154,7 +155,7 @@ impl Draws {
     }
 
     /// Whether a token may draw from there; what is refused is written down.
-    pub fn check(&self, spec: &EnvironmentSpec, distributions: &[Distribution]) -> Result<(), Refusal> {
+    pub fn check(&self, spec: &EnvironmentSpec, distributions: &[Distribution]) -> Result<(), Error> {
         let Some(role) = self.bearer.as_ref().and_then(|bearer| bearer.role()) else { return Ok(()) };
         let region = spec.region(distributions);
         let Err(reason) = role.check(spec, &region) else { return Ok(()) };
@@ -163,12 +164,7 @@ impl Draws {
         {
             ledger.note(Event::Refused { who: self.who(spec), region: region.clone(), reason: reason.clone() });
         }
-        Err(Refusal::NotAllowed {
-            role: role.name().into(),
-            environment: spec.name,
-            region: region.to_string(),
-            reason,
-        })
+        Err(Error::NotAllowed { role: role.name().into(), environment: spec.name, region: region.to_string(), reason })
     }
 
     /// Whether nothing is asked or written.
@@ -182,7 +178,7 @@ impl Draws {
         spec: &EnvironmentSpec,
         begins: impl Iterator<Item = (Next<'a>, usize)> + Clone,
         ends: Vec<Draw>,
-    ) -> Result<Begun, Refusal> {
+    ) -> Result<Begun, Error> {
         let mut last: Option<&[Distribution]> = None;
         for (Next { distributions, .. }, _) in begins.clone() {
             if last.replace(distributions) != Some(distributions) {

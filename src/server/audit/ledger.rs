@@ -1,6 +1,7 @@
 //! Writes the ledger: what every token drew, before it draws it. See [`perturb_protocol::ledger`].
 
-use crate::server::status::Refusal;
+use super::Error;
+use crate::server::error::InvalidValue;
 use perturb_protocol::ledger::{Chain, Event, LONGEST, read};
 use std::{
     fs::{File, OpenOptions},
@@ -67,17 +68,18 @@ impl Ledger {
     /// Writes a line, and waits until it is on the disk.
     ///
     /// # Errors
-    /// [`Refusal::NoLedger`].
-    pub async fn write(&self, event: Event) -> Result<(), Refusal> {
+    /// [`Error::NoLedger`].
+    pub async fn write(&self, event: Event) -> Result<(), Error> {
         // What a session asks for is bounded, but numbers are longer as text.
         let size = serde_json::to_vec(&event).map_or(usize::MAX, |json| json.len());
         if size as u64 > LONGEST / 2 {
             let got = format!("{size} bytes as a line of this server's ledger");
-            return Err(Refusal::value(
+            return Err(InvalidValue::new(
                 "what is to be drawn",
                 got,
                 format!("at most {}: ask for less at a time", LONGEST / 2),
-            ));
+            )
+            .into());
         }
         let (done, written) = oneshot::channel();
         let _ = self.lines.send((event, Some(done))); // nobody is there only if the thread is gone, and then nobody answers
@@ -86,7 +88,7 @@ impl Ledger {
             Ok(Err(reason)) => reason,
             Err(_) => "its thread is gone".into(),
         };
-        Err(Refusal::NoLedger { reason })
+        Err(Error::NoLedger { reason })
     }
 
     /// Has a line written, sooner or later.

@@ -1,7 +1,10 @@
 //! The gate before the services.
 
 use super::Tokens;
-use crate::server::{net::peers::Connection, refusals::Refusals};
+use crate::server::{
+    error::{ErrorCounters, RequestError, status},
+    net::managed_io::Connection,
+};
 use std::{
     convert::Infallible,
     future::{Future, ready},
@@ -9,32 +12,47 @@ use std::{
     task::{Context, Poll},
 };
 use tonic::{
-    Status,
     body::Body,
     codegen::{Service, http},
     server::NamedService,
 };
+use tower::Layer;
 
 /// A service that answers whoever shows a token, if there are any to be shown.
 #[derive(Clone)]
-pub struct Gated<S> {
+pub struct AuthService<S> {
     service: S,
     tokens: Option<Tokens>,
-    refusals: Refusals,
+    counters: ErrorCounters,
 }
 
-impl<S> Gated<S> {
+/// Puts [`AuthService`] around a service.
+#[derive(Clone)]
+pub struct AuthLayer {
+    tokens: Option<Tokens>,
+    counters: ErrorCounters,
+}
+
+impl AuthLayer {
     /// Asks for one of these, or for none, and counts whom it refuses.
-    pub fn new(service: S, tokens: Option<Tokens>, refusals: Refusals) -> Self {
-        Self { service, tokens, refusals }
+    pub fn new(tokens: Option<Tokens>, counters: ErrorCounters) -> Self {
+        Self { tokens, counters }
     }
 }
 
-impl<S: NamedService> NamedService for Gated<S> {
+impl<S> Layer<S> for AuthLayer {
+    type Service = AuthService<S>;
+
+    fn layer(&self, service: S) -> Self::Service {
+        AuthService { service, tokens: self.tokens.clone(), counters: self.counters.clone() }
+    }
+}
+
+impl<S: NamedService> NamedService for AuthService<S> {
     const NAME: &'static str = S::NAME;
 }
 
-impl<S> Service<http::Request<Body>> for Gated<S>
+impl<S> Service<http::Request<Body>> for AuthService<S>
 where
     S: Service<http::Request<Body>, Response = http::Response<Body>, Error = Infallible>,
     S::Future: Send + 'static,
@@ -55,11 +73,11 @@ where
                 }
                 Box::pin(self.service.call(request))
             }
-            Err(refusal) => {
+            Err(error) => {
                 let peer = request.extensions().get::<Connection>().map(|connection| connection.peer);
-                tracing::debug!(?peer, path = request.uri().path(), %refusal, "refused a call");
-                self.refusals.count(&refusal, None);
-                Box::pin(ready(Ok(Status::from(refusal).into_http())))
+                tracing::debug!(?peer, path = request.uri().path(), refusal = %error, "refused a call");
+                self.counters.count(error.kind());
+                Box::pin(ready(Ok(status(&error).into_http())))
             }
         }
     }

@@ -1,5 +1,6 @@
 //! Who may call: tokens, of which a file has names, digests, quotas and roles, and the gate that asks for them.
 
+mod error;
 pub mod file_watcher;
 mod layer;
 mod quota;
@@ -7,15 +8,13 @@ mod rate_limiter;
 mod role;
 mod token_file;
 
-pub use layer::Gated;
+pub use error::Error;
+pub use layer::{AuthLayer, AuthService};
 pub use quota::Held;
 pub use role::Role;
 pub use token_file::{Wrong, new_token};
 
-use super::{
-    net::peers::{Connection, Peer},
-    status::Refusal,
-};
+use super::net::{managed_io::Connection, peer_limiter::Peer};
 use crate::env::Catalogue;
 use quota::{Kind, Quota};
 use rate_limiter::{Pace, TooFast};
@@ -115,10 +114,10 @@ impl Token {
     /// Waits until its environments may step again.
     ///
     /// # Errors
-    /// [`Refusal::TooFast`], at once, if that would be too long.
-    pub async fn turn(&self) -> Result<(), Refusal> {
+    /// [`Error::TooFast`], at once, if that would be too long.
+    pub async fn turn(&self) -> Result<(), Error> {
         let turn = self.quotas.pace.turn().await;
-        turn.map_err(|TooFast { rate, ahead }| Refusal::TooFast {
+        turn.map_err(|TooFast { rate, ahead }| Error::TooFast {
             name: self.name.clone(),
             rate,
             seconds: ahead.as_secs(),
@@ -136,11 +135,11 @@ impl Token {
     }
 
     /// Waits until it is in the file no more, or with another role, and gives the refusal of what comes then.
-    pub async fn revoked(&self) -> Refusal {
+    pub async fn revoked(&self) -> Error {
         loop {
             let told = self.told.notified();
             if self.is_revoked() {
-                return Refusal::RevokedToken { name: self.name.clone() };
+                return Error::RevokedToken { name: self.name.clone() };
             }
             told.await;
         }
@@ -154,16 +153,16 @@ impl Token {
     /// A session of it.
     ///
     /// # Errors
-    /// [`Refusal::TooManyOfAToken`].
-    pub fn session(self: &Arc<Self>) -> Result<Held, Refusal> {
+    /// [`Error::QuotaExceeded`].
+    pub fn session(self: &Arc<Self>) -> Result<Held, Error> {
         self.take(1, Kind::Sessions)
     }
 
     /// So many environments of it.
     ///
     /// # Errors
-    /// [`Refusal::TooManyOfAToken`].
-    pub fn envs(self: &Arc<Self>, count: usize) -> Result<Held, Refusal> {
+    /// [`Error::QuotaExceeded`].
+    pub fn envs(self: &Arc<Self>, count: usize) -> Result<Held, Error> {
         self.take(count, Kind::Environments)
     }
 
@@ -172,7 +171,7 @@ impl Token {
         Held::nothing(Arc::clone(self), Kind::Bytes)
     }
 
-    fn take(self: &Arc<Self>, count: usize, kind: Kind) -> Result<Held, Refusal> {
+    fn take(self: &Arc<Self>, count: usize, kind: Kind) -> Result<Held, Error> {
         let mut held = Held::nothing(Arc::clone(self), kind);
         held.grow(count)?;
         Ok(held)
@@ -244,18 +243,18 @@ impl Tokens {
     /// Whose call it is; none for one by a Unix socket, which needs no token.
     ///
     /// # Errors
-    /// [`Refusal::NoToken`] or [`Refusal::WrongToken`].
-    fn admit(&self, request: &http::Request<Body>) -> Result<Option<Bearer>, Refusal> {
+    /// [`Error::NoToken`] or [`Error::WrongToken`].
+    fn admit(&self, request: &http::Request<Body>) -> Result<Option<Bearer>, Error> {
         let peer = request.extensions().get::<Connection>().map(|connection| connection.peer);
         if matches!(peer, Some(Peer::User(_))) {
             return Ok(None);
         }
-        let header = request.headers().get(http::header::AUTHORIZATION).ok_or(Refusal::NoToken)?.as_bytes();
-        let (scheme, token) = header.split_at_checked("Bearer ".len()).ok_or(Refusal::NoToken)?;
+        let header = request.headers().get(http::header::AUTHORIZATION).ok_or(Error::NoToken)?.as_bytes();
+        let (scheme, token) = header.split_at_checked("Bearer ".len()).ok_or(Error::NoToken)?;
         if !scheme.eq_ignore_ascii_case(b"Bearer ") {
-            return Err(Refusal::NoToken);
+            return Err(Error::NoToken);
         }
-        let bearer = self.find(token).ok_or(Refusal::WrongToken)?;
+        let bearer = self.find(token).ok_or(Error::WrongToken)?;
         tracing::debug!(token = bearer.name(), path = request.uri().path(), ?peer, "a call");
         Ok(Some(bearer))
     }

@@ -1,7 +1,6 @@
 //! What a token may have at a time.
 
-use super::{Bearer, Token};
-use crate::server::status::Refusal;
+use super::{Bearer, Error, Token};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// So many of something, of which a token may have no more than a limit.
@@ -70,9 +69,9 @@ impl Held {
     /// Takes so many more.
     ///
     /// # Errors
-    /// [`Refusal::TooManyOfAToken`]; then it is as before.
-    pub fn grow(&mut self, count: usize) -> Result<(), Refusal> {
-        self.kind.of(&self.token).take(count).map_err(|limit| Refusal::TooManyOfAToken {
+    /// [`Error::QuotaExceeded`]; then it is as before.
+    pub fn grow(&mut self, count: usize) -> Result<(), Error> {
+        self.kind.of(&self.token).take(count).map_err(|limit| Error::QuotaExceeded {
             name: self.token.name.clone(),
             wanted: count,
             limit,

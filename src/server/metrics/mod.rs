@@ -10,8 +10,8 @@ pub mod process;
 
 use super::{
     auth::Tokens,
-    net::{access_log::Access, peers::Places},
-    refusals::Refusals,
+    error::ErrorCounters,
+    net::{access_log::Access, peer_limiter::Places},
     session::{instrumented::Counts, lease::Numbers},
     transport::budget::Budget,
 };
@@ -21,6 +21,9 @@ use tokio::time::{Instant, sleep_until};
 
 /// How often it is looked how late the transport's thread wakes.
 const TICK: Duration = Duration::from_millis(100);
+
+/// A protocol, and its requests by kind.
+pub type RequestCounts = (&'static str, Arc<Counts>);
 
 /// Where the numbers are, which others count.
 pub struct Sources {
@@ -35,9 +38,9 @@ pub struct Sources {
     /// Bytes in flight.
     pub budget: Budget,
     /// Requests of each protocol.
-    pub requests: [(&'static str, Arc<Counts>); 2],
+    pub requests: [RequestCounts; 2],
     /// Why requests were refused.
-    pub refusals: Refusals,
+    pub errors: ErrorCounters,
     /// How sessions ended.
     pub access: Access,
     /// Whose sessions there are.

@@ -74,7 +74,7 @@ impl Numbers {
     }
 
     fn requests(&self, page: &mut Page<'_>) -> Written {
-        let Sources { requests, refusals, access, .. } = &*self.0;
+        let Sources { requests, errors, access, .. } = &*self.0;
         let each = requests.iter().flat_map(|(protocol, counts)| {
             counts.iter().flat_map(move |(kind, count)| {
                 let refused = count.refused.load(Ordering::Relaxed);
@@ -84,7 +84,7 @@ impl Numbers {
             })
         });
         page.counters("perturb_requests", "Requests of sessions that were answered", each)?;
-        let named: Vec<_> = refusals.counts().map(|(kind, n)| (written(kind.code()), kind.reason(), n)).collect();
+        let named: Vec<_> = errors.counts().map(|(kind, n)| (written(kind.code()), kind.reason(), n)).collect();
         let each = named.iter().map(|(code, reason, n)| ([("code", code.as_str()), ("reason", reason)], *n as f64));
         page.counters("perturb_refusals", "Requests, calls and sessions that were refused or ended, by reason", each)?;
         let endings = access.endings();

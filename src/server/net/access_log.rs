@@ -1,6 +1,6 @@
 //! The access log: a line for each session that ended, so many a second, so that clients that come and go fill no disk.
 
-use super::peers::Peer;
+use super::peer_limiter::Peer;
 use std::{
     collections::BTreeMap,
     sync::{Arc, Mutex, MutexGuard, PoisonError},

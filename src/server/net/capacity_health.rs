@@ -1,6 +1,6 @@
 //! Whether there is room for another session, as health tells it to load balancers.
 
-use super::peers::Places;
+use super::peer_limiter::Places;
 use crate::pool::Pool;
 use tonic_health::{ServingStatus, server::HealthReporter};
 

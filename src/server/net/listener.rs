@@ -1,7 +1,8 @@
 //! Binding addresses: TCP ports and Unix sockets.
 
 use super::{
-    peers::{Guarded, Peer, Place, Places},
+    managed_io::Guarded,
+    peer_limiter::{Peer, Place, Places},
     tls::Tls,
 };
 use crate::config::{ListenAddress, SocketMode};

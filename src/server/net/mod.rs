@@ -3,6 +3,7 @@
 pub mod access_log;
 pub mod capacity_health;
 pub mod listener;
-pub mod peers;
+pub mod managed_io;
+pub mod peer_limiter;
 pub mod probe;
 pub mod tls;

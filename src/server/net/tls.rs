@@ -1,8 +1,8 @@
 //! TLS 1.3: the server's certificate, and whose certificates clients must show.
 
+use crate::config::TlsFiles;
 use std::{
     io,
-    path::PathBuf,
     sync::{Arc, PoisonError, RwLock},
 };
 use tokio::{
@@ -21,52 +21,35 @@ use tokio_rustls::{
     server::TlsStream,
 };
 
-/// The files of TLS, in PEM.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Files {
-    /// The server's certificate, and those between it and its authority's.
-    pub cert: PathBuf,
-    /// Its private key.
-    pub key: PathBuf,
-    /// The authorities one of which must have signed a client's certificate; none: clients need none.
-    pub client_ca: Option<PathBuf>,
-}
-
-impl Files {
-    /// In the order in which [`Tls::renew`] takes what is in them.
-    pub fn paths(&self) -> Vec<PathBuf> {
-        [Some(&self.cert), Some(&self.key), self.client_ca.as_ref()].into_iter().flatten().cloned().collect()
-    }
-
-    fn configured(&self, contents: &[Vec<u8>]) -> Result<ServerConfig, String> {
-        let [cert, key, rest @ ..] = contents else { return Err("a certificate and a key are expected".into()) };
-        let chain = certificates(&self.cert, cert)?;
-        let key = PrivateKeyDer::from_pem_slice(key).map_err(|error| {
-            format!("{}: {error}; expected a private key in PEM, without a passphrase", self.key.display())
-        })?;
-        let clients = match (&self.client_ca, rest) {
-            (Some(path), [authorities, ..]) => {
-                let wrong = |error: &dyn ToString| format!("{}: {}", path.display(), error.to_string());
-                let mut roots = RootCertStore::empty();
-                for certificate in certificates(path, authorities)? {
-                    roots.add(certificate).map_err(|error| wrong(&error))?;
-                }
-                let provider = Arc::new(ring::default_provider());
-                let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider).build();
-                verifier.map_err(|error| wrong(&error))?
+/// The settings of connections with what is in the files.
+fn configured(files: &TlsFiles, contents: &[Vec<u8>]) -> Result<ServerConfig, String> {
+    let [cert, key, rest @ ..] = contents else { return Err("a certificate and a key are expected".into()) };
+    let chain = certificates(&files.cert, cert)?;
+    let key = PrivateKeyDer::from_pem_slice(key).map_err(|error| {
+        format!("{}: {error}; expected a private key in PEM, without a passphrase", files.key.display())
+    })?;
+    let clients = match (&files.client_ca, rest) {
+        (Some(path), [authorities, ..]) => {
+            let wrong = |error: &dyn ToString| format!("{}: {}", path.display(), error.to_string());
+            let mut roots = RootCertStore::empty();
+            for certificate in certificates(path, authorities)? {
+                roots.add(certificate).map_err(|error| wrong(&error))?;
             }
-            _ => WebPkiClientVerifier::no_client_auth(),
-        };
-        let (cert, key_file) = (self.cert.display(), self.key.display());
-        let mut config = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()))
-            .with_protocol_versions(&[&TLS13])
-            .map_err(|error| error.to_string())?
-            .with_client_cert_verifier(clients)
-            .with_single_cert(chain, key)
-            .map_err(|error| format!("{cert} and {key_file} do not go together: {error}"))?;
-        config.alpn_protocols = vec![b"h2".to_vec()];
-        Ok(config)
-    }
+            let provider = Arc::new(ring::default_provider());
+            let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider).build();
+            verifier.map_err(|error| wrong(&error))?
+        }
+        _ => WebPkiClientVerifier::no_client_auth(),
+    };
+    let (cert, key_file) = (files.cert.display(), files.key.display());
+    let mut config = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()))
+        .with_protocol_versions(&[&TLS13])
+        .map_err(|error| error.to_string())?
+        .with_client_cert_verifier(clients)
+        .with_single_cert(chain, key)
+        .map_err(|error| format!("{cert} and {key_file} do not go together: {error}"))?;
+    config.alpn_protocols = vec![b"h2".to_vec()];
+    Ok(config)
 }
 
 /// The certificates of a file, at least one.
@@ -82,7 +65,7 @@ fn certificates(path: &std::path::Path, pem: &[u8]) -> Result<Vec<CertificateDer
 /// How connections are encrypted from now on.
 #[derive(Clone)]
 pub struct Tls {
-    files: Arc<Files>,
+    files: Arc<TlsFiles>,
     config: Arc<RwLock<Arc<ServerConfig>>>,
 }
 
@@ -91,8 +74,8 @@ impl Tls {
     ///
     /// # Errors
     /// What is wrong with which of them.
-    pub fn new(files: Files, contents: &[Vec<u8>]) -> Result<Self, String> {
-        let config = Arc::new(files.configured(contents)?);
+    pub fn new(files: TlsFiles, contents: &[Vec<u8>]) -> Result<Self, String> {
+        let config = Arc::new(configured(&files, contents)?);
         Ok(Self { files: Arc::new(files), config: Arc::new(RwLock::new(config)) })
     }
 
@@ -101,7 +84,7 @@ impl Tls {
     /// # Errors
     /// What is wrong with which of them; then all stays as it is.
     pub fn renew(&self, contents: &[Vec<u8>]) -> Result<(), String> {
-        let config = Arc::new(self.files.configured(contents)?);
+        let config = Arc::new(configured(&self.files, contents)?);
         *self.config.write().unwrap_or_else(PoisonError::into_inner) = config;
         Ok(())
     }

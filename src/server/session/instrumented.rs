@@ -1,12 +1,12 @@
 //! Spans and counts of requests: a layer around the dialogues of both protocols.
 
-use super::driver::{Dialogue, Turn};
+use super::handler::{Dialogue, Turn};
 use crate::{
     pool::Follower,
     server::{
+        limits::Allowance,
         net::access_log::About,
-        status::Refusal,
-        transport::{budget::Outbox, message_reader::Allowance, precheck::Field},
+        transport::{budget::Outbox, precheck::Field},
     },
 };
 use std::{
@@ -75,13 +75,13 @@ impl<D: Observed> Counted<D> {
 }
 
 impl<D: Observed> Counted<D> {
-    fn count(&self, kind: &str, refusal: Option<&Refusal>) {
-        if let Some(refusal) = refusal {
-            tracing::debug!(refusal = refusal.to_string(), "refused");
+    fn count(&self, kind: &str, error: Option<&D::Error>) {
+        if let Some(error) = error {
+            tracing::debug!(refusal = error.to_string(), "refused");
         }
         if let Some((_, count)) = self.counts.iter().find(|(known, _)| *known == kind) {
             count.answered.fetch_add(1, Ordering::Relaxed);
-            count.refused.fetch_add(refusal.is_some().into(), Ordering::Relaxed);
+            count.refused.fetch_add(error.is_some().into(), Ordering::Relaxed);
         }
     }
 }
@@ -89,6 +89,7 @@ impl<D: Observed> Counted<D> {
 impl<D: Observed> Dialogue for Counted<D> {
     type Request = D::Request;
     type Response = D::Response;
+    type Error = D::Error;
     const FIELDS: &'static [Field] = D::FIELDS;
     const TAKES_UP: bool = D::TAKES_UP;
     const PROTOCOL: &'static str = D::PROTOCOL;
@@ -105,7 +106,7 @@ impl<D: Observed> Dialogue for Counted<D> {
         self.dialogue.about()
     }
 
-    async fn answer(&mut self, request: Self::Request) -> Result<Self::Response, Refusal> {
+    async fn answer(&mut self, request: Self::Request) -> Result<Self::Response, Self::Error> {
         let kind = D::kind(&request);
         let span = tracing::debug_span!("request", kind);
         let response = self.dialogue.answer(request).instrument(span.clone()).await;
@@ -121,8 +122,8 @@ impl<D: Observed> Dialogue for Counted<D> {
         D::follow(follower, request);
     }
 
-    fn undecoded(&self, refusal: &Refusal) {
-        self.count("unknown", Some(refusal));
+    fn undecoded(&self, error: &Self::Error) {
+        self.count("unknown", Some(error));
     }
 
     fn takes_up(request: &Self::Request) -> bool {
@@ -137,7 +138,7 @@ impl<D: Observed> Dialogue for Counted<D> {
         self.dialogue.attach(outbox);
     }
 
-    fn refusal(refusal: Refusal) -> Self::Response {
-        D::refusal(refusal)
+    fn refusal(error: Self::Error) -> Self::Response {
+        D::refusal(error)
     }
 }

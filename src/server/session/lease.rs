@@ -2,10 +2,14 @@
 //!
 //! - Here: which there are, and how a new stream asks for one.
 //! - [`replay_buffer`](super::replay_buffer): replies that may not have been received.
-//! - [`driver`](super::driver): who runs such a session, and waits for its streams.
+//! - Beside it, the driver runs such a session and waits for its streams.
 
-use super::driver::Line;
-use crate::server::{auth::Bearer, status::Refusal, transport::message_reader::Frames};
+use crate::server::{
+    auth::Bearer,
+    error::{ErrorKind, RequestError},
+    id::{Id, NoRandomness, random},
+    transport::message_reader::Frames,
+};
 use std::{
     sync::{
         Arc, Mutex, MutexGuard, PoisonError,
@@ -15,12 +19,10 @@ use std::{
 };
 use subtle::ConstantTimeEq;
 use tokio::sync::{mpsc, oneshot};
+use tonic::Status;
 
 /// The most replies that are kept for a client which sends requests ahead.
 pub const MOST_KEPT: u32 = 64;
-
-/// What a session is named by: nobody guesses it.
-pub type Name = [u8; 16];
 
 /// Why a session cannot be taken up.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -58,6 +60,21 @@ pub enum Error {
     TakenUp,
 }
 
+impl RequestError for Error {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Unknown => ErrorKind::UnknownLease,
+            Self::OtherToken => ErrorKind::OtherToken,
+            Self::NoReply { .. } => ErrorKind::NoSuchReply,
+            Self::Forgotten { .. } => ErrorKind::ReplyNotKept,
+            Self::TakenUp => ErrorKind::TakenUp,
+        }
+    }
+}
+
+/// Where responses go that are made elsewhere than in the stream which sends them.
+pub type Line<T> = mpsc::Sender<Result<T, Status>>;
+
 /// The leases of a server, of sessions with these responses.
 pub struct Leases<R>(Arc<State<R>>);
 
@@ -75,7 +92,7 @@ struct State<R> {
 
 /// One that holds.
 struct Lease<R> {
-    name: Name,
+    name: Id,
     bearer: Option<Bearer>,
     asks: mpsc::Sender<Ask<R>>,
 }
@@ -164,7 +181,7 @@ pub struct Arrived<R> {
 pub struct Grant<R> {
     leases: Leases<R>,
     /// What the session is named by.
-    pub name: Name,
+    pub name: Id,
     /// The most requests of its client that wait.
     pub most: usize,
     /// Streams that ask for it.
@@ -180,8 +197,8 @@ impl<R> Leases<R> {
     /// Gives a session a lease, unless they hold no time.
     ///
     /// # Errors
-    /// [`Refusal::NoRandomness`].
-    pub fn give(&self, bearer: Option<Bearer>, most: usize) -> Result<Option<Grant<R>>, Refusal> {
+    /// [`NoRandomness`].
+    pub fn give(&self, bearer: Option<Bearer>, most: usize) -> Result<Option<Grant<R>>, NoRandomness> {
         if self.0.time.is_zero() {
             return Ok(None);
         }
@@ -240,14 +257,4 @@ impl<R> Drop for Grant<R> {
         self.leases.lock().retain(|lease| lease.name != self.name);
         self.numbers().0.held.fetch_sub(1, Ordering::Relaxed);
     }
-}
-
-/// 128 bits of the system's, which no seed has anything to do with.
-///
-/// # Errors
-/// [`Refusal::NoRandomness`].
-pub fn random() -> Result<Name, Refusal> {
-    let mut bytes = Name::default();
-    let got = rustix::rand::getrandom(&mut bytes, rustix::rand::GetRandomFlags::empty());
-    if got.is_ok_and(|n| n == bytes.len()) { Ok(bytes) } else { Err(Refusal::NoRandomness) }
 }

@@ -1,10 +1,8 @@
 //! The bytes in flight: one budget for requests, replies, pictures and policies, over all sessions, of which a token may
 //! have a part.
 
-use crate::server::{
-    auth::{Bearer, Held, Token},
-    status::Refusal,
-};
+use super::Error;
+use crate::server::auth::{Bearer, Held, Token};
 use bytes::Bytes;
 use std::sync::{
     Arc, Mutex, PoisonError,
@@ -52,8 +50,8 @@ impl Budget {
     /// So many bytes, until the share is dropped.
     ///
     /// # Errors
-    /// [`Refusal::NoMemory`], [`Refusal::TooManyOfAToken`].
-    pub fn take(&self, bytes: usize) -> Result<Share, Refusal> {
+    /// [`Error::MemoryFull`], [`Error::Auth`].
+    pub fn take(&self, bytes: usize) -> Result<Share, Error> {
         let mut share = self.nothing();
         share.grow(bytes)?;
         Ok(share)
@@ -77,8 +75,8 @@ impl Share {
     /// Takes so many bytes more.
     ///
     /// # Errors
-    /// [`Refusal::NoMemory`], [`Refusal::TooManyOfAToken`]; then it is as before.
-    pub fn grow(&mut self, bytes: usize) -> Result<(), Refusal> {
+    /// [`Error::MemoryFull`], [`Error::Auth`]; then it is as before.
+    pub fn grow(&mut self, bytes: usize) -> Result<(), Error> {
         if bytes == 0 {
             return Ok(());
         }
@@ -94,7 +92,7 @@ impl Share {
                 if let Some(held) = &mut self.held {
                     held.give_back(bytes);
                 }
-                Err(Refusal::NoMemory { wanted: bytes, used, limit: *limit })
+                Err(Error::MemoryFull { wanted: bytes, used, limit: *limit })
             }
         }
     }
@@ -154,7 +152,7 @@ mod tests {
     fn what_does_not_fit_is_refused_and_what_is_dropped_is_free_again() {
         let budget = Budget::new(100);
         let mut first = budget.take(60).unwrap();
-        assert_eq!(budget.take(41).err(), Some(Refusal::NoMemory { wanted: 41, used: 60, limit: 100 }));
+        assert_eq!(budget.take(41).err(), Some(Error::MemoryFull { wanted: 41, used: 60, limit: 100 }));
         first.grow(40).unwrap();
         assert!(first.grow(1).is_err() && budget.take(usize::MAX).is_err());
         first.set(150);

@@ -1,26 +1,23 @@
 //! Messages off the wire: gRPC's frames, each bounded by what its stream may send now, before anything of it is kept.
 //!
 //! tonic has one limit for all messages of a service, and decodes them on the transport's thread. So the streams of both
-//! protocols keep their bodies from it (`Kept`) and read them here.
+//! protocols keep their bodies from it ([`raw_body`](super::raw_body)) and read them here.
 
 use super::{
+    Error,
     budget::{Budget, Outbox, Share},
-    watched_body::{Patience, Replies},
 };
-use crate::server::{auth::Bearer, net::peers::Connection, session::driver::MOST_BYTES_BEFORE_OPEN, status::Refusal};
+use crate::server::{
+    auth::Bearer,
+    limits::{Allowance, MOST_BYTES_BEFORE_OPEN},
+    net::managed_io::Connection,
+};
 use bytes::{Buf, Bytes, BytesMut};
 use http_body::Body as _;
 use http_body_util::BodyExt;
-use std::{
-    convert::Infallible,
-    future::Future,
-    pin::Pin,
-    sync::{Arc, Mutex, PoisonError},
-    task::{Context, Poll},
-    time::Duration,
-};
+use std::time::Duration;
 use tokio::time::{Instant, timeout_at};
-use tonic::{Code, Status, body::Body, codegen::Service, codegen::http, server::NamedService};
+use tonic::{Code, Status, body::Body};
 
 /// A frame's flag and its length.
 const HEADER: usize = 5;
@@ -30,25 +27,6 @@ const SMALL: usize = MOST_BYTES_BEFORE_OPEN;
 const LEAST_RATE: usize = 64 << 10;
 /// A message of so many bytes is worth an allocation of its own.
 const LARGE: usize = 1 << 20;
-
-/// What a stream may send now.
-#[derive(Debug, Clone, Copy)]
-pub struct Allowance {
-    /// The most bytes of a message.
-    pub bytes: usize,
-    /// The most entries of fields that have one for each environment.
-    pub entries: usize,
-    /// The bytes of a message for which the budget was asked already.
-    pub covered: usize,
-}
-
-/// A service one of whose methods, that at `path`, reads its requests from `Kept` and not from tonic.
-#[derive(Clone)]
-pub struct Keeping<S> {
-    service: S,
-    path: &'static str,
-    transit: Transit,
-}
 
 /// What requests and replies are subject to on their way.
 #[derive(Clone)]
@@ -60,64 +38,6 @@ pub struct Transit {
     /// How long it may leave the first reply unread.
     pub handshake: Duration,
 }
-
-impl<S> Keeping<S> {
-    /// Keeps the bodies of calls of this path.
-    pub fn new(service: S, path: &'static str, transit: Transit) -> Self {
-        Self { service, path, transit }
-    }
-}
-
-impl<S: NamedService> NamedService for Keeping<S> {
-    const NAME: &'static str = S::NAME;
-}
-
-impl<S> Service<http::Request<Body>> for Keeping<S>
-where
-    S: Service<http::Request<Body>, Response = http::Response<Body>, Error = Infallible>,
-    S::Future: Send + 'static,
-{
-    type Response = http::Response<Body>;
-    type Error = Infallible;
-    type Future = Pin<Box<dyn Future<Output = Result<Self::Response, Infallible>> + Send>>;
-
-    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Infallible>> {
-        self.service.poll_ready(context)
-    }
-
-    fn call(&mut self, mut request: http::Request<Body>) -> Self::Future {
-        let outbox = Outbox::default();
-        let connection = request.extensions().get::<Connection>().cloned();
-        let is_stream = request.uri().path() == self.path;
-        // What is no stream is one small reply.
-        let patience = is_stream.then_some(Patience { first: self.transit.handshake, rest: self.transit.limit });
-        if is_stream {
-            let bearer = request.extensions_mut().remove::<Bearer>();
-            let transit = Transit { budget: self.transit.budget.of(bearer.clone()), ..self.transit };
-            let body = std::mem::take(request.body_mut());
-            let frames = Frames {
-                body,
-                buffer: BytesMut::new(),
-                message: None,
-                due: None,
-                share: transit.budget.nothing(),
-                transit,
-                connection: connection.clone(),
-                bearer,
-                outbox: outbox.clone(),
-            };
-            request.extensions_mut().insert(Kept(Arc::new(Mutex::new(Some(frames)))));
-        }
-        let response = self.service.call(request);
-        Box::pin(
-            async move { Ok(response.await?.map(|body| Body::new(Replies::new(body, outbox, connection, patience)))) },
-        )
-    }
-}
-
-/// A request's frames, as an extension of the request, which must be one that could be cloned.
-#[derive(Clone)]
-struct Kept(Arc<Mutex<Option<Frames>>>);
 
 /// The messages of a request's body, as they come.
 pub struct Frames {
@@ -143,7 +63,7 @@ enum Begun {
     /// It has so many bytes.
     Wanted(usize),
     /// There was no room for it. So many of its bytes have not come yet, and are thrown away.
-    Refused(usize, Refusal),
+    Refused(usize, Error),
 }
 
 /// A message.
@@ -151,34 +71,56 @@ pub enum Message {
     /// Its bytes, with their share of the budget.
     Whole(Bytes, Share),
     /// The budget has no room for it.
-    Refused(Refusal),
+    Refused(Error),
 }
 
 /// Why a stream ends before its client's end.
-pub enum Stop {
+pub enum Stop<E = Error> {
     /// The server wants no more of it.
-    Refused(Refusal),
+    Refused(E),
     /// What came is not to be understood, the connection broke, or the server has a defect.
     Broken(Status),
     /// The client wants no more of it, or something in between, or nothing comes from there any more.
     Cancelled,
 }
 
-impl From<Status> for Stop {
+impl<E> Stop<E> {
+    /// The same with another error.
+    pub fn map<F>(self, error: impl FnOnce(E) -> F) -> Stop<F> {
+        match self {
+            Self::Refused(refused) => Stop::Refused(error(refused)),
+            Self::Broken(status) => Stop::Broken(status),
+            Self::Cancelled => Stop::Cancelled,
+        }
+    }
+}
+
+impl<E> From<Status> for Stop<E> {
     fn from(status: Status) -> Self {
         Self::Broken(status)
     }
 }
 
 impl Frames {
-    /// Those of a request whose body was kept.
-    ///
-    /// # Errors
-    /// Where it was not: a defect.
-    pub fn of<T>(request: &mut tonic::Request<T>) -> Result<Self, Status> {
-        let kept = request.extensions_mut().remove::<Kept>();
-        let frames = kept.and_then(|kept| kept.0.lock().unwrap_or_else(PoisonError::into_inner).take());
-        frames.ok_or_else(|| Status::internal("the request's body is not there: a defect of the server"))
+    /// The messages of this body.
+    pub fn new(
+        body: Body,
+        transit: Transit,
+        connection: Option<Connection>,
+        bearer: Option<Bearer>,
+        outbox: Outbox,
+    ) -> Self {
+        Self {
+            body,
+            buffer: BytesMut::new(),
+            message: None,
+            due: None,
+            share: transit.budget.nothing(),
+            transit,
+            connection,
+            bearer,
+            outbox,
+        }
     }
 
     /// What they take their bytes from.
@@ -188,17 +130,8 @@ impl Frames {
 
     /// Their place, when they go elsewhere: nothing comes there any more.
     pub fn leave(&mut self) -> Self {
-        let left = Self {
-            body: Body::empty(),
-            buffer: BytesMut::new(),
-            message: None,
-            due: None,
-            share: self.transit.budget.nothing(),
-            transit: self.transit.clone(),
-            connection: self.connection.clone(),
-            bearer: self.bearer.clone(),
-            outbox: Outbox::default(),
-        };
+        let (connection, bearer) = (self.connection.clone(), self.bearer.clone());
+        let left = Self::new(Body::empty(), self.transit.clone(), connection, bearer, Outbox::default());
         std::mem::replace(self, left)
     }
 
@@ -238,7 +171,7 @@ impl Frames {
             None => Ok(next.await),
             Some(limit) => {
                 let soon = Instant::now() + limit;
-                let unfinished = |_| Stop::Refused(Refusal::Unfinished { seconds: limit.as_secs(), rate: LEAST_RATE });
+                let unfinished = |_| Stop::Refused(Error::Unfinished { seconds: limit.as_secs(), rate: LEAST_RATE });
                 timeout_at(self.due.map_or(soon, |due| due.min(soon)), next).await.map_err(unfinished)
             }
         }
@@ -253,7 +186,7 @@ impl Frames {
         }
         let length = self.buffer.get_u32() as usize;
         if length > allowance.bytes {
-            return Err(Stop::Refused(Refusal::TooLarge { got: length, limit: allowance.bytes }));
+            return Err(Stop::Refused(Error::TooLarge { got: length, limit: allowance.bytes }));
         }
         let longest = |limit| limit + Duration::from_secs((length / LEAST_RATE) as u64);
         self.due = self.transit.limit.map(|limit| Instant::now() + longest(limit));

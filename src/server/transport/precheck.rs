@@ -1,9 +1,11 @@
 //! Requests from their bytes. The encoding lets two bytes stand for an entry of a hundred, so entries are counted before
 //! anything is made of them, and what has many fields is decoded by other threads than the transport's.
 
-use self::Inside::{Fields, Numbers, Opaque};
-use super::message_reader::Allowance;
-use crate::{priority::lower, server::status::Refusal};
+use self::Inside::{Fields, Numbers};
+use crate::{
+    priority::lower,
+    server::{error::InvalidValue, limits::Allowance},
+};
 use bytes::Bytes;
 use prost::Message;
 use std::sync::Arc;
@@ -18,7 +20,7 @@ const AT_A_TIME: usize = 2;
 const NICENESS: i32 = 5;
 /// Most parts that a message has wherever their number does not follow from the environments'. Where fewer are legal the
 /// refusal that names them is to come from those who know.
-const MANY: usize = 1024;
+pub const MANY: usize = 1024;
 /// Bytes of numbers in a row that are counted in the time of a field.
 const NUMBERS_A_FIELD: usize = 64;
 /// Room for the counts of a message's fields, of which no list here has more.
@@ -33,7 +35,7 @@ pub struct Field {
 }
 
 /// What a field's entries are.
-enum Inside {
+pub enum Inside {
     /// Messages.
     Fields(&'static [Field]),
     /// Numbers, which may stand in a row.
@@ -43,8 +45,10 @@ enum Inside {
 }
 
 /// How many entries a field may have.
-enum Most {
+pub enum Most {
+    /// At most one.
     One,
+    /// At most [`MANY`].
     Many,
     /// As many as there are environments, and no fewer than [`MANY`].
     Environments,
@@ -60,45 +64,10 @@ impl Most {
     }
 }
 
-const fn field(number: u64, name: &'static str, most: Most, inside: Inside) -> Field {
+/// A field that is counted.
+pub const fn field(number: u64, name: &'static str, most: Most, inside: Inside) -> Field {
     Field { number, name, most, inside }
 }
-
-const DISTRIBUTION: &[Field] = &[field(1, "intervals", Most::Many, Opaque)];
-const PARAMETER: &[Field] = &[field(2, "a distribution", Most::One, Fields(DISTRIBUTION))];
-const GROUP: &[Field] = &[field(3, "open.groups.parameters", Most::Many, Fields(PARAMETER))];
-const OPEN: &[Field] = &[
-    field(3, "open.parameters", Most::Many, Fields(PARAMETER)),
-    field(11, "open.groups", Most::Environments, Fields(GROUP)),
-];
-const RESET: &[Field] = &[
-    field(2, "reset.seeds", Most::Environments, Numbers),
-    field(3, "reset.parameters", Most::Many, Fields(PARAMETER)),
-];
-const RESTORE: &[Field] = &[field(2, "restore.snapshots", Most::Environments, Opaque)];
-const POLICY: &[Field] = &[field(1, "act.policy.hidden", Most::Many, Numbers)];
-const ACT: &[Field] = &[field(1, "act.policy", Most::One, Fields(POLICY))];
-/// Those of `perturb.v1.SessionRequest`.
-pub const SESSION_REQUEST: &[Field] = &[
-    field(1, "open", Most::One, Fields(OPEN)),
-    field(2, "step", Most::One, Opaque),
-    field(3, "reset", Most::One, Fields(RESET)),
-    field(5, "restore", Most::One, Fields(RESTORE)),
-    field(8, "act", Most::One, Fields(ACT)),
-];
-
-const SETTINGS_FIRST: &[Field] = &[field(1, "settings", Most::Many, Opaque)];
-const SETTINGS_SECOND: &[Field] = &[field(2, "settings", Most::Many, Opaque)];
-const AGENT_STEP: &[Field] =
-    &[field(1, "step.actions", Most::Many, Opaque), field(2, "step.requested_observations", Most::Many, Numbers)];
-/// Those of `dm_env_rpc.v1.EnvironmentRequest`.
-pub const ENVIRONMENT_REQUEST: &[Field] = &[
-    field(1, "create_world", Most::One, Fields(SETTINGS_FIRST)),
-    field(2, "join_world", Most::One, Fields(SETTINGS_SECOND)),
-    field(3, "step", Most::One, Fields(AGENT_STEP)),
-    field(4, "reset", Most::One, Fields(SETTINGS_FIRST)),
-    field(5, "reset_world", Most::One, Fields(SETTINGS_SECOND)),
-];
 
 /// Decodes requests, the large ones elsewhere.
 #[derive(Clone)]
@@ -130,7 +99,7 @@ impl Decoder {
         bytes: Bytes,
         fields: &'static [Field],
         allowance: Allowance,
-    ) -> Result<Result<T, Refusal>, Status> {
+    ) -> Result<Result<T, InvalidValue>, Status> {
         match check(&bytes, fields, allowance, FEW_FIELDS) {
             Ok(()) => return decoded(bytes).map(Ok),
             Err(Stop::Refused(refusal)) => return Ok(Err(refusal)),
@@ -158,7 +127,7 @@ fn decoded<T: Message + Default>(bytes: Bytes) -> Result<T, Status> {
 enum Stop {
     /// It has more fields than were to be looked at.
     Work,
-    Refused(Refusal),
+    Refused(InvalidValue),
 }
 
 /// Counts a message's fields and entries, at most `work` of them. What is not well-formed ends the count, as it ends the
@@ -181,7 +150,7 @@ fn count(mut message: &[u8], fields: &[Field], allowance: Allowance, work: &mut 
             // Groups of fields, which are no part of this version of the encoding.
             kind => {
                 let got = format!("with a field of the encoding's kind {kind}");
-                return Err(Stop::Refused(Refusal::value("request", got, "kinds 0, 1, 2 and 5")));
+                return Err(Stop::Refused(InvalidValue::new("request", got, "kinds 0, 1, 2 and 5")));
             }
         };
         let Some(part) = part else { return Ok(false) };
@@ -198,7 +167,7 @@ fn count(mut message: &[u8], fields: &[Field], allowance: Allowance, work: &mut 
         let most = field.most.entries(allowance);
         if *counted > most {
             let got = format!("there more than {most} times");
-            return Err(Stop::Refused(Refusal::value(field.name, got, "no more than can be needed")));
+            return Err(Stop::Refused(InvalidValue::new(field.name, got, "no more than can be needed")));
         }
         if let Fields(fields) = field.inside
             && !count(part, fields, allowance, work)?
@@ -226,7 +195,10 @@ fn varint(message: &mut &[u8]) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::proto::{self, session_request::Request};
+    use crate::{
+        proto::{self, session_request::Request},
+        server::api::perturb_v1::fields::SESSION_REQUEST,
+    };
 
     const ALLOWANCE: Allowance = Allowance { bytes: 0, entries: 2000, covered: 0 };
 

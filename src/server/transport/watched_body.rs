@@ -2,7 +2,7 @@
 //! loses its connection.
 
 use super::budget::Outbox;
-use crate::server::net::peers::Connection;
+use crate::server::net::managed_io::Connection;
 use bytes::Bytes;
 use http_body::{Body as HttpBody, Frame, SizeHint};
 use std::{

@@ -1,6 +1,8 @@
 //! One stream: the legal order of its requests, each answered once.
 
 use super::{
+    Error,
+    fields::ENVIRONMENT_REQUEST,
     properties,
     runner::Runner,
     settings, specs,
@@ -13,17 +15,11 @@ use crate::{
     },
     server::{
         auth::Bearer,
+        limits::{Allowance, MOST_BYTES_BEFORE_OPEN},
         net::access_log::About,
-        session::{
-            driver::{Dialogue, MOST_BYTES_BEFORE_OPEN, Sessions},
-            instrumented::Observed,
-        },
+        session::{self, driver::Sessions, handler::Dialogue, instrumented::Observed},
         shutdown::Phase,
-        status::Refusal,
-        transport::{
-            message_reader::Allowance,
-            precheck::{self, Field},
-        },
+        transport::precheck::Field,
     },
 };
 use std::sync::Arc;
@@ -47,9 +43,9 @@ impl Agent {
         Self { worlds, caller, sessions, joined: None, about: About::default() }
     }
 
-    async fn create_world(&mut self, request: rpc::CreateWorldRequest) -> Result<rpc::CreateWorldResponse, Refusal> {
+    async fn create_world(&mut self, request: rpc::CreateWorldRequest) -> Result<rpc::CreateWorldResponse, Error> {
         if self.sessions.phase() != Phase::Running {
-            return Err(Refusal::Draining);
+            return Err(session::Error::Draining.into());
         }
         let (settings, version, own) = settings::create(self.worlds.catalogue(), &request.settings)?;
         self.worlds.is_free(&self.caller, &own)?;
@@ -58,9 +54,9 @@ impl Agent {
         Ok(rpc::CreateWorldResponse { world_name: self.worlds.add(&self.caller, runner, own, held)? })
     }
 
-    async fn join_world(&mut self, request: rpc::JoinWorldRequest) -> Result<rpc::JoinWorldResponse, Refusal> {
+    async fn join_world(&mut self, request: rpc::JoinWorldRequest) -> Result<rpc::JoinWorldResponse, Error> {
         if let Some(joined) = &self.joined {
-            return Err(Refusal::AlreadyJoined { world: joined.world.name().into() });
+            return Err(Error::AlreadyJoined { world: joined.world.name().into() });
         }
         settings::none("join_world", &request.settings)?;
         let (world, runner) = self.worlds.join(&self.caller, &request.world_name)?;
@@ -71,7 +67,7 @@ impl Agent {
         Ok(rpc::JoinWorldResponse { specs: Some(specs::of(joined.world.spec())) })
     }
 
-    async fn step(&mut self, request: rpc::StepRequest) -> Result<rpc::StepResponse, Refusal> {
+    async fn step(&mut self, request: rpc::StepRequest) -> Result<rpc::StepResponse, Error> {
         let Joined { world, runner } = self.joined("step")?;
         specs::check_requested(&request.requested_observations)?;
         let outcome = if runner.is_running() {
@@ -87,14 +83,14 @@ impl Agent {
         Ok(specs::response(&outcome, &request.requested_observations))
     }
 
-    fn reset(&mut self, request: rpc::ResetRequest) -> Result<rpc::ResetResponse, Refusal> {
+    fn reset(&mut self, request: rpc::ResetRequest) -> Result<rpc::ResetResponse, Error> {
         let Joined { world, runner } = self.joined("reset")?;
         world.change(settings::change(world.spec(), "reset", &request.settings)?)?;
         runner.stop();
         Ok(rpc::ResetResponse { specs: Some(specs::of(world.spec())) })
     }
 
-    fn reset_world(&mut self, request: rpc::ResetWorldRequest) -> Result<rpc::ResetWorldResponse, Refusal> {
+    fn reset_world(&mut self, request: rpc::ResetWorldRequest) -> Result<rpc::ResetWorldResponse, Error> {
         let world = self.worlds.of(&self.caller, &request.world_name, "reset_world")?;
         world.change(settings::change(world.spec(), "reset_world", &request.settings)?)?;
         match &mut self.joined {
@@ -104,7 +100,7 @@ impl Agent {
         Ok(rpc::ResetWorldResponse {})
     }
 
-    fn destroy_world(&mut self, request: &rpc::DestroyWorldRequest) -> Result<rpc::DestroyWorldResponse, Refusal> {
+    fn destroy_world(&mut self, request: &rpc::DestroyWorldRequest) -> Result<rpc::DestroyWorldResponse, Error> {
         self.worlds.destroy(&self.caller, &request.world_name)?;
         Ok(rpc::DestroyWorldResponse {})
     }
@@ -116,8 +112,8 @@ impl Agent {
         }
     }
 
-    fn joined(&mut self, request: &'static str) -> Result<&mut Joined, Refusal> {
-        self.joined.as_mut().ok_or(Refusal::NotJoined { request })
+    fn joined(&mut self, request: &'static str) -> Result<&mut Joined, Error> {
+        self.joined.as_mut().ok_or(Error::NotJoined { request })
     }
 }
 
@@ -131,7 +127,8 @@ impl Drop for Agent {
 impl Dialogue for Agent {
     type Request = rpc::EnvironmentRequest;
     type Response = rpc::EnvironmentResponse;
-    const FIELDS: &'static [Field] = precheck::ENVIRONMENT_REQUEST;
+    type Error = Error;
+    const FIELDS: &'static [Field] = ENVIRONMENT_REQUEST;
     const PROTOCOL: &'static str = "dm_env_rpc.v1";
 
     fn allowance(&self) -> Allowance {
@@ -147,7 +144,7 @@ impl Dialogue for Agent {
         self.about
     }
 
-    async fn answer(&mut self, request: Self::Request) -> Result<Self::Response, Refusal> {
+    async fn answer(&mut self, request: Self::Request) -> Result<Self::Response, Error> {
         let response = match request.payload {
             Some(Request::CreateWorld(create)) => self.create_world(create).await.map(Response::CreateWorld),
             Some(Request::JoinWorld(join)) => self.join_world(join).await.map(Response::JoinWorld),
@@ -164,14 +161,14 @@ impl Dialogue for Agent {
             }
             None => {
                 let expected = "create_world, join_world, step, …";
-                Err(Refusal::value("request", "empty or of a kind this server does not know", expected))
+                Err(Error::value("request", "empty or of a kind this server does not know", expected))
             }
         };
         response.map(|payload| rpc::EnvironmentResponse { payload: Some(payload) })
     }
 
-    fn refusal(refusal: Refusal) -> Self::Response {
-        rpc::EnvironmentResponse { payload: Some(Response::Error(refusal.into())) }
+    fn refusal(error: Error) -> Self::Response {
+        rpc::EnvironmentResponse { payload: Some(Response::Error(error.into())) }
     }
 }
 

@@ -11,6 +11,8 @@
 //! - `properties`: values by name.
 
 mod agent;
+mod error;
+mod fields;
 mod properties;
 mod runner;
 pub mod service;
@@ -19,3 +21,5 @@ mod specs;
 mod tensors;
 mod world;
 mod worlds;
+
+pub use error::Error;

@@ -2,6 +2,7 @@
 //! is written takes effect when the next begins.
 
 use super::{
+    Error,
     settings::{self, Change},
     tensors,
     world::Joined,
@@ -18,7 +19,6 @@ use crate::{
         tensor::{DoubleArray, Payload, StringArray, Uint32Array, Uint64Array},
         tensor_spec,
     },
-    server::status::Refusal,
 };
 use prost::Message;
 use prost_types::Any;
@@ -46,14 +46,14 @@ struct Property {
 ///
 /// # Errors
 /// If it is of another extension or cannot be decoded, or for what the request is refused for.
-pub(super) fn answer(catalogue: &Catalogue, joined: Option<&Joined>, request: &Any) -> Result<Any, Refusal> {
+pub(super) fn answer(catalogue: &Catalogue, joined: Option<&Joined>, request: &Any) -> Result<Any, Error> {
     let name = request.type_url.rsplit('/').next().unwrap_or_default();
     if name != REQUEST {
-        return Err(Refusal::UnknownExtension { name: shorten(name), known: REQUEST });
+        return Err(Error::UnknownExtension { name: shorten(name), known: REQUEST });
     }
     let expected = "read_property, write_property or list_property";
     let request = PropertyRequest::decode(request.value.as_slice())
-        .map_err(|error| Refusal::value("extension", format!("no {REQUEST}: {error}"), expected))?;
+        .map_err(|error| Error::value("extension", format!("no {REQUEST}: {error}"), expected))?;
     let properties = properties(catalogue, joined);
     let response = match request.payload {
         Some(Request::ReadProperty(read)) => {
@@ -69,7 +69,7 @@ pub(super) fn answer(catalogue: &Catalogue, joined: Option<&Joined>, request: &A
             let values = self::list(&properties, &list.key)?.map(Property::spec).collect();
             Response::ListProperty(ListPropertyResponse { values })
         }
-        None => return Err(Refusal::value("extension", "an empty PropertyRequest", expected)),
+        None => return Err(Error::value("extension", "an empty PropertyRequest", expected)),
     };
     let value = PropertyResponse { payload: Some(response) }.encode_to_vec();
     Ok(Any { type_url: RESPONSE_URL.into(), value })
@@ -128,8 +128,8 @@ fn of_world(joined: &Joined, episode: EpisodeId, receipt: Option<&Receipt>) -> V
     all
 }
 
-fn find<'a>(properties: &'a [Property], key: &str) -> Result<&'a Property, Refusal> {
-    properties.iter().find(|property| property.key == key).ok_or_else(|| Refusal::Unknown {
+fn find<'a>(properties: &'a [Property], key: &str) -> Result<&'a Property, Error> {
+    properties.iter().find(|property| property.key == key).ok_or_else(|| Error::Unknown {
         what: "property",
         name: format!("{:?}", shorten(key)),
         known: "list properties to see which there are; most are a world's, which must be joined".into(),
@@ -137,7 +137,7 @@ fn find<'a>(properties: &'a [Property], key: &str) -> Result<&'a Property, Refus
 }
 
 /// The properties that a key holds, or those at the root.
-fn list<'a>(properties: &'a [Property], key: &'a str) -> Result<impl Iterator<Item = &'a Property>, Refusal> {
+fn list<'a>(properties: &'a [Property], key: &'a str) -> Result<impl Iterator<Item = &'a Property>, Error> {
     if !key.is_empty() {
         let property = find(properties, key)?;
         if property.value.is_some() {
@@ -147,13 +147,13 @@ fn list<'a>(properties: &'a [Property], key: &'a str) -> Result<impl Iterator<It
     Ok(properties.iter().filter(move |property| property.parent() == key))
 }
 
-fn write(joined: Option<&Joined>, property: &Property, request: &WritePropertyRequest) -> Result<(), Refusal> {
+fn write(joined: Option<&Joined>, property: &Property, request: &WritePropertyRequest) -> Result<(), Error> {
     // Only a joined world's can be written.
     let (Some(joined), true) = (joined, property.is_writable) else {
         return Err(property.forbidden("written"));
     };
     let field = format!("property {:?}", property.key);
-    let no_value = || Refusal::value(field.clone(), "written without a value", "a tensor");
+    let no_value = || Error::value(field.clone(), "written without a value", "a tensor");
     let value = request.value.as_ref().ok_or_else(no_value)?;
     let mut change = Change::default();
     match property.key.as_str() {
@@ -209,8 +209,8 @@ impl Property {
         }
     }
 
-    fn forbidden(&self, access: &'static str) -> Refusal {
-        Refusal::Forbidden { key: self.key.clone(), access }
+    fn forbidden(&self, access: &'static str) -> Error {
+        Error::Forbidden { key: self.key.clone(), access }
     }
 }
 

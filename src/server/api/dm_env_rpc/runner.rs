@@ -1,10 +1,11 @@
 //! A world's episodes, one after the other, on the pool: a batch of one environment.
 
+use super::Error;
 use crate::{
     env::{Distribution, EnvironmentSpec, EpisodeStart, Settings, Version},
     pool::{Batch, BatchSettings, Pool, ResetEntry, Stepped},
     proto::dm_env_rpc::v1::EnvironmentStateType as State,
-    server::{audit::draws::Draws, status::Refusal},
+    server::audit::draws::Draws,
 };
 use bytes::Bytes;
 use std::sync::Arc;
@@ -69,7 +70,7 @@ impl Runner {
         settings: BatchSettings,
         version: Version,
         draws: Draws,
-    ) -> Result<Self, Refusal> {
+    ) -> Result<Self, Error> {
         let (begun, spec) = (draws.open(&settings).await?, settings.spec);
         let opened = Batch::open(pool, settings).await;
         let (mut batch, first, started) = opened.inspect_err(|_| draws.not_opened(spec, begun))?;
@@ -129,7 +130,7 @@ impl Runner {
     ///
     /// # Errors
     /// If the server has a defect.
-    pub(super) async fn begin(&mut self, changes: Changes) -> Result<Outcome, Refusal> {
+    pub(super) async fn begin(&mut self, changes: Changes) -> Result<Outcome, Error> {
         let Changes { version, seed, distributions } = changes;
         if self.phase != Phase::Unseen || seed.is_some() || distributions.is_some() {
             let entries = vec![ResetEntry { slot: 0, seed, distributions, state: None }];
@@ -153,7 +154,7 @@ impl Runner {
     ///
     /// # Errors
     /// If the server has a defect.
-    pub(super) async fn step(&mut self, actions: &[u8], interrupted: bool) -> Result<Outcome, Refusal> {
+    pub(super) async fn step(&mut self, actions: &[u8], interrupted: bool) -> Result<Outcome, Error> {
         let Stepped { observations, rewards, terminated, truncated, ended, .. } = self.batch.step(actions).await?;
         let is_set = |flags: &Bytes| flags.first().is_some_and(|flag| *flag == 1);
         let truncated = is_set(&truncated);

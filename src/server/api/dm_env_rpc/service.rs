@@ -11,11 +11,14 @@ use crate::{
             driver::{Responses, Sessions},
             instrumented::{Counted, Counts},
         },
-        transport::message_reader::Frames,
+        transport::raw_body,
     },
 };
 use std::sync::Arc;
 use tonic::{Request, Response, Status, Streaming};
+
+/// The path of calls that are streams of agents.
+pub const ENDPOINT: &str = "/dm_env_rpc.v1.Environment/Process";
 
 /// Serves worlds, which all streams share.
 #[derive(Clone)]
@@ -45,7 +48,7 @@ impl Environment for Service {
         &self,
         mut request: Request<Streaming<EnvironmentRequest>>,
     ) -> Result<Response<Self::ProcessStream>, Status> {
-        let frames = Frames::of(&mut request)?;
+        let frames = raw_body::messages(&mut request)?;
         let agent = Agent::new(Arc::clone(&self.worlds), frames.bearer.clone(), self.sessions.clone());
         Ok(Response::new(self.sessions.begin(frames, Counted::new(agent, &self.counts))?))
     }

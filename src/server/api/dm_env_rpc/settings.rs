@@ -1,11 +1,10 @@
 //! Settings to the domain. Names and types are checked here, values by the domain.
 
-use super::tensors;
+use super::{Error, tensors};
 use crate::{
     env::{self, Catalogue, Distribution, EnvironmentSpec, Version, resolve, shorten},
     pool::{Autoreset, BatchSettings, SlotGroup},
     proto::dm_env_rpc::v1::Tensor,
-    server::status::Refusal,
 };
 use std::collections::BTreeMap;
 
@@ -46,13 +45,10 @@ pub(super) struct Change {
 ///
 /// # Errors
 /// For settings that are missing, unknown, of a wrong type or out of range.
-pub(super) fn create(
-    catalogue: &Catalogue,
-    settings: &Settings,
-) -> Result<(BatchSettings, Version, Ownership), Refusal> {
+pub(super) fn create(catalogue: &Catalogue, settings: &Settings) -> Result<(BatchSettings, Version, Ownership), Error> {
     let id = settings.get(ENV_ID).ok_or_else(|| {
         let expected = format!("a STRING scalar, one of {}", catalogue.names().collect::<Vec<_>>().join(", "));
-        Refusal::value(field(ENV_ID), "missing", expected)
+        Error::value(field(ENV_ID), "missing", expected)
     })?;
     let spec = catalogue.find(tensors::text(&field(ENV_ID), id)?)?;
     let own = [ENV_ID, VERSION, SEED, ENVIRONMENT_INDEX, EPISODES_PER_TRIAL, WORLD_NAME, SHARED];
@@ -86,13 +82,13 @@ pub(super) fn create(
     Ok((batch, version, ownership(settings)?))
 }
 
-fn ownership(settings: &Settings) -> Result<Ownership, Refusal> {
+fn ownership(settings: &Settings) -> Result<Ownership, Error> {
     let name = settings.get(WORLD_NAME).map(|tensor| tensors::text(&field(WORLD_NAME), tensor)).transpose()?;
     let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte);
     if let Some(name) = name.filter(|name| name.is_empty() || name.len() > LONGEST_NAME || !name.bytes().all(is_plain))
     {
         let expected = format!("1 to {LONGEST_NAME} letters, digits, -, _ or .");
-        return Err(Refusal::value(field(WORLD_NAME), format!("{:?}", shorten(name)), expected));
+        return Err(Error::value(field(WORLD_NAME), format!("{:?}", shorten(name)), expected));
     }
     let shared = settings.get(SHARED).map(|tensor| tensors::boolean(&field(SHARED), tensor)).transpose()?;
     Ok(Ownership { name: name.map(String::from), shared: shared.unwrap_or(false) })
@@ -106,7 +102,7 @@ pub(super) fn change(
     spec: &'static EnvironmentSpec,
     request: &'static str,
     settings: &Settings,
-) -> Result<Change, Refusal> {
+) -> Result<Change, Error> {
     check_names(spec, request, &[VERSION, SEED], settings)?;
     Ok(Change {
         version: version(settings)?,
@@ -119,7 +115,7 @@ pub(super) fn change(
 ///
 /// # Errors
 /// If there are.
-pub(super) fn none(request: &'static str, settings: &Settings) -> Result<(), Refusal> {
+pub(super) fn none(request: &'static str, settings: &Settings) -> Result<(), Error> {
     match settings.keys().next() {
         Some(name) => Err(unknown(name, format!("{request} takes no settings; give them to create_world or reset"))),
         None => Ok(()),
@@ -130,18 +126,18 @@ pub(super) fn none(request: &'static str, settings: &Settings) -> Result<(), Ref
 ///
 /// # Errors
 /// If it is another letter.
-pub(super) fn version_of(field: String, letter: &str) -> Result<Version, Refusal> {
+pub(super) fn version_of(field: String, letter: &str) -> Result<Version, Error> {
     let found = letter.parse().ok().filter(|version| Version::ALL.contains(version));
-    found.ok_or_else(|| Refusal::value(field, format!("{:?}", shorten(letter)), "\"D\", \"R\" or \"E\""))
+    found.ok_or_else(|| Error::value(field, format!("{:?}", shorten(letter)), "\"D\", \"R\" or \"E\""))
 }
 
-fn version(settings: &Settings) -> Result<Option<Version>, Refusal> {
+fn version(settings: &Settings) -> Result<Option<Version>, Error> {
     let read = |tensor| version_of(field(VERSION), tensors::text(&field(VERSION), tensor)?);
     settings.get(VERSION).map(read).transpose()
 }
 
 /// Those of the settings that are the environment's parameters.
-fn parameters(spec: &EnvironmentSpec, settings: &Settings) -> Result<Vec<(&'static str, Distribution)>, Refusal> {
+fn parameters(spec: &EnvironmentSpec, settings: &Settings) -> Result<Vec<(&'static str, Distribution)>, Error> {
     let given = spec.parameters.iter().filter_map(|p| Some((p.name, settings.get(p.name)?)));
     given.map(|(name, tensor)| Ok((name, Distribution::fixed(tensors::number(&field(name), tensor)?)))).collect()
 }
@@ -151,7 +147,7 @@ fn check_names(
     request: &'static str,
     own: &[&str],
     settings: &Settings,
-) -> Result<(), Refusal> {
+) -> Result<(), Error> {
     let is_known = |name: &&String| own.contains(&name.as_str()) || spec.parameters.iter().any(|p| p.name == *name);
     match settings.keys().find(|name| !is_known(name)) {
         Some(name) => {
@@ -167,6 +163,6 @@ fn field(name: &str) -> String {
     format!("setting {name:?}")
 }
 
-fn unknown(name: &str, known: String) -> Refusal {
-    Refusal::Unknown { what: "setting", name: format!("{:?}", shorten(name)), known }
+fn unknown(name: &str, known: String) -> Error {
+    Error::Unknown { what: "setting", name: format!("{:?}", shorten(name)), known }
 }

@@ -1,6 +1,6 @@
 //! Actions and observations: uids, names, types and bounds.
 
-use super::{runner::Outcome, tensors};
+use super::{Error, runner::Outcome, tensors};
 use crate::{
     env::{ActionSpace, Channel, EnvironmentSpec},
     proto::dm_env_rpc::v1::{
@@ -8,7 +8,6 @@ use crate::{
         tensor::{BoolArray, FloatArray, Int32Array, Payload},
         tensor_spec::{Value, value},
     },
-    server::status::Refusal,
 };
 use std::collections::BTreeMap;
 
@@ -62,8 +61,8 @@ pub(super) fn of(spec: &EnvironmentSpec) -> ActionObservationSpecs {
 /// Checks that there are observations of these uids.
 ///
 /// # Errors
-/// [`Refusal::Unknown`].
-pub(super) fn check_requested(uids: &[u64]) -> Result<(), Refusal> {
+/// [`Error::Unknown`].
+pub(super) fn check_requested(uids: &[u64]) -> Result<(), Error> {
     match uids.iter().find(|uid| !(OBSERVATION..=DIVERGED).contains(uid)) {
         Some(uid) => Err(unknown("observation", *uid, format!("observations are {OBSERVATION} … {DIVERGED}"))),
         None => Ok(()),
@@ -74,13 +73,13 @@ pub(super) fn check_requested(uids: &[u64]) -> Result<(), Refusal> {
 ///
 /// # Errors
 /// If there is an unknown one, or none, or one that is not as its spec says.
-pub(super) fn actions(spec: &EnvironmentSpec, actions: &BTreeMap<u64, Tensor>) -> Result<Vec<u8>, Refusal> {
+pub(super) fn actions(spec: &EnvironmentSpec, actions: &BTreeMap<u64, Tensor>) -> Result<Vec<u8>, Error> {
     if let Some(uid) = actions.keys().find(|uid| **uid != ACTION) {
         return Err(unknown("action", *uid, format!("the only action is {ACTION}")));
     }
     let field = format!("action {ACTION}");
     let tensor = actions.get(&ACTION).ok_or_else(|| {
-        Refusal::value(field.clone(), "missing", "a tensor: every step while an episode runs takes an action")
+        Error::value(field.clone(), "missing", "a tensor: every step while an episode runs takes an action")
     })?;
     Ok(match spec.action {
         ActionSpace::Discrete(names) => {
@@ -143,6 +142,6 @@ fn bounds(channels: &[Channel]) -> (Option<Value>, Option<Value>) {
     (value(|c| c.low), value(|c| c.high))
 }
 
-fn unknown(what: &'static str, uid: u64, known: String) -> Refusal {
-    Refusal::Unknown { what, name: uid.to_string(), known }
+fn unknown(what: &'static str, uid: u64, known: String) -> Error {
+    Error::Unknown { what, name: uid.to_string(), known }
 }

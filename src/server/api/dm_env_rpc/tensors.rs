@@ -1,9 +1,7 @@
 //! What a tensor must be: type, shape, number of elements, bounds. Nothing is converted.
 
-use crate::{
-    proto::dm_env_rpc::v1::{DataType, Tensor, tensor::Payload},
-    server::status::Refusal,
-};
+use super::Error;
+use crate::proto::dm_env_rpc::v1::{DataType, Tensor, tensor::Payload};
 use std::fmt::Display;
 
 /// The most dimensions that a refusal repeats.
@@ -13,7 +11,7 @@ const SHOWN_DIMENSIONS: usize = 8;
 ///
 /// # Errors
 /// If it is something else.
-pub(super) fn text<'a>(field: &str, tensor: &'a Tensor) -> Result<&'a str, Refusal> {
+pub(super) fn text<'a>(field: &str, tensor: &'a Tensor) -> Result<&'a str, Error> {
     match (&tensor.payload, tensor.shape.as_slice()) {
         (Some(Payload::Strings(strings)), []) if strings.array.len() == 1 => Ok(&strings.array[0]),
         _ => Err(refuse(field, tensor, "a scalar: STRING, shape [], elements: 1")),
@@ -24,7 +22,7 @@ pub(super) fn text<'a>(field: &str, tensor: &'a Tensor) -> Result<&'a str, Refus
 ///
 /// # Errors
 /// If it is something else.
-pub(super) fn boolean(field: &str, tensor: &Tensor) -> Result<bool, Refusal> {
+pub(super) fn boolean(field: &str, tensor: &Tensor) -> Result<bool, Error> {
     match (&tensor.payload, tensor.shape.as_slice()) {
         (Some(Payload::Bools(bools)), []) if bools.array.len() == 1 => Ok(bools.array[0]),
         _ => Err(refuse(field, tensor, "a scalar: BOOL, shape [], elements: 1")),
@@ -35,11 +33,11 @@ pub(super) fn boolean(field: &str, tensor: &Tensor) -> Result<bool, Refusal> {
 ///
 /// # Errors
 /// If it is something else, or not finite.
-pub(super) fn number(field: &str, tensor: &Tensor) -> Result<f64, Refusal> {
+pub(super) fn number(field: &str, tensor: &Tensor) -> Result<f64, Error> {
     match (&tensor.payload, tensor.shape.as_slice()) {
         (Some(Payload::Doubles(doubles)), []) if doubles.array.len() == 1 => match doubles.array[0] {
             x if x.is_finite() => Ok(x),
-            x => Err(Refusal::value(field.to_owned(), x, "a finite number")),
+            x => Err(Error::value(field.to_owned(), x, "a finite number")),
         },
         _ => Err(refuse(field, tensor, "a scalar: DOUBLE, shape [], elements: 1")),
     }
@@ -49,7 +47,7 @@ pub(super) fn number(field: &str, tensor: &Tensor) -> Result<f64, Refusal> {
 ///
 /// # Errors
 /// If it is something else, or not in this range.
-pub(super) fn integer(field: &str, tensor: &Tensor, low: u64, high: u64) -> Result<u64, Refusal> {
+pub(super) fn integer(field: &str, tensor: &Tensor, low: u64, high: u64) -> Result<u64, Error> {
     let one = match (&tensor.payload, tensor.shape.as_slice()) {
         (Some(Payload::Int32s(i)), []) if i.array.len() == 1 => i128::from(i.array[0]),
         (Some(Payload::Int64s(i)), []) if i.array.len() == 1 => i128::from(i.array[0]),
@@ -58,19 +56,14 @@ pub(super) fn integer(field: &str, tensor: &Tensor, low: u64, high: u64) -> Resu
         _ => return Err(refuse(field, tensor, "a scalar: INT64, INT32, UINT64 or UINT32, shape [], elements: 1")),
     };
     let within = u64::try_from(one).ok().filter(|n| (low..=high).contains(n));
-    within.ok_or_else(|| Refusal::value(field.to_owned(), one, format!("an integer from {low} to {high}")))
+    within.ok_or_else(|| Error::value(field.to_owned(), one, format!("an integer from {low} to {high}")))
 }
 
 /// INT32 elements of exactly this shape, each within its bounds.
 ///
 /// # Errors
 /// If it is something else.
-pub(super) fn int32s(
-    field: &str,
-    tensor: &Tensor,
-    shape: &[usize],
-    bounds: &[(i32, i32)],
-) -> Result<Vec<i32>, Refusal> {
+pub(super) fn int32s(field: &str, tensor: &Tensor, shape: &[usize], bounds: &[(i32, i32)]) -> Result<Vec<i32>, Error> {
     match &tensor.payload {
         Some(Payload::Int32s(given)) => elements(field, tensor, &given.array, shape, DataType::Int32, bounds),
         _ => Err(refuse(field, tensor, &of(DataType::Int32, shape))),
@@ -81,12 +74,7 @@ pub(super) fn int32s(
 ///
 /// # Errors
 /// If it is something else.
-pub(super) fn floats(
-    field: &str,
-    tensor: &Tensor,
-    shape: &[usize],
-    bounds: &[(f32, f32)],
-) -> Result<Vec<f32>, Refusal> {
+pub(super) fn floats(field: &str, tensor: &Tensor, shape: &[usize], bounds: &[(f32, f32)]) -> Result<Vec<f32>, Error> {
     match &tensor.payload {
         Some(Payload::Floats(given)) => elements(field, tensor, &given.array, shape, DataType::Float, bounds),
         _ => Err(refuse(field, tensor, &of(DataType::Float, shape))),
@@ -102,7 +90,7 @@ fn elements<T: Copy + PartialOrd + Display>(
     shape: &[usize],
     dtype: DataType,
     bounds: &[(T, T)],
-) -> Result<Vec<T>, Refusal> {
+) -> Result<Vec<T>, Error> {
     let refuse = || refuse(field, tensor, &of(dtype, shape));
     let inferred = tensor.shape.iter().filter(|&&length| length < 0).count();
     let fits = |(&given, &wanted): (&i32, &usize)| given < 0 || usize::try_from(given).is_ok_and(|n| n == wanted);
@@ -118,18 +106,18 @@ fn elements<T: Copy + PartialOrd + Display>(
     match all.iter().zip(bounds).position(|(x, (low, high))| !(low..=high).contains(&x)) {
         Some(i) => {
             let (got, (low, high)) = (format!("{} in element {i}", all[i]), bounds[i]);
-            Err(Refusal::value(field.to_owned(), got, format!("a number within [{low}, {high}]")))
+            Err(Error::value(field.to_owned(), got, format!("a number within [{low}, {high}]")))
         }
         None => Ok(all),
     }
 }
 
-fn refuse(field: &str, tensor: &Tensor, expected: &str) -> Refusal {
+fn refuse(field: &str, tensor: &Tensor, expected: &str) -> Error {
     let got = match dtype_and_count(tensor) {
         Some((dtype, count)) => format!("{}, {}, elements: {count}", dtype.as_str_name(), shape_of(&tensor.shape)),
         None => "a tensor without a payload".into(),
     };
-    Refusal::value(field.to_owned(), got, expected)
+    Error::value(field.to_owned(), got, expected)
 }
 
 fn of(dtype: DataType, shape: &[usize]) -> String {

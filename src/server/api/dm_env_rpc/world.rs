@@ -1,12 +1,13 @@
 //! What requests of any stream may change about a world. The physics follows when the next episode begins.
 
 use super::{
+    Error,
     runner::{Changes, Runner},
     settings::Change,
 };
 use crate::{
     env::{Distribution, EnvironmentSpec, Version, resolve},
-    server::{audit::draws::Draws, status::Refusal},
+    server::audit::draws::Draws,
 };
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -63,7 +64,7 @@ impl World {
     ///
     /// # Errors
     /// If a parameter is out of its bounds, or the token may not draw from there; nothing is noted then.
-    pub(super) fn change(&self, change: Change) -> Result<(), Refusal> {
+    pub(super) fn change(&self, change: Change) -> Result<(), Error> {
         let mut wanted = self.lock();
         let version = change.version.unwrap_or(wanted.version);
         if change.version.is_some() || !change.parameters.is_empty() {

@@ -2,15 +2,14 @@
 //! cannot be guessed, unless they were asked for: whoever is told one may join, with the token that the world was made
 //! with.
 
-use super::{runner::Runner, settings::Ownership, world::World};
+use super::{Error, runner::Runner, settings::Ownership, world::World};
 use crate::{
     env::{Catalogue, shorten},
     pool::Pool,
     server::{
         audit::{draws::Draws, ledger::Ledger},
         auth::{Bearer, Held},
-        session::lease,
-        status::Refusal,
+        id,
     },
 };
 use std::{
@@ -31,9 +30,9 @@ impl Caller {
     /// So many environments of its token.
     ///
     /// # Errors
-    /// [`Refusal::TooManyOfAToken`].
-    pub(super) fn envs(&self, count: usize) -> Result<Option<Held>, Refusal> {
-        self.bearer.as_ref().map(|bearer| bearer.envs(count)).transpose()
+    /// If it has as many as it may have.
+    pub(super) fn envs(&self, count: usize) -> Result<Option<Held>, Error> {
+        Ok(self.bearer.as_ref().map(|bearer| bearer.envs(count)).transpose()?)
     }
 
     /// What it calls so.
@@ -104,10 +103,10 @@ impl Worlds {
     /// Whether there is no world of the name that is asked for.
     ///
     /// # Errors
-    /// [`Refusal::Taken`].
-    pub(super) fn is_free(&self, maker: &Caller, own: &Ownership) -> Result<(), Refusal> {
+    /// [`Error::Taken`].
+    pub(super) fn is_free(&self, maker: &Caller, own: &Ownership) -> Result<(), Error> {
         match own.name.as_ref().filter(|name| self.lock().worlds.contains_key(&maker.key(name))) {
-            Some(name) => Err(Refusal::Taken { world: name.clone() }),
+            Some(name) => Err(Error::Taken { world: name.clone() }),
             None => Ok(()),
         }
     }
@@ -115,21 +114,21 @@ impl Worlds {
     /// Takes a world that a stream has made, and what it holds of its token's. Returns its name.
     ///
     /// # Errors
-    /// [`Refusal::Taken`] if another has the name that was asked for, [`Refusal::NoRandomness`].
+    /// [`Error::Taken`] if another has the name that was asked for, [`Error::NoRandomness`].
     pub(super) fn add(
         &self,
         maker: &Caller,
         runner: Runner,
         own: Ownership,
         held: Option<Held>,
-    ) -> Result<String, Refusal> {
+    ) -> Result<String, Error> {
         let name = match own.name {
             Some(name) => name,
             None => random_name(runner.spec().name)?,
         };
         let (key, mut registry) = (maker.key(&name), self.lock());
         if registry.worlds.contains_key(&key) {
-            return Err(Refusal::Taken { world: name });
+            return Err(Error::Taken { world: name });
         }
         let world = Arc::new(World::new(name.clone(), &runner));
         let entry = Entry {
@@ -147,19 +146,19 @@ impl Worlds {
     /// The world of that name, for a stream that wants to change it.
     ///
     /// # Errors
-    /// [`Refusal::Unknown`], [`Refusal::NotYours`].
-    pub(super) fn of(&self, caller: &Caller, name: &str, request: &'static str) -> Result<Arc<World>, Refusal> {
+    /// [`Error::Unknown`], [`Error::NotYours`].
+    pub(super) fn of(&self, caller: &Caller, name: &str, request: &'static str) -> Result<Arc<World>, Error> {
         Ok(Arc::clone(&self.lock().of(caller, name, request)?.world))
     }
 
     /// Gives a world to a stream's agent.
     ///
     /// # Errors
-    /// [`Refusal::Unknown`], [`Refusal::Occupied`].
-    pub(super) fn join(&self, caller: &Caller, name: &str) -> Result<(Arc<World>, Runner), Refusal> {
+    /// [`Error::Unknown`], [`Error::Occupied`].
+    pub(super) fn join(&self, caller: &Caller, name: &str) -> Result<(Arc<World>, Runner), Error> {
         let mut registry = self.lock();
         let entry = registry.find(caller, name)?;
-        let occupied = || Refusal::Occupied { world: name.into(), request: "join_world" };
+        let occupied = || Error::Occupied { world: name.into(), request: "join_world" };
         let runner = entry.runner.take().ok_or_else(occupied)?;
         entry.agent = Some(caller.stream);
         Ok((Arc::clone(&entry.world), runner))
@@ -177,11 +176,11 @@ impl Worlds {
     /// Frees a world.
     ///
     /// # Errors
-    /// [`Refusal::Unknown`], [`Refusal::NotYours`], [`Refusal::Occupied`].
-    pub(super) fn destroy(&self, caller: &Caller, name: &str) -> Result<(), Refusal> {
+    /// [`Error::Unknown`], [`Error::NotYours`], [`Error::Occupied`].
+    pub(super) fn destroy(&self, caller: &Caller, name: &str) -> Result<(), Error> {
         let mut registry = self.lock();
         if registry.of(caller, name, "destroy_world")?.runner.is_none() {
-            return Err(Refusal::Occupied { world: name.into(), request: "destroy_world" });
+            return Err(Error::Occupied { world: name.into(), request: "destroy_world" });
         }
         registry.worlds.remove(&caller.key(name));
         Ok(())
@@ -208,14 +207,14 @@ impl Worlds {
 
 impl Registry {
     /// The world of that name, if the stream has made it, is its agent's, or may do as if.
-    fn of(&mut self, caller: &Caller, name: &str, request: &'static str) -> Result<&Entry, Refusal> {
+    fn of(&mut self, caller: &Caller, name: &str, request: &'static str) -> Result<&Entry, Error> {
         let entry = self.find(caller, name)?;
         let is_its = entry.shared || [entry.maker, entry.agent].contains(&Some(caller.stream));
-        if is_its { Ok(entry) } else { Err(Refusal::NotYours { world: name.into(), request }) }
+        if is_its { Ok(entry) } else { Err(Error::NotYours { world: name.into(), request }) }
     }
 
     /// The world of that name, if there is one for streams with this token.
-    fn find(&mut self, caller: &Caller, name: &str) -> Result<&mut Entry, Refusal> {
+    fn find(&mut self, caller: &Caller, name: &str) -> Result<&mut Entry, Error> {
         self.worlds.get_mut(&caller.key(name)).ok_or_else(|| unknown(name))
     }
 
@@ -226,12 +225,12 @@ impl Registry {
 }
 
 /// One that nobody guesses.
-fn random_name(environment: &str) -> Result<String, Refusal> {
-    Ok(format!("{environment}-{:032x}", u128::from_ne_bytes(lease::random()?)))
+fn random_name(environment: &str) -> Result<String, Error> {
+    Ok(format!("{environment}-{:032x}", u128::from_ne_bytes(id::random()?)))
 }
 
-fn unknown(name: &str) -> Refusal {
+fn unknown(name: &str) -> Error {
     let known = "send the name that create_world returned; a world goes when it has neither an agent nor the stream \
                  that made it";
-    Refusal::Unknown { what: "world", name: format!("{:?}", shorten(name)), known: known.into() }
+    Error::Unknown { what: "world", name: format!("{:?}", shorten(name)), known: known.into() }
 }

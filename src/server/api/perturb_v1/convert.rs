@@ -1,5 +1,6 @@
 //! Between the protocol and the domain. All validation of what clients send is here: what leaves this file is legal.
 
+use super::Error;
 use crate::{
     env::{
         self, Achievement, ActionSpace, Catalogue, Channel, Comparison, Distribution, EnvironmentSpec, EpisodeEnd,
@@ -8,14 +9,13 @@ use crate::{
     pool::{Autoreset, Batch, BatchSettings, ResetEntry, SlotGroup, Stepped},
     proto,
     render::Size,
-    server::status::Refusal,
 };
 use bytes::Bytes;
 use perturb_protocol::limits::{PICTURE_PIXELS, USUAL_PICTURE_PIXELS};
 use std::{collections::HashMap, sync::Arc};
 
 /// Checks an `open` of at most `most` environments.
-pub fn open(catalogue: &Catalogue, most: usize, request: proto::Open) -> Result<BatchSettings, Refusal> {
+pub fn open(catalogue: &Catalogue, most: usize, request: proto::Open) -> Result<BatchSettings, Error> {
     let spec = catalogue.find(&request.environment)?;
     let autoreset = match request.autoreset_mode() {
         proto::AutoresetMode::NextStep => Autoreset::NextStep,
@@ -23,7 +23,7 @@ pub fn open(catalogue: &Catalogue, most: usize, request: proto::Open) -> Result<
         proto::AutoresetMode::Disabled => Autoreset::Disabled,
         proto::AutoresetMode::Unspecified => {
             let expected = "AUTORESET_MODE_NEXT_STEP (1), _SAME_STEP (2) or _DISABLED (3)";
-            return Err(Refusal::value("open.autoreset_mode", request.autoreset_mode, expected));
+            return Err(Error::value("open.autoreset_mode", request.autoreset_mode, expected));
         }
     };
     let proto::Open { receipts, receipt_arrays, reward_terms, observe_parameters, .. } = request;
@@ -34,7 +34,7 @@ pub fn open(catalogue: &Catalogue, most: usize, request: proto::Open) -> Result<
         // Before anything is made of them: each has one environment at least.
         if request.groups.len() > most {
             let got = format!("{} groups", request.groups.len());
-            return Err(Refusal::value("open.groups", got, format!("at most {most}, as this server has environments")));
+            return Err(Error::value("open.groups", got, format!("at most {most}, as this server has environments")));
         }
         let numbered = request.groups.into_iter().enumerate();
         let named = |i, slots| group(spec, &format!("open.groups[{i}]"), &format!("open.groups[{i}].size"), slots);
@@ -51,7 +51,7 @@ fn single(request: proto::Open) -> proto::SlotGroup {
 }
 
 /// Refuses groups beside what they are in place of.
-fn check_no_single(request: &proto::Open) -> Result<(), Refusal> {
+fn check_no_single(request: &proto::Open) -> Result<(), Error> {
     let given = [
         ("open.version", request.version != 0),
         ("open.parameters", !request.parameters.is_empty()),
@@ -61,7 +61,7 @@ fn check_no_single(request: &proto::Open) -> Result<(), Refusal> {
         ("open.episodes_per_trial", request.episodes_per_trial != 0),
     ];
     match given.into_iter().find(|(_, given)| *given) {
-        Some((field, _)) => Err(Refusal::value(field, "given beside open.groups", "it in each group alone")),
+        Some((field, _)) => Err(Error::value(field, "given beside open.groups", "it in each group alone")),
         None => Ok(()),
     }
 }
@@ -72,19 +72,19 @@ fn group(
     path: &str,
     size_field: &str,
     group: proto::SlotGroup,
-) -> Result<SlotGroup, Refusal> {
+) -> Result<SlotGroup, Error> {
     let version = Version::from_proto(group.version()).ok_or_else(|| {
         let expected = "VERSION_DEFAULT (1), VERSION_RANDOM (2), VERSION_EXTREME (3) or VERSION_RANDOM_OR_EXTREME (4)";
-        Refusal::value(format!("{path}.version"), group.version, expected)
+        Error::value(format!("{path}.version"), group.version, expected)
     })?;
     if group.size == 0 {
-        return Err(Refusal::value(size_field.to_owned(), 0, "at least 1"));
+        return Err(Error::value(size_field.to_owned(), 0, "at least 1"));
     }
     let first = group.first_environment_index;
     if first.checked_add(group.size - 1).is_none() {
         let (field, got) =
             (format!("{path}.first_environment_index"), format!("{first} for a batch of {}", group.size));
-        return Err(Refusal::value(field, got, "the last environment's index below 2^32"));
+        return Err(Error::value(field, got, "the last environment's index below 2^32"));
     }
     let mut distributions = spec.distributions(version);
     override_parameters(spec, &mut distributions, &group.parameters)?;
@@ -102,7 +102,7 @@ fn override_parameters(
     spec: &'static EnvironmentSpec,
     base: &mut [Distribution],
     parameters: &HashMap<String, proto::Distribution>,
-) -> Result<(), Refusal> {
+) -> Result<(), Error> {
     // In order of names, so that the same request always gets the same refusal.
     let mut parameters: Vec<_> = parameters.iter().collect();
     parameters.sort_by_key(|(name, _)| *name);
@@ -114,7 +114,7 @@ fn override_parameters(
 }
 
 /// Checks a step's actions for a batch of `size` environments.
-pub fn actions(spec: &EnvironmentSpec, size: usize, actions: &Bytes) -> Result<(), Refusal> {
+pub fn actions(spec: &EnvironmentSpec, size: usize, actions: &Bytes) -> Result<(), Error> {
     const FIELD: &str = "step.actions";
     let (element, width) = match spec.action {
         ActionSpace::Discrete(_) => ("int32 [N]", 1),
@@ -122,7 +122,7 @@ pub fn actions(spec: &EnvironmentSpec, size: usize, actions: &Bytes) -> Result<(
     };
     if actions.len() != 4 * width * size {
         let expected = format!("{} bytes: {element} with N = {size}, A = {width}", 4 * width * size);
-        return Err(Refusal::value(FIELD, format!("{} bytes", actions.len()), expected));
+        return Err(Error::value(FIELD, format!("{} bytes", actions.len()), expected));
     }
     let words = actions.as_chunks::<4>().0;
     match spec.action {
@@ -130,13 +130,13 @@ pub fn actions(spec: &EnvironmentSpec, size: usize, actions: &Bytes) -> Result<(
             let legal = |word: &[u8; 4]| (0..names.len() as i32).contains(&i32::from_le_bytes(*word));
             if let Some(slot) = words.iter().position(|word| !legal(word)) {
                 let got = format!("{} in slot {slot}", i32::from_le_bytes(words[slot]));
-                return Err(Refusal::value(FIELD, got, format!("a choice in 0 … {}", names.len() - 1)));
+                return Err(Error::value(FIELD, got, format!("a choice in 0 … {}", names.len() - 1)));
             }
         }
         ActionSpace::Continuous(_) => {
             if let Some(i) = words.iter().position(|word| !f32::from_le_bytes(*word).is_finite()) {
                 let got = format!("{} in slot {}, entry {}", f32::from_le_bytes(words[i]), i / width, i % width);
-                return Err(Refusal::value(FIELD, got, "finite numbers"));
+                return Err(Error::value(FIELD, got, "finite numbers"));
             }
         }
     }
@@ -144,27 +144,27 @@ pub fn actions(spec: &EnvironmentSpec, size: usize, actions: &Bytes) -> Result<(
 }
 
 /// The slots that a mask selects.
-pub fn mask(field: &'static str, size: usize, mask: &[u8]) -> Result<Vec<usize>, Refusal> {
+pub fn mask(field: &'static str, size: usize, mask: &[u8]) -> Result<Vec<usize>, Error> {
     if mask.is_empty() {
         return Ok((0..size).collect());
     }
     if mask.len() != size {
         let expected = format!("one byte for each of the {size} environments, or none for all");
-        return Err(Refusal::value(field, format!("{} bytes", mask.len()), expected));
+        return Err(Error::value(field, format!("{} bytes", mask.len()), expected));
     }
     if let Some(slot) = mask.iter().position(|&byte| byte > 1) {
-        return Err(Refusal::value(field, format!("{} in slot {slot}", mask[slot]), "0 or 1"));
+        return Err(Error::value(field, format!("{} in slot {slot}", mask[slot]), "0 or 1"));
     }
     Ok((0..size).filter(|&slot| mask[slot] == 1).collect())
 }
 
 /// Checks a `reset` of a batch.
-pub fn reset(batch: &Batch, request: proto::Reset) -> Result<Vec<ResetEntry>, Refusal> {
+pub fn reset(batch: &Batch, request: proto::Reset) -> Result<Vec<ResetEntry>, Error> {
     let spec = batch.settings().spec;
     let slots = mask("reset.mask", batch.size(), &request.mask)?;
     if !request.seeds.is_empty() && request.seeds.len() != slots.len() {
         let expected = format!("one for each of the {} selected environments, or none", slots.len());
-        return Err(Refusal::value("reset.seeds", format!("{} seeds", request.seeds.len()), expected));
+        return Err(Error::value("reset.seeds", format!("{} seeds", request.seeds.len()), expected));
     }
     let mut states = states(spec, &request.states, slots.len())?.into_iter();
     // Neighbours mostly share their distributions, which are then overridden once.
@@ -186,7 +186,7 @@ pub fn reset(batch: &Batch, request: proto::Reset) -> Result<Vec<ResetEntry>, Re
     Ok(entries)
 }
 
-fn states(spec: &EnvironmentSpec, bytes: &Bytes, selected: usize) -> Result<Vec<Vec<f64>>, Refusal> {
+fn states(spec: &EnvironmentSpec, bytes: &Bytes, selected: usize) -> Result<Vec<Vec<f64>>, Error> {
     const FIELD: &str = "reset.states";
     if bytes.is_empty() {
         return Ok(Vec::new());
@@ -194,47 +194,47 @@ fn states(spec: &EnvironmentSpec, bytes: &Bytes, selected: usize) -> Result<Vec<
     let n = spec.state.len();
     if bytes.len() != 8 * n * selected {
         let expected = format!("{} bytes: float64 [M, S] with M = {selected}, S = {n}", 8 * n * selected);
-        return Err(Refusal::value(FIELD, format!("{} bytes", bytes.len()), expected));
+        return Err(Error::value(FIELD, format!("{} bytes", bytes.len()), expected));
     }
     let numbers: Vec<f64> = bytes.as_chunks::<8>().0.iter().map(|word| f64::from_le_bytes(*word)).collect();
     for (i, &x) in numbers.iter().enumerate() {
         let Channel { name, unit, low, high } = spec.state[i % n];
         if !x.is_finite() || x < low || x > high {
             let got = format!("{x} {unit} for {name} in row {}", i / n);
-            return Err(Refusal::value(FIELD, got, format!("a finite number within [{low}, {high}]")));
+            return Err(Error::value(FIELD, got, format!("a finite number within [{low}, {high}]")));
         }
     }
     Ok(numbers.chunks_exact(n).map(<[f64]>::to_vec).collect())
 }
 
 /// The slots that a `release` frees.
-pub fn release(size: usize, request: &proto::Release) -> Result<Vec<usize>, Refusal> {
+pub fn release(size: usize, request: &proto::Release) -> Result<Vec<usize>, Error> {
     const FIELD: &str = "release.mask";
     let slots = mask(FIELD, size, &request.mask)?;
     let expected = "at least one environment that goes and one that stays; end the stream to free all";
     match slots.len() {
-        0 => Err(Refusal::value(FIELD, "without a selected environment", expected)),
-        all if all == size => Err(Refusal::value(FIELD, format!("all of the {size} environments"), expected)),
+        0 => Err(Error::value(FIELD, "without a selected environment", expected)),
+        all if all == size => Err(Error::value(FIELD, format!("all of the {size} environments"), expected)),
         _ => Ok(slots),
     }
 }
 
 /// Pairs a restore's snapshots with their slots.
-pub fn restore(size: usize, request: proto::Restore) -> Result<Vec<(usize, Bytes)>, Refusal> {
+pub fn restore(size: usize, request: proto::Restore) -> Result<Vec<(usize, Bytes)>, Error> {
     let slots = mask("restore.mask", size, &request.mask)?;
     if request.snapshots.len() != slots.len() {
         let got = format!("{} snapshots", request.snapshots.len());
         let expected = format!("one for each of the {} selected environments", slots.len());
-        return Err(Refusal::value("restore.snapshots", got, expected));
+        return Err(Error::value("restore.snapshots", got, expected));
     }
     Ok(slots.into_iter().zip(request.snapshots).collect())
 }
 
 /// The slot of a batch of `n` that a `render` asks for, and the picture's size.
-pub fn render(n: usize, request: proto::Render) -> Result<(usize, Size), Refusal> {
+pub fn render(n: usize, request: proto::Render) -> Result<(usize, Size), Error> {
     let slot = request.slot as usize;
     if slot >= n {
-        return Err(Refusal::value("render.slot", request.slot, format!("a slot of the batch, 0 … {}", n - 1)));
+        return Err(Error::value("render.slot", request.slot, format!("a slot of the batch, 0 … {}", n - 1)));
     }
     let pixels = |field, value| match u16::try_from(value) {
         Ok(0) => Ok(USUAL_PICTURE_PIXELS),
@@ -242,7 +242,7 @@ pub fn render(n: usize, request: proto::Render) -> Result<(usize, Size), Refusal
         _ => {
             let (least, most) = (PICTURE_PIXELS.start(), PICTURE_PIXELS.end());
             let expected = format!("{least} … {most} pixels, or 0 for {USUAL_PICTURE_PIXELS}");
-            Err(Refusal::value(field, value, expected))
+            Err(Error::value(field, value, expected))
         }
     };
     let (width, height) = (pixels("render.width", request.width)?, pixels("render.height", request.height)?);

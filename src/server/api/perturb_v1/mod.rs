@@ -6,7 +6,11 @@
 //! - [`sizes`]: how many bytes requests and replies have.
 
 pub mod convert;
+mod error;
+pub mod fields;
 pub mod policy;
 pub mod service;
 pub mod session;
 pub mod sizes;
+
+pub use error::Error;

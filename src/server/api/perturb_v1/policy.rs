@@ -1,11 +1,10 @@
 //! Policies and what they played, between the protocol and the domain, with all validation.
 
-use super::convert;
+use super::{Error, convert};
 use crate::{
     env::ActionSpace,
     pool::{Autoreset, Batch, EndedAt, Play, Played, Policy, PolicyRole, Turn},
     proto,
-    server::status::Refusal,
 };
 use bytes::Bytes;
 use perturb_policy::{ActionKind, Inputs, Normalisers, ObservationNormaliser, PlayerState, PolicySpec, Task};
@@ -37,9 +36,9 @@ struct Sizes {
 
 /// Checks an `act` against the batch and the policy at play, of a client whose environments may take so many steps a
 /// second, if that is bounded.
-pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<Turn, Refusal> {
+pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<Turn, Error> {
     let (settings, n_envs) = (batch.settings(), batch.size());
-    let order = |when: &'static str, advice| Refusal::Order { request: "act", when: when.into(), advice };
+    let order = |when: &'static str, advice| Error::Order { request: "act", when: when.into(), advice };
     if settings.autoreset != Autoreset::SameStep {
         let advice = "open one with AUTORESET_MODE_SAME_STEP (2)";
         return Err(order("in a session of another autoreset mode than same-step", advice));
@@ -88,7 +87,7 @@ pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<Tur
     let computed = spec.map_or(0.0, |spec| spec.n_weights() as f64 / WEIGHTS_A_MICROSECOND);
     if computed * n_envs as f64 > MOST_COST {
         let got = format!("with {} weights in {n_envs} environments", spec.map_or(0, PolicySpec::n_weights));
-        return Err(Refusal::value("act.policy", got, "fewer, so that a step takes less than about a second"));
+        return Err(Error::value("act.policy", got, "fewer, so that a step takes less than about a second"));
     }
     let affordable = (MOST_COST / ((settings.spec.step_cost + computed) * n_envs as f64)).max(1.0) as usize;
     // Of a second, so that none waits long for the next.
@@ -98,18 +97,18 @@ pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<Tur
     Ok(Turn { policy, weights: given_weights, task, most_steps, only_ended })
 }
 
-fn task(task: Option<proto::act::Task>, n_envs: usize) -> Result<Option<Task>, Refusal> {
+fn task(task: Option<proto::act::Task>, n_envs: usize) -> Result<Option<Task>, Error> {
     use proto::act::Task::{Episodes, Steps};
     match task {
         None => Ok(None),
-        Some(Steps(0)) => Err(Refusal::value("act.steps", 0, "at least 1")),
-        Some(Episodes(0)) => Err(Refusal::value("act.episodes", 0, "at least 1")),
+        Some(Steps(0)) => Err(Error::value("act.steps", 0, "at least 1")),
+        Some(Episodes(0)) => Err(Error::value("act.episodes", 0, "at least 1")),
         Some(Steps(count)) => Ok(Some(Task::steps(count as usize))),
         Some(Episodes(count)) => Ok(Some(Task::episodes(count as usize, n_envs))),
     }
 }
 
-fn policy(policy: proto::Policy, given: &Bytes, sizes: Sizes, episodes_per_trial: u32) -> Result<Policy, Refusal> {
+fn policy(policy: proto::Policy, given: &Bytes, sizes: Sizes, episodes_per_trial: u32) -> Result<Policy, Error> {
     let inputs = Inputs::new(sizes.observation, sizes.action, sizes.envs, policy.outcomes);
     let spec = spec(&policy, inputs.size(), sizes)?;
     let weights = weights(given, &spec)?;
@@ -119,14 +118,14 @@ fn policy(policy: proto::Policy, given: &Bytes, sizes: Sizes, episodes_per_trial
         rewards: read("act.policy.rewards", &policy.rewards)?,
     };
     normalisers.check(sizes.envs, sizes.observation, sizes.parameters).map_err(|error| {
-        Refusal::value("act.policy", format!("with statistics that do not fit: {error}"), "those of this session")
+        Error::value("act.policy", format!("with statistics that do not fit: {error}"), "those of this session")
     })?;
     let role = match policy.role {
         Some(proto::policy::Role::Training(stream)) => {
             PolicyRole::Training((&stream).try_into().map_err(within("act.policy.training"))?)
         }
         Some(proto::policy::Role::Testing(proto::TestStreams { seed })) => PolicyRole::Testing { seed },
-        None => return Err(Refusal::value("act.policy.role", "missing", "training or testing")),
+        None => return Err(Error::value("act.policy.role", "missing", "training or testing")),
     };
     let state = match (policy.state, &role) {
         (None, _) => None,
@@ -134,42 +133,38 @@ fn policy(policy: proto::Policy, given: &Bytes, sizes: Sizes, episodes_per_trial
             Some(state(&given, sizes, inputs.size() - sizes.observation, spec.memory_size(), stream.clone())?)
         }
         (Some(_), PolicyRole::Testing { .. }) => {
-            return Err(Refusal::value("act.policy.state", "given in testing", "none: each trial begins anew"));
+            return Err(Error::value("act.policy.state", "given in testing", "none: each trial begins anew"));
         }
     };
     Ok(Policy { spec, inputs, normalisers, role, state, weights, episodes_per_trial })
 }
 
 /// The shape of a policy whose inputs have `input_size` numbers.
-fn spec(policy: &proto::Policy, input_size: usize, sizes: Sizes) -> Result<PolicySpec, Refusal> {
+fn spec(policy: &proto::Policy, input_size: usize, sizes: Sizes) -> Result<PolicySpec, Error> {
     const FIELD: &str = "act.policy.hidden";
     if policy.hidden.len() > MOST_LAYERS {
         let got = format!("{} layers", policy.hidden.len());
-        return Err(Refusal::value(FIELD, got, format!("at most {MOST_LAYERS}")));
+        return Err(Error::value(FIELD, got, format!("at most {MOST_LAYERS}")));
     }
     let widths = 1..=GREATEST_WIDTH;
     if let Some(width) = policy.hidden.iter().find(|width| !widths.contains(width)) {
-        return Err(Refusal::value(
-            FIELD,
-            format!("with a width of {width}"),
-            format!("widths of 1 … {GREATEST_WIDTH}"),
-        ));
+        return Err(Error::value(FIELD, format!("with a width of {width}"), format!("widths of 1 … {GREATEST_WIDTH}")));
     }
     if policy.lstm > GREATEST_WIDTH {
         let expected = format!("a width of 1 … {GREATEST_WIDTH}, or 0 for a feed-forward policy");
-        return Err(Refusal::value("act.policy.lstm", policy.lstm, expected));
+        return Err(Error::value("act.policy.lstm", policy.lstm, expected));
     }
     let hidden: Vec<usize> = policy.hidden.iter().map(|&width| width as usize).collect();
     let lstm = (policy.lstm > 0).then_some(policy.lstm as usize);
     let width = hidden.iter().sum::<usize>() + lstm.unwrap_or(0);
     if width * sizes.envs > MOST_NUMBERS {
         let got = format!("of widths whose sum is {width}, in {} environments", sizes.envs);
-        return Err(Refusal::value("act.policy", got, format!("a product of at most {MOST_NUMBERS}")));
+        return Err(Error::value("act.policy", got, format!("a product of at most {MOST_NUMBERS}")));
     }
     Ok(PolicySpec { observation_size: input_size, action: sizes.action, hidden, lstm })
 }
 
-fn weights(given: &Bytes, spec: &PolicySpec) -> Result<Vec<f32>, Refusal> {
+fn weights(given: &Bytes, spec: &PolicySpec) -> Result<Vec<f32>, Error> {
     has_floats("act.weights", given, spec.n_weights(), "float32 [P]")?;
     read_floats("weights", given).map_err(within("act"))
 }
@@ -178,15 +173,15 @@ fn weights(given: &Bytes, spec: &PolicySpec) -> Result<Vec<f32>, Refusal> {
 fn read<'a, M, T: TryFrom<&'a M, Error = Unreadable>>(
     field: &'static str,
     given: &'a Option<M>,
-) -> Result<Option<T>, Refusal> {
+) -> Result<Option<T>, Error> {
     given.as_ref().map(T::try_from).transpose().map_err(within(field))
 }
 
 /// Names the message that a field is of.
-fn within(message: &'static str) -> impl Fn(Unreadable) -> Refusal {
+fn within(message: &'static str) -> impl Fn(Unreadable) -> Error {
     move |wrong| {
         let Unreadable { field, got, expected } = wrong.within(message);
-        Refusal::value(field, got, expected)
+        Error::value(field, got, expected)
     }
 }
 
@@ -196,11 +191,11 @@ fn state(
     extra: usize,
     memory_size: usize,
     actions: ChaCha8Rng,
-) -> Result<PlayerState, Refusal> {
+) -> Result<PlayerState, Error> {
     let n = sizes.envs;
     if given.starts.len() != n {
         let got = format!("{} bytes", given.starts.len());
-        return Err(Refusal::value("act.policy.state.starts", got, format!("{n} bytes: uint8 [N] with N = {n}")));
+        return Err(Error::value("act.policy.state.starts", got, format!("{n} bytes: uint8 [N] with N = {n}")));
     }
     let has = |field, bytes, size, shape| has_floats(field, bytes, n * size, shape);
     has("act.policy.state.observations", &given.observations, sizes.observation, "float32 [N, O]")?;
@@ -210,10 +205,10 @@ fn state(
 }
 
 /// Whether there are bytes for exactly `count` numbers.
-fn has_floats(field: &'static str, bytes: &Bytes, count: usize, shape: &str) -> Result<(), Refusal> {
+fn has_floats(field: &'static str, bytes: &Bytes, count: usize, shape: &str) -> Result<(), Error> {
     let expected = || format!("{} bytes: {shape}, {count} numbers", 4 * count);
     let got = || format!("{} bytes", bytes.len());
-    if bytes.len() == 4 * count { Ok(()) } else { Err(Refusal::value(field, got(), expected())) }
+    if bytes.len() == 4 * count { Ok(()) } else { Err(Error::value(field, got(), expected())) }
 }
 
 /// What was played.
@@ -241,8 +236,8 @@ fn ended_at(EndedAt { step, slot, end, terminated, truncated }: EndedAt) -> prot
 }
 
 /// What stands beside the weights of the policy that plays.
-pub fn saved(batch: &Batch) -> Result<proto::PlayerSaved, Refusal> {
-    let order = |when: &'static str, advice| Err(Refusal::Order { request: "save_player", when: when.into(), advice });
+pub fn saved(batch: &Batch) -> Result<proto::PlayerSaved, Error> {
+    let order = |when: &'static str, advice| Err(Error::Order { request: "save_player", when: when.into(), advice });
     let Some(play) = batch.play() else {
         return order("while no policy plays", "send act with a policy first; step, reset, restore and release end it");
     };

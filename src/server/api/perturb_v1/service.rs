@@ -8,11 +8,14 @@ use crate::{
             driver::{Responses, Sessions},
             instrumented::{Counted, Counts},
         },
-        transport::message_reader::Frames,
+        transport::raw_body,
     },
 };
 use std::sync::Arc;
 use tonic::{Request, Response, Status, Streaming};
+
+/// The path of calls that are sessions.
+pub const ENDPOINT: &str = "/perturb.v1.Perturb/Session";
 
 /// Serves the catalogue and sessions.
 #[derive(Clone)]
@@ -49,7 +52,7 @@ impl Perturb for Service {
         &self,
         mut request: Request<Streaming<proto::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        let frames = Frames::of(&mut request)?;
+        let frames = raw_body::messages(&mut request)?;
         let (budget, outbox) = (frames.budget().clone(), frames.outbox.clone());
         let session = Session::new(Arc::clone(&self.shared), frames.bearer.clone(), budget, outbox);
         Ok(Response::new(self.sessions.begin(frames, Counted::new(session, &self.counts))?))

@@ -1,6 +1,6 @@
 //! One session: the legal order of its requests, each answered once.
 
-use super::{convert, policy, sizes};
+use super::{Error, convert, fields::SESSION_REQUEST, policy, sizes};
 use crate::{
     env::Catalogue,
     pool::{Batch, Follower, Pool},
@@ -9,17 +9,16 @@ use crate::{
     server::{
         audit::{draws::Draws, ledger::Ledger},
         auth::{Bearer, Held},
+        limits::{Allowance, MOST_BYTES_BEFORE_OPEN},
         net::access_log::About,
         session::{
-            driver::{Dialogue, MOST_BYTES_BEFORE_OPEN, Turn},
+            handler::{Dialogue, Turn},
             instrumented::Observed,
             lease::{Leases, MOST_KEPT},
         },
-        status::Refusal,
         transport::{
             budget::{Budget, Outbox, Share},
-            message_reader::Allowance,
-            precheck::{self, Field},
+            precheck::Field,
         },
     },
 };
@@ -71,13 +70,13 @@ impl Session {
         Self { shared, batch: None, bearer, held: None, draws, budget, outbox, kept: None, playing: None, turn: None }
     }
 
-    async fn open(&mut self, request: proto::Open) -> Result<proto::Opened, Refusal> {
+    async fn open(&mut self, request: proto::Open) -> Result<proto::Opened, Error> {
         if self.batch.is_some() {
-            return Err(Refusal::AlreadyOpen);
+            return Err(Error::AlreadyOpen);
         }
         let (autoreset_mode, unanswered) = (request.autoreset_mode, request.lease);
         if unanswered > MOST_KEPT {
-            return Err(Refusal::value(
+            return Err(Error::value(
                 "open.lease",
                 unanswered,
                 format!("requests that wait at a time, 0 … {MOST_KEPT}"),
@@ -119,7 +118,7 @@ impl Session {
         })
     }
 
-    async fn step(&mut self, request: proto::Step) -> Result<proto::Stepped, Refusal> {
+    async fn step(&mut self, request: proto::Step) -> Result<proto::Stepped, Error> {
         let batch = self.opened("step")?;
         convert::actions(batch.settings().spec, batch.size(), &request.actions)?;
         let stepped = batch.step(&request.actions).await?;
@@ -127,8 +126,8 @@ impl Session {
         Ok(convert::stepped(stepped))
     }
 
-    async fn reset(&mut self, request: proto::Reset) -> Result<proto::ResetDone, Refusal> {
-        let batch = self.batch.as_mut().ok_or(Refusal::NotOpen { request: "reset" })?;
+    async fn reset(&mut self, request: proto::Reset) -> Result<proto::ResetDone, Error> {
+        let batch = self.batch.as_mut().ok_or(Error::NotOpen { request: "reset" })?;
         let entries = convert::reset(batch, request)?;
         self.draws.reset(batch, &entries).await?;
         let (observations, started) = batch.reset(entries).await?;
@@ -136,7 +135,7 @@ impl Session {
         Ok(proto::ResetDone { observations, started: convert::started(started) })
     }
 
-    async fn snapshot(&mut self, request: proto::Snapshot) -> Result<proto::Snapshotted, Refusal> {
+    async fn snapshot(&mut self, request: proto::Snapshot) -> Result<proto::Snapshotted, Error> {
         let batch = self.opened("snapshot")?;
         let slots = convert::mask("snapshot.mask", batch.size(), &request.mask)?;
         let mut share = self.budget.take(sizes::snapshots(slots.len()))?;
@@ -147,8 +146,8 @@ impl Session {
         Ok(proto::Snapshotted { snapshots })
     }
 
-    async fn restore(&mut self, request: proto::Restore) -> Result<proto::Restored, Refusal> {
-        let batch = self.batch.as_mut().ok_or(Refusal::NotOpen { request: "restore" })?;
+    async fn restore(&mut self, request: proto::Restore) -> Result<proto::Restored, Error> {
+        let batch = self.batch.as_mut().ok_or(Error::NotOpen { request: "restore" })?;
         let entries = convert::restore(batch.size(), request)?;
         let begun = self.draws.restore(batch, &entries).await?;
         let slots: Vec<usize> = entries.iter().map(|(slot, _)| *slot).collect();
@@ -163,18 +162,18 @@ impl Session {
         Ok(proto::Restored { observations })
     }
 
-    async fn render(&mut self, request: proto::Render) -> Result<proto::Rendered, Refusal> {
+    async fn render(&mut self, request: proto::Render) -> Result<proto::Rendered, Error> {
         let batch = self.opened("render")?;
         let (slot, size) = convert::render(batch.size(), request)?;
-        let scene = batch.scene(slot)?.ok_or(Refusal::NothingToDraw { slot })?;
+        let scene = batch.scene(slot)?.ok_or(Error::NothingToDraw { slot })?;
         let share = self.budget.take(sizes::picture(size))?;
         let pixels = self.shared.renderer.draw(scene, size).await?;
         self.outbox.put(share);
         Ok(proto::Rendered { pixels, width: size.width.into(), height: size.height.into() })
     }
 
-    async fn release(&mut self, request: proto::Release) -> Result<proto::Released, Refusal> {
-        let batch = self.batch.as_mut().ok_or(Refusal::NotOpen { request: "release" })?;
+    async fn release(&mut self, request: proto::Release) -> Result<proto::Released, Error> {
+        let batch = self.batch.as_mut().ok_or(Error::NotOpen { request: "release" })?;
         let slots = convert::release(batch.size(), &request)?;
         self.draws.release(batch, &slots);
         batch.release(&slots).await?;
@@ -184,8 +183,8 @@ impl Session {
         Ok(proto::Released {})
     }
 
-    async fn act(&mut self, request: proto::Act) -> Result<proto::Acted, Refusal> {
-        let batch = self.batch.as_mut().ok_or(Refusal::NotOpen { request: "act" })?;
+    async fn act(&mut self, request: proto::Act) -> Result<proto::Acted, Error> {
+        let batch = self.batch.as_mut().ok_or(Error::NotOpen { request: "act" })?;
         let policy = sizes::policy(&request, batch.size());
         let policy = (policy > 0).then(|| self.budget.take(policy)).transpose()?;
         let turn = policy::turn(batch, self.bearer.as_ref().and_then(|bearer| bearer.rate()), request)?;
@@ -196,13 +195,13 @@ impl Session {
         Ok(acted)
     }
 
-    fn save_player(&mut self) -> Result<proto::PlayerSaved, Refusal> {
+    fn save_player(&mut self) -> Result<proto::PlayerSaved, Error> {
         policy::saved(self.opened("save_player")?)
     }
 
-    async fn resume(&mut self, request: proto::Resume) -> Result<proto::Resumed, Refusal> {
+    async fn resume(&mut self, request: proto::Resume) -> Result<proto::Resumed, Error> {
         if self.batch.is_some() {
-            return Err(Refusal::Order {
+            return Err(Error::Order {
                 request: "resume",
                 when: "on a session that is open".into(),
                 advice: "send it on a stream of its own",
@@ -215,15 +214,16 @@ impl Session {
         Ok(proto::Resumed { last_reply })
     }
 
-    fn opened(&mut self, request: &'static str) -> Result<&mut Batch, Refusal> {
-        self.batch.as_mut().ok_or(Refusal::NotOpen { request })
+    fn opened(&mut self, request: &'static str) -> Result<&mut Batch, Error> {
+        self.batch.as_mut().ok_or(Error::NotOpen { request })
     }
 }
 
 impl Dialogue for Session {
     type Request = proto::SessionRequest;
     type Response = proto::SessionResponse;
-    const FIELDS: &'static [Field] = precheck::SESSION_REQUEST;
+    type Error = Error;
+    const FIELDS: &'static [Field] = SESSION_REQUEST;
     const TAKES_UP: bool = true;
     const PROTOCOL: &'static str = "perturb.v1";
 
@@ -253,7 +253,7 @@ impl Dialogue for Session {
         })
     }
 
-    async fn answer(&mut self, request: Self::Request) -> Result<Self::Response, Refusal> {
+    async fn answer(&mut self, request: Self::Request) -> Result<Self::Response, Error> {
         let response = match request.request {
             Some(Request::Open(open)) => self.open(open).await.map(Response::Opened),
             Some(Request::Step(step)) => self.step(step).await.map(Response::Stepped),
@@ -265,7 +265,7 @@ impl Dialogue for Session {
             Some(Request::Act(act)) => self.act(act).await.map(Response::Act),
             Some(Request::SavePlayer(_)) => self.save_player().map(Response::SavePlayer),
             Some(Request::Resume(resume)) => self.resume(resume).await.map(Response::Resumed),
-            None => Err(Refusal::value("request", "empty or of a kind this server does not know", "open, step, …")),
+            None => Err(Error::value("request", "empty or of a kind this server does not know", "open, step, …")),
         };
         response.map(|response| proto::SessionResponse { response: Some(response) })
     }
@@ -297,8 +297,8 @@ impl Dialogue for Session {
         self.outbox = outbox;
     }
 
-    fn refusal(refusal: Refusal) -> Self::Response {
-        proto::SessionResponse { response: Some(Response::Error(refusal.into())) }
+    fn refusal(error: Error) -> Self::Response {
+        proto::SessionResponse { response: Some(Response::Error(error.into())) }
     }
 }
 

@@ -1,14 +1,16 @@
 //! A conversation with a lease: a task of its own, which streams come to and are lost from. What was asked for is done
 //! whether or not anybody waits for it, and the last replies are kept.
 
-use super::{Conversation, Dialogue, Line, revoked};
+use super::{Conversation, refused, revoked};
 use crate::server::{
+    error::{ErrorKind, RequestError, status},
     net::access_log::{CLOSED, GONE, LEASE_OVER},
     session::{
-        lease::{self, Arrived, Ask, Grant, Ticket},
+        Error,
+        handler::Dialogue,
+        lease::{self, Arrived, Ask, Grant, Line, Ticket},
         replay_buffer::Kept,
     },
-    status::Refusal,
     transport::{
         budget::{Outbox, Share},
         message_reader::Stop,
@@ -78,9 +80,9 @@ impl<D: Dialogue> Leased<D> {
                 tokio::select! {
                     biased;
                     () = conversation.sessions.drain.closed() => {
-                        return self.stopped(line.clone(), Stop::Refused(Refusal::Draining));
+                        return self.stopped(line.clone(), refused(Error::Draining));
                     }
-                    refusal = revoked(bearer.as_ref()) => return self.stopped(line.clone(), Stop::Refused(refusal)),
+                    error = revoked(bearer.as_ref()) => return self.stopped(line.clone(), refused(error)),
                     Some(ask) = grant.asks.recv() => if let Some(coming) = self.agree(ask) {
                         return Some(self.give_way(line.clone(), coming));
                     },
@@ -130,10 +132,10 @@ impl<D: Dialogue> Leased<D> {
         let bearer = self.conversation.requests.bearer.clone();
         loop {
             let Self { conversation, grant, .. } = self;
-            let refusal = tokio::select! {
+            let error = tokio::select! {
                 biased;
-                () = conversation.sessions.drain.draining() => Some(Refusal::Draining),
-                refusal = revoked(bearer.as_ref()) => Some(refusal),
+                () = conversation.sessions.drain.draining() => Some(Error::Draining),
+                error = revoked(bearer.as_ref()) => Some(error.into()),
                 arrived = arrival(&mut coming) => {
                     coming = None;
                     match arrived {
@@ -154,8 +156,8 @@ impl<D: Dialogue> Leased<D> {
                 }
                 () = sleep_until(over) => None,
             };
-            match refusal {
-                Some(refusal) => self.conversation.end_by(&refusal),
+            match error {
+                Some(error) => self.conversation.end_by(&error),
                 None => self.conversation.ending = LEASE_OVER,
             }
             return None;
@@ -176,7 +178,7 @@ impl<D: Dialogue> Leased<D> {
 
     /// Has the stream end: another takes its place.
     fn give_way(&mut self, line: Line<D::Response>, coming: Coming<D::Response>) -> At<D::Response> {
-        tell(line, Refusal::from(lease::Error::TakenUp).into());
+        tell(line, status(&lease::Error::TakenUp));
         self.lost(Some(coming))
     }
 
@@ -188,7 +190,7 @@ impl<D: Dialogue> Leased<D> {
     }
 
     /// A stream cannot go on: that is its client's loss, unless the session is to end.
-    fn stopped(&mut self, line: Line<D::Response>, stop: Stop) -> Option<At<D::Response>> {
+    fn stopped(&mut self, line: Line<D::Response>, stop: Stop<D::Error>) -> Option<At<D::Response>> {
         match stop {
             Stop::Cancelled => Some(self.lost(None)),
             Stop::Broken(status) => {
@@ -205,8 +207,10 @@ impl<D: Dialogue> Leased<D> {
     }
 
     /// Keeps an answer as a reply. Where the budget has no room beside those before, they go.
-    fn keep(&mut self, answer: Result<D::Response, Refusal>) {
-        if matches!(answer, Err(Refusal::NoMemory { .. } | Refusal::TooManyOfAToken { .. })) {
+    fn keep(&mut self, answer: Result<D::Response, D::Error>) {
+        let wants_room =
+            |kind| matches!(kind, ErrorKind::MemoryFull | ErrorKind::TokenQuota | ErrorKind::MoreThanTokenQuota);
+        if answer.as_ref().is_err_and(|error| wants_room(error.kind())) {
             self.kept.clear(); // they were received, and may be what is in the way
         }
         let Ok(reply) = self.conversation.told(Ok(answer)) else { return };

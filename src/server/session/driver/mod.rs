@@ -3,102 +3,37 @@
 
 mod leased;
 
-use super::lease::{Arrived, Grant, Numbers, One, Ticket};
+use super::{
+    Error,
+    handler::{Dialogue, Turn},
+    lease::{Arrived, Numbers, One},
+};
 use crate::{
     pool::Follower,
     server::{
-        auth::{Bearer, Held, Token},
+        auth::{self, Bearer, Held, Token},
+        error::{ErrorCounters, RequestError, status},
+        limits::Allowance,
         net::{
-            access_log::{About, Access, BROKEN, CLOSED, Ended, GONE},
-            peers::{Full, Place, Places},
+            access_log::{Access, BROKEN, CLOSED, Ended, GONE},
+            peer_limiter::{Full, Place, Places},
         },
-        refusals::Refusals,
         shutdown::{Drain, Phase},
-        status::Refusal,
         transport::{
-            budget::Outbox,
-            message_reader::{Allowance, Frames, Message, Stop},
-            precheck::{Decoder, Field, decoded_at_once},
+            self,
+            message_reader::{Frames, Message, Stop},
+            precheck::{Decoder, decoded_at_once},
         },
     },
 };
 use futures_util::{Stream, stream};
 use perturb_protocol::Awake;
-use std::{convert::Infallible, future::Future, pin::Pin, time::Duration};
+use std::{convert::Infallible, pin::Pin, time::Duration};
 use tokio::{sync::mpsc, time::Instant};
 use tonic::Status;
 
-/// The most bytes of a request before a session is open: enough for thousands of groups, and little enough that all
-/// sessions may come so far.
-pub const MOST_BYTES_BEFORE_OPEN: usize = 64 << 10;
-
 /// Responses as they come, or the status that ends the stream.
 pub type Responses<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
-
-/// Where responses go that are made elsewhere than in the stream which sends them.
-pub type Line<T> = mpsc::Sender<Result<T, Status>>;
-
-/// What becomes of a stream after a response.
-pub enum Turn<R> {
-    /// Its session has a lease, and outlives it.
-    Leased(Grant<R>),
-    /// It goes on with the session that it has taken up.
-    TakesUp(Ticket<R>),
-}
-
-/// The server's part of a conversation. Dropping it frees what it holds.
-pub trait Dialogue: Send + 'static {
-    /// What the client sends.
-    type Request: prost::Message + Default + 'static;
-    /// What it gets.
-    type Response: prost::Message + Clone + 'static;
-    /// The parts of a request that are counted before it is decoded.
-    const FIELDS: &'static [Field];
-    /// What the protocol is called.
-    const PROTOCOL: &'static str;
-
-    /// What the client may send now.
-    fn allowance(&self) -> Allowance;
-
-    /// Whether it holds something that a shutdown should wait for.
-    fn is_open(&self) -> bool;
-
-    /// What has come of it so far.
-    fn about(&self) -> About;
-
-    /// Answers a request.
-    fn answer(&mut self, request: Self::Request) -> impl Future<Output = Result<Self::Response, Refusal>> + Send;
-
-    /// Where the request after this one is told of that comes before it is answered; none if it must wait for its turn.
-    fn follower(&self, _request: &Self::Request) -> Option<Follower> {
-        None
-    }
-
-    /// Tells of it. It will be the next that is answered.
-    fn follow(_follower: &Follower, _request: Self::Request) {}
-
-    /// Takes note of a request that was refused before it was decoded.
-    fn undecoded(&self, _refusal: &Refusal) {}
-
-    /// Whether there are requests that take up another session.
-    const TAKES_UP: bool = false;
-
-    /// Whether a request does.
-    fn takes_up(_request: &Self::Request) -> bool {
-        false
-    }
-
-    /// What becomes of the stream after the response that was just given, if not what was before; told once.
-    fn turn(&mut self) -> Option<Turn<Self::Response>> {
-        None
-    }
-
-    /// Its responses go by another stream now, or by none: this is where their shares go.
-    fn attach(&mut self, _outbox: Outbox) {}
-
-    /// The answer to a request that is refused.
-    fn refusal(refusal: Refusal) -> Self::Response;
-}
 
 /// What all sessions of the server are subject to: their number, how long they may be silent, and the shutdown.
 #[derive(Clone)]
@@ -107,7 +42,7 @@ pub struct Sessions {
     limits: Limits,
     decoder: Decoder,
     drain: Drain,
-    refusals: Refusals,
+    counters: ErrorCounters,
     access: Access,
     leases: Numbers,
 }
@@ -129,11 +64,11 @@ impl Sessions {
         places: Places,
         limits: Limits,
         drain: Drain,
-        refusals: Refusals,
+        counters: ErrorCounters,
         access: Access,
         leases: Numbers,
     ) -> Self {
-        Self { places, limits, decoder: Decoder::default(), drain, refusals, access, leases }
+        Self { places, limits, decoder: Decoder::default(), drain, counters, access, leases }
     }
 
     /// How far the shutdown is.
@@ -148,7 +83,10 @@ impl Sessions {
     pub fn begin<D: Dialogue>(&self, requests: Frames, dialogue: D) -> Result<Responses<D::Response>, Status> {
         let place = self.admit(&requests);
         let place = if D::TAKES_UP { place.or_else(|refusal| self.spare(refusal)) } else { place };
-        let place = place.inspect_err(|refusal| self.refusals.count(refusal, requests.bearer.as_ref()))?;
+        let place = place.map_err(|error| {
+            self.count(&error, requests.bearer.as_ref());
+            status(&error)
+        })?;
         let sessions = Self { drain: self.drain.enter(), ..self.clone() };
         let (start, awake, ending) = (Instant::now(), Awake::default(), GONE);
         let conversation = Conversation {
@@ -186,10 +124,10 @@ impl Sessions {
     }
 
     /// Lets a stream in for which there is no place, if it might be one that takes up a session, which has a place.
-    fn spare(&self, refusal: Refusal) -> Result<Seat, Refusal> {
+    fn spare(&self, refusal: Error) -> Result<Seat, Error> {
         let is_full = matches!(
             refusal,
-            Refusal::TooManySessions { .. } | Refusal::TooManyOfAPeer { .. } | Refusal::TooManyOfAToken { .. }
+            Error::SessionsFull { .. } | Error::PeerFull { .. } | Error::Auth(auth::Error::QuotaExceeded { .. })
         );
         match self.leases.spare().filter(|_| is_full) {
             Some(spare) => Ok(Seat::Spare(spare, refusal)),
@@ -197,14 +135,22 @@ impl Sessions {
         }
     }
 
-    fn admit(&self, requests: &Frames) -> Result<Seat, Refusal> {
+    /// Counts an error, also for the token that the stream has.
+    fn count(&self, error: &impl RequestError, bearer: Option<&Bearer>) {
+        self.counters.count(error.kind());
+        if let Some(bearer) = bearer {
+            bearer.refused();
+        }
+    }
+
+    fn admit(&self, requests: &Frames) -> Result<Seat, Error> {
         if self.phase() != Phase::Running {
-            return Err(Refusal::Draining);
+            return Err(Error::Draining);
         }
         let place = self.places.take(requests.connection.as_ref().map(|connection| connection.peer));
         let place = place.map_err(|full| match full {
-            Full::All(limit) => Refusal::TooManySessions { limit },
-            Full::Peer(limit) => Refusal::TooManyOfAPeer { limit },
+            Full::All(limit) => Error::SessionsFull { limit },
+            Full::Peer(limit) => Error::PeerFull { limit },
         })?;
         Ok(Seat::Own(place, requests.bearer.as_ref().map(Token::session).transpose()?))
     }
@@ -226,14 +172,14 @@ enum Seat {
     /// A place of its own, with that of its token.
     Own(#[expect(dead_code, reason = "held")] Place, #[expect(dead_code, reason = "held")] Option<Held>),
     /// That it takes up a session; otherwise this is its refusal.
-    Spare(#[expect(dead_code, reason = "held")] One, Refusal),
+    Spare(#[expect(dead_code, reason = "held")] One, Error),
 }
 
 /// A dialogue and its transport.
 struct Conversation<D: Dialogue> {
     requests: Frames,
     /// What came while the request before it was being answered.
-    ahead: Option<Result<Option<Message>, Stop>>,
+    ahead: Option<Result<Option<Message>, Stop<transport::Error>>>,
     /// Whether the present request came so, and may have begun then.
     came_ahead: bool,
     /// Whether anything may: not where it might have to be asked for again.
@@ -290,7 +236,7 @@ impl<D: Dialogue> Conversation<D> {
     }
 
     /// The next request, none at the client's end. To be called again if its future was dropped: nothing is lost.
-    async fn request(&mut self) -> Result<Option<Message>, Stop> {
+    async fn request(&mut self) -> Result<Option<Message>, Stop<D::Error>> {
         let Limits { handshake, idle, .. } = self.sessions.limits;
         let allowance = self.allowance();
         let bearer = self.requests.bearer.clone();
@@ -307,7 +253,7 @@ impl<D: Dialogue> Conversation<D> {
         let passed = if self.was_open { Duration::ZERO } else { self.known_open.elapsed() };
         let late = || {
             let seconds = limit.map_or(0, |limit| limit.as_secs());
-            Err(Stop::Refused(Refusal::Idle { seconds }))
+            Err(refused(Error::Idle { seconds }))
         };
         // Also where the next request is there already.
         if limit.is_some_and(|limit| passed > limit) {
@@ -315,29 +261,29 @@ impl<D: Dialogue> Conversation<D> {
         }
         tokio::select! {
             biased; // the end comes first: a client that never pauses must not outlast it
-            () = self.sessions.drain.closed() => Err(Stop::Refused(Refusal::Draining)),
-            refusal = revoked(bearer.as_ref()) => Err(Stop::Refused(refusal)),
-            request = next => request,
+            () = self.sessions.drain.closed() => Err(refused(Error::Draining)),
+            error = revoked(bearer.as_ref()) => Err(refused(error)),
+            request = next => request.map_err(|stop| stop.map(|error| Error::from(error).into())),
             () = silence(limit.map(|limit| limit.saturating_sub(passed))) => late(),
         }
     }
 
     /// The answer to a request. A stream that was let in to take up a session ends with its first refusal.
-    async fn answer(&mut self, message: Message) -> Result<Result<D::Response, Refusal>, Stop> {
+    async fn answer(&mut self, message: Message) -> Result<Result<D::Response, D::Error>, Stop<D::Error>> {
         match (self.respond(message).await?, &self.place) {
             (Err(refusal), Seat::Spare(..)) => Err(Stop::Refused(refusal)),
             (answer, _) => Ok(answer),
         }
     }
 
-    async fn respond(&mut self, message: Message) -> Result<Result<D::Response, Refusal>, Stop> {
+    async fn respond(&mut self, message: Message) -> Result<Result<D::Response, D::Error>, Stop<D::Error>> {
         if self.sessions.phase() != Phase::Running && !self.dialogue.is_open() {
-            return Err(Stop::Refused(Refusal::Draining));
+            return Err(refused(Error::Draining));
         }
         // Until it is answered its bytes are kept.
         let (request, _share) = match message {
             Message::Whole(bytes, share) => (bytes, share),
-            Message::Refused(refusal) => return Ok(self.undecoded(refusal)),
+            Message::Refused(error) => return Ok(self.undecoded(error)),
         };
         // Who is ahead of their rate waits, and nothing has happened yet. Nothing steps before a session is open; what
         // came ahead had no rate to keep.
@@ -347,19 +293,19 @@ impl<D: Dialogue> Conversation<D> {
             biased;
             paced = paced(paced_bearer) => match paced {
                 Ok(()) => {}
-                Err(refusal) => return Ok(self.undecoded(refusal)),
+                Err(error) => return Ok(self.undecoded(error)),
             },
-            () = self.sessions.drain.closed() => return Err(Stop::Refused(Refusal::Draining)),
-            refusal = revoked(bearer.as_ref()) => return Err(Stop::Refused(refusal)),
+            () = self.sessions.drain.closed() => return Err(refused(Error::Draining)),
+            error = revoked(bearer.as_ref()) => return Err(refused(error)),
         }
         let request = match self.sessions.decoder.decode(request, D::FIELDS, self.allowance()).await? {
             Ok(request) => request,
-            Err(refusal) => return Ok(self.undecoded(refusal)),
+            Err(error) => return Ok(self.undecoded(error)),
         };
         if let Seat::Spare(_, refusal) = &self.place
             && !D::takes_up(&request)
         {
-            return Err(Stop::Refused(refusal.clone()));
+            return Err(refused(refusal.clone()));
         }
         let follower = self.dialogue.follower(&request).filter(|_| self.reads_ahead);
         let allowance = self.allowance();
@@ -367,26 +313,26 @@ impl<D: Dialogue> Conversation<D> {
         tokio::select! {
             biased; // it mostly is there at once
             answer = dialogue.answer(request) => Ok(answer),
-            refusal = revoked(bearer.as_ref()) => Err(Stop::Refused(refusal)),
+            error = revoked(bearer.as_ref()) => Err(refused(error)),
             never = read_ahead::<D>(requests, ahead, follower, allowance) => match never {},
         }
     }
 
     /// The response that an answer is; an error ends the stream.
-    fn told(&mut self, answer: Result<Result<D::Response, Refusal>, Stop>) -> Result<D::Response, Status> {
+    fn told(&mut self, answer: Result<Result<D::Response, D::Error>, Stop<D::Error>>) -> Result<D::Response, Status> {
         self.spend();
         if self.was_open || self.dialogue.is_open() {
             self.known_open = Instant::now();
         }
         match answer {
             Ok(Ok(response)) => Ok(response),
-            Ok(Err(refusal)) => {
-                self.count(&refusal);
-                Ok(D::refusal(refusal))
+            Ok(Err(error)) => {
+                self.count(&error);
+                Ok(D::refusal(error))
             }
-            Err(Stop::Refused(refusal)) => {
-                self.end_by(&refusal);
-                Err(refusal.into())
+            Err(Stop::Refused(error)) => {
+                self.end_by(&error);
+                Err(status(&error))
             }
             Err(Stop::Broken(status)) => {
                 self.ending = BROKEN;
@@ -399,19 +345,20 @@ impl<D: Dialogue> Conversation<D> {
         }
     }
 
-    fn count(&self, refusal: &Refusal) {
-        self.sessions.refusals.count(refusal, self.requests.bearer.as_ref());
+    fn count(&self, error: &impl RequestError) {
+        self.sessions.count(error, self.requests.bearer.as_ref());
     }
 
     /// The server ends it.
-    fn end_by(&mut self, refusal: &Refusal) {
-        self.count(refusal);
-        self.ending = refusal.kind().reason();
+    fn end_by(&mut self, error: &impl RequestError) {
+        self.count(error);
+        self.ending = error.kind().reason();
     }
 
-    fn undecoded(&self, refusal: Refusal) -> Result<D::Response, Refusal> {
-        self.dialogue.undecoded(&refusal);
-        Err(refusal)
+    fn undecoded(&self, error: impl Into<Error>) -> Result<D::Response, D::Error> {
+        let error = D::Error::from(error.into());
+        self.dialogue.undecoded(&error);
+        Err(error)
     }
 
     /// Tells its token of the steps that it was not told of.
@@ -461,8 +408,13 @@ async fn read_ahead<D: Dialogue>(
     std::future::pending().await
 }
 
+/// The session ends with this error.
+fn refused<E: From<Error>>(error: impl Into<Error>) -> Stop<E> {
+    Stop::Refused(error.into().into())
+}
+
 /// Resolves when the token is revoked, if there is one.
-async fn revoked(bearer: Option<&Bearer>) -> Refusal {
+async fn revoked(bearer: Option<&Bearer>) -> auth::Error {
     match bearer {
         Some(bearer) => bearer.revoked().await,
         None => std::future::pending().await,
@@ -470,7 +422,7 @@ async fn revoked(bearer: Option<&Bearer>) -> Refusal {
 }
 
 /// Resolves when the token, if there is one, lets its environments step.
-async fn paced(bearer: Option<&Bearer>) -> Result<(), Refusal> {
+async fn paced(bearer: Option<&Bearer>) -> Result<(), auth::Error> {
     match bearer {
         Some(bearer) => bearer.turn().await,
         None => Ok(()),

@@ -1,29 +1,12 @@
-//! Who is at the other end: places by peer, the time that a connection has to begin, and how one is ended.
+//! Who is at the other end of a connection, and places by peer.
 
-use futures_util::task::AtomicWaker;
 use std::{
     collections::BTreeMap,
     fmt,
-    future::Future,
-    io::{self, ErrorKind, IoSlice},
     net::{IpAddr, Ipv6Addr},
-    pin::Pin,
-    sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicBool, Ordering},
-    },
-    task::{Context, Poll},
-    time::Duration,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
 };
-use tokio::{
-    io::{AsyncRead, AsyncWrite, ReadBuf},
-    sync::Notify,
-    time::{Sleep, sleep},
-};
-use tonic::transport::server::Connected;
-
-/// What a client of HTTP/2 sends first, in bytes.
-const PREFACE: usize = 24;
+use tokio::sync::Notify;
 
 /// Whom a connection is from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -143,115 +126,6 @@ impl Drop for Place {
                 by_peer.remove(&peer);
             }
         }
-    }
-}
-
-/// A connection, as its calls see it.
-#[derive(Clone)]
-pub struct Connection {
-    /// Whom it is from.
-    pub peer: Peer,
-    end: Arc<End>,
-}
-
-#[derive(Default)]
-struct End {
-    came: AtomicBool,
-    waker: AtomicWaker,
-}
-
-impl Connection {
-    /// Ends it, with all its calls.
-    pub fn end(&self) {
-        self.end.came.store(true, Ordering::Release);
-        self.end.waker.wake();
-    }
-}
-
-/// A connection's bytes. It fails if its client's first do not come in time, and once it is ended.
-pub struct Guarded<S> {
-    stream: S,
-    connection: Connection,
-    /// The bytes of the preface that have not come, and until when they may.
-    preface: Option<(usize, Pin<Box<Sleep>>)>,
-    _place: Place,
-}
-
-impl<S> Guarded<S> {
-    /// Gives the client so long to begin.
-    pub fn new(stream: S, peer: Peer, place: Place, limit: Duration) -> Self {
-        let preface = Some((PREFACE, Box::pin(sleep(limit))));
-        Self { stream, connection: Connection { peer, end: Arc::default() }, preface, _place: place }
-    }
-
-    fn check(&self, context: &Context<'_>) -> io::Result<()> {
-        self.connection.end.waker.register(context.waker());
-        let ended = self.connection.end.came.load(Ordering::Acquire);
-        if ended { Err(ErrorKind::ConnectionAborted.into()) } else { Ok(()) }
-    }
-}
-
-impl<S> Drop for Guarded<S> {
-    /// Nobody needs to be woken any more; the waker would keep the connection's memory as long as a call knows of it.
-    fn drop(&mut self) {
-        self.connection.end.waker.take();
-    }
-}
-
-impl<S> Connected for Guarded<S> {
-    type ConnectInfo = Connection;
-
-    fn connect_info(&self) -> Connection {
-        self.connection.clone()
-    }
-}
-
-impl<S: AsyncRead + Unpin> AsyncRead for Guarded<S> {
-    fn poll_read(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        buffer: &mut ReadBuf<'_>,
-    ) -> Poll<io::Result<()>> {
-        self.check(context)?;
-        let before = buffer.filled().len();
-        let polled = Pin::new(&mut self.stream).poll_read(context, buffer);
-        if let Some((left, limit)) = &mut self.preface {
-            *left = left.saturating_sub(buffer.filled().len() - before);
-            if *left == 0 {
-                self.preface = None;
-            } else if limit.as_mut().poll(context).is_ready() {
-                return Poll::Ready(Err(ErrorKind::TimedOut.into()));
-            }
-        }
-        polled
-    }
-}
-
-impl<S: AsyncWrite + Unpin> AsyncWrite for Guarded<S> {
-    fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
-        self.check(context)?;
-        Pin::new(&mut self.stream).poll_write(context, bytes)
-    }
-
-    fn poll_write_vectored(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        parts: &[IoSlice<'_>],
-    ) -> Poll<io::Result<usize>> {
-        self.check(context)?;
-        Pin::new(&mut self.stream).poll_write_vectored(context, parts)
-    }
-
-    fn is_write_vectored(&self) -> bool {
-        self.stream.is_write_vectored()
-    }
-
-    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_flush(context)
-    }
-
-    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_shutdown(context)
     }
 }
 

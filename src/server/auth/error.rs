@@ -1,0 +1,82 @@
+//! Why a token is not good, or not good for that.
+
+use crate::server::error::{ErrorKind, RequestError};
+
+/// An error of a token's holder.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// A call without a token.
+    #[error(
+        "this server asks for a token, and none came; ask who runs it for one, and name the file that has it in \
+         PERTURB_TOKEN_FILE, or send it as the metadata `authorization: Bearer TOKEN`"
+    )]
+    NoToken,
+    /// A call with a token that is none here.
+    #[error("this server does not know the token that came; ask who runs it for one that is good")]
+    WrongToken,
+    /// The session's token was taken out of the file of tokens.
+    #[error("the token {name:?} was revoked, or has another role now; ask who runs this server")]
+    RevokedToken {
+        /// What it is called.
+        name: String,
+    },
+    /// A token has all that it may have.
+    #[error(
+        "the token {name:?} may have {limit} {what} here, and {wanted} more would be too many; ask for less, or close"
+    )]
+    QuotaExceeded {
+        /// What it is called.
+        name: String,
+        /// What was asked for.
+        wanted: usize,
+        /// The most there may be.
+        limit: usize,
+        /// Sessions, environments or bytes in flight.
+        what: &'static str,
+    },
+    /// A token's environments have stepped too fast for too long.
+    #[error(
+        "the token {name:?} may take {rate} steps a second here, and its sessions are {seconds} s ahead of that; step \
+         fewer environments at a time or in fewer sessions, or try again later"
+    )]
+    TooFast {
+        /// What it is called.
+        name: String,
+        /// The most steps a second.
+        rate: u32,
+        /// How long until it may step again.
+        seconds: u64,
+    },
+}
+
+impl RequestError for Error {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::NoToken => ErrorKind::NoToken,
+            Self::WrongToken => ErrorKind::WrongToken,
+            Self::RevokedToken { .. } => ErrorKind::RevokedToken,
+            Self::QuotaExceeded { wanted, limit, .. } if wanted > limit => ErrorKind::MoreThanTokenQuota,
+            Self::QuotaExceeded { .. } => ErrorKind::TokenQuota,
+            Self::TooFast { .. } => ErrorKind::TokenRate,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::server::error::ErrorCounters;
+
+    #[test]
+    fn kinds_are_counted_by_themselves() {
+        let counters = ErrorCounters::default();
+        let of_a_token = |wanted| Error::QuotaExceeded { name: "ann".into(), wanted, limit: 4, what: "sessions" };
+        for error in [of_a_token(5), of_a_token(1), of_a_token(4), Error::NoToken] {
+            counters.count(error.kind());
+        }
+        let counted: Vec<_> = counters.counts().filter(|(_, count)| *count > 0).collect();
+        let expected = [(ErrorKind::NoToken, 1), (ErrorKind::MoreThanTokenQuota, 1), (ErrorKind::TokenQuota, 2)];
+        assert_eq!(counted, expected);
+    }
+}

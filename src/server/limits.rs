@@ -1,0 +1,16 @@
+//! How large requests may be.
+
+/// The most bytes of a request before a session is open: enough for thousands of groups, and little enough that all
+/// sessions may come so far.
+pub const MOST_BYTES_BEFORE_OPEN: usize = 64 << 10;
+
+/// What a stream may send now.
+#[derive(Debug, Clone, Copy)]
+pub struct Allowance {
+    /// The most bytes of a message.
+    pub bytes: usize,
+    /// The most entries of fields that have one for each environment.
+    pub entries: usize,
+    /// The bytes of a message for which the budget was asked already.
+    pub covered: usize,
+}

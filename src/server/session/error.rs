@@ -1,0 +1,71 @@
+//! Why a stream is not let in, or ends.
+
+use super::lease;
+use crate::server::{
+    auth,
+    error::{ErrorKind, InvalidValue, RequestError},
+    id::NoRandomness,
+    transport,
+};
+
+/// An error of a session's transport: the session's own, or one of the layers below.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// The token is not good any more, has all that it may have, or steps too fast.
+    #[error(transparent)]
+    Auth(#[from] auth::Error),
+    /// A message is refused.
+    #[error(transparent)]
+    Transport(#[from] transport::Error),
+    /// A session cannot be taken up, or was.
+    #[error(transparent)]
+    Lease(#[from] lease::Error),
+    /// A lease would have no name.
+    #[error(transparent)]
+    NoRandomness(#[from] NoRandomness),
+    /// The server is full of sessions.
+    #[error("all of this server's {limit} sessions are in use; close one, or try again later")]
+    SessionsFull {
+        /// The most there may be.
+        limit: usize,
+    },
+    /// One peer has all the sessions that it may have.
+    #[error("all of the {limit} sessions that one machine or user may have here are in use; close one")]
+    PeerFull {
+        /// The most there may be.
+        limit: usize,
+    },
+    /// The session sent nothing for too long.
+    #[error(
+        "the session was idle for {seconds} s, or was not opened in them, the most this server allows; start a new one"
+    )]
+    Idle {
+        /// The limit.
+        seconds: u64,
+    },
+    /// The server takes no new work.
+    #[error("this server is shutting down; use another, or try again later")]
+    Draining,
+}
+
+impl From<InvalidValue> for Error {
+    fn from(error: InvalidValue) -> Self {
+        Self::Transport(error.into())
+    }
+}
+
+impl RequestError for Error {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Auth(error) => error.kind(),
+            Self::Transport(error) => error.kind(),
+            Self::Lease(error) => error.kind(),
+            Self::NoRandomness(error) => error.kind(),
+            Self::SessionsFull { .. } => ErrorKind::SessionsFull,
+            Self::PeerFull { .. } => ErrorKind::PeerQuota,
+            Self::Idle { .. } => ErrorKind::Idle,
+            Self::Draining => ErrorKind::Draining,
+        }
+    }
+}

@@ -1,0 +1,62 @@
+//! Why a message is refused.
+
+use crate::server::{
+    auth,
+    error::{ErrorKind, InvalidValue, RequestError},
+};
+
+/// An error of a message, or of the memory that it takes.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// The token has as many bytes in flight as it may have.
+    #[error(transparent)]
+    Auth(#[from] auth::Error),
+    /// A field has too many entries, or one that is not of the encoding.
+    #[error(transparent)]
+    Value(#[from] InvalidValue),
+    /// The budget of bytes in flight is used up.
+    #[error(
+        "this needs {wanted} bytes, but {used} of the server's {limit} for what is in flight are in use; ask for less at \
+         a time, read the replies that wait, or try again later"
+    )]
+    MemoryFull {
+        /// What was asked for.
+        wanted: usize,
+        /// In use.
+        used: usize,
+        /// The most there may be.
+        limit: usize,
+    },
+    /// A message began and does not end.
+    #[error(
+        "a message began, and nothing more of it came for {seconds} s, or less than {rate} bytes a second in all; send \
+         messages whole"
+    )]
+    Unfinished {
+        /// The longest pause.
+        seconds: u64,
+        /// The least bytes a second.
+        rate: usize,
+    },
+    /// A message is larger than its stream may send now.
+    #[error("a message of {got} bytes came; at most {limit} are read here now")]
+    TooLarge {
+        /// Its length in bytes.
+        got: usize,
+        /// The most there may be.
+        limit: usize,
+    },
+}
+
+impl RequestError for Error {
+    fn kind(&self) -> ErrorKind {
+        match self {
+            Self::Auth(error) => error.kind(),
+            Self::Value(error) => error.kind(),
+            Self::MemoryFull { .. } => ErrorKind::MemoryFull,
+            Self::Unfinished { .. } => ErrorKind::UnfinishedMessage,
+            Self::TooLarge { .. } => ErrorKind::TooLarge,
+        }
+    }
+}

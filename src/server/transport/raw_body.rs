@@ -1,0 +1,110 @@
+//! The bodies of streams, kept from tonic: it would decode their messages itself.
+
+use super::{
+    budget::Outbox,
+    message_reader::{Frames, Transit},
+    watched_body::{Patience, Replies},
+};
+use crate::server::{auth::Bearer, net::managed_io::Connection};
+use std::{
+    convert::Infallible,
+    future::Future,
+    pin::Pin,
+    sync::{Arc, Mutex, PoisonError},
+    task::{Context, Poll},
+};
+use tonic::{
+    Status,
+    body::Body,
+    codegen::{Service, http},
+    server::NamedService,
+};
+use tower::Layer;
+
+/// A service one of whose methods, that at `path`, has the body of its requests kept from tonic.
+#[derive(Clone)]
+pub struct RawBodyService<S> {
+    service: S,
+    path: &'static str,
+    transit: Transit,
+}
+
+/// Puts [`RawBodyService`] around a service.
+#[derive(Clone)]
+pub struct RawBodyLayer {
+    path: &'static str,
+    transit: Transit,
+}
+
+impl RawBodyLayer {
+    /// Keeps the bodies of calls of this path.
+    pub fn new(path: &'static str, transit: Transit) -> Self {
+        Self { path, transit }
+    }
+}
+
+impl<S> Layer<S> for RawBodyLayer {
+    type Service = RawBodyService<S>;
+
+    fn layer(&self, service: S) -> Self::Service {
+        RawBodyService::new(service, self.path, self.transit.clone())
+    }
+}
+
+impl<S> RawBodyService<S> {
+    /// Keeps the bodies of calls of this path.
+    pub fn new(service: S, path: &'static str, transit: Transit) -> Self {
+        Self { service, path, transit }
+    }
+}
+
+impl<S: NamedService> NamedService for RawBodyService<S> {
+    const NAME: &'static str = S::NAME;
+}
+
+impl<S> Service<http::Request<Body>> for RawBodyService<S>
+where
+    S: Service<http::Request<Body>, Response = http::Response<Body>, Error = Infallible>,
+    S::Future: Send + 'static,
+{
+    type Response = http::Response<Body>;
+    type Error = Infallible;
+    type Future = Pin<Box<dyn Future<Output = Result<Self::Response, Infallible>> + Send>>;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Infallible>> {
+        self.service.poll_ready(context)
+    }
+
+    fn call(&mut self, mut request: http::Request<Body>) -> Self::Future {
+        let outbox = Outbox::default();
+        let connection = request.extensions().get::<Connection>().cloned();
+        let is_stream = request.uri().path() == self.path;
+        // What is no stream is one small reply.
+        let patience = is_stream.then_some(Patience { first: self.transit.handshake, rest: self.transit.limit });
+        if is_stream {
+            let bearer = request.extensions_mut().remove::<Bearer>();
+            let transit = Transit { budget: self.transit.budget.of(bearer.clone()), ..self.transit };
+            let body = std::mem::take(request.body_mut());
+            let frames = Frames::new(body, transit, connection.clone(), bearer, outbox.clone());
+            request.extensions_mut().insert(Kept(Arc::new(Mutex::new(Some(frames)))));
+        }
+        let response = self.service.call(request);
+        Box::pin(
+            async move { Ok(response.await?.map(|body| Body::new(Replies::new(body, outbox, connection, patience)))) },
+        )
+    }
+}
+
+/// A request's frames, as an extension of the request, which must be one that could be cloned.
+#[derive(Clone)]
+struct Kept(Arc<Mutex<Option<Frames>>>);
+
+/// The messages of a request whose body was kept.
+///
+/// # Errors
+/// Where it was not: a defect.
+pub fn messages<T>(request: &mut tonic::Request<T>) -> Result<Frames, Status> {
+    let kept = request.extensions_mut().remove::<Kept>();
+    let frames = kept.and_then(|kept| kept.0.lock().unwrap_or_else(PoisonError::into_inner).take());
+    frames.ok_or_else(|| Status::internal("the request's body is not there: a defect of the server"))
+}
