@@ -1,16 +1,24 @@
 //! A session's environments: requests in, gathered replies out.
 
 use super::{
-    Autoreset, Error, Play, Played, Pool, Turn,
-    bytes::{put, put_actions},
-    follow::{Follow, Follower},
-    gather::{Gather, Stepped, collect},
-    round::Round,
-    shard::{Command, Shard, SlotReset},
-    workers::{Job, Permit, Shared, lock},
+    Error,
+    capacity::Permit,
+    encode::put,
+    follower::Follower,
+    job::Job,
+    pipelined_step::Follow,
+    rollout::{
+        play::Play,
+        round::{Played, Round, Turn},
+    },
+    scheduler::{Pool, Shared},
+    settings::{Autoreset, BatchSettings, SlotGroup},
+    shard::{Command, Shard, SlotReset, put_actions},
+    step_result::{Gather, Stepped, collect},
+    sync::lock,
 };
 use crate::{
-    env::{Distribution, Draw, EnvironmentSpec, EpisodeStart, Episodes, Settings},
+    env::{Distribution, Draw, EnvironmentSpec, EpisodeStart, Episodes},
     meters::Tally,
     scene::Scene,
 };
@@ -29,54 +37,6 @@ const SHARDS_A_WORKER: f64 = 32.0;
 const LEAST_SHARE: f64 = 10.0;
 /// So many environments are freed in less time than the transport notices, and no other thread is asked to.
 const FEW: usize = 64;
-
-/// What a batch is opened with.
-#[derive(Debug, Clone)]
-pub struct BatchSettings {
-    /// The environment.
-    pub spec: &'static EnvironmentSpec,
-    /// Its slots, at least one group.
-    pub groups: Vec<SlotGroup>,
-    /// What happens to ended episodes.
-    pub autoreset: Autoreset,
-    /// Whether episodes carry receipts.
-    pub receipts: bool,
-    /// Whether those of steps are arrays.
-    pub receipt_arrays: bool,
-    /// Whether steps report the reward's terms.
-    pub reward_terms: bool,
-    /// Whether observations have the parameters at their end.
-    pub observe_parameters: bool,
-}
-
-/// Successive slots with settings of their own.
-#[derive(Debug, Clone)]
-pub struct SlotGroup {
-    /// How many, at least 1.
-    pub size: usize,
-    /// Fixes all randomness; `environment_index` is that of the group's first slot, and its last slot's fits a u32.
-    pub episodes: Settings,
-}
-
-impl BatchSettings {
-    /// N, when the batch is opened.
-    pub fn size(&self) -> usize {
-        self.groups.iter().map(|group| group.size).sum()
-    }
-
-    /// O: the length of an observation.
-    pub fn observation_size(&self) -> usize {
-        let parameters = if self.observe_parameters { self.spec.parameters.len() } else { 0 };
-        self.spec.observation.len() + parameters
-    }
-
-    /// Episodes in a trial, if all groups have as many.
-    pub fn episodes_per_trial(&self) -> Option<u32> {
-        let mut each = self.groups.iter().map(|group| group.episodes.episodes_per_trial);
-        let first = each.next()?;
-        each.all(|other| other == first).then_some(first)
-    }
-}
 
 /// One environment's part of a reset: a new episode, or with a seed or distributions a new trial.
 #[derive(Debug, Clone, PartialEq)]
@@ -124,7 +84,7 @@ impl Batch {
     /// [`Error::Full`], or [`Error::Environment`] if a model cannot be loaded.
     pub async fn open(pool: &Pool, settings: BatchSettings) -> Result<(Self, Bytes, Vec<(u32, EpisodeStart)>), Error> {
         let (workers, size) = (pool.queue(), settings.size());
-        let owned = (Arc::new(workers.reserve(size)?), Arc::new(Tally::new(pool.meter(settings.spec.name))));
+        let owned = (Arc::new(workers.capacity.reserve(size)?), Arc::new(Tally::new(pool.meter(settings.spec.name))));
         let shard_size = shard_size(settings.spec, size, pool.workers());
         let parts = cut(&settings.groups, shard_size).into_iter().enumerate();
         let shard = |(i, part)| Mutex::new(Shard::new(&settings, part, i * shard_size));
@@ -263,7 +223,7 @@ impl Batch {
         let mut slot = 0..;
         let gone: Vec<Episodes> = all.extract_if(.., |_| slot.next().is_some_and(|slot: usize| leaves[slot])).collect();
         let mut gone = Some(gone);
-        self.workers.free(Box::new(move || {
+        self.workers.reaper.free(Box::new(move || {
             drop(gone.take());
             true
         }));
@@ -471,7 +431,7 @@ impl Drop for Batch {
         }
         // Who holds the job last frees the environments: neither this thread, which lets it go now, nor a worker.
         let mut rest = Some((Arc::clone(&self.job), self.play.take(), self.farewell.take()));
-        self.workers.free(Box::new(move || {
+        self.workers.reaper.free(Box::new(move || {
             let is_alone = rest.as_ref().is_none_or(|(job, ..)| Arc::strong_count(job) == 1);
             if let Some((job, _, farewell)) = rest.take_if(|_| is_alone)
                 && let Some(tell) = farewell

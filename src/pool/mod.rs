@@ -12,22 +12,29 @@
 //! into the queue; only the end of such a round wakes the session.
 
 mod batch;
-mod bytes;
-mod follow;
-mod gather;
-mod play;
-mod round;
+mod capacity;
+mod encode;
+mod follower;
+mod job;
+mod pipelined_step;
+mod reaper;
+mod receipts;
+mod rollout;
+mod scheduler;
+mod settings;
 mod shard;
-mod told;
-mod workers;
+mod step_result;
+mod sync;
 
-pub use batch::{Batch, BatchSettings, Farewell, ResetEntry, SlotGroup};
-pub use follow::Follower;
-pub use gather::Stepped;
-pub use play::{Play, Policy, PolicyRole};
-pub use round::{EndedAt, Played, Turn};
-pub use shard::Autoreset;
-pub use workers::Pool;
+pub use batch::{Batch, Farewell, ResetEntry};
+pub use follower::Follower;
+pub use rollout::{
+    play::{Play, Policy, PolicyRole},
+    round::{EndedAt, Played, Turn},
+};
+pub use scheduler::Pool;
+pub use settings::{Autoreset, BatchSettings, SlotGroup};
+pub use step_result::Stepped;
 
 use crate::env;
 

@@ -1,7 +1,10 @@
 //! A part of a batch: what one worker runs at a time.
 
-use super::batch::{BatchSettings, SlotGroup};
-use super::told::Told;
+use super::{
+    receipts::Told,
+    settings::{Autoreset, BatchSettings, SlotGroup},
+    sync::lock,
+};
 use crate::{
     env::{
         self, Action, ActionSpace, Distribution, Draw, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings,
@@ -9,18 +12,7 @@ use crate::{
     scene::Scene,
 };
 use bytes::Bytes;
-use std::sync::Arc;
-
-/// What happens to an environment whose episode has ended (Gymnasium's three modes).
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Autoreset {
-    /// The next step ignores its action and resets.
-    NextStep,
-    /// The last step itself resets.
-    SameStep,
-    /// Nothing: the client resets.
-    Disabled,
-}
+use std::sync::{Arc, Mutex};
 
 /// What a shard is asked to do. Slots are counted within the shard.
 pub(super) enum Command {
@@ -330,5 +322,17 @@ impl Shard {
     fn observe(&mut self, slot: usize) {
         let n = self.observation_size;
         self.slots[slot].observe(&mut self.observations[slot * n..][..n]);
+    }
+}
+
+/// Gives every shard its part of a batch's actions, i32 `[N]` or f32 `[N, A]`.
+pub(super) fn put_actions(shards: &[Mutex<Shard>], actions: &[u8]) {
+    let mut words = actions.as_chunks::<4>().0.iter();
+    for shard in shards {
+        let mut shard = lock(shard);
+        let Shard { choices, vectors, .. } = &mut *shard;
+        // One of the two is empty. The words come second in each pair, so that none is lost where a shard's part ends.
+        choices.iter_mut().zip(&mut words).for_each(|(to, from)| *to = u32::from_le_bytes(*from));
+        vectors.iter_mut().zip(&mut words).for_each(|(to, from)| *to = f32::from_le_bytes(*from));
     }
 }

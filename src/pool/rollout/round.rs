@@ -3,14 +3,16 @@
 //! The worker that ends a step's last shard has the round take what came of it, choose the next actions and give them to
 //! the shards; then the job goes to the queue's tail, as that of any other step. The session is woken at the round's end.
 
-use super::{
-    Error,
-    bytes::{put, put_flags},
-    play::{Play, Policy},
-    shard::{Command, Shard},
-    workers::lock,
+use super::play::{Play, Policy};
+use crate::{
+    env::EpisodeEnd,
+    pool::{
+        Error,
+        encode::{put, put_flags},
+        shard::{Command, Shard},
+        sync::lock,
+    },
 };
-use crate::env::EpisodeEnd;
 use bytes::BytesMut;
 use perturb_policy::{RolloutStep, Task};
 use std::sync::Mutex;
@@ -98,7 +100,7 @@ enum Phase {
 }
 
 /// The steps of one reply.
-pub(super) struct Round {
+pub(in crate::pool) struct Round {
     turn: Turn,
     play: Option<Box<Play>>,
     phase: Phase,
@@ -108,18 +110,18 @@ pub(super) struct Round {
 
 impl Round {
     /// A round of the policy of before, if there is no new one.
-    pub(super) fn new(turn: Turn, play: Option<Box<Play>>) -> Self {
+    pub(in crate::pool) fn new(turn: Turn, play: Option<Box<Play>>) -> Self {
         Self { turn, play, phase: Phase::Begin, played: Played::default(), error: None }
     }
 
     /// What came of it, with the policy at play unless it failed.
-    pub(super) fn finish(self) -> Result<(Option<Box<Play>>, Played), Error> {
+    pub(in crate::pool) fn finish(self) -> Result<(Option<Box<Play>>, Played), Error> {
         self.error.map_or(Ok((self.play, self.played)), Err)
     }
 
     /// Takes what the shards did last and tells them what to do next; false at the round's end. It ends in any case when
     /// it is `halted`.
-    pub(super) fn conduct(&mut self, shards: &[Mutex<Shard>], halted: bool) -> bool {
+    pub(in crate::pool) fn conduct(&mut self, shards: &[Mutex<Shard>], halted: bool) -> bool {
         match self.advance(shards) {
             Ok(goes_on) => goes_on && !halted,
             Err(error) => {

@@ -2,14 +2,11 @@
 //! to tell of the first, is still being woken.
 
 use super::{
-    bytes::put_actions,
-    gather::{Gather, Stepped},
-    shard::Shard,
-    workers::Job,
+    shard::{Shard, put_actions},
+    step_result::{Gather, Stepped},
 };
-use crate::env::EnvironmentSpec;
 use bytes::{Bytes, BytesMut};
-use std::sync::{Arc, Mutex};
+use std::sync::Mutex;
 use tokio::time::Instant;
 
 /// What follows the step of a job that is under way.
@@ -65,29 +62,10 @@ impl Follow {
         self.ended
     }
 
-    fn offer(&mut self, actions: Bytes) {
+    /// Keeps the actions of the step that is to follow, if one can.
+    pub(super) fn offer(&mut self, actions: Bytes) {
         if self.is_under_way && self.stepped.is_none() {
             self.actions = Some(actions);
-        }
-    }
-}
-
-/// Where the actions are left of the step that follows the one under way.
-pub struct Follower {
-    pub(super) job: Arc<Job>,
-    /// The environments'.
-    pub spec: &'static EnvironmentSpec,
-    /// N.
-    pub size: usize,
-}
-
-impl Follower {
-    /// Has the step that is under way, if one is, be followed by one with these actions, which were checked. The batch's
-    /// next request must then be that step.
-    pub fn follow(&self, actions: Bytes) {
-        // Who holds it now is at the step's end.
-        if let Ok(mut follow) = self.job.follow.try_lock() {
-            follow.offer(actions);
         }
     }
 }

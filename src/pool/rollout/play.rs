@@ -1,7 +1,13 @@
 //! A policy that plays a batch.
 
-use super::{Error, bytes::put_actions, shard::Shard, workers::lock};
-use crate::env::EpisodeEnd;
+use crate::{
+    env::EpisodeEnd,
+    pool::{
+        Error,
+        shard::{Shard, put_actions},
+        sync::lock,
+    },
+};
 use perturb_policy::{Ended, Inputs, Normalisers, Outcome, Player, PlayerState, PolicySpec, Role, Task};
 use rand_chacha::ChaCha8Rng;
 use std::sync::Mutex;
@@ -41,30 +47,30 @@ pub enum PolicyRole {
 /// A policy at play, between two steps.
 pub struct Play {
     player: Player,
-    pub(super) task: Task,
+    pub(in crate::pool) task: Task,
     /// In a test.
     seed: Option<u64>,
     /// What the last step brought.
-    pub(super) step: Gathered,
+    pub(in crate::pool) step: Gathered,
     spec: PolicySpec,
 }
 
 /// What a step of all environments brought; buffers are used again.
 #[derive(Default)]
-pub(super) struct Gathered {
+pub(in crate::pool) struct Gathered {
     observations: Vec<f32>,
     rewards: Vec<f32>,
-    pub(super) terminated: Vec<bool>,
-    pub(super) truncated: Vec<bool>,
+    pub(in crate::pool) terminated: Vec<bool>,
+    pub(in crate::pool) truncated: Vec<bool>,
     final_observations: Vec<f32>,
     ended: Vec<Ended>,
     /// The same with all that is known of them.
-    pub(super) ends: Vec<(u32, EpisodeEnd)>,
+    pub(in crate::pool) ends: Vec<(u32, EpisodeEnd)>,
 }
 
 impl Play {
     /// Has the policy begin in the environments of `shards`, at the start of a trial or from its saved state.
-    pub(super) fn begin(policy: Policy, shards: &[Mutex<Shard>]) -> Result<Self, Error> {
+    pub(in crate::pool) fn begin(policy: Policy, shards: &[Mutex<Shard>]) -> Result<Self, Error> {
         let Policy { spec, inputs, normalisers, role, state, weights, episodes_per_trial } = policy;
         let trials: Vec<(u32, u64)> =
             shards.iter().flat_map(|shard| lock(shard).trials().collect::<Vec<_>>()).collect();
@@ -102,18 +108,18 @@ impl Play {
     }
 
     /// Takes over weights `[P]`.
-    pub(super) fn load(&mut self, weights: &[f32]) -> Result<(), Error> {
+    pub(in crate::pool) fn load(&mut self, weights: &[f32]) -> Result<(), Error> {
         Ok(self.player.load(weights)?)
     }
 
     /// Begins a task; whether all environments are to be reset before.
-    pub(super) fn begin_task(&mut self, task: Task) -> bool {
+    pub(in crate::pool) fn begin_task(&mut self, task: Task) -> bool {
         self.task = task;
         matches!(self.task, Task::Episodes(_))
     }
 
     /// Begins the task's episodes in environments that were reset.
-    pub(super) fn begin_episodes(&mut self, shards: &[Mutex<Shard>]) -> Result<(), Error> {
+    pub(in crate::pool) fn begin_episodes(&mut self, shards: &[Mutex<Shard>]) -> Result<(), Error> {
         let Self { player, task, seed, step, .. } = self;
         step.gather_observations(shards);
         player.begin(&step.observations, Some(task))?;
@@ -128,14 +134,14 @@ impl Play {
     }
 
     /// Chooses actions and gives them to the shards; returns them as they are on the wire.
-    pub(super) fn act(&mut self, shards: &[Mutex<Shard>]) -> Result<&[u8], Error> {
+    pub(in crate::pool) fn act(&mut self, shards: &[Mutex<Shard>]) -> Result<&[u8], Error> {
         let actions = self.player.act()?;
         put_actions(shards, actions);
         Ok(actions)
     }
 
     /// Takes what came of the actions.
-    pub(super) fn observe(&mut self, shards: &[Mutex<Shard>]) -> Result<(), Error> {
+    pub(in crate::pool) fn observe(&mut self, shards: &[Mutex<Shard>]) -> Result<(), Error> {
         let Self { player, task, step, .. } = self;
         step.gather(shards);
         task.advance(step.ended.iter().map(|end| end.slot));
@@ -143,7 +149,7 @@ impl Play {
     }
 
     /// V of the present observations, `[N]`.
-    pub(super) fn last_values(&mut self) -> Result<&[f32], Error> {
+    pub(in crate::pool) fn last_values(&mut self) -> Result<&[f32], Error> {
         Ok(self.player.last_values(&self.task)?)
     }
 }

@@ -1,10 +1,10 @@
 //! What came of a step, out of the shards.
 
 use super::{
-    bytes::{put, put_wide},
+    encode::{put, put_wide},
+    receipts::Told,
     shard::Shard,
-    told::Told,
-    workers::lock,
+    sync::lock,
 };
 use crate::env::{EpisodeEnd, EpisodeStart};
 use bytes::{Bytes, BytesMut};

@@ -1,0 +1,76 @@
+//! How many environments there may be, and are.
+
+use super::Error;
+use std::sync::{
+    Arc,
+    atomic::{AtomicUsize, Ordering},
+};
+use tokio::sync::Notify;
+
+/// The pool's budget of environments.
+pub(super) struct Capacity {
+    used: AtomicUsize,
+    limit: usize,
+    /// Told whenever `used` has changed.
+    changed: Notify,
+}
+
+impl Capacity {
+    /// Of at most so many environments, none of which is in use.
+    pub(super) fn new(limit: usize) -> Self {
+        Self { used: AtomicUsize::new(0), limit, changed: Notify::new() }
+    }
+
+    /// Environments in use.
+    pub(super) fn used(&self) -> usize {
+        self.used.load(Ordering::Relaxed)
+    }
+
+    /// The most environments there may be.
+    pub(super) fn limit(&self) -> usize {
+        self.limit
+    }
+
+    /// Waits until the number of environments in use has changed since this was last waited for, by one caller.
+    pub(super) async fn changed(&self) {
+        self.changed.notified().await;
+    }
+
+    /// Takes `requested` environments out of the budget until the permit is dropped.
+    pub(super) fn reserve(self: &Arc<Self>, requested: usize) -> Result<Permit, Error> {
+        let limit = self.limit;
+        let fits = |used: usize| used.checked_add(requested).filter(|&sum| sum <= limit);
+        match self.used.fetch_update(Ordering::Relaxed, Ordering::Relaxed, fits) {
+            Ok(_) => {
+                self.changed.notify_one();
+                Ok(Permit { capacity: Arc::clone(self), count: AtomicUsize::new(requested) })
+            }
+            Err(used) => Err(Error::Full { requested, used, limit }),
+        }
+    }
+
+    fn give_back(&self, environments: usize) {
+        self.used.fetch_sub(environments, Ordering::Relaxed);
+        self.changed.notify_one();
+    }
+}
+
+/// A part of the pool's budget of environments.
+pub(super) struct Permit {
+    capacity: Arc<Capacity>,
+    count: AtomicUsize,
+}
+
+impl Permit {
+    /// Gives back so many environments, which must not be more than there are.
+    pub(super) fn give_back(&self, count: usize) {
+        self.count.fetch_sub(count, Ordering::Relaxed);
+        self.capacity.give_back(count);
+    }
+}
+
+impl Drop for Permit {
+    fn drop(&mut self) {
+        self.capacity.give_back(*self.count.get_mut());
+    }
+}

@@ -1,0 +1,70 @@
+//! Frees what sessions leave behind, on a thread of its own.
+
+use super::sync::lock;
+use crate::priority::lower;
+use std::{
+    io,
+    sync::{
+        Mutex,
+        mpsc::{self, RecvTimeoutError},
+    },
+    thread::{self, JoinHandle},
+    time::Duration,
+};
+
+/// The niceness of the thread, for which nobody waits.
+const NICENESS: i32 = 3;
+
+/// Frees what a session leaves behind, and says whether it could: thousands of environments take longer than the transport
+/// may be kept.
+pub(super) type Rest = Box<dyn FnMut() -> bool + Send>;
+/// How often it is looked whether what could not be freed can be.
+const AGAIN: Duration = Duration::from_millis(1);
+
+/// The way to the thread that frees, until it is closed.
+pub(super) struct Reaper(Mutex<Option<mpsc::Sender<Rest>>>);
+
+impl Reaper {
+    /// Starts the thread.
+    ///
+    /// # Errors
+    /// If the operating system starts no thread.
+    pub(super) fn start() -> io::Result<(Self, JoinHandle<()>)> {
+        let (rests, received) = mpsc::channel::<Rest>();
+        let freeing = move || {
+            lower(NICENESS);
+            free(&received);
+        };
+        let thread = thread::Builder::new().name("free".into()).spawn(freeing)?;
+        Ok((Self(Mutex::new(Some(rests))), thread))
+    }
+
+    /// Frees what a session leaves behind, elsewhere.
+    pub(super) fn free(&self, rest: Rest) {
+        if let Some(rests) = &*lock(&self.0) {
+            let _ = rests.send(rest); // its thread ends only with the pool
+        }
+    }
+
+    /// Ends the thread when it has nothing left to free.
+    pub(super) fn close(&self) {
+        *lock(&self.0) = None;
+    }
+}
+
+/// Frees what comes, as soon as it can be, until the pool ends.
+fn free(received: &mpsc::Receiver<Rest>) {
+    let mut left: Vec<Rest> = Vec::new();
+    loop {
+        let come = match left.is_empty() {
+            true => received.recv().map_err(|_| RecvTimeoutError::Disconnected),
+            false => received.recv_timeout(AGAIN),
+        };
+        match come {
+            Ok(rest) => left.push(rest),
+            Err(RecvTimeoutError::Timeout) => {}
+            Err(RecvTimeoutError::Disconnected) => return,
+        }
+        left.retain_mut(|rest| !rest());
+    }
+}

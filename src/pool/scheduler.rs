@@ -1,0 +1,286 @@
+//! The worker threads and their queue.
+
+use super::{
+    Error,
+    capacity::Capacity,
+    job::{Job, Next, TINY, TINY_ALONE},
+    reaper::Reaper,
+    rollout::round::Round,
+    sync::lock,
+};
+use crate::{
+    meters::{Histogram, Meter},
+    priority::lower,
+};
+use std::{
+    collections::{BTreeMap, VecDeque},
+    io,
+    sync::{
+        Arc, Condvar, Mutex, PoisonError,
+        atomic::{AtomicBool, AtomicPtr, AtomicUsize, Ordering},
+    },
+    thread::{self, JoinHandle},
+};
+use tokio::time::Instant;
+
+/// How often an idle worker offers its core before it sleeps. A sleeping worker costs the next request a wake-up, which
+/// is more than a step of many small environments.
+const YIELDS_BEFORE_SLEEP: usize = 100;
+
+/// The workers' niceness: the transport, which has little to do at a time, comes before them.
+const NICENESS: i32 = 1;
+
+/// Worker threads that step batches, and the count of environments they may hold.
+pub struct Pool {
+    shared: Arc<Shared>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+impl Pool {
+    /// Starts `workers` threads (at least 1) for at most `max_environments` environments at a time.
+    ///
+    /// # Errors
+    /// If the operating system starts no thread.
+    pub fn new(workers: usize, max_environments: usize) -> io::Result<Self> {
+        let (reaper, freeing) = Reaper::start()?;
+        let shared = Arc::new(Shared {
+            reaper,
+            capacity: Arc::new(Capacity::new(max_environments)),
+            queue: Mutex::new(Queue { jobs: VecDeque::with_capacity(1024), sleeping: 0, closed: false }),
+            waiting: AtomicUsize::new(0),
+            ready: Condvar::new(),
+            closing: AtomicBool::new(false),
+            last: AtomicPtr::default(),
+            meters: Mutex::default(),
+            waits: Histogram::default(),
+        });
+        let mut pool = Self { shared, threads: Vec::new() };
+        for i in 0..workers.max(1) {
+            let shared = Arc::clone(&pool.shared);
+            let thread = thread::Builder::new().name(format!("physics-{i}")).spawn(move || shared.work(i))?;
+            pool.threads.push(thread);
+        }
+        pool.threads.push(freeing);
+        Ok(pool)
+    }
+
+    /// The number of worker threads.
+    pub fn workers(&self) -> usize {
+        self.threads.len() - 1
+    }
+
+    /// Environments in use.
+    pub fn environments(&self) -> usize {
+        self.shared.capacity.used()
+    }
+
+    /// The most environments there may be.
+    pub fn limit(&self) -> usize {
+        self.shared.capacity.limit()
+    }
+
+    /// Waits until the number of environments in use has changed since this was last waited for, by one caller.
+    pub async fn changed(&self) {
+        self.shared.capacity.changed().await;
+    }
+
+    /// Where what happens in environments of this name is counted.
+    pub fn meter(&self, environment: &'static str) -> Arc<Meter> {
+        Arc::clone(lock(&self.shared.meters).entry(environment).or_default())
+    }
+
+    /// What happened in the environments of each kind that has a meter, by name.
+    pub fn meters(&self) -> BTreeMap<&'static str, Arc<Meter>> {
+        lock(&self.shared.meters).clone()
+    }
+
+    /// How long batches with something to do wait for a worker to take a part of it, each time.
+    pub fn waits(&self) -> &Histogram {
+        &self.shared.waits
+    }
+
+    pub(super) fn queue(&self) -> Arc<Shared> {
+        Arc::clone(&self.shared)
+    }
+}
+
+impl Drop for Pool {
+    fn drop(&mut self) {
+        self.shared.closing.store(true, Ordering::Relaxed);
+        lock(&self.shared.queue).closed = true;
+        self.shared.reaper.close();
+        self.shared.ready.notify_all();
+        for thread in self.threads.drain(..) {
+            // A worker never panics: shards run inside catch_unwind.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// What the workers and the batches share.
+pub(super) struct Shared {
+    pub(super) reaper: Reaper,
+    pub(super) capacity: Arc<Capacity>,
+    queue: Mutex<Queue>,
+    /// Jobs in the queue, to be looked at without its lock.
+    waiting: AtomicUsize,
+    ready: Condvar,
+    /// The pool ends: rounds end with their present step.
+    closing: AtomicBool,
+    /// Whose environments moved last; only to be compared.
+    last: AtomicPtr<Job>,
+    meters: Mutex<BTreeMap<&'static str, Arc<Meter>>>,
+    waits: Histogram,
+}
+
+struct Queue {
+    /// Jobs with the number of their parts, shards or a round's beginning, that nobody has taken, which is never 0, and
+    /// since when they are at this place.
+    jobs: VecDeque<(Arc<Job>, usize, Instant)>,
+    /// Workers that wait for `ready`.
+    sleeping: usize,
+    closed: bool,
+}
+
+impl Shared {
+    /// Steps the environments of every shard here, if that is soon done; whether it was.
+    pub(super) fn step_here(&self, job: &Job) -> bool {
+        let tiny = if self.moves(job) { TINY_ALONE } else { TINY };
+        if job.cost > tiny {
+            return false;
+        }
+        job.prepare();
+        (0..job.shards.len()).for_each(|shard| _ = job.run(shard));
+        true
+    }
+
+    /// Has the workers step the environments of every shard. Another step may follow.
+    pub(super) fn begin_step(&self, job: &Arc<Job>) {
+        lock(&job.follow).begin();
+        self.begin(job);
+    }
+
+    /// Runs every shard of the job on the workers and waits for the last: the job's `number`th request.
+    pub(super) async fn run(&self, job: &Arc<Job>, number: u64) -> Result<(), Error> {
+        self.begin(job);
+        self.wait(job, number).await
+    }
+
+    fn begin(&self, job: &Arc<Job>) {
+        job.prepare();
+        let shards = job.shards.len();
+        self.push(job, shards, shards); // its lock publishes the job's counters
+    }
+
+    /// Runs a round on the workers: its beginning, and whatever steps it wants. Gives it back at its end.
+    pub(super) async fn play(&self, job: &Arc<Job>, round: Box<Round>, number: u64) -> Result<Box<Round>, Error> {
+        self.moves(job);
+        job.prepare_round(round);
+        self.push(job, 1, 1);
+        self.wait(job, number).await?;
+        job.take_round().ok_or(Error::Defect)
+    }
+
+    /// Takes note that a job's environments move, and says whether they were the last that did.
+    fn moves(&self, job: &Job) -> bool {
+        let job = std::ptr::from_ref(job).cast_mut();
+        self.last.swap(job, Ordering::Relaxed) == job
+    }
+
+    /// Waits until a job's first `number` requests that workers were asked for have ended.
+    pub(super) async fn wait(&self, job: &Arc<Job>, number: u64) -> Result<(), Error> {
+        let has_ended = || job.ended.load(Ordering::Acquire) >= number;
+        // A job that is nearly done is worth more polls than a sleep: being woken costs more than many steps.
+        for _ in 0..job.patience {
+            if has_ended() {
+                break;
+            }
+            tokio::task::yield_now().await;
+        }
+        // What told of one end may have been meant for the one before.
+        while !has_ended() {
+            job.done.notified().await;
+        }
+        job.result()
+    }
+
+    /// Puts a job of so many parts at the queue's tail, and wakes no more than `helpers` workers for them.
+    fn push(&self, job: &Arc<Job>, parts: usize, helpers: usize) {
+        let now = Instant::now();
+        let mut queue = lock(&self.queue);
+        queue.jobs.push_back((Arc::clone(job), parts, now));
+        self.waiting.store(queue.jobs.len(), Ordering::Release);
+        let sleeping = queue.sleeping;
+        drop(queue);
+        // A wake-up is a system call, also when nobody sleeps.
+        match sleeping.min(helpers) {
+            0 => {}
+            1 => self.ready.notify_one(),
+            _ => self.ready.notify_all(),
+        }
+    }
+
+    /// The job at the queue's head, one part of which is now the caller's. If parts remain the job goes to the tail,
+    /// where others find it.
+    fn pop(&self) -> Option<Arc<Job>> {
+        for _ in 0..YIELDS_BEFORE_SLEEP {
+            if self.waiting.load(Ordering::Acquire) > 0 {
+                break;
+            }
+            thread::yield_now();
+        }
+        let mut queue = lock(&self.queue);
+        loop {
+            if let Some((job, parts, since)) = queue.jobs.pop_front() {
+                let now = Instant::now();
+                self.waits.observe(now - since);
+                if parts > 1 {
+                    queue.jobs.push_back((Arc::clone(&job), parts - 1, now));
+                }
+                self.waiting.store(queue.jobs.len(), Ordering::Release);
+                return Some(job);
+            }
+            if queue.closed {
+                return None;
+            }
+            queue.sleeping += 1;
+            queue = self.ready.wait(queue).unwrap_or_else(PoisonError::into_inner);
+            queue.sleeping -= 1;
+        }
+    }
+
+    fn work(&self, worker: usize) {
+        lower(NICENESS);
+        while let Some(job) = self.pop() {
+            if job.run_part(worker) {
+                self.conduct(&job);
+            }
+        }
+    }
+
+    /// A job's last part has ended: its session is told, and another step begins if a round wants one or one follows.
+    fn conduct(&self, job: &Arc<Job>) {
+        loop {
+            let next = job.conduct(self.closing.load(Ordering::Relaxed));
+            if matches!(next, Next::Nothing) {
+                return job.tell();
+            }
+            job.prepare();
+            let shards = job.shards.len();
+            // Others have their turn first. One part is this worker's, which is awake, if nobody waits: through the queue
+            // an idle worker would snatch a job that is in this one's cache.
+            let is_own = shards == 1 && self.waiting.load(Ordering::Acquire) == 0;
+            if !is_own {
+                self.push(job, shards, shards - 1);
+            }
+            if matches!(next, Next::Request) {
+                self.moves(job);
+                job.tell();
+            }
+            if !is_own {
+                return;
+            }
+            job.run(0);
+        }
+    }
+}
