@@ -1,146 +1,160 @@
-//! A learning curve from `monitor.csv` as it grows: some hundred points, however many episodes there are.
+//! The learning curve of a training, from `monitor.csv` while it grows. It has at most 160 points.
 
 use perturb_study::words::shortened;
 use serde::Serialize;
 
-use crate::tail::{Look, MOST, Tail};
+use crate::tail::{MAX_READ_BYTES, Tail, TailUpdate};
 
-/// When there are so many stretches, pairs of them become one.
-const MOST_STRETCHES: usize = 512;
-/// A curve has at most so many points …
-const MOST_POINTS: usize = 160;
-/// … and one for so many episodes at least.
-const LEAST_EPISODES: usize = 10;
-/// A speed is one of so many seconds at least …
-const LEAST_SECONDS: f64 = 1.0;
-/// … and there are at most so many.
-const MOST_SPEEDS: f64 = 40.0;
-/// Episodes that come after less than this share of the time before them were written with them.
-const AT_ONCE: f64 = 0.02;
+/// Maximum number of groups in memory. Beyond it, pairs of groups are merged.
+const MAX_GROUPS: usize = 512;
+/// Maximum number of points of a curve.
+const MAX_POINTS: usize = 160;
+/// Minimum number of episodes of a point.
+const MIN_EPISODES_PER_POINT: usize = 10;
+/// Minimum time over which a speed is measured, in seconds.
+const MIN_SPEED_SECONDS: f64 = 1.0;
+/// Maximum number of different speeds of a curve.
+const MAX_SPEEDS: f64 = 40.0;
+/// Share of the time since the last speed. Episodes that follow within it were written in the same block.
+const SAME_BLOCK_SHARE: f64 = 0.02;
 
-/// Follows the episodes of a training.
+/// Sums over the episodes of a growing log.
 #[derive(Debug)]
-pub(crate) struct Episodes {
+pub(crate) struct EpisodeLog {
     tail: Tail,
-    /// Where the columns return, length, seconds and success are; `None` before the names were read.
+    /// Positions of the columns return, length, seconds and success; `None` before the header was read.
     columns: Option<[usize; 4]>,
-    stretches: Vec<Stretch>,
-    /// Episodes in a stretch, but for the last one.
-    size: usize,
-    /// Lines, and what is wrong with the first that is not understood.
+    groups: Vec<EpisodeGroup>,
+    /// Number of episodes in each group but the last one.
+    group_size: usize,
+    /// Number of lines that were read.
     lines: usize,
-    wrong: Option<String>,
-    /// Why it cannot be read now.
-    unread: Option<String>,
+    /// Fault of the first line that is not understood.
+    line_fault: Option<String>,
+    /// Reason why the file cannot be read now.
+    read_error: Option<String>,
 }
 
-/// Sums over some episodes in a row.
+/// Sums over consecutive episodes.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-struct Stretch {
+struct EpisodeGroup {
     episodes: usize,
     episode_return: f64,
     steps: f64,
     successes: f64,
-    /// Seconds since the start of the training at its end.
+    /// Time of the last episode, in seconds since the start of the training.
     end: f64,
 }
 
-/// A curve as it is drawn. All lists have one number a point: the mean over some episodes.
+/// A curve as it is drawn. Each list has one number for each point, which is a mean over some episodes.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub(crate) struct Curve {
-    /// Episodes in the middle of the point.
+pub(crate) struct LearningCurve {
+    /// Number of episodes at the middle of the point.
     pub(crate) episodes: Vec<f64>,
-    /// Steps of all environments in the middle of it.
+    /// Number of steps of all environments at the middle of the point.
     pub(crate) steps: Vec<f64>,
-    /// The undiscounted return.
+    /// Undiscounted return.
     #[serde(rename = "return")]
     pub(crate) episode_return: Vec<Option<f64>>,
-    /// The success rate, %.
+    /// Success rate, in percent.
     pub(crate) success: Vec<f64>,
-    /// Steps of an episode.
+    /// Episode length, in steps.
     pub(crate) length: Vec<f64>,
-    /// Steps in a second.
+    /// Steps per second.
     pub(crate) speed: Vec<Option<f64>>,
-    /// Episodes of a point, but for the last one.
-    pub(crate) each: usize,
+    /// Number of episodes of each point but the last one.
+    #[serde(rename = "each")]
+    pub(crate) episodes_per_point: usize,
 }
 
-impl Episodes {
-    /// Of the log at `path`, which need not be there yet.
-    pub(crate) fn of(path: &std::path::Path) -> Self {
-        let (columns, stretches) = (None, Vec::new());
-        Self { tail: Tail::of(path), columns, stretches, size: 1, lines: 0, wrong: None, unread: None }
+impl EpisodeLog {
+    /// Makes an empty log that reads the file at `path`, which need not exist yet.
+    pub(crate) fn new(path: &std::path::Path) -> Self {
+        Self {
+            tail: Tail::new(path),
+            columns: None,
+            groups: Vec::new(),
+            group_size: 1,
+            lines: 0,
+            line_fault: None,
+            read_error: None,
+        }
     }
 
-    /// Reads what is new; whether anything is.
-    pub(crate) fn look(&mut self) -> bool {
-        let new = match self.tail.look() {
-            Ok(Look::Same) => return self.unread.take().is_some(),
-            Ok(Look::More(new)) => new,
-            Ok(Look::Anew(new)) => {
-                (self.columns, self.stretches, self.size, self.lines, self.wrong) = (None, Vec::new(), 1, 0, None);
+    /// Reads the new episodes. Returns whether anything has changed.
+    pub(crate) fn read_new(&mut self) -> bool {
+        let new = match self.tail.read_new() {
+            Ok(TailUpdate::Unchanged) => return self.read_error.take().is_some(),
+            Ok(TailUpdate::Appended(new)) => new,
+            Ok(TailUpdate::Restarted(new)) => {
+                self.columns = None;
+                self.groups.clear();
+                self.group_size = 1;
+                self.lines = 0;
+                self.line_fault = None;
                 new
             }
-            Ok(Look::Endless) => {
-                let wrong =
-                    format!("line {} is longer than {} MiB; nothing behind it is read", self.lines + 1, MOST >> 20);
-                self.wrong = Some(wrong);
+            Ok(TailUpdate::LineTooLong) => {
+                let (line, limit) = (self.lines + 1, MAX_READ_BYTES >> 20);
+                self.line_fault = Some(format!("line {line} is longer than {limit} MiB; nothing after it is read"));
                 return true;
             }
             Err(error) => {
-                let unread = Some(format!("it cannot be read: {error}"));
-                return std::mem::replace(&mut self.unread, unread.clone()) != unread;
+                let read_error = Some(format!("it cannot be read: {error}"));
+                return std::mem::replace(&mut self.read_error, read_error.clone()) != read_error;
             }
         };
-        self.unread = None;
+        self.read_error = None;
         for line in new.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
             self.lines += 1;
-            if let Err(reason) = self.line(&String::from_utf8_lossy(line)) {
-                self.wrong.get_or_insert(format!("line {}: {reason}", self.lines));
+            if let Err(reason) = self.add_line(&String::from_utf8_lossy(line)) {
+                self.line_fault.get_or_insert(format!("line {}: {reason}", self.lines));
             }
         }
         true
     }
 
-    /// How many episodes there were.
-    pub(crate) fn count(&self) -> usize {
-        self.stretches.iter().map(|stretch| stretch.episodes).sum()
+    /// Returns the number of episodes.
+    pub(crate) fn episode_count(&self) -> usize {
+        self.groups.iter().map(|group| group.episodes).sum()
     }
 
-    /// Steps of an episode, and steps in a second, of the last tenth of the time; `None` before there are any.
+    /// Returns the mean length in steps and the speed in steps per second of the last tenth of the time. Returns `None` before
+    /// there are episodes.
     pub(crate) fn recent(&self) -> Option<(f64, f64)> {
-        let all = self.stretches.last()?.end;
-        let long_ago = |stretch: &Stretch| all - stretch.end >= LEAST_SECONDS.max(all / 10.0);
-        let first = self.stretches.iter().rposition(long_ago).map_or(0, |before| before + 1);
-        let recent = Stretch::sum(&self.stretches[first..]);
-        let begun = first.checked_sub(1).map_or(0.0, |before| self.stretches[before].end);
-        let (length, speed) = (recent.steps / recent.episodes as f64, recent.steps / (recent.end - begun));
+        let end = self.groups.last()?.end;
+        let is_old = |group: &EpisodeGroup| end - group.end >= MIN_SPEED_SECONDS.max(end / 10.0);
+        let first = self.groups.iter().rposition(is_old).map_or(0, |before| before + 1);
+        let recent = EpisodeGroup::sum(&self.groups[first..]);
+        let start = first.checked_sub(1).map_or(0.0, |before| self.groups[before].end);
+        let length = recent.steps / recent.episodes as f64;
+        let speed = recent.steps / (recent.end - start);
         (length > 0.0 && speed > 0.0 && speed.is_finite()).then_some((length, speed))
     }
 
-    /// What is wrong with the log.
-    pub(crate) fn wrong(&self) -> Option<&str> {
-        self.unread.as_deref().or(self.wrong.as_deref())
+    /// Returns the log's fault, if it has one.
+    pub(crate) fn fault(&self) -> Option<&str> {
+        self.read_error.as_deref().or(self.line_fault.as_deref())
     }
 
-    fn line(&mut self, line: &str) -> Result<(), String> {
+    fn add_line(&mut self, line: &str) -> Result<(), String> {
         if line.starts_with('#') {
             return Ok(());
         }
         let fields: Vec<&str> = line.trim_end().split(',').collect();
         let Some(columns) = self.columns else {
-            let place = |name: &str| {
+            let position = |name: &str| {
                 fields.iter().position(|field| *field == name).ok_or_else(|| format!("there is no column `{name}`"))
             };
-            self.columns = Some([place("r")?, place("l")?, place("t")?, place("success")?]);
+            self.columns = Some([position("r")?, position("l")?, position("t")?, position("success")?]);
             return Ok(());
         };
         let number = |column: usize| {
             let text = fields.get(column).copied().unwrap_or_default();
-            text.parse::<f64>().map_err(|_| format!("`{}` is no number", shortened(text)))
+            text.parse::<f64>().map_err(|_| format!("`{}` is not a number", shortened(text)))
         };
         let [episode_return, steps, end, successes] = columns.map(number);
-        self.add(Stretch {
+        self.add(EpisodeGroup {
             episodes: 1,
             episode_return: episode_return?,
             steps: steps?,
@@ -150,32 +164,32 @@ impl Episodes {
         Ok(())
     }
 
-    fn add(&mut self, episode: Stretch) {
-        match self.stretches.last_mut() {
-            Some(last) if last.episodes < self.size => last.add(&episode),
-            _ => self.stretches.push(episode),
+    fn add(&mut self, episode: EpisodeGroup) {
+        match self.groups.last_mut() {
+            Some(last) if last.episodes < self.group_size => last.add(&episode),
+            _ => self.groups.push(episode),
         }
-        if self.stretches.len() > MOST_STRETCHES {
-            self.stretches = self.stretches.chunks(2).map(Stretch::sum).collect();
-            self.size *= 2;
+        if self.groups.len() > MAX_GROUPS {
+            self.groups = self.groups.chunks(2).map(EpisodeGroup::sum).collect();
+            self.group_size *= 2;
         }
     }
 
-    /// The curve so far.
-    pub(crate) fn curve(&self) -> Curve {
-        let points = (self.count() / LEAST_EPISODES).clamp(1, MOST_POINTS);
-        let together = self.stretches.len().div_ceil(points).max(1);
-        let mut parts: Vec<Stretch> = self.stretches.chunks(together).map(Stretch::sum).collect();
-        let each = together * self.size;
-        // A mean over a few episodes at the end would only mislead.
+    /// Returns the curve so far.
+    pub(crate) fn curve(&self) -> LearningCurve {
+        let points = (self.episode_count() / MIN_EPISODES_PER_POINT).clamp(1, MAX_POINTS);
+        let groups_per_point = self.groups.len().div_ceil(points).max(1);
+        let mut parts: Vec<EpisodeGroup> = self.groups.chunks(groups_per_point).map(EpisodeGroup::sum).collect();
+        let episodes_per_point = groups_per_point * self.group_size;
+        // A mean over a few episodes at the end would mislead.
         if let [.., before, last] = &mut parts[..]
-            && last.episodes < each / 2
+            && last.episodes < episodes_per_point / 2
         {
             before.add(&last.clone());
             parts.pop();
         }
         let (mut episodes, mut steps) = (0.0, 0.0);
-        let mut curve = Curve { each, speed: speeds(&parts), ..Curve::default() };
+        let mut curve = LearningCurve { episodes_per_point, speed: speeds(&parts), ..LearningCurve::default() };
         for part in parts {
             let count = part.episodes as f64;
             let mean = part.episode_return / count;
@@ -191,27 +205,32 @@ impl Episodes {
     }
 }
 
-/// Steps in a second of each part. Episodes are written in blocks, with the time of their writing: so parts share a speed
-/// until enough time has passed.
-fn speeds(parts: &[Stretch]) -> Vec<Option<f64>> {
-    let all = parts.last().map_or(0.0, |last| last.end);
-    let (mut speeds, mut begun, mut steps) = (Vec::new(), 0.0, 0.0);
-    for (place, part) in parts.iter().enumerate() {
+/// Returns the steps per second of each part.
+///
+/// A training writes its episodes in blocks, with the time of writing. So consecutive parts share a speed until enough time
+/// has passed.
+fn speeds(parts: &[EpisodeGroup]) -> Vec<Option<f64>> {
+    let end = parts.last().map_or(0.0, |last| last.end);
+    let mut speeds = Vec::new();
+    let mut start = 0.0;
+    let mut steps = 0.0;
+    for (index, part) in parts.iter().enumerate() {
         steps += part.steps;
-        let time = part.end - begun;
-        let at_once = parts.get(place + 1).is_some_and(|next| next.end - part.end < AT_ONCE * time);
-        if time >= LEAST_SECONDS.max(all / MOST_SPEEDS) && !at_once {
-            speeds.resize(place + 1, Some(steps / time));
-            (begun, steps) = (part.end, 0.0);
+        let time = part.end - start;
+        let next_is_same_block = parts.get(index + 1).is_some_and(|next| next.end - part.end < SAME_BLOCK_SHARE * time);
+        if time >= MIN_SPEED_SECONDS.max(end / MAX_SPEEDS) && !next_is_same_block {
+            speeds.resize(index + 1, Some(steps / time));
+            start = part.end;
+            steps = 0.0;
         }
     }
-    // What is left at the end, and what was too short altogether.
-    let rest = speeds.last().copied().unwrap_or_else(|| Some(steps / all).filter(|speed| speed.is_finite()));
-    speeds.resize(parts.len(), rest);
+    // The last parts have the speed before them. If the whole curve is short, all parts have its mean speed.
+    let last = speeds.last().copied().unwrap_or_else(|| Some(steps / end).filter(|speed| speed.is_finite()));
+    speeds.resize(parts.len(), last);
     speeds
 }
 
-impl Stretch {
+impl EpisodeGroup {
     fn add(&mut self, next: &Self) {
         self.episodes += next.episodes;
         self.episode_return += next.episode_return;
@@ -220,9 +239,9 @@ impl Stretch {
         self.end = next.end;
     }
 
-    fn sum(stretches: &[Self]) -> Self {
+    fn sum(groups: &[Self]) -> Self {
         let mut sum = Self::default();
-        stretches.iter().for_each(|stretch| sum.add(stretch));
+        groups.iter().for_each(|group| sum.add(group));
         sum
     }
 }
@@ -233,48 +252,51 @@ mod tests {
 
     const NAMES: &str = "#{\"t_start\": 1}\nr,l,t,success,terminated\n";
 
-    fn read(text: &str) -> (Episodes, Curve) {
+    fn read(text: &str) -> (EpisodeLog, LearningCurve) {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("monitor.csv");
         std::fs::write(&path, text).unwrap();
-        let mut episodes = Episodes::of(&path);
-        assert!(episodes.look());
+        let mut episodes = EpisodeLog::new(&path);
+        assert!(episodes.read_new());
         let curve = episodes.curve();
         (episodes, curve)
     }
 
     #[test]
-    fn a_point_is_a_mean_over_ten_episodes_at_least() {
+    fn a_point_is_a_mean_over_at_least_ten_episodes() {
         let line = |i: usize| format!("{}.5,4,{},{},1\n", i / 10, (i + 1) * 2, i % 2);
         let (episodes, curve) = read(&(NAMES.to_owned() + &(0..30).map(line).collect::<String>()));
-        assert_eq!((episodes.count(), episodes.wrong()), (30, None));
-        let expected = Curve {
+        assert_eq!((episodes.episode_count(), episodes.fault()), (30, None));
+        let expected = LearningCurve {
             episodes: vec![5.0, 15.0, 25.0],
             steps: vec![20.0, 60.0, 100.0],
             episode_return: vec![Some(0.5), Some(1.5), Some(2.5)],
             success: vec![50.0; 3],
             length: vec![4.0; 3],
             speed: vec![Some(2.0); 3],
-            each: 10,
+            episodes_per_point: 10,
         };
         assert_eq!(curve, expected);
     }
 
     #[test]
-    fn a_few_episodes_at_the_end_are_no_point_of_their_own() {
+    fn few_episodes_at_the_end_join_the_last_point() {
         let line = |i: usize| format!("1,1,{i},{},1\n", u8::from(i >= 20));
-        // Nine of eleven, and two.
+        // Nine points of eleven episodes, and two more episodes.
         let (_, curve) = read(&(NAMES.to_owned() + &(0..101).map(line).collect::<String>()));
-        assert_eq!((curve.each, curve.episodes.len(), curve.episodes[7], curve.episodes[8]), (11, 9, 82.5, 94.5));
-        assert_eq!((curve.steps[8], curve.success[8]), (94.5, 100.0), "nothing is lost");
-        // Eleven, and then ten.
+        assert_eq!(
+            (curve.episodes_per_point, curve.episodes.len(), curve.episodes[7], curve.episodes[8]),
+            (11, 9, 82.5, 94.5)
+        );
+        assert_eq!((curve.steps[8], curve.success[8]), (94.5, 100.0), "no episode is lost");
+        // Three points of eleven episodes, and one of ten.
         let (_, curve) = read(&(NAMES.to_owned() + &(0..43).map(line).collect::<String>()));
-        assert_eq!((curve.each, &curve.episodes[..]), (11, &[5.5, 16.5, 27.5, 38.0][..]));
+        assert_eq!((curve.episodes_per_point, &curve.episodes[..]), (11, &[5.5, 16.5, 27.5, 38.0][..]));
     }
 
     #[test]
-    fn episodes_that_are_written_in_blocks_have_the_speed_of_their_blocks() {
-        // Sixty episodes of ten steps, thirty at a time: after three seconds, and after six.
+    fn episodes_have_the_speed_of_their_block() {
+        // Sixty episodes of ten steps: thirty after three seconds, and thirty after six.
         let line = |i: usize| format!("1,10,{}.{i:03},0,1\n", 3 * (1 + i / 30));
         let (episodes, curve) = read(&(NAMES.to_owned() + &(0..60).map(line).collect::<String>()));
         assert!(curve.speed.iter().flatten().all(|speed| (90.0..101.0).contains(speed)), "{:?}", curve.speed);
@@ -286,27 +308,27 @@ mod tests {
     }
 
     #[test]
-    fn long_trainings_have_no_more_points_and_no_other_sums() {
+    fn long_trainings_have_bounded_curves() {
         let line = |i: usize| format!("{i},{},{i},{},0\n", 1 + i % 3, usize::from(i >= 7500));
         let (episodes, curve) = read(&(NAMES.to_owned() + &(0..15_000).map(line).collect::<String>()));
-        assert_eq!(episodes.count(), 15_000);
-        assert!((80..=MOST_POINTS).contains(&curve.success.len()), "{}", curve.success.len());
-        assert!(episodes.stretches.len() <= MOST_STRETCHES);
+        assert_eq!(episodes.episode_count(), 15_000);
+        assert!((80..=MAX_POINTS).contains(&curve.success.len()), "{}", curve.success.len());
+        assert!(episodes.groups.len() <= MAX_GROUPS);
         let (first, last) = (curve.success[0], curve.success[curve.success.len() - 1]);
         assert_eq!((first, last), (0.0, 100.0));
         assert!(*curve.episodes.last().unwrap() < 15_000.0 && *curve.steps.last().unwrap() < 30_000.0);
         let mean = curve.episode_return.iter().flatten().sum::<f64>() / curve.success.len() as f64;
-        assert!((mean - 7499.5).abs() < 150.0, "{mean}"); // the last point has fewer episodes than the others
+        assert!((mean - 7499.5).abs() < 150.0, "{mean}"); // the last point has fewer episodes
     }
 
     #[test]
-    fn what_is_not_understood_is_told_and_the_rest_is_shown() {
+    fn faulty_lines_are_reported_and_skipped() {
         let (episodes, curve) = read(&(NAMES.to_owned() + "1,2,3,1,0\nx,2,4,1,0\n\n5,2,5,1,0\n6,2"));
-        assert_eq!((episodes.count(), episodes.wrong()), (2, Some("line 4: `x` is no number")));
+        assert_eq!((episodes.episode_count(), episodes.fault()), (2, Some("line 4: `x` is not a number")));
         assert_eq!(curve.episode_return, [Some(3.0)]);
         let long = read(&(NAMES.to_owned() + &"x".repeat(100_000) + ",2,3,1,0\n")).0;
-        assert!(long.wrong().unwrap().len() < 400, "no more is quoted than anybody reads");
-        assert_eq!(read("a,b\n1,2\n").0.wrong(), Some("line 1: there is no column `r`"));
+        assert!(long.fault().unwrap().len() < 400, "the quotation is shortened");
+        assert_eq!(read("a,b\n1,2\n").0.fault(), Some("line 1: there is no column `r`"));
         assert_eq!(read(&(NAMES.to_owned() + "NaN,2,3,1,0\n")).1.episode_return, [None]);
     }
 }

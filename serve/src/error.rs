@@ -1,4 +1,4 @@
-//! Why nothing is served.
+//! Errors of the server and of its pages.
 
 use std::io::ErrorKind;
 use std::net::SocketAddr;
@@ -6,18 +6,20 @@ use std::path::PathBuf;
 
 use perturb_study::files::FileError;
 
-/// Why nothing is served.
+use crate::cached_loader::LoadError;
+
+/// The server cannot start.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-#[expect(missing_docs, reason = "the sentences say what the fields are")]
+#[expect(missing_docs, reason = "the messages explain the fields")]
 pub enum ServeError {
-    /// There is nothing to show.
+    /// The folder does not exist.
     #[error("{}", perturb_study::runs::no_folder(path))]
     NoFolder { path: PathBuf },
-    /// It may not be read.
+    /// The folder cannot be read.
     #[error(transparent)]
     File(#[from] FileError),
-    /// The address cannot be had.
+    /// The address cannot be used.
     #[error("cannot listen at {address}: {}", explained(source))]
     Address { address: SocketAddr, source: std::io::Error },
 }
@@ -25,11 +27,22 @@ pub enum ServeError {
 fn explained(error: &std::io::Error) -> String {
     match error.kind() {
         ErrorKind::AddrInUse => {
-            "something listens there already; end it, or give another port, e.g. --address 127.0.0.1:0 for a free one"
+            "another program listens there already; end it, or give another port, e.g. --address 127.0.0.1:0 for a free one"
                 .into()
         }
-        ErrorKind::AddrNotAvailable => "it is no address of this machine".into(),
-        ErrorKind::PermissionDenied => "ports below 1024 are the administrator's; give another one".into(),
+        ErrorKind::AddrNotAvailable => "it is not an address of this machine".into(),
+        ErrorKind::PermissionDenied => "ports below 1024 need administrator rights; give another port".into(),
         _ => error.to_string(),
     }
+}
+
+/// Why a page has nothing to show.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum ViewError {
+    /// There is no run in the folder that the address names.
+    RunNotFound,
+    /// The served folder cannot be listed, for this reason.
+    Unlisted(String),
+    /// The run's files could not be read.
+    Load(LoadError),
 }

@@ -1,4 +1,4 @@
-//! What is known of an experiment.
+//! The state of an experiment, read again when its files change.
 
 use std::collections::{HashMap, HashSet};
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -11,106 +11,112 @@ use perturb_study::words::shortened;
 use perturb_study::{Cell, generated_episodes, records, tested_episodes};
 use serde::Serialize;
 
-use crate::curve::Curve;
-use crate::remaining::Pace;
-use crate::training::{LOCK_INTERVAL, Training};
+use crate::curve::LearningCurve;
+use crate::eta::Eta;
+use crate::training::{LOCK_INTERVAL, LiveTraining};
 
-/// Of at most so many cells in work the curves are followed.
-pub(crate) const MOST_FOLLOWED: usize = 48;
-/// A test episode takes about so much of the time of a training's.
+/// Maximum number of cells in work whose curves are read.
+pub(crate) const MAX_CURVES: usize = 48;
+/// Approximate duration of a test episode, as a share of a training episode's.
 const TEST_SHARE: f64 = 0.25;
-/// From one cell to the next it may take so long.
-const BETWEEN: Duration = Duration::from_secs(15);
-/// How often, as a share of the time that it took, a plan that is not understood is read again.
-const REREAD: u32 = 20;
+/// Longest time between the end of a cell and the start of the next one, during which the experiment is still in work.
+const BETWEEN_CELLS: Duration = Duration::from_secs(15);
+/// Pause before a plan that was not understood is read again, as a multiple of the time that reading took.
+const REREAD_FACTOR: u32 = 20;
 
-/// An experiment that is looked at now and then.
+/// The state of an experiment at the last refresh.
 #[derive(Debug)]
-pub(crate) struct Experiment {
-    /// What links may not lead out of.
+pub(crate) struct LiveExperiment {
+    /// The served folder. Links must not lead out of it.
     root: PathBuf,
     path: PathBuf,
-    looked: Option<Instant>,
-    took: Duration,
-    /// Of `cells/`, and of the plan.
+    /// Time of the last reading, and how long it took.
+    read: Option<Instant>,
+    read_duration: Duration,
+    /// Stamps of `cells/` and of the plan.
     stamps: [Option<Stamp>; 2],
     status: Result<ExperimentStatus, String>,
-    /// When somebody was last seen to work on it.
+    /// Time at which a cell was last seen in work.
     worked: Option<Instant>,
-    /// The first cells in work, by their ids, with their curves.
-    followed: HashMap<String, Training>,
-    /// How far all cells in work are, by their ids.
-    logs: HashMap<String, Log>,
-    pace: Pace,
-    /// What cells take in terms of others, for so many that are done.
-    weights: (usize, Vec<f64>),
-    sources: Sources,
-    /// Cells that have a page of their own.
+    /// Trainings of the first cells in work, by the cells' ids.
+    trainings: HashMap<String, LiveTraining>,
+    /// Progress of all cells in work, by their ids.
+    progress: HashMap<String, CellProgress>,
+    eta: Eta,
+    /// Number of settled cells for which `weights` were computed.
+    weighted: usize,
+    /// Duration of each cell relative to the others.
+    weights: Vec<f64>,
+    report_files: ReportFiles,
+    /// Ids of cells whose trainings have a page.
     with_page: HashSet<String>,
 }
 
-/// The end of a cell's `progress.csv`.
+/// The progress of a cell, from the last line of its `progress.csv`.
 #[derive(Clone, Copy, Debug, Default)]
-struct Log {
+struct CellProgress {
     stamp: Option<Stamp>,
     episodes: u64,
 }
 
-/// Of all that the report is made from.
+/// The files from which the report is built.
 #[derive(Debug, Default)]
-struct Sources {
+struct ReportFiles {
+    /// Time at which the files were listed.
     at: Option<Instant>,
-    /// For so many cells that are settled, and when these last changed.
+    /// Number of settled cells, and the time of their last change in seconds since 1970.
     settled: (usize, i64),
-    /// Another number when the report would be another one.
-    state: u64,
-    /// One that must not be read.
-    out: Option<String>,
+    /// A hash of the files' names and stamps.
+    fingerprint: u64,
+    /// Name of a file that leads out of the served folder and must not be read.
+    outside: Option<String>,
 }
 
 /// The curve of a cell in work.
 #[derive(Debug, Serialize)]
 pub(crate) struct CellCurve {
     pub(crate) id: String,
-    /// Environment, learner and what it is trained on.
+    /// Environment, method and training version or set.
     pub(crate) kind: String,
-    /// Episodes in the middle of a point.
+    /// Number of episodes at the middle of each point.
     pub(crate) episodes: Vec<f64>,
-    /// Its success rate, %.
+    /// Success rate of each point, in percent.
     pub(crate) success: Vec<f64>,
 }
 
-impl Experiment {
-    /// That in `path`, of which nothing is shown that is outside of `root`.
-    pub(crate) fn of(root: &Path, path: &Path) -> Self {
+impl LiveExperiment {
+    /// Makes the state of the experiment in `path`, before its first refresh. Files outside of `root` are not read.
+    pub(crate) fn new(root: &Path, path: &Path) -> Self {
         Self {
             root: root.to_owned(),
             path: path.to_owned(),
-            looked: None,
-            took: Duration::ZERO,
+            read: None,
+            read_duration: Duration::ZERO,
             stamps: [None; 2],
-            status: Err("it was not looked at".into()),
+            status: Err("it was not read yet".into()),
             worked: None,
-            followed: HashMap::new(),
-            logs: HashMap::new(),
-            pace: Pace::default(),
-            weights: Default::default(),
-            sources: Sources::default(),
+            trainings: HashMap::new(),
+            progress: HashMap::new(),
+            eta: Eta::default(),
+            weighted: 0,
+            weights: Vec::new(),
+            report_files: ReportFiles::default(),
             with_page: HashSet::new(),
         }
     }
 
-    /// Reads what has changed of its state.
-    pub(crate) fn look(&mut self) {
-        // A cell's first file makes its folder; what follows is in there.
+    /// Reads the status again if its files have changed, or if enough time has passed.
+    pub(crate) fn refresh(&mut self) {
+        // A new cell changes the stamp of `cells/`. Changes inside of a cell's folder do not, hence the time.
         let stamps = ["cells", "plan.toml"].map(|name| Stamp::of(&self.path.join(name)));
-        let idle = self.state() != "in work";
-        let rest = if self.status.is_err() { LOCK_INTERVAL.max(self.took * REREAD) } else { LOCK_INTERVAL };
-        let rested = self.looked.is_none_or(|looked| looked.elapsed() >= rest);
-        if stamps == self.stamps && idle && !rested {
+        let is_idle = self.state() != "in work";
+        let reread_pause = LOCK_INTERVAL.max(self.read_duration * REREAD_FACTOR);
+        let pause = if self.status.is_err() { reread_pause } else { LOCK_INTERVAL };
+        let is_due = self.read.is_none_or(|read| read.elapsed() >= pause);
+        if stamps == self.stamps && is_idle && !is_due {
             return;
         }
-        let begun = Instant::now();
+        let start = Instant::now();
         self.stamps = stamps;
         let read = match &mut self.status {
             Ok(status) => status.refresh(),
@@ -122,75 +128,78 @@ impl Experiment {
         if self.status.as_ref().is_ok_and(|status| status.state() == "in work") {
             self.worked = Some(Instant::now());
         }
-        self.read_logs();
-        (self.looked, self.took) = (Some(Instant::now()), begun.elapsed());
+        self.read_progress();
+        self.read = Some(Instant::now());
+        self.read_duration = start.elapsed();
     }
 
-    /// How far the cells in work are.
-    fn read_logs(&mut self) {
-        let Ok(status) = &self.status else { return self.logs.clear() };
-        let mut before = std::mem::take(&mut self.logs);
+    /// Reads the progress of the cells in work.
+    fn read_progress(&mut self) {
+        let Ok(status) = &self.status else { return self.progress.clear() };
+        let mut before = std::mem::take(&mut self.progress);
         for id in working(status) {
-            let place = Path::new("cells").join(id).join("training/progress.csv");
-            let mut log = before.remove(id).unwrap_or_default();
-            let stamp = Stamp::of(&self.path.join(&place)).filter(|_| !leads_out(&self.root, &self.path, &place));
-            if stamp != log.stamp {
-                let last = stamp.and_then(|_| last_progress(&self.path.join(&place)));
-                log = Log { stamp, episodes: last.and_then(|last| last.episodes()).unwrap_or_default() };
+            let file = Path::new("cells").join(id).join("training/progress.csv");
+            let mut progress = before.remove(id).unwrap_or_default();
+            let stamp = Stamp::of(&self.path.join(&file)).filter(|_| !leads_out(&self.root, &self.path, &file));
+            if stamp != progress.stamp {
+                let last = stamp.and_then(|_| last_progress(&self.path.join(&file)));
+                progress = CellProgress { stamp, episodes: last.and_then(|last| last.episodes()).unwrap_or_default() };
             }
-            self.logs.insert(id.to_owned(), log);
+            self.progress.insert(id.to_owned(), progress);
         }
     }
 
-    /// The same, and all that its page shows.
-    pub(crate) fn follow(&mut self) {
-        self.look();
-        let Ok(status) = &self.status else { return self.followed.clear() };
-        let within = |id: &str| !leads_out(&self.root, &self.path, Path::new("cells").join(id).join("training"));
-        let first: Vec<&str> = working(status).filter(|id| within(id)).take(MOST_FOLLOWED).collect();
-        self.followed.retain(|id, _| first.contains(&id.as_str()));
+    /// Refreshes the status and everything else that the page shows.
+    pub(crate) fn refresh_details(&mut self) {
+        self.refresh();
+        let Ok(status) = &self.status else { return self.trainings.clear() };
+        let is_inside = |id: &str| !leads_out(&self.root, &self.path, Path::new("cells").join(id).join("training"));
+        let first: Vec<&str> = working(status).filter(|id| is_inside(id)).take(MAX_CURVES).collect();
+        self.trainings.retain(|id, _| first.contains(&id.as_str()));
         for id in first {
-            let training = || Training::of(&self.root, &status.folder.cell(id).training());
-            self.followed.entry(id.to_owned()).or_insert_with(training).follow();
+            let training = || LiveTraining::new(&self.root, &status.folder.cell(id).training());
+            self.trainings.entry(id.to_owned()).or_insert_with(training).refresh_details();
         }
         let settled = status.count(CellStatus::is_settled);
-        if self.weights.0 != settled || self.weights.1.len() != status.cells.len() {
-            self.weights = (settled, weights(status));
+        if self.weighted != settled || self.weights.len() != status.cells.len() {
+            self.weighted = settled;
+            self.weights = weights(status);
         }
         let shares = self.shares(status);
         if self.state() != "in work" {
-            self.pace.forget();
+            self.eta.reset();
         } else {
-            self.pace.hear(Instant::now(), &shares);
+            self.eta.sample(Instant::now(), &shares);
         }
         let settled = (settled, status.changed());
-        let anew = self.sources.settled != settled || self.sources.at.is_none_or(|at| at.elapsed() >= LOCK_INTERVAL);
-        if anew {
-            self.sources = Sources::of(status, settled, &self.root);
+        let files = &self.report_files;
+        let is_due = files.settled != settled || files.at.is_none_or(|at| at.elapsed() >= LOCK_INTERVAL);
+        if is_due {
+            self.report_files = ReportFiles::list(status, settled, &self.root);
             self.with_page.clear();
         }
         for (cell, known) in status.plan.cells.iter().zip(&status.cells) {
-            let asked = *known == CellStatus::InWork && !self.with_page.contains(&cell.id);
-            if asked || anew && *known != (CellStatus::Waiting { begun: false }) {
+            let is_new = *known == CellStatus::InWork && !self.with_page.contains(&cell.id);
+            if is_new || is_due && *known != (CellStatus::Waiting { begun: false }) {
                 let config = status.folder.cell(&cell.id).training().join("config.toml");
-                if config.is_file() && within(&cell.id) {
+                if config.is_file() && is_inside(&cell.id) {
                     self.with_page.insert(cell.id.clone());
                 }
             }
         }
     }
 
-    /// How far it is, or why that is not known.
+    /// Returns the status, or the reason why it is not known.
     pub(crate) fn status(&self) -> Result<&ExperimentStatus, &str> {
         self.status.as_ref().map_err(String::as_str)
     }
 
-    /// What [`ExperimentStatus::state`] says, but between two cells it is still in work.
+    /// Returns [`ExperimentStatus::state`], but between two cells the experiment is still in work.
     pub(crate) fn state(&self) -> &'static str {
         let Ok(status) = &self.status else { return "not understood" };
-        let left = status.cells.iter().any(|cell| !cell.is_settled());
-        let lately = self.worked.is_some_and(|worked| worked.elapsed() < BETWEEN);
-        if left && lately { "in work" } else { status.state() }
+        let has_open_cells = status.cells.iter().any(|cell| !cell.is_settled());
+        let worked_lately = self.worked.is_some_and(|worked| worked.elapsed() < BETWEEN_CELLS);
+        if has_open_cells && worked_lately { "in work" } else { status.state() }
     }
 
     pub(crate) fn summary(&self) -> RunSummary {
@@ -200,60 +209,60 @@ impl Experiment {
         }
     }
 
-    /// When it last changed, s since 1970.
+    /// Returns the time of the last change, in seconds since 1970.
     pub(crate) fn changed(&self) -> i64 {
-        let logs = self.logs.values().map(|log| log.stamp);
-        let stamps = self.stamps.into_iter().chain(logs).flatten().map(|stamp| stamp.seconds());
+        let progress = self.progress.values().map(|progress| progress.stamp);
+        let stamps = self.stamps.into_iter().chain(progress).flatten().map(|stamp| stamp.seconds());
         stamps.chain(self.status.as_ref().map(ExperimentStatus::changed)).max().unwrap_or_default()
     }
 
-    /// Another number when its report would be another one.
-    pub(crate) fn files(&self) -> u64 {
-        self.sources.state
+    /// Returns a number that changes with the files from which the report is built.
+    pub(crate) fn report_fingerprint(&self) -> u64 {
+        self.report_files.fingerprint
     }
 
-    /// Where it is, for a report; in its place why none is made.
-    pub(crate) fn reported(&self) -> Result<PathBuf, String> {
-        let out = self.sources.out.clone();
+    /// Returns the folder for the report, or the reason why none can be built.
+    pub(crate) fn report_folder(&self) -> Result<PathBuf, String> {
+        let outside = self.report_files.outside.clone();
         self.status().map_err(|reason| format!("this experiment is not understood: {reason}"))?;
-        out.map_or_else(|| Ok(self.path.clone()), |name| Err(format!("{name} is {LEADS_OUT}")))
+        outside.map_or_else(|| Ok(self.path.clone()), |name| Err(format!("{name} is {LEADS_OUT}")))
     }
 
-    /// The training of a cell in work, unless there are too many.
-    pub(crate) fn training(&self, id: &str) -> Option<&Training> {
-        self.followed.get(id)
+    /// Returns the training of a cell in work, unless it is beyond [`MAX_CURVES`].
+    pub(crate) fn training(&self, id: &str) -> Option<&LiveTraining> {
+        self.trainings.get(id)
     }
 
-    /// Whether a cell has a page of its own.
+    /// Tells whether a cell's training has a page.
     pub(crate) fn has_page(&self, id: &str) -> bool {
         self.with_page.contains(id)
     }
 
-    /// How long it may still take, s.
-    pub(crate) fn left(&self) -> Option<f64> {
+    /// Returns the remaining seconds, if they are known.
+    pub(crate) fn remaining_seconds(&self) -> Option<f64> {
         let status = self.status.as_ref().ok()?;
-        self.pace.left(Instant::now(), &self.shares(status), &self.weights.1)
+        self.eta.remaining_seconds(Instant::now(), &self.shares(status), &self.weights)
     }
 
-    /// The curves of cells in work, in the order of the plan.
+    /// Returns the curves of cells in work, in the order of the plan.
     pub(crate) fn curves(&self) -> Vec<CellCurve> {
         let Ok(status) = &self.status else { return Vec::new() };
-        let of = |cell: &Cell| {
-            let Curve { episodes, success, .. } = self.followed.get(&cell.id)?.curve();
+        let curve = |cell: &Cell| {
+            let LearningCurve { episodes, success, .. } = self.trainings.get(&cell.id)?.curve();
             let kind = format!("{} {}, {}", cell.config.common.environment, cell.method(), cell.trained_on());
             (success.len() > 1).then(|| CellCurve { id: cell.id.clone(), kind, episodes, success })
         };
-        status.plan.cells.iter().filter_map(of).collect()
+        status.plan.cells.iter().filter_map(curve).collect()
     }
 
-    /// How much of each cell is done.
+    /// Returns the done share of each cell, 0 to 1.
     fn shares(&self, status: &ExperimentStatus) -> Vec<f32> {
         let share = |(cell, known): (&Cell, &CellStatus)| match known {
             CellStatus::Done(_) | CellStatus::Failed(_) => 1.0,
             CellStatus::InWork => {
-                let training = self.logs.get(&cell.id).map_or(0.0, |log| log.episodes as f64);
+                let trained = self.progress.get(&cell.id).map_or(0.0, |progress| progress.episodes as f64);
                 let budget = cell.config.common.episodes as f64;
-                (training.min(budget) / (budget + testing(cell))) as f32
+                (trained.min(budget) / (budget + test_cost(cell))) as f32
             }
             CellStatus::NotUnderstood(_) | CellStatus::Waiting { .. } => 0.0,
         };
@@ -261,66 +270,68 @@ impl Experiment {
     }
 }
 
-/// The cells in work, in the order of the plan.
+/// Returns the ids of the cells in work, in the order of the plan.
 fn working(status: &ExperimentStatus) -> impl Iterator<Item = &str> {
     let all = status.plan.cells.iter().zip(&status.cells);
     all.filter(|(_, known)| **known == CellStatus::InWork).map(|(cell, _)| cell.id.as_str())
 }
 
-/// What the tests of a cell take, in episodes of its training.
-fn testing(cell: &Cell) -> f64 {
+/// Returns the duration of a cell's tests, in training episodes.
+fn test_cost(cell: &Cell) -> f64 {
     TEST_SHARE * tested_episodes(cell)
 }
 
-/// What cells take in terms of others: what those of their kind took, or else as many episodes as they have.
+/// Returns the duration of each cell relative to the others: the measured seconds of its kind, or an estimate by the number
+/// of its episodes.
 fn weights(status: &ExperimentStatus) -> Vec<f64> {
     let taken = status.taken();
     let cells = &status.plan.cells;
-    let episodes = |cell: &Cell| generated_episodes(&cell.config, cell.config.common.episodes) + testing(cell);
-    // Seconds of an episode, where cells are done.
-    let known: Vec<f64> =
+    let episodes = |cell: &Cell| generated_episodes(&cell.config, cell.config.common.episodes) + test_cost(cell);
+    // Seconds per episode of the kinds that were measured.
+    let measured: Vec<f64> =
         cells.iter().filter_map(|cell| taken.seconds(cell).map(|seconds| seconds / episodes(cell))).collect();
-    let usual = if known.is_empty() { 1.0 } else { perturb_study::mean(known.iter().copied()) };
-    cells.iter().map(|cell| taken.seconds(cell).unwrap_or_else(|| usual * episodes(cell))).collect()
+    let mean = if measured.is_empty() { 1.0 } else { perturb_study::mean(measured.iter().copied()) };
+    cells.iter().map(|cell| taken.seconds(cell).unwrap_or_else(|| mean * episodes(cell))).collect()
 }
 
-impl Sources {
-    /// Looks at the plan with its tables, heatmaps, and of each cell that is settled at what the report reads of it.
-    fn of(status: &ExperimentStatus, settled: (usize, i64), root: &Path) -> Self {
-        let (mut hasher, mut out) = (DefaultHasher::new(), None);
-        let place = status.folder.path();
+impl ReportFiles {
+    /// Lists the plan and its tables, the heatmaps, and of each settled cell the files that a report reads.
+    fn list(status: &ExperimentStatus, settled: (usize, i64), root: &Path) -> Self {
+        let mut hasher = DefaultHasher::new();
+        let mut outside = None;
+        let folder = status.folder.path();
         let mut add = |path: &Path| {
-            let name = path.strip_prefix(place).unwrap_or(path);
-            if out.is_none() && leads_out(root, place, name) {
-                out = Some(name.display().to_string());
+            let name = path.strip_prefix(folder).unwrap_or(path);
+            if outside.is_none() && leads_out(root, folder, name) {
+                outside = Some(name.display().to_string());
             }
             (name, Stamp::of(path)).hash(&mut hasher);
         };
         add(&status.folder.plan_path());
         let listed = |folder: &Path| files::list(folder).unwrap_or_default();
-        listed(place)
+        listed(folder)
             .iter()
-            .filter(|path| path.extension().is_some_and(|ending| ending == "csv"))
+            .filter(|path| path.extension().is_some_and(|extension| extension == "csv"))
             .for_each(|path| add(path));
-        let heatmaps = place.join("heatmaps");
+        let heatmaps = folder.join("heatmaps");
         add(&heatmaps);
         listed(&heatmaps).iter().for_each(|path| add(path));
         for (cell, known) in status.plan.cells.iter().zip(&status.cells) {
-            let folder = status.folder.cell(&cell.id);
+            let cell_folder = status.folder.cell(&cell.id);
             let names: &[&str] = match known {
                 CellStatus::Done(_) => &["result.json"],
                 CellStatus::Failed(_) => &["failure.json"],
                 CellStatus::NotUnderstood(_) => &["result.json", "failure.json"],
                 CellStatus::InWork | CellStatus::Waiting { .. } => &[],
             };
-            names.iter().for_each(|name| add(&folder.path().join(name)));
+            names.iter().for_each(|name| add(&cell_folder.path().join(name)));
             if let CellStatus::Done(_) = known {
-                add(&folder.path().join(records::FILE));
-                add(&folder.training().join("monitor.csv"));
-                cell.tests.marks.iter().for_each(|mark| add(&folder.mark(*mark).join(records::FILE)));
+                add(&cell_folder.path().join(records::FILE));
+                add(&cell_folder.training().join("monitor.csv"));
+                cell.tests.marks.iter().for_each(|mark| add(&cell_folder.mark(*mark).join(records::FILE)));
             }
         }
-        Self { at: Some(Instant::now()), settled, state: hasher.finish(), out }
+        Self { at: Some(Instant::now()), settled, fingerprint: hasher.finish(), outside }
     }
 }
 

@@ -1,4 +1,6 @@
-//! Sending a file of a run, or a part of it.
+//! Sends a file of a run, or a part of it.
+//!
+//! tower-http's file server would follow links, and compares times of whole seconds in place of entity tags.
 
 use std::fs::{File, Metadata};
 use std::io::SeekFrom;
@@ -13,18 +15,21 @@ use perturb_study::files::{Stamp, open_plain};
 use tokio::io::{AsyncReadExt, AsyncSeekExt};
 use tokio_util::io::ReaderStream;
 
-use crate::paths::{Relative, Root, media_type};
+use crate::paths::{RelativePath, Root, media_type};
 
-/// The end of what is asked of a file.
+/// Bytes that a request asks for.
 #[derive(Debug, PartialEq)]
-enum Asked {
+enum RequestedRange {
+    /// The whole file.
     Whole,
+    /// The bytes at these positions.
     Part(RangeInclusive<u64>),
-    Beyond,
+    /// Bytes after the end of the file.
+    NotSatisfiable,
 }
 
-/// The file that `relative` names; `None` if it is not sent.
-pub(crate) async fn send(root: Root, relative: Relative, headers: &HeaderMap) -> Option<Response> {
+/// Sends the file that `relative` names. Returns `None` if there is none or such files are not sent.
+pub(crate) async fn send(root: Root, relative: RelativePath, headers: &HeaderMap) -> Option<Response> {
     let opened = tokio::task::spawn_blocking(move || {
         let path = root.resolve(&relative)?;
         let kind = media_type(&path)?;
@@ -33,18 +38,18 @@ pub(crate) async fn send(root: Root, relative: Relative, headers: &HeaderMap) ->
     let (kind, (file, metadata)) = opened.await.ok()??;
     let (length, mut file) = (metadata.len(), tokio::fs::File::from_std(file));
     let tag = format!("\"{}\"", Stamp::of_metadata(&metadata).tag());
-    let said = |name: header::HeaderName| headers.get(name).and_then(|value| value.to_str().ok());
-    let known = |tags: &str| tags.split(',').any(|known| known.trim().trim_start_matches("W/") == tag);
-    if said(header::IF_NONE_MATCH).is_some_and(known) {
+    let header_text = |name: header::HeaderName| headers.get(name).and_then(|value| value.to_str().ok());
+    let has_tag = |tags: &str| tags.split(',').any(|known| known.trim().trim_start_matches("W/") == tag);
+    if header_text(header::IF_NONE_MATCH).is_some_and(has_tag) {
         return Some((StatusCode::NOT_MODIFIED, [(header::ETAG, tag)]).into_response());
     }
-    // A part of what has become another file fits no other part.
-    let range = said(header::RANGE).filter(|_| said(header::IF_RANGE).is_none_or(|of| of == tag));
-    let asked = range.map_or(Asked::Whole, |range| part(range, length));
-    let (status, from, count) = match &asked {
-        Asked::Whole => (StatusCode::OK, 0, length),
-        Asked::Part(range) => (StatusCode::PARTIAL_CONTENT, *range.start(), range.end() - range.start() + 1),
-        Asked::Beyond => {
+    // The client has parts of an earlier file if the tag differs. It gets the whole new file.
+    let range = header_text(header::RANGE).filter(|_| header_text(header::IF_RANGE).is_none_or(|known| known == tag));
+    let requested = range.map_or(RequestedRange::Whole, |range| parse_range(range, length));
+    let (status, from, count) = match &requested {
+        RequestedRange::Whole => (StatusCode::OK, 0, length),
+        RequestedRange::Part(range) => (StatusCode::PARTIAL_CONTENT, *range.start(), range.end() - range.start() + 1),
+        RequestedRange::NotSatisfiable => {
             let range = [(header::CONTENT_RANGE, format!("bytes */{length}"))];
             return Some((StatusCode::RANGE_NOT_SATISFIABLE, range).into_response());
         }
@@ -57,14 +62,14 @@ pub(crate) async fn send(root: Root, relative: Relative, headers: &HeaderMap) ->
     headers.insert(header::CONTENT_LENGTH, count.into());
     headers.insert(header::ETAG, HeaderValue::from_str(&tag).ok()?);
     headers.insert(header::ACCEPT_RANGES, HeaderValue::from_static("bytes"));
-    if let Asked::Part(range) = asked {
+    if let RequestedRange::Part(range) = requested {
         let range = format!("bytes {}-{}/{length}", range.start(), range.end());
         headers.insert(header::CONTENT_RANGE, HeaderValue::from_str(&range).ok()?);
     }
     Some(response)
 }
 
-/// Opens the plain file at a `path` without links. Had a part of it become a link meanwhile, another one would be open.
+/// Opens the plain file at `path`, whose links are resolved already. Fails if a part of the path has become a link since.
 fn open(path: &Path) -> std::io::Result<(File, Metadata)> {
     let opened = open_plain(path)?;
     match std::fs::read_link(format!("/proc/self/fd/{}", opened.0.as_raw_fd()))? == path {
@@ -73,20 +78,19 @@ fn open(path: &Path) -> std::io::Result<(File, Metadata)> {
     }
 }
 
-/// What a Range header asks of a file: one part, from somewhere, or so much of the end. What is not understood asks for
-/// all.
-fn part(header: &str, length: u64) -> Asked {
+/// Parses a `Range` header with one range. The whole file is sent for several ranges and for invalid headers.
+fn parse_range(header: &str, length: u64) -> RequestedRange {
     let Some((from, to)) = header.strip_prefix("bytes=").and_then(|range| range.split_once('-')) else {
-        return Asked::Whole;
+        return RequestedRange::Whole;
     };
     let last = length.saturating_sub(1);
     let (from, to) = match (from.parse::<u64>(), to.parse::<u64>()) {
         (Ok(from), Ok(to)) if from <= to => (from, to.min(last)),
         (Ok(from), Err(_)) if to.is_empty() => (from, last),
         (Err(_), Ok(count)) if from.is_empty() => (length.saturating_sub(count), last),
-        _ => return Asked::Whole,
+        _ => return RequestedRange::Whole,
     };
-    if from > to || length == 0 { Asked::Beyond } else { Asked::Part(from..=to) }
+    if from > to || length == 0 { RequestedRange::NotSatisfiable } else { RequestedRange::Part(from..=to) }
 }
 
 #[cfg(test)]
@@ -96,21 +100,21 @@ mod tests {
     use super::*;
 
     #[rstest]
-    #[case("bytes=0-", Asked::Part(0..=9))]
-    #[case("bytes=2-3", Asked::Part(2..=3))]
-    #[case("bytes=2-99", Asked::Part(2..=9))]
-    #[case("bytes=-4", Asked::Part(6..=9))]
-    #[case("bytes=-99", Asked::Part(0..=9))]
-    #[case("bytes=10-", Asked::Beyond)]
-    #[case("bytes=3-2", Asked::Whole)]
-    #[case("bytes=0-1,4-5", Asked::Whole)]
-    #[case("lines=1-2", Asked::Whole)]
-    fn a_part_of_ten_bytes(#[case] header: &str, #[case] expected: Asked) {
-        assert_eq!(part(header, 10), expected);
+    #[case("bytes=0-", RequestedRange::Part(0..=9))]
+    #[case("bytes=2-3", RequestedRange::Part(2..=3))]
+    #[case("bytes=2-99", RequestedRange::Part(2..=9))]
+    #[case("bytes=-4", RequestedRange::Part(6..=9))]
+    #[case("bytes=-99", RequestedRange::Part(0..=9))]
+    #[case("bytes=10-", RequestedRange::NotSatisfiable)]
+    #[case("bytes=3-2", RequestedRange::Whole)]
+    #[case("bytes=0-1,4-5", RequestedRange::Whole)]
+    #[case("lines=1-2", RequestedRange::Whole)]
+    fn ranges_of_ten_bytes(#[case] header: &str, #[case] expected: RequestedRange) {
+        assert_eq!(parse_range(header, 10), expected);
     }
 
     #[test]
-    fn what_has_become_a_link_meanwhile_is_not_opened() {
+    fn links_in_a_resolved_path_are_refused() {
         let directory = tempfile::tempdir().unwrap();
         let path = |name: &str| directory.path().canonicalize().unwrap().join(name);
         std::fs::create_dir(path("folder")).unwrap();

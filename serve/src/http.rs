@@ -1,4 +1,4 @@
-//! Requests and answers: pages, events, reports, files; nothing is ever changed.
+//! Routes and responses: pages, events, reports and files. No request changes anything.
 
 use std::convert::Infallible;
 use std::net::{IpAddr, SocketAddr};
@@ -16,42 +16,44 @@ use futures_util::{StreamExt, future};
 use perturb_protocol::Address;
 use tokio_stream::wrappers::WatchStream;
 
-use crate::load::Asked;
-use crate::paths::{Relative, Root};
-use crate::report::Reports;
-use crate::watch::{Missing, Seen, Topic, Watch};
+use crate::error::ViewError;
+use crate::paths::{RelativePath, Root};
+use crate::publisher::{EventData, Publisher, Topic};
+use crate::report::ReportCache;
+use crate::server_status::ServerMonitor;
 use crate::{files, pages};
-use pages::not_there;
+use pages::error_page;
 
-/// How often a stream says something although there is nothing to say: so it is known whether anybody listens.
-const KEEP_ALIVE: Duration = Duration::from_secs(15);
-/// Pages are made of this program's own files alone, and of pictures of the folder.
-const POLICY: &str =
+/// Time between comments on a silent event stream. They show whether the client is still there.
+const KEEP_ALIVE_INTERVAL: Duration = Duration::from_secs(15);
+/// Content security policy of pages. They use files of this program and pictures of the folder only.
+const PAGE_POLICY: &str =
     "default-src 'self'; object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'";
-/// A report has its style inside, and no script. A picture may have styles, too.
-const INERT: &str = "default-src 'none'; style-src 'unsafe-inline'; img-src 'self' data:; base-uri 'none'; \
+/// Content security policy of reports and files. Reports and pictures may have styles inside, but no scripts.
+const STATIC_POLICY: &str = "default-src 'none'; style-src 'unsafe-inline'; img-src 'self' data:; base-uri 'none'; \
                      form-action 'none'; frame-ancestors 'self'";
 
-/// What all requests share.
+/// State that all requests share.
 #[derive(Debug)]
-pub(crate) struct Shared {
+pub(crate) struct AppState {
     root: Root,
-    /// Whether only this machine can ask.
-    loopback: bool,
-    reports: Arc<Reports>,
-    pub(crate) watch: Arc<Watch>,
+    /// Whether the server listens on the loopback address.
+    is_loopback: bool,
+    reports: Arc<ReportCache>,
+    pub(crate) publisher: Arc<Publisher>,
 }
 
-impl Shared {
+impl AppState {
     pub(crate) fn new(root: Root, address: SocketAddr, server: Option<Address>) -> Self {
-        let (reports, server) = (Arc::new(Reports::default()), server.map(|address| Arc::new(Asked::at(address))));
-        let watch = Arc::new(Watch::new(root.clone(), Arc::clone(&reports), server));
-        Self { root, loopback: address.ip().is_loopback(), reports, watch }
+        let reports = Arc::new(ReportCache::default());
+        let server = server.map(|address| Arc::new(ServerMonitor::new(address)));
+        let publisher = Arc::new(Publisher::new(root.clone(), Arc::clone(&reports), server));
+        Self { root, is_loopback: address.ip().is_loopback(), reports, publisher }
     }
 }
 
-/// All that can be asked for.
-pub(crate) fn router(shared: Arc<Shared>) -> Router {
+/// Returns the routes of all pages.
+pub(crate) fn router(state: Arc<AppState>) -> Router {
     Router::new()
         .route("/", get(index))
         .route("/run/", get(run))
@@ -63,28 +65,29 @@ pub(crate) fn router(shared: Arc<Shared>) -> Router {
         .route("/events/", get(run_events))
         .route("/events/{*path}", get(run_events))
         .route("/assets/{name}", get(asset))
-        .fallback(|| async { pages::refusal(StatusCode::NOT_FOUND, "There is no such page.") })
-        .layer(from_fn_with_state(Arc::clone(&shared), guard))
-        .with_state(shared)
+        .fallback(|| async { pages::message_page(StatusCode::NOT_FOUND, "There is no such page.") })
+        .layer(from_fn_with_state(Arc::clone(&state), guard))
+        .with_state(state)
 }
 
-/// Refuses what is no question, and what another site may have had a browser ask; says with each answer what browsers may
-/// do with it.
-async fn guard(State(shared): State<Arc<Shared>>, request: Request, next: Next) -> Response {
+/// Refuses methods that change something and requests that another site caused. Adds the security headers to each response.
+async fn guard(State(state): State<Arc<AppState>>, request: Request, next: Next) -> Response {
     let mut response = if !matches!(*request.method(), Method::GET | Method::HEAD) {
-        let mut refusal = pages::refusal(StatusCode::METHOD_NOT_ALLOWED, "This server only shows; it changes nothing.");
-        refusal.headers_mut().insert(header::ALLOW, HeaderValue::from_static("GET, HEAD"));
-        refusal
-    } else if shared.loopback && !is_local(request.headers(), request.uri()) {
-        let words = "This server answers to localhost, 127.0.0.1 and [::1] alone: ask for it by one of these names.";
-        pages::refusal(StatusCode::MISDIRECTED_REQUEST, words)
-    } else if is_of_another_site(request.headers()) {
-        let words = "A page of another site has asked for this; open it by its address, or by a link.";
-        pages::refusal(StatusCode::FORBIDDEN, words)
+        let mut response =
+            pages::message_page(StatusCode::METHOD_NOT_ALLOWED, "This server changes nothing; use GET or HEAD.");
+        response.headers_mut().insert(header::ALLOW, HeaderValue::from_static("GET, HEAD"));
+        response
+    } else if state.is_loopback && !is_local(request.headers(), request.uri()) {
+        let message =
+            "This server answers to localhost, 127.0.0.1 and [::1] only. Use one of these names in the address.";
+        pages::message_page(StatusCode::MISDIRECTED_REQUEST, message)
+    } else if is_embedded_by_another_site(request.headers()) {
+        let message = "A page of another site has requested this. Open it by its address or by a link.";
+        pages::message_page(StatusCode::FORBIDDEN, message)
     } else {
         next.run(request).await
     };
-    let always = [
+    let security_headers = [
         (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
         (header::REFERRER_POLICY, "no-referrer"),
         (header::CACHE_CONTROL, "no-cache"),
@@ -92,21 +95,22 @@ async fn guard(State(shared): State<Arc<Shared>>, request: Request, next: Next) 
         (HeaderName::from_static("cross-origin-opener-policy"), "same-origin"),
     ];
     let headers = response.headers_mut();
-    headers.extend(always.map(|(name, value)| (name, HeaderValue::from_static(value))));
-    headers.entry(header::CONTENT_SECURITY_POLICY).or_insert(HeaderValue::from_static(POLICY));
+    headers.extend(security_headers.map(|(name, value)| (name, HeaderValue::from_static(value))));
+    headers.entry(header::CONTENT_SECURITY_POLICY).or_insert(HeaderValue::from_static(PAGE_POLICY));
     response
 }
 
-/// Whether a browser asks because a page of another site has a picture, a frame or a script from here: that page would see
-/// nothing, but have files read all the time. A link is followed, whoever has it.
-fn is_of_another_site(headers: &HeaderMap) -> bool {
-    let said = |name: &str| headers.get(name).and_then(|value| value.to_str().ok());
-    let link = said("sec-fetch-mode") == Some("navigate") && said("sec-fetch-dest") == Some("document");
-    matches!(said("sec-fetch-site"), Some("cross-site" | "same-site")) && !link
+/// Tells whether a page of another site embeds a picture, frame or script from here. That page would see nothing, but could
+/// have files read all the time. Links are followed from any site.
+fn is_embedded_by_another_site(headers: &HeaderMap) -> bool {
+    let header_text = |name: &str| headers.get(name).and_then(|value| value.to_str().ok());
+    let is_link =
+        header_text("sec-fetch-mode") == Some("navigate") && header_text("sec-fetch-dest") == Some("document");
+    matches!(header_text("sec-fetch-site"), Some("cross-site" | "same-site")) && !is_link
 }
 
-/// Whether a browser asked for a name of this machine. Another name may lead here, too, whoever has it: so a page of
-/// theirs would be of the same origin.
+/// Tells whether the request names this machine as localhost or by a loopback address. Another site could let its own name
+/// lead here, and its pages would then have the same origin.
 fn is_local(headers: &HeaderMap, uri: &Uri) -> bool {
     let host =
         headers.get(header::HOST).and_then(|host| host.to_str().ok()).or(uri.authority().map(|host| host.as_str()));
@@ -119,82 +123,82 @@ fn is_local(headers: &HeaderMap, uri: &Uri) -> bool {
     name.eq_ignore_ascii_case("localhost") || name.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
 }
 
-async fn index(State(shared): State<Arc<Shared>>) -> Response {
-    match shared.watch.see(&Topic::Index).await {
-        Ok(shown) => page(pages::index::page(&shared.root, &shown.update)),
-        Err(missing) => not_there(&missing),
+async fn index(State(state): State<Arc<AppState>>) -> Response {
+    match state.publisher.view(&Topic::Index).await {
+        Ok(view) => page(pages::index::page(&state.root, &view.update)),
+        Err(error) => error_page(&error),
     }
 }
 
-async fn run(State(shared): State<Arc<Shared>>, uri: Uri) -> Response {
-    let Some(relative) = named(&uri, "/run/") else { return not_there(&Missing::NoRun) };
-    match shared.watch.see(&Topic::Run(relative.clone())).await {
-        Ok(shown) => page(pages::run_page(&shared.root, &relative, &shown.update)),
-        Err(missing) => not_there(&missing),
+async fn run(State(state): State<Arc<AppState>>, uri: Uri) -> Response {
+    let Some(relative) = relative_path(&uri, "/run/") else { return error_page(&ViewError::RunNotFound) };
+    match state.publisher.view(&Topic::Run(relative.clone())).await {
+        Ok(view) => page(pages::run_page(&state.root, &relative, &view.update)),
+        Err(error) => error_page(&error),
     }
 }
 
-async fn index_events(State(shared): State<Arc<Shared>>) -> Response {
-    events(&shared, Topic::Index)
+async fn index_events(State(state): State<Arc<AppState>>) -> Response {
+    events(&state, Topic::Index)
 }
 
-async fn run_events(State(shared): State<Arc<Shared>>, uri: Uri) -> Response {
-    match named(&uri, "/events/") {
-        Some(relative) => events(&shared, Topic::Run(relative)),
-        None => not_there(&Missing::NoRun),
+async fn run_events(State(state): State<Arc<AppState>>, uri: Uri) -> Response {
+    match relative_path(&uri, "/events/") {
+        Some(relative) => events(&state, Topic::Run(relative)),
+        None => error_page(&ViewError::RunNotFound),
     }
 }
 
-/// What is seen, whenever it is something else.
-fn events(shared: &Shared, topic: Topic) -> Response {
-    let Some(seen) = shared.watch.subscribe(topic) else {
-        return pages::refusal(StatusCode::SERVICE_UNAVAILABLE, "Too many pages are open already; close some.");
+/// Streams the events of a page.
+fn events(state: &AppState, topic: Topic) -> Response {
+    let Some(events) = state.publisher.subscribe(topic) else {
+        return pages::message_page(StatusCode::SERVICE_UNAVAILABLE, "Too many pages are open already; close some.");
     };
-    let seen = WatchStream::new(seen).filter(|seen: &Seen| future::ready(!seen.is_empty()));
-    let events = seen.map(|seen| Ok::<_, Infallible>(Event::default().data(seen)));
-    Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)).into_response()
+    let events = WatchStream::new(events).filter(|event: &EventData| future::ready(!event.is_empty()));
+    let events = events.map(|event| Ok::<_, Infallible>(Event::default().data(event)));
+    Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE_INTERVAL)).into_response()
 }
 
-async fn report(State(shared): State<Arc<Shared>>, uri: Uri) -> Response {
-    let Some(relative) = named(&uri, "/report/") else { return not_there(&Missing::NoRun) };
-    // What the page says about the state is what the report is of.
-    let reported = match shared.watch.see(&Topic::Run(relative)).await {
-        Ok(shown) => shown.update.reported.clone(),
-        Err(missing) => return not_there(&missing),
+async fn report(State(state): State<Arc<AppState>>, uri: Uri) -> Response {
+    let Some(relative) = relative_path(&uri, "/report/") else { return error_page(&ViewError::RunNotFound) };
+    // The report is built from the files that the page has shown.
+    let source = match state.publisher.view(&Topic::Run(relative)).await {
+        Ok(view) => view.update.report_source.clone(),
+        Err(error) => return error_page(&error),
     };
-    let Some(pages::Reported { folder, state }) = reported else { return not_there(&Missing::NoRun) };
+    let Some(pages::ReportSource { folder, fingerprint }) = source else { return error_page(&ViewError::RunNotFound) };
     let page = match folder {
-        Ok(folder) => shared.reports.page(&folder, state).await,
+        Ok(folder) => state.reports.page(&folder, fingerprint).await,
         Err(reason) => Err(reason),
     };
     let mut response = match page {
         Ok(page) => Html(page.to_string()).into_response(),
         Err(reason) => Html(pages::no_report(&reason)).into_response(),
     };
-    response.headers_mut().insert(header::CONTENT_SECURITY_POLICY, HeaderValue::from_static(INERT));
+    response.headers_mut().insert(header::CONTENT_SECURITY_POLICY, HeaderValue::from_static(STATIC_POLICY));
     response
 }
 
-async fn file(State(shared): State<Arc<Shared>>, uri: Uri, headers: HeaderMap) -> Response {
-    let sent = match named(&uri, "/file/") {
-        Some(relative) => files::send(shared.root.clone(), relative, &headers).await,
+async fn file(State(state): State<Arc<AppState>>, uri: Uri, headers: HeaderMap) -> Response {
+    let sent = match relative_path(&uri, "/file/") {
+        Some(relative) => files::send(state.root.clone(), relative, &headers).await,
         None => None,
     };
-    let Some(mut response) = sent else { return pages::refusal(StatusCode::NOT_FOUND, "There is no such file.") };
-    response.headers_mut().insert(header::CONTENT_SECURITY_POLICY, HeaderValue::from_static(INERT));
+    let Some(mut response) = sent else { return pages::message_page(StatusCode::NOT_FOUND, "There is no such file.") };
+    response.headers_mut().insert(header::CONTENT_SECURITY_POLICY, HeaderValue::from_static(STATIC_POLICY));
     response
 }
 
 async fn asset(uri: Uri) -> Response {
     match uri.path().strip_prefix("/assets/").and_then(pages::asset) {
         Some((kind, content)) => ([(header::CONTENT_TYPE, kind)], content).into_response(),
-        None => pages::refusal(StatusCode::NOT_FOUND, "There is no such file."),
+        None => pages::message_page(StatusCode::NOT_FOUND, "There is no such file."),
     }
 }
 
-/// What the address names behind `prefix`, as it was written.
-fn named(uri: &Uri, prefix: &str) -> Option<Relative> {
-    Relative::decode(uri.path().strip_prefix(prefix)?)
+/// Returns the path after `prefix` in the address.
+fn relative_path(uri: &Uri, prefix: &str) -> Option<RelativePath> {
+    RelativePath::decode(uri.path().strip_prefix(prefix)?)
 }
 
 fn page(text: String) -> Response {
@@ -233,13 +237,13 @@ mod tests {
     #[case(&[("sec-fetch-site", "cross-site"), ("sec-fetch-mode", "no-cors"), ("sec-fetch-dest", "image")], true)]
     #[case(&[("sec-fetch-site", "cross-site"), ("sec-fetch-mode", "navigate"), ("sec-fetch-dest", "iframe")], true)]
     #[case(&[("sec-fetch-site", "same-site"), ("sec-fetch-mode", "cors"), ("sec-fetch-dest", "empty")], true)]
-    fn pages_of_other_sites_have_links_and_nothing_else(#[case] said: &[(&'static str, &str)], #[case] refused: bool) {
-        let said = said.iter().map(|(name, value)| (HeaderName::from_static(name), value.parse().unwrap()));
-        assert_eq!(is_of_another_site(&HeaderMap::from_iter(said)), refused);
+    fn pages_of_other_sites_may_only_link(#[case] headers: &[(&'static str, &str)], #[case] refused: bool) {
+        let headers = headers.iter().map(|(name, value)| (HeaderName::from_static(name), value.parse().unwrap()));
+        assert_eq!(is_embedded_by_another_site(&HeaderMap::from_iter(headers)), refused);
     }
 
     #[test]
-    fn who_names_nobody_is_no_browser_of_this_machine() {
+    fn a_request_without_a_host_is_not_local() {
         assert!(!is_local(&HeaderMap::new(), &Uri::from_static("/")));
     }
 }

@@ -1,95 +1,96 @@
-//! What is below the folder.
+//! The list of all runs below the served folder.
 
 use perturb_study::files::FileError;
 use perturb_study::runs::{Kind, Place, RunSummary, places};
 
-use crate::experiment::Experiment;
-use crate::pages::pictures::{Pictures, in_folder};
-use crate::paths::{Relative, Root};
-use crate::training::Training;
-use crate::watch::Views;
+use crate::experiment::LiveExperiment;
+use crate::paths::{RelativePath, Root};
+use crate::pictures::{Pictures, scan_folder};
+use crate::runs::Runs;
+use crate::training::LiveTraining;
 
-/// At most so many folders are looked at.
-pub(crate) const MOST_FOLDERS: usize = 10_000;
-/// At most so many runs are listed.
-pub(crate) const MOST_ROWS: usize = 500;
-/// At most so many pictures that lie beside runs are shown.
-const MOST_PICTURES: usize = 24;
+/// Maximum number of folders that are searched for runs.
+pub(crate) const MAX_FOLDERS: usize = 10_000;
+/// Maximum number of listed runs.
+pub(crate) const MAX_ROWS: usize = 500;
+/// Maximum number of pictures from folders that are no runs.
+const MAX_PICTURES: usize = 24;
 
 /// All runs.
 #[derive(Debug)]
 pub(crate) struct Index {
-    /// Those in work first, then those that changed last; at most [`MOST_ROWS`].
+    /// Runs in work first, then those that changed last; at most [`MAX_ROWS`].
     pub(crate) runs: Vec<Row>,
-    /// How many runs there are beside these.
+    /// Number of runs that are not listed.
     pub(crate) more_runs: usize,
-    /// Whether there are more folders than were looked at.
-    pub(crate) more: bool,
-    /// In folders that are no runs.
+    /// Whether there are more folders than were searched.
+    pub(crate) has_more_folders: bool,
+    /// Pictures from folders that are no runs.
     pub(crate) pictures: Pictures,
 }
 
 /// A run.
 #[derive(Debug)]
 pub(crate) struct Row {
-    pub(crate) relative: Relative,
+    pub(crate) relative: RelativePath,
     pub(crate) kind: Kind,
     pub(crate) summary: RunSummary,
-    /// s since 1970.
+    /// Time of the last change, in seconds since 1970.
     pub(crate) changed: i64,
-    /// s, if that is known.
-    pub(crate) left: Option<f64>,
+    /// Remaining time in seconds, if it is known.
+    pub(crate) remaining_seconds: Option<f64>,
 }
 
 impl Index {
-    pub(crate) fn look(root: &Root, views: &Views) -> Result<Self, FileError> {
-        Self::of(root, views, MOST_FOLDERS, MOST_ROWS)
+    pub(crate) fn scan(root: &Root, runs: &Runs) -> Result<Self, FileError> {
+        Self::scan_within(root, runs, MAX_FOLDERS, MAX_ROWS)
     }
 
-    /// Of so many folders at most, with so many rows.
-    fn of(root: &Root, views: &Views, most_folders: usize, most_rows: usize) -> Result<Self, FileError> {
-        let found = places(root.path(), most_folders)?;
-        // A hidden folder is no part of what is served.
-        let rows = found.runs.iter().filter_map(|place| Some(Row::of(root.relative(&place.path)?, place, root, views)));
+    fn scan_within(root: &Root, known: &Runs, max_folders: usize, max_rows: usize) -> Result<Self, FileError> {
+        let found = places(root.path(), max_folders)?;
+        // Hidden folders are not served.
+        let rows =
+            found.runs.iter().filter_map(|place| Some(Row::new(root.relative(&place.path)?, place, root, known)));
         let mut runs: Vec<Row> = rows.collect();
         runs.sort_by_key(|row| (row.summary.state != "in work", std::cmp::Reverse(row.changed)));
-        let more_runs = runs.len().saturating_sub(most_rows);
-        runs.truncate(most_rows);
+        let more_runs = runs.len().saturating_sub(max_rows);
+        runs.truncate(max_rows);
         let mut pictures = Pictures::default();
         for path in &found.others {
             if let Some(relative) = root.relative(path) {
-                let room = MOST_PICTURES - pictures.shown.len();
-                pictures.add(in_folder(&relative, path, room));
+                let max_shown = MAX_PICTURES - pictures.shown.len();
+                pictures.add(scan_folder(&relative, path, max_shown));
             }
         }
-        Ok(Self { runs, more_runs, more: found.more, pictures })
+        Ok(Self { runs, more_runs, has_more_folders: found.more, pictures })
     }
 }
 
 impl Row {
-    fn of(relative: Relative, Place { path, kind }: &Place, root: &Root, views: &Views) -> Self {
-        let (summary, changed, left) = match kind {
-            Kind::Training => views.trainings.with(
+    fn new(relative: RelativePath, Place { path, kind }: &Place, root: &Root, runs: &Runs) -> Self {
+        let (summary, changed, remaining_seconds) = match kind {
+            Kind::Training => runs.trainings.with(
                 path,
-                || Training::of(root.path(), path),
+                || LiveTraining::new(root.path(), path),
                 |training| {
-                    training.look();
+                    training.refresh();
                     if training.status().is_ok_and(|status| status.state == "in work") {
-                        training.follow(); // how long it may take follows from its log
+                        // The remaining time follows from the log of episodes.
+                        training.refresh_details();
                     }
-                    (training.summary(), training.changed(), training.left())
+                    (training.summary(), training.changed(), training.remaining_seconds())
                 },
             ),
-            Kind::Experiment => views.experiments.with(
+            Kind::Experiment => runs.experiments.with(
                 path,
-                || Experiment::of(root.path(), path),
+                || LiveExperiment::new(root.path(), path),
                 |experiment| {
-                    experiment.look();
+                    experiment.refresh();
                     (experiment.summary(), experiment.changed(), None)
                 },
             ),
         };
-        Self { relative, kind: *kind, summary, changed, left }
+        Self { relative, kind: *kind, summary, changed, remaining_seconds }
     }
 }
 
@@ -98,7 +99,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn of_many_folders_runs_and_pictures_some_are_shown_and_the_others_counted() {
+    fn runs_and_pictures_beyond_the_limits_are_counted() {
         let directory = tempfile::tempdir().unwrap();
         let write = |name: &str| {
             let path = directory.path().join(name);
@@ -110,11 +111,11 @@ mod tests {
         (0..20).for_each(|picture| write(&format!("b/{picture}.svg")));
         (0..20).for_each(|picture| write(&format!("b/{picture}.png")));
         let root = Root::open(directory.path()).unwrap();
-        let index = Index::of(&root, &Views::default(), 100, 2).unwrap();
-        assert_eq!((index.runs.len(), index.more_runs, index.more), (2, 1, false));
-        assert_eq!((index.pictures.shown.len(), index.pictures.more), (MOST_PICTURES, 16), "none counts twice");
-        assert!(Index::of(&root, &Views::default(), 3, 2).unwrap().more);
+        let index = Index::scan_within(&root, &Runs::default(), 100, 2).unwrap();
+        assert_eq!((index.runs.len(), index.more_runs, index.has_more_folders), (2, 1, false));
+        assert_eq!((index.pictures.shown.len(), index.pictures.more), (MAX_PICTURES, 16), "none counts twice");
+        assert!(Index::scan_within(&root, &Runs::default(), 3, 2).unwrap().has_more_folders);
         std::fs::remove_dir_all(directory.path()).unwrap();
-        assert!(Index::look(&root, &Views::default()).unwrap_err().to_string().starts_with("cannot list "));
+        assert!(Index::scan(&root, &Runs::default()).unwrap_err().to_string().starts_with("cannot list "));
     }
 }

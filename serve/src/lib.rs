@@ -1,87 +1,88 @@
-//! A page that shows trainings and experiments as they go: read-only, over HTTP.
+//! `perturb serve`: a read-only web page that shows trainings and experiments while they run.
 //!
-//! - [`Server`] listens. [`http`](self) answers: which requests there are, what keeps strangers out.
-//! - `paths` and `files`: what of the folder is sent.
-//! - `watch`: one task looks at the files for all who look at pages, and tells them by server-sent events; `paced` says how
-//!   often anything is looked at, `shelf` keeps what is known of each run under a lock of its own.
-//! - `training`, `experiment`, `index`: what is known of each, kept between looks; `tail` and `curve` follow a log that
-//!   grows, `remaining` says how long an experiment may take, `report` makes its report, `load` asks a server.
-//! - `pages`: all of it as HTML.
+//! - [`Server`] listens. `connections` limits connections, `http` routes requests and keeps other sites out.
+//! - `paths` and `files` send files of the served folder.
+//! - `publisher` reads the files of open pages and sends changes as server-sent events. `cached_loader` limits how often files
+//!   are read, `runs` keeps the state of each run between two readings.
+//! - `training`, `experiment`, `index` and `pictures` read runs. `tail` and `curve` follow a growing log, `eta` estimates the
+//!   remaining time, `report` builds reports, `server_status` polls a server of environments.
+//! - `pages` makes HTML of all this.
 #![forbid(unsafe_code)]
 
+mod cached_loader;
 mod connections;
 mod curve;
 mod error;
+mod eta;
 mod experiment;
 mod files;
 mod http;
 mod index;
-mod load;
-mod paced;
+mod keyed_cache;
 mod pages;
 mod paths;
-mod remaining;
+mod pictures;
+mod publisher;
 mod report;
-mod shelf;
+mod runs;
+mod server_status;
 mod tail;
 mod training;
-mod watch;
 
+use std::convert::Infallible;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use tokio::net::TcpListener;
 
+use connections::ConnectionLimits;
 pub use error::ServeError;
-use http::Shared;
+use http::AppState;
 use paths::Root;
 
-/// What is served, and where.
+/// Options of the server.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// The folder that the runs are in.
+    /// The folder with the runs.
     pub folder: PathBuf,
-    /// Where to listen; port 0 takes a free one.
+    /// Address to listen at; port 0 takes a free port.
     pub address: SocketAddr,
-    /// The server of environments whose load is shown.
+    /// A server of environments whose status is shown.
     pub server: Option<perturb_protocol::Address>,
 }
 
-/// A server of pages that listens.
+/// A web server that listens.
 #[derive(Debug)]
 pub struct Server {
     listener: TcpListener,
     address: SocketAddr,
-    shared: Arc<Shared>,
+    state: Arc<AppState>,
 }
 
 impl Server {
-    /// Begins to listen.
+    /// Opens the folder and listens.
     ///
     /// # Errors
-    /// [`ServeError`], with what to do.
+    /// [`ServeError`] if the folder cannot be read or the address cannot be used.
     pub async fn bind(options: &Options) -> Result<Self, ServeError> {
         let root = Root::open(&options.folder)?;
         let failed = |source| ServeError::Address { address: options.address, source };
         let listener = TcpListener::bind(options.address).await.map_err(failed)?;
         let address = listener.local_addr().map_err(failed)?;
-        let shared = Arc::new(Shared::new(root, address, options.server.clone()));
-        Ok(Self { listener, address, shared })
+        let state = Arc::new(AppState::new(root, address, options.server.clone()));
+        Ok(Self { listener, address, state })
     }
 
-    /// Where it listens.
+    /// Returns the address at which the server listens.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// Answers requests, for ever.
-    ///
-    /// # Errors
-    /// The operating system's.
-    pub async fn run(self) -> std::io::Result<()> {
-        let Self { listener, shared, .. } = self;
-        tokio::spawn(Arc::clone(&shared.watch).run());
-        axum::serve(connections::Connections::of(listener), http::router(shared)).await
+    /// Answers requests. Never returns.
+    pub async fn run(self) -> Infallible {
+        let Self { listener, state, .. } = self;
+        tokio::spawn(Arc::clone(&state.publisher).run());
+        connections::serve(listener, http::router(state), ConnectionLimits::default()).await
     }
 }

@@ -1,4 +1,4 @@
-//! Which paths below the folder an address can name, and what of it is sent.
+//! Paths below the served folder, as addresses name them, and the kinds of files that are sent.
 
 use std::ffi::OsStr;
 use std::os::unix::ffi::{OsStrExt, OsStringExt};
@@ -9,24 +9,27 @@ use perturb_study::files::require_folder;
 
 use crate::error::ServeError;
 
-/// What stands for itself in an address.
-const PLAIN: &AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'_').remove(b'.').remove(b'~');
+/// Bytes that are escaped in addresses: all but letters, digits and `-_.~`.
+const ESCAPED: &AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'_').remove(b'.').remove(b'~');
 
-/// The folder that is served.
+/// The served folder.
 #[derive(Clone, Debug)]
 pub(crate) struct Root {
-    /// Without symbolic links.
+    /// Absolute path without symbolic links.
     path: PathBuf,
-    /// As it was given.
+    /// Path as the user gave it.
     given: PathBuf,
 }
 
-/// A path below the folder, whose names are all plain: nothing leads up, and nothing is hidden. Empty for the folder itself.
+/// A path below the served folder, without `..` and without hidden names. It is empty for the folder itself.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Hash)]
-pub(crate) struct Relative(PathBuf);
+pub(crate) struct RelativePath(PathBuf);
 
 impl Root {
-    /// The folder at `given`, which must be there now.
+    /// Opens the folder at `given`.
+    ///
+    /// # Errors
+    /// [`ServeError`] if there is no folder or it cannot be read.
     pub(crate) fn open(given: &Path) -> Result<Self, ServeError> {
         let no_folder = || ServeError::NoFolder { path: given.to_owned() };
         if !given.is_dir() {
@@ -40,44 +43,44 @@ impl Root {
         &self.path
     }
 
-    /// As it was given.
+    /// Returns the path as the user gave it.
     pub(crate) fn given(&self) -> &Path {
         &self.given
     }
 
-    /// What `relative` names, without symbolic links; `None` if nothing is there, or it is not below the folder.
-    pub(crate) fn resolve(&self, relative: &Relative) -> Option<PathBuf> {
+    /// Returns the absolute path of `relative` without symbolic links. Returns `None` if nothing is there, or if it is not
+    /// below the folder.
+    pub(crate) fn resolve(&self, relative: &RelativePath) -> Option<PathBuf> {
         let real = self.path.join(&relative.0).canonicalize().ok()?;
         self.relative(&real).map(|_| real)
     }
 
-    /// The name of what is at `path`; `None` if it is not below the folder, or hidden.
-    pub(crate) fn relative(&self, path: &Path) -> Option<Relative> {
+    /// Returns the path of `path` below the folder. Returns `None` if it is elsewhere or hidden.
+    pub(crate) fn relative(&self, path: &Path) -> Option<RelativePath> {
         let names = path.strip_prefix(&self.path).ok()?;
-        names.iter().all(is_plain).then(|| Relative(names.to_owned()))
+        names.iter().all(is_visible_name).then(|| RelativePath(names.to_owned()))
     }
 }
 
-impl Relative {
-    /// What an address means by `text`, in which bytes may be written as `%41`; `None` for what names no path, or a hidden
-    /// one.
+impl RelativePath {
+    /// Decodes the path in an address, whose bytes may be written as `%41`. Returns `None` for invalid and hidden paths.
     pub(crate) fn decode(text: &str) -> Option<Self> {
         let text = text.strip_suffix('/').unwrap_or(text);
         let mut path = PathBuf::new();
         for name in text.split('/').filter(|_| !text.is_empty()) {
             let name = std::ffi::OsString::from_vec(percent_decode_str(name).collect());
-            path.push(is_plain(&name).then_some(name)?);
+            path.push(is_visible_name(&name).then_some(name)?);
         }
         Some(Self(path))
     }
 
-    /// As an address has it.
+    /// Encodes the path for an address.
     pub(crate) fn encode(&self) -> String {
-        let names = self.0.iter().map(|name| percent_encode(name.as_bytes(), PLAIN).to_string());
+        let names = self.0.iter().map(|name| percent_encode(name.as_bytes(), ESCAPED).to_string());
         names.collect::<Vec<_>>().join("/")
     }
 
-    /// With another name behind it.
+    /// Returns the path with another name at its end.
     pub(crate) fn join(&self, name: impl AsRef<Path>) -> Self {
         Self(self.0.join(name))
     }
@@ -87,14 +90,14 @@ impl Relative {
     }
 }
 
-/// Whether `name` is that of a file or a folder in the one before it, and not hidden.
-fn is_plain(name: &OsStr) -> bool {
+/// Tells whether `name` is a single file name that is not hidden. `.` and `..` count as hidden.
+fn is_visible_name(name: &OsStr) -> bool {
     let bytes = name.as_bytes();
     !bytes.is_empty() && bytes[0] != b'.' && !bytes.contains(&b'/') && !bytes.contains(&0)
 }
 
-/// Names of text files that runs write.
-const TEXTS: [(&str, &str); 7] = [
+/// Text files of runs that are sent, with their media types.
+const TEXT_FILES: [(&str, &str); 7] = [
     ("config.toml", "text/plain; charset=utf-8"),
     ("plan.toml", "text/plain; charset=utf-8"),
     ("log.txt", "text/plain; charset=utf-8"),
@@ -103,8 +106,8 @@ const TEXTS: [(&str, &str); 7] = [
     ("timing.json", "application/json"),
     ("report.md", "text/plain; charset=utf-8"),
 ];
-/// Endings of tables, pictures and films.
-const ENDINGS: [(&str, &str); 6] = [
+/// Extensions of tables, pictures and films that are sent, with their media types.
+const MEDIA_EXTENSIONS: [(&str, &str); 6] = [
     ("csv", "text/csv; charset=utf-8"),
     ("svg", "image/svg+xml"),
     ("png", "image/png"),
@@ -113,14 +116,14 @@ const ENDINGS: [(&str, &str); 6] = [
     ("webm", "video/webm"),
 ];
 
-/// The type of the file at `path`; `None` for those that are not sent.
+/// Returns the media type of the file at `path`. Returns `None` if such files are not sent.
 pub(crate) fn media_type(path: &Path) -> Option<&'static str> {
     let name = path.file_name()?.to_str()?;
-    let ending = path.extension().and_then(OsStr::to_str).unwrap_or_default();
-    let of = |known: &[(&str, &'static str)], wanted: &str| {
+    let extension = path.extension().and_then(OsStr::to_str).unwrap_or_default();
+    let find = |known: &[(&str, &'static str)], wanted: &str| {
         known.iter().find(|(name, _)| *name == wanted).map(|(_, kind)| *kind)
     };
-    of(&TEXTS, name).or_else(|| of(&ENDINGS, ending))
+    find(&TEXT_FILES, name).or_else(|| find(&MEDIA_EXTENSIONS, extension))
 }
 
 #[cfg(test)]
@@ -149,20 +152,20 @@ mod tests {
     #[case("./a", None)]
     #[case("a%00.svg", None)]
     #[case(".ssh/id", None)]
-    fn an_address_names_what_is_below_and_nothing_else(#[case] text: &str, #[case] expected: Option<&str>) {
-        assert_eq!(Relative::decode(text), expected.map(|path| Relative(path.into())));
+    fn addresses_name_visible_paths_below_the_folder(#[case] text: &str, #[case] expected: Option<&str>) {
+        assert_eq!(RelativePath::decode(text), expected.map(|path| RelativePath(path.into())));
     }
 
     #[test]
-    fn whatever_bytes_a_name_has_it_comes_back() {
+    fn names_of_any_bytes_survive_encoding() {
         let name = OsStr::from_bytes(b"\xff%2f\" <&?#\n");
-        let relative = Relative(Path::new("a").join(name));
-        assert_eq!(Relative::decode(&relative.encode()), Some(relative.clone()));
+        let relative = RelativePath(Path::new("a").join(name));
+        assert_eq!(RelativePath::decode(&relative.encode()), Some(relative.clone()));
         assert!(relative.encode().bytes().all(|byte| byte.is_ascii_graphic() && !b"\"<>&?#".contains(&byte)));
     }
 
     #[test]
-    fn links_that_lead_out_lead_nowhere() {
+    fn links_out_of_the_folder_resolve_to_nothing() {
         let directory = tempfile::tempdir().unwrap();
         let path = |name: &str| directory.path().join(name);
         std::fs::create_dir_all(path("runs/inside")).unwrap();
@@ -172,7 +175,7 @@ mod tests {
             std::os::unix::fs::symlink(path(to), path("runs").join(name)).unwrap();
         }
         let root = Root::open(&path("runs")).unwrap();
-        let resolved = |text: &str| root.resolve(&Relative::decode(text).unwrap());
+        let resolved = |text: &str| root.resolve(&RelativePath::decode(text).unwrap());
         assert_eq!((resolved("out.csv"), resolved("up/secret.csv"), resolved("missing")), (None, None, None));
         assert_eq!(resolved("in/a.csv"), resolved("inside/a.csv"));
         assert_eq!(resolved(""), Some(root.path().to_owned()));

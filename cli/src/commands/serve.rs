@@ -24,6 +24,6 @@ pub(super) fn run(args: &ServeArgs) -> Result<()> {
         writeln!(out, "http://{address}")?;
         out.flush()?;
         note(format_args!("showing {} there; Ctrl-C ends it", args.dir.display()));
-        server.run().await.map_err(system("take connections"))
+        match server.run().await {}
     })
 }

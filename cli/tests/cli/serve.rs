@@ -50,7 +50,10 @@ fn an_address_that_others_reach_is_warned_about() {
     write!(stream, "GET / HTTP/1.1\r\nHost: machine.example\r\nConnection: close\r\n\r\n").expect("sent");
     let mut answer = String::new();
     stream.read_to_string(&mut answer).expect("an answer");
-    assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("There is nothing yet"), "{answer}");
+    assert!(
+        answer.starts_with("HTTP/1.1 200") && answer.contains("There is no training and no experiment yet"),
+        "{answer}"
+    );
     child.kill().expect("killed");
     let output = ended(child);
     let said = String::from_utf8_lossy(&output.stderr);

@@ -9,17 +9,24 @@ use perturb_study::runs::{CellStatus, ExperimentStatus, Kind};
 use perturb_study::words::{duration, grouped};
 use serde_json::json;
 
-use super::{Reported, Update, badge, bar, chart, crumbs, name_of, pictures, run_link, time, troubles};
-use crate::experiment::{Experiment, MOST_FOLLOWED as MOST_LISTED};
-use crate::paths::{Relative, Root};
+use super::{ReportSource, Update, badge, bar, breadcrumbs, chart, faults, pictures, run_link, shown_name, time};
+use crate::experiment::{LiveExperiment, MAX_CURVES as MAX_LISTED};
+use crate::paths::{RelativePath, Root};
+use crate::pictures::scan_run;
 
-/// Of more cells no map is drawn.
-const MOST_MAPPED: usize = 1000;
+/// Maximum number of cells of which a map is drawn.
+const MAX_MAPPED: usize = 1000;
 
-pub(crate) fn update(root: &Root, relative: &Relative, path: &Path, experiment: &Experiment, report: u64) -> Update {
-    let name = name_of(root, relative);
+pub(crate) fn update(
+    root: &Root,
+    relative: &RelativePath,
+    path: &Path,
+    experiment: &LiveExperiment,
+    report: u64,
+) -> Update {
+    let name = shown_name(root, relative);
     let (title, parts) = match experiment.status() {
-        Err(reason) => (name, vec![("head", troubles(&[format!("This experiment is not understood: {reason}")]))]),
+        Err(reason) => (name, vec![("head", faults(&[format!("This experiment is not understood: {reason}")]))]),
         Ok(status) => {
             let parts = vec![
                 ("head", head(status, experiment)),
@@ -27,21 +34,29 @@ pub(crate) fn update(root: &Root, relative: &Relative, path: &Path, experiment: 
                 ("working", working(status, experiment, relative)),
                 ("map", map(status, experiment, relative)),
                 ("failures", failures(status, experiment, relative)),
-                ("lag", lag(report != experiment.files())),
-                ("pictures", pictures::of_run(relative, path)),
+                ("lag", lag(report != experiment.report_fingerprint())),
+                ("pictures", pictures::section(&scan_run(relative, path))),
             ];
             (title(&name, status, experiment), parts)
         }
     };
     let charts = json!({ "cells": experiment.curves() });
-    let reported = Some(Reported { folder: experiment.reported(), state: experiment.files() });
-    Update { title, kind: Some(Kind::Experiment), parts, charts, report, reported, crumbs: crumbs(root, relative) }
+    let source = ReportSource { folder: experiment.report_folder(), fingerprint: experiment.report_fingerprint() };
+    Update {
+        title,
+        kind: Some(Kind::Experiment),
+        parts,
+        charts,
+        report,
+        report_source: Some(source),
+        breadcrumbs: breadcrumbs(root, relative),
+    }
 }
 
-pub(crate) fn page(root: &Root, relative: &Relative, update: &Update) -> String {
+pub(crate) fn page(root: &Root, relative: &RelativePath, update: &Update) -> String {
     let report = format!("/report/{}", relative.encode());
     let main = html! {
-        h1 { (name_of(root, relative)) }
+        h1 { (shown_name(root, relative)) }
         (update.part("head"))
         (update.part("failures"))
         (update.part("kinds"))
@@ -50,22 +65,22 @@ pub(crate) fn page(root: &Root, relative: &Relative, update: &Update) -> String 
         details open { summary { "All cells" } (update.part("map")) }
         (update.part("pictures"))
         h2 { "Report as it stands" }
-        p.note { a href=(report) { "The report alone" } ", as " code { "perturb report --html" } " writes it when all is done." }
+        p.note { a href=(report) { "The report on its own page" } ", as " code { "perturb report --html" } " writes it at the end." }
         (update.part("lag"))
         iframe.report src=(report) title="Report as it stands" loading="lazy" data-report=(format!("{:016x}", update.report)) {}
         p.note {
             "Files: " a href={ "/file/" (relative.join("plan.toml").encode()) } { "plan.toml" }
         }
     };
-    super::document(&update.title, &format!("/events/{}", relative.encode()), &update.crumbs, &main)
+    super::document(&update.title, &format!("/events/{}", relative.encode()), &update.breadcrumbs, &main)
 }
 
-fn title(name: &str, status: &ExperimentStatus, experiment: &Experiment) -> String {
+fn title(name: &str, status: &ExperimentStatus, experiment: &LiveExperiment) -> String {
     let (done, all) = (status.count(CellStatus::is_settled), status.cells.len());
     if experiment.state() == "in work" { format!("{done}/{all} · {name}") } else { format!("{name} · perturb") }
 }
 
-fn head(status: &ExperimentStatus, experiment: &Experiment) -> Markup {
+fn head(status: &ExperimentStatus, experiment: &LiveExperiment) -> Markup {
     let all = status.cells.len() as u64;
     let (done, settled) = (status.done().count(), status.count(CellStatus::is_settled) as u64);
     let count = |is: fn(&CellStatus) -> bool| status.count(is);
@@ -79,7 +94,7 @@ fn head(status: &ExperimentStatus, experiment: &Experiment) -> Markup {
             CellStatus::NotUnderstood(reason) => Some(reason.clone()),
             _ => None,
         })
-        .take(MOST_LISTED)
+        .take(MAX_LISTED)
         .collect();
     html! {
         p.head { (status.plan.environments().join(", ")) " " (badge(experiment.state())) }
@@ -89,25 +104,25 @@ fn head(status: &ExperimentStatus, experiment: &Experiment) -> Markup {
             @for (number, what) in [(failed, "failed"), (working, "in work"), (waiting, "to do")] {
                 @if number > 0 { ", " (grouped(number)) " " (what) }
             }
-            @if let Some(left) = experiment.left() { "; about " (duration(left)) " left" }
+            @if let Some(left) = experiment.remaining_seconds() { "; about " (duration(left)) " left" }
             "; changed " (time(experiment.changed())) "."
         }
-        (troubles(&wrong))
+        (faults(&wrong))
     }
 }
 
-/// Success of what is done, and how many cells there are, by kinds.
+/// Shows the success of the finished cells, and the number of cells, by kinds of cells.
 fn kinds(status: &ExperimentStatus) -> Markup {
     let rates = status.rates();
     let mut kinds: Vec<(String, usize, usize)> = Vec::new();
     for (cell, known) in status.plan.cells.iter().zip(&status.cells) {
         let kind = cell.described();
-        let place = kinds.iter().position(|(name, ..)| *name == kind).unwrap_or_else(|| {
+        let index = kinds.iter().position(|(name, ..)| *name == kind).unwrap_or_else(|| {
             kinds.push((kind, 0, 0));
             kinds.len() - 1
         });
-        kinds[place].1 += usize::from(matches!(known, CellStatus::Done(_)));
-        kinds[place].2 += 1;
+        kinds[index].1 += usize::from(matches!(known, CellStatus::Done(_)));
+        kinds[index].2 += 1;
     }
     let mut seen = BTreeSet::new();
     let sets: Vec<&str> = (status.plan.cells.iter().flat_map(|cell| &cell.tests.sets))
@@ -115,7 +130,7 @@ fn kinds(status: &ExperimentStatus) -> Markup {
         .filter(|name| seen.insert(*name))
         .collect();
     html! {
-        h2 { "Success of what is done, %" }
+        h2 { "Success of the finished cells, %" }
         div.wide {
             table.rates {
                 thead {
@@ -143,23 +158,23 @@ fn kinds(status: &ExperimentStatus) -> Markup {
                 }
             }
         }
-        p.note { "Means over settings and runs; the report below selects." }
+        p.note { "Means over configurations and runs. The report below has the selected configurations." }
     }
 }
 
-fn working(status: &ExperimentStatus, experiment: &Experiment, relative: &Relative) -> Markup {
+fn working(status: &ExperimentStatus, experiment: &LiveExperiment, relative: &RelativePath) -> Markup {
     let cells = || {
         let all = status.plan.cells.iter().zip(&status.cells);
         all.filter(|(_, known)| **known == CellStatus::InWork).map(|(cell, _)| cell)
     };
-    let more = cells().count().saturating_sub(MOST_LISTED);
+    let more = cells().count().saturating_sub(MAX_LISTED);
     html! {
         @if cells().next().is_some() {
             h2 { "In work" }
             div.wide {
                 table.working {
                     thead { tr { @for name in ["cell", "training", "success, last 100", "doing"] { th scope="col" { (name) } } } }
-                    tbody { @for cell in cells().take(MOST_LISTED) { (one(cell, experiment, relative)) } }
+                    tbody { @for cell in cells().take(MAX_LISTED) { (one(cell, experiment, relative)) } }
                 }
             }
             @if more > 0 { p { "And " (more) " more." } }
@@ -167,7 +182,7 @@ fn working(status: &ExperimentStatus, experiment: &Experiment, relative: &Relati
     }
 }
 
-fn one(cell: &Cell, experiment: &Experiment, relative: &Relative) -> Markup {
+fn one(cell: &Cell, experiment: &LiveExperiment, relative: &RelativePath) -> Markup {
     let training = experiment.training(&cell.id).and_then(|training| training.status().ok());
     let (episodes, budget) = (training.map_or(0, |status| status.episodes), cell.config.common.episodes);
     let success = training.and_then(|status| status.progress.as_ref()?.success_percent());
@@ -189,14 +204,14 @@ fn one(cell: &Cell, experiment: &Experiment, relative: &Relative) -> Markup {
     }
 }
 
-/// Reports are made seldom, so that trainings do not notice.
+/// Says that the report is older than the results. Reports are built seldom, so that trainings do not notice.
 fn lag(lags: bool) -> Markup {
-    html! { @if lags { p.note { "Some results are newer than this report. It will be made again soon, and shown without a reload." } } }
+    html! { @if lags { p.note { "Some results are newer than this report. It will be built again soon and shown without a reload." } } }
 }
 
-/// Every cell as a square.
-fn map(status: &ExperimentStatus, experiment: &Experiment, relative: &Relative) -> Markup {
-    if status.cells.len() > MOST_MAPPED {
+/// Shows every cell as a square.
+fn map(status: &ExperimentStatus, experiment: &LiveExperiment, relative: &RelativePath) -> Markup {
+    if status.cells.len() > MAX_MAPPED {
         return html! { p { (grouped(status.cells.len())) " cells are too many to draw one by one." } };
     }
     let word = |known: &CellStatus| match known {
@@ -225,7 +240,7 @@ fn map(status: &ExperimentStatus, experiment: &Experiment, relative: &Relative) 
     }
 }
 
-fn failures(status: &ExperimentStatus, experiment: &Experiment, relative: &Relative) -> Markup {
+fn failures(status: &ExperimentStatus, experiment: &LiveExperiment, relative: &RelativePath) -> Markup {
     let failed: Vec<(&Cell, &str)> = status
         .plan
         .cells
@@ -239,17 +254,17 @@ fn failures(status: &ExperimentStatus, experiment: &Experiment, relative: &Relat
     html! {
         @if !failed.is_empty() {
             ul.trouble {
-                @for (cell, reason) in failed.iter().take(MOST_LISTED) {
+                @for (cell, reason) in failed.iter().take(MAX_LISTED) {
                     li { (cell_link(experiment, relative, cell, &html! { (cell.id) })) " failed: " (reason) }
                 }
-                @if failed.len() > MOST_LISTED { li { "and " (failed.len() - MOST_LISTED) " more" } }
+                @if failed.len() > MAX_LISTED { li { "and " (failed.len() - MAX_LISTED) " more" } }
             }
         }
     }
 }
 
-/// Leads to a cell's training, if that was begun.
-fn cell_link(experiment: &Experiment, relative: &Relative, cell: &Cell, words: &Markup) -> Markup {
+/// Links to a cell's training, if it has begun.
+fn cell_link(experiment: &LiveExperiment, relative: &RelativePath, cell: &Cell, words: &Markup) -> Markup {
     let address = || run_link(&relative.join("cells").join(&cell.id).join("training"));
     html! { @if experiment.has_page(&cell.id) { a href=(address()) { (words) } } @else { (words) } }
 }

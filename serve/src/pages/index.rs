@@ -1,4 +1,4 @@
-//! The page of all runs.
+//! The page with the list of all runs.
 
 use std::time::Duration;
 
@@ -7,43 +7,43 @@ use perturb_protocol::Address;
 use perturb_study::runs::Kind;
 use perturb_study::words::{duration, grouped};
 
-use super::{Update, badge, bar, facts, name_of, pictures, run_link, time};
-use crate::index::{Index, MOST_FOLDERS, Row};
-use crate::load::Answer;
+use super::{Update, badge, bar, facts, pictures, run_link, shown_name, time};
+use crate::index::{Index, MAX_FOLDERS, Row};
 use crate::paths::Root;
+use crate::server_status::ServerStatus;
 
-/// An asked server with its last answer, if there is one yet.
-type Server<'a> = (&'a Address, Option<Result<Answer, String>>);
+/// A polled server with its last answer, if there is one yet.
+type PolledServer<'a> = (&'a Address, Option<Result<ServerStatus, String>>);
 
-pub(crate) fn update(root: &Root, index: &Index, server: Option<&Server<'_>>) -> Update {
+pub(crate) fn update(root: &Root, index: &Index, server: Option<&PolledServer<'_>>) -> Update {
     let in_work = index.runs.iter().filter(|row| row.summary.state == "in work").count();
     Update {
         title: if in_work > 0 { format!("{in_work} in work · perturb") } else { "perturb".into() },
         kind: None,
         parts: vec![
             ("runs", runs(root, index)),
-            ("server", server.map_or_else(Markup::default, of_server)),
-            ("pictures", pictures::shown(&index.pictures)),
+            ("server", server.map_or_else(Markup::default, server_section)),
+            ("pictures", pictures::section(&index.pictures)),
         ],
         ..Update::default()
     }
 }
 
 pub(crate) fn page(root: &Root, update: &Update) -> String {
-    let crumbs = html! { ol { li { span aria-current="page" { (root.given().display()) } } } };
+    let breadcrumbs = html! { ol { li { span aria-current="page" { (root.given().display()) } } } };
     let main = html! {
         h1 { "Trainings and experiments" }
         (update.part("runs"))
         (update.part("server"))
         (update.part("pictures"))
     };
-    super::document(&update.title, "/events", &crumbs, &main)
+    super::document(&update.title, "/events", &breadcrumbs, &main)
 }
 
 fn runs(root: &Root, index: &Index) -> Markup {
     html! {
         @if index.runs.is_empty() {
-            p { "There is nothing yet: neither a training nor an experiment is in " code { (root.given().display()) } "." }
+            p { "There is no training and no experiment yet in " code { (root.given().display()) } "." }
         } @else {
             table.runs role="table" {
                 thead role="rowgroup" {
@@ -59,14 +59,14 @@ fn runs(root: &Root, index: &Index) -> Markup {
         @if index.more_runs > 0 {
             p { "And " (grouped(index.more_runs)) " more, which changed before these." }
         }
-        @if index.more {
-            p { "There are more than " (grouped(MOST_FOLDERS)) " folders; the others were not looked at." }
+        @if index.has_more_folders {
+            p { "There are more than " (grouped(MAX_FOLDERS)) " folders; the others were not searched." }
         }
     }
 }
 
-fn run(root: &Root, Row { relative, kind, summary, changed, left }: &Row) -> Markup {
-    let name = name_of(root, relative);
+fn run(root: &Root, Row { relative, kind, summary, changed, remaining_seconds }: &Row) -> Markup {
+    let name = shown_name(root, relative);
     let known = !summary.unit.is_empty();
     let number = |number: u64| grouped(number as usize);
     html! {
@@ -80,7 +80,7 @@ fn run(root: &Root, Row { relative, kind, summary, changed, left }: &Row) -> Mar
                 @if known {
                     (bar(summary.done, summary.budget, &format!("{name}: done")))
                     span { (number(summary.done)) " of " (number(summary.budget)) " " (summary.unit) }
-                    @if let Some(left) = left { span { ", about " (duration(*left)) " left" } }
+                    @if let Some(seconds) = remaining_seconds { span { ", about " (duration(*seconds)) " left" } }
                 }
             }
             td.number role="cell" data-name="success" { @if let Some(percent) = summary.success_percent { (format!("{percent:.1} %")) } }
@@ -94,21 +94,21 @@ fn milliseconds(time: Duration) -> String {
     format!("{:.1} ms", 1e3 * time.as_secs_f64())
 }
 
-/// What a server of environments says of itself.
-fn of_server((address, last): &Server<'_>) -> Markup {
+/// Shows the status of the server of environments.
+fn server_section((address, last): &PolledServer<'_>) -> Markup {
     let text = |text: String| html! { (text) };
     html! {
         h2 { "Server of environments" }
         @match last {
             None => p { code { (address) } " was not asked yet." },
-            Some(Err(reason)) => { (super::troubles(&[format!("{address} does not take sessions: {reason}")])) },
+            Some(Err(reason)) => { (super::faults(&[format!("{address} does not take sessions: {reason}")])) },
             Some(Ok(answer)) => { p { code { (address) } } (facts([
                 ("state", html! { (badge("takes sessions")) }),
-                ("answers in", text(milliseconds(answer.usual))),
-                ("slowest answer of late", text(milliseconds(answer.slowest))),
+                ("median response time", text(milliseconds(answer.median_response))),
+                ("slowest response lately", text(milliseconds(answer.max_response))),
                 ("version", text(answer.version.clone())),
-                ("kinds of environments", text(grouped(answer.environments))),
-                ("environments a session, at most", text(grouped(answer.most as usize))),
+                ("environments in the catalogue", text(grouped(answer.environments))),
+                ("maximum environments in a session", text(grouped(answer.max_batch_size as usize))),
             ])) }
         }
     }

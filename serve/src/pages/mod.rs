@@ -1,7 +1,7 @@
-//! Everything as HTML. Whatever comes from a file or an address is escaped.
+//! The pages as HTML. Texts from files and addresses are escaped.
 //!
-//! A page consists of parts with names. When something changes, its parts come again as they would be in a new page, and the
-//! script puts them in their places; curves come as numbers.
+//! A page consists of named parts. When something changes, an event has all parts as they would be in a new page, and the
+//! script replaces them. Curves are sent as numbers.
 
 pub(crate) mod experiment;
 pub(crate) mod index;
@@ -18,95 +18,95 @@ use perturb_study::runs::Kind;
 use perturb_study::words::shortened;
 use serde_json::{Map, Value, json};
 
-use crate::paced::Trouble;
-use crate::paths::{Relative, Root};
-use crate::watch::Missing;
+use crate::cached_loader::LoadError;
+use crate::error::ViewError;
+use crate::paths::{RelativePath, Root};
 
-/// What there is to see of something.
+/// The content of a page.
 #[derive(Debug, Default)]
 pub(crate) struct Update {
-    /// Of the window.
+    /// Title of the window.
     pub(crate) title: String,
-    /// Of what; `None` for all runs.
+    /// Kind of the run; `None` for the list of all runs.
     pub(crate) kind: Option<Kind>,
     /// The parts of the page, by their names.
     pub(crate) parts: Vec<(&'static str, Markup)>,
-    /// What is drawn.
+    /// Numbers of the charts.
     pub(crate) charts: Value,
-    /// The state of which a report would be sent.
+    /// Fingerprint of the report that would be sent now.
     pub(crate) report: u64,
-    /// Of an experiment: what a report is made from now.
-    pub(crate) reported: Option<Reported>,
-    /// The way to it.
-    crumbs: Markup,
+    /// Files of an experiment's report; `None` for other pages.
+    pub(crate) report_source: Option<ReportSource>,
+    /// Links to the folders above.
+    breadcrumbs: Markup,
 }
 
-/// What a report is made from.
+/// The files from which a report is built.
 #[derive(Clone, Debug)]
-pub(crate) struct Reported {
-    /// The folder; in its place why there is no report.
+pub(crate) struct ReportSource {
+    /// The experiment's folder, or the reason why there is no report.
     pub(crate) folder: Result<PathBuf, String>,
-    /// Of its files.
-    pub(crate) state: u64,
+    /// A number that changes with the files.
+    pub(crate) fingerprint: u64,
 }
 
 impl Update {
-    /// As the script reads it.
+    /// Returns the page as JSON for the script.
     pub(crate) fn to_json(&self) -> String {
         let parts: Map<String, Value> =
             self.parts.iter().map(|(name, part)| ((*name).to_owned(), Value::from(part.0.clone()))).collect();
-        // A number of 64 bits is none of a script's.
+        // JavaScript's numbers have 53 bits.
         let report = format!("{:016x}", self.report);
         json!({ "title": self.title, "parts": parts, "charts": self.charts, "report": report }).to_string()
     }
 
-    /// A part of the page, in its place.
+    /// Returns a part of the page in an element that the script can replace.
     fn part(&self, name: &str) -> Markup {
         let content = self.parts.iter().find(|(known, _)| *known == name).map(|(_, part)| part);
         html! { div id=(name) data-part { @if let Some(content) = content { (content) } } }
     }
 }
 
-/// What is sent when there is nothing to see.
-pub(crate) fn gone(missing: &Missing) -> String {
-    let words = match missing {
-        Missing::NoRun => "There is no run here any more.".into(),
-        missing => words_of(missing).1,
+/// Returns the event for subscribers of a page that cannot be shown.
+pub(crate) fn error_event(error: &ViewError) -> String {
+    let message = match error {
+        ViewError::RunNotFound => "There is no run here any more.".into(),
+        error => describe(error).1,
     };
-    json!({ "gone": words }).to_string()
+    json!({ "gone": message }).to_string()
 }
 
-/// What is answered when there is nothing to see.
-pub(crate) fn not_there(missing: &Missing) -> Response {
-    let (status, words) = words_of(missing);
-    refusal(status, &words)
+/// Returns the response for a page that cannot be shown.
+pub(crate) fn error_page(error: &ViewError) -> Response {
+    let (status, message) = describe(error);
+    message_page(status, &message)
 }
 
-fn words_of(missing: &Missing) -> (StatusCode, String) {
-    match missing {
-        Missing::NoRun => (StatusCode::NOT_FOUND, "There is no run here, or not any more.".into()),
-        Missing::Gone(reason) => (StatusCode::NOT_FOUND, format!("The runs cannot be listed: {reason}.")),
-        Missing::Not(Trouble::Panicked) => {
-            let words = "The server cannot show this: a mistake of its own, which it has said on its console.";
-            (StatusCode::INTERNAL_SERVER_ERROR, words.into())
+fn describe(error: &ViewError) -> (StatusCode, String) {
+    match error {
+        ViewError::RunNotFound => (StatusCode::NOT_FOUND, "There is no run here, or not any more.".into()),
+        ViewError::Unlisted(reason) => (StatusCode::NOT_FOUND, format!("The runs cannot be listed: {reason}.")),
+        ViewError::Load(LoadError::Panicked) => {
+            let message = "The server cannot show this because of a fault of its own. Its console has the details.";
+            (StatusCode::INTERNAL_SERVER_ERROR, message.into())
         }
-        Missing::Not(Trouble::Slow) => {
-            let words = "Looking at these files takes too long; perhaps their disk or network does not answer.";
-            (StatusCode::SERVICE_UNAVAILABLE, words.into())
+        ViewError::Load(LoadError::TimedOut) => {
+            let message = "Reading these files takes too long; perhaps their disk or network does not answer.";
+            (StatusCode::SERVICE_UNAVAILABLE, message.into())
         }
     }
 }
 
-/// The page of a run.
-pub(crate) fn run_page(root: &Root, relative: &Relative, update: &Update) -> String {
+/// Returns the page of a run.
+pub(crate) fn run_page(root: &Root, relative: &RelativePath, update: &Update) -> String {
     match update.kind {
         Some(Kind::Experiment) => experiment::page(root, relative, update),
         _ => training::page(root, relative, update),
     }
 }
 
-/// A whole page, which hears of changes at the address `events`.
-fn document(title: &str, events: &str, crumbs: &Markup, main: &Markup) -> String {
+/// Returns a whole page, which gets its changes from the address `events`.
+fn document(title: &str, events: &str, breadcrumbs: &Markup, main: &Markup) -> String {
     html! {
         (DOCTYPE)
         html lang="en" {
@@ -123,31 +123,31 @@ fn document(title: &str, events: &str, crumbs: &Markup, main: &Markup) -> String
             }
             body data-events=(events) {
                 header.top {
-                    nav aria-label="Where this is" { (crumbs) }
-                    p #live role="status" { noscript { "Without JavaScript this stays as it is now; load it again to see more." } }
+                    nav aria-label="Where this is" { (breadcrumbs) }
+                    p #live role="status" { noscript { "Without JavaScript this page does not update itself; reload it to see changes." } }
                 }
                 main { (main) }
-                footer { p { "perturb " (perturb_study::VERSION) ". This page only shows; it changes nothing." } }
+                footer { p { "perturb " (perturb_study::VERSION) ". This page changes no file." } }
             }
         }
     }
     .into_string()
 }
 
-/// The way to `relative`: the folder of all runs, the runs that it is in, and itself.
-fn crumbs(root: &Root, relative: &Relative) -> Markup {
-    let mut way = Relative::default();
+/// Returns links to the served folder, to the runs above `relative`, and to itself.
+fn breadcrumbs(root: &Root, relative: &RelativePath) -> Markup {
+    let mut way = RelativePath::default();
     let mut links = Vec::new();
     let names: Vec<_> = relative.path().iter().collect();
     let mut shown = String::new();
-    for (place, name) in names.iter().enumerate() {
+    for (index, name) in names.iter().enumerate() {
         way = way.join(name);
         shown = if shown.is_empty() {
             name.to_string_lossy().into_owned()
         } else {
             format!("{shown}/{}", name.to_string_lossy())
         };
-        let last = place + 1 == names.len();
+        let last = index + 1 == names.len();
         if last || root.resolve(&way).is_some_and(|path| Kind::of(&path).is_some()) {
             links.push((std::mem::take(&mut shown), way.clone(), last));
         }
@@ -162,40 +162,40 @@ fn crumbs(root: &Root, relative: &Relative) -> Markup {
     }
 }
 
-/// The address of a run's page.
-fn run_link(relative: &Relative) -> String {
+/// Returns the address of a run's page.
+fn run_link(relative: &RelativePath) -> String {
     format!("/run/{}", relative.encode())
 }
 
-/// A name for `relative`, which is `root` if it is empty.
-fn name_of(root: &Root, relative: &Relative) -> String {
+/// Returns the shown name of `relative`. An empty path stands for the served folder.
+fn shown_name(root: &Root, relative: &RelativePath) -> String {
     let path: &Path = if relative.path().as_os_str().is_empty() { root.given() } else { relative.path() };
     path.display().to_string()
 }
 
-/// "in work", with a colour.
+/// Returns a state such as "in work" with its colour.
 fn badge(state: &str) -> Markup {
     html! { span class={ "state " (state.replace(' ', "-")) } { (state) } }
 }
 
-/// A bar, which those who do not see it hear as `label`.
-fn bar(done: u64, of: u64, label: &str) -> Markup {
-    html! { progress max=(of.max(1)) value=(done.min(of)) aria-label=(label) {} }
+/// Returns a progress bar. Screen readers read `label`.
+fn bar(done: u64, total: u64, label: &str) -> Markup {
+    html! { progress max=(total.max(1)) value=(done.min(total)) aria-label=(label) {} }
 }
 
-/// A time of day, UTC; the script makes it that of the reader.
+/// Returns a time in UTC, given in seconds since 1970. The script changes it to the reader's time zone.
 fn time(seconds: i64) -> Markup {
     let Some(time) = DateTime::from_timestamp(seconds, 0) else { return html! {} };
     html! { time datetime=(time.format("%Y-%m-%dT%H:%M:%SZ")) { (time.format("%Y-%m-%d %H:%M UTC")) } }
 }
 
-/// Names with their values.
+/// Returns a list of names with their values.
 fn facts<'a>(facts: impl IntoIterator<Item = (&'a str, Markup)>) -> Markup {
     html! { dl.facts { @for (name, value) in facts { div { dt { (name) } dd { (value) } } } } }
 }
 
-/// What is wrong.
-fn troubles(sentences: &[String]) -> Markup {
+/// Returns a list of faults; empty if there are none.
+fn faults(sentences: &[String]) -> Markup {
     html! {
         @if !sentences.is_empty() {
             ul.trouble { @for sentence in sentences { li { (sentence) } } }
@@ -203,7 +203,7 @@ fn troubles(sentences: &[String]) -> Markup {
     }
 }
 
-/// The place of a plot.
+/// Returns the element in which the script draws a chart.
 fn chart(name: &str, title: &str) -> Markup {
     html! {
         figure.chart data-chart=(name) {
@@ -213,8 +213,8 @@ fn chart(name: &str, title: &str) -> Markup {
     }
 }
 
-/// A page that says why there is nothing to see.
-pub(crate) fn refusal(status: StatusCode, words: &str) -> Response {
+/// Returns a page with a message in place of content.
+pub(crate) fn message_page(status: StatusCode, message: &str) -> Response {
     let page = html! {
         (DOCTYPE)
         html lang="en" {
@@ -225,16 +225,16 @@ pub(crate) fn refusal(status: StatusCode, words: &str) -> Response {
                 title { "perturb: " (status.as_u16()) }
                 link rel="stylesheet" href="/assets/style.css";
             }
-            body { main { h1 { (status) } p { (words) } p { a href="/" { "All runs" } } } }
+            body { main { h1 { (status) } p { (message) } p { a href="/" { "All runs" } } } }
         }
     };
     (status, Html(page.into_string())).into_response()
 }
 
-/// After so many seconds a report is asked for again that could not be made.
-const AGAIN: u32 = 15;
+/// Time after which browsers ask again for a report that could not be built, in seconds.
+const REPORT_RETRY_SECONDS: u32 = 15;
 
-/// What stands in the place of a report.
+/// Returns the page that is shown in place of a report.
 pub(crate) fn no_report(reason: &str) -> String {
     html! {
         (DOCTYPE)
@@ -242,7 +242,7 @@ pub(crate) fn no_report(reason: &str) -> String {
             head {
                 meta charset="utf-8";
                 meta name="color-scheme" content="light dark";
-                meta http-equiv="refresh" content=(AGAIN); // what was wrong may have been put right
+                meta http-equiv="refresh" content=(REPORT_RETRY_SECONDS); // the cause may be gone by then
                 title { "perturb: no report" }
             }
             body { p { "There is no report now: " (shortened(reason)) } }
@@ -251,7 +251,7 @@ pub(crate) fn no_report(reason: &str) -> String {
     .into_string()
 }
 
-/// A file of this program by its name, with its type.
+/// Returns a file of this program by its name, with its media type.
 pub(crate) fn asset(name: &str) -> Option<(&'static str, &'static str)> {
     const SCRIPT: &str = "text/javascript; charset=utf-8";
     const STYLE: &str = "text/css; charset=utf-8";

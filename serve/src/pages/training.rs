@@ -8,46 +8,48 @@ use perturb_study::words::{duration, grouped, shortened};
 use perturb_study::{CellResult, TestResult};
 use serde_json::json;
 
-use super::{Update, badge, bar, chart, crumbs, facts, name_of, pictures, time, troubles};
-use crate::curve::Curve;
-use crate::paths::{Relative, Root};
-use crate::training::Training;
+use super::{Update, badge, bar, breadcrumbs, chart, facts, faults, pictures, shown_name, time};
+use crate::curve::LearningCurve;
+use crate::paths::{RelativePath, Root};
+use crate::pictures::scan_run;
+use crate::training::LiveTraining;
 
-/// Where time goes, and its colour's class.
-const SHARES: [(&str, &str); 4] =
+/// Names of the time shares, each with the class of its colour.
+const TIME_SHARES: [(&str, &str); 4] =
     [("choosing actions", "a"), ("waiting for servers", "b"), ("updating the policy", "c"), ("anything else", "d")];
 
-pub(crate) fn update(root: &Root, relative: &Relative, path: &Path, training: &Training) -> Update {
+pub(crate) fn update(root: &Root, relative: &RelativePath, path: &Path, training: &LiveTraining) -> Update {
     let curve = training.curve();
-    let name = name_of(root, relative);
+    let name = shown_name(root, relative);
     let (title, head) = match training.status() {
         Ok(status) => (title(&name, status), head(status, training)),
-        Err(reason) => (name, troubles(&[format!("This training is not understood: {reason}")])),
+        Err(reason) => (name, faults(&[format!("This training is not understood: {reason}")])),
     };
     let (result, failure) = match training.result() {
         Some(Ok(result)) => (Some(result), None),
         Some(Err(reason)) => (None, Some(reason)),
         None => (None, None),
     };
-    let wrong: Vec<String> = failure.into_iter().chain(training.troubles()).collect();
+    let all_faults: Vec<String> = failure.into_iter().chain(training.faults()).collect();
     let parts = vec![
         ("head", head),
-        ("troubles", troubles(&wrong)),
+        ("troubles", faults(&all_faults)),
         ("figures", figures(training, &curve)),
         ("note", note(training, &curve)),
         ("shares", shares(training)),
         ("tests", result.map_or_else(Markup::default, |result| tests(&result))),
-        ("pictures", pictures::of_run(relative, path)),
+        ("pictures", pictures::section(&scan_run(relative, path))),
         ("settings", settings(training)),
         ("files", files(training, relative)),
     ];
     let charts = json!({ "curve": curve });
-    Update { title, kind: Some(Kind::Training), parts, charts, crumbs: crumbs(root, relative), ..Update::default() }
+    let breadcrumbs = breadcrumbs(root, relative);
+    Update { title, kind: Some(Kind::Training), parts, charts, breadcrumbs, ..Update::default() }
 }
 
-pub(crate) fn page(root: &Root, relative: &Relative, update: &Update) -> String {
+pub(crate) fn page(root: &Root, relative: &RelativePath, update: &Update) -> String {
     let main = html! {
-        h1 { (name_of(root, relative)) }
+        h1 { (shown_name(root, relative)) }
         (update.part("head"))
         (update.part("troubles"))
         (update.part("figures"))
@@ -60,8 +62,8 @@ pub(crate) fn page(root: &Root, relative: &Relative, update: &Update) -> String 
         div.charts {
             (chart("return", "Return"))
             (chart("success", "Success, %"))
-            (chart("length", "Steps of an episode"))
-            (chart("speed", "Steps in a second"))
+            (chart("length", "Episode length, steps"))
+            (chart("speed", "Steps per second"))
         }
         (update.part("note"))
         (update.part("shares"))
@@ -70,7 +72,7 @@ pub(crate) fn page(root: &Root, relative: &Relative, update: &Update) -> String 
         (update.part("settings"))
         (update.part("files"))
     };
-    super::document(&update.title, &format!("/events/{}", relative.encode()), &update.crumbs, &main)
+    super::document(&update.title, &format!("/events/{}", relative.encode()), &update.breadcrumbs, &main)
 }
 
 fn title(name: &str, status: &TrainingStatus) -> String {
@@ -79,7 +81,7 @@ fn title(name: &str, status: &TrainingStatus) -> String {
     if status.state == "in work" { format!("{percent} % · {name}") } else { format!("{name} · perturb") }
 }
 
-fn head(status: &TrainingStatus, training: &Training) -> Markup {
+fn head(status: &TrainingStatus, training: &LiveTraining) -> Markup {
     let (done, budget) = (status.episodes, status.config.common.episodes);
     let number = |number: u64| grouped(number as usize);
     html! {
@@ -87,7 +89,7 @@ fn head(status: &TrainingStatus, training: &Training) -> Markup {
         (bar(done, budget, "Episodes that are done"))
         p {
             (number(done)) " of " (number(budget)) " episodes"
-            @if let Some(left) = training.left() { ", about " (duration(left)) " left" }
+            @if let Some(left) = training.remaining_seconds() { ", about " (duration(left)) " left" }
             "; changed " (time(training.changed())) ". "
             @match status.saved {
                 Some(saved) => { "The last checkpoint has " (number(saved)) " episodes." },
@@ -97,49 +99,49 @@ fn head(status: &TrainingStatus, training: &Training) -> Markup {
     }
 }
 
-/// The last episodes, the last update.
-fn figures(training: &Training, curve: &Curve) -> Markup {
+/// Shows figures of the last 100 episodes and of the last update.
+fn figures(training: &LiveTraining, curve: &LearningCurve) -> Markup {
     let Some(progress) = training.progress() else { return Markup::default() };
     let text = |text: String| html! { (text) };
-    let of = |name: &'static str, column: &str, show: &dyn Fn(f64) -> String| {
+    let figure = |name: &'static str, column: &str, show: &dyn Fn(f64) -> String| {
         progress.get(column).map(|value| (name, text(show(value))))
     };
     let whole = |number: f64| grouped(number.max(0.0) as usize);
     let plain = |number: f64| format!("{number:.2}");
     let speed = curve.speed.last().copied().flatten().map(|speed| ("steps/s", text(whole(speed))));
     let known = [
-        of("return, last 100", "rollout/ep_rew_mean", &plain),
-        of("success, last 100", "rollout/success_rate", &|rate| format!("{:.1} %", 100.0 * rate)),
-        of("length, last 100", "rollout/ep_len_mean", &plain),
-        of("environment steps", "time/total_timesteps", &whole),
+        figure("return, last 100", "rollout/ep_rew_mean", &plain),
+        figure("success, last 100", "rollout/success_rate", &|rate| format!("{:.1} %", 100.0 * rate)),
+        figure("length, last 100", "rollout/ep_len_mean", &plain),
+        figure("environment steps", "time/total_timesteps", &whole),
         speed,
-        of("time", "time/time_elapsed", &duration),
-        of("updates", "train/n_updates", &whole),
-        of("explained variance", "train/explained_variance", &plain),
+        figure("time", "time/time_elapsed", &duration),
+        figure("updates", "train/n_updates", &whole),
+        figure("explained variance", "train/explained_variance", &plain),
     ];
     facts(known.into_iter().flatten())
 }
 
-/// What a point is.
-fn note(training: &Training, curve: &Curve) -> Markup {
+/// Explains the points of the curve.
+fn note(training: &LiveTraining, curve: &LearningCurve) -> Markup {
     let count = curve.episodes.len();
     html! {
         @if count == 0 {
             p.note { "No episode has ended yet." }
         } @else {
             p.note {
-                "A point is the mean of " (grouped(curve.each.min(training.count()))) " episodes, the last one of some more or fewer. Return is not normalised."
+                "A point is the mean of " (grouped(curve.episodes_per_point.min(training.episode_count()))) " episodes; the last point may have a few more or fewer. Returns are not normalised."
             }
         }
     }
 }
 
-/// Where the time went, as a bar with its numbers.
-fn shares(training: &Training) -> Markup {
-    let Some(shares) = training.shares() else { return Markup::default() };
+/// Shows the shares of the time as a bar with numbers.
+fn shares(training: &LiveTraining) -> Markup {
+    let Some(shares) = training.time_shares() else { return Markup::default() };
     let all: f64 = shares.iter().sum::<f64>().max(1e-9);
     let mut before = 0.0;
-    let parts: Vec<(&str, &str, f64, f64)> = SHARES
+    let parts: Vec<(&str, &str, f64, f64)> = TIME_SHARES
         .iter()
         .zip(shares)
         .map(|((name, class), seconds)| {
@@ -163,7 +165,7 @@ fn shares(training: &Training) -> Markup {
     }
 }
 
-/// What a cell's tests came to.
+/// Shows the results of a cell's tests.
 fn tests(result: &CellResult) -> Markup {
     let row = |name: &str, TestResult { episodes, success_percent, success_percent_95: [low, high], mean_return, mean_length }: &TestResult| {
         html! {
@@ -191,11 +193,11 @@ fn tests(result: &CellResult) -> Markup {
                 tbody { @for (name, test) in &result.results { (row(name, test)) } }
             }
         }
-        p.note { "Again: " code { (result.command) } }
+        p.note { "Command to repeat this: " code { (result.command) } }
     }
 }
 
-fn settings(training: &Training) -> Markup {
+fn settings(training: &LiveTraining) -> Markup {
     let Ok(status) = training.status() else { return Markup::default() };
     let table = status.config.table();
     html! {
@@ -208,11 +210,11 @@ fn shown(value: &toml::Value) -> String {
     shortened(value.as_str().map_or_else(|| value.to_string(), str::to_owned))
 }
 
-fn files(training: &Training, relative: &Relative) -> Markup {
+fn files(training: &LiveTraining, relative: &RelativePath) -> Markup {
     html! {
         p.note {
-            @for (place, name) in training.files().enumerate() {
-                @if place > 0 { ", " } @else { "Files: " }
+            @for (index, name) in training.files().enumerate() {
+                @if index > 0 { ", " } @else { "Files: " }
                 a href={ "/file/" (relative.join(name).encode()) } { (name) }
             }
         }

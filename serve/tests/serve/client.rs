@@ -1,4 +1,4 @@
-//! A folder of runs, a server that shows it, and requests byte for byte.
+//! A fixture: a folder of runs, a server that shows it, and a client that sends raw requests.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -10,20 +10,20 @@ use perturb_study::settings::TrainConfig;
 use perturb_study::{CellResult, Counters, Folder, Plan, TestResult, Training};
 use tempfile::TempDir;
 
-/// How long anything may take that must not hang: much longer than it does, as the machine may be busy.
+/// Upper bound of every wait. It is long because the machine may be busy.
 pub const LIMIT: Duration = Duration::from_secs(60);
 pub const MONITOR: &str = "#{\"t_start\": 1}\nr,l,t,success,terminated\n";
 const PLAN: &str =
     "environments = ['CartPole']\nversions = ['D', 'R']\ntest_versions = ['D', 'R', 'E']\ntest_episodes = 10
     settings = { episodes = 100 }\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\n";
 
-/// A folder of runs that is shown.
+/// A served folder of runs.
 pub struct Place {
     pub folder: TempDir,
     pub address: SocketAddr,
 }
 
-/// An answer.
+/// A response; `head` is in lower case.
 pub struct Answer {
     pub status: u16,
     pub head: String,
@@ -31,7 +31,7 @@ pub struct Answer {
 }
 
 impl Place {
-    /// `outside.csv`, and beside it `runs/` with a training `one`, an experiment `study` and a picture.
+    /// Makes `outside.csv`, and beside it `runs/` with a training `one`, an experiment `study` and a picture.
     pub fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let runs = folder.path().join("runs");
@@ -50,12 +50,12 @@ impl Place {
         self.folder.path().join("runs").join(name)
     }
 
-    /// What a browser of this machine gets.
+    /// Sends a GET request as a browser of this machine does.
     pub fn get(&self, path: &str) -> Answer {
         self.ask("GET", path, "localhost")
     }
 
-    /// The page as soon as it is as `wanted` says: it may be that of a second ago.
+    /// Repeats a request until the response satisfies `wanted`. Pages may be a second old.
     #[track_caller]
     pub fn until(&self, path: &str, wanted: impl Fn(&Answer) -> bool) -> Answer {
         let start = Instant::now();
@@ -91,11 +91,11 @@ impl Place {
     }
 }
 
-/// A stream of events.
+/// An open event stream.
 pub struct Events(BufReader<TcpStream>);
 
 impl Events {
-    /// The next events, until one is as `wanted` says.
+    /// Returns the next event that satisfies `wanted`.
     #[track_caller]
     pub fn until(&mut self, what: &str, wanted: impl Fn(&serde_json::Value) -> bool) -> serde_json::Value {
         let start = Instant::now();
@@ -113,7 +113,7 @@ impl Events {
         }
     }
 
-    /// The status of the answer.
+    /// Returns the response's status.
     pub fn status(&mut self) -> String {
         let mut line = String::new();
         self.0.read_line(&mut line).unwrap();
@@ -127,19 +127,19 @@ fn connect(address: SocketAddr) -> TcpStream {
     stream
 }
 
-/// Shows `folder` until the test program ends.
+/// Serves `folder` until the test program ends.
 pub fn serve(folder: &Path) -> SocketAddr {
     let options = Options { folder: folder.to_owned(), address: ([127, 0, 0, 1], 0).into(), server: None };
-    let (tell, told) = std::sync::mpsc::channel();
+    let (sender, receiver) = std::sync::mpsc::channel();
     std::thread::spawn(move || {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         runtime.block_on(async {
             let server = Server::bind(&options).await.unwrap();
-            tell.send(server.address()).unwrap();
-            server.run().await.unwrap();
+            sender.send(server.address()).unwrap();
+            server.run().await;
         });
     });
-    told.recv().unwrap()
+    receiver.recv().unwrap()
 }
 
 pub fn write(path: &Path, content: &str) {
@@ -147,7 +147,7 @@ pub fn write(path: &Path, content: &str) {
     std::fs::write(path, content).unwrap();
 }
 
-/// A training that has had so many episodes, half of them successes, with returns 0, 1, 2, …
+/// Writes the files of a training with this number of episodes. Half of them are successes, and the returns are 0, 1, 2, …
 pub fn write_training(path: &Path, episodes: usize) {
     let text = "environment = 'CartPole'\nalgorithm = 'a2c'\nepisodes = 200";
     let config = TrainConfig::from_table("the test", text.parse().unwrap()).unwrap();
@@ -158,12 +158,12 @@ pub fn write_training(path: &Path, episodes: usize) {
     write(&path.join("progress.csv"), progress);
 }
 
-/// Lines of monitor.csv.
+/// Returns lines of monitor.csv.
 pub fn lines(from: usize, to: usize) -> String {
     (from..to).map(|i| format!("{i},4,{}.0,{},1\n", i + 1, i % 2)).collect()
 }
 
-/// Of a cell whose tests succeed in so many percent: 91 on D, 92 on R, 93 on E.
+/// Returns a result of a cell with success rates of 91 % on D, 92 % on R and 93 % on E.
 pub fn result(cell: &perturb_study::Cell) -> CellResult {
     let test = |(name, percent): (&str, f64)| {
         let result = TestResult {

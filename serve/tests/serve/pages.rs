@@ -1,11 +1,11 @@
-//! What is shown, and when.
+//! Contents of the pages, and when they change.
 
 use perturb_study::files::Lock;
 use perturb_study::{Folder, Plan};
 
 use crate::client::{Place, lines, write, write_training};
 
-/// The training's curve in an event.
+/// Returns the training's curve in an event.
 fn curve(event: &serde_json::Value) -> &serde_json::Value {
     &event["charts"]["curve"]
 }
@@ -15,7 +15,7 @@ fn part(event: &serde_json::Value, name: &str) -> String {
 }
 
 #[test]
-fn all_runs_are_listed_with_their_state_and_pictures_beside_them() {
+fn the_index_lists_runs_with_their_state_and_pictures() {
     let page = Place::new().get("/");
     assert_eq!(page.status, 200);
     assert!(page.head.contains("content-type: text/html"), "{}", page.head);
@@ -33,11 +33,11 @@ fn all_runs_are_listed_with_their_state_and_pictures_beside_them() {
     ] {
         assert!(page.body.contains(words), "{words} is not in {}", page.body);
     }
-    assert!(!page.body.contains("<b>."), "names are text");
+    assert!(!page.body.contains("<b>."), "names are escaped");
 }
 
 #[test]
-fn a_training_has_its_curve_figures_and_settings() {
+fn a_training_page_has_curve_figures_and_settings() {
     let place = Place::new();
     let page = place.get("/run/one");
     assert_eq!(page.status, 200);
@@ -54,7 +54,7 @@ fn a_training_has_its_curve_figures_and_settings() {
 }
 
 #[test]
-fn an_experiment_has_its_cells_rates_and_report() {
+fn an_experiment_page_has_cells_rates_and_report() {
     let place = Place::new();
     let page = place.get("/run/study");
     assert_eq!(page.status, 200);
@@ -78,7 +78,7 @@ fn an_experiment_has_its_cells_rates_and_report() {
 }
 
 #[test]
-fn a_curve_grows_with_its_file_and_nothing_is_sent_while_nothing_changes() {
+fn events_follow_the_file_and_stop_without_changes() {
     let place = Place::new();
     let mut events = place.events("/events/one");
     events.until("the curve", |event| curve(event)["success"].as_array().unwrap().len() == 3);
@@ -90,8 +90,8 @@ fn a_curve_grows_with_its_file_and_nothing_is_sent_while_nothing_changes() {
     add(&(lines(30, 50) + "7,7"));
     let event = events.until("more", |event| curve(event)["success"].as_array().unwrap().len() == 5);
     assert_eq!(curve(&event)["return"][4], 44.5);
-    assert!(part(&event, "troubles").is_empty(), "half a line is not wrong: {event:#}");
-    // The next event is of the next change: what is in between says nothing.
+    assert!(part(&event, "troubles").is_empty(), "half a line is no fault: {event:#}");
+    // No event is sent before the next change.
     std::thread::sleep(std::time::Duration::from_secs(3));
     add(",8,1,1\n");
     let event = events.until("the next event", |_| true);
@@ -99,7 +99,7 @@ fn a_curve_grows_with_its_file_and_nothing_is_sent_while_nothing_changes() {
 }
 
 #[test]
-fn a_run_in_work_says_so_as_soon_as_it_is() {
+fn a_locked_run_is_in_work() {
     let place = Place::new();
     let mut events = place.events("/events");
     events.until("the list", |event| part(event, "runs").contains("without a checkpoint"));
@@ -111,7 +111,7 @@ fn a_run_in_work_says_so_as_soon_as_it_is() {
 }
 
 #[test]
-fn a_cell_in_work_is_shown_with_its_curve_until_it_is_done() {
+fn a_cell_in_work_has_a_curve_until_it_is_done() {
     let place = Place::new();
     let folder = Folder::new(&place.path("study"));
     let plan = Plan::load(&folder.plan_path()).unwrap();
@@ -134,7 +134,7 @@ fn a_cell_in_work_is_shown_with_its_curve_until_it_is_done() {
 }
 
 #[test]
-fn a_report_that_is_older_than_the_results_says_so_until_it_is_made_again() {
+fn an_old_report_says_so_until_it_is_built_again() {
     let place = Place::new();
     let folder = Folder::new(&place.path("study"));
     let plan = Plan::load(&folder.plan_path()).unwrap();
@@ -143,13 +143,13 @@ fn a_report_that_is_older_than_the_results_says_so_until_it_is_made_again() {
     folder.cell(&plan.cells[1].id).write_result(&crate::client::result(&plan.cells[1])).unwrap();
     let older = place.until("/run/study", |page| page.body.contains("2 of 2 cells done"));
     assert!(older.body.contains("Some results are newer than this report"), "{}", older.body);
-    assert!(place.get("/report/study").body.contains("1 of 2 cells are done"), "it rests");
+    assert!(place.get("/report/study").body.contains("1 of 2 cells are done"), "it is too recent to be built again");
     place.until("/run/study", |page| !page.body.contains("newer than this report"));
     assert!(!place.get("/report/study").body.contains("1 of 2 cells are done"));
 }
 
 #[test]
-fn what_is_broken_is_told_and_ends_nothing() {
+fn broken_files_are_named_on_the_page() {
     let place = Place::new();
     write(&place.path("one/config.toml"), "no = TOML =");
     write(&place.path("bad/plan.toml"), "environments = 7");
@@ -170,12 +170,12 @@ fn what_is_broken_is_told_and_ends_nothing() {
     write(&place.path("one/monitor.csv"), "r,l,t,success\n1,2,3,1\nx,2,4,1\n\u{0}\u{1}\n5,2,5,1\n");
     write(&place.path("one/checkpoint/checkpoint.json"), "{");
     write(&place.path("one/progress.csv"), "\u{fffd}\n\n,,,");
-    let page = place.until("/run/one", |page| page.body.contains("monitor.csv: line 3: `x` is no number"));
+    let page = place.until("/run/one", |page| page.body.contains("monitor.csv: line 3: `x` is not a number"));
     assert!(page.body.contains("checkpoint.json is not a usable checkpoint"), "{}", page.body);
 }
 
 #[test]
-fn a_folder_that_vanishes_is_told_and_one_that_comes_back_is_shown() {
+fn folders_may_vanish_and_come_back() {
     let place = Place::new();
     let mut events = place.events("/events/one");
     let mut all = place.events("/events");
@@ -196,7 +196,7 @@ fn a_folder_that_vanishes_is_told_and_one_that_comes_back_is_shown() {
 }
 
 #[test]
-fn pipes_and_devices_in_the_place_of_files_hold_nobody_up() {
+fn pipes_and_devices_do_not_block_pages() {
     let place = Place::new();
     let pipe = |name: &str| {
         let path = place.path(name);
@@ -224,7 +224,7 @@ fn pipes_and_devices_in_the_place_of_files_hold_nobody_up() {
 }
 
 #[test]
-fn what_is_behind_a_link_out_of_the_folder_is_neither_shown_nor_quoted() {
+fn files_behind_outside_links_are_not_quoted() {
     let place = Place::new();
     write(&place.folder.path().join("credentials.toml"), "[registry]\ntoken = \"secret-token");
     let link = |name: &str| {
@@ -252,7 +252,7 @@ fn what_is_behind_a_link_out_of_the_folder_is_neither_shown_nor_quoted() {
 }
 
 #[test]
-fn links_lead_to_what_is_there() {
+fn pages_link_to_existing_files_only() {
     let place = Place::new();
     let plan = Plan::load(&place.path("study/plan.toml")).unwrap();
     let page = place.get("/run/study");
@@ -272,7 +272,7 @@ fn links_lead_to_what_is_there() {
 }
 
 #[test]
-fn many_who_ask_have_files_looked_at_no_more_often() {
+fn files_are_read_at_most_once_a_second() {
     let place = Place::new();
     let begun = std::time::Instant::now();
     place.get("/run/one");
@@ -282,7 +282,7 @@ fn many_who_ask_have_files_looked_at_no_more_often() {
 }
 
 #[test]
-fn a_run_itself_can_be_served() {
+fn a_single_run_can_be_served() {
     let place = Place::new();
     let address = crate::client::serve(&place.path("study"));
     let study = Place { address, ..place };

@@ -1,4 +1,4 @@
-//! What is refused.
+//! Requests that are refused.
 
 use std::os::unix::fs::symlink;
 
@@ -39,7 +39,7 @@ use crate::client::{Place, write};
 #[case("/assets/../Cargo.toml")]
 #[case("/assets/%2e%2e")]
 #[case("/nothing")]
-fn what_is_not_below_the_folder_or_no_known_kind_is_not_there(#[case] path: &str) {
+fn paths_outside_and_unknown_kinds_are_not_found(#[case] path: &str) {
     let place = Place::new();
     symlink(place.path("../outside.csv"), place.path("link.csv")).unwrap();
     symlink(place.path(".."), place.path("up")).unwrap();
@@ -60,7 +60,7 @@ fn what_is_not_below_the_folder_or_no_known_kind_is_not_there(#[case] path: &str
 #[case("PATCH", "/run/one")]
 #[case("OPTIONS", "/")]
 #[case("TRACE", "/")]
-fn nothing_can_be_changed(#[case] method: &str, #[case] path: &str) {
+fn methods_other_than_get_and_head_are_refused(#[case] method: &str, #[case] path: &str) {
     let place = Place::new();
     let answer = place.ask(method, path, "localhost");
     assert!(answer.status == 405 && answer.head.contains("allow: get, head"), "{}", answer.head);
@@ -68,7 +68,7 @@ fn nothing_can_be_changed(#[case] method: &str, #[case] path: &str) {
 }
 
 #[test]
-fn another_name_for_this_machine_is_refused() {
+fn foreign_host_names_are_refused() {
     let place = Place::new();
     for (host, status) in [("localhost:1234", 200), ("127.0.0.1", 200), ("[::1]:8420", 200), ("evil.example:8420", 421)]
     {
@@ -82,7 +82,7 @@ fn another_name_for_this_machine_is_refused() {
 }
 
 #[test]
-fn another_site_has_nothing_looked_at() {
+fn embedding_by_another_site_is_refused() {
     let place = Place::new();
     let ask = |site: &str, mode: &str, dest: &str, path: &str| {
         let said = format!("Sec-Fetch-Site: {site}\r\nSec-Fetch-Mode: {mode}\r\nSec-Fetch-Dest: {dest}");
@@ -96,7 +96,7 @@ fn another_site_has_nothing_looked_at() {
 }
 
 #[test]
-fn answers_say_what_browsers_may_do_with_them() {
+fn every_response_has_security_headers() {
     let place = Place::new();
     for path in ["/", "/run/one", "/run/study", "/report/study", "/file/pictures/over%20%3Cb%3E.svg", "/nothing"] {
         let answer = place.get(path);
@@ -108,14 +108,14 @@ fn answers_say_what_browsers_may_do_with_them() {
         for header in ["x-content-type-options: nosniff", "cross-origin-resource-policy: same-origin"] {
             assert!(answer.head.contains(header), "{path}: {}", answer.head);
         }
-        // Nothing inside a page runs by itself, and nothing comes from elsewhere.
+        // Pages have no inline scripts and load nothing from other hosts.
         let elsewhere = ["<script>", "onclick", "src=\"http", "href=\"http"];
         assert!(!elsewhere.iter().any(|words| answer.body.contains(words)), "{path}: {}", answer.body);
     }
 }
 
 #[test]
-fn files_are_sent_whole_in_part_and_by_their_kind() {
+fn files_support_ranges_and_entity_tags() {
     let place = Place::new();
     write(&place.path("film.mp4"), "0123456789");
     let answer = place.get("/file/film.mp4");
@@ -140,7 +140,7 @@ fn files_are_sent_whole_in_part_and_by_their_kind() {
     assert_eq!(with(&format!("Range: bytes=2-4\r\nIf-Range: {tag}")).body, "234");
     write(&place.path("film.mp4"), "another film");
     assert_eq!(with(&format!("If-None-Match: {tag}")).body, "another film");
-    assert_eq!(with(&format!("Range: bytes=2-4\r\nIf-Range: {tag}")).status, 200, "a part of another file");
+    assert_eq!(with(&format!("Range: bytes=2-4\r\nIf-Range: {tag}")).status, 200, "the tag is of another file");
     let head = place.ask("HEAD", "/file/film.mp4", "localhost");
     assert_eq!((head.status, head.body.as_str()), (200, ""));
 }
@@ -150,20 +150,20 @@ fn answer_tag(head: &str) -> String {
 }
 
 #[test]
-fn so_many_look_on_and_no_more() {
+fn at_most_64_event_streams_are_open() {
     let place = Place::new();
     let mut all: Vec<_> = (0..64).map(|_| place.events("/events/one")).collect();
     for events in &mut all {
         events.until("an event", |event| event["title"].is_string());
     }
     assert_eq!(place.get("/events").status, 503);
-    assert_eq!(place.get("/run/one").status, 200, "pages are there");
+    assert_eq!(place.get("/run/one").status, 200, "pages can be loaded");
     all.truncate(32);
     let start = std::time::Instant::now();
-    // Who has gone is noticed with the next event.
+    // The server notices closed connections when it sends the next event.
     while place.events("/events").status() != "200" {
         write(&place.path("one/monitor.csv"), &format!("r,l,t,success\n{},1,1,1\n", start.elapsed().as_nanos()));
-        assert!(start.elapsed() < crate::client::LIMIT, "there is still no room");
+        assert!(start.elapsed() < crate::client::LIMIT, "closed streams still count");
         std::thread::sleep(std::time::Duration::from_millis(200));
     }
 }

@@ -1,0 +1,183 @@
+//! A cached value that one task at a time refreshes, for a limited share of the time.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use tokio::sync::{Mutex, Semaphore};
+
+/// Minimum pause between two loads of a value.
+pub(crate) const MIN_PAUSE: Duration = Duration::from_secs(1);
+/// Pause between two loads, as a multiple of the time that the last load took.
+pub(crate) const PAUSE_FACTOR: u32 = 5;
+/// Longest time that a caller waits for a load.
+const LOAD_TIMEOUT: Duration = Duration::from_secs(20);
+
+/// A value that is loaded again when it is wanted and its pause is over. Clones share the value.
+#[derive(Debug)]
+pub(crate) struct CachedLoader<T> {
+    last: Arc<Mutex<Option<LoadedValue<T>>>>,
+    /// Set while a load takes longer than callers wait.
+    is_overdue: Arc<AtomicBool>,
+}
+
+/// Result of the last load.
+#[derive(Debug)]
+struct LoadedValue<T> {
+    value: Result<T, LoadError>,
+    /// Time at which the load ended.
+    at: Instant,
+    duration: Duration,
+}
+
+/// Why there is no value.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum LoadError {
+    /// The loading function has panicked, which is a fault of this program.
+    Panicked,
+    /// The load takes too long, for example because a file system does not answer.
+    TimedOut,
+}
+
+/// Returns the pause after a load that took `duration`.
+pub(crate) fn pause_after(duration: Duration) -> Duration {
+    MIN_PAUSE.max(duration * PAUSE_FACTOR)
+}
+
+impl<T> Default for CachedLoader<T> {
+    fn default() -> Self {
+        Self { last: Arc::new(Mutex::new(None)), is_overdue: Arc::default() }
+    }
+}
+
+impl<T> Clone for CachedLoader<T> {
+    fn clone(&self) -> Self {
+        Self { last: Arc::clone(&self.last), is_overdue: Arc::clone(&self.is_overdue) }
+    }
+}
+
+impl<T: Clone + Send + 'static> CachedLoader<T> {
+    /// Tells whether a load is under way.
+    pub(crate) fn is_loading(&self) -> bool {
+        self.last.try_lock().is_err()
+    }
+
+    /// Returns the last value during its pause. After the pause it calls `load`, as soon as `permits` has a permit.
+    ///
+    /// A load runs to its end although nobody waits for it any more, but an overdue load returns its permit.
+    pub(crate) async fn get(
+        &self,
+        permits: &Arc<Semaphore>,
+        load: impl FnOnce() -> T + Send + 'static,
+    ) -> Result<T, LoadError> {
+        self.get_within(LOAD_TIMEOUT, permits, load).await
+    }
+
+    async fn get_within(
+        &self,
+        timeout: Duration,
+        permits: &Arc<Semaphore>,
+        load: impl FnOnce() -> T + Send + 'static,
+    ) -> Result<T, LoadError> {
+        if self.is_overdue.load(Ordering::Relaxed) {
+            return Err(LoadError::TimedOut);
+        }
+        let (last, is_overdue, permits) = (Arc::clone(&self.last), Arc::clone(&self.is_overdue), Arc::clone(permits));
+        let task = tokio::spawn(async move {
+            let mut last = last.lock_owned().await;
+            if let Some(last) = last.as_ref().filter(|last| last.at.elapsed() < pause_after(last.duration)) {
+                return last.value.clone();
+            }
+            // The semaphore is never closed.
+            let permit = permits.acquire_owned().await;
+            let start = Instant::now();
+            let mut load = tokio::task::spawn_blocking(load);
+            let loaded = match tokio::time::timeout(timeout, &mut load).await {
+                Ok(loaded) => loaded,
+                Err(_) => {
+                    drop(permit);
+                    is_overdue.store(true, Ordering::Relaxed);
+                    let loaded = load.await;
+                    is_overdue.store(false, Ordering::Relaxed);
+                    loaded
+                }
+            };
+            let value = loaded.map_err(|error| {
+                tracing::error!("reading the files of a page failed: {error}");
+                LoadError::Panicked
+            });
+            *last = Some(LoadedValue { value: value.clone(), at: Instant::now(), duration: start.elapsed() });
+            value
+        });
+        match tokio::time::timeout(timeout, task).await {
+            Ok(value) => value.unwrap_or(Err(LoadError::Panicked)),
+            Err(_) => Err(LoadError::TimedOut),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use super::*;
+
+    fn permits() -> Arc<Semaphore> {
+        Arc::new(Semaphore::new(2))
+    }
+
+    #[tokio::test]
+    async fn many_callers_cause_one_load_and_a_pause() {
+        let (loads, loader, permits) = (Arc::new(AtomicUsize::new(0)), CachedLoader::default(), permits());
+        let get = || {
+            let loads = Arc::clone(&loads);
+            loader.get(&permits, move || {
+                std::thread::sleep(Duration::from_millis(300));
+                loads.fetch_add(1, Ordering::SeqCst)
+            })
+        };
+        let start = Instant::now();
+        let (one, other) = tokio::join!(get(), get());
+        assert_eq!((one, other), (Ok(0), Ok(0)));
+        while get().await == Ok(0) {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+        assert!(start.elapsed() >= Duration::from_millis(1800), "the pause is five times the load");
+        assert_eq!(get().await, Ok(1));
+    }
+
+    #[tokio::test]
+    async fn a_panic_is_an_error_until_the_next_load() {
+        let (broken, whole, permits) = (CachedLoader::<u8>::default(), CachedLoader::default(), permits());
+        for _ in 0..5 {
+            assert_eq!(broken.get(&permits, || panic!("as intended")).await, Err(LoadError::Panicked));
+        }
+        assert_eq!(whole.get(&permits, || 7).await, Ok(7));
+        assert_eq!(broken.get(&permits, || 8).await, Err(LoadError::Panicked), "there is a pause after a panic, too");
+        // Printing the panic's backtrace counts as part of the load.
+        while broken.get(&permits, || 8).await == Err(LoadError::Panicked) {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+        assert_eq!(broken.get(&permits, || 8).await, Ok(8));
+    }
+
+    #[tokio::test]
+    async fn callers_of_an_overdue_load_get_an_error() {
+        let (overdue, other, permits) =
+            (CachedLoader::<u8>::default(), CachedLoader::default(), Arc::new(Semaphore::new(1)));
+        let (end, ended) = std::sync::mpsc::channel::<()>();
+        let value = overdue.get_within(Duration::from_millis(100), &permits, move || {
+            let _ = ended.recv();
+            1
+        });
+        assert_eq!(value.await, Err(LoadError::TimedOut));
+        assert!(overdue.is_loading() && !other.is_loading());
+        assert_eq!(other.get(&permits, || 2).await, Ok(2), "the permit is free again");
+        assert_eq!(overdue.get(&permits, || 3).await, Err(LoadError::TimedOut), "later callers do not wait");
+        drop(end);
+        while overdue.get(&permits, || 3).await == Err(LoadError::TimedOut) {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        assert_eq!(overdue.get(&permits, || 3).await, Ok(1), "the overdue load's value is kept");
+    }
+}

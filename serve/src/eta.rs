@@ -1,0 +1,76 @@
+//! The remaining time of an experiment, from its progress while its page was open.
+//!
+//! It does not matter who makes the progress: processes, Slurm jobs or several machines.
+
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+/// Time between two samples of the progress.
+const SAMPLE_INTERVAL: Duration = Duration::from_secs(10);
+/// Number of samples that are kept.
+const MAX_SAMPLES: usize = 90;
+/// Time between the first sample and the first estimate.
+const MIN_TIME: Duration = Duration::from_secs(10);
+/// Share of the whole experiment that must be done between the first sample and an estimate.
+const MIN_SHARE: f64 = 0.002;
+
+/// Samples of the progress: the done share of each cell, 0 to 1, with the time of the sample.
+#[derive(Debug, Default)]
+pub(crate) struct Eta(VecDeque<(Instant, Vec<f32>)>);
+
+impl Eta {
+    /// Adds a sample if the last one is old enough.
+    pub(crate) fn sample(&mut self, now: Instant, shares: &[f32]) {
+        // Cells were begun anew or the plan has changed, so that earlier samples do not apply.
+        let differs =
+            |then: &[f32]| then.len() != shares.len() || then.iter().zip(shares).any(|(then, now)| now < then);
+        if self.0.back().is_some_and(|(_, then)| differs(then)) {
+            self.0.clear();
+        }
+        if self.0.back().is_none_or(|(time, _)| now.duration_since(*time) >= SAMPLE_INTERVAL) {
+            self.0.push_back((now, shares.to_vec()));
+            self.0.drain(..self.0.len().saturating_sub(MAX_SAMPLES));
+        }
+    }
+
+    /// Drops all samples, because nobody works on the experiment.
+    pub(crate) fn reset(&mut self) {
+        self.0.clear();
+    }
+
+    /// Returns the remaining seconds at the speed since the first sample. `weights` are the cells' durations relative to each
+    /// other. Returns `None` before there is enough progress.
+    pub(crate) fn remaining_seconds(&self, now: Instant, shares: &[f32], weights: &[f64]) -> Option<f64> {
+        let (start, then) = self.0.front()?;
+        let time = now.duration_since(*start);
+        let sum =
+            |shares: &[f32]| shares.iter().zip(weights).map(|(share, weight)| f64::from(*share) * weight).sum::<f64>();
+        let (all, done) = (weights.iter().sum::<f64>(), sum(shares));
+        let new = done - sum(then);
+        let known = time >= MIN_TIME && new >= MIN_SHARE * all;
+        known.then(|| (all - done).max(0.0) / new * time.as_secs_f64())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_remaining_time_follows_from_the_progress() {
+        let (begin, mut eta) = (Instant::now(), Eta::default());
+        let at = |seconds| begin + Duration::from_secs(seconds);
+        let weights = [10.0, 10.0, 20.0];
+        eta.sample(at(0), &[0.5, 0.0, 0.0]);
+        assert_eq!(eta.remaining_seconds(at(5), &[0.9, 0.0, 0.0], &weights), None, "too early");
+        assert_eq!(eta.remaining_seconds(at(20), &[0.5, 0.0, 0.0], &weights), None, "nothing was done");
+        eta.sample(at(20), &[1.0, 0.0, 0.0]);
+        // 5 of 40 were done in 20 s, so 30 remain.
+        assert_eq!(eta.remaining_seconds(at(20), &[1.0, 0.0, 0.0], &weights), Some(120.0));
+        eta.sample(at(40), &[0.0, 0.0, 0.0]);
+        let anew = eta.remaining_seconds(at(60), &[0.1, 0.0, 0.0], &weights).unwrap(); // 1 of 40 in 20 s
+        assert!((anew - 39.0 / 1.0 * 20.0).abs() < 1e-3, "begun anew: {anew}");
+        eta.reset();
+        assert_eq!(eta.remaining_seconds(at(60), &[0.2, 0.0, 0.0], &weights), None);
+    }
+}
