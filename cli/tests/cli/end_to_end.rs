@@ -8,13 +8,12 @@ use crate::common::{
     addresses, child_server, config, ended, is_running, kill, perturb, read, run, server, stderr, wait_for,
     wait_for_server,
 };
-use perturb_learner::algorithm::Experience;
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers, Session, StepReply};
 use perturb_learner::evaluation::test;
 use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Collector, Normalisers, Rollout};
-use perturb_policy::{ActionKind, Inputs, Player, PolicySpec, Role};
+use perturb_policy::{ActionKind, CollectUntil, Inputs, Player, PolicySpec, Role};
 use perturb_study::Version;
 use perturb_study::interrupt::StopFlag;
 use perturb_torch::{Sequences, TorchPolicy};
@@ -143,7 +142,7 @@ fn two_rollouts(servers: &Servers) -> (Policy, [Rollout; 2]) {
     let mut collector = Collector::new(player);
     let rollouts = [(); 2].map(|()| {
         let mut rollout = Rollout::new(N_STEPS, N_ENVS, size, 1);
-        let steps = Experience::Steps(N_STEPS);
+        let steps = CollectUntil::Steps(N_STEPS);
         collector.collect(&mut session, policy.flat_weights(), steps, &mut rollout, |_| {}).expect("a rollout");
         rollout
     });

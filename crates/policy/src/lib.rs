@@ -8,6 +8,7 @@
 mod act;
 mod act_ff;
 mod act_rc;
+mod collect_until;
 mod differentiator;
 mod error;
 mod initial;
@@ -25,10 +26,10 @@ pub mod random;
 mod recurrent;
 mod sample;
 mod spec;
-mod task;
 mod weights;
 
 pub use act::{Actor, Acts, Streams};
+pub use collect_until::{CollectUntil, EpisodeQuotas, Remaining};
 pub use differentiator::{Differentiator, Samples};
 pub use error::{Error, Result, check_length};
 pub use initial::initial_weights;
@@ -43,5 +44,4 @@ pub use recurrent::{
     register_recurrent,
 };
 pub use spec::{ActionKind, PolicySpec};
-pub use task::{Dues, Task};
 pub use weights::{NamedArray, Weights, check_arrays};

@@ -3,13 +3,13 @@
 use rand_chacha::ChaCha8Rng;
 
 use crate::act::{Actor, Acts, Streams};
+use crate::collect_until::Remaining;
 use crate::differentiator::Differentiator;
 use crate::error::{Result, check_length};
 use crate::inputs::Inputs;
 use crate::normalisers::{Normalisers, Statistics};
 use crate::random::{Purpose, normal, stream, trial_stream};
 use crate::spec::PolicySpec;
-use crate::task::Task;
 
 /// Plays N environments with a policy: [`Player::act`] chooses actions, somebody steps the environments, and
 /// [`Player::observe`] takes what came of it. Learner and server play with the same code, so that they give the same
@@ -266,14 +266,14 @@ impl Player {
     }
 
     /// A trial begins in every environment with `observations` `[N, O]`; running statistics take in those of the
-    /// environments where `task` counts.
+    /// environments where `remaining` counts.
     ///
     /// # Errors
     /// Another length; numbers that are not finite.
-    pub fn begin(&mut self, observations: &[f32], task: Option<&Task>) -> Result<()> {
+    pub fn begin(&mut self, observations: &[f32], remaining: Option<&Remaining>) -> Result<()> {
         check_length("observations [N, O]", observations.len(), self.observations.len())?;
         self.observations.copy_from_slice(observations);
-        let active = task.and_then(Task::active);
+        let active = remaining.and_then(Remaining::active);
         self.normalisers.take_observations(&mut self.observations, self.role.statistics(), active)?;
         if let (Statistics::Running, Some(normaliser)) = (self.role.statistics(), &mut self.normalisers.rewards) {
             normaliser.reset_returns();
@@ -329,12 +329,12 @@ impl Player {
         &self.bytes
     }
 
-    /// Takes what came of the last actions, after `task` was advanced: of which environments statistics take in rewards
+    /// Takes what came of the last actions, after `remaining` was advanced: of which environments statistics take in rewards
     /// and next observations.
     ///
     /// # Errors
     /// Other lengths; numbers that are not finite.
-    pub fn observe(&mut self, outcome: &Outcome<'_>, task: Option<&Task>) -> Result<()> {
+    pub fn observe(&mut self, outcome: &Outcome<'_>, remaining: Option<&Remaining>) -> Result<()> {
         let n_envs = self.starts.len();
         check_length("observations [N, O]", outcome.observations.len(), self.observations.len())?;
         check_length("rewards [N]", outcome.rewards.len(), n_envs)?;
@@ -345,10 +345,10 @@ impl Player {
         self.last.take(outcome, self.episodes_per_trial);
 
         let Self { actor, inputs, role, normalisers, last, observations, .. } = self;
-        let (statistics, stepped) = (role.statistics(), task.and_then(Task::stepped));
+        let (statistics, stepped) = (role.statistics(), remaining.and_then(Remaining::stepped));
         observations.copy_from_slice(outcome.observations);
         normalisers.take_rewards(&mut last.rewards, &last.trial_ended, statistics, stepped)?;
-        normalisers.take_observations(observations, statistics, task.and_then(Task::active))?;
+        normalisers.take_observations(observations, statistics, remaining.and_then(Remaining::active))?;
         inputs.remember(&last.acts, &last.rewards, &last.done)?;
         if statistics == Statistics::Running && last.gather_truncated(outcome, self.observation_size) {
             normalisers.normalise(&mut last.finals)?;
@@ -397,10 +397,10 @@ impl Player {
     ///
     /// # Errors
     /// Observations that do not fit.
-    pub fn last_values(&mut self, task: &Task) -> Result<&[f32]> {
-        match task {
-            Task::Steps { .. } => self.actor.values(self.inputs.of(&self.observations), &mut self.values)?,
-            Task::Episodes(_) => {
+    pub fn last_values(&mut self, remaining: &Remaining) -> Result<&[f32]> {
+        match remaining {
+            Remaining::Steps(_) => self.actor.values(self.inputs.of(&self.observations), &mut self.values)?,
+            Remaining::Episodes(_) => {
                 self.values.clear();
                 self.values.resize(self.starts.len(), 0.0);
             }

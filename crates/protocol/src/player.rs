@@ -1,7 +1,7 @@
 //! What a player is made of, on the wire and in memory.
 
 use bytes::Bytes;
-use perturb_policy::{ObservationNormaliser, PlayerState, RewardNormaliser, RunningMoments};
+use perturb_policy::{CollectUntil, ObservationNormaliser, PlayerState, RewardNormaliser, RunningMoments};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
@@ -27,6 +27,24 @@ impl Unreadable {
     /// The same of the message that this one is in.
     pub fn within(self, field: &str) -> Self {
         Self { field: format!("{field}.{}", self.field), ..self }
+    }
+}
+
+impl From<CollectUntil> for proto::act::Task {
+    fn from(until: CollectUntil) -> Self {
+        match until {
+            CollectUntil::Steps(count) => Self::Steps(count as u32),
+            CollectUntil::Episodes(count) => Self::Episodes(count as u32),
+        }
+    }
+}
+
+impl From<proto::act::Task> for CollectUntil {
+    fn from(task: proto::act::Task) -> Self {
+        match task {
+            proto::act::Task::Steps(count) => Self::Steps(count as usize),
+            proto::act::Task::Episodes(count) => Self::Episodes(count as usize),
+        }
     }
 }
 

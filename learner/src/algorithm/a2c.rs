@@ -1,9 +1,9 @@
 //! Advantage actor-critic.
 
-use perturb_policy::{Descent, Losses, Objective, Optimiser, Surrogate};
+use perturb_policy::{CollectUntil, Descent, Losses, Objective, Optimiser, Surrogate};
 use perturb_study::settings::A2cConfig;
 
-use super::{Algorithm, AlgorithmState, Experience, InTurn, UpdateStats, check_rollout, explained_variance};
+use super::{Algorithm, AlgorithmState, InTurn, UpdateStats, check_rollout, explained_variance};
 use crate::error::Result;
 use crate::policy::Policy;
 use crate::rollout::{Estimates, Rollout, n_step_returns};
@@ -32,8 +32,8 @@ impl A2c {
 }
 
 impl Algorithm for A2c {
-    fn experience(&self) -> Experience {
-        Experience::Steps(self.config.n_steps)
+    fn collect_until(&self) -> CollectUntil {
+        CollectUntil::Steps(self.config.n_steps)
     }
 
     fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats> {

@@ -1,9 +1,10 @@
 //! EPOpt: learning from the worst episodes.
 
-use super::{Algorithm, AlgorithmState, Experience, InTurn, UpdateStats};
+use super::{Algorithm, AlgorithmState, InTurn, UpdateStats};
 use crate::error::Result;
 use crate::policy::Policy;
 use crate::rollout::{Rollout, Span};
+use perturb_policy::CollectUntil;
 use perturb_study::settings::{EpoptConfig, Ranking};
 
 /// EPOpt-ε, Rajeswaran et al. (2017), arXiv:1610.01283, around another algorithm: an iteration generates L complete
@@ -42,8 +43,8 @@ impl Epopt {
 }
 
 impl Algorithm for Epopt {
-    fn experience(&self) -> Experience {
-        Experience::Episodes(self.config.episodes_per_iteration)
+    fn collect_until(&self) -> CollectUntil {
+        CollectUntil::Episodes(self.config.episodes_per_iteration)
     }
 
     /// `rollout` holds L complete episodes, see [`Rollout::episodes`].

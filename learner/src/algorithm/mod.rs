@@ -15,32 +15,12 @@ use serde::{Deserialize, Serialize};
 use crate::error::Result;
 use crate::policy::Policy;
 use crate::rollout::{self, Estimates, Rollout};
-use perturb_policy::NamedArray;
-use perturb_policy::{Task, check_length};
-
-/// What an update learns from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Experience {
-    /// T steps of every environment, episodes running on from one rollout to the next.
-    Steps(usize),
-    /// So many complete episodes, each in a freshly drawn environment.
-    Episodes(usize),
-}
-
-impl Experience {
-    /// What is to be played in N = `n_envs` environments.
-    pub fn task(self, n_envs: usize) -> Task {
-        match self {
-            Self::Steps(count) => Task::steps(count),
-            Self::Episodes(count) => Task::episodes(count, n_envs),
-        }
-    }
-}
+use perturb_policy::{CollectUntil, NamedArray, check_length};
 
 /// Learns from rollouts.
 pub trait Algorithm: Send {
-    /// What is collected between two updates.
-    fn experience(&self) -> Experience;
+    /// How much is collected between two updates.
+    fn collect_until(&self) -> CollectUntil;
 
     /// Improves `policy` by a finished rollout. `progress_remaining` falls from 1 at the start of training to 0 at its
     /// end. A loss or gradient that is not finite is an error, after which the policy is as it was before that gradient

@@ -1,11 +1,11 @@
 //! Proximal policy optimisation.
 
 use perturb_policy::random::{Purpose, stream, uniform};
-use perturb_policy::{Descent, Losses, Objective, Optimiser, Surrogate};
+use perturb_policy::{CollectUntil, Descent, Losses, Objective, Optimiser, Surrogate};
 use perturb_study::settings::{PpoConfig, SettingError};
 use rand_chacha::ChaCha8Rng;
 
-use super::{Algorithm, AlgorithmState, Experience, InTurn, UpdateStats, check_rollout, explained_variance};
+use super::{Algorithm, AlgorithmState, InTurn, UpdateStats, check_rollout, explained_variance};
 use crate::error::Result;
 use crate::policy::Policy;
 use crate::rollout::{Estimates, Rollout, gae};
@@ -47,8 +47,8 @@ impl Ppo {
 }
 
 impl Algorithm for Ppo {
-    fn experience(&self) -> Experience {
-        Experience::Steps(self.config.n_steps)
+    fn collect_until(&self) -> CollectUntil {
+        CollectUntil::Steps(self.config.n_steps)
     }
 
     fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats> {

@@ -11,18 +11,6 @@ use super::part::Part;
 use super::session::Session;
 use crate::proto;
 
-/// Where actions of trainings and tests are chosen, which changes no byte.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum ActAt {
-    /// At the server, if it can: a line's delay is then paid once a rollout, not at each step. Trainings over several
-    /// servers, several together whose rollouts are [short](perturb_study::settings::Rollouts), and those that see noise
-    /// choose theirs at the client all the same.
-    #[default]
-    Server,
-    /// At the client.
-    Client,
-}
-
 /// Steps that one server played in all its environments, with the episodes that ended in them.
 #[derive(Clone, Debug, Default)]
 pub struct Played {

@@ -14,11 +14,11 @@ mod session;
 mod single;
 mod waiting;
 
-pub use acting::{ActAt, Played};
-pub use options::OpenOptions;
+pub use acting::Played;
+pub use options::{ActAt, OpenOptions, ServerWait};
 pub use perturb_protocol::{Address, AddressError, ClientError, EndedEpisode, PrivateServer};
 pub use reply::{StepReply, StepSlice};
 pub use servers::Servers;
 pub use session::Session;
 pub use single::{BegunEpisode, Picture, Single};
-pub use waiting::{After, ServerWait, Waiting};
+pub use waiting::{After, Waiting};

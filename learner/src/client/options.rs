@@ -1,6 +1,7 @@
-//! What is opened: environments of one or several trainings.
+//! What is opened: environments of one or several trainings; where actions are chosen, and how long servers are waited for.
 
 use std::ops::Range;
+use std::time::Duration;
 
 use perturb_protocol::{Version, proto};
 use perturb_study::sets::Parameters;
@@ -25,6 +26,33 @@ pub struct OpenOptions {
     pub episodes_per_trial: u32,
     /// What observations have; the same in all options of a session.
     pub observe: Observe,
+}
+
+/// Where actions of trainings and tests are chosen, which changes no byte.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ActAt {
+    /// At the server, if it can: a line's delay is then paid once a rollout, not at each step. Trainings over several
+    /// servers, several together whose rollouts are [short](perturb_study::settings::Rollouts), and those that see noise
+    /// choose theirs at the client all the same.
+    #[default]
+    Server,
+    /// At the client.
+    Client,
+}
+
+/// How long lost servers are waited for.
+#[derive(Clone, Copy, Debug)]
+pub struct ServerWait {
+    /// In all, until something is gained; zero does not wait at all.
+    pub limit: Duration,
+    /// Hears what is waited for, in a sentence.
+    pub tell: fn(&str),
+}
+
+impl Default for ServerWait {
+    fn default() -> Self {
+        Self { limit: Duration::ZERO, tell: |_| {} }
+    }
 }
 
 /// The request for the slots of `range`, counted over all `options`; `None` if an index is beyond what the protocol can

@@ -11,8 +11,7 @@ use tokio::sync::oneshot;
 use perturb_protocol::names::EnvironmentName;
 use perturb_protocol::{Address, ClientError, Connection, Machines, PrivateServer, first_of, machines};
 
-use super::acting::ActAt;
-use super::waiting::ServerWait;
+use super::options::{ActAt, ServerWait};
 use crate::proto;
 use perturb_study::settings::Common;
 

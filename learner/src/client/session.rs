@@ -6,8 +6,7 @@ use bytes::Bytes;
 use perturb_protocol::{Address, Ask, ClientError, Distribution};
 use tokio::runtime::Handle;
 
-use super::acting::ActAt;
-use super::options::OpenOptions;
+use super::options::{ActAt, OpenOptions};
 use super::part::Part;
 use super::reply::StepReply;
 use super::servers::Servers;

@@ -7,6 +7,7 @@ use perturb_study::interrupt::StopFlag;
 use perturb_study::words::duration;
 use tokio::time::sleep;
 
+use super::options::ServerWait;
 use super::servers::Servers;
 
 /// After the first look, which is at once, the pause before the next; it doubles with each look …
@@ -17,21 +18,6 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(10);
 const STAYS_AWAY: Duration = Duration::from_secs(5);
 /// How often it is looked whether the program is to end.
 const TICK: Duration = Duration::from_millis(20);
-
-/// How long lost servers are waited for.
-#[derive(Clone, Copy, Debug)]
-pub struct ServerWait {
-    /// In all, until something is gained; zero does not wait at all.
-    pub limit: Duration,
-    /// Hears what is waited for, in a sentence.
-    pub tell: fn(&str),
-}
-
-impl Default for ServerWait {
-    fn default() -> Self {
-        Self { limit: Duration::ZERO, tell: |_| {} }
-    }
-}
 
 /// The losses of something that goes on after them.
 #[derive(Debug, Default)]

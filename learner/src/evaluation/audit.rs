@@ -6,7 +6,8 @@ use perturb_protocol::Version;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::records::{About, EpisodeRecord, Records};
 
-use super::test::{TestError, outlasting};
+use super::error::TestError;
+use super::test::outlasting;
 use super::trials::Trials;
 use crate::checkpoint::Checkpoint;
 use crate::client::{EndedEpisode, OpenOptions, Servers, Session};

@@ -6,7 +6,8 @@ use perturb_study::records::Records;
 use perturb_study::sets::{Contexts, TestSet};
 use perturb_study::{Axis, Heatmap, HeatmapOptions, MOST_POINTS};
 
-use super::test::{TestError, TestOptions, Tester};
+use super::error::TestError;
+use super::test::{TestOptions, Tester};
 use crate::checkpoint::Checkpoint;
 use crate::client::Servers;
 

@@ -1,10 +1,12 @@
 //! Testing: does a trained policy still work when the physics changes?
 
 mod audit;
+mod error;
 mod heatmap;
 mod test;
 mod trials;
 
 pub use audit::{Audit, AuditError, audit};
+pub use error::TestError;
 pub use heatmap::{HeatmapError, heatmap, heatmap_again};
-pub use test::{TestError, TestOptions, Tester, open_options, test};
+pub use test::{TestOptions, Tester, open_options, test};

@@ -6,7 +6,7 @@ use std::ops::Range;
 use perturb_policy::{Ended, Player, Result as PolicyResult};
 use perturb_protocol::player::floats;
 
-use super::test::TestError;
+use super::error::TestError;
 use crate::checkpoint::Checkpoint;
 use crate::client::{EndedEpisode, Played, Session, StepReply, acting};
 use crate::proto;

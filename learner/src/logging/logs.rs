@@ -9,8 +9,8 @@ use perturb_study::files::{self, FileError, io, sync_folder};
 use serde::{Deserialize, Serialize};
 
 use super::{Clock, Monitor, Progress, ProgressLog};
-use crate::checkpoint::EnvironmentSummary;
 use crate::client::EndedEpisode;
+use perturb_study::checkpoint::EnvironmentSummary;
 
 const MONITOR: &str = "monitor.csv";
 const PROGRESS: &str = "progress.csv";
@@ -119,12 +119,6 @@ impl Logs {
         let [progress, events] = self.progress.sync().map_err(io("write", &self.directory.join(PROGRESS)))?;
         Ok(LogLengths { monitor, progress, events, events_file: self.progress.events_file().to_owned() })
     }
-}
-
-/// Brings `file` to the disk and gives its length.
-pub(super) fn sync(file: &File) -> std::io::Result<u64> {
-    file.sync_data()?;
-    Ok(file.metadata()?.len())
 }
 
 /// Opens a log for appending that has at least `length` bytes, with the end of a line there if it consists of `lines`.

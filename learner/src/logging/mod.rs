@@ -2,6 +2,7 @@
 //! stable-baselines3's names, so that the tools that people have read them.
 
 mod clock;
+mod disk;
 mod logs;
 mod monitor;
 mod progress;

@@ -5,9 +5,9 @@ use std::io::{BufWriter, Write};
 use std::path::Path;
 
 use super::Clock;
-use super::logs::sync;
-use crate::checkpoint::EnvironmentSummary;
+use super::disk::sync;
 use crate::client::EndedEpisode;
+use perturb_study::checkpoint::EnvironmentSummary;
 
 /// Writes stable-baselines3's Monitor format: a line of JSON after `#`, a header, and a line an episode with its return
 /// `r`, its length `l` and the seconds `t` since the start; then `success`, `terminated` (0 or 1), `episode_index`,

@@ -6,7 +6,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::EventWriter;
-use super::logs::sync;
+use super::disk::sync;
 use crate::algorithm::UpdateStats;
 use crate::client::EndedEpisode;
 

@@ -9,7 +9,7 @@ use std::path::Path;
 
 use prost::Message;
 
-use super::logs::sync;
+use super::disk::sync;
 
 /// The parts of tensorflow/core/util/event.proto that scalars need.
 #[derive(Clone, PartialEq, Message)]

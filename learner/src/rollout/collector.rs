@@ -3,9 +3,8 @@
 use bytes::Bytes;
 
 use super::Rollout;
-use crate::algorithm::Experience;
 use crate::client::{ClientError, EndedEpisode, Session, StepReply, StepSlice};
-use perturb_policy::{Ended, Player, PlayerState, Task};
+use perturb_policy::{CollectUntil, Ended, Player, PlayerState, Remaining};
 
 /// Why a rollout could not be collected.
 #[derive(Debug, thiserror::Error)]
@@ -40,7 +39,7 @@ impl CollectError {
 #[derive(Debug)]
 pub struct Collector {
     player: Player,
-    task: Task,
+    remaining: Remaining,
     /// Buffer of a step.
     ended: Vec<Ended>,
 }
@@ -57,7 +56,7 @@ pub struct CollectorState {
 impl Collector {
     /// Collects what `player` does.
     pub fn new(player: Player) -> Self {
-        Self { player, task: Task::steps(0), ended: Vec::new() }
+        Self { player, remaining: Remaining::Steps(0), ended: Vec::new() }
     }
 
     /// The player.
@@ -77,15 +76,15 @@ impl Collector {
     /// [`CollectError`].
     pub fn begin(
         &mut self,
-        experience: Experience,
+        until: CollectUntil,
         rollout: &mut Rollout,
         reset: impl FnOnce(&mut [f32]) -> Result<(), ClientError>,
     ) -> Result<(), CollectError> {
-        self.task = experience.task(self.player.n_envs());
-        if let Task::Episodes(_) = self.task {
+        self.remaining = until.begin(self.player.n_envs());
+        if let CollectUntil::Episodes(_) = until {
             let mut observations = vec![0.0; self.player.n_envs() * self.player.observation_size()];
             reset(&mut observations)?;
-            self.player.begin(&observations, Some(&self.task))?;
+            self.player.begin(&observations, Some(&self.remaining))?;
         }
         rollout.begin(self.player.memory());
         Ok(())
@@ -93,7 +92,7 @@ impl Collector {
 
     /// Whether nothing is left to collect.
     pub fn is_done(&self) -> bool {
-        self.task.is_done()
+        self.remaining.is_done()
     }
 
     /// The next actions, as the protocol wants them.
@@ -114,13 +113,13 @@ impl Collector {
         rollout: &mut Rollout,
         mut on_episode: impl FnMut(&EndedEpisode),
     ) -> Result<(), CollectError> {
-        let Self { player, task, ended } = self;
+        let Self { player, remaining, ended } = self;
         let outcome = reply.outcome(ended);
-        task.advance(outcome.ended.iter().map(|end| end.slot));
-        player.observe(&outcome, Some(task))?;
+        remaining.advance(outcome.ended.iter().map(|end| end.slot));
+        player.observe(&outcome, Some(remaining))?;
         rollout.push(player.played())?;
-        for (end, episode) in outcome.ended.iter().zip(reply.ended).filter(|(end, _)| task.counts(end.slot)) {
-            if let Task::Episodes(_) = task {
+        for (end, episode) in outcome.ended.iter().zip(reply.ended).filter(|(end, _)| remaining.counts(end.slot)) {
+            if let Remaining::Episodes(_) = remaining {
                 rollout.note_episode(end.slot, rollout.len(), episode.length as usize, episode.episode_return)?;
             }
             on_episode(episode);
@@ -133,7 +132,7 @@ impl Collector {
     /// # Errors
     /// [`CollectError::Numbers`].
     pub fn finish(&mut self, rollout: &mut Rollout) -> Result<(), CollectError> {
-        Ok(rollout.finish(self.player.last_values(&self.task)?)?)
+        Ok(rollout.finish(self.player.last_values(&self.remaining)?)?)
     }
 
     /// A whole rollout under the policy of `weights`, from a session of this collector's environments alone.
@@ -144,13 +143,13 @@ impl Collector {
         &mut self,
         session: &mut Session<'_>,
         weights: &[f32],
-        experience: Experience,
+        until: CollectUntil,
         rollout: &mut Rollout,
         mut on_episode: impl FnMut(&EndedEpisode),
     ) -> Result<(), CollectError> {
         let mut reply = StepReply::default();
         self.player.load(weights)?;
-        self.begin(experience, rollout, |observations| session.reset(0..session.num_envs(), observations))?;
+        self.begin(until, rollout, |observations| session.reset(0..session.num_envs(), observations))?;
         while !self.is_done() {
             session.step(self.act()?, &mut reply)?;
             self.take(&reply.all(), rollout, &mut on_episode)?;

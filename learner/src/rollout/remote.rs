@@ -1,10 +1,9 @@
 //! Collecting rollouts that a server plays.
 
 use super::{CollectError, Rollout};
-use crate::algorithm::Experience;
 use crate::client::{EndedEpisode, Played, Session, acting};
 use crate::proto;
-use perturb_policy::{ActionKind, Normalisers, Player, PlayerState, PolicySpec, RolloutStep};
+use perturb_policy::{ActionKind, CollectUntil, Normalisers, Player, PlayerState, PolicySpec, RolloutStep};
 use perturb_protocol::player::{floats, read_floats};
 
 /// Fills rollouts with what a player does that plays at the server, to the bytes of a
@@ -17,7 +16,7 @@ pub struct RemoteCollector {
     spec: PolicySpec,
     /// Until the server has it.
     player: Option<Player>,
-    experience: Experience,
+    until: CollectUntil,
     /// Of a reply; 0 leaves it to the server.
     most_steps: u32,
     /// The next reply is the rollout's first.
@@ -43,8 +42,8 @@ struct Arrays {
 impl RemoteCollector {
     /// Collects what `player` does from where it is, with a policy of `spec`.
     pub fn new(spec: PolicySpec, player: Player) -> Self {
-        let (experience, arrays) = (Experience::Steps(0), Arrays::default());
-        Self { spec, player: Some(player), experience, most_steps: 0, begins: true, arrays }
+        let (until, arrays) = (CollectUntil::Steps(0), Arrays::default());
+        Self { spec, player: Some(player), until, most_steps: 0, begins: true, arrays }
     }
 
     /// The same with replies of about so many environment steps at most, where others wait for the server too.
@@ -54,15 +53,12 @@ impl RemoteCollector {
     }
 
     /// The request that begins a rollout under the policy of `weights`.
-    pub fn begin(&mut self, weights: &[f32], experience: Experience) -> proto::Act {
-        (self.experience, self.begins) = (experience, true);
+    pub fn begin(&mut self, weights: &[f32], until: CollectUntil) -> proto::Act {
+        (self.until, self.begins) = (until, true);
         proto::Act {
             policy: self.player.take().map(|player| acting::policy(&self.spec, &player)),
             weights: floats(weights),
-            task: Some(match experience {
-                Experience::Steps(count) => proto::act::Task::Steps(count as u32),
-                Experience::Episodes(count) => proto::act::Task::Episodes(count as u32),
-            }),
+            task: Some(until.into()),
             most_steps: self.most_steps,
             ..proto::Act::default()
         }
@@ -80,7 +76,7 @@ impl RemoteCollector {
         rollout: &mut Rollout,
         mut on_episode: impl FnMut(&EndedEpisode),
     ) -> Result<Option<proto::Act>, CollectError> {
-        let Self { spec, experience, most_steps, begins, arrays, .. } = self;
+        let Self { spec, until, most_steps, begins, arrays, .. } = self;
         let mismatch = |got| session.misplayed(got);
         if std::mem::take(begins) {
             let memory = read_floats("memory", &played.acted.memory);
@@ -90,7 +86,7 @@ impl RemoteCollector {
         let before = rollout.len();
         rollout.push(arrays.steps())?;
         for (step, episode) in &played.ended {
-            if let Experience::Episodes(_) = experience {
+            if let CollectUntil::Episodes(_) = until {
                 let (end, length) = (before + step + 1, episode.length as usize);
                 rollout.note_episode(episode.slot, end, length, episode.episode_return)?;
             }

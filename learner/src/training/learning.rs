@@ -5,14 +5,14 @@ use std::time::{Duration, Instant};
 
 use super::ending::{RECENT, is_over};
 use super::{LastCheckpoint, Outcome, Result, RunDirectory, TrainError};
-use crate::algorithm::{self, Algorithm, Experience, UpdateStats};
+use crate::algorithm::{self, Algorithm, UpdateStats};
 use crate::checkpoint::{Checkpoint, EnvironmentSummary, History, ResumeState, State};
 use crate::client::{EndedEpisode, OpenOptions, Servers};
 use crate::logging::{Clock, EpisodeFigures, Logs, Progress, TimeShares};
 use crate::policy::{Policy, Room};
 use crate::proto;
 use crate::rollout::{CollectorState, Rollout};
-use perturb_policy::{Normalisers, Player, PlayerState, PolicySpec, RewardNormaliser, Role};
+use perturb_policy::{CollectUntil, Normalisers, Player, PlayerState, PolicySpec, RewardNormaliser, Role};
 use perturb_study::Counters;
 use perturb_study::files::write_atomically;
 use perturb_study::interrupt::StopFlag;
@@ -176,9 +176,9 @@ impl<'a> Learning<'a> {
         }
         let spec = policy.spec();
         let (n_envs, input_size, width) = (config.common.num_envs, spec.observation_size, spec.action.width());
-        let rollout = match algorithm.experience() {
-            Experience::Steps(n_steps) => Rollout::new(n_steps, n_envs, input_size, width),
-            Experience::Episodes(_) => Rollout::of_episodes(n_envs, input_size, width),
+        let rollout = match algorithm.collect_until() {
+            CollectUntil::Steps(n_steps) => Rollout::new(n_steps, n_envs, input_size, width),
+            CollectUntil::Episodes(_) => Rollout::of_episodes(n_envs, input_size, width),
         };
         Ok(Self {
             directory,
@@ -210,8 +210,8 @@ impl<'a> Learning<'a> {
         self.policy.spec()
     }
 
-    pub(super) fn experience(&self) -> Experience {
-        self.algorithm.experience()
+    pub(super) fn collect_until(&self) -> CollectUntil {
+        self.algorithm.collect_until()
     }
 
     /// `[P]` the weights.
@@ -297,9 +297,9 @@ impl<'a> Learning<'a> {
         if let Some(error) = ended.iter().find_map(|episode| difference(comparison, episode)) {
             return Err(error);
         }
-        let steps = match self.algorithm.experience() {
-            Experience::Steps(_) => (self.rollout.n_steps() * self.rollout.n_envs()) as u64,
-            Experience::Episodes(_) => ended.iter().map(|episode| u64::from(episode.length)).sum(),
+        let steps = match self.algorithm.collect_until() {
+            CollectUntil::Steps(_) => (self.rollout.n_steps() * self.rollout.n_envs()) as u64,
+            CollectUntil::Episodes(_) => ended.iter().map(|episode| u64::from(episode.length)).sum(),
         };
         let count = ended.len() as u64;
         ended.clear();

@@ -163,11 +163,11 @@ impl<'a> Seat<'a> {
     fn act(&mut self, session: &mut Session<'_>, times: Times) -> Result<()> {
         if !self.collecting {
             (self.collecting, self.begun) = (true, times);
-            let experience = self.learning.experience();
+            let until = self.learning.collect_until();
             let (rollout, _) = self.learning.collecting();
             let slots = self.slots.clone();
             let reset = |observations: &mut [f32]| session.reset(slots, observations);
-            self.collector.begin(experience, rollout, reset)?;
+            self.collector.begin(until, rollout, reset)?;
         }
         self.collector.act()?;
         Ok(())

@@ -78,9 +78,9 @@ impl<'a> Remote<'a> {
     /// Asks for a rollout.
     fn ask(&mut self, waited: Duration) -> Result<()> {
         self.waited = waited;
-        let experience = self.learning.experience();
+        let until = self.learning.collect_until();
         let weights = self.learning.weights();
-        Ok(self.session.ask_to_play(self.collector.begin(weights, experience))?)
+        Ok(self.session.ask_to_play(self.collector.begin(weights, until))?)
     }
 
     /// Waits for what was asked for.

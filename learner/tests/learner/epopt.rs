@@ -3,9 +3,7 @@
 use std::collections::{BTreeMap, HashSet};
 
 use crate::common::{bases, connect, contents, moved, options, server};
-use perturb_learner::algorithm::{
-    A2c, Algorithm, AlgorithmState, Epopt, Experience, InTurn, Ppo, Selection, UpdateStats,
-};
+use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Epopt, InTurn, Ppo, Selection, UpdateStats};
 use perturb_learner::client::{EndedEpisode, PrivateServer, Session};
 use perturb_learner::error::Error;
 use perturb_learner::policy::Policy;
@@ -14,7 +12,7 @@ use perturb_learner::rollout::{
 };
 use perturb_policy::random::{Purpose, normal, stream, uniform};
 use perturb_policy::{
-    ActionKind, Actor, Acts, Inputs, ObservationNormaliser, Player, PolicySpec, RewardNormaliser, Role,
+    ActionKind, Actor, Acts, CollectUntil, Inputs, ObservationNormaliser, Player, PolicySpec, RewardNormaliser, Role,
 };
 use perturb_study::settings::{A2cConfig, EpoptConfig, PpoConfig, Ranking};
 use perturb_torch::{Sequences, TorchPolicy};
@@ -602,7 +600,7 @@ fn collect(servers: &[PrivateServer], normalised: bool) -> (Vec<(Rollout, Vec<En
     for _ in 0..2 {
         let (mut rollout, mut ended) = (Rollout::of_episodes(CARTPOLES, size, 1), Vec::new());
         let on_episode = |episode: &EndedEpisode| ended.push(episode.clone());
-        let episodes = Experience::Episodes(COUNT);
+        let episodes = CollectUntil::Episodes(COUNT);
         let weights = policy.flat_weights();
         collector.collect(&mut session, weights, episodes, &mut rollout, on_episode).expect("a rollout");
         collected.push((rollout, ended));

@@ -2,7 +2,7 @@
 //! learn.
 
 use crate::common::{bases, connect, contents, moved, options, server};
-use perturb_learner::algorithm::{A2c, Algorithm, Experience, Ppo};
+use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{EndedEpisode, OpenOptions, Servers, Session, StepReply};
 use perturb_learner::evaluation::test;
@@ -10,7 +10,7 @@ use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Collector, Normalisers, Rollout, RolloutStep, gae};
 use perturb_learner::training::{RunDirectory, train};
 use perturb_policy::random::{Purpose, stream, uniform};
-use perturb_policy::{ActionKind, Actor, Acts, Inputs, Player, PolicySpec, Role};
+use perturb_policy::{ActionKind, Actor, Acts, CollectUntil, Inputs, Player, PolicySpec, Role};
 use perturb_study::Version;
 use perturb_study::interrupt::StopFlag;
 use perturb_study::settings::{self, A2cConfig, PpoConfig, TrainConfig};
@@ -123,7 +123,7 @@ fn a_trial_of_one_episode_is_a_recurrent_policy_with_longer_inputs() {
         let mut rollout = Rollout::new(n_steps, N_ENVS, policy.spec().observation_size, 1);
         let (mut session, mut collector) = collector(&servers, &options, &policy);
         collector
-            .collect(&mut session, policy.flat_weights(), Experience::Steps(n_steps), &mut rollout, |_| {})
+            .collect(&mut session, policy.flat_weights(), CollectUntil::Steps(n_steps), &mut rollout, |_| {})
             .expect("a rollout");
         assert!(rollout.starts()[N_ENVS..].contains(&true), "an episode has ended");
         assert_eq!(contents(&rollout), contents(&expected), "{environment}");
@@ -155,7 +155,7 @@ impl Steps {
         for t in 0..n_steps {
             let mut rollout = Rollout::new(1, N_ENVS, policy.spec().observation_size, 1);
             let on_episode = |episode: &EndedEpisode| steps.ended.push((t, episode.clone()));
-            let one = Experience::Steps(1);
+            let one = CollectUntil::Steps(1);
             collector.collect(&mut session, policy.flat_weights(), one, &mut rollout, on_episode).expect("a rollout");
             steps.rollouts.push(rollout);
         }
@@ -228,7 +228,7 @@ fn advantages_run_across_the_episodes_of_a_trial() {
     let (mut session, mut collector) = collector(&servers, &options("CartPole", N_ENVS, 2), &policy);
     let mut lengths: [Vec<(u32, u32)>; N_ENVS] = Default::default();
     let on_episode = |end: &EndedEpisode| lengths[end.slot].push((end.length, end.episode_in_trial));
-    let steps = Experience::Steps(150);
+    let steps = CollectUntil::Steps(150);
     collector.collect(&mut session, policy.flat_weights(), steps, &mut rollout, on_episode).expect("a rollout");
     let trajectories = rollout.trajectories().expect("a finished rollout");
     let (gamma, values) = (0.9, rollout.values());

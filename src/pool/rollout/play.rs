@@ -8,7 +8,9 @@ use crate::{
         sync::lock,
     },
 };
-use perturb_policy::{Ended, Inputs, Normalisers, Outcome, Player, PlayerState, PolicySpec, Role, Task};
+use perturb_policy::{
+    CollectUntil, Ended, Inputs, Normalisers, Outcome, Player, PlayerState, PolicySpec, Remaining, Role,
+};
 use rand_chacha::ChaCha8Rng;
 use std::sync::Mutex;
 
@@ -47,7 +49,7 @@ pub enum PolicyRole {
 /// A policy at play, between two steps.
 pub struct Play {
     player: Player,
-    pub(in crate::pool) task: Task,
+    pub(in crate::pool) task: Remaining,
     /// In a test.
     seed: Option<u64>,
     /// What the last step brought.
@@ -80,7 +82,7 @@ impl Play {
             PolicyRole::Testing { seed } => (Role::testing_in(seed, trials.into_iter()), Some(seed)),
         };
         let player = Player::new(&spec, inputs, n_envs, episodes_per_trial, normalisers, role);
-        let mut play = Self { player, task: Task::steps(0), seed, step: Gathered::default(), spec };
+        let mut play = Self { player, task: Remaining::Steps(0), seed, step: Gathered::default(), spec };
         play.player.load(&weights)?;
         match state {
             Some(state) => play.player.restore(&state)?,
@@ -103,7 +105,7 @@ impl Play {
     }
 
     /// What is played.
-    pub fn task(&self) -> &Task {
+    pub fn task(&self) -> &Remaining {
         &self.task
     }
 
@@ -113,9 +115,9 @@ impl Play {
     }
 
     /// Begins a task; whether all environments are to be reset before.
-    pub(in crate::pool) fn begin_task(&mut self, task: Task) -> bool {
-        self.task = task;
-        matches!(self.task, Task::Episodes(_))
+    pub(in crate::pool) fn begin_task(&mut self, task: CollectUntil) -> bool {
+        self.task = task.begin(self.player.n_envs());
+        matches!(task, CollectUntil::Episodes(_))
     }
 
     /// Begins the task's episodes in environments that were reset.

@@ -14,7 +14,7 @@ use crate::{
     },
 };
 use bytes::BytesMut;
-use perturb_policy::{RolloutStep, Task};
+use perturb_policy::{CollectUntil, Remaining, RolloutStep};
 use std::sync::Mutex;
 
 /// A round of about so many bytes ends: many gRPC libraries receive no more than 4 MiB.
@@ -32,7 +32,7 @@ pub struct Turn {
     /// New weights of the policy of before, `[P]`, finite; none: those that it has.
     pub weights: Option<Vec<f32>>,
     /// A new task; none: what is left of the one before.
-    pub task: Option<Task>,
+    pub task: Option<CollectUntil>,
     /// The most steps, at least 1.
     pub most_steps: usize,
     /// Records nothing but the episodes that ended.
@@ -190,8 +190,8 @@ impl Played {
         let (n_envs, spec) = (play.player().n_envs(), play.spec());
         let step_bytes = n_envs * (4 * (spec.observation_size + spec.action.width() + 4) + 3);
         let steps = match play.task() {
-            Task::Steps { left } => turn.most_steps.min(*left),
-            Task::Episodes(_) => turn.most_steps.min(FIRST_ROOM),
+            Remaining::Steps(left) => turn.most_steps.min(*left),
+            Remaining::Episodes(_) => turn.most_steps.min(FIRST_ROOM),
         };
         let steps = steps.min(MOST_BYTES / step_bytes + 1);
         let room = |bytes: usize| BytesMut::with_capacity(steps * n_envs * bytes);

@@ -7,8 +7,8 @@ use perturb::proto::{
     TestStreams, Version, act, action_space::Kind, policy::Role,
 };
 use perturb_policy::{
-    self as acting, ActionKind, Ended, Inputs, Normalisers, ObservationNormaliser, Outcome, Player, PolicySpec,
-    RewardNormaliser, RunningMoments, Task,
+    self as acting, ActionKind, CollectUntil, Ended, Inputs, Normalisers, ObservationNormaliser, Outcome, Player,
+    PolicySpec, Remaining, RewardNormaliser, RunningMoments,
     random::{Purpose, stream},
 };
 
@@ -193,10 +193,11 @@ impl Client {
     }
 
     /// Plays a task with these weights, and writes down what the server should say of it.
-    pub async fn play(&mut self, version: u64, mut task: Task) -> Acted {
+    pub async fn play(&mut self, version: u64, task: CollectUntil) -> Acted {
         let Self { game, session, environment, player } = self;
         player.load(&game.weights(environment, version)).unwrap();
-        if let Task::Episodes(_) = task {
+        let mut task = task.begin(game.n);
+        if let Remaining::Episodes(_) = task {
             let reset = session.ask(Reset::default()).await;
             player.begin(&floats(&reset.observations), Some(&task)).unwrap();
             for start in reset.started.iter().filter(|_| game.testing) {

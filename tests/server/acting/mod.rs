@@ -10,7 +10,7 @@ use perturb::proto::{
     Act, Acted, AutoresetMode, EndedAt, EpisodeEnd, Open, Policy, Restore, SavePlayer, SlotGroup, Snapshot, Version,
     act::Task as Asked, policy::Role,
 };
-use perturb_policy::Task;
+use perturb_policy::CollectUntil;
 use rstest::rstest;
 
 /// Beyond an episode of every task.
@@ -66,10 +66,7 @@ async fn same_bytes(game: Game) {
     let asked = [Asked::Steps(7), Asked::Steps(STEPS), Asked::Episodes(8), Asked::Steps(5)];
     let mut ends = 0;
     for (version, task) in (0..).zip(asked) {
-        let expected = match task {
-            Asked::Steps(count) => client.play(version, Task::steps(count as usize)).await,
-            Asked::Episodes(count) => client.play(version, Task::episodes(count as usize, game.n)).await,
-        };
+        let expected = client.play(version, task.into()).await;
         let policy = (version == 0).then(|| game.policy(&environment));
         let act =
             Act { policy, weights: wire(&game.weights(&environment, version)), task: Some(task), ..Act::default() };
@@ -91,7 +88,7 @@ async fn bytes_do_not_depend_on_the_number_of_workers_and_shards_or_replies(
     let server = Server::start(&["--workers", workers]);
     let mut client = Client::begin(game, &server).await;
     let (mut session, environment) = game.session(&server).await;
-    let expected = client.play(0, Task::steps(40)).await;
+    let expected = client.play(0, CollectUntil::Steps(40)).await;
     let act = Act { most_steps, ..game.act(&environment, Asked::Steps(40)) };
     let (acted, replies) = play(&mut session, act).await;
     assert_same(&acted, &expected);

@@ -12,7 +12,7 @@ use perturb::{
     tasks,
 };
 use perturb_policy::{
-    ActionKind, Inputs, Normalisers, PolicySpec, Task,
+    ActionKind, CollectUntil, Inputs, Normalisers, PolicySpec,
     random::{Purpose, stream},
 };
 use rstest::rstest;
@@ -50,7 +50,7 @@ fn endless(size: usize) -> Turn {
         state: None,
         episodes_per_trial: 1,
     };
-    let task = Some(Task::steps(usize::MAX));
+    let task = Some(CollectUntil::Steps(usize::MAX));
     Turn { policy: Some(policy), weights: None, task, most_steps: usize::MAX, only_ended: true }
 }
 
@@ -86,7 +86,7 @@ async fn a_play_that_nobody_waits_for_ends_and_the_batch_goes_on(#[values(4, 200
     batch.settle().await;
     assert!(batch.play().is_none());
     batch.step(&vec![0; 4 * size]).await.unwrap();
-    let short = Turn { task: Some(Task::steps(3)), ..endless(size) };
+    let short = Turn { task: Some(CollectUntil::Steps(3)), ..endless(size) };
     assert_eq!(batch.act(short).await.unwrap().steps, 3);
 }
 

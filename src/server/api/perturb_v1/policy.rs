@@ -7,7 +7,7 @@ use crate::{
     proto,
 };
 use bytes::Bytes;
-use perturb_policy::{ActionKind, Inputs, Normalisers, ObservationNormaliser, PlayerState, PolicySpec, Task};
+use perturb_policy::{ActionKind, CollectUntil, Inputs, Normalisers, ObservationNormaliser, PlayerState, PolicySpec};
 use perturb_protocol::player::{Unreadable, player_state, read_floats};
 use rand_chacha::ChaCha8Rng;
 
@@ -55,7 +55,7 @@ pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<Tur
     let parameters = observation - settings.spec.observation.len();
     let sizes = Sizes { envs: n_envs, observation, parameters, action };
     let proto::Act { policy: given, weights: given_weights, task: given_task, most_steps, only_ended } = request;
-    let task = task(given_task, n_envs)?;
+    let task = task(given_task)?;
     let (policy, given_weights) = match (given, batch.play()) {
         (Some(_), _) if given_weights.is_empty() => {
             return Err(order("with a new policy but without its weights", "send both together"));
@@ -97,14 +97,13 @@ pub fn turn(batch: &Batch, rate: Option<u32>, request: proto::Act) -> Result<Tur
     Ok(Turn { policy, weights: given_weights, task, most_steps, only_ended })
 }
 
-fn task(task: Option<proto::act::Task>, n_envs: usize) -> Result<Option<Task>, Error> {
+fn task(task: Option<proto::act::Task>) -> Result<Option<CollectUntil>, Error> {
     use proto::act::Task::{Episodes, Steps};
     match task {
         None => Ok(None),
         Some(Steps(0)) => Err(Error::value("act.steps", 0, "at least 1")),
         Some(Episodes(0)) => Err(Error::value("act.episodes", 0, "at least 1")),
-        Some(Steps(count)) => Ok(Some(Task::steps(count as usize))),
-        Some(Episodes(count)) => Ok(Some(Task::episodes(count as usize, n_envs))),
+        Some(task) => Ok(Some(task.into())),
     }
 }
 

@@ -1,0 +1,50 @@
+//! Why a checkpoint could not be tested.
+
+use perturb_study::ValueError;
+use perturb_study::testing::NotRecorded;
+
+use crate::checkpoint::Changed;
+use crate::client::ClientError;
+
+/// Why a checkpoint could not be tested.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum TestError {
+    /// A server or the connection to it failed.
+    #[error(transparent)]
+    Client(#[from] ClientError),
+    /// The policy gives numbers that are not finite, or does not fit.
+    #[error(transparent)]
+    Numbers(#[from] perturb_policy::Error),
+    /// The environment does not have the set's parameters, or refuses their values; or the threshold is of something
+    /// else than what its success rule compares.
+    #[error(transparent)]
+    Value(#[from] ValueError),
+    /// The checkpoint cannot be named.
+    #[error("the checkpoint cannot be named: {0}")]
+    Unnamed(String),
+    /// The server played something else than what was asked for.
+    #[error(transparent)]
+    NotRecorded(#[from] NotRecorded),
+    /// The environment is no longer what the policy was trained in.
+    #[error(transparent)]
+    Changed(#[from] Changed),
+    /// The program was asked to end.
+    #[error("stopped before all episodes were tested")]
+    Stopped {
+        /// The signal.
+        signal: i32,
+    },
+}
+
+impl TestError {
+    /// Whether the same may go well later or with another server, see [`ClientError::can_be_retried`].
+    pub fn can_be_retried(&self) -> bool {
+        matches!(self, Self::Client(error) if error.can_be_retried())
+    }
+
+    /// The signal that ended the test, if one did.
+    pub fn signal(&self) -> Option<i32> {
+        if let Self::Stopped { signal } = self { Some(*signal) } else { None }
+    }
+}
