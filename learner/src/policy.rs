@@ -21,8 +21,8 @@ pub struct Policy {
     calculus: Calculus,
 }
 
-/// Where gradients of feed-forward policies of one shape are computed.
-pub struct Room {
+/// Buffers in which gradients of feed-forward policies of one shape are computed.
+pub struct GradientWorkspace {
     networks: Box<Differentiator>,
     /// `[P]`.
     gradient: Vec<f32>,
@@ -96,13 +96,13 @@ impl Policy {
         Ok(Policy { calculus, ..self })
     }
 
-    /// A room like the one in which this policy computes gradients; `None` if it is recurrent.
+    /// A workspace like the one in which this policy computes gradients; `None` if it is recurrent.
     ///
     /// # Errors
     /// Those of [`Differentiator::new`].
-    pub fn room(&self) -> Result<Option<Room>> {
+    pub fn workspace(&self) -> Result<Option<GradientWorkspace>> {
         match self.calculus {
-            Calculus::FeedForward(..) => Ok(Some(Room {
+            Calculus::FeedForward(..) => Ok(Some(GradientWorkspace {
                 networks: Box::new(Differentiator::new(&self.spec, 1)?),
                 gradient: vec![0.0; self.weights.len()],
             })),
@@ -110,9 +110,8 @@ impl Policy {
         }
     }
 
-    /// Exchanges the room for another one. Policies of one shape that learn by turns in the same room find its gradient, and
-    /// what leads to it, in the processor's caches.
-    pub fn change_room(&mut self, other: &mut Room) {
+    /// Swaps in another gradient workspace. Policies of one shape that share one find it in the processor's caches.
+    pub fn swap_workspace(&mut self, other: &mut GradientWorkspace) {
         if let Calculus::FeedForward(networks, is_current) = &mut self.calculus {
             std::mem::swap(networks, &mut other.networks);
             std::mem::swap(&mut self.gradient, &mut other.gradient);
@@ -120,10 +119,9 @@ impl Policy {
         }
     }
 
-    /// Takes over the networks of a player that has played with the weights as they are, with what it has kept: they need
-    /// not be loaded again.
-    /// It must load weights before it plays on.
-    pub fn take_networks(&mut self, player: &mut Player) {
+    /// Takes the networks of a player that acted with the present weights, with their cached activations, to skip a forward
+    /// pass. The player must load weights before it acts again.
+    pub fn reuse_activations(&mut self, player: &mut Player) {
         if let Calculus::FeedForward(networks, is_current) = &mut self.calculus {
             *is_current = player.give_networks(networks);
         }
@@ -222,12 +220,12 @@ impl Policy {
         Ok(())
     }
 
-    /// One gradient step down `objective` on `sequences` of `batch`. Gives the losses before it, and the gradient's global
+    /// One gradient step down `objective` on `sequences` of `batch`. Returns the losses before it, and the gradient's global
     /// norm before clipping.
     ///
     /// # Errors
-    /// A loss or a gradient that is not finite; the policy is as before then.
-    pub fn descend(
+    /// A loss or a gradient that is not finite; the weights are unchanged then.
+    pub fn gradient_step(
         &mut self,
         batch: &Batch<'_>,
         sequences: &[u32],

@@ -73,7 +73,8 @@ impl InTurn for A2c {
             check_rollout(rollout, policy, self.config.n_steps)?;
             let estimated = n_step_returns(&rollout.trajectories()?, gamma, bootstrap_truncation);
             let batch = policy.batch(rollout, &estimated)?;
-            let step = policy.descend(&batch, &batch.sequences(), &objective, &mut self.descent, learning_rate)?;
+            let step =
+                policy.gradient_step(&batch, &batch.sequences(), &objective, &mut self.descent, learning_rate)?;
             losses += step.0;
             norms += step.1;
             drop(batch);

@@ -108,7 +108,7 @@ impl InTurn for Ppo {
                     shuffle(sequences, &mut self.rng); // the order of one mean's samples does not matter
                 }
                 for part in sequences.chunks_exact(sequences.len() / n_minibatches) {
-                    let step = policy.descend(batch, part, &objective, &mut self.descent, learning_rate)?;
+                    let step = policy.gradient_step(batch, part, &objective, &mut self.descent, learning_rate)?;
                     losses += step.0;
                     norms += step.1;
                 }

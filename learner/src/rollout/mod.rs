@@ -3,10 +3,10 @@
 mod advantage;
 mod buffer;
 mod collector;
-mod remote;
+mod decoded;
 
 pub use advantage::{Estimates, Trajectories, explained_variance, gae, n_step_returns};
 pub use buffer::{Rollout, Span};
 pub use collector::{CollectError, Collector, CollectorState};
+pub use decoded::DecodedRollout;
 pub use perturb_policy::{Normalisers, RolloutStep};
-pub use remote::RemoteCollector;

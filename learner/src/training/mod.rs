@@ -1,68 +1,76 @@
-//! The training loop: rollout, update, log, checkpoint.
+//! The training loop: collect rollouts, update policies, log, write checkpoints.
+//!
+//! [`train`] and [`resume`] train one run, [`train_together`] several. All end in one loop, [`train_loop`]. Runs differ in
+//! who chooses actions: this process, for all runs of one session in lockstep ([`ClientSide`]; a run alone is a lockstep of
+//! one), or the server, in a session for each run ([`ServerSide`]). Both implement [`CollectRollouts`]. A [`Trainer`] holds
+//! everything else of a run. docs/reading-ppo.md follows PPO from the command line through this file to the weights.
 //!
 //! Randomness: the environments' seed is the training's seed; initial weights, minibatch order and sampled actions have
 //! streams of their own (see [`perturb_policy::random`]). Every sum has one order, so that equal configurations give equal
 //! weights, byte for byte, whatever the number of servers, of their workers and of threads, wherever actions are chosen,
 //! and whichever trainings run together.
 
+mod client_side;
 mod ending;
 mod error;
-mod learning;
-mod lockstep;
 mod random;
-mod remote;
 mod run_directory;
+mod server_side;
+mod start;
+mod trainer;
 
-use std::ops::Range;
+use std::time::Duration;
 
-use crate::checkpoint::{Checkpoint, ResumeState};
-use crate::client::{After, OpenOptions, Servers, Session, Waiting};
-use crate::logging::Progress;
-use crate::rollout::{Collector, RemoteCollector};
+use bytes::Bytes;
+use client_side::ClientSide;
 pub use ending::is_over;
 pub use error::{LastCheckpoint, TrainError};
-use learning::Learning;
-use lockstep::{Lockstep, Seat};
-use perturb_policy::Player;
+use perturb_policy::{Normalisers, Player, PlayerState};
 use perturb_study::interrupt::StopFlag;
-use perturb_study::settings::{Rollouts, TrainConfig};
-use remote::Remote;
+use perturb_study::settings::TrainConfig;
 pub use run_directory::{RunDirectory, RunDirectoryError, mark_in};
+use server_side::ServerSide;
+use trainer::Trainer;
+
+use crate::checkpoint::{Checkpoint, ResumeState};
+use crate::client::{After, Servers, Waiting};
+use crate::logging::Progress;
+use crate::policy::GradientWorkspace;
 
 type Result<T> = std::result::Result<T, TrainError>;
 
-/// Environment steps of a reply to one of several trainings: some milliseconds of a classic task, a tenth of a second of a
-/// robot. So none waits for long, however many there are.
-const PIECE: usize = 4096;
+/// During longer updates connections are kept alive. Servers wait for seconds at least.
+const LONG_UPDATE: Duration = Duration::from_millis(100);
 
-/// What a training came to.
+/// Result of a training.
 #[derive(Debug)]
 pub struct Outcome {
     /// The last checkpoint, as written.
     pub checkpoint: Checkpoint,
-    /// The last figures.
+    /// Figures of the last iteration.
     pub progress: Progress,
     /// The signal that ended the training before its budget; `None` if it ran to its end.
     pub signal: Option<i32>,
 }
 
-/// A training that is to be begun, or gone on with.
+/// A training to begin or to resume.
 #[derive(Debug)]
 pub struct Entry<'a> {
-    /// Where it is kept.
+    /// The directory for logs and checkpoints.
     pub directory: &'a RunDirectory,
-    /// From where on.
+    /// The point at which the training starts.
     pub start: Start,
-    /// Episodes of the budget, ascending, after which the policy of the moment is kept as well: [`RunDirectory::mark`].
+    /// Numbers of episodes, ascending, after which the policy is kept for an intermediate evaluation, see
+    /// [`RunDirectory::mark`].
     pub marks: &'a [u64],
 }
 
-/// Where a training begins.
+/// The point at which a training starts.
 #[derive(Clone, Debug)]
 pub enum Start {
-    /// At its beginning.
+    /// Initial weights.
     Fresh(Box<TrainConfig>),
-    /// At its last checkpoint.
+    /// The last checkpoint.
     Checkpoint(Box<(Checkpoint, ResumeState)>),
 }
 
@@ -74,7 +82,7 @@ impl Start {
         }
     }
 
-    /// Steps that are behind it.
+    /// Steps that were trained before.
     fn timesteps(&self) -> u64 {
         match self {
             Self::Fresh(_) => 0,
@@ -82,8 +90,8 @@ impl Start {
         }
     }
 
-    /// Where the training of `config` in `directory` goes on that was broken off.
-    fn again(directory: &RunDirectory, config: &TrainConfig) -> Result<Self> {
+    /// The point at which an interrupted training of `config` in `directory` is resumed.
+    fn resume_point(directory: &RunDirectory, config: &TrainConfig) -> Result<Self> {
         Ok(match directory.last_checkpoint()? {
             Some((mut checkpoint, state)) => {
                 checkpoint.state.config = config.clone(); // a larger budget may not have been saved yet
@@ -94,10 +102,10 @@ impl Start {
     }
 }
 
-/// Trains as `config` says, with `threads` threads in updates, which change no byte, and writes everything to `directory`;
-/// calls `report` after every iteration. When `stop` is
-/// raised, the iteration is finished and the checkpoint written. Servers that are lost are [waited
-/// for](crate::client::ServerWait), and the training goes on from its last checkpoint, to the same bytes.
+/// Trains as `config` says and writes logs and checkpoints to `directory`. Updates use `threads` threads, whose number
+/// changes no byte. Calls `report` after every iteration. When `stop` is raised, the iteration is finished and the
+/// checkpoint written. A lost server is [waited for](crate::client::ServerWait), and the training is resumed from its last
+/// checkpoint, to the same bytes.
 ///
 /// # Errors
 /// A server that is lost for good, numbers that are not finite, a full disk. The last checkpoint in the directory stays as it is.
@@ -109,17 +117,12 @@ pub fn train(
     stop: &StopFlag,
     report: impl FnMut(&Progress),
 ) -> Result<Outcome> {
-    alone(
-        servers,
-        Entry { directory, start: Start::Fresh(Box::new(config.clone())), marks: &[] },
-        threads,
-        stop,
-        report,
-    )
+    let start = Start::Fresh(Box::new(config.clone()));
+    train_with_retry(servers, Entry { directory, start, marks: &[] }, threads, stop, report)
 }
 
-/// Goes on with the run in `directory` from its last `checkpoint` to the same bytes as without the break, times aside;
-/// otherwise as [`train`]. `servers` may be others than before. What the logs hold beyond the checkpoint is deleted.
+/// Resumes the run in `directory` from its last `checkpoint`, to the same bytes as without the break except times.
+/// Otherwise as [`train`]. `servers` may be others than before. Lines of the logs beyond the checkpoint are deleted.
 ///
 /// # Errors
 /// Those of [`train`]; an environment, a state or a log that does not fit the checkpoint, before anything is changed.
@@ -132,11 +135,11 @@ pub fn resume(
     report: impl FnMut(&Progress),
 ) -> Result<Outcome> {
     let start = Start::Checkpoint(Box::new(checkpoint));
-    alone(servers, Entry { directory, start, marks: &[] }, threads, stop, report)
+    train_with_retry(servers, Entry { directory, start, marks: &[] }, threads, stop, report)
 }
 
-/// Trains one policy, from its last checkpoint on when servers were lost and have come back.
-fn alone(
+/// Trains one run, and resumes it from its last checkpoint each time that servers were lost and have come back.
+fn train_with_retry(
     servers: &Servers,
     entry: Entry<'_>,
     threads: usize,
@@ -147,47 +150,43 @@ fn alone(
     let config = start.config().clone();
     let (mut waiting, mut saved) = (Waiting::default(), start.timesteps());
     loop {
-        let mut hear = |progress: &Progress| {
-            if progress.saved_timesteps > saved {
-                saved = progress.saved_timesteps;
-                waiting.progressed();
-            }
-            report(progress);
-        };
-        let error = match once(servers, Entry { directory, start, marks }, threads, stop, &mut hear) {
+        let mut outcome = None;
+        let attempt = train_together(
+            servers,
+            vec![Entry { directory, start, marks }],
+            threads,
+            stop,
+            &mut |_, progress| {
+                if progress.saved_timesteps > saved {
+                    saved = progress.saved_timesteps;
+                    waiting.progressed();
+                }
+                report(progress);
+            },
+            &mut |_, end| outcome = Some(end),
+        );
+        let ended = || outcome.unwrap_or_else(|| unreachable!("a training ends with an outcome or an error"));
+        let error = match attempt.and_then(|()| ended()) {
             Ok(outcome) => return Ok(outcome),
             Err(error) => error,
         };
         let Some(lost) = error.of_server() else { return Err(error) };
         match waiting.wait(servers, lost, stop) {
-            After::Again => start = Start::again(directory, &config)?,
+            After::Again => start = Start::resume_point(directory, &config)?,
             After::GivenUp => return Err(error),
             After::Stopped { signal } => return Err(TrainError::Stopped { signal, source: Box::new(error) }),
         }
     }
 }
 
-/// Trains one policy while its servers are there.
-fn once(
-    servers: &Servers,
-    entry: Entry<'_>,
-    threads: usize,
-    stop: &StopFlag,
-    report: &mut dyn FnMut(&Progress),
-) -> Result<Outcome> {
-    let mut outcome = None;
-    let mut ended = |_, end| outcome = Some(end);
-    train_together(servers, vec![entry], threads, stop, &mut |_, progress| report(progress), &mut ended)?;
-    outcome.unwrap_or_else(|| unreachable!("a training ends with an outcome or an error"))
-}
-
-/// Trains several policies in one environment as [`train`] and [`resume`] do each alone, to the same bytes: in lockstep over
-/// one session, but for those with long rollouts where servers act, which have a session each. What adds noise to
-/// observations acts here. `report` and `ended` are told the place among `entries`. One that fails ends; the others go on.
+/// Trains several runs in one environment as [`train`] and [`resume`] do each alone, to the same bytes. Runs with short
+/// rollouts share one session in lockstep. Runs with long rollouts get a session each, and the server acts. Runs with
+/// observation noise always act in this process. `report` and `ended` get the run's place among `entries`. If a run fails,
+/// the others go on.
 ///
 /// # Errors
-/// Those of opening sessions, and the lockstep's, which ends all that have not ended yet; their last checkpoints stay as
-/// they are.
+/// A session that cannot be opened, or a failure of the shared session, which ends all runs that have not ended yet. Their
+/// last checkpoints stay as they are.
 pub fn train_together(
     servers: &Servers,
     entries: Vec<Entry<'_>>,
@@ -196,93 +195,183 @@ pub fn train_together(
     report: &mut dyn FnMut(usize, &Progress),
     ended: &mut dyn FnMut(usize, Result<Outcome>),
 ) -> Result<()> {
-    let of_random = |(_, entry): &(usize, Entry<'_>)| entry.start.config().settings.is_random();
-    let (random, entries): (Vec<_>, Vec<_>) = entries.into_iter().enumerate().partition(of_random);
+    let is_random = |(_, entry): &(usize, Entry<'_>)| entry.start.config().settings.is_random();
+    let (random, entries): (Vec<_>, Vec<_>) = entries.into_iter().enumerate().partition(is_random);
     for (index, entry) in random {
         ended(index, random::make(servers, &entry));
     }
-    let is_one = entries.len() == 1;
-    let (mut remotes, mut in_lockstep) = (Vec::new(), Vec::new());
-    for (index, entry) in entries {
-        let config = entry.start.config();
-        let rollouts = config.rollouts();
-        if rollouts == Rollouts::Noisy || (!is_one && rollouts != Rollouts::Long) {
-            in_lockstep.push((index, entry));
-            continue;
-        }
-        let mut observations = Vec::new();
-        let mut session = Session::open(servers, &learning::options(config), &mut observations)?;
-        if !session.plays_together() {
-            in_lockstep.push((index, entry));
-            continue;
-        }
-        let slots = 0..session.num_envs();
-        match sit_down(entry, &mut session, slots, &observations, threads) {
-            Ok((learning, player)) => {
-                let collector = RemoteCollector::new(learning.spec().clone(), player);
-                let collector = if is_one { collector } else { collector.in_pieces(PIECE) };
-                remotes.push(Remote::new(index, session, collector, learning));
-            }
-            Err(error) => ended(index, Err(error)),
-        }
+    let (mut server_side, runs, others) = ServerSide::open(servers, entries, threads, ended)?;
+    train_loop(servers, &mut server_side, runs, stop, report, ended)?;
+    if others.is_empty() {
+        return Ok(());
     }
-    remote::run(servers, remotes, stop, report, ended)?;
-    if in_lockstep.is_empty() { Ok(()) } else { lockstep(servers, in_lockstep, threads, stop, report, ended) }
+    let (mut client_side, runs) = ClientSide::open(servers, others, threads, ended)?;
+    train_loop(servers, &mut client_side, runs, stop, report, ended)
 }
 
-/// Trains `entries`, at least one, each with its index, over one session.
-fn lockstep(
+/// A run in the training loop.
+struct Run<'a> {
+    /// The place among the runs that were begun together.
+    index: usize,
+    trainer: Trainer<'a>,
+    /// Set when the run has ended.
+    end: Option<Result<Outcome>>,
+}
+
+impl Run<'_> {
+    /// Ends the run if `result` is an error, and returns the value otherwise.
+    ///
+    /// # Errors
+    /// An error of a server if the run's session `is_shared` with other runs, which it ends too.
+    fn store_error<T>(&mut self, result: Result<T>, is_shared: bool) -> Result<Option<T>> {
+        match result {
+            Ok(value) => Ok(Some(value)),
+            Err(error @ TrainError::Client(_)) if is_shared => Err(error),
+            Err(error) => {
+                self.end = Some(Err(self.trainer.failed(error)));
+                Ok(None)
+            }
+        }
+    }
+}
+
+/// A run whose rollout is whole.
+struct Collected {
+    /// The run's index.
+    index: usize,
+    /// Time spent on choosing actions in this process.
+    acting: Duration,
+    /// Time spent on waiting for servers.
+    waiting: Duration,
+}
+
+/// A way to collect the rollouts of the runs of a loop. Runs are named by their index.
+trait CollectRollouts {
+    /// Collects until the rollout of at least one run is whole, or until a run has failed. Returns the runs with whole
+    /// rollouts, in the order in which they should be updated.
+    ///
+    /// # Errors
+    /// A failure that ends all runs. The failure of one run is stored in the run.
+    fn collect(&mut self, runs: &mut [Run<'_>]) -> Result<Vec<Collected>>;
+
+    /// The player of a run that acts in this process, to be given the new weights; `None` if the server acts.
+    fn player(&mut self, index: usize) -> Option<&mut Player>;
+
+    /// State and statistics of a run's player between two rollouts; `None` before the first.
+    ///
+    /// # Errors
+    /// The failures of a connection.
+    fn player_state(&mut self, index: usize) -> Result<Option<(PlayerState, Normalisers)>>;
+
+    /// Snapshots of a run's environments between two rollouts.
+    ///
+    /// # Errors
+    /// The failures of a connection.
+    fn snapshots(&mut self, index: usize) -> Result<Vec<Bytes>>;
+
+    /// Frees the environments of a run that has ended.
+    ///
+    /// # Errors
+    /// The failures of a shared connection.
+    fn release(&mut self, index: usize) -> Result<()>;
+
+    /// Whether all runs share a session, so that the failure of its connection ends all of them.
+    fn is_shared(&self) -> bool;
+}
+
+/// Trains `runs` until each has ended, and passes each run's outcome to `ended`.
+///
+/// # Errors
+/// A failure of a shared session. Runs that have not ended by then can be resumed from their checkpoints.
+fn train_loop(
     servers: &Servers,
-    entries: Vec<(usize, Entry<'_>)>,
-    threads: usize,
+    collector: &mut dyn CollectRollouts,
+    mut runs: Vec<Run<'_>>,
     stop: &StopFlag,
     report: &mut dyn FnMut(usize, &Progress),
     ended: &mut dyn FnMut(usize, Result<Outcome>),
 ) -> Result<()> {
-    let options: Vec<OpenOptions> = entries.iter().map(|(_, entry)| learning::options(entry.start.config())).collect();
-    let mut observations = Vec::new();
-    let mut session = Session::open_together(servers, &options, &mut observations)?;
-    let size = session.observation_size();
-    let (mut seats, mut free) = (Vec::new(), Vec::new());
-    let mut first = 0;
-    for ((index, entry), options) in entries.into_iter().zip(&options) {
-        let slots = first..first + options.num_envs;
-        first = slots.end;
-        let observations = &observations[slots.start * size..slots.end * size];
-        match sit_down(entry, &mut session, slots.clone(), observations, threads) {
-            Ok((learning, player)) => seats.push(Seat::new(index, slots, Collector::new(player), learning)),
-            Err(error) => {
-                free.push(slots);
-                ended(index, Err(error));
-            }
+    let mut workspace = if let [first, _, ..] = runs.as_slice() { first.trainer.workspace()? } else { None };
+    while !runs.is_empty() {
+        let iteration = train_iteration(servers, collector, &mut runs, &mut workspace, stop, report);
+        let mut released = Vec::new();
+        while let Some(place) = runs.iter().position(|run| run.end.is_some()) {
+            let Run { index, end, .. } = runs.remove(place);
+            end.into_iter().for_each(|end| ended(index, end));
+            released.push(index);
         }
+        if let Err(error) = iteration {
+            return Err(match runs.as_slice() {
+                [alone] => alone.trainer.failed(error),
+                _ => error,
+            });
+        }
+        if !runs.is_empty() {
+            released.into_iter().try_for_each(|index| collector.release(index))?;
+        } // otherwise everything is closed as a whole
     }
-    let mut lockstep = Lockstep::new(session, seats)?;
-    free.into_iter().rev().try_for_each(|slots| lockstep.release(slots))?;
-    lockstep.run(servers, stop, report, ended)
+    Ok(())
 }
 
-/// Brings a training and its player to where they begin, in `slots` of the session.
-fn sit_down<'a>(
-    entry: Entry<'a>,
-    session: &mut Session<'_>,
-    slots: Range<usize>,
-    observations: &[f32],
-    threads: usize,
-) -> Result<(Learning<'a>, Player)> {
-    let environment = session.environment().clone();
-    let Entry { directory, start, marks } = entry;
-    let (mut learning, player) = match start {
-        Start::Fresh(config) => Learning::begin(&config, directory, &environment, observations, threads)?,
-        Start::Checkpoint(saved) => {
-            let (checkpoint, state) = *saved;
-            let restore = || {
-                let restored = session.restore(slots, &state.collector.snapshots);
-                restored.map(drop).map_err(|error| learning::not_restored("environments", error.into()))
-            };
-            Learning::resume((checkpoint, &state), directory, &environment, threads, restore)?
+/// One iteration of the runs whose rollouts are whole first: collect, update, then log and save.
+fn train_iteration(
+    servers: &Servers,
+    collector: &mut dyn CollectRollouts,
+    runs: &mut [Run<'_>],
+    workspace: &mut Option<GradientWorkspace>,
+    stop: &StopFlag,
+    report: &mut dyn FnMut(usize, &Progress),
+) -> Result<()> {
+    let collected = collector.collect(runs)?;
+    let is_shared = collector.is_shared();
+    let mut updated: Vec<(usize, Progress)> = Vec::with_capacity(collected.len());
+    let expected: Duration = collected.iter().filter_map(|it| Some(find(runs, it.index)?.trainer.last_update())).sum();
+    keep_alive(servers, expected, || {
+        for Collected { index, acting, waiting } in collected {
+            let Some(run) = find(runs, index) else { continue };
+            let progress = run.trainer.update(collector.player(index), workspace.as_mut(), acting, waiting);
+            updated.extend(run.store_error(progress, is_shared)?.map(|progress| (index, progress)));
         }
-    };
-    learning.keep_at(marks);
-    Ok((learning, player))
+        Ok::<(), TrainError>(())
+    })?;
+    updated.sort_by_key(|(index, _)| *index); // whatever the order of updates
+    for (index, progress) in updated {
+        let Some(run) = find(runs, index) else { continue };
+        report(index, &progress);
+        let finished = finish_iteration(collector, run, progress, stop);
+        run.store_error(finished, is_shared)?;
+    }
+    Ok(())
+}
+
+/// Logs an iteration of a run, and writes a checkpoint if one is due.
+fn finish_iteration(
+    collector: &mut dyn CollectRollouts,
+    run: &mut Run<'_>,
+    progress: Progress,
+    stop: &StopFlag,
+) -> Result<()> {
+    let Run { index, trainer, end } = run;
+    let iteration = trainer.finish_iteration(progress, stop)?;
+    if (iteration.save || !iteration.marks.is_empty())
+        && let Some((player, normalisers)) = collector.player_state(*index)?
+    {
+        trainer.keep(&iteration, &normalisers)?;
+        if iteration.save {
+            trainer.save(collector.snapshots(*index)?, player, normalisers)?;
+        }
+    }
+    if iteration.ends {
+        *end = Some(Ok(trainer.end(&iteration)?));
+    }
+    Ok(())
+}
+
+fn find<'r, 'a>(runs: &'r mut [Run<'a>], index: usize) -> Option<&'r mut Run<'a>> {
+    runs.iter_mut().find(|run| run.index == index)
+}
+
+/// Runs `work` and keeps the connections alive meanwhile if it is `expected` to take long.
+fn keep_alive<T>(servers: &Servers, expected: Duration, work: impl FnOnce() -> T) -> T {
+    if expected < LONG_UPDATE { work() } else { servers.keep_alive_during(work) }
 }

@@ -1,0 +1,206 @@
+//! Rollouts of runs whose actions are chosen in this process, in lockstep over one session.
+//!
+//! Each run has its own weights, randomness, logs and checkpoint, and its own slots of the session. So its bytes are those
+//! that it has alone.
+
+use std::ops::Range;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use perturb_policy::{Normalisers, Player, PlayerState};
+
+use super::start::{options, start_or_resume};
+use super::trainer::Trainer;
+use super::{CollectRollouts, Collected, Entry, Outcome, Result, Run};
+use crate::client::{OpenOptions, Servers, Session, StepReply};
+use crate::rollout::Collector;
+
+/// Collects the rollouts of runs that share a session: every step is one request for the environments of all runs.
+pub(super) struct ClientSide<'a> {
+    session: Session<'a>,
+    /// One for each run, in the order of their slots.
+    lanes: Vec<Lane>,
+    /// Whether runs act and are updated in reverse order. The order is reversed after updates, so that the run that was
+    /// updated last comes first: its weights are still in the processor's caches, which are too small for all runs.
+    is_reversed: bool,
+    /// The actions of all runs, in order of slots.
+    actions: Vec<u8>,
+    reply: StepReply,
+    times: Times,
+}
+
+/// Time spent since the session was opened.
+#[derive(Clone, Copy, Debug, Default)]
+struct Times {
+    acting: Duration,
+    waiting: Duration,
+}
+
+/// What a run has in the session.
+struct Lane {
+    /// The run's index.
+    index: usize,
+    slots: Range<usize>,
+    collector: Collector,
+    /// The times at which the present rollout began; `None` between rollouts.
+    begun: Option<Times>,
+}
+
+impl<'a> ClientSide<'a> {
+    /// Opens a session for all `entries`, at least one, and begins or resumes their runs. A run that cannot start is passed
+    /// to `ended`.
+    ///
+    /// # Errors
+    /// A session that cannot be opened.
+    pub(super) fn open<'d>(
+        servers: &'a Servers,
+        entries: Vec<(usize, Entry<'d>)>,
+        threads: usize,
+        ended: &mut dyn FnMut(usize, Result<Outcome>),
+    ) -> Result<(Self, Vec<Run<'d>>)> {
+        let options: Vec<OpenOptions> = entries.iter().map(|(_, entry)| options(entry.start.config())).collect();
+        let mut observations = Vec::new();
+        let mut session = Session::open_together(servers, &options, &mut observations)?;
+        let size = session.observation_size();
+        let (mut lanes, mut runs, mut failed) = (Vec::new(), Vec::new(), Vec::new());
+        let mut first = 0;
+        for ((index, entry), options) in entries.into_iter().zip(&options) {
+            let slots = first..first + options.num_envs;
+            first = slots.end;
+            let observations = &observations[slots.start * size..slots.end * size];
+            match start_or_resume(entry, &mut session, slots.clone(), observations, threads) {
+                Ok((trainer, player)) => {
+                    lanes.push(Lane { index, slots, collector: Collector::new(player), begun: None });
+                    runs.push(Run { index, trainer, end: None });
+                }
+                Err(error) => {
+                    failed.push(slots);
+                    ended(index, Err(error));
+                }
+            }
+        }
+        let (reply, times) = (StepReply::default(), Times::default());
+        let mut client_side = Self { session, lanes, is_reversed: false, actions: Vec::new(), reply, times };
+        failed.into_iter().rev().try_for_each(|slots| client_side.release_slots(slots))?;
+        Ok((client_side, runs))
+    }
+
+    /// One step of all environments.
+    fn step(&mut self, runs: &mut [Run<'_>]) -> Result<()> {
+        let Self { session, lanes, is_reversed, actions, reply, times } = self;
+        let start = Instant::now();
+        for (lane, run) in in_order(lanes.iter_mut().zip(runs.iter_mut()), *is_reversed) {
+            let acted = lane.act(session, &mut run.trainer, *times);
+            run.store_error(acted, true)?;
+        }
+        actions.clear();
+        // A run that has just failed is stepped once more, and its reply is ignored.
+        lanes.iter().for_each(|lane| actions.extend_from_slice(lane.collector.player().actions()));
+        let sent = Instant::now();
+        session.step(actions, reply)?;
+        let received = Instant::now();
+        times.waiting += received - sent;
+        for (lane, run) in lanes.iter_mut().zip(runs.iter_mut()).filter(|(_, run)| run.end.is_none()) {
+            let taken = lane.take(reply, &mut run.trainer);
+            run.store_error(taken, true)?;
+        }
+        times.acting += (sent - start) + received.elapsed();
+        Ok(())
+    }
+
+    fn lane(&mut self, index: usize) -> Option<&mut Lane> {
+        self.lanes.iter_mut().find(|lane| lane.index == index)
+    }
+
+    /// Frees slots that belong to no run any more.
+    fn release_slots(&mut self, slots: Range<usize>) -> Result<()> {
+        if self.lanes.is_empty() {
+            return Ok(()); // the session is closed as a whole
+        }
+        self.session.release(slots.clone())?;
+        for lane in self.lanes.iter_mut().filter(|lane| lane.slots.start >= slots.end) {
+            lane.slots = lane.slots.start - slots.len()..lane.slots.end - slots.len();
+        }
+        Ok(())
+    }
+}
+
+impl CollectRollouts for ClientSide<'_> {
+    fn collect(&mut self, runs: &mut [Run<'_>]) -> Result<Vec<Collected>> {
+        loop {
+            self.step(runs)?;
+            let Self { lanes, is_reversed, times, .. } = self;
+            let is_whole = |(lane, run): &(&mut Lane, &Run<'_>)| run.end.is_none() && lane.collector.is_done();
+            let whole = in_order(lanes.iter_mut().zip(runs.iter()), *is_reversed).filter(is_whole);
+            let collected: Vec<Collected> = whole.map(|(lane, _)| lane.collected(*times)).collect();
+            if !collected.is_empty() {
+                self.is_reversed = !self.is_reversed;
+                return Ok(collected);
+            }
+            if runs.iter().any(|run| run.end.is_some()) {
+                return Ok(collected);
+            }
+        }
+    }
+
+    fn player(&mut self, index: usize) -> Option<&mut Player> {
+        self.lane(index).map(|lane| lane.collector.player_mut())
+    }
+
+    fn player_state(&mut self, index: usize) -> Result<Option<(PlayerState, Normalisers)>> {
+        let player = self.lane(index).map(|lane| lane.collector.player());
+        Ok(player.and_then(|player| Some((player.state()?, player.normalisers().clone()))))
+    }
+
+    fn snapshots(&mut self, index: usize) -> Result<Vec<Bytes>> {
+        let slots = self.lane(index).map_or(0..0, |lane| lane.slots.clone());
+        Ok(self.session.snapshot(slots)?)
+    }
+
+    fn release(&mut self, index: usize) -> Result<()> {
+        let Some(place) = self.lanes.iter().position(|lane| lane.index == index) else { return Ok(()) };
+        let Lane { slots, .. } = self.lanes.remove(place);
+        self.release_slots(slots)
+    }
+
+    fn is_shared(&self) -> bool {
+        true
+    }
+}
+
+impl Lane {
+    /// Chooses actions, and begins a rollout if none is being collected.
+    fn act(&mut self, session: &mut Session<'_>, trainer: &mut Trainer<'_>, now: Times) -> Result<()> {
+        if self.begun.is_none() {
+            self.begun = Some(now);
+            let until = trainer.collect_until();
+            let (rollout, _) = trainer.collecting();
+            let slots = self.slots.clone();
+            let reset = |observations: &mut [f32]| session.reset(slots, observations);
+            self.collector.begin(until, rollout, reset)?;
+        }
+        self.collector.act()?;
+        Ok(())
+    }
+
+    /// Appends a step to the rollout.
+    fn take(&mut self, reply: &StepReply, trainer: &mut Trainer<'_>) -> Result<()> {
+        let (rollout, tally) = trainer.collecting();
+        let slice = reply.slice(self.slots.clone());
+        self.collector.take(&slice, rollout, |episode| tally.note(episode))?;
+        if self.collector.is_done() {
+            self.collector.finish(rollout)?;
+        }
+        Ok(())
+    }
+
+    /// Ends the collection of a rollout that is whole.
+    fn collected(&mut self, now: Times) -> Collected {
+        let begun = self.begun.take().unwrap_or(now);
+        Collected { index: self.index, acting: now.acting - begun.acting, waiting: now.waiting - begun.waiting }
+    }
+}
+
+fn in_order<T>(mut items: impl DoubleEndedIterator<Item = T>, is_reversed: bool) -> impl Iterator<Item = T> {
+    std::iter::from_fn(move || if is_reversed { items.next_back() } else { items.next() })
+}

@@ -1,0 +1,218 @@
+//! Rollouts that servers play: each run has a session of its own, and this process gets whole rollouts.
+//!
+//! While one run is updated, the rollouts of the others are played. No run waits for another, and runs share nothing but
+//! this thread and the gradient workspace. So the bytes of a run are those that it has alone.
+
+use std::pin::Pin;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use futures_util::StreamExt;
+use futures_util::stream::FuturesUnordered;
+use perturb_policy::{CollectUntil, Normalisers, Player, PlayerState, PolicySpec};
+use perturb_protocol::player::{floats, read_floats};
+use perturb_study::settings::Rollouts;
+
+use super::start::{options, start_or_resume};
+use super::trainer::Trainer;
+use super::{CollectRollouts, Collected, Entry, Outcome, Result, Run};
+use crate::client::{ClientError, Played, Servers, Session, acting};
+use crate::proto;
+use crate::rollout::{CollectError, DecodedRollout};
+
+/// Environment steps of one reply where several runs wait for the server: some milliseconds of a classic task, a tenth of
+/// a second of a robot. So no run waits for long, however many there are.
+const PIECE_ENV_STEPS: usize = 4096;
+
+/// A reply that is awaited, with the run's session.
+type Playing<'a> = Pin<Box<dyn Future<Output = (Box<Lane<'a>>, std::result::Result<Played, ClientError>)> + 'a>>;
+
+/// Collects the rollouts of runs whose policies the server plays.
+pub(super) struct ServerSide<'a> {
+    servers: &'a Servers,
+    /// Runs whose server plays nothing: between two rollouts.
+    idle: Vec<Box<Lane<'a>>>,
+    /// Runs whose server plays.
+    playing: FuturesUnordered<Playing<'a>>,
+    /// How long no run had a rollout to learn from.
+    waited: Duration,
+}
+
+/// The session of a run.
+struct Lane<'a> {
+    /// The run's index.
+    index: usize,
+    session: Session<'a>,
+    spec: PolicySpec,
+    /// The player, until the server has it.
+    player: Option<Player>,
+    /// Steps of one reply at most; 0 leaves the number to the server.
+    max_steps: u32,
+    /// Whether the next reply is the rollout's first.
+    begins: bool,
+    decoded: DecodedRollout,
+    /// [`ServerSide::waited`] when the rollout was asked for.
+    waited: Duration,
+}
+
+impl<'a> ServerSide<'a> {
+    /// Opens a session for each of `entries` whose policy a server can play, and begins or resumes its run. Returns the
+    /// runs, and the entries whose actions must be chosen in this process: those that see noise, those with several
+    /// servers, and those with short rollouts unless there is only one entry. A run that cannot start is passed to `ended`.
+    ///
+    /// # Errors
+    /// A session that cannot be opened.
+    #[allow(clippy::type_complexity)] // two lists of which each is used once
+    pub(super) fn open<'d>(
+        servers: &'a Servers,
+        entries: Vec<(usize, Entry<'d>)>,
+        threads: usize,
+        ended: &mut dyn FnMut(usize, Result<Outcome>),
+    ) -> Result<(Self, Vec<Run<'d>>, Vec<(usize, Entry<'d>)>)> {
+        let is_one = entries.len() == 1;
+        let (mut idle, mut runs, mut others) = (Vec::new(), Vec::new(), Vec::new());
+        for (index, entry) in entries {
+            let config = entry.start.config();
+            let rollouts = config.rollouts();
+            if rollouts == Rollouts::Noisy || (!is_one && rollouts != Rollouts::Long) {
+                others.push((index, entry));
+                continue;
+            }
+            let mut observations = Vec::new();
+            let mut session = Session::open(servers, &options(config), &mut observations)?;
+            if !session.plays_together() {
+                others.push((index, entry));
+                continue;
+            }
+            let n_envs = session.num_envs();
+            match start_or_resume(entry, &mut session, 0..n_envs, &observations, threads) {
+                Ok((trainer, player)) => {
+                    idle.push(Box::new(Lane {
+                        index,
+                        session,
+                        spec: trainer.spec().clone(),
+                        player: Some(player),
+                        max_steps: if is_one { 0 } else { (PIECE_ENV_STEPS / n_envs).max(1) as u32 },
+                        begins: true,
+                        decoded: DecodedRollout::default(),
+                        waited: Duration::ZERO,
+                    }));
+                    runs.push(Run { index, trainer, end: None });
+                }
+                Err(error) => ended(index, Err(error)),
+            }
+        }
+        let server_side = Self { servers, idle, playing: FuturesUnordered::new(), waited: Duration::ZERO };
+        Ok((server_side, runs, others))
+    }
+
+    fn lane(&mut self, index: usize) -> Option<&mut Lane<'a>> {
+        self.idle.iter_mut().map(Box::as_mut).find(|lane| lane.index == index)
+    }
+}
+
+impl CollectRollouts for ServerSide<'_> {
+    fn collect(&mut self, runs: &mut [Run<'_>]) -> Result<Vec<Collected>> {
+        for mut lane in std::mem::take(&mut self.idle) {
+            let Some(run) = super::find(runs, lane.index) else { continue };
+            let asked = lane.request_rollout(&run.trainer, self.waited);
+            if run.store_error(asked, false)?.is_some() {
+                self.playing.push(Box::pin(lane.played()));
+            }
+        }
+        while runs.iter().all(|run| run.end.is_none()) {
+            let start = Instant::now();
+            let Some((mut lane, played)) = self.servers.block_on(self.playing.next()) else { break };
+            self.waited += start.elapsed();
+            let Some(run) = super::find(runs, lane.index) else { continue };
+            let is_whole = lane.take(played, &mut run.trainer);
+            match run.store_error(is_whole, false)? {
+                None => {}
+                Some(false) => self.playing.push(Box::pin(lane.played())),
+                Some(true) => {
+                    let waiting = self.waited - lane.waited;
+                    let collected = Collected { index: lane.index, acting: Duration::ZERO, waiting };
+                    self.idle.push(lane);
+                    return Ok(vec![collected]);
+                }
+            }
+        }
+        Ok(Vec::new())
+    }
+
+    fn player(&mut self, _: usize) -> Option<&mut Player> {
+        None
+    }
+
+    fn player_state(&mut self, index: usize) -> Result<Option<(PlayerState, Normalisers)>> {
+        let Some(lane) = self.lane(index).filter(|lane| lane.player.is_none()) else { return Ok(None) };
+        Ok(lane.session.save_player()?)
+    }
+
+    fn snapshots(&mut self, index: usize) -> Result<Vec<Bytes>> {
+        let Some(lane) = self.lane(index) else { return Ok(Vec::new()) };
+        Ok(lane.session.snapshot(0..lane.session.num_envs())?)
+    }
+
+    fn release(&mut self, index: usize) -> Result<()> {
+        self.idle.retain(|lane| lane.index != index);
+        Ok(())
+    }
+
+    fn is_shared(&self) -> bool {
+        false
+    }
+}
+
+impl<'a> Lane<'a> {
+    /// Asks the server for a rollout under the trainer's policy.
+    fn request_rollout(&mut self, trainer: &Trainer<'_>, waited: Duration) -> Result<()> {
+        (self.begins, self.waited) = (true, waited);
+        let act = proto::Act {
+            policy: self.player.take().map(|player| acting::policy(&self.spec, &player)),
+            weights: floats(trainer.weights()),
+            task: Some(trainer.collect_until().into()),
+            most_steps: self.max_steps,
+            ..proto::Act::default()
+        };
+        Ok(self.session.ask_to_play(act)?)
+    }
+
+    /// Waits for the reply.
+    async fn played(mut self: Box<Self>) -> (Box<Self>, std::result::Result<Played, ClientError>) {
+        let played = self.session.played().await;
+        (self, played)
+    }
+
+    /// Appends the steps of a reply to the rollout. Returns whether the rollout is whole; if not, the rest was asked for.
+    ///
+    /// # Errors
+    /// A reply that does not fit, or a failure of the connection. The steps of this rollout are lost then.
+    fn take(&mut self, played: std::result::Result<Played, ClientError>, trainer: &mut Trainer<'_>) -> Result<bool> {
+        let Self { session, spec, max_steps, begins, decoded, .. } = self;
+        let Played { acted, ended } = played?;
+        let until = trainer.collect_until();
+        let (rollout, tally) = trainer.collecting();
+        let mismatch = |got| CollectError::Client(session.misplayed(got));
+        if std::mem::take(begins) {
+            let memory = read_floats("memory", &acted.memory);
+            rollout.begin(&memory.map_err(|wrong| mismatch(wrong.to_string()))?);
+        }
+        decoded.decode(&acted, spec).map_err(mismatch)?;
+        let before = rollout.len();
+        rollout.push(decoded.steps())?;
+        for (step, episode) in &ended {
+            if let CollectUntil::Episodes(_) = until {
+                let (end, length) = (before + step + 1, episode.length as usize);
+                rollout.note_episode(episode.slot, end, length, episode.episode_return)?;
+            }
+            tally.note(episode);
+        }
+        if acted.finished {
+            rollout.finish(decoded.last_values())?;
+            return Ok(true);
+        }
+        session.ask_to_play(proto::Act { most_steps: *max_steps, ..proto::Act::default() })?;
+        Ok(false)
+    }
+}

@@ -1,0 +1,200 @@
+//! Where runs begin: from initial weights, or from a checkpoint.
+
+use std::collections::VecDeque;
+use std::ops::Range;
+
+use super::ending::RECENT;
+use super::trainer::{Tally, Trainer};
+use super::{Entry, Result, RunDirectory, Start, TrainError};
+use crate::algorithm;
+use crate::checkpoint::{Checkpoint, EnvironmentSummary, ResumeState, State};
+use crate::client::{OpenOptions, Session};
+use crate::logging::{Clock, Logs, TimeShares};
+use crate::policy::Policy;
+use crate::proto;
+use crate::rollout::Rollout;
+use perturb_policy::{CollectUntil, Normalisers, Player, RewardNormaliser, Role};
+use perturb_study::Counters;
+use perturb_study::files::write_atomically;
+use perturb_study::records::Comparison;
+use perturb_study::settings::{Base, Common, Settings, TrainConfig, Wrapper};
+
+/// The environments that `config` trains in.
+pub(super) fn options(config: &TrainConfig) -> OpenOptions {
+    let common = &config.common;
+    OpenOptions {
+        environment: common.environment.clone(),
+        version: common.version,
+        parameters: common.parameters.clone(),
+        num_envs: common.num_envs,
+        seed: common.seed,
+        episodes_per_trial: config.settings.episodes_per_trial(),
+        observe: common.observe,
+    }
+}
+
+/// Brings a run and its player to the point at which it starts, in `slots` of the session, whose first `observations`
+/// `[N, O]` are given.
+pub(super) fn start_or_resume<'a>(
+    entry: Entry<'a>,
+    session: &mut Session<'_>,
+    slots: Range<usize>,
+    observations: &[f32],
+    threads: usize,
+) -> Result<(Trainer<'a>, Player)> {
+    let environment = session.environment().clone();
+    let Entry { directory, start, marks } = entry;
+    let (mut trainer, player) = match start {
+        Start::Fresh(config) => begin(&config, directory, &environment, observations, threads)?,
+        Start::Checkpoint(saved) => {
+            let (checkpoint, state) = *saved;
+            let restore = || {
+                let restored = session.restore(slots, &state.collector.snapshots);
+                restored.map(drop).map_err(|error| not_restored("environments", error.into()))
+            };
+            resume((checkpoint, &state), directory, &environment, threads, restore)?
+        }
+    };
+    // The others were kept when they came.
+    let episodes = trainer.checkpoint.state.counters.episodes;
+    trainer.marks = marks.iter().copied().filter(|mark| *mark > episodes).collect();
+    Ok((trainer, player))
+}
+
+/// Begins a run in `environment`, whose first `observations` `[N, O]` are given. Deletes an earlier run in the directory.
+fn begin<'a>(
+    config: &TrainConfig,
+    directory: &'a RunDirectory,
+    environment: &proto::Environment,
+    observations: &[f32],
+    threads: usize,
+) -> Result<(Trainer<'a>, Player)> {
+    let common = &config.common;
+    let summary = EnvironmentSummary::of(environment).ok_or(TrainError::NoActions)?;
+    let state = State {
+        environment_spec: summary,
+        observation_normaliser: None,
+        reward_normaliser: None,
+        counters: Counters::default(),
+        config: config.clone(),
+        commits: Vec::new(),
+    };
+    let spec = state.policy();
+    let policy = Policy::new(spec.clone(), common.seed)?.with_threads(threads)?;
+    let normalisers = Normalisers {
+        observations: state.fresh_normaliser(),
+        rewards: common.normalize_rewards.then(|| {
+            let normaliser = RewardNormaliser::new(common.num_envs, config.settings.gamma());
+            normaliser.running_on(common.reward_return_runs_on)
+        }),
+    };
+    let mut player = player(&state, normalisers);
+    player.begin(observations, None).map_err(crate::error::Error::from)?;
+    player.load(policy.flat_weights()).map_err(crate::error::Error::from)?;
+    let weights = policy.weights();
+    let checkpoint = Checkpoint { state, policy: spec, weights };
+    directory.prepare()?; // from here on an earlier run is gone
+    tracing::debug!(directory = %directory.path().display(), "training begins");
+    let (path, clock) = (directory.path(), Clock::start(0.0));
+    let logs = Logs::create(path, &common.environment, &checkpoint.state.environment_spec, clock)?;
+    write_atomically(&path.join("config.toml"), config.to_toml().as_bytes())?;
+    Ok((new_trainer(directory, policy, environment, checkpoint, logs, clock)?, player))
+}
+
+/// Resumes a run from a checkpoint; `restore` restores its environments. Deletes the lines of the logs beyond the checkpoint,
+/// as the last step.
+fn resume<'a>(
+    (checkpoint, resume): (Checkpoint, &ResumeState),
+    directory: &'a RunDirectory,
+    environment: &proto::Environment,
+    threads: usize,
+    restore: impl FnOnce() -> Result<()>,
+) -> Result<(Trainer<'a>, Player)> {
+    let state = &checkpoint.state;
+    let served = EnvironmentSummary::of(environment).ok_or(TrainError::NoActions)?;
+    if let Some((what, trained, served)) = state.environment_spec.difference(&served) {
+        let environment = state.config.common.environment.clone();
+        return Err(TrainError::Changed { environment, what, trained, served });
+    }
+    let policy = Policy::from_weights(checkpoint.policy.clone(), &checkpoint.weights)?.with_threads(threads)?;
+    let normalisers =
+        Normalisers { observations: state.observation_normaliser.clone(), rewards: state.reward_normaliser.clone() };
+    let mut player = player(state, normalisers);
+    let played = player.restore(&resume.collector.player).map_err(crate::error::Error::from);
+    played.map_err(|error| not_restored("environments", error.into()))?;
+    player.load(policy.flat_weights()).map_err(crate::error::Error::from)?;
+    restore()?;
+    let clock = Clock::start(resume.history.elapsed);
+    let mut algorithm = algorithm::build(&state.config.settings, &policy, state.config.common.seed)?;
+    let loaded = algorithm.load_state(&resume.algorithm);
+    loaded.map_err(|error| not_restored("optimiser", error.into()))?;
+    let logs = Logs::resume(directory.path(), &resume.history.logs, &state.environment_spec, clock)?;
+    tracing::debug!(directory = %directory.path().display(), "training goes on");
+    let mut trainer = new_trainer(directory, policy, environment, checkpoint, logs, clock)?;
+    trainer.algorithm = algorithm;
+    trainer.saved = Some(trainer.checkpoint.state.counters);
+    trainer.tally.recent.extend(&resume.history.recent);
+    trainer.shares = resume.history.shares;
+    Ok((trainer, player))
+}
+
+/// A trainer with a fresh algorithm, and without episodes so far.
+fn new_trainer<'a>(
+    directory: &'a RunDirectory,
+    policy: Policy,
+    environment: &proto::Environment,
+    mut checkpoint: Checkpoint,
+    logs: Logs,
+    clock: Clock,
+) -> Result<Trainer<'a>> {
+    let State { config, commits, .. } = &mut checkpoint.state;
+    let algorithm = algorithm::build(&config.settings, &policy, config.common.seed)?;
+    if !commits.iter().any(|commit| commit == perturb_study::VERSION) {
+        commits.push(perturb_study::VERSION.into());
+    }
+    let spec = policy.spec();
+    let (n_envs, input_size, width) = (config.common.num_envs, spec.observation_size, spec.action.width());
+    let rollout = match algorithm.collect_until() {
+        CollectUntil::Steps(n_steps) => Rollout::new(n_steps, n_envs, input_size, width),
+        CollectUntil::Episodes(_) => Rollout::of_episodes(n_envs, input_size, width),
+    };
+    Ok(Trainer {
+        directory,
+        policy,
+        algorithm,
+        rollout,
+        tally: Tally {
+            comparison: Comparison::of(environment),
+            recent: VecDeque::with_capacity(RECENT),
+            ended: Vec::new(),
+        },
+        logs,
+        checkpoint,
+        clock,
+        shares: TimeShares::default(),
+        last_update: None,
+        saved: None,
+        marks: VecDeque::new(),
+    })
+}
+
+/// The error of a part of a checkpoint that does not fit.
+fn not_restored(what: &'static str, source: TrainError) -> TrainError {
+    TrainError::Restore { what, source: Box::new(source) }
+}
+
+/// The player of a run.
+fn player(state: &State, normalisers: Normalisers) -> Player {
+    let Common { num_envs, seed, observation_noise, .. } = state.config.common;
+    let (spec, inputs) = (state.policy(), state.inputs(num_envs));
+    let episodes_per_trial = state.config.settings.episodes_per_trial();
+    let player = Player::new(&spec, inputs, num_envs, episodes_per_trial, normalisers, Role::training(seed));
+    let player = player.with_noise(observation_noise);
+    match &state.config.settings {
+        // A2C updates once a rollout, and needs just the activations that acting has computed.
+        Settings { base: Base::A2c(a2c), wrapper: Wrapper::Plain | Wrapper::Rl2(_) } => {
+            player.keeping_activations(a2c.n_steps)
+        }
+        _ => player,
+    }
+}
