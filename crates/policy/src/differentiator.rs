@@ -7,32 +7,15 @@ use pulp::Simd;
 use crate::act::Actor;
 use crate::act_ff::{Activations, BLOCK, Networks};
 use crate::error::{Error, Result, check_length};
+use crate::gradient::{ActingOutputs, Batch, GradientBackend};
 use crate::kernel::{Kernel, run};
 use crate::objective::{Acting, Gaussian, Losses, Objective, Outputs, Sample};
 use crate::perceptron::{Backward, Forward};
-use crate::spec::{ActionKind, PolicySpec};
+use crate::samples::{Samples, SequenceSamples};
+use crate::spec::PolicySpec;
 
 /// The most parts of a minibatch, and so the most threads that work on one.
 const MOST_PARTS: usize = 16;
-
-/// B samples of a rollout.
-#[derive(Clone, Copy, Debug)]
-pub struct Samples<'a> {
-    /// `[B, O]` normalised observations.
-    pub observations: &'a [f32],
-    /// `[B, A]` actions; a discrete one is its index, A = 1.
-    pub actions: &'a [f32],
-    /// `[B]` log-probabilities under the policy that acted.
-    pub old_log_probs: &'a [f32],
-    /// `[B]` its values.
-    pub old_values: &'a [f32],
-    /// `[B]` advantages.
-    pub advantages: &'a [f32],
-    /// `[B]` value targets.
-    pub returns: &'a [f32],
-    /// Its distributions, for their divergence.
-    pub acting: Option<Acting<'a>>,
-}
 
 /// Differentiates losses of a feed-forward policy.
 ///
@@ -46,6 +29,8 @@ pub struct Differentiator {
     networks: Networks,
     gaussian: Gaussian,
     parts: Vec<Part>,
+    /// Whether `networks` have the weights that the next gradient is for.
+    is_current: bool,
     /// Rows of the first part that hold what the networks compute of the observations in them.
     computed: usize,
     /// None: the calling thread does everything.
@@ -85,10 +70,6 @@ impl Differentiator {
     /// # Errors
     /// [`Error::Threads`] if the system starts no more.
     pub fn new(spec: &PolicySpec, threads: usize) -> Result<Self> {
-        let n_log_std = match spec.action {
-            ActionKind::Discrete { .. } => 0,
-            ActionKind::Continuous { size } => size,
-        };
         let others = threads.min(MOST_PARTS) - 1;
         let pool = || ThreadPoolBuilder::new().num_threads(others).build();
         let threads = (others > 0).then(pool).transpose();
@@ -96,8 +77,9 @@ impl Differentiator {
             spec: spec.clone(),
             n_weights: spec.n_weights(),
             networks: Networks::new(spec),
-            gaussian: Gaussian::new(n_log_std),
+            gaussian: Gaussian::new(spec.action.log_stds()),
             parts: Vec::new(),
+            is_current: false,
             computed: 0,
             threads: threads.map_err(|error| Error::Threads { wanted: others, reason: error.to_string() })?,
         })
@@ -113,7 +95,12 @@ impl Differentiator {
         self.networks.load(&mut rest);
         self.gaussian.load(rest);
         self.computed = 0;
+        self.is_current = true;
         Ok(())
+    }
+
+    fn load_if_changed(&mut self, weights: &[f32]) -> Result<()> {
+        if self.is_current { Ok(()) } else { self.load(weights) }
     }
 
     /// Takes over the networks of an actor that has the weights, which is quicker than to load them, and says whether it
@@ -156,7 +143,7 @@ impl Differentiator {
     ///
     /// # Panics
     /// If an index is not one of a sample, or a discrete action is not in 0 … n-1.
-    pub fn gradient(
+    pub fn gradient_at(
         &mut self,
         weights: &[f32],
         samples: &Samples<'_>,
@@ -164,7 +151,7 @@ impl Differentiator {
         objective: &Objective,
         gradient: &mut [f32],
     ) -> Result<Losses> {
-        self.check(samples)?;
+        samples.check(&self.spec)?;
         check_length("weights [P]", weights.len(), self.n_weights)?;
         check_length("gradient [P]", gradient.len(), self.n_weights)?;
         if indices.is_empty() {
@@ -176,8 +163,7 @@ impl Differentiator {
         if !is_computed {
             self.computed = 0; // from here on the rows are others
         }
-        let (mean, scale) =
-            if objective.normalize_advantages { mean_and_scale(samples.advantages, indices) } else { (0.0, 1.0) };
+        let (mean, scale) = if objective.normalize_advantages { samples.mean_and_scale(indices) } else { (0.0, 1.0) };
         let Self { spec, networks, gaussian, parts, threads, .. } = self;
         let (spec, networks, gaussian, n) = (&*spec, &*networks, &*gaussian, indices.len());
         let size = n.div_ceil(n_parts);
@@ -242,30 +228,43 @@ impl Differentiator {
         }
         Ok(())
     }
-
-    fn check(&self, samples: &Samples<'_>) -> Result<()> {
-        let Samples { observations, actions, old_log_probs, old_values, advantages, returns, acting } = samples;
-        let n = returns.len();
-        check_length("observations [B, O]", observations.len(), n * self.spec.observation_size)?;
-        check_length("actions [B, A]", actions.len(), n * self.spec.action.width())?;
-        for (name, got) in
-            [("old_log_probs [B]", old_log_probs), ("old_values [B]", old_values), ("advantages [B]", advantages)]
-        {
-            check_length(name, got.len(), n)?;
-        }
-        let Some(acting) = acting else { return Ok(()) };
-        check_length("acting outputs [B, n]", acting.outputs.len(), n * self.spec.action.outputs())?;
-        check_length("acting log_std [A]", acting.log_std.len(), self.gaussian.log_std.len())
-    }
 }
 
-/// Mean of the advantages at `indices`, and 1/(standard deviation + 10⁻⁸).
-fn mean_and_scale(advantages: &[f32], indices: &[u32]) -> (f32, f32) {
-    let picked = || indices.iter().map(|&i| f64::from(advantages[i as usize]));
-    let n = indices.len() as f64;
-    let mean = picked().sum::<f64>() / n;
-    let variance = picked().map(|x| (x - mean) * (x - mean)).sum::<f64>() / n;
-    (mean as f32, (1.0 / (variance.sqrt() + 1e-8)) as f32)
+impl GradientBackend for Differentiator {
+    fn batch<'a>(&self, sequences: &SequenceSamples<'a>) -> Result<Batch<'a>> {
+        Ok(Batch::FeedForward { samples: sequences.samples, indices: sequences.indices(), acting: None })
+    }
+
+    fn remember_acting(&mut self, weights: &[f32], batch: &mut Batch<'_>) -> Result<()> {
+        let Batch::FeedForward { samples, acting, .. } = batch else { unreachable!("a recurrent policy's batch") };
+        self.load_if_changed(weights)?;
+        let mut outputs = Vec::new();
+        self.outputs(samples.observations, &mut outputs)?;
+        *acting = Some(ActingOutputs { outputs, log_std: self.gaussian.log_std.clone() });
+        Ok(())
+    }
+
+    fn gradient(
+        &mut self,
+        weights: &[f32],
+        batch: &Batch<'_>,
+        sequences: &[u32],
+        objective: &Objective,
+        gradient: &mut [f32],
+    ) -> Result<Losses> {
+        let Batch::FeedForward { samples, acting, .. } = batch else { unreachable!("a recurrent policy's batch") };
+        self.load_if_changed(weights)?;
+        let acting = acting.as_ref().map(|it| Acting { outputs: &it.outputs, log_std: &it.log_std });
+        self.gradient_at(weights, &Samples { acting, ..*samples }, sequences, objective, gradient)
+    }
+
+    fn weights_changed(&mut self) {
+        self.is_current = false;
+    }
+
+    fn reuse_activations(&mut self, actor: &mut Actor) {
+        self.is_current = self.load_from(actor);
+    }
 }
 
 /// Adds `more` to `sums`.

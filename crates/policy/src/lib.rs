@@ -8,9 +8,11 @@
 mod act;
 mod act_ff;
 mod act_rc;
+mod backend;
 mod collect_until;
 mod differentiator;
 mod error;
+mod gradient;
 mod initial;
 mod inputs;
 mod kernel;
@@ -25,13 +27,16 @@ mod product;
 pub mod random;
 mod recurrent;
 mod sample;
+mod samples;
 mod spec;
 mod weights;
 
 pub use act::{Actor, Acts, Streams};
+pub use backend::gradient_backend;
 pub use collect_until::{CollectUntil, EpisodeQuotas, Remaining};
-pub use differentiator::{Differentiator, Samples};
+pub use differentiator::Differentiator;
 pub use error::{Error, Result, check_length};
+pub use gradient::{ActingOutputs, Batch, GradientBackend};
 pub use initial::initial_weights;
 pub use inputs::Inputs;
 pub use normaliser::{ObservationNormaliser, RewardNormaliser, RunningMoments};
@@ -40,8 +45,8 @@ pub use objective::{Acting, Losses, Objective, Surrogate};
 pub use optimiser::{Adam, Descent, Optimiser, RmsProp};
 pub use player::{Ended, Outcome, Player, PlayerState, Role, RolloutStep, TrialStreams};
 pub use recurrent::{
-    MakeRecurrent, RecurrentBatch, RecurrentDifferentiator, SequenceSamples, has_recurrent, recurrent_differentiator,
-    register_recurrent,
+    MakeRecurrent, RecurrentBatch, RecurrentDifferentiator, has_recurrent, recurrent_differentiator, register_recurrent,
 };
+pub use samples::{Samples, SequenceSamples};
 pub use spec::{ActionKind, PolicySpec};
 pub use weights::{NamedArray, Weights, check_arrays};

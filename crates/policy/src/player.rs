@@ -4,8 +4,8 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::act::{Actor, Acts, Streams};
 use crate::collect_until::Remaining;
-use crate::differentiator::Differentiator;
 use crate::error::{Result, check_length};
+use crate::gradient::GradientBackend;
 use crate::inputs::Inputs;
 use crate::normalisers::{Normalisers, Statistics};
 use crate::random::{Purpose, normal, stream, trial_stream};
@@ -258,11 +258,10 @@ impl Player {
         self.actor.load_flat(weights)
     }
 
-    /// Gives the networks with which it acts to who differentiates them, if they fit, see
-    /// [`Differentiator::load_from`]; weights are to be loaded then before it plays on.
-    #[must_use]
-    pub fn give_networks(&mut self, to: &mut Differentiator) -> bool {
-        to.load_from(&mut self.actor)
+    /// Lets `backend` take the networks with which this player acts, see [`GradientBackend::reuse_activations`]. Weights must
+    /// be loaded before this player acts again.
+    pub fn give_activations(&mut self, backend: &mut dyn GradientBackend) {
+        backend.reuse_activations(&mut self.actor);
     }
 
     /// A trial begins in every environment with `observations` `[N, O]`; running statistics take in those of the

@@ -2,26 +2,10 @@
 
 use std::sync::OnceLock;
 
-use crate::differentiator::Samples;
 use crate::error::{Error, Result};
 use crate::objective::{Losses, Objective};
+use crate::samples::SequenceSamples;
 use crate::spec::PolicySpec;
-
-/// Sequences of T steps of N environments, each of which a recurrent policy must see whole. B = T·N, and the sample of
-/// step t of environment n is t·N + n.
-#[derive(Clone, Copy, Debug)]
-pub struct SequenceSamples<'a> {
-    /// What a policy learns from, `[T, N, …]`.
-    pub samples: Samples<'a>,
-    /// T.
-    pub n_steps: usize,
-    /// `[T, N]`: whether an episode starts with that step.
-    pub starts: &'a [bool],
-    /// `[N, S]` the memory before the first step, S = [`PolicySpec::memory_size`].
-    pub memory: &'a [f32],
-    /// `[N]`: of environment n only so many of the first steps are samples, the others fill it up. None: all are.
-    pub lengths: Option<&'a [usize]>,
-}
 
 /// Computes gradients of recurrent policies of one shape.
 pub trait RecurrentDifferentiator {

@@ -30,6 +30,14 @@ impl ActionKind {
         }
     }
 
+    /// Number of log standard deviations: A, or 0 for discrete actions.
+    pub fn log_stds(self) -> usize {
+        match self {
+            ActionKind::Discrete { .. } => 0,
+            ActionKind::Continuous { size } => size,
+        }
+    }
+
     /// Outputs of the policy network: n logits, or A means.
     pub fn outputs(self) -> usize {
         match self {
@@ -133,11 +141,7 @@ impl PolicySpec {
         let linear = |(inputs, outputs): (usize, usize)| outputs * (inputs + 1);
         let hidden: usize = self.hidden_layers().into_iter().map(linear).sum();
         let heads = |inputs| linear((inputs, self.action.outputs())) + linear((inputs, 1));
-        let log_std = match self.action {
-            ActionKind::Discrete { .. } => 0,
-            ActionKind::Continuous { size } => size,
-        };
-        log_std
+        self.action.log_stds()
             + match self.lstm {
                 None => 2 * hidden + heads(self.hidden_size()),
                 Some(width) => hidden + 4 * width * (self.hidden_size() + width + 1) + heads(width),

@@ -6,7 +6,7 @@ use perturb_study::settings::A2cConfig;
 use super::{Algorithm, AlgorithmState, InTurn, UpdateStats, check_rollout, explained_variance};
 use crate::error::Result;
 use crate::policy::Policy;
-use crate::rollout::{Estimates, Rollout, n_step_returns};
+use crate::rollout::{Estimates, Rollout, Trajectories};
 
 /// Synchronous advantage actor-critic, Mnih et al. (2016), arXiv:1602.01783, without asynchrony: one gradient step a
 /// rollout on all its T·N samples,
@@ -72,11 +72,12 @@ impl InTurn for A2c {
         for rollout in rollouts {
             check_rollout(rollout, policy, self.config.n_steps)?;
             let estimated = n_step_returns(&rollout.trajectories()?, gamma, bootstrap_truncation);
-            let batch = policy.batch(rollout, &estimated)?;
-            let step =
-                policy.gradient_step(&batch, &batch.sequences(), &objective, &mut self.descent, learning_rate)?;
-            losses += step.0;
-            norms += step.1;
+            let Policy { weights, gradient, backend, .. } = &mut *policy;
+            let batch = backend.batch(&rollout.sequences(&estimated))?;
+            let loss = backend.gradient(weights, &batch, &batch.sequences(), &objective, gradient)?;
+            norms += self.descent.step(loss.total, gradient, weights, learning_rate)?;
+            backend.weights_changed();
+            losses += loss;
             drop(batch);
             estimates.push(estimated);
         }
@@ -98,4 +99,22 @@ impl InTurn for A2c {
             selection: None,
         })
     }
+}
+
+/// n-step returns, Mnih et al. (2016), arXiv:1602.01783, algorithm S3: for t = T-1 … 0
+///
+/// R_t = r_t + γ V' if step t ended an episode or t = T-1, else r_t + γ R_{t+1}.
+///
+/// Every return thus looks as far as the rollout or the episode goes. The advantages are R_t - V(s_t), which is [`gae`](super::gae)
+/// with λ = 1.
+///
+/// # Panics
+///
+/// If arrays have different lengths.
+pub fn n_step_returns(trajectories: &Trajectories<'_>, gamma: f64, bootstrap_truncation: bool) -> Estimates {
+    trajectories.backward(bootstrap_truncation, |step| {
+        let next = if step.ended || step.last { step.next_value } else { step.next_return };
+        let target = step.reward + gamma * next;
+        (target - step.value, target)
+    })
 }

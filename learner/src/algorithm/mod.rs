@@ -4,9 +4,9 @@ mod a2c;
 mod epopt;
 mod ppo;
 
-pub use a2c::A2c;
+pub use a2c::{A2c, n_step_returns};
 pub use epopt::{Epopt, Selection};
-pub use ppo::Ppo;
+pub use ppo::{Ppo, gae};
 
 use perturb_study::settings::{Base, Settings, Wrapper};
 use rand_chacha::ChaCha8Rng;

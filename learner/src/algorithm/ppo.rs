@@ -1,14 +1,14 @@
 //! Proximal policy optimisation.
 
 use perturb_policy::random::{Purpose, stream, uniform};
-use perturb_policy::{CollectUntil, Descent, Losses, Objective, Optimiser, Surrogate};
+use perturb_policy::{Batch, CollectUntil, Descent, Losses, Objective, Optimiser, Surrogate};
 use perturb_study::settings::{PpoConfig, SettingError};
 use rand_chacha::ChaCha8Rng;
 
 use super::{Algorithm, AlgorithmState, InTurn, UpdateStats, check_rollout, explained_variance};
 use crate::error::Result;
 use crate::policy::Policy;
-use crate::rollout::{Estimates, Rollout, gae};
+use crate::rollout::{Estimates, Rollout, Trajectories};
 
 /// Proximal policy optimisation with a clipped ratio, Schulman et al. (2017), arXiv:1707.06347: `n_epochs` passes over a
 /// rollout's T·N samples, each in `n_minibatches` random parts with one gradient step (of samples or, for a recurrent
@@ -76,26 +76,20 @@ impl InTurn for Ppo {
         rollouts: &[&Rollout],
         progress_remaining: f64,
     ) -> Result<UpdateStats> {
-        let PpoConfig { n_epochs, n_minibatches, .. } = self.config;
-        let PpoConfig { gamma, gae_lambda, kl_coef, bootstrap_truncation, .. } = self.config;
+        let PpoConfig { gamma, gae_lambda, n_epochs, n_minibatches, kl_coef, bootstrap_truncation, .. } = self.config;
         let mut estimates: Vec<Estimates> = Vec::with_capacity(rollouts.len());
         for rollout in rollouts {
             check_rollout(rollout, policy, self.config.n_steps)?;
             estimates.push(gae(&rollout.trajectories()?, gamma, gae_lambda, bootstrap_truncation));
         }
-        let mut batches = Vec::with_capacity(rollouts.len());
+        let mut batches: Vec<(Batch<'_>, Vec<u32>)> = Vec::with_capacity(rollouts.len());
         for (rollout, estimates) in rollouts.iter().zip(&estimates) {
-            let mut batch = policy.batch(rollout, estimates)?;
+            let mut batch = policy.backend.batch(&rollout.sequences(estimates))?;
             if kl_coef > 0.0 {
-                policy.remember_acting(&mut batch)?;
+                policy.backend.remember_acting(&policy.weights, &mut batch)?;
             }
             let sequences = batch.sequences();
-            let count = sequences.len();
-            if !count.is_multiple_of(n_minibatches) {
-                let got = format!("{n_minibatches}, to part {count}");
-                let expected = "a divisor of n_steps times num_envs, or of num_envs if the policy is recurrent";
-                return Err(SettingError { name: "n_minibatches", got, expected }.into());
-            }
+            check_minibatches(n_minibatches, sequences.len())?;
             batches.push((batch, sequences));
         }
         let learning_rate = self.config.learning_rate_schedule.at(self.config.learning_rate, progress_remaining)?;
@@ -107,10 +101,12 @@ impl InTurn for Ppo {
                 if n_minibatches > 1 {
                     shuffle(sequences, &mut self.rng); // the order of one mean's samples does not matter
                 }
-                for part in sequences.chunks_exact(sequences.len() / n_minibatches) {
-                    let step = policy.gradient_step(batch, part, &objective, &mut self.descent, learning_rate)?;
-                    losses += step.0;
-                    norms += step.1;
+                for minibatch in sequences.chunks_exact(sequences.len() / n_minibatches) {
+                    let Policy { weights, gradient, backend, .. } = &mut *policy;
+                    let loss = backend.gradient(weights, batch, minibatch, &objective, gradient)?;
+                    norms += self.descent.step(loss.total, gradient, weights, learning_rate)?;
+                    backend.weights_changed();
+                    losses += loss;
                 }
             }
         }
@@ -132,6 +128,34 @@ impl InTurn for Ppo {
             selection: None,
         })
     }
+}
+
+/// Generalised advantage estimation (GAE), Schulman et al. (2016), arXiv:1506.02438, equation 16: for t = T-1 … 0
+///
+/// δ_t = r_t + γ V' - V(s_t),
+/// A_t = δ_t + γ λ c_t A_{t+1},
+///
+/// where c_t = 0 if step t ended an episode, else 1, and A_T = 0. The returns are A_t + V(s_t).
+///
+/// # Panics
+///
+/// If arrays have different lengths.
+pub fn gae(trajectories: &Trajectories<'_>, gamma: f64, gae_lambda: f64, bootstrap_truncation: bool) -> Estimates {
+    trajectories.backward(bootstrap_truncation, |step| {
+        let delta = step.reward + gamma * step.next_value - step.value;
+        let advantage = if step.ended { delta } else { delta + gamma * gae_lambda * step.next_advantage };
+        (advantage, advantage + step.value)
+    })
+}
+
+/// Refuses minibatches that do not part a rollout evenly.
+fn check_minibatches(n_minibatches: usize, n_sequences: usize) -> Result<()> {
+    if n_sequences.is_multiple_of(n_minibatches) {
+        return Ok(());
+    }
+    let got = format!("{n_minibatches}, to part {n_sequences}");
+    let expected = "a divisor of n_steps times num_envs, or of num_envs if the policy is recurrent";
+    Err(SettingError { name: "n_minibatches", got, expected }.into())
 }
 
 /// Puts `indices` in random order (Fisher and Yates).

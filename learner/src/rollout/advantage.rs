@@ -1,6 +1,7 @@
-//! Returns and advantages, as pure functions over arrays.
+//! Returns and advantages: what their estimators have in common.
 //!
-//! Both estimators treat the end of an episode alike. Let V' be what is expected after step t, t = 0 … T-1:
+//! PPO estimates advantages by [`gae`](crate::algorithm::gae), A2C returns by
+//! [`n_step_returns`](crate::algorithm::n_step_returns). Both treat the end of an episode alike. Let V' be what is expected after step t, t = 0 … T-1:
 //!
 //! - terminated: V' = 0;
 //! - else truncated: V' = V(final observation), or 0 without `bootstrap_truncation`;
@@ -34,6 +35,25 @@ pub struct Trajectories<'a> {
     pub last_values: &'a [f32],
 }
 
+/// Step t of an environment, as an estimator sees it.
+#[derive(Clone, Copy, Debug)]
+pub struct EstimatorStep {
+    /// r_t.
+    pub reward: f64,
+    /// V(s_t).
+    pub value: f64,
+    /// V'.
+    pub next_value: f64,
+    /// Whether step t ended an episode.
+    pub ended: bool,
+    /// Whether t = T-1.
+    pub last: bool,
+    /// The advantage of step t+1; 0 for t = T-1.
+    pub next_advantage: f64,
+    /// The return of step t+1; 0 for t = T-1.
+    pub next_return: f64,
+}
+
 /// Advantages and value targets.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Estimates {
@@ -43,88 +63,49 @@ pub struct Estimates {
     pub returns: Vec<f32>,
 }
 
-/// Generalised advantage estimation, Schulman et al. (2016), arXiv:1506.02438, equation 16: for t = T-1 … 0
-///
-/// δ_t = r_t + γ V' - V(s_t),
-/// A_t = δ_t + γ λ c_t A_{t+1},
-///
-/// where c_t = 0 if step t ended an episode, else 1, and A_T = 0. The returns are A_t + V(s_t).
-///
-/// # Panics
-///
-/// If arrays have different lengths.
-pub fn gae(trajectories: &Trajectories<'_>, gamma: f64, gae_lambda: f64, bootstrap_truncation: bool) -> Estimates {
-    backward(trajectories, bootstrap_truncation, |step| {
-        let delta = step.reward + gamma * step.next_value - step.value;
-        let advantage = if step.ended { delta } else { delta + gamma * gae_lambda * step.later.0 };
-        (advantage, advantage + step.value)
-    })
-}
-
-/// n-step returns, Mnih et al. (2016), arXiv:1602.01783, algorithm S3: for t = T-1 … 0
-///
-/// R_t = r_t + γ V' if step t ended an episode or t = T-1, else r_t + γ R_{t+1}.
-///
-/// Every return thus looks as far as the rollout or the episode goes. The advantages are R_t - V(s_t), which is [`gae`]
-/// with λ = 1.
-///
-/// # Panics
-///
-/// If arrays have different lengths.
-pub fn n_step_returns(trajectories: &Trajectories<'_>, gamma: f64, bootstrap_truncation: bool) -> Estimates {
-    backward(trajectories, bootstrap_truncation, |step| {
-        let next = if step.ended || step.last { step.next_value } else { step.later.1 };
-        let target = step.reward + gamma * next;
-        (target - step.value, target)
-    })
-}
-
-/// What an estimator sees of step t of an environment.
-struct Step {
-    reward: f64,
-    value: f64,
-    /// V'.
-    next_value: f64,
-    /// Whether an episode ended.
-    ended: bool,
-    /// Whether t = T-1.
-    last: bool,
-    /// Advantage and return of step t+1; 0 for t = T-1.
-    later: (f64, f64),
-}
-
-/// Walks every environment from its last step to its first; `estimate` gives a step's advantage and return.
-fn backward(trajectories: &Trajectories<'_>, bootstrap: bool, estimate: impl Fn(Step) -> (f64, f64)) -> Estimates {
-    let Trajectories { n_envs, rewards, values, terminated, truncated, truncation_values, last_values } = *trajectories;
-    let size = rewards.len();
-    let lengths = [values.len(), terminated.len(), truncated.len(), truncation_values.len()];
-    assert!(lengths == [size; 4] && last_values.len() == n_envs, "arrays [T, N] have {size} and {lengths:?} elements");
-    let mut estimates = Estimates { advantages: vec![0.0; size], returns: vec![0.0; size] };
-    for (n, &last_value) in last_values.iter().enumerate() {
-        let mut later = (0.0, 0.0);
-        let mut later_value = f64::from(last_value);
-        for i in (n..size).step_by(n_envs).rev() {
-            let next_value = match (terminated[i], truncated[i]) {
-                (true, _) => 0.0,
-                (false, true) if bootstrap => f64::from(truncation_values[i]),
-                (false, true) => 0.0,
-                (false, false) => later_value,
-            };
-            let value = f64::from(values[i]);
-            later = estimate(Step {
-                reward: f64::from(rewards[i]),
-                value,
-                next_value,
-                ended: terminated[i] || truncated[i],
-                last: i + n_envs >= size,
-                later,
-            });
-            later_value = value;
-            estimates.advantages[i] = later.0 as f32;
-            estimates.returns[i] = later.1 as f32;
+impl Trajectories<'_> {
+    /// Walks every environment from its last step to its first; `estimate` returns a step's advantage and return. Truncated
+    /// episodes are bootstrapped if `bootstrap_truncation` is set.
+    ///
+    /// # Panics
+    ///
+    /// If arrays have different lengths.
+    pub fn backward(&self, bootstrap_truncation: bool, estimate: impl Fn(EstimatorStep) -> (f64, f64)) -> Estimates {
+        let Trajectories { n_envs, rewards, values, terminated, truncated, truncation_values, last_values } = *self;
+        let size = rewards.len();
+        let lengths = [values.len(), terminated.len(), truncated.len(), truncation_values.len()];
+        assert!(
+            lengths == [size; 4] && last_values.len() == n_envs,
+            "arrays [T, N] have {size} and {lengths:?} elements"
+        );
+        let mut estimates = Estimates { advantages: vec![0.0; size], returns: vec![0.0; size] };
+        for (n, &last_value) in last_values.iter().enumerate() {
+            let mut next = (0.0, 0.0);
+            let mut value_after = f64::from(last_value);
+            for i in (n..size).step_by(n_envs).rev() {
+                let next_value = match (terminated[i], truncated[i]) {
+                    (true, _) => 0.0,
+                    (false, true) if bootstrap_truncation => f64::from(truncation_values[i]),
+                    (false, true) => 0.0,
+                    (false, false) => value_after,
+                };
+                let value = f64::from(values[i]);
+                next = estimate(EstimatorStep {
+                    reward: f64::from(rewards[i]),
+                    value,
+                    next_value,
+                    ended: terminated[i] || truncated[i],
+                    last: i + n_envs >= size,
+                    next_advantage: next.0,
+                    next_return: next.1,
+                });
+                value_after = value;
+                estimates.advantages[i] = next.0 as f32;
+                estimates.returns[i] = next.1 as f32;
+            }
         }
+        estimates
     }
-    estimates
 }
 
 /// 1 - Var(return - value)/Var(return) over all samples: 1 = values are perfect, 0 = no better than a constant, below

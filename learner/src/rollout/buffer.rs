@@ -1,8 +1,8 @@
 //! The rollout buffer.
 
-use super::advantage::Trajectories;
+use super::advantage::{Estimates, Trajectories};
 use crate::error::{Error, Result};
-use perturb_policy::{RolloutStep, check_length};
+use perturb_policy::{RolloutStep, Samples, SequenceSamples, check_length};
 
 /// A complete episode in a rollout.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -171,6 +171,21 @@ impl Rollout {
             truncation_values: &self.truncation_values,
             last_values: &self.last_values,
         })
+    }
+
+    /// The rollout as a policy learns from it, with what was estimated from it.
+    pub fn sequences<'a>(&'a self, estimates: &'a Estimates) -> SequenceSamples<'a> {
+        let samples = Samples {
+            observations: &self.observations,
+            actions: &self.actions,
+            old_log_probs: &self.log_probs,
+            old_values: &self.values,
+            advantages: &estimates.advantages,
+            returns: &estimates.returns,
+            acting: None,
+        };
+        let n_steps = self.n_steps();
+        SequenceSamples { samples, n_steps, starts: &self.starts, memory: &self.memory, lengths: self.lengths() }
     }
 
     /// Steps pushed since the last `clear`.

@@ -5,7 +5,7 @@ mod buffer;
 mod collector;
 mod decoded;
 
-pub use advantage::{Estimates, Trajectories, explained_variance, gae, n_step_returns};
+pub use advantage::{Estimates, EstimatorStep, Trajectories, explained_variance};
 pub use buffer::{Rollout, Span};
 pub use collector::{CollectError, Collector, CollectorState};
 pub use decoded::DecodedRollout;

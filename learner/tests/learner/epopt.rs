@@ -7,9 +7,7 @@ use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Epopt, InTurn, 
 use perturb_learner::client::{EndedEpisode, PrivateServer, Session};
 use perturb_learner::error::Error;
 use perturb_learner::policy::Policy;
-use perturb_learner::rollout::{
-    Collector, Estimates, Normalisers, Rollout, RolloutStep, Span, Trajectories, gae, n_step_returns,
-};
+use perturb_learner::rollout::{Collector, Estimates, Normalisers, Rollout, RolloutStep, Span, Trajectories};
 use perturb_policy::random::{Purpose, normal, stream, uniform};
 use perturb_policy::{
     ActionKind, Actor, Acts, CollectUntil, Inputs, ObservationNormaliser, Player, PolicySpec, RewardNormaliser, Role,

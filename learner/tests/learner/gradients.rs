@@ -205,7 +205,7 @@ fn gradients_agree_with_libtorch(
     network.load(policy.flat_weights()).expect("weights that fit");
     let mut gradient = vec![f32::NAN; spec.n_weights()];
     let losses = network
-        .gradient(policy.flat_weights(), &data.samples(), &indices, &objective, &mut gradient)
+        .gradient_at(policy.flat_weights(), &data.samples(), &indices, &objective, &mut gradient)
         .expect("a gradient");
     let (expected, reference) = data.torch(&torch(&spec, policy.flat_weights()), &indices, &objective);
     assert_arrays_close(&spec, &gradient, &reference);
@@ -249,7 +249,8 @@ fn ten_updates_agree_with_libtorch(
     let mut gradient = begin.clone();
     for indices in &minibatches {
         network.load(&own).expect("weights that fit");
-        let losses = network.gradient(&own, &data.samples(), indices, &objective, &mut gradient).expect("a gradient");
+        let losses =
+            network.gradient_at(&own, &data.samples(), indices, &objective, &mut gradient).expect("a gradient");
         own_descent.step(losses.total, &gradient, &mut own, learning_rate).expect("a step");
         let (losses, gradient) = data.torch(&torch(&spec, &reference), indices, &objective);
         reference_descent.step(losses.total, &gradient, &mut reference, learning_rate).expect("a step");

@@ -1,6 +1,7 @@
 //! Advantages against numbers from numpy (`crates/torch/tests/fixtures/make_losses.py`), and against identities.
 
-use perturb_learner::rollout::{Trajectories, explained_variance, gae, n_step_returns};
+use perturb_learner::algorithm::{gae, n_step_returns};
+use perturb_learner::rollout::{Trajectories, explained_variance};
 use proptest::prelude::*;
 
 /// Results of order 1 in f32, from means over 11 samples: some ten roundings of 2⁻²⁴.

@@ -2,12 +2,12 @@
 //! learn.
 
 use crate::common::{bases, connect, contents, moved, options, server};
-use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
+use perturb_learner::algorithm::{A2c, Algorithm, Ppo, gae};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{EndedEpisode, OpenOptions, Servers, Session, StepReply};
 use perturb_learner::evaluation::test;
 use perturb_learner::policy::Policy;
-use perturb_learner::rollout::{Collector, Normalisers, Rollout, RolloutStep, gae};
+use perturb_learner::rollout::{Collector, Normalisers, Rollout, RolloutStep};
 use perturb_learner::training::{RunDirectory, train};
 use perturb_policy::random::{Purpose, stream, uniform};
 use perturb_policy::{ActionKind, Actor, Acts, CollectUntil, Inputs, Player, PolicySpec, Role};

@@ -44,7 +44,7 @@ fn gradient(differentiator: &mut Differentiator, weights: &[f32], observations: 
         acting: None,
     };
     let mut gradient = vec![0.0; weights.len()];
-    differentiator.gradient(weights, &samples, indices, &OBJECTIVE, &mut gradient).expect("a gradient");
+    differentiator.gradient_at(weights, &samples, indices, &OBJECTIVE, &mut gradient).expect("a gradient");
 }
 
 const OBSERVATIONS: [f32; 6] = [1.0, 2.0, 3.0, 4.0, 5.0, 0.0];

@@ -47,7 +47,7 @@ fn gradient(action: ActionKind, n: usize, threads: usize) -> Vec<f32> {
     network.load(&weights).expect("weights that fit");
     let mut gradient = vec![f32::NAN; spec.n_weights()];
     let indices: Vec<u32> = (0..n as u32).collect();
-    network.gradient(&weights, &samples, &indices, &OBJECTIVE, &mut gradient).expect("a gradient");
+    network.gradient_at(&weights, &samples, &indices, &OBJECTIVE, &mut gradient).expect("a gradient");
     gradient
 }
 
@@ -90,7 +90,7 @@ fn what_an_actor_has_kept_gives_the_same_gradient(
         let expect_same = |network: &mut Differentiator, weights: &[f32], indices: &[u32]| {
             let gradient = |network: &mut Differentiator| {
                 let mut gradient = vec![f32::NAN; spec.n_weights()];
-                network.gradient(weights, &samples, indices, &OBJECTIVE, &mut gradient).expect("a gradient");
+                network.gradient_at(weights, &samples, indices, &OBJECTIVE, &mut gradient).expect("a gradient");
                 gradient.iter().map(|g| g.to_bits()).collect::<Vec<_>>()
             };
             let mut fresh = Differentiator::new(&spec, 1).expect("threads");
@@ -134,7 +134,7 @@ fn an_actors_networks_give_the_same_gradient(
     let objective = Objective { normalize_advantages: false, ..OBJECTIVE };
     let gradient = |network: &mut Differentiator| {
         let mut gradient = vec![f32::NAN; spec.n_weights()];
-        network.gradient(&weights, &samples, &[0], &objective, &mut gradient).expect("a gradient");
+        network.gradient_at(&weights, &samples, &[0], &objective, &mut gradient).expect("a gradient");
         gradient
     };
     let mut loaded = Differentiator::new(&spec, 1).expect("threads");
@@ -167,7 +167,7 @@ fn an_actors_networks_give_the_same_gradient(
     loaded.load(&others).expect("weights that fit");
     let gradient = |network: &mut Differentiator| {
         let mut gradient = vec![f32::NAN; spec.n_weights()];
-        network.gradient(&others, &samples, &[0], &objective, &mut gradient).expect("a gradient");
+        network.gradient_at(&others, &samples, &[0], &objective, &mut gradient).expect("a gradient");
         gradient
     };
     assert_eq!(gradient(&mut taken), gradient(&mut loaded));
@@ -308,7 +308,7 @@ fn gradients_are_finite_differences(
     network.load(&weights).expect("weights that fit");
     let mut gradient = vec![f32::NAN; weights.len()];
     let indices: Vec<u32> = (0..n as u32).rev().collect();
-    let losses = network.gradient(&weights, &samples, &indices, &objective, &mut gradient).expect("a gradient");
+    let losses = network.gradient_at(&weights, &samples, &indices, &objective, &mut gradient).expect("a gradient");
     let exact: Vec<f64> = weights.iter().map(|&w| f64::from(w)).collect();
     let expected = total(&spec, &exact, &samples, &objective);
     assert!((losses.total - expected).abs() < 1e-5 * expected.abs().max(1.0), "{} {expected}", losses.total);
@@ -351,10 +351,10 @@ fn lengths_that_do_not_fit_are_refused() {
         Samples { advantages: &[0.0; 1], ..samples },
     ];
     for samples in wrong {
-        let result = network.gradient(&weights, &samples, &[0], &OBJECTIVE, &mut gradient);
+        let result = network.gradient_at(&weights, &samples, &[0], &OBJECTIVE, &mut gradient);
         assert!(matches!(result, Err(Error::Length { .. })), "{result:?}");
     }
-    assert_eq!(network.gradient(&weights, &samples, &[], &OBJECTIVE, &mut gradient), Err(Error::NoSamples));
-    let result = network.gradient(&weights, &samples, &[0], &OBJECTIVE, &mut [0.0; 3]);
+    assert_eq!(network.gradient_at(&weights, &samples, &[], &OBJECTIVE, &mut gradient), Err(Error::NoSamples));
+    let result = network.gradient_at(&weights, &samples, &[0], &OBJECTIVE, &mut [0.0; 3]);
     assert!(matches!(result, Err(Error::Length { name: "gradient [P]", got: 3, .. })), "{result:?}");
 }

@@ -1,0 +1,52 @@
+//! The gradient backend of a policy.
+
+use crate::act::Actor;
+use crate::differentiator::Differentiator;
+use crate::error::Result;
+use crate::gradient::{Batch, GradientBackend};
+use crate::objective::{Losses, Objective};
+use crate::recurrent::{RecurrentDifferentiator, recurrent_differentiator};
+use crate::samples::SequenceSamples;
+use crate::spec::PolicySpec;
+
+/// The backend of a policy of shape `spec`. A feed-forward policy's computes with `threads` threads, at least 1, whose number
+/// changes no byte. A recurrent policy's ignores `threads`.
+///
+/// # Errors
+/// Threads that cannot be started; a recurrent policy in a process where nothing is registered to differentiate it.
+pub fn gradient_backend(spec: &PolicySpec, threads: usize) -> Result<Box<dyn GradientBackend>> {
+    Ok(match spec.lstm {
+        None => Box::new(Differentiator::new(spec, threads)?),
+        Some(_) => Box::new(RecurrentBackend(recurrent_differentiator(spec)?)),
+    })
+}
+
+/// The backend of recurrent policies. It gets the weights with each gradient, and keeps none.
+struct RecurrentBackend(Box<dyn RecurrentDifferentiator>);
+
+impl GradientBackend for RecurrentBackend {
+    fn batch<'a>(&self, sequences: &SequenceSamples<'a>) -> Result<Batch<'a>> {
+        Ok(Batch::Recurrent(self.0.batch(sequences)?))
+    }
+
+    fn remember_acting(&mut self, weights: &[f32], batch: &mut Batch<'_>) -> Result<()> {
+        let Batch::Recurrent(batch) = batch else { unreachable!("a feed-forward policy's batch") };
+        batch.remember_acting(weights)
+    }
+
+    fn gradient(
+        &mut self,
+        weights: &[f32],
+        batch: &Batch<'_>,
+        sequences: &[u32],
+        objective: &Objective,
+        gradient: &mut [f32],
+    ) -> Result<Losses> {
+        let Batch::Recurrent(batch) = batch else { unreachable!("a feed-forward policy's batch") };
+        batch.gradient(weights, sequences, objective, gradient)
+    }
+
+    fn weights_changed(&mut self) {}
+
+    fn reuse_activations(&mut self, _: &mut Actor) {}
+}
