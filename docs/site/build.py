@@ -68,6 +68,8 @@ class Links:
             if place is None:
                 return words
             target = os.path.relpath(place, Path(self.places[page]).parent)
+            if re.fullmatch(r"L\d+", anchor):
+                anchor = ""  # lines have addresses on GitHub, but not on the site
             return f"{image}[{words}]({target}{'#' if anchor else ''}{anchor})"
 
         parts = re.split(r"(^ *```.*?^ *```$)", text, flags=re.MULTILINE | re.DOTALL)

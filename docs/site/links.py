@@ -1,4 +1,5 @@
-"""Follows the relative links of the repository's documents, as GitHub does, and of the built site.
+"""Follows the relative links of the repository's documents, as GitHub does, and of the built site. A link to a line of a
+source file must show what it says, see code_links.py.
 
     links.py SITE
 
@@ -11,6 +12,8 @@ import re
 import sys
 from pathlib import Path
 from urllib.parse import unquote
+
+import code_links
 
 DOCUMENTS = [*Path().glob("*.md"), *Path("docs").rglob("*.md")]
 DOCUMENTS += [Path(folder) / "README.md" for folder in ("python", "docker", "results")]
@@ -78,6 +81,9 @@ def main():
         count, found = broken(paths, parse)
         wrong += found
         print(f"{count} links of {len(paths)} {what}")
+    count, found = code_links.broken(DOCUMENTS)
+    wrong += found
+    print(f"{count} links to lines")
     if wrong:
         sys.exit("\n".join(["Links to nowhere:", *wrong]))
 

@@ -9,7 +9,8 @@ use crate::act_ff::{Activations, BLOCK, Networks};
 use crate::error::{Error, Result, check_length};
 use crate::gradient::{ActingOutputs, Batch, GradientBackend};
 use crate::kernel::{Kernel, run};
-use crate::objective::{Acting, Gaussian, Losses, Objective, Outputs, Sample};
+use crate::losses::Losses;
+use crate::objective::{Acting, Gaussian, Objective, Outputs, Sample};
 use crate::perceptron::{Backward, Forward};
 use crate::samples::{Samples, SequenceSamples};
 use crate::spec::PolicySpec;
@@ -204,7 +205,7 @@ impl Differentiator {
                 run(Add { sums: gradient, more: &part.gradient });
             }
         }
-        Ok(losses.means(n, objective))
+        Ok(objective.means(losses, n))
     }
 
     /// Replaces `outputs` by the logits `[B, n]` or means `[B, A]` at `observations` `[B, O]`.

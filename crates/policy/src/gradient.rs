@@ -2,7 +2,8 @@
 
 use crate::act::Actor;
 use crate::error::Result;
-use crate::objective::{Losses, Objective};
+use crate::losses::Losses;
+use crate::objective::Objective;
 use crate::recurrent::RecurrentBatch;
 use crate::samples::{Samples, SequenceSamples};
 

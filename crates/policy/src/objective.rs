@@ -1,5 +1,6 @@
 //! What an update minimises, and its derivatives by a policy's outputs.
 
+use crate::losses::Losses;
 use crate::math::{exp, ln};
 use crate::sample::{LOG_TAU, greatest_and_total};
 use crate::spec::ActionKind;
@@ -38,58 +39,6 @@ pub struct Objective {
     pub value_clip_range: Option<f64>,
     /// Weight of the divergence from the acting policy, per nat.
     pub kl_coef: f64,
-}
-
-/// What the parts of a loss came to, as means over samples.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Losses {
-    /// The surrogate.
-    pub policy: f64,
-    /// The value loss, before `vf_coef`.
-    pub value: f64,
-    /// Entropy of the action distributions, nats.
-    pub entropy: f64,
-    /// The sum that is minimised.
-    pub total: f64,
-    /// Estimate of the KL divergence of the new from the acting policy, in nats: 1/B Σ_b (ρ_b - 1 - log ρ_b), which is not
-    /// negative but for rounding (as stable-baselines3; the reference logs 1/B Σ_b ½ log² ρ_b, which is the same to second order). 0 without
-    /// ratios.
-    pub approx_kl: f64,
-    /// Share of samples whose ratio is outside 1 ± range; 0 without ratios.
-    pub clip_fraction: f64,
-    /// KL(π_old ‖ π), nats; 0 where the acting distributions are not given.
-    pub kl_divergence: f64,
-}
-
-impl Losses {
-    /// These sums over `n` samples as means, with the total of `objective`.
-    pub(crate) fn means(self, n: usize, objective: &Objective) -> Self {
-        let mut means = self;
-        let parts = [
-            &mut means.policy,
-            &mut means.value,
-            &mut means.entropy,
-            &mut means.approx_kl,
-            &mut means.clip_fraction,
-            &mut means.kl_divergence,
-        ];
-        parts.into_iter().for_each(|sum| *sum /= n as f64);
-        let Objective { ent_coef, vf_coef, kl_coef, .. } = objective;
-        means.total = means.policy - ent_coef * means.entropy + vf_coef * means.value + kl_coef * means.kl_divergence;
-        means
-    }
-}
-
-impl std::ops::AddAssign for Losses {
-    fn add_assign(&mut self, other: Losses) {
-        self.policy += other.policy;
-        self.value += other.value;
-        self.entropy += other.entropy;
-        self.total += other.total;
-        self.approx_kl += other.approx_kl;
-        self.clip_fraction += other.clip_fraction;
-        self.kl_divergence += other.kl_divergence;
-    }
 }
 
 /// The distributions of the policy that acted, at B samples.
@@ -148,6 +97,23 @@ pub(crate) struct Outputs<'a> {
 }
 
 impl Objective {
+    /// The means over `n` samples whose losses have these `sums`, with their total.
+    pub(crate) fn means(&self, sums: Losses, n: usize) -> Losses {
+        let mut means = sums;
+        let parts = [
+            &mut means.policy,
+            &mut means.value,
+            &mut means.entropy,
+            &mut means.approx_kl,
+            &mut means.clip_fraction,
+            &mut means.kl_divergence,
+        ];
+        parts.into_iter().for_each(|sum| *sum /= n as f64);
+        let Objective { ent_coef, vf_coef, kl_coef, .. } = self;
+        means.total = means.policy - ent_coef * means.entropy + vf_coef * means.value + kl_coef * means.kl_divergence;
+        means
+    }
+
     /// The losses of one of `n` samples, not divided by `n`; the derivatives are.
     #[inline(always)]
     pub(crate) fn differentiate(

@@ -3,7 +3,8 @@
 use std::sync::OnceLock;
 
 use crate::error::{Error, Result};
-use crate::objective::{Losses, Objective};
+use crate::losses::Losses;
+use crate::objective::Objective;
 use crate::samples::SequenceSamples;
 use crate::spec::PolicySpec;
 

@@ -3,7 +3,7 @@
 use perturb_policy::{CollectUntil, Descent, Losses, Objective, Optimiser, Surrogate};
 use perturb_study::settings::A2cConfig;
 
-use super::{Algorithm, AlgorithmState, InTurn, UpdateStats, check_rollout, explained_variance};
+use super::{Algorithm, AlgorithmState, BaseAlgorithm, UpdateStats, check_rollout, explained_variance};
 use crate::error::Result;
 use crate::policy::Policy;
 use crate::rollout::{Estimates, Rollout, Trajectories};
@@ -37,7 +37,7 @@ impl Algorithm for A2c {
     }
 
     fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats> {
-        self.update_in_turn(policy, &[rollout], progress_remaining)
+        self.update_many(policy, &[rollout], progress_remaining)
     }
 
     fn state(&self) -> AlgorithmState {
@@ -50,8 +50,8 @@ impl Algorithm for A2c {
     }
 }
 
-impl InTurn for A2c {
-    fn update_in_turn(
+impl BaseAlgorithm for A2c {
+    fn update_many(
         &mut self,
         policy: &mut Policy,
         rollouts: &[&Rollout],

@@ -1,6 +1,6 @@
 //! EPOpt: learning from the worst episodes.
 
-use super::{Algorithm, AlgorithmState, InTurn, UpdateStats};
+use super::{Algorithm, AlgorithmState, BaseAlgorithm, UpdateStats};
 use crate::error::Result;
 use crate::policy::Policy;
 use crate::rollout::{Rollout, Span};
@@ -14,7 +14,7 @@ use perturb_study::settings::{EpoptConfig, Ranking};
 /// ranked by the sums of their normalised rewards.
 pub struct Epopt {
     config: EpoptConfig,
-    base: Box<dyn InTurn>,
+    base: Box<dyn BaseAlgorithm>,
     iterations: u64,
 }
 
@@ -36,7 +36,7 @@ pub struct Selection {
 
 impl Epopt {
     /// Checks the settings; `base` is fresh.
-    pub fn new(config: EpoptConfig, base: Box<dyn InTurn>) -> Result<Self> {
+    pub fn new(config: EpoptConfig, base: Box<dyn BaseAlgorithm>) -> Result<Self> {
         config.validate()?;
         Ok(Epopt { config, base, iterations: 0 })
     }
@@ -65,7 +65,7 @@ impl Algorithm for Epopt {
         };
         let parts: Vec<&[Span]> = if self.config.update_per_episode { kept.chunks(1).collect() } else { vec![&kept] };
         let parts = parts.into_iter().map(|episodes| rollout.select(episodes)).collect::<Result<Vec<Rollout>>>()?;
-        let mut stats = self.base.update_in_turn(policy, &parts.iter().collect::<Vec<_>>(), progress_remaining)?;
+        let mut stats = self.base.update_many(policy, &parts.iter().collect::<Vec<_>>(), progress_remaining)?;
         stats.selection = Some(selection);
         self.iterations += 1;
         Ok(stats)

@@ -34,14 +34,15 @@ pub trait Algorithm: Send {
     fn load_state(&mut self, state: &AlgorithmState) -> Result<()>;
 }
 
-/// What can learn from several rollouts in turn; EPOpt is wrapped around it.
-pub trait InTurn: Algorithm {
-    /// Improves `policy` by each of `rollouts`, at least one, as often as by one alone: A2C by a step on each, PPO by
-    /// `n_epochs` rounds of them. All advantages are those of before the first step. Figures are means over all steps.
+/// An algorithm that EPOpt can wrap: it can learn from several rollouts at once.
+pub trait BaseAlgorithm: Algorithm {
+    /// Improves `policy` by `rollouts`, at least one, with as many passes over each as over one alone: A2C takes a step on
+    /// each, PPO makes `n_epochs` passes over all. All advantages are estimated before the first step. Figures are means over
+    /// all steps.
     ///
     /// # Errors
     /// Those of [`Algorithm::update`].
-    fn update_in_turn(
+    fn update_many(
         &mut self,
         policy: &mut Policy,
         rollouts: &[&Rollout],
@@ -112,7 +113,7 @@ fn check_rollout(rollout: &Rollout, policy: &Policy, n_steps: usize) -> Result<(
 /// # Errors
 /// A setting out of its range.
 pub fn build(settings: &Settings, policy: &Policy, seed: u64) -> Result<Box<dyn Algorithm>> {
-    let base: Box<dyn InTurn> = match &settings.base {
+    let base: Box<dyn BaseAlgorithm> = match &settings.base {
         Base::A2c(settings) => Box::new(A2c::new(settings.clone(), policy)?),
         Base::Ppo(settings) => Box::new(Ppo::new(settings.clone(), policy, seed)?),
         Base::Random => unreachable!("a random policy is made, not trained"),

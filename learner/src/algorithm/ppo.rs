@@ -5,7 +5,7 @@ use perturb_policy::{Batch, CollectUntil, Descent, Losses, Objective, Optimiser,
 use perturb_study::settings::{PpoConfig, SettingError};
 use rand_chacha::ChaCha8Rng;
 
-use super::{Algorithm, AlgorithmState, InTurn, UpdateStats, check_rollout, explained_variance};
+use super::{Algorithm, AlgorithmState, BaseAlgorithm, UpdateStats, check_rollout, explained_variance};
 use crate::error::Result;
 use crate::policy::Policy;
 use crate::rollout::{Estimates, Rollout, Trajectories};
@@ -52,7 +52,7 @@ impl Algorithm for Ppo {
     }
 
     fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats> {
-        self.update_in_turn(policy, &[rollout], progress_remaining)
+        self.update_many(policy, &[rollout], progress_remaining)
     }
 
     fn state(&self) -> AlgorithmState {
@@ -69,8 +69,8 @@ impl Algorithm for Ppo {
     }
 }
 
-impl InTurn for Ppo {
-    fn update_in_turn(
+impl BaseAlgorithm for Ppo {
+    fn update_many(
         &mut self,
         policy: &mut Policy,
         rollouts: &[&Rollout],

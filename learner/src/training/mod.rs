@@ -1,8 +1,8 @@
 //! The training loop: collect rollouts, update policies, log, write checkpoints.
 //!
-//! [`train`] and [`resume`] train one run, [`train_together`] several. All end in one loop, [`train_loop`]. Runs differ in
-//! who chooses actions: this process, for all runs of one session in lockstep ([`ClientSide`]; a run alone is a lockstep of
-//! one), or the server, in a session for each run ([`ServerSide`]). Both implement [`CollectRollouts`]. A [`Trainer`] holds
+//! [`train`] and [`resume`] train one run, [`train_together`] several. All end in one loop, `train_loop`. Runs differ in
+//! who chooses actions: this process, for all runs of one session in lockstep (`ClientSide`; a run alone is a lockstep of
+//! one), or the server, in a session for each run (`ServerSide`). Both implement `CollectRollouts`. A `Trainer` holds
 //! everything else of a run. docs/reading-ppo.md follows PPO from the command line through this file to the weights.
 //!
 //! Randomness: the environments' seed is the training's seed; initial weights, minibatch order and sampled actions have
@@ -12,6 +12,7 @@
 
 mod client_side;
 mod ending;
+mod entry;
 mod error;
 mod random;
 mod run_directory;
@@ -24,6 +25,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use client_side::ClientSide;
 pub use ending::is_over;
+pub use entry::{Entry, Outcome, Start};
 pub use error::{LastCheckpoint, TrainError};
 use perturb_policy::{Normalisers, Player, PlayerState};
 use perturb_study::interrupt::StopFlag;
@@ -41,66 +43,6 @@ type Result<T> = std::result::Result<T, TrainError>;
 
 /// During longer updates connections are kept alive. Servers wait for seconds at least.
 const LONG_UPDATE: Duration = Duration::from_millis(100);
-
-/// Result of a training.
-#[derive(Debug)]
-pub struct Outcome {
-    /// The last checkpoint, as written.
-    pub checkpoint: Checkpoint,
-    /// Figures of the last iteration.
-    pub progress: Progress,
-    /// The signal that ended the training before its budget; `None` if it ran to its end.
-    pub signal: Option<i32>,
-}
-
-/// A training to begin or to resume.
-#[derive(Debug)]
-pub struct Entry<'a> {
-    /// The directory for logs and checkpoints.
-    pub directory: &'a RunDirectory,
-    /// The point at which the training starts.
-    pub start: Start,
-    /// Numbers of episodes, ascending, after which the policy is kept for an intermediate evaluation, see
-    /// [`RunDirectory::mark`].
-    pub marks: &'a [u64],
-}
-
-/// The point at which a training starts.
-#[derive(Clone, Debug)]
-pub enum Start {
-    /// Initial weights.
-    Fresh(Box<TrainConfig>),
-    /// The last checkpoint.
-    Checkpoint(Box<(Checkpoint, ResumeState)>),
-}
-
-impl Start {
-    fn config(&self) -> &TrainConfig {
-        match self {
-            Self::Fresh(config) => config,
-            Self::Checkpoint(saved) => &saved.0.state.config,
-        }
-    }
-
-    /// Steps that were trained before.
-    fn timesteps(&self) -> u64 {
-        match self {
-            Self::Fresh(_) => 0,
-            Self::Checkpoint(saved) => saved.0.state.counters.timesteps,
-        }
-    }
-
-    /// The point at which an interrupted training of `config` in `directory` is resumed.
-    fn resume_point(directory: &RunDirectory, config: &TrainConfig) -> Result<Self> {
-        Ok(match directory.last_checkpoint()? {
-            Some((mut checkpoint, state)) => {
-                checkpoint.state.config = config.clone(); // a larger budget may not have been saved yet
-                Self::Checkpoint(Box::new((checkpoint, state)))
-            }
-            None => Self::Fresh(Box::new(config.clone())),
-        })
-    }
-}
 
 /// Trains as `config` says and writes logs and checkpoints to `directory`. Updates use `threads` threads, whose number
 /// changes no byte. Calls `report` after every iteration. When `stop` is raised, the iteration is finished and the

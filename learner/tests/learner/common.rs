@@ -1,6 +1,6 @@
 //! What the tests of EPOpt and of RL² share.
 
-use perturb_learner::algorithm::{A2c, InTurn, Ppo};
+use perturb_learner::algorithm::{A2c, BaseAlgorithm, Ppo};
 use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers};
 use perturb_learner::policy::Policy;
 use perturb_learner::rollout::Rollout;
@@ -44,7 +44,7 @@ pub fn moved(spec: &PolicySpec) -> Policy {
 }
 
 /// A2C and PPO.
-pub fn bases(n_steps: usize, n_minibatches: usize, policy: &Policy) -> [Box<dyn InTurn>; 2] {
+pub fn bases(n_steps: usize, n_minibatches: usize, policy: &Policy) -> [Box<dyn BaseAlgorithm>; 2] {
     let a2c = A2cConfig { n_steps, learning_rate: 7e-3, ..A2cConfig::default() };
     let ppo =
         PpoConfig { n_steps, n_minibatches, n_epochs: 3, learning_rate: 3e-3, kl_coef: 0.1, ..Default::default() };

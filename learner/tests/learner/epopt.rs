@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, HashSet};
 
 use crate::common::{bases, connect, contents, moved, options, server};
-use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Epopt, InTurn, Ppo, Selection, UpdateStats};
+use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, BaseAlgorithm, Epopt, Ppo, Selection, UpdateStats};
 use perturb_learner::client::{EndedEpisode, PrivateServer, Session};
 use perturb_learner::error::Error;
 use perturb_learner::policy::Policy;
@@ -86,7 +86,7 @@ fn of_episodes(spec: &PolicySpec, n_envs: usize) -> Rollout {
     Rollout::of_episodes(n_envs, O, spec.action.width())
 }
 
-fn epopt(base: Box<dyn InTurn>, epsilon: f64, full_iterations: u64) -> Epopt {
+fn epopt(base: Box<dyn BaseAlgorithm>, epsilon: f64, full_iterations: u64) -> Epopt {
     let config = EpoptConfig { episodes_per_iteration: 8, epsilon, full_iterations, ..EpoptConfig::default() };
     Epopt::new(config, base).expect("valid settings")
 }
@@ -203,7 +203,7 @@ fn each_kept_episode_can_have_an_update_of_its_own() {
             let mut other = moved(&spec);
             let mut each = base(&other);
             let parts: Vec<&Rollout> = alone.iter().collect();
-            let expected = each.update_in_turn(&mut other, &parts, 1.0).expect("an update");
+            let expected = each.update_many(&mut other, &parts, 1.0).expect("an update");
             assert_eq!(policy.weights(), other.weights(), "{lstm:?}");
             assert_eq!(UpdateStats { selection: None, ..stats }, expected, "{lstm:?}");
             let mut other = moved(&spec);
@@ -244,7 +244,7 @@ fn an_epoch_of_ppo_is_a_round_of_all_kept_episodes() {
             let config = PpoConfig { n_epochs, learning_rate: 3e-3, ..PpoConfig::default() };
             let mut ppo = Ppo::new(config, &policy, 1).expect("valid settings");
             for _ in 0..updates {
-                ppo.update_in_turn(&mut policy, &parts, 1.0).expect("an update");
+                ppo.update_many(&mut policy, &parts, 1.0).expect("an update");
             }
             policy.weights()
         };
@@ -531,7 +531,7 @@ fn padding_is_no_sample_of_an_update() {
         for action in [DISCRETE, CONTINUOUS] {
             let spec = spec(action, lstm);
             let rollout = play(&moved(&spec), &unequal(), &zeros(&unequal()), of_episodes(&spec, 4));
-            let update = |mut algorithm: Box<dyn InTurn>, episodes: &[Span]| {
+            let update = |mut algorithm: Box<dyn BaseAlgorithm>, episodes: &[Span]| {
                 let packed = rollout.select(episodes).expect("its own episodes");
                 algorithm.update(&mut moved(&spec), &packed, 1.0).expect("an update")
             };
@@ -731,12 +731,12 @@ fn pull(policy: &Policy, rng: &mut ChaCha8Rng, episodes: usize) -> Rollout {
     rollout
 }
 
-fn a2c(policy: &Policy) -> Box<dyn InTurn> {
+fn a2c(policy: &Policy) -> Box<dyn BaseAlgorithm> {
     let config = A2cConfig { learning_rate: 7e-3, ..A2cConfig::default() };
     Box::new(A2c::new(config, policy).expect("valid settings"))
 }
 
-fn ppo(policy: &Policy) -> Box<dyn InTurn> {
+fn ppo(policy: &Policy) -> Box<dyn BaseAlgorithm> {
     let config = PpoConfig { learning_rate: 3e-3, ..PpoConfig::default() };
     Box::new(Ppo::new(config, policy, 5).expect("valid settings"))
 }
@@ -746,7 +746,7 @@ fn ppo(policy: &Policy) -> Box<dyn InTurn> {
 #[case::a2c(a2c, 1500)]
 #[case::ppo(ppo, 100)]
 fn it_avoids_what_is_catastrophic_in_some_environments_and_its_base_does_not(
-    #[case] base: fn(&Policy) -> Box<dyn InTurn>,
+    #[case] base: fn(&Policy) -> Box<dyn BaseAlgorithm>,
     #[case] updates: usize,
     #[values(0.2, 1.0)] epsilon: f64,
 ) {

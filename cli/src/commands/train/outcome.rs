@@ -1,0 +1,104 @@
+//! The messages at the end of `perturb train`.
+
+use std::io::Write;
+use std::process::ExitCode;
+
+use perturb_learner::checkpoint::State;
+use perturb_learner::logging::{EpisodeFigures, Progress, TimeShares};
+use perturb_learner::training::{Outcome, RunDirectory, TrainError};
+use perturb_study::settings::TrainConfig;
+use perturb_study::words::quoted;
+use serde_json::json;
+
+use super::super::again::{explain, resume_command};
+use super::super::args::TrainArgs;
+use super::super::display::note;
+use super::super::error::Result;
+use super::super::signal_code;
+
+/// Says what a training came to.
+pub(super) fn end(
+    args: &TrainArgs,
+    config: &TrainConfig,
+    directory: &RunDirectory,
+    outcome: Result<Outcome, TrainError>,
+) -> Result<ExitCode> {
+    let outcome = match outcome {
+        Ok(outcome) => outcome,
+        Err(TrainError::Stopped { signal, source }) => {
+            let lost = explain(*source, &args.play);
+            note(format_args!("stopped by signal {signal}, waiting for a server: {lost}"));
+            return Ok(signal_code(signal));
+        }
+        Err(error) => return Err(explain(error, &args.play)),
+    };
+    if !config.settings.is_random() {
+        summarise(&outcome.progress);
+    }
+    if let Some(number) = outcome.signal {
+        note(format_args!(
+            "stopped by signal {number} after {} of {} episodes; go on with: {}",
+            outcome.progress.episodes,
+            config.common.episodes,
+            resume_command(directory.path(), &args.play)
+        ));
+    }
+    say(args, directory, &outcome.checkpoint.state, outcome.progress.recent, outcome.signal)?;
+    Ok(outcome.signal.map_or(ExitCode::SUCCESS, signal_code))
+}
+
+/// Says where the policy is and, as JSON, what it is; `recent` are the means over the last 100 episodes.
+pub(super) fn say(
+    args: &TrainArgs,
+    directory: &RunDirectory,
+    state: &State,
+    recent: Option<EpisodeFigures>,
+    signal: Option<i32>,
+) -> Result<()> {
+    let TrainConfig { common, settings } = &state.config;
+    args.json.write(json!({
+        "run": directory.path(),
+        "checkpoint": directory.checkpoint(),
+        "environment": common.environment,
+        "algorithm": settings.name(),
+        "architecture": common.architecture,
+        "train_version": common.version,
+        "train_parameters": common.parameters,
+        "seed": common.seed,
+        "training_episodes": state.counters.episodes,
+        "training_steps": state.counters.timesteps,
+        "budget": common.episodes,
+        "finished": signal.is_none(),
+        "last_100": recent.map(|EpisodeFigures { episode_return, length, success }| json!({
+            "success_percent": 100.0 * success,
+            "mean_return": episode_return,
+            "mean_length": length,
+        })),
+    }))?;
+    if signal.is_some() || args.json.is_printed() {
+        return Ok(());
+    }
+    let mut out = std::io::stdout();
+    writeln!(out, "trained policy: {}", directory.checkpoint().display())?;
+    let command = format!("perturb evaluate --checkpoint {}", quoted(directory.path()));
+    Ok(writeln!(out, "test it: {command}")?)
+}
+
+/// A line of figures, with the shares of the time.
+fn summarise(progress: &Progress) {
+    let TimeShares { acting, waiting, updating } = progress.percent();
+    let recent = match progress.recent {
+        Some(EpisodeFigures { episode_return, length, success }) => {
+            format!("; the last 100: return {episode_return:.1}, length {length:.1}, success {:.1} %", 100.0 * success)
+        }
+        None => String::new(),
+    };
+    note(format_args!(
+        "{} episodes, {} steps in {:.1} s{recent}",
+        progress.episodes, progress.timesteps, progress.elapsed
+    ));
+    note(format_args!(
+        "{:.0} steps/s: {acting:.0} % acting, {waiting:.0} % waiting for the server, {updating:.0} % updating",
+        progress.fps()
+    ));
+}
