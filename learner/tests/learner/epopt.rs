@@ -3,7 +3,9 @@
 use std::collections::{BTreeMap, HashSet};
 
 use crate::common::{bases, connect, contents, moved, options, server};
-use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, BaseAlgorithm, Epopt, Ppo, Selection, UpdateStats};
+use perturb_learner::algorithm::{
+    A2c, Algorithm, AlgorithmState, BaseAlgorithm, Epopt, Ppo, Selection, UpdateStats, gae, n_step_returns,
+};
 use perturb_learner::client::{EndedEpisode, PrivateServer, Session};
 use perturb_learner::error::Error;
 use perturb_learner::policy::Policy;
