@@ -21,7 +21,7 @@ use super::{
     },
     security::Guards,
     session::{
-        driver::{Limits, Sessions},
+        admission::{Limits, Sessions},
         lease::{self, Leases},
     },
     shutdown::{Controller, Drain, Phase},

@@ -17,7 +17,9 @@ use perturb::server::error::{ErrorCounters, ErrorKind};
 use perturb::server::net::access_log::Access;
 use perturb::server::net::managed_io::Guarded;
 use perturb::server::net::peer_limiter::{Peer, Places};
-use perturb::server::session::driver::{Limits, Responses, Sessions};
+use perturb::server::session::admission::{Limits, Sessions};
+use perturb::server::session::driver::Responses;
+use perturb::server::session::instrumented::Counts;
 use perturb::server::session::lease::{Leases, Numbers};
 use perturb::server::shutdown::Controller;
 use perturb::server::transport::budget::Budget;
@@ -96,7 +98,8 @@ pub async fn serve(ledger: Ledger) -> turmoil::Result {
     let limits = Limits { bytes: MOST_BYTES, handshake: HANDSHAKE, idle: None };
     let (places, numbers, counters) = (ledger.places.clone(), ledger.numbers.clone(), ledger.counters.clone());
     let sessions = Sessions::new(places, limits, drain, counters, Access::default(), numbers.clone());
-    let service = Service { sessions, leases: Leases::new(LEASE, numbers), ledger };
+    let counts = Counts::new::<Counting>();
+    let service = Service { sessions, leases: Leases::new(LEASE, numbers), ledger, counts };
     let transit = Transit { budget, limit: Some(LEASE), handshake: HANDSHAKE };
     let listener = turmoil::net::TcpListener::bind((Ipv4Addr::UNSPECIFIED, PORT)).await?;
     let connections = Places::new(usize::MAX, usize::MAX);
@@ -142,6 +145,7 @@ struct Service {
     sessions: Sessions,
     leases: Leases<proto::SessionResponse>,
     ledger: Ledger,
+    counts: Arc<Counts>,
 }
 
 #[tonic::async_trait]
@@ -160,6 +164,6 @@ impl proto::perturb_server::Perturb for Service {
         mut request: Request<Streaming<proto::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
         let counting = Counting::new(self.leases.clone(), self.ledger.clone());
-        Ok(Response::new(self.sessions.begin(raw_body::messages(&mut request)?, counting)?))
+        Ok(Response::new(self.sessions.begin(raw_body::messages(&mut request)?, counting, &self.counts)?))
     }
 }

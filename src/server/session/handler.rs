@@ -1,80 +1,84 @@
-//! What answers the requests of a session, whatever its protocol.
+//! What answers the requests of a session, whatever its protocol and its transport: a request in, a reply out.
 
 use super::{
     Error,
     lease::{Grant, Ticket},
 };
-use crate::{
-    pool::Follower,
-    server::{
-        error::RequestError,
-        limits::Allowance,
-        net::access_log::About,
-        transport::{budget::Outbox, precheck::Field},
-    },
+use crate::server::{
+    error::RequestError,
+    limits::Allowance,
+    net::access_log::About,
+    transport::{budget::Share, precheck::Field},
 };
 use std::future::Future;
 
-/// What becomes of a stream after a response.
-pub enum Turn<R> {
-    /// Its session has a lease, and outlives it.
-    Leased(Grant<R>),
-    /// It goes on with the session that it has taken up.
-    TakesUp(Ticket<R>),
+/// What a response does to the stream that it is sent in.
+pub enum StreamHandover<R> {
+    /// The session has a lease from now on, and outlives the stream.
+    Lease(Grant<R>),
+    /// The stream goes on with the session that it resumes.
+    Resume(Ticket<R>),
 }
 
-/// The server's part of a conversation. Dropping it frees what it holds.
-pub trait Dialogue: Send + 'static {
-    /// What the client sends.
-    type Request: prost::Message + Default + 'static;
-    /// What it gets.
-    type Response: prost::Message + Clone + 'static;
-    /// Why a request is refused: by the dialogue, or by its transport.
-    type Error: RequestError + From<Error> + Send;
-    /// The parts of a request that are counted before it is decoded.
-    const FIELDS: &'static [Field];
-    /// What the protocol is called.
-    const PROTOCOL: &'static str;
+/// The answer to a request.
+pub struct Reply<R> {
+    /// The response.
+    pub response: R,
+    /// The memory that the response takes until it is sent, if it is not part of what the session holds anyway.
+    pub memory: Option<Share>,
+    /// What the response does to its stream.
+    pub handover: Option<StreamHandover<R>>,
+}
 
-    /// What the client may send now.
+impl<R> Reply<R> {
+    /// A reply that changes nothing but the session.
+    pub fn new(response: R) -> Self {
+        Self { response, memory: None, handover: None }
+    }
+}
+
+/// The state of one session, in one protocol. Dropping it frees what it holds.
+pub trait SessionHandler: Send + 'static {
+    /// A message of the client.
+    type Request: prost::Message + Default + 'static;
+    /// A message of the server.
+    type Response: prost::Message + Clone + 'static;
+    /// Why a request is refused, by the handler or before it.
+    type Error: RequestError + From<Error> + Send;
+    /// The fields of a request whose entries are counted before it is decoded.
+    const FIELDS: &'static [Field];
+    /// The protocol's name in logs and metrics.
+    const PROTOCOL: &'static str;
+    /// The kinds of requests in logs and metrics. The last one is for requests that cannot be decoded.
+    const KINDS: &'static [&'static str];
+    /// Whether a request resumes another session; `None` in a protocol without leases.
+    const RESUMES: Option<fn(&Self::Request) -> bool>;
+
+    /// The kind of a request, one of [`KINDS`](Self::KINDS).
+    fn kind(request: &Self::Request) -> &'static str;
+
+    /// How large the next request may be.
     fn allowance(&self) -> Allowance;
 
-    /// Whether it holds something that a shutdown should wait for.
+    /// Whether the session holds something that a shutdown should wait for.
     fn is_open(&self) -> bool;
 
-    /// What has come of it so far.
+    /// What the session has done so far.
     fn about(&self) -> About;
 
     /// Answers a request.
-    fn answer(&mut self, request: Self::Request) -> impl Future<Output = Result<Self::Response, Self::Error>> + Send;
+    ///
+    /// # Errors
+    /// Why the request is refused; the session goes on.
+    fn answer(
+        &mut self,
+        request: Self::Request,
+    ) -> impl Future<Output = Result<Reply<Self::Response>, Self::Error>> + Send;
 
-    /// Where the request after this one is told of that comes before it is answered; none if it must wait for its turn.
-    fn follower(&self, _request: &Self::Request) -> Option<Follower> {
-        None
-    }
+    /// Returns a function that offers the next request to the pool while `request` runs, or `None` if the next request must
+    /// wait. The caller must answer a request that it offered next.
+    fn pipeline(&self, request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<Self>>;
 
-    /// Tells of it. It will be the next that is answered.
-    fn follow(_follower: &Follower, _request: Self::Request) {}
-
-    /// Takes note of a request that was refused before it was decoded.
-    fn undecoded(&self, _error: &Self::Error) {}
-
-    /// Whether there are requests that take up another session.
-    const TAKES_UP: bool = false;
-
-    /// Whether a request does.
-    fn takes_up(_request: &Self::Request) -> bool {
-        false
-    }
-
-    /// What becomes of the stream after the response that was just given, if not what was before; told once.
-    fn turn(&mut self) -> Option<Turn<Self::Response>> {
-        None
-    }
-
-    /// Its responses go by another stream now, or by none: this is where their shares go.
-    fn attach(&mut self, _outbox: Outbox) {}
-
-    /// The answer to a request that is refused.
+    /// The response to a request that is refused.
     fn refusal(error: Self::Error) -> Self::Response;
 }

@@ -8,7 +8,7 @@ use crate::server::{
     auth::Bearer,
     error::{ErrorKind, RequestError},
     id::{Id, NoRandomness, random},
-    transport::message_reader::Frames,
+    transport::{budget::Share, message_reader::Frames},
 };
 use std::{
     sync::{
@@ -72,8 +72,16 @@ impl RequestError for Error {
     }
 }
 
-/// Where responses go that are made elsewhere than in the stream which sends them.
-pub type Line<T> = mpsc::Sender<Result<T, Status>>;
+/// A response on its way to a stream.
+pub struct OutgoingResponse<R> {
+    /// The response.
+    pub response: R,
+    /// The memory that it takes until it is sent.
+    pub memory: Option<Share>,
+}
+
+/// Sends responses to a stream, or the status that ends it.
+pub type Line<R> = mpsc::Sender<Result<OutgoingResponse<R>, Status>>;
 
 /// The leases of a server, of sessions with these responses.
 pub struct Leases<R>(Arc<State<R>>);

@@ -38,6 +38,11 @@ impl<R> Kept<R> {
         self.replies.iter()
     }
 
+    /// The same, to be changed.
+    pub fn replies_mut(&mut self) -> impl Iterator<Item = &mut R> {
+        self.replies.iter_mut()
+    }
+
     /// Lets go of all of them.
     pub fn clear(&mut self) {
         self.replies.clear();
@@ -59,9 +64,10 @@ impl<R> Kept<R> {
     }
 
     /// The reply of this number, if it is here.
-    pub fn get(&self, number: u64) -> Option<&R> {
+    pub fn get_mut(&mut self, number: u64) -> Option<&mut R> {
         let behind = usize::try_from(self.last.checked_sub(number)?).ok()?;
-        self.replies.get(self.replies.len().checked_sub(behind + 1)?)
+        let place = self.replies.len().checked_sub(behind + 1)?;
+        self.replies.get_mut(place)
     }
 }
 
@@ -75,13 +81,13 @@ mod tests {
         let mut kept = Kept::new(1);
         kept.asked();
         kept.made('a');
-        assert_eq!((kept.check(0), kept.check(1), kept.get(1)), (Ok(()), Ok(()), Some(&'a')));
+        assert_eq!((kept.check(0), kept.check(1), kept.get_mut(1)), (Ok(()), Ok(()), Some(&mut 'a')));
         assert_eq!(kept.check(2), Err(Error::NoReply { got: 2, last: 1 }));
         kept.asked();
         assert_eq!(kept.check(0), Err(Error::Forgotten { got: 0, first: 1 }));
-        assert_eq!((kept.check(1), kept.get(1)), (Ok(()), None), "that one was received, and is not wanted");
+        assert_eq!((kept.check(1), kept.get_mut(1)), (Ok(()), None), "that one was received, and is not wanted");
         kept.made('b');
-        assert_eq!((kept.get(1), kept.get(2), kept.get(3)), (None, Some(&'b'), None));
+        assert_eq!([1, 2, 3].map(|number| kept.get_mut(number).copied()), [None, Some('b'), None]);
         kept.clear();
         assert_eq!((kept.check(1), kept.check(2)), (Err(Error::Forgotten { got: 1, first: 2 }), Ok(())));
     }
@@ -107,10 +113,11 @@ mod tests {
                     _ => {}
                 }
                 prop_assert_eq!(kept.check(received), Ok(()));
-                for number in received + 1..=kept.last() {
-                    prop_assert_eq!(kept.get(number), Some(&number));
+                for mut number in received + 1..=kept.last() {
+                    prop_assert_eq!(kept.get_mut(number), Some(&mut number));
                 }
-                prop_assert_eq!(kept.get(kept.last() + 1), None);
+                let last = kept.last();
+                prop_assert_eq!(kept.get_mut(last + 1), None);
                 prop_assert!(kept.replies.len() <= most);
                 prop_assert!(kept.check(kept.last() + 1).is_err());
             }

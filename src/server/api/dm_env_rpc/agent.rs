@@ -17,7 +17,11 @@ use crate::{
         auth::Bearer,
         limits::{Allowance, MOST_BYTES_BEFORE_OPEN},
         net::access_log::About,
-        session::{self, driver::Sessions, handler::Dialogue, instrumented::Observed},
+        session::{
+            self,
+            admission::Sessions,
+            handler::{Reply, SessionHandler},
+        },
         shutdown::Phase,
         transport::precheck::Field,
     },
@@ -124,12 +128,38 @@ impl Drop for Agent {
     }
 }
 
-impl Dialogue for Agent {
+impl SessionHandler for Agent {
     type Request = rpc::EnvironmentRequest;
     type Response = rpc::EnvironmentResponse;
     type Error = Error;
     const FIELDS: &'static [Field] = ENVIRONMENT_REQUEST;
     const PROTOCOL: &'static str = "dm_env_rpc.v1";
+    const KINDS: &'static [&'static str] = &[
+        "create_world",
+        "join_world",
+        "step",
+        "reset",
+        "reset_world",
+        "leave_world",
+        "destroy_world",
+        "extension",
+        "unknown",
+    ];
+    const RESUMES: Option<fn(&Self::Request) -> bool> = None;
+
+    fn kind(request: &Self::Request) -> &'static str {
+        match request.payload {
+            Some(Request::CreateWorld(_)) => "create_world",
+            Some(Request::JoinWorld(_)) => "join_world",
+            Some(Request::Step(_)) => "step",
+            Some(Request::Reset(_)) => "reset",
+            Some(Request::ResetWorld(_)) => "reset_world",
+            Some(Request::LeaveWorld(_)) => "leave_world",
+            Some(Request::DestroyWorld(_)) => "destroy_world",
+            Some(Request::Extension(_)) => "extension",
+            None => "unknown",
+        }
+    }
 
     fn allowance(&self) -> Allowance {
         Allowance { bytes: if self.is_open() { MOST_BYTES } else { MOST_BYTES_BEFORE_OPEN }, entries: 1, covered: 0 }
@@ -144,7 +174,7 @@ impl Dialogue for Agent {
         self.about
     }
 
-    async fn answer(&mut self, request: Self::Request) -> Result<Self::Response, Error> {
+    async fn answer(&mut self, request: Self::Request) -> Result<Reply<Self::Response>, Error> {
         let response = match request.payload {
             Some(Request::CreateWorld(create)) => self.create_world(create).await.map(Response::CreateWorld),
             Some(Request::JoinWorld(join)) => self.join_world(join).await.map(Response::JoinWorld),
@@ -164,38 +194,15 @@ impl Dialogue for Agent {
                 Err(Error::value("request", "empty or of a kind this server does not know", expected))
             }
         };
-        response.map(|payload| rpc::EnvironmentResponse { payload: Some(payload) })
+        response.map(|payload| Reply::new(rpc::EnvironmentResponse { payload: Some(payload) }))
+    }
+
+    /// A world is stepped by the thread that asks.
+    fn pipeline(&self, _request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<>> {
+        None::<fn(Self::Request)>
     }
 
     fn refusal(error: Error) -> Self::Response {
         rpc::EnvironmentResponse { payload: Some(Response::Error(error.into())) }
-    }
-}
-
-impl Observed for Agent {
-    const KINDS: &'static [&'static str] = &[
-        "create_world",
-        "join_world",
-        "step",
-        "reset",
-        "reset_world",
-        "leave_world",
-        "destroy_world",
-        "extension",
-        "unknown",
-    ];
-
-    fn kind(request: &Self::Request) -> &'static str {
-        match request.payload {
-            Some(Request::CreateWorld(_)) => "create_world",
-            Some(Request::JoinWorld(_)) => "join_world",
-            Some(Request::Step(_)) => "step",
-            Some(Request::Reset(_)) => "reset",
-            Some(Request::ResetWorld(_)) => "reset_world",
-            Some(Request::LeaveWorld(_)) => "leave_world",
-            Some(Request::DestroyWorld(_)) => "destroy_world",
-            Some(Request::Extension(_)) => "extension",
-            None => "unknown",
-        }
     }
 }

@@ -7,10 +7,7 @@ use crate::{
     proto::dm_env_rpc::v1::{EnvironmentRequest, EnvironmentResponse, environment_server::Environment},
     server::{
         audit::ledger::Ledger,
-        session::{
-            driver::{Responses, Sessions},
-            instrumented::{Counted, Counts},
-        },
+        session::{admission::Sessions, driver::Responses, instrumented::Counts},
         transport::raw_body,
     },
 };
@@ -31,7 +28,7 @@ pub struct Service {
 impl Service {
     /// A service over a pool, without worlds, whose draws the ledger has.
     pub fn new(pool: Arc<Pool>, catalogue: Arc<Catalogue>, sessions: Sessions, ledger: Option<Ledger>) -> Self {
-        Self { worlds: Arc::new(Worlds::new(pool, catalogue, ledger)), sessions, counts: Counts::of::<Agent>() }
+        Self { worlds: Arc::new(Worlds::new(pool, catalogue, ledger)), sessions, counts: Counts::new::<Agent>() }
     }
 
     /// The requests so far.
@@ -50,6 +47,6 @@ impl Environment for Service {
     ) -> Result<Response<Self::ProcessStream>, Status> {
         let frames = raw_body::messages(&mut request)?;
         let agent = Agent::new(Arc::clone(&self.worlds), frames.bearer.clone(), self.sessions.clone());
-        Ok(Response::new(self.sessions.begin(frames, Counted::new(agent, &self.counts))?))
+        Ok(Response::new(self.sessions.begin(frames, agent, &self.counts)?))
     }
 }

@@ -4,10 +4,7 @@ use super::session::{Session, Shared};
 use crate::{
     proto::{self, perturb_server::Perturb},
     server::{
-        session::{
-            driver::{Responses, Sessions},
-            instrumented::{Counted, Counts},
-        },
+        session::{admission::Sessions, driver::Responses, instrumented::Counts},
         transport::raw_body,
     },
 };
@@ -28,7 +25,7 @@ pub struct Service {
 impl Service {
     /// A service of sessions that share this.
     pub fn new(shared: Shared, sessions: Sessions) -> Self {
-        Self { shared: Arc::new(shared), sessions, counts: Counts::of::<Session>() }
+        Self { shared: Arc::new(shared), sessions, counts: Counts::new::<Session>() }
     }
 
     /// The requests so far.
@@ -53,8 +50,7 @@ impl Perturb for Service {
         mut request: Request<Streaming<proto::SessionRequest>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
         let frames = raw_body::messages(&mut request)?;
-        let (budget, outbox) = (frames.budget().clone(), frames.outbox.clone());
-        let session = Session::new(Arc::clone(&self.shared), frames.bearer.clone(), budget, outbox);
-        Ok(Response::new(self.sessions.begin(frames, Counted::new(session, &self.counts))?))
+        let session = Session::new(Arc::clone(&self.shared), frames.bearer.clone(), frames.budget().clone());
+        Ok(Response::new(self.sessions.begin(frames, session, &self.counts)?))
     }
 }

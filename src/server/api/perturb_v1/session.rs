@@ -3,7 +3,7 @@
 use super::{Error, convert, fields::SESSION_REQUEST, policy, sizes};
 use crate::{
     env::Catalogue,
-    pool::{Batch, Follower, Pool},
+    pool::{Batch, Pool},
     proto::{self, session_request::Request, session_response::Response},
     render::Renderer,
     server::{
@@ -12,12 +12,11 @@ use crate::{
         limits::{Allowance, MOST_BYTES_BEFORE_OPEN},
         net::access_log::About,
         session::{
-            handler::{Dialogue, Turn},
-            instrumented::Observed,
+            handler::{Reply, SessionHandler, StreamHandover},
             lease::{Leases, MOST_KEPT},
         },
         transport::{
-            budget::{Budget, Outbox, Share},
+            budget::{Budget, Share},
             precheck::Field,
         },
     },
@@ -53,24 +52,20 @@ pub struct Session {
     held: Option<Held>,
     draws: Draws,
     budget: Budget,
-    /// What replies take beyond `kept`.
-    outbox: Outbox,
     /// What steps need.
     kept: Option<Share>,
     /// What the policy needs that plays.
     playing: Option<Share>,
-    /// What becomes of its stream after this reply.
-    turn: Option<Turn<proto::SessionResponse>>,
 }
 
 impl Session {
-    /// A session that is not open yet, whose replies' bytes are taken from the budget until they leave the outbox.
-    pub fn new(shared: Arc<Shared>, bearer: Option<Bearer>, budget: Budget, outbox: Outbox) -> Self {
+    /// A session that is not open yet, whose replies' bytes are taken from the budget.
+    pub fn new(shared: Arc<Shared>, bearer: Option<Bearer>, budget: Budget) -> Self {
         let draws = Draws::new(bearer.clone(), shared.ledger.clone());
-        Self { shared, batch: None, bearer, held: None, draws, budget, outbox, kept: None, playing: None, turn: None }
+        Self { shared, batch: None, bearer, held: None, draws, budget, kept: None, playing: None }
     }
 
-    async fn open(&mut self, request: proto::Open) -> Result<proto::Opened, Error> {
+    async fn open(&mut self, request: proto::Open) -> Result<SessionReply, Error> {
         if self.batch.is_some() {
             return Err(Error::AlreadyOpen);
         }
@@ -101,11 +96,10 @@ impl Session {
         };
         let lease = grant.as_ref().map_or_else(Bytes::new, |grant| Bytes::copy_from_slice(&grant.name));
         let lease_seconds = grant.as_ref().map_or(0, |grant| grant.time().as_secs() as u32);
-        self.turn = grant.map(Turn::Leased);
         (self.batch, self.kept, self.held) = (Some(batch), kept, held);
         let started = convert::started(started);
         let acts = true;
-        Ok(proto::Opened {
+        let opened = proto::Opened {
             environment,
             observations,
             started,
@@ -115,38 +109,38 @@ impl Session {
             receipt_arrays,
             lease,
             lease_seconds,
-        })
+        };
+        Ok(Reply { handover: grant.map(StreamHandover::Lease), ..reply(Response::Opened(opened)) })
     }
 
-    async fn step(&mut self, request: proto::Step) -> Result<proto::Stepped, Error> {
+    async fn step(&mut self, request: proto::Step) -> Result<SessionReply, Error> {
         let batch = self.opened("step")?;
         convert::actions(batch.settings().spec, batch.size(), &request.actions)?;
         let stepped = batch.step(&request.actions).await?;
         self.playing = None;
-        Ok(convert::stepped(stepped))
+        Ok(reply(Response::Stepped(convert::stepped(stepped))))
     }
 
-    async fn reset(&mut self, request: proto::Reset) -> Result<proto::ResetDone, Error> {
+    async fn reset(&mut self, request: proto::Reset) -> Result<SessionReply, Error> {
         let batch = self.batch.as_mut().ok_or(Error::NotOpen { request: "reset" })?;
         let entries = convert::reset(batch, request)?;
         self.draws.reset(batch, &entries).await?;
         let (observations, started) = batch.reset(entries).await?;
         self.playing = None;
-        Ok(proto::ResetDone { observations, started: convert::started(started) })
+        Ok(reply(Response::Reset(proto::ResetDone { observations, started: convert::started(started) })))
     }
 
-    async fn snapshot(&mut self, request: proto::Snapshot) -> Result<proto::Snapshotted, Error> {
+    async fn snapshot(&mut self, request: proto::Snapshot) -> Result<SessionReply, Error> {
         let batch = self.opened("snapshot")?;
         let slots = convert::mask("snapshot.mask", batch.size(), &request.mask)?;
         let mut share = self.budget.take(sizes::snapshots(slots.len()))?;
         let batch = self.opened("snapshot")?;
         let snapshots = batch.snapshot(slots).await?;
         share.set(sizes::taken(&snapshots));
-        self.outbox.put(share);
-        Ok(proto::Snapshotted { snapshots })
+        Ok(Reply { memory: Some(share), ..reply(Response::Snapshot(proto::Snapshotted { snapshots })) })
     }
 
-    async fn restore(&mut self, request: proto::Restore) -> Result<proto::Restored, Error> {
+    async fn restore(&mut self, request: proto::Restore) -> Result<SessionReply, Error> {
         let batch = self.batch.as_mut().ok_or(Error::NotOpen { request: "restore" })?;
         let entries = convert::restore(batch.size(), request)?;
         let begun = self.draws.restore(batch, &entries).await?;
@@ -159,20 +153,20 @@ impl Session {
             }
         };
         self.playing = None;
-        Ok(proto::Restored { observations })
+        Ok(reply(Response::Restore(proto::Restored { observations })))
     }
 
-    async fn render(&mut self, request: proto::Render) -> Result<proto::Rendered, Error> {
+    async fn render(&mut self, request: proto::Render) -> Result<SessionReply, Error> {
         let batch = self.opened("render")?;
         let (slot, size) = convert::render(batch.size(), request)?;
         let scene = batch.scene(slot)?.ok_or(Error::NothingToDraw { slot })?;
         let share = self.budget.take(sizes::picture(size))?;
         let pixels = self.shared.renderer.draw(scene, size).await?;
-        self.outbox.put(share);
-        Ok(proto::Rendered { pixels, width: size.width.into(), height: size.height.into() })
+        let rendered = proto::Rendered { pixels, width: size.width.into(), height: size.height.into() };
+        Ok(Reply { memory: Some(share), ..reply(Response::Render(rendered)) })
     }
 
-    async fn release(&mut self, request: proto::Release) -> Result<proto::Released, Error> {
+    async fn release(&mut self, request: proto::Release) -> Result<SessionReply, Error> {
         let batch = self.batch.as_mut().ok_or(Error::NotOpen { request: "release" })?;
         let slots = convert::release(batch.size(), &request)?;
         self.draws.release(batch, &slots);
@@ -180,10 +174,10 @@ impl Session {
         if let Some(held) = &mut self.held {
             held.give_back(slots.len());
         }
-        Ok(proto::Released {})
+        Ok(reply(Response::Release(proto::Released {})))
     }
 
-    async fn act(&mut self, request: proto::Act) -> Result<proto::Acted, Error> {
+    async fn act(&mut self, request: proto::Act) -> Result<SessionReply, Error> {
         let batch = self.batch.as_mut().ok_or(Error::NotOpen { request: "act" })?;
         let policy = sizes::policy(&request, batch.size());
         let policy = (policy > 0).then(|| self.budget.take(policy)).transpose()?;
@@ -191,15 +185,14 @@ impl Session {
         let share = self.budget.take(sizes::reply_to(&turn, batch))?;
         self.playing = policy.or(self.playing.take());
         let acted = policy::acted(batch.act(turn).await?);
-        self.outbox.put(share);
-        Ok(acted)
+        Ok(Reply { memory: Some(share), ..reply(Response::Act(acted)) })
     }
 
-    fn save_player(&mut self) -> Result<proto::PlayerSaved, Error> {
-        policy::saved(self.opened("save_player")?)
+    fn save_player(&mut self) -> Result<SessionReply, Error> {
+        Ok(reply(Response::SavePlayer(policy::saved(self.opened("save_player")?)?)))
     }
 
-    async fn resume(&mut self, request: proto::Resume) -> Result<proto::Resumed, Error> {
+    async fn resume(&mut self, request: proto::Resume) -> Result<SessionReply, Error> {
         if self.batch.is_some() {
             return Err(Error::Order {
                 request: "resume",
@@ -209,9 +202,8 @@ impl Session {
         }
         let proto::Resume { lease, last_reply } = request;
         let ticket = self.shared.leases.ask(&lease, self.bearer.as_ref(), last_reply).await?;
-        let last_reply = ticket.last_reply;
-        self.turn = Some(Turn::TakesUp(ticket));
-        Ok(proto::Resumed { last_reply })
+        let resumed = proto::Resumed { last_reply: ticket.last_reply };
+        Ok(Reply { handover: Some(StreamHandover::Resume(ticket)), ..reply(Response::Resumed(resumed)) })
     }
 
     fn opened(&mut self, request: &'static str) -> Result<&mut Batch, Error> {
@@ -219,13 +211,50 @@ impl Session {
     }
 }
 
-impl Dialogue for Session {
+/// A reply of this protocol.
+type SessionReply = Reply<proto::SessionResponse>;
+
+fn reply(response: Response) -> SessionReply {
+    Reply::new(proto::SessionResponse { response: Some(response) })
+}
+
+impl SessionHandler for Session {
     type Request = proto::SessionRequest;
     type Response = proto::SessionResponse;
     type Error = Error;
     const FIELDS: &'static [Field] = SESSION_REQUEST;
-    const TAKES_UP: bool = true;
     const PROTOCOL: &'static str = "perturb.v1";
+    const KINDS: &'static [&'static str] = &[
+        "open",
+        "step",
+        "reset",
+        "snapshot",
+        "restore",
+        "render",
+        "release",
+        "act",
+        "save_player",
+        "resume",
+        "unknown",
+    ];
+    const RESUMES: Option<fn(&Self::Request) -> bool> =
+        Some(|request| matches!(request.request, Some(Request::Resume(_))));
+
+    fn kind(request: &Self::Request) -> &'static str {
+        match request.request {
+            Some(Request::Open(_)) => "open",
+            Some(Request::Step(_)) => "step",
+            Some(Request::Reset(_)) => "reset",
+            Some(Request::Snapshot(_)) => "snapshot",
+            Some(Request::Restore(_)) => "restore",
+            Some(Request::Render(_)) => "render",
+            Some(Request::Release(_)) => "release",
+            Some(Request::Act(_)) => "act",
+            Some(Request::SavePlayer(_)) => "save_player",
+            Some(Request::Resume(_)) => "resume",
+            None => "unknown",
+        }
+    }
 
     fn allowance(&self) -> Allowance {
         match &self.batch {
@@ -253,83 +282,37 @@ impl Dialogue for Session {
         })
     }
 
-    async fn answer(&mut self, request: Self::Request) -> Result<Self::Response, Error> {
-        let response = match request.request {
-            Some(Request::Open(open)) => self.open(open).await.map(Response::Opened),
-            Some(Request::Step(step)) => self.step(step).await.map(Response::Stepped),
-            Some(Request::Reset(reset)) => self.reset(reset).await.map(Response::Reset),
-            Some(Request::Snapshot(snapshot)) => self.snapshot(snapshot).await.map(Response::Snapshot),
-            Some(Request::Restore(restore)) => self.restore(restore).await.map(Response::Restore),
-            Some(Request::Render(render)) => self.render(render).await.map(Response::Render),
-            Some(Request::Release(release)) => self.release(release).await.map(Response::Release),
-            Some(Request::Act(act)) => self.act(act).await.map(Response::Act),
-            Some(Request::SavePlayer(_)) => self.save_player().map(Response::SavePlayer),
-            Some(Request::Resume(resume)) => self.resume(resume).await.map(Response::Resumed),
+    async fn answer(&mut self, request: Self::Request) -> Result<SessionReply, Error> {
+        match request.request {
+            Some(Request::Open(open)) => self.open(open).await,
+            Some(Request::Step(step)) => self.step(step).await,
+            Some(Request::Reset(reset)) => self.reset(reset).await,
+            Some(Request::Snapshot(snapshot)) => self.snapshot(snapshot).await,
+            Some(Request::Restore(restore)) => self.restore(restore).await,
+            Some(Request::Render(render)) => self.render(render).await,
+            Some(Request::Release(release)) => self.release(release).await,
+            Some(Request::Act(act)) => self.act(act).await,
+            Some(Request::SavePlayer(_)) => self.save_player(),
+            Some(Request::Resume(resume)) => self.resume(resume).await,
             None => Err(Error::value("request", "empty or of a kind this server does not know", "open, step, …")),
-        };
-        response.map(|response| proto::SessionResponse { response: Some(response) })
-    }
-
-    /// Steps follow steps, unless a token has to wait between them.
-    fn follower(&self, request: &Self::Request) -> Option<Follower> {
-        let batch = self.batch.as_ref().filter(|_| matches!(request.request, Some(Request::Step(_))))?;
-        let is_free = self.bearer.as_ref().is_none_or(|bearer| bearer.rate().is_none());
-        batch.follower().filter(|_| is_free)
-    }
-
-    fn follow(follower: &Follower, request: Self::Request) {
-        if let Some(Request::Step(proto::Step { actions })) = request.request
-            && convert::actions(follower.spec, follower.size, &actions).is_ok()
-        {
-            follower.follow(actions);
         }
     }
 
-    fn takes_up(request: &Self::Request) -> bool {
-        matches!(request.request, Some(Request::Resume(_)))
-    }
-
-    fn turn(&mut self) -> Option<Turn<Self::Response>> {
-        self.turn.take()
-    }
-
-    fn attach(&mut self, outbox: Outbox) {
-        self.outbox = outbox;
+    /// Steps follow steps, unless a token has to wait between them.
+    fn pipeline(&self, request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<>> {
+        let batch = self.batch.as_ref().filter(|_| matches!(request.request, Some(Request::Step(_))))?;
+        let has_no_rate = self.bearer.as_ref().is_none_or(|bearer| bearer.rate().is_none());
+        let follower = batch.follower().filter(|_| has_no_rate)?;
+        Some(move |request: Self::Request| {
+            if let Some(Request::Step(proto::Step { actions })) = request.request
+                && convert::actions(follower.spec, follower.size, &actions).is_ok()
+            {
+                follower.follow(actions);
+            }
+        })
     }
 
     fn refusal(error: Error) -> Self::Response {
         proto::SessionResponse { response: Some(Response::Error(error.into())) }
-    }
-}
-
-impl Observed for Session {
-    const KINDS: &'static [&'static str] = &[
-        "open",
-        "step",
-        "reset",
-        "snapshot",
-        "restore",
-        "render",
-        "release",
-        "act",
-        "save_player",
-        "resume",
-        "unknown",
-    ];
-
-    fn kind(request: &Self::Request) -> &'static str {
-        match request.request {
-            Some(Request::Open(_)) => "open",
-            Some(Request::Step(_)) => "step",
-            Some(Request::Reset(_)) => "reset",
-            Some(Request::Snapshot(_)) => "snapshot",
-            Some(Request::Restore(_)) => "restore",
-            Some(Request::Render(_)) => "render",
-            Some(Request::Release(_)) => "release",
-            Some(Request::Act(_)) => "act",
-            Some(Request::SavePlayer(_)) => "save_player",
-            Some(Request::Resume(_)) => "resume",
-            None => "unknown",
-        }
     }
 }

@@ -1,0 +1,384 @@
+//! The task that runs a session. Streams attach to it and detach from it. Without a lease the session ends with its
+//! stream. With one it outlives the stream for a while: what was asked for is done whether or not anybody waits for it, and
+//! the last replies are stored, to be sent again.
+
+use super::{
+    Error,
+    admission::Sessions,
+    exchange::{Exchange, MOVED, refused, revoked},
+    handler::{Reply, SessionHandler, StreamHandover},
+    instrumented::Counts,
+    lease::{self, Arrived, Ask, Grant, Line, OutgoingResponse, Ticket},
+    replay_buffer::Kept,
+};
+use crate::server::{
+    error::{ErrorKind, RequestError, status},
+    net::access_log::{CLOSED, GONE, LEASE_OVER},
+    transport::{
+        budget::Share,
+        message_reader::{Frames, Message, Stop},
+    },
+};
+use futures_util::{Stream, stream};
+use prost::Message as _;
+use std::{
+    future::Future,
+    pin::{Pin, pin},
+    sync::Arc,
+};
+use tokio::{
+    sync::{
+        mpsc::{self, error::TrySendError},
+        oneshot,
+    },
+    time::{Instant, sleep_until},
+};
+use tonic::Status;
+
+/// The most bytes of a session's stored replies, unless the last one alone has more: a client that has not received that
+/// much is better off with a snapshot.
+const MAX_STORED_BYTES: usize = 4 << 20;
+/// A stored reply's bytes beside those that are sent.
+const REPLY_OVERHEAD_BYTES: usize = 512;
+
+/// Responses as they come, or the status that ends the stream.
+pub type Responses<R> = Pin<Box<dyn Stream<Item = Result<R, Status>> + Send>>;
+
+impl Sessions {
+    /// Begins a session in a task of its own: the handler answers the requests of the stream.
+    ///
+    /// # Errors
+    /// If the server is shutting down or has no room for another session, or its token may have no more.
+    pub fn begin<H: SessionHandler>(
+        &self,
+        requests: Frames,
+        handler: H,
+        counts: &Arc<Counts>,
+    ) -> Result<Responses<H::Response>, Status> {
+        let seat = self.admit(&requests, H::RESUMES.is_some()).map_err(|error| {
+            self.count(&error, requests.bearer.as_ref());
+            status(&error)
+        })?;
+        let (responses, mut received) = mpsc::channel::<Result<OutgoingResponse<H::Response>, Status>>(1);
+        let outbox = requests.outbox.clone();
+        let exchange = Exchange::new(requests, handler, Arc::clone(counts), self.enter(), seat);
+        tokio::spawn(SessionDriver { exchange, lease: None }.run(responses));
+        let stream = stream::poll_fn(move |context| {
+            received.poll_recv(context).map(|response| {
+                Some(response?.map(|OutgoingResponse { response, memory }| {
+                    memory.into_iter().for_each(|share| outbox.put(share));
+                    response
+                }))
+            })
+        });
+        Ok(Box::pin(stream))
+    }
+}
+
+struct SessionDriver<H: SessionHandler> {
+    exchange: Exchange<H>,
+    lease: Option<Lease<H::Response>>,
+}
+
+/// A session's lease, and the replies that its client may not have received.
+struct Lease<R> {
+    grant: Grant<R>,
+    stored: Kept<StoredReply<R>>,
+    /// The number of the last reply that was sent in the present stream.
+    sent: u64,
+}
+
+struct StoredReply<R> {
+    response: R,
+    /// The memory for it. A reply without is dropped when it is sent.
+    memory: Option<Share>,
+    /// The memory that the handler took for it, until it is sent for the first time.
+    outgoing: Option<Share>,
+}
+
+/// Whether a session has a stream.
+enum Attachment<R> {
+    /// The session has the stream that takes these responses.
+    Attached(Line<R>),
+    /// The session has none. One may be about to come.
+    Detached(Option<Resuming<R>>),
+    /// The session has ended.
+    Ended,
+}
+
+type Resuming<R> = oneshot::Receiver<Arrived<R>>;
+
+impl<H: SessionHandler> SessionDriver<H> {
+    async fn run(mut self, responses: Line<H::Response>) {
+        let mut attachment = Attachment::Attached(responses);
+        loop {
+            attachment = match attachment {
+                Attachment::Attached(responses) => self.attached(&responses).await,
+                Attachment::Detached(resuming) => self.detached(resuming).await,
+                Attachment::Ended => return,
+            };
+        }
+    }
+
+    /// Answers a stream's requests, until it is lost, or another takes its place, or the session ends.
+    async fn attached(&mut self, responses: &Line<H::Response>) -> Attachment<H::Response> {
+        let mut closed = pin!(responses.closed());
+        loop {
+            while self.lease.as_ref().is_some_and(|lease| lease.sent < lease.stored.last()) {
+                let slot = match self.slot(responses).await {
+                    Ok(slot) => slot,
+                    Err(attachment) => return attachment,
+                };
+                if let Some(response) = self.lease.as_mut().and_then(Lease::next) {
+                    slot.send(Ok(response));
+                }
+            }
+            let Self { exchange, lease } = self;
+            let message = tokio::select! {
+                biased; // a client's own end comes before that of its connection
+                ask = resume_request(lease) => match self.accept_resume(ask) {
+                    Some(resuming) => return self.supersede(responses, resuming),
+                    None => continue,
+                },
+                request = exchange.request() => match request {
+                    Ok(Some(message)) => message,
+                    Ok(None) => {
+                        exchange.ending = CLOSED;
+                        return Attachment::Ended;
+                    }
+                    Err(stop) => return self.stopped(responses, stop),
+                },
+                () = &mut closed => return self.detach(None),
+            };
+            if let Err(attachment) = self.respond(message, responses, closed.as_mut()).await {
+                return attachment;
+            }
+        }
+    }
+
+    /// Answers a request. Without a lease it is given up when its stream is lost.
+    async fn respond(
+        &mut self,
+        message: Message,
+        responses: &Line<H::Response>,
+        closed: Pin<&mut impl Future<Output = ()>>,
+    ) -> Result<(), Attachment<H::Response>> {
+        if let Some(lease) = &mut self.lease {
+            lease.stored.asked();
+            match self.exchange.answer(message).await {
+                Ok(answer) => self.store_reply(answer),
+                Err(stop) => return Err(self.stopped(responses, stop)),
+            }
+            return Ok(());
+        }
+        let answer = tokio::select! {
+            biased;
+            answer = self.exchange.answer(message) => answer,
+            () = closed => return Err(Attachment::Ended),
+        };
+        match answer {
+            Ok(answer) => {
+                let reply = self.exchange.finish(answer);
+                self.deliver(reply, responses).await
+            }
+            Err(stop) => Err(self.stopped(responses, stop)),
+        }
+    }
+
+    /// Sends the reply of a session without a lease, which may get one by it.
+    async fn deliver(
+        &mut self,
+        reply: Reply<H::Response>,
+        responses: &Line<H::Response>,
+    ) -> Result<(), Attachment<H::Response>> {
+        let Reply { response, memory, handover } = reply;
+        let resumed = match handover {
+            Some(StreamHandover::Lease(grant)) => {
+                // A request that was read ahead would be lost with its stream, and come again.
+                self.exchange.reads_ahead = false;
+                self.lease = Some(Lease { stored: Kept::new(grant.most), grant, sent: 0 });
+                None
+            }
+            Some(StreamHandover::Resume(ticket)) => Some(ticket),
+            None => None,
+        };
+        match responses.try_send(Ok(OutgoingResponse { response, memory })) {
+            Ok(()) => {}
+            Err(TrySendError::Closed(_)) => return Err(self.detach(None)),
+            Err(TrySendError::Full(response)) => self.slot(responses).await?.send(response),
+        }
+        let Some(ticket) = resumed else { return Ok(()) };
+        self.exchange.ending = MOVED;
+        // If the session has ended by now, the stream ends at once.
+        let _ = ticket.arrival.send(Arrived { requests: self.exchange.requests.leave(), line: responses.clone() });
+        Err(Attachment::Ended)
+    }
+
+    /// Waits until the stream takes another response.
+    async fn slot<'r>(
+        &mut self,
+        responses: &'r Line<H::Response>,
+    ) -> Result<mpsc::Permit<'r, Result<OutgoingResponse<H::Response>, Status>>, Attachment<H::Response>> {
+        let bearer = self.exchange.requests.bearer.clone();
+        loop {
+            let Self { exchange, lease } = self;
+            let stop = tokio::select! {
+                biased;
+                () = exchange.sessions.drain.closed() => refused(Error::Draining),
+                error = revoked(bearer.as_ref()) => refused(error),
+                ask = resume_request(lease) => match self.accept_resume(ask) {
+                    Some(resuming) => return Err(self.supersede(responses, resuming)),
+                    None => continue,
+                },
+                slot = responses.reserve() => return slot.map_err(|_| self.detach(None)),
+            };
+            return Err(self.stopped(responses, stop));
+        }
+    }
+
+    /// Waits for another stream, until the lease is over.
+    async fn detached(&mut self, mut resuming: Option<Resuming<H::Response>>) -> Attachment<H::Response> {
+        let Self { exchange, lease } = self;
+        let Some(lease) = lease else { return Attachment::Ended };
+        let _counted = lease.grant.numbers().detach();
+        let over = Instant::now() + lease.grant.time();
+        let bearer = exchange.requests.bearer.clone();
+        loop {
+            let error = tokio::select! {
+                biased;
+                () = exchange.sessions.drain.draining() => Some(Error::Draining),
+                error = revoked(bearer.as_ref()) => Some(error.into()),
+                arrived = arrival(&mut resuming) => {
+                    resuming = None;
+                    match arrived {
+                        Ok(Arrived { requests, line }) => {
+                            exchange.requests = requests;
+                            exchange.resumed += 1;
+                            exchange.ending = GONE;
+                            lease.grant.numbers().add_resumed();
+                            return Attachment::Attached(line);
+                        }
+                        Err(_) => continue, // that stream was lost, too
+                    }
+                }
+                Some(ask) = lease.grant.asks.recv() => {
+                    resuming = lease.accept_resume(ask).or(resuming);
+                    continue;
+                }
+                () = sleep_until(over) => None,
+            };
+            match error {
+                Some(error) => exchange.end_by(&error),
+                None => exchange.ending = LEASE_OVER,
+            }
+            return Attachment::Ended;
+        }
+    }
+
+    fn accept_resume(&mut self, ask: Ask<H::Response>) -> Option<Resuming<H::Response>> {
+        self.lease.as_mut().and_then(|lease| lease.accept_resume(ask))
+    }
+
+    /// Ends the stream, because another takes its place.
+    fn supersede(&mut self, responses: &Line<H::Response>, resuming: Resuming<H::Response>) -> Attachment<H::Response> {
+        end_stream(responses, status(&lease::Error::TakenUp));
+        self.detach(Some(resuming))
+    }
+
+    /// Leaves the stream. Without a lease the session ends.
+    fn detach(&mut self, resuming: Option<Resuming<H::Response>>) -> Attachment<H::Response> {
+        let Some(lease) = &mut self.lease else { return Attachment::Ended };
+        drop(self.exchange.requests.leave());
+        lease.stored.replies_mut().for_each(|reply| reply.outgoing = None);
+        Attachment::Detached(resuming)
+    }
+
+    /// Ends a stream that cannot go on. The session of a lease ends only if the server wants it.
+    fn stopped(&mut self, responses: &Line<H::Response>, stop: Stop<H::Error>) -> Attachment<H::Response> {
+        match (stop, self.lease.is_some()) {
+            (Stop::Cancelled, _) => self.detach(None),
+            (Stop::Broken(status), true) => {
+                end_stream(responses, status);
+                self.detach(None)
+            }
+            (stop, _) => {
+                if let Some(status) = self.exchange.end(stop) {
+                    end_stream(responses, status);
+                }
+                Attachment::Ended
+            }
+        }
+    }
+
+    /// Stores a reply for sending it, maybe again. If the memory budget is exhausted, the older stored replies are dropped
+    /// first.
+    fn store_reply(&mut self, answer: Result<Reply<H::Response>, H::Error>) {
+        let Self { exchange, lease: Some(lease) } = self else { return };
+        let stored = &mut lease.stored;
+        let wants_room =
+            |kind| matches!(kind, ErrorKind::MemoryFull | ErrorKind::TokenQuota | ErrorKind::MoreThanTokenQuota);
+        if answer.as_ref().is_err_and(|error| wants_room(error.kind())) {
+            stored.clear(); // they were received, and may be what is in the way
+        }
+        let Reply { response, memory: outgoing, .. } = exchange.finish(answer);
+        let (budget, bytes) = (exchange.requests.budget().clone(), response.encoded_len() + REPLY_OVERHEAD_BYTES);
+        let held: usize = stored.replies().map(|reply| reply.memory.as_ref().map_or(0, Share::bytes)).sum();
+        let mut memory = budget.take(bytes);
+        if memory.is_err() || held + bytes > MAX_STORED_BYTES {
+            stored.clear();
+            memory = memory.or_else(|_| budget.take(bytes));
+        }
+        stored.made(StoredReply { response, memory: memory.ok(), outgoing });
+    }
+}
+
+impl<R: Clone> Lease<R> {
+    /// The next reply that the stream does not have.
+    fn next(&mut self) -> Option<OutgoingResponse<R>> {
+        self.sent += 1;
+        let reply = self.stored.get_mut(self.sent)?;
+        let (response, memory) = (reply.response.clone(), reply.outgoing.take());
+        if reply.memory.is_none() {
+            self.stored.clear();
+        }
+        Some(OutgoingResponse { response, memory })
+    }
+
+    /// Answers a stream that asks for the session. Returns where it will come, if it may.
+    fn accept_resume(&mut self, Ask { last_reply, answer }: Ask<R>) -> Option<Resuming<R>> {
+        if let Err(error) = self.stored.check(last_reply) {
+            let _ = answer.send(Err(error)); // a stream that is gone does not hear it
+            return None;
+        }
+        let (arrival, resuming) = oneshot::channel();
+        answer.send(Ok(Ticket { last_reply: self.stored.last(), arrival })).ok()?;
+        self.sent = last_reply;
+        Some(resuming)
+    }
+}
+
+/// Ends a stream with this status, as soon as it takes it.
+fn end_stream<R: Send + 'static>(responses: &Line<R>, status: Status) {
+    if let Err(TrySendError::Full(status)) = responses.try_send(Err(status)) {
+        let responses = responses.clone();
+        tokio::spawn(async move { responses.send(status).await });
+    }
+}
+
+/// Waits for a stream that asks for the session; for ever without a lease.
+async fn resume_request<R>(lease: &mut Option<Lease<R>>) -> Ask<R> {
+    if let Some(lease) = lease
+        && let Some(ask) = lease.grant.asks.recv().await
+    {
+        return ask;
+    }
+    std::future::pending().await
+}
+
+/// Waits for a stream that is about to come, or for ever.
+async fn arrival<R>(resuming: &mut Option<Resuming<R>>) -> Result<Arrived<R>, oneshot::error::RecvError> {
+    match resuming {
+        Some(resuming) => resuming.await,
+        None => std::future::pending().await,
+    }
+}

@@ -1,0 +1,289 @@
+//! One request and its answer: what stands between a stream and the handler of its session.
+
+use super::{
+    Error,
+    admission::{Limits, Seat, Sessions},
+    handler::{Reply, SessionHandler},
+    instrumented::Counts,
+};
+use crate::server::{
+    auth::{self, Bearer},
+    error::{RequestError, status},
+    limits::Allowance,
+    net::access_log::{BROKEN, Ended, GONE},
+    shutdown::Phase,
+    transport::{
+        message_reader::{Frames, Message, Stop},
+        precheck::decoded_at_once,
+    },
+};
+use perturb_protocol::Awake;
+use std::{convert::Infallible, sync::Arc, time::Duration};
+use tokio::time::Instant;
+use tonic::Status;
+
+/// The ending of a stream that goes on with another session. It has no line in the access log.
+pub(super) const MOVED: &str = "moved";
+
+/// A session's handler, and the requests of the stream that the session has now.
+pub(super) struct Exchange<H: SessionHandler> {
+    pub(super) requests: Frames,
+    /// The request that came while the one before it was being answered.
+    ahead: Option<Result<Option<Message>, Stop>>,
+    /// Whether the present request was read ahead. Its step may have begun then.
+    came_ahead: bool,
+    /// Whether requests may be read before the previous one is answered.
+    pub(super) reads_ahead: bool,
+    handler: H,
+    counts: Arc<Counts>,
+    /// The session counts as running as long as it holds this.
+    pub(super) sessions: Sessions,
+    start: Instant,
+    /// Whether the session was open when it began to wait for the present request.
+    was_open: bool,
+    /// Last time the session was known to be open. The handshake timeout counts from here, so refused requests do not
+    /// extend it.
+    known_open: Instant,
+    /// The session's steps that its token has been charged for.
+    charged: u64,
+    awake: Awake,
+    /// How the session ends, if nothing else happens.
+    pub(super) ending: &'static str,
+    /// How often another stream resumed the session.
+    pub(super) resumed: u32,
+    seat: Seat,
+}
+
+impl<H: SessionHandler> Exchange<H> {
+    pub(super) fn new(requests: Frames, handler: H, counts: Arc<Counts>, sessions: Sessions, seat: Seat) -> Self {
+        let start = Instant::now();
+        Self {
+            requests,
+            ahead: None,
+            came_ahead: false,
+            reads_ahead: true,
+            handler,
+            counts,
+            sessions,
+            start,
+            was_open: false,
+            known_open: start,
+            charged: 0,
+            awake: Awake::default(),
+            ending: GONE,
+            resumed: 0,
+            seat,
+        }
+    }
+
+    /// Returns the next request, or `None` at the client's end. If the future is dropped, the next call goes on where it
+    /// was: nothing is lost.
+    pub(super) async fn request(&mut self) -> Result<Option<Message>, Stop<H::Error>> {
+        let Limits { handshake, idle, .. } = self.sessions.limits;
+        let allowance = self.allowance();
+        let bearer = self.requests.bearer.clone();
+        self.was_open = self.handler.is_open();
+        let Self { requests, ahead, came_ahead, awake, .. } = self;
+        *came_ahead = ahead.is_some();
+        let next = async {
+            match ahead.take() {
+                Some(request) => request,
+                None => awake.until(requests.next(allowance)).await,
+            }
+        };
+        let limit = if self.was_open { idle } else { Some(idle.map_or(handshake, |idle| idle.min(handshake))) };
+        let passed = if self.was_open { Duration::ZERO } else { self.known_open.elapsed() };
+        let late = || {
+            let seconds = limit.map_or(0, |limit| limit.as_secs());
+            Err(refused(Error::Idle { seconds }))
+        };
+        // Also where the next request is there already.
+        if limit.is_some_and(|limit| passed > limit) {
+            return late();
+        }
+        tokio::select! {
+            biased; // the end comes first: a client that never pauses must not outlast it
+            () = self.sessions.drain.closed() => Err(refused(Error::Draining)),
+            error = revoked(bearer.as_ref()) => Err(refused(error)),
+            request = next => request.map_err(|stop| stop.map(|error| Error::from(error).into())),
+            () = sleep(limit.map(|limit| limit.saturating_sub(passed))) => late(),
+        }
+    }
+
+    /// Answers a request. A stream that was admitted only to resume a session ends with its first refusal.
+    pub(super) async fn answer(
+        &mut self,
+        message: Message,
+    ) -> Result<Result<Reply<H::Response>, H::Error>, Stop<H::Error>> {
+        match (self.respond(message).await?, &self.seat) {
+            (Err(error), Seat::Spare(..)) => Err(Stop::Refused(error)),
+            (answer, _) => Ok(answer),
+        }
+    }
+
+    async fn respond(&mut self, message: Message) -> Result<Result<Reply<H::Response>, H::Error>, Stop<H::Error>> {
+        if self.sessions.phase() != Phase::Running && !self.handler.is_open() {
+            return Err(refused(Error::Draining));
+        }
+        // The request's bytes count until it is answered.
+        let (request, _share) = match message {
+            Message::Whole(bytes, share) => (bytes, share),
+            Message::Refused(error) => return Ok(self.undecoded(error)),
+        };
+        // A client that is ahead of its rate waits before anything has happened. Nothing steps before a session is open. A
+        // request that was read ahead had no rate to keep.
+        let bearer = self.requests.bearer.clone();
+        let paced = bearer.as_ref().filter(|_| self.handler.is_open() && !self.came_ahead);
+        tokio::select! {
+            biased;
+            paced = wait_for_rate(paced) => match paced {
+                Ok(()) => {}
+                Err(error) => return Ok(self.undecoded(error)),
+            },
+            () = self.sessions.drain.closed() => return Err(refused(Error::Draining)),
+            error = revoked(bearer.as_ref()) => return Err(refused(error)),
+        }
+        let request = match self.sessions.decoder.decode(request, H::FIELDS, self.allowance()).await? {
+            Ok(request) => request,
+            Err(error) => return Ok(self.undecoded(error)),
+        };
+        if let Seat::Spare(_, refusal) = &self.seat
+            && !H::RESUMES.is_some_and(|resumes| resumes(&request))
+        {
+            return Err(refused(refusal.clone()));
+        }
+        let offer = if self.reads_ahead { self.handler.pipeline(&request) } else { None };
+        let allowance = self.allowance();
+        let Self { handler, counts, requests, ahead, .. } = self;
+        tokio::select! {
+            biased; // the answer is mostly there at once
+            answer = counts.answer(handler, request) => Ok(answer),
+            error = revoked(bearer.as_ref()) => Err(refused(error)),
+            never = read_ahead::<H>(requests, ahead, offer, allowance) => match never {},
+        }
+    }
+
+    /// Accounts for an answer, and returns the reply that it is.
+    pub(super) fn finish(&mut self, answer: Result<Reply<H::Response>, H::Error>) -> Reply<H::Response> {
+        self.charge_steps();
+        if self.was_open || self.handler.is_open() {
+            self.known_open = Instant::now();
+        }
+        answer.unwrap_or_else(|error| {
+            self.count(&error);
+            Reply::new(H::refusal(error))
+        })
+    }
+
+    /// Notes why the session ends. Returns the status that its stream ends with, if its client still listens.
+    pub(super) fn end(&mut self, stop: Stop<H::Error>) -> Option<Status> {
+        match stop {
+            Stop::Refused(error) => {
+                self.end_by(&error);
+                Some(status(&error))
+            }
+            Stop::Broken(status) => {
+                self.ending = BROKEN;
+                Some(status)
+            }
+            Stop::Cancelled => None,
+        }
+    }
+
+    /// Notes that the server ends the session with this error.
+    pub(super) fn end_by(&mut self, error: &impl RequestError) {
+        self.count(error);
+        self.ending = error.kind().reason();
+    }
+
+    fn allowance(&self) -> Allowance {
+        let allowance = self.handler.allowance();
+        Allowance { bytes: allowance.bytes.min(self.sessions.limits.bytes), ..allowance }
+    }
+
+    fn count(&self, error: &impl RequestError) {
+        self.sessions.count(error, self.requests.bearer.as_ref());
+    }
+
+    /// Refuses a request that was not decoded.
+    fn undecoded<R>(&self, error: impl Into<Error>) -> Result<R, H::Error> {
+        let error = H::Error::from(error.into());
+        self.counts.count_undecoded(&error);
+        Err(error)
+    }
+
+    /// Charges the token for the steps since the last call.
+    fn charge_steps(&mut self) {
+        if let Some(bearer) = &self.requests.bearer {
+            let steps = self.handler.about().steps;
+            bearer.stepped(steps.saturating_sub(self.charged));
+            self.charged = steps;
+        }
+    }
+}
+
+impl<H: SessionHandler> Drop for Exchange<H> {
+    fn drop(&mut self) {
+        if self.ending == MOVED {
+            return;
+        }
+        self.charge_steps();
+        self.sessions.access.ended(&Ended {
+            peer: self.requests.connection.as_ref().map(|connection| connection.peer),
+            token: self.requests.bearer.as_ref().map(|bearer| bearer.name()),
+            protocol: H::PROTOCOL,
+            about: self.handler.about(),
+            time: self.start.elapsed(),
+            resumed: (self.resumed > 0).then_some(self.resumed),
+            ending: self.ending,
+        });
+    }
+}
+
+/// Reads the request that comes while another is answered, and offers it to the pool.
+async fn read_ahead<H: SessionHandler>(
+    requests: &mut Frames,
+    ahead: &mut Option<Result<Option<Message>, Stop>>,
+    offer: Option<impl FnOnce(H::Request)>,
+    allowance: Allowance,
+) -> Infallible {
+    if let Some(offer) = offer.filter(|_| ahead.is_none()) {
+        let came = requests.next(allowance).await;
+        if let Ok(Some(Message::Whole(bytes, _))) = &came
+            && let Some(request) = decoded_at_once(bytes.clone(), H::FIELDS, allowance)
+        {
+            offer(request);
+        }
+        *ahead = Some(came);
+    }
+    std::future::pending().await
+}
+
+/// Ends a session with this error.
+pub(super) fn refused<E: From<Error>>(error: impl Into<Error>) -> Stop<E> {
+    Stop::Refused(error.into().into())
+}
+
+/// Resolves when the token is revoked, if there is one.
+pub(super) async fn revoked(bearer: Option<&Bearer>) -> auth::Error {
+    match bearer {
+        Some(bearer) => bearer.revoked().await,
+        None => std::future::pending().await,
+    }
+}
+
+/// Resolves when the token, if there is one, lets its environments step.
+async fn wait_for_rate(bearer: Option<&Bearer>) -> Result<(), auth::Error> {
+    match bearer {
+        Some(bearer) => bearer.turn().await,
+        None => Ok(()),
+    }
+}
+
+/// Resolves after that long, or never.
+async fn sleep(limit: Option<Duration>) {
+    match limit {
+        Some(limit) => tokio::time::sleep(limit).await,
+        None => std::future::pending().await,
+    }
+}
