@@ -261,7 +261,7 @@ $(PROGRAMS)/perturb-server: build ;
 
 # The native module is compiled when the package is installed, and the server is asked for its catalogue.
 $(VENV)/installed: python/requirements-dev.txt python/pyproject.toml python/build_backend.py proto/perturb/v1/perturb.proto \
-		$(wildcard python/native/Cargo.toml python/native/src/*.rs python/native/src/*/*.rs crates/p*/src/*.rs study/src/*.rs study/src/*/*.rs) Cargo.lock \
+		$(wildcard python/native/Cargo.toml python/native/src/*.rs python/native/src/*/*.rs crates/*/src/*.rs crates/*/src/*/*.rs crates/*/src/*/*/*.rs) Cargo.lock \
 		$(PROGRAMS)/perturb-server | python-venv
 	python3 -m venv $(VENV)
 	$(VENV)/bin/pip install -q --disable-pip-version-check -r python/requirements-dev.txt

@@ -7,8 +7,7 @@ use std::process::Command;
 /// Names the commit where there is no repository to ask, e.g. in a container.
 const VARIABLE: &str = "PERTURB_COMMIT";
 /// What the programs are made of, from the top of the repository.
-const SOURCES: [&str; 10] =
-    ["Cargo.lock", "cli", "crates", "learner", "models", "proto", "recurrent", "serve", "src", "study"];
+const SOURCES: [&str; 9] = ["Cargo.lock", "cli", "crates", "learner", "models", "proto", "recurrent", "serve", "src"];
 
 fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo:rerun-if-env-changed={VARIABLE}");

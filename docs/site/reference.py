@@ -228,8 +228,8 @@ def documented(source, struct):
 
 
 def settings(programs):
-    """Every setting: what it is by the comments of study/src/settings, its defaults by what the program resolves."""
-    sources = "".join(path.read_text() for path in sorted(Path("study/src/settings").glob("*.rs")))
+    """Every setting: what it is by the comments of crates/settings/src/settings, its defaults by what the program resolves."""
+    sources = "".join(path.read_text() for path in sorted(Path("crates/settings/src/settings").glob("*.rs")))
     defaults = {preset: resolved(programs, preset) for preset in ("perturb", "paper")}
     page = (
         "# Settings\n\nOf `perturb train --set KEY=VALUE`, of `--config FILE.toml`, and of the tables `settings` and"
@@ -298,8 +298,8 @@ def spread(values):
 
 
 def experiment_files():
-    """The keys of an experiment file, by the comments of study/src/plan/file.rs."""
-    source = Path("study/src/plan/file.rs").read_text()
+    """The keys of an experiment file, by the comments of crates/experiment/src/plan/file.rs."""
+    source = Path("crates/experiment/src/plan/file.rs").read_text()
     page = "# Experiment files\n\nEvery key of the TOML files that `perturb plan` and `perturb run` read."
     page += " What they are for, with examples: [experiments](../experiments.md#the-file).\n\n"
     page += "## Of the file\n\n" + keys(documented(source, "File"))

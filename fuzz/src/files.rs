@@ -4,10 +4,10 @@ use std::sync::LazyLock;
 
 use perturb::config::Config;
 use perturb::tasks;
-use perturb_study::Plan;
-use perturb_study::checkpoint::Checkpoint;
-use perturb_study::ledger::Ledgers;
-use perturb_study::records::Records;
+use perturb_checkpoint::Checkpoint;
+use perturb_experiment::Plan;
+use perturb_records::Records;
+use perturb_records::ledger::Ledgers;
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 

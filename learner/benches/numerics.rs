@@ -9,7 +9,7 @@ use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Rollout, RolloutStep};
 use perturb_policy::random::{Purpose, normal, stream};
 use perturb_policy::{ActionKind, Actor, Acts, ObservationNormaliser, PolicySpec};
-use perturb_study::settings::{A2cConfig, PpoConfig};
+use perturb_settings::{A2cConfig, PpoConfig};
 
 const TASKS: [(&str, usize, ActionKind); 2] =
     [("cart_pole", 4, ActionKind::Discrete { n: 2 }), ("half_cheetah", 26, ActionKind::Continuous { size: 6 })];

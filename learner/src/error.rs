@@ -1,6 +1,6 @@
 //! What can go wrong in the numerical half of the learner.
 
-use perturb_study::settings::SettingError;
+use perturb_settings::SettingError;
 
 /// A failure of a policy, a rollout or an update.
 #[derive(Debug, thiserror::Error)]

@@ -4,10 +4,10 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use perturb_study::files::{FileError, io};
-use perturb_study::interrupt::{Scratch, StopFlag};
-use perturb_study::scheduler::CellEvent;
-use perturb_study::{Cell, Folder, Measurement, Speed};
+use perturb_experiment::scheduler::CellEvent;
+use perturb_experiment::{Cell, Folder, Measurement, Speed};
+use perturb_files::interrupt::{Scratch, StopFlag};
+use perturb_files::{FileError, io};
 
 use crate::cell::{CellOrder, run_cells};
 use crate::checkpoint::{Checkpoint, CheckpointError};

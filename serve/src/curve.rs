@@ -1,6 +1,6 @@
 //! The learning curve of a training, from `monitor.csv` while it grows. It has at most 160 points.
 
-use perturb_study::words::shortened;
+use perturb_text::shortened;
 use serde::Serialize;
 
 use crate::tail::{MAX_READ_BYTES, Tail, TailUpdate};

@@ -4,7 +4,7 @@ use std::io::ErrorKind;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-use perturb_study::files::FileError;
+use perturb_files::FileError;
 
 use crate::cached_loader::LoadError;
 
@@ -14,7 +14,7 @@ use crate::cached_loader::LoadError;
 #[expect(missing_docs, reason = "the messages explain the fields")]
 pub enum ServeError {
     /// The folder does not exist.
-    #[error("{}", perturb_study::runs::no_folder(path))]
+    #[error("{}", perturb_experiment::runs::no_folder(path))]
     NoFolder { path: PathBuf },
     /// The folder cannot be read.
     #[error(transparent)]

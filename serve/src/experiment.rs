@@ -5,10 +5,11 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use perturb_study::files::{self, Stamp, leads_out};
-use perturb_study::runs::{CellStatus, ExperimentStatus, LEADS_OUT, RunSummary, last_progress};
-use perturb_study::words::shortened;
-use perturb_study::{Cell, generated_episodes, records, tested_episodes};
+use perturb_experiment::runs::{CellStatus, ExperimentStatus, LEADS_OUT, RunSummary, last_progress};
+use perturb_experiment::{Cell, generated_episodes, tested_episodes};
+use perturb_files::{self as files, Stamp, leads_out};
+use perturb_records::{self as records};
+use perturb_text::shortened;
 use serde::Serialize;
 
 use crate::curve::LearningCurve;
@@ -290,7 +291,7 @@ fn weights(status: &ExperimentStatus) -> Vec<f64> {
     // Seconds per episode of the kinds that were measured.
     let measured: Vec<f64> =
         cells.iter().filter_map(|cell| taken.seconds(cell).map(|seconds| seconds / episodes(cell))).collect();
-    let mean = if measured.is_empty() { 1.0 } else { perturb_study::mean(measured.iter().copied()) };
+    let mean = if measured.is_empty() { 1.0 } else { perturb_records::statistics::mean(measured.iter().copied()) };
     cells.iter().map(|cell| taken.seconds(cell).unwrap_or_else(|| mean * episodes(cell))).collect()
 }
 

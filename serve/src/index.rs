@@ -1,7 +1,7 @@
 //! The list of all runs below the served folder.
 
-use perturb_study::files::FileError;
-use perturb_study::runs::{Kind, Place, RunSummary, places};
+use perturb_experiment::runs::{Kind, Place, RunSummary, places};
+use perturb_files::FileError;
 
 use crate::experiment::LiveExperiment;
 use crate::paths::{RelativePath, Root};

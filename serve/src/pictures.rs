@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use perturb_study::files::{self, Stamp};
+use perturb_files::{self as files, Stamp};
 
 use crate::paths::RelativePath;
 

@@ -7,7 +7,7 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use perturb_study::runs::Kind;
+use perturb_experiment::runs::Kind;
 use tokio::sync::{Notify, Semaphore, watch};
 
 use crate::cached_loader::{CachedLoader, pause_after};

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use perturb_study::Folder;
-use perturb_study::report::{ReportError, Sources, Whole};
+use perturb_experiment::Folder;
+use perturb_report::{ReportError, Sources, Whole};
 use tokio::sync::Semaphore;
 
 /// Number of reports that are kept.

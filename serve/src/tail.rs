@@ -3,7 +3,7 @@
 use std::io::{ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use perturb_study::files::{Stamp, open_plain};
+use perturb_files::{Stamp, open_plain};
 
 /// Number of bytes that one call reads at most; the next call reads on. Longer lines are not read.
 pub(crate) const MAX_READ_BYTES: u64 = 64 << 20;

@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use perturb_study::files::{Stamp, is_locked, leads_out};
-use perturb_study::runs::{LEADS_OUT, LastProgress, RunSummary, TrainingStatus};
-use perturb_study::words::shortened;
-use perturb_study::{CellResult, CellState, Folder, FolderError, generated_episodes};
+use perturb_experiment::runs::{LEADS_OUT, LastProgress, RunSummary, TrainingStatus};
+use perturb_experiment::{CellResult, CellState, Folder, FolderError, generated_episodes};
+use perturb_files::{Stamp, is_locked, leads_out};
+use perturb_text::shortened;
 
 use crate::curve::{EpisodeLog, LearningCurve};
 

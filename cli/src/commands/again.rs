@@ -2,10 +2,11 @@
 
 use std::path::Path;
 
+use perturb_learner::training::{LastCheckpoint, TrainError};
+use perturb_text::quoted;
+
 use super::args::{PlayArgs, WaitArgs};
 use super::error::CommandError;
-use perturb_learner::training::{LastCheckpoint, TrainError};
-use perturb_study::words::quoted;
 
 /// What this process was given, as it was typed.
 pub(super) fn this_command() -> String {

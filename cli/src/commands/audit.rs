@@ -8,12 +8,13 @@ use std::process::ExitCode;
 
 use serde_json::{Value, json};
 
+use perturb_experiment::Folder;
+use perturb_files as files;
+use perturb_files::interrupt::StopFlag;
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::Servers;
 use perturb_learner::evaluation::{Audit, audit};
-use perturb_study::interrupt::StopFlag;
-use perturb_study::records::{FILE, Records};
-use perturb_study::{Assessed, Folder, files};
+use perturb_records::{Assessed, FILE, Records};
 
 use super::args::AuditArgs;
 use super::display::{Display, say};

@@ -4,17 +4,18 @@ use std::collections::HashMap;
 use std::io::Write;
 use std::process::ExitCode;
 
+use perturb_experiment::scheduler::{Announcement, Backend, Rate, RunEnd, RunError, run as run_plan, write_line};
+use perturb_experiment::{FailureMark, Folder, Plan};
+use perturb_files::interrupt::StopFlag;
+use perturb_report::Sources;
+use perturb_text::{count, quoted};
+
 use super::again::this_command;
 use super::args::RunArgs;
 use super::display::{Display, note};
 use super::error::{CommandError, Result};
 use super::signal_code;
 use super::{json, report};
-use perturb_study::interrupt::StopFlag;
-use perturb_study::report::Sources;
-use perturb_study::scheduler::{Announcement, Backend, Rate, RunEnd, RunError, count, run as run_plan, write_line};
-use perturb_study::words::quoted;
-use perturb_study::{FailureMark, Folder, Plan};
 
 /// So many kinds of cells are told of at the end.
 const MOST_RATES: usize = 24;

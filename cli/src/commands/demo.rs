@@ -7,24 +7,25 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Instant;
 
-use super::args::DemoArgs;
-use super::display::{Display, note};
-use super::error::{CommandError, Result, system};
-use super::{lasting_servers, refuse_file, signal_code, threads};
-use crate::video::{VideoError, VideoFile, VideoOptions, film};
+use perturb_files::interrupt::StopFlag;
+use perturb_files::write_atomically;
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{ClientError, Servers};
 use perturb_learner::evaluation::{TestError, heatmap, test};
 use perturb_learner::logging::Progress;
 use perturb_learner::training::{RunDirectory, train};
-use perturb_study::files::write_atomically;
-use perturb_study::interrupt::StopFlag;
-use perturb_study::plot;
-use perturb_study::sets::Context;
-use perturb_study::settings::TrainConfig;
-use perturb_study::table::Table;
-use perturb_study::words::{duration, grouped};
-use perturb_study::{HeatmapOptions, Metric, PolicyHeatmap, Scenario, Version, paper, policies_side_by_side};
+use perturb_protocol::Version;
+use perturb_records::{HeatmapOptions, Metric, Scenario, paper};
+use perturb_report::{PolicyHeatmap, plot, policies_side_by_side};
+use perturb_settings::TrainConfig;
+use perturb_settings::sets::Context;
+use perturb_text::{Table, duration, grouped};
+
+use super::args::DemoArgs;
+use super::display::{Display, note};
+use super::error::{CommandError, Result, system};
+use super::{lasting_servers, refuse_file, signal_code, threads};
+use crate::video::{VideoError, VideoFile, VideoOptions, film};
 
 /// The paper's budgets.
 const PAPER_EPISODES: u64 = 15_000;
@@ -61,7 +62,7 @@ pub(super) fn run(args: &DemoArgs) -> Result<ExitCode> {
     let usual = || PathBuf::from(format!("runs/demo-{}", chrono::Utc::now().format("%Y%m%d-%H%M%S")));
     let out = args.out.clone().unwrap_or_else(usual);
     refuse_file(&out)?;
-    if !perturb_study::files::list(&out)?.is_empty() {
+    if !perturb_files::list(&out)?.is_empty() {
         let message = format!("{} is not empty: give the demo another --out, or delete that", out.display());
         return Err(CommandError::Usage(message));
     }

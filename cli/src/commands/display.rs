@@ -7,11 +7,11 @@ use std::time::{Duration, Instant};
 
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 
+use perturb_experiment::generated_episodes;
+use perturb_experiment::scheduler::{Pace, Status};
 use perturb_learner::logging::{EpisodeFigures, Progress};
-use perturb_study::generated_episodes;
-use perturb_study::scheduler::{Pace, Status};
-use perturb_study::settings::TrainConfig;
-use perturb_study::words::{duration, grouped};
+use perturb_settings::TrainConfig;
+use perturb_text::{duration, grouped};
 
 /// How often a plain line is printed.
 const LINE_INTERVAL: Duration = Duration::from_secs(10);

@@ -2,13 +2,13 @@
 
 use std::io::Write;
 
+use perturb_learner::proto::{Channel, Distribution, Environment, action_space::Kind};
 use perturb_protocol::catalogue;
+use perturb_text::Table;
 
 use super::args::EnvsArgs;
 use super::error::Result;
 use super::servers;
-use perturb_learner::proto::{Channel, Distribution, Environment, action_space::Kind};
-use perturb_study::table::Table;
 
 pub(super) fn run(args: &EnvsArgs) -> Result<()> {
     args.json.check()?;

@@ -2,20 +2,20 @@
 
 use std::io::ErrorKind;
 
+use perturb_experiment::scheduler::RunError;
+use perturb_experiment::scheduler::slurm::{OptionError, SlurmError};
+use perturb_experiment::{FolderError, PlanError, VerifyError};
+use perturb_files::FileError;
 use perturb_learner::checkpoint::CheckpointError;
 use perturb_learner::client::ClientError;
 use perturb_learner::evaluation::{AuditError, HeatmapError, TestError};
 use perturb_learner::measure::MeasureError;
 use perturb_learner::training::{RunDirectoryError, TrainError};
+use perturb_records::{AssessedError, RecordsError};
+use perturb_report::ReportError;
+use perturb_report::plot::PlotError;
 use perturb_serve::ServeError;
-use perturb_study::files::FileError;
-use perturb_study::plot::PlotError;
-use perturb_study::records::RecordsError;
-use perturb_study::report::ReportError;
-use perturb_study::scheduler::RunError;
-use perturb_study::scheduler::slurm::{OptionError, SlurmError};
-use perturb_study::settings::ConfigError;
-use perturb_study::{AssessedError, FolderError, PlanError, ValueError, VerifyError};
+use perturb_settings::{ConfigError, ValueError};
 
 use crate::video::VideoError;
 

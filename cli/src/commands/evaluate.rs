@@ -2,21 +2,21 @@
 
 use std::io::Write;
 
+use perturb_files::interrupt::StopFlag;
+use perturb_files::require_writable;
+use perturb_learner::checkpoint::{Checkpoint, State};
+use perturb_learner::evaluation::{TestOptions, Tester};
+use perturb_records::TestResult;
+use perturb_records::success::Criterion;
+use perturb_settings::TrainConfig;
+use perturb_settings::sets::TestSet;
+use perturb_text::Table;
 use serde_json::{Map, Value, json};
 
 use super::args::EvaluateArgs;
 use super::display::Display;
 use super::error::{Result, system};
 use super::{playing_servers, sets};
-use perturb_learner::checkpoint::{Checkpoint, State};
-use perturb_learner::evaluation::{TestOptions, Tester};
-use perturb_study::TestResult;
-use perturb_study::files::require_writable;
-use perturb_study::interrupt::StopFlag;
-use perturb_study::sets::TestSet;
-use perturb_study::settings::TrainConfig;
-use perturb_study::success::Criterion;
-use perturb_study::table::Table;
 
 pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
     args.json.check()?;

@@ -5,22 +5,22 @@ mod experiment;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use super::args::HeatmapArgs;
-use super::display::Display;
-use super::error::{CommandError, Result, system};
-use super::{playing_servers, sets};
+use perturb_files::interrupt::StopFlag;
+use perturb_files::{require_writable, write_atomically};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::Servers;
 use perturb_learner::evaluation::{heatmap, heatmap_again};
 use perturb_learner::proto;
 use perturb_protocol::{Distribution, Version, names};
-use perturb_study::files::{require_writable, write_atomically};
-use perturb_study::interrupt::StopFlag;
-use perturb_study::plot;
-use perturb_study::records::Records;
-use perturb_study::sets::Context;
-use perturb_study::settings::{Common, TrainConfig};
-use perturb_study::{Heatmap, HeatmapKind, HeatmapOptions, PolicyHeatmap, policies_side_by_side};
+use perturb_records::{Heatmap, HeatmapKind, HeatmapOptions, Records};
+use perturb_report::{PolicyHeatmap, plot, policies_side_by_side};
+use perturb_settings::sets::Context;
+use perturb_settings::{Common, TrainConfig};
+
+use super::args::HeatmapArgs;
+use super::display::Display;
+use super::error::{CommandError, Result, system};
+use super::{playing_servers, sets};
 
 pub(super) fn run(args: &HeatmapArgs) -> Result<()> {
     match &args.dir {

@@ -4,11 +4,11 @@ use std::fs::File;
 use std::io::Write;
 use std::path::Path;
 
+use perturb_files::{io, require_writable, write_json};
 use serde::Serialize;
 
 use super::args::JsonArgs;
 use super::error::Result;
-use perturb_study::files::{io, require_writable, write_json};
 
 /// What stands for standard output.
 const STANDARD_OUTPUT: &str = "-";

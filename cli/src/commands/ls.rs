@@ -2,12 +2,12 @@
 
 use std::io::Write;
 
+use perturb_experiment::runs::{RunSummary, no_folder, places};
+use perturb_text::{Table, grouped};
+
 use super::args::LsArgs;
 use super::display::terminal_width;
 use super::error::{CommandError, Result};
-use perturb_study::runs::{RunSummary, no_folder, places};
-use perturb_study::table::Table;
-use perturb_study::words::grouped;
 
 /// Below the list.
 const SUCCESS: &str = "\nsuccess: a training's last 100 episodes, all tests of an experiment's done cells";

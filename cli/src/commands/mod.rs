@@ -36,9 +36,9 @@ use std::process::ExitCode;
 use args::{Cli, Command, PlayArgs, ServerArgs, WaitArgs};
 use display::{BesideBar, note};
 use error::{CommandError, Result};
+use perturb_experiment::{Folder, Plan};
+use perturb_files::interrupt::end_on_signals;
 use perturb_learner::client::{ActAt, Address, PrivateServer, ServerWait, Servers};
-use perturb_study::interrupt::end_on_signals;
-use perturb_study::{Folder, Plan};
 
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {

@@ -4,20 +4,18 @@ use std::collections::HashMap;
 use std::io::Write;
 use std::time::Duration;
 
+use perturb_experiment::{
+    Cell, Estimate, Folder, Grouping, Measurement, Plan, Selection, Taken, estimates, representatives,
+};
+use perturb_files::interrupt::StopFlag;
+use perturb_learner::client::Servers;
+use perturb_learner::measure::measure;
+use perturb_text::{Table, count, counted, duration, grouped};
 use serde_json::json;
 
 use super::args::PlanArgs;
 use super::error::{CommandError, Result, system};
 use super::{cores, load_plan, recurrent, servers_of_jobs};
-use perturb_learner::client::Servers;
-use perturb_learner::measure::measure;
-use perturb_study::interrupt::StopFlag;
-use perturb_study::scheduler::count;
-use perturb_study::table::Table;
-use perturb_study::words::{counted, duration, grouped};
-use perturb_study::{
-    Cell, Estimate, Folder, Grouping, Measurement, Plan, Selection, Taken, estimates, representatives,
-};
 
 pub(super) fn run(args: &PlanArgs) -> Result<()> {
     let plan = load_plan(&args.file)?;

@@ -5,10 +5,9 @@ use std::path::{Path, PathBuf};
 
 use serde_json::json;
 
-use perturb_study::TestResult;
-use perturb_study::records::{FILE, Records};
-use perturb_study::success::Criterion;
-use perturb_study::table::Table;
+use perturb_records::success::Criterion;
+use perturb_records::{FILE, Records, TestResult};
+use perturb_text::Table;
 
 use super::args::RatesArgs;
 use super::error::{CommandError, Result};

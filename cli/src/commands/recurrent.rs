@@ -6,10 +6,11 @@ use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
 use std::process::Command;
 
-use super::error::{CommandError, Result, system};
+use perturb_experiment::{Plan, VERSION};
 use perturb_policy::has_recurrent;
-use perturb_study::settings::Architecture;
-use perturb_study::{Plan, VERSION};
+use perturb_settings::Architecture;
+
+use super::error::{CommandError, Result, system};
 
 /// The name of the program that has libtorch, beside this one.
 const PROGRAM: &str = "perturb-recurrent";

@@ -3,14 +3,16 @@
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+use perturb_experiment::{Folder, Footing, Results, read_curves};
+use perturb_files::{require_writable, write_atomically};
+use perturb_report::curves_table;
+use perturb_report::plot::{Quantity, draw_curves, save};
+use perturb_report::{Sources, save_heatmaps};
+
 use super::args::{CurvesArgs, ReportArgs};
 use super::display::{note, terminal_width};
 use super::error::{CommandError, Result};
 use super::{plan_in, refuse_file};
-use perturb_study::files::{require_writable, write_atomically};
-use perturb_study::plot::{Quantity, draw_curves, save};
-use perturb_study::report::{Sources, save_heatmaps};
-use perturb_study::{Folder, Footing, Results, curves_table, read_curves};
 
 pub(super) fn run(args: &ReportArgs) -> Result<()> {
     let mut sources = Sources { rule: args.selection, ..Sources::default() };

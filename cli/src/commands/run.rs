@@ -8,20 +8,22 @@ use std::process::{Command, ExitCode};
 use std::sync::Mutex;
 use std::time::Duration;
 
+use perturb_experiment::runs::Kind;
+use perturb_experiment::scheduler::{CellEvent, Local, News, Order, OrderedCell, Teller};
+use perturb_experiment::{Cell, Folder, Grouping, Plan, Taken, estimates, representatives};
+use perturb_files::interrupt::StopFlag;
+use perturb_files::require_writable;
+use perturb_learner::cell::{CellOrder, run_cells};
+use perturb_learner::client::{Address, PrivateServer, Servers};
+use perturb_learner::measure::{MeasureError, measure};
+use perturb_text::count;
+
 use super::args::{Engine, RunArgs};
 use super::cells::Doing;
 use super::display::{is_quiet, note, say};
 use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
 use super::{cores, load_plan, recurrent, refuse_file, servers_of_jobs, slurm};
-use perturb_learner::cell::{CellOrder, run_cells};
-use perturb_learner::client::{Address, PrivateServer, Servers};
-use perturb_learner::measure::{MeasureError, measure};
-use perturb_study::files::require_writable;
-use perturb_study::interrupt::StopFlag;
-use perturb_study::runs::Kind;
-use perturb_study::scheduler::{CellEvent, Local, News, Order, OrderedCell, Teller, count};
-use perturb_study::{Cell, Folder, Grouping, Plan, Taken, estimates, representatives};
 
 /// How long each group of trainings is measured.
 const MEASURE: Duration = Duration::from_secs(1);

@@ -2,12 +2,12 @@
 
 use std::collections::BTreeMap;
 
+use perturb_files::read;
 use perturb_learner::proto::Environment;
-use perturb_protocol::names;
-use perturb_study::files::read;
-use perturb_study::sets::{Assignment, Contexts, TestSet, set_of, set_of_csv};
-use perturb_study::success::{Criterion, Rule, Threshold};
-use perturb_study::{ValueError, Version};
+use perturb_protocol::{Version, names};
+use perturb_records::success::{Criterion, Rule, Threshold};
+use perturb_settings::ValueError;
+use perturb_settings::sets::{Assignment, Contexts, TestSet, set_of, set_of_csv};
 
 use super::args::SetArgs;
 use super::error::{CommandError, Result};
@@ -122,7 +122,7 @@ pub(super) fn spelled_rule(
 #[cfg(test)]
 mod tests {
     use perturb_learner::proto::Parameter;
-    use perturb_study::success::Side;
+    use perturb_records::success::Side;
 
     use super::*;
 

@@ -2,10 +2,11 @@
 
 use std::io::Write;
 
+use perturb_text::quoted;
+
 use super::args::{Cli, CompletionsArgs, ManArgs};
 use super::display::note;
 use super::error::{CommandError, Result, system};
-use perturb_study::words::quoted;
 
 pub(super) fn completions(args: &CompletionsArgs) -> Result<()> {
     let mut script = Vec::new();

@@ -3,18 +3,19 @@
 use std::process::ExitCode;
 use std::time::Duration;
 
+use perturb_experiment::scheduler::slurm::{Jobs, Slurm, SlurmOptions, Task};
+use perturb_experiment::{Estimate, Folder, Grouping, Plan, estimates, representatives};
+use perturb_files::interrupt::StopFlag;
+use perturb_learner::client::{Address, Servers};
+use perturb_learner::measure::measure;
+use perturb_text::count;
+
 use super::args::{RunArgs, ServerArgs};
 use super::cells::Doing;
 use super::display::note;
 use super::error::{Result, system};
 use super::plan::step_limits;
 use super::{recurrent, refuse_workers, servers_of_jobs};
-use perturb_learner::client::{Address, Servers};
-use perturb_learner::measure::measure;
-use perturb_study::interrupt::StopFlag;
-use perturb_study::scheduler::count;
-use perturb_study::scheduler::slurm::{Jobs, Slurm, SlurmOptions, Task};
-use perturb_study::{Estimate, Folder, Grouping, Plan, estimates, representatives};
 
 /// How long each group of trainings is measured.
 const MEASURE: Duration = Duration::from_secs(2);

@@ -6,19 +6,19 @@ mod resume;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+use perturb_experiment::runs::Kind;
+use perturb_files::interrupt::StopFlag;
+use perturb_files::{create_folder, io};
+use perturb_learner::logging::Progress;
+use perturb_learner::training::{RunDirectory, train};
+use perturb_protocol::Version;
+use perturb_settings::TrainConfig;
 use toml::{Table, Value};
 
 use super::args::TrainArgs;
 use super::display::Display;
 use super::error::{CommandError, Result, system};
 use super::{playing_servers, recurrent, refuse_file, require_file, sets, threads};
-use perturb_learner::logging::Progress;
-use perturb_learner::training::{RunDirectory, train};
-use perturb_study::Version;
-use perturb_study::files::{create_folder, io};
-use perturb_study::interrupt::StopFlag;
-use perturb_study::runs::Kind;
-use perturb_study::settings::TrainConfig;
 
 pub(super) fn run(args: &TrainArgs) -> Result<ExitCode> {
     args.json.check()?;
@@ -50,7 +50,7 @@ fn begin(args: &TrainArgs) -> Result<ExitCode> {
     config.common.environment = environment.name.clone(); // however it was spelled
     config.common.parameters =
         sets::spelled("--parameters", std::mem::take(&mut config.common.parameters), &environment)?;
-    perturb_study::sets::check("--parameters", &config.common.parameters, &environment)?;
+    perturb_settings::sets::check("--parameters", &config.common.parameters, &environment)?;
     let directory = match chosen {
         Some(directory) => directory,
         None => RunDirectory::choose(&usual_directory(&config)?, false)?,

@@ -2,14 +2,15 @@
 
 use std::io::Write;
 
+use perturb_files::interrupt::StopFlag;
+use perturb_learner::checkpoint::Checkpoint;
+use perturb_text::Table;
+
 use super::args::VideoArgs;
 use super::display::{Display, note};
 use super::error::{CommandError, Result, system};
 use super::{servers, sets};
 use crate::video::{Footage, Format, VideoFile, VideoOptions, film};
-use perturb_learner::checkpoint::Checkpoint;
-use perturb_study::interrupt::StopFlag;
-use perturb_study::table::Table;
 
 /// Of a whole episode so many pictures are drawn for a contact sheet, which takes few: a robot's takes some 60 ms.
 const MOMENTS: u32 = 500;

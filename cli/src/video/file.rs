@@ -4,6 +4,7 @@ use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
+use perturb_files::{io, require_writable};
 use tempfile::NamedTempFile;
 
 use super::VideoError;
@@ -11,7 +12,6 @@ use super::encode::Encode;
 use super::gif::{self, GifEncoder};
 use super::mp4::{self, Mp4Encoder};
 use super::sheet::{Grid, SheetEncoder};
-use perturb_study::files::{io, require_writable};
 
 /// How a video is encoded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

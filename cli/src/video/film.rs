@@ -2,16 +2,17 @@
 
 use std::time::{Duration, Instant};
 
-use super::panel::{Panel, Shown, ShownEnding, parameter};
-use super::{Grid, VideoError, VideoFile, VideoWriter};
+use perturb_files::interrupt::StopFlag;
 use perturb_learner::checkpoint::{Checkpoint, State};
 use perturb_learner::client::{BegunEpisode, ClientError, Picture, Servers, Single, StepReply};
 use perturb_learner::evaluation::{TestError, open_options};
 use perturb_learner::proto;
 use perturb_policy::{Ended, Player};
-use perturb_study::interrupt::StopFlag;
-use perturb_study::sets::TestSet;
-use perturb_study::success::Criterion;
+use perturb_records::success::Criterion;
+use perturb_settings::sets::TestSet;
+
+use super::panel::{Panel, Shown, ShownEnding, parameter};
+use super::{Grid, VideoError, VideoFile, VideoWriter};
 
 /// The end of an episode stays for so many seconds.
 const HOLD: f64 = 2.0;

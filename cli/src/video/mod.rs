@@ -20,9 +20,9 @@ pub use film::{Footage, VideoOptions, film};
 pub use panel::PIXELS;
 pub use sheet::Grid;
 
+use perturb_files::FileError;
 use perturb_learner::evaluation::TestError;
-use perturb_study::files::FileError;
-use perturb_study::plot::PlotError;
+use perturb_report::plot::PlotError;
 
 /// Why there is no video.
 #[derive(Debug, thiserror::Error)]

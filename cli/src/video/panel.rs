@@ -2,13 +2,13 @@
 
 use std::ops::RangeInclusive;
 
+use perturb_learner::client::Picture;
+use perturb_protocol::limits::PICTURE_PIXELS;
+use perturb_report::plot::{FAMILY, PlotError, drawing, is_dark, load_font};
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::VideoError;
-use perturb_learner::client::Picture;
-use perturb_protocol::limits::PICTURE_PIXELS;
-use perturb_study::plot::{FAMILY, PlotError, drawing, is_dark, load_font};
 
 /// Width and height of a picture: below them nothing could be read, above them a server draws none.
 pub const PIXELS: RangeInclusive<u32> = 240..=*PICTURE_PIXELS.end() as u32;

@@ -6,10 +6,10 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
+use perturb_files::interrupt::StopFlag;
 use perturb_learner::client::{Address, PrivateServer, Servers};
 use perturb_learner::training::{Outcome, RunDirectory, train};
-use perturb_study::interrupt::StopFlag;
-use perturb_study::settings::TrainConfig;
+use perturb_settings::TrainConfig;
 use tempfile::TempDir;
 
 /// How long anything may take that must not hang: much longer than it does, as the machine may be busy.

@@ -4,19 +4,20 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::common::{
-    addresses, child_server, config, ended, is_running, kill, perturb, read, run, server, stderr, wait_for,
-    wait_for_server,
-};
+use perturb_files::interrupt::StopFlag;
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers, Session, StepReply};
 use perturb_learner::evaluation::test;
 use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Collector, Normalisers, Rollout};
 use perturb_policy::{ActionKind, CollectUntil, Inputs, Player, PolicySpec, Role};
-use perturb_study::Version;
-use perturb_study::interrupt::StopFlag;
+use perturb_protocol::Version;
 use perturb_torch::{Sequences, TorchPolicy};
+
+use crate::common::{
+    addresses, child_server, config, ended, is_running, kill, perturb, read, run, server, stderr, wait_for,
+    wait_for_server,
+};
 use rstest::rstest;
 use tch::Tensor;
 

@@ -3,8 +3,8 @@
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
+use perturb_files::Lock;
 use perturb_learner::checkpoint::Checkpoint;
-use perturb_study::files::Lock;
 use tempfile::TempDir;
 
 use crate::common::{perturb, read, stderr};

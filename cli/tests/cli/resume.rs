@@ -5,16 +5,17 @@ use std::path::{Path, PathBuf};
 use std::process::Child;
 use std::time::Duration;
 
-use crate::common::{
-    addresses, child_server, config, ended, kill, perturb, read, refusal, run, server, stderr, wait_for,
-};
-use insta::assert_snapshot;
+use perturb_files::interrupt::StopFlag;
 use perturb_learner::checkpoint::{Checkpoint, ResumeState};
 use perturb_learner::client::{ClientError, OpenOptions, Servers, Session, StepReply};
 use perturb_learner::evaluation::{TestOptions, Tester};
 use perturb_learner::training::{Outcome, RunDirectory, resume, train};
-use perturb_study::Version;
-use perturb_study::interrupt::StopFlag;
+use perturb_protocol::Version;
+
+use crate::common::{
+    addresses, child_server, config, ended, kill, perturb, read, refusal, run, server, stderr, wait_for,
+};
+use insta::assert_snapshot;
 use serde_json::Value;
 use tempfile::TempDir;
 

@@ -5,10 +5,11 @@ use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::Child;
 
-use crate::common::{addresses, ended, kill, perturb, server, stderr, wait_for};
+use perturb_experiment::{Folder, Plan};
 use perturb_learner::client::{Address, OpenOptions, Servers, Session};
-use perturb_study::Version;
-use perturb_study::{Folder, Plan};
+use perturb_protocol::Version;
+
+use crate::common::{addresses, ended, kill, perturb, server, stderr, wait_for};
 
 /// Four cells of some seconds.
 const PLAN: &str = "

@@ -10,8 +10,8 @@ use perturb::env::{Action, Catalogue, Environment, EnvironmentSpec, Error, Strea
 use perturb::scene::Scene;
 use perturb::server::{net::listener::Listener, security::Guards};
 use perturb::tasks::cart_pole;
-use perturb_study::records::{FILE, Records};
-use perturb_study::{CellResult, CellState, Folder, Plan};
+use perturb_experiment::{CellResult, CellState, Folder, Plan};
+use perturb_records::{FILE, Records};
 use tempfile::TempDir;
 use tokio::sync::oneshot;
 

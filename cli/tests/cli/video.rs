@@ -5,15 +5,16 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use crate::common::{addresses, child_server, ended, kill, perturb, refusal, run, server, stderr, wait_for};
-use gif::{ColorOutput, DecodeOptions};
-use insta::assert_snapshot;
 use perturb_cli::video::{Footage, VideoFile, VideoOptions, film};
+use perturb_files::interrupt::StopFlag;
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{PrivateServer, Servers};
 use perturb_learner::evaluation::test;
-use perturb_study::Version;
-use perturb_study::interrupt::StopFlag;
+use perturb_protocol::Version;
+
+use crate::common::{addresses, child_server, ended, kill, perturb, refusal, run, server, stderr, wait_for};
+use gif::{ColorOutput, DecodeOptions};
+use insta::assert_snapshot;
 use tempfile::TempDir;
 
 /// A policy that was trained for a moment.

@@ -325,9 +325,12 @@ fn exemptions_that_nothing_needs_are_warned_of() {
 
 #[test]
 fn files_are_counted_for_their_folder() {
-    for (path, folder) in
-        [("src/server/a/b.rs", "src/server"), ("src/a.rs", "src"), ("build.rs", "."), ("study/src/a.rs", "study")]
-    {
+    for (path, folder) in [
+        ("src/server/a/b.rs", "src/server"),
+        ("src/a.rs", "src"),
+        ("build.rs", "."),
+        ("crates/records/src/a.rs", "crates/records"),
+    ] {
         assert_eq!(folder_of(path), folder, "{path}");
     }
     for (path, expected) in

@@ -11,11 +11,11 @@
 use std::time::{Duration, Instant};
 
 use perturb_faults::{Course, Line};
+use perturb_files::interrupt::StopFlag;
 use perturb_learner::client::{ActAt, Address, PrivateServer, Servers};
 use perturb_learner::logging::TimeShares;
 use perturb_learner::training::{Entry, RunDirectory, Start, train, train_together};
-use perturb_study::interrupt::StopFlag;
-use perturb_study::settings::TrainConfig;
+use perturb_settings::TrainConfig;
 
 type Result<T> = std::result::Result<T, Box<dyn std::error::Error + Send + Sync>>;
 

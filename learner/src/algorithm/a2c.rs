@@ -1,7 +1,7 @@
 //! Advantage actor-critic.
 
 use perturb_policy::{CollectUntil, Descent, Losses, Objective, Optimiser, Surrogate};
-use perturb_study::settings::A2cConfig;
+use perturb_settings::A2cConfig;
 
 use super::{Algorithm, AlgorithmState, BaseAlgorithm, UpdateStats, check_rollout, explained_variance};
 use crate::error::Result;

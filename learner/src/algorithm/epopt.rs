@@ -1,11 +1,12 @@
 //! EPOpt: learning from the worst episodes.
 
+use perturb_policy::CollectUntil;
+use perturb_settings::{EpoptConfig, Ranking};
+
 use super::{Algorithm, AlgorithmState, BaseAlgorithm, UpdateStats};
 use crate::error::Result;
 use crate::policy::Policy;
 use crate::rollout::{Rollout, Span};
-use perturb_policy::CollectUntil;
-use perturb_study::settings::{EpoptConfig, Ranking};
 
 /// EPOpt-ε, Rajeswaran et al. (2017), arXiv:1610.01283, around another algorithm: an iteration generates L complete
 /// episodes, each in a freshly drawn environment, and the other algorithm learns from those whose undiscounted return is

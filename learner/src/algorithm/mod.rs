@@ -8,14 +8,14 @@ pub use a2c::{A2c, n_step_returns};
 pub use epopt::{Epopt, Selection};
 pub use ppo::{Ppo, gae};
 
-use perturb_study::settings::{Base, Settings, Wrapper};
+use perturb_policy::{CollectUntil, NamedArray, check_length};
+use perturb_settings::{Base, Settings, Wrapper};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::error::Result;
 use crate::policy::Policy;
 use crate::rollout::{self, Estimates, Rollout};
-use perturb_policy::{CollectUntil, NamedArray, check_length};
 
 /// Learns from rollouts.
 pub trait Algorithm: Send {

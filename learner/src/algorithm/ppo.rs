@@ -2,7 +2,7 @@
 
 use perturb_policy::random::{Purpose, stream, uniform};
 use perturb_policy::{Batch, CollectUntil, Descent, Losses, Objective, Optimiser, Surrogate};
-use perturb_study::settings::{PpoConfig, SettingError};
+use perturb_settings::{PpoConfig, SettingError};
 use rand_chacha::ChaCha8Rng;
 
 use super::{Algorithm, AlgorithmState, BaseAlgorithm, UpdateStats, check_rollout, explained_variance};

@@ -5,16 +5,18 @@ mod result;
 use std::path::Path;
 use std::time::Instant;
 
+use perturb_checkpoint::Counters;
+use perturb_experiment::scheduler::CellEvent;
+use perturb_experiment::{Cell, CellFolder, CellState, Failure, FailureMark, FolderError, Timing};
+use perturb_files::Lock;
+use perturb_files::interrupt::StopFlag;
+use perturb_records::RecordsError;
+
 use crate::checkpoint::{Checkpoint, ResumeState};
 use crate::client::Servers;
 use crate::evaluation::TestError;
 use crate::logging::Progress;
 use crate::training::{Entry, Outcome, RunDirectory, RunDirectoryError, Start, TrainError, is_over, train_together};
-use perturb_study::files::Lock;
-use perturb_study::interrupt::StopFlag;
-use perturb_study::records::RecordsError;
-use perturb_study::scheduler::CellEvent;
-use perturb_study::{Cell, CellFolder, CellState, Counters, Failure, FailureMark, FolderError, Timing};
 
 /// What a stop without a signal counts as.
 const SIGTERM: i32 = 15;
@@ -272,7 +274,7 @@ impl<'a> Work<'a> {
             (Err(Broken { reason, fault }), None) => {
                 // Without the folder's place: wherever the same happens, the same is recorded.
                 let reason = reason.replace(&format!("{}/", folder.path().display()), "");
-                let (commit, begins_anew) = (perturb_study::VERSION.into(), fault == Fault::Training);
+                let (commit, begins_anew) = (perturb_experiment::VERSION.into(), fault == Fault::Training);
                 let failure = Failure { id: cell.id.clone(), reason, commit, begins_anew };
                 folder.write_failure(&failure)?;
                 Ok(CellEvent::Failed { reason: failure.reason })

@@ -3,17 +3,18 @@
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
+use perturb_experiment::scheduler::CellEvent;
+use perturb_experiment::{Cell, CellFolder, CellResult, MarkResult, Tests, Training};
+use perturb_files::interrupt::StopFlag;
+use perturb_protocol::Distribution;
+use perturb_records::{RecordedTest, Records, TestResult};
+use perturb_settings::sets::{Parameters, TestSet};
+
 use super::CellError;
 use crate::checkpoint::Checkpoint;
 use crate::client::Servers;
 use crate::evaluation::{TestError, TestOptions, Tester};
 use crate::training::{TrainError, mark_in};
-use perturb_protocol::Distribution;
-use perturb_study::interrupt::StopFlag;
-use perturb_study::records::{self, RecordedTest, Records};
-use perturb_study::scheduler::CellEvent;
-use perturb_study::sets::{Parameters, TestSet};
-use perturb_study::{Cell, CellFolder, CellResult, MarkResult, TestResult, Tests, Training};
 
 /// Stands for the program that began a training whose checkpoint does not say.
 const UNKNOWN: &str = "unknown";
@@ -44,7 +45,7 @@ pub(super) fn tested(
         let kept = Checkpoint::load(&mark_in(&folder.training(), mark)).map_err(TrainError::from)?;
         let when = format!(" after {mark} episodes");
         let Some(records) = test(&kept, sets, episodes, false, &when)? else { return Ok(None) };
-        records.write(&folder.mark(mark).join(records::FILE))?;
+        records.write(&folder.mark(mark).join(perturb_records::FILE))?;
         let (results, agreement) = (results(&records), records.agreement());
         of_marks.insert(mark, MarkResult { counters: kept.state.counters, results, agreement });
     }
@@ -53,7 +54,7 @@ pub(super) fn tested(
         let Some(selecting) = test(&checkpoint, &[set], episodes, true, "")? else { return Ok(None) };
         records.append(selecting);
     }
-    records.write(&folder.path().join(records::FILE))?;
+    records.write(&folder.path().join(perturb_records::FILE))?;
     let results = results(&records);
     let state = checkpoint.state;
     let common = &state.config.common;
@@ -76,7 +77,7 @@ pub(super) fn tested(
         results,
         marks: of_marks,
         agreement: Some(records.agreement()),
-        commit: perturb_study::VERSION.into(),
+        commit: perturb_experiment::VERSION.into(),
         earlier_commits: earlier_commits(state.commits),
         command: command(cell),
     }))
@@ -93,7 +94,7 @@ fn earlier_commits(mut commits: Vec<String>) -> Vec<String> {
     if commits.is_empty() {
         return vec![UNKNOWN.into()];
     }
-    commits.retain(|commit| commit != perturb_study::VERSION);
+    commits.retain(|commit| commit != perturb_experiment::VERSION);
     commits
 }
 
@@ -151,7 +152,7 @@ fn command(cell: &Cell) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use perturb_study::Plan;
+    use perturb_experiment::Plan;
 
     fn cell() -> Cell {
         let text = "environments = ['Pendulum']\nversions = ['E']\ntest_versions = ['D', 'E']\ntest_episodes = 9
@@ -182,8 +183,8 @@ mod tests {
     #[test]
     fn only_programs_that_differ_are_named_beside_the_one_that_finished() {
         let of = |commits: &[&str]| earlier_commits(commits.iter().map(|&commit| commit.to_owned()).collect());
-        assert!(of(&[perturb_study::VERSION]).is_empty(), "as if it had not been broken off");
-        assert_eq!(of(&["a", perturb_study::VERSION, "b"]), ["a", "b"]);
+        assert!(of(&[perturb_experiment::VERSION]).is_empty(), "as if it had not been broken off");
+        assert_eq!(of(&["a", perturb_experiment::VERSION, "b"]), ["a", "b"]);
         assert_eq!(of(&[]), [UNKNOWN], "a checkpoint of a program that did not say");
     }
 }

@@ -1,4 +1,4 @@
-//! [Checkpoints](perturb_study::checkpoint) with what a training needs beside its policy to go on exactly where it was.
+//! [Checkpoints](perturb_checkpoint) with what a training needs beside its policy to go on exactly where it was.
 //!
 //! Large arrays are in a file of their own, which testing does not read; the rest is `resume` in `checkpoint.json`.
 
@@ -8,15 +8,15 @@ mod tests;
 use std::path::Path;
 
 use bytes::Bytes;
+use perturb_checkpoint::{Array, Arrays, ArraysFile, JSON, RESUME_PREFIX, Result, Resume, damaged, encode};
+use perturb_policy::PlayerState;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::algorithm::AlgorithmState;
 use crate::logging::{EpisodeFigures, LogLengths, TimeShares};
 use crate::rollout::CollectorState;
-use perturb_policy::PlayerState;
-use perturb_study::checkpoint::{Array, Arrays, ArraysFile, JSON, RESUME_PREFIX, Result, Resume, damaged, encode};
-pub use perturb_study::checkpoint::{Changed, Checkpoint, CheckpointError, EnvironmentSummary, State};
+pub use perturb_checkpoint::{Changed, Checkpoint, CheckpointError, EnvironmentSummary, State};
 
 /// The state of a training between two iterations, beside what a [`Checkpoint`] holds.
 #[derive(Clone, Debug, PartialEq)]

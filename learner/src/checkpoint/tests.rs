@@ -1,12 +1,12 @@
 use std::fs;
 
 use bytes::Bytes;
+use perturb_files as files;
+use perturb_policy::NamedArray;
+use perturb_policy::random::{Purpose, stream};
 use rand::Rng;
 
 use super::*;
-use perturb_policy::NamedArray;
-use perturb_policy::random::{Purpose, stream};
-use perturb_study::files;
 
 /// Of a shipped experiment, and told from others by its counters and a weight.
 fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {

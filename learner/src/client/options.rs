@@ -4,8 +4,8 @@ use std::ops::Range;
 use std::time::Duration;
 
 use perturb_protocol::{Version, proto};
-use perturb_study::sets::Parameters;
-use perturb_study::settings::Observe;
+use perturb_settings::Observe;
+use perturb_settings::sets::Parameters;
 
 use crate::proto::AutoresetMode;
 
@@ -32,7 +32,7 @@ pub struct OpenOptions {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ActAt {
     /// At the server, if it can: a line's delay is then paid once a rollout, not at each step. Trainings over several
-    /// servers, several together whose rollouts are [short](perturb_study::settings::Rollouts), and those that see noise
+    /// servers, several together whose rollouts are [short](perturb_settings::Rollouts), and those that see noise
     /// choose theirs at the client all the same.
     #[default]
     Server,

@@ -10,10 +10,10 @@ use tokio::sync::oneshot;
 
 use perturb_protocol::names::EnvironmentName;
 use perturb_protocol::{Address, ClientError, Connection, Machines, PrivateServer, first_of, machines};
+use perturb_settings::Common;
 
 use super::options::{ActAt, ServerWait};
 use crate::proto;
-use perturb_study::settings::Common;
 
 /// Connections to servers, all of which serve the same environments.
 #[derive(Debug)]

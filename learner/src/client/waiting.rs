@@ -2,9 +2,9 @@
 
 use std::time::{Duration, Instant};
 
+use perturb_files::interrupt::StopFlag;
 use perturb_protocol::{Address, ClientError};
-use perturb_study::interrupt::StopFlag;
-use perturb_study::words::duration;
+use perturb_text::duration;
 use tokio::time::sleep;
 
 use super::options::ServerWait;

@@ -2,9 +2,9 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
+use perturb_files::interrupt::StopFlag;
 use perturb_protocol::Version;
-use perturb_study::interrupt::StopFlag;
-use perturb_study::records::{About, EpisodeRecord, Records};
+use perturb_records::{About, EpisodeRecord, Records};
 
 use super::error::TestError;
 use super::test::outlasting;

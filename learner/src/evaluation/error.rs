@@ -1,7 +1,7 @@
 //! Why a checkpoint could not be tested.
 
-use perturb_study::ValueError;
-use perturb_study::testing::NotRecorded;
+use perturb_records::testing::NotRecorded;
+use perturb_settings::ValueError;
 
 use crate::checkpoint::Changed;
 use crate::client::ClientError;

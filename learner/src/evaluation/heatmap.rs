@@ -1,10 +1,9 @@
 //! Testing a policy over two parameters.
 
+use perturb_files::interrupt::StopFlag;
 use perturb_protocol::proto;
-use perturb_study::interrupt::StopFlag;
-use perturb_study::records::Records;
-use perturb_study::sets::{Contexts, TestSet};
-use perturb_study::{Axis, Heatmap, HeatmapOptions, MOST_POINTS};
+use perturb_records::{Axis, Heatmap, HeatmapOptions, MOST_POINTS, Records};
+use perturb_settings::sets::{Contexts, TestSet};
 
 use super::error::TestError;
 use super::test::{TestOptions, Tester};

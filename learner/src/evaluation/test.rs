@@ -1,14 +1,13 @@
 //! Testing a checkpoint on a set of its environment's parameters, and recording every episode.
 
+use perturb_files::interrupt::StopFlag;
 use perturb_policy::random::Purpose;
 use perturb_protocol::{Version, proto};
-use perturb_study::TestResult;
-use perturb_study::interrupt::StopFlag;
-use perturb_study::records::{About, Records};
-use perturb_study::sets::{self, TestSet};
-use perturb_study::settings::TrainConfig;
-use perturb_study::success::Rule;
-use perturb_study::testing::{Counting, environment_seed};
+use perturb_records::success::Rule;
+use perturb_records::testing::{Counting, environment_seed};
+use perturb_records::{About, Records, TestResult};
+use perturb_settings::sets::TestSet;
+use perturb_settings::{TrainConfig, sets};
 
 use super::error::TestError;
 use super::trials::{RemoteTrials, Trials};

@@ -5,12 +5,12 @@ use std::io::ErrorKind;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
-use perturb_study::files::{self, FileError, io, sync_folder};
+use perturb_checkpoint::EnvironmentSummary;
+use perturb_files::{self as files, FileError, io, sync_folder};
 use serde::{Deserialize, Serialize};
 
 use super::{Clock, Monitor, Progress, ProgressLog};
 use crate::client::EndedEpisode;
-use perturb_study::checkpoint::EnvironmentSummary;
 
 const MONITOR: &str = "monitor.csv";
 const PROGRESS: &str = "progress.csv";

@@ -4,10 +4,11 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
+use perturb_checkpoint::EnvironmentSummary;
+
 use super::Clock;
 use super::disk::sync;
 use crate::client::EndedEpisode;
-use perturb_study::checkpoint::EnvironmentSummary;
 
 /// Writes stable-baselines3's Monitor format: a line of JSON after `#`, a header, and a line an episode with its return
 /// `r`, its length `l` and the seconds `t` since the start; then `success`, `terminated` (0 or 1), `episode_index`,

@@ -1,8 +1,9 @@
 //! When a training is over.
 
+use perturb_checkpoint::Counters;
+use perturb_settings::Common;
+
 use crate::logging::EpisodeFigures;
-use perturb_study::Counters;
-use perturb_study::settings::Common;
 
 /// Means over the last episodes are over so many, as in stable-baselines3.
 pub(super) const RECENT: usize = 100;
@@ -24,7 +25,7 @@ mod tests {
     use rstest::rstest;
 
     use super::*;
-    use perturb_study::settings::TrainConfig;
+    use perturb_settings::TrainConfig;
 
     #[rstest]
     #[case(0.0, 300, 100, 100, false, "nothing to stop at")]

@@ -1,6 +1,6 @@
 //! The input and the result of a training.
 
-use perturb_study::settings::TrainConfig;
+use perturb_settings::TrainConfig;
 
 use super::{Result, RunDirectory};
 use crate::checkpoint::{Checkpoint, ResumeState};

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use perturb_study::files::FileError;
-use perturb_study::records::Difference;
+use perturb_files::FileError;
+use perturb_records::Difference;
 
 use super::RunDirectoryError;
 use crate::checkpoint::CheckpointError;

@@ -4,16 +4,17 @@
 //! action space, each entry by itself, whatever is observed. The weights say so: none of an observation, the middles of the
 //! box as biases, and the logarithms of half its widths where log standard deviations stand.
 
+use perturb_checkpoint::Counters;
+use perturb_files::write_atomically;
+use perturb_policy::math::ln;
+use perturb_policy::{NamedArray, PolicySpec, RewardNormaliser, Weights};
+use perturb_settings::{Common, TrainConfig};
+
 use super::{Entry, Outcome, Result, TrainError};
 use crate::checkpoint::{Checkpoint, EnvironmentSummary, State};
 use crate::client::Servers;
 use crate::logging::Progress;
 use crate::proto::{Channel, Environment, action_space::Kind};
-use perturb_policy::math::ln;
-use perturb_policy::{NamedArray, PolicySpec, RewardNormaliser, Weights};
-use perturb_study::Counters;
-use perturb_study::files::write_atomically;
-use perturb_study::settings::{Common, TrainConfig};
 
 /// Writes the random policy to the directory of `entry`, as the last checkpoint and as that of all its marks.
 ///
@@ -42,7 +43,7 @@ fn checkpoint(config: &TrainConfig, environment: &Environment) -> Result<Checkpo
         reward_normaliser: rewards,
         counters: Counters::default(),
         config: config.clone(),
-        commits: vec![perturb_study::VERSION.into()],
+        commits: vec![perturb_experiment::VERSION.into()],
     };
     state.observation_normaliser = state.fresh_normaliser();
     let policy = state.policy();

@@ -4,8 +4,8 @@ use std::cell::{Cell, OnceCell};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use perturb_study::files::{self, FileError, Lock};
-use perturb_study::words::quoted;
+use perturb_files::{self as files, FileError, Lock};
+use perturb_text::quoted;
 
 use crate::checkpoint::{Checkpoint, CheckpointError, ResumeState};
 

@@ -11,7 +11,7 @@ use futures_util::StreamExt;
 use futures_util::stream::FuturesUnordered;
 use perturb_policy::{CollectUntil, Normalisers, Player, PlayerState, PolicySpec};
 use perturb_protocol::player::{floats, read_floats};
-use perturb_study::settings::Rollouts;
+use perturb_settings::Rollouts;
 
 use super::start::{options, start_or_resume};
 use super::trainer::Trainer;

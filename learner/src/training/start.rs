@@ -3,21 +3,21 @@
 use std::collections::VecDeque;
 use std::ops::Range;
 
+use perturb_checkpoint::Counters;
+use perturb_files::write_atomically;
+use perturb_policy::{CollectUntil, Normalisers, Player, RewardNormaliser, Role};
+use perturb_records::Comparison;
+use perturb_settings::{Base, Common, Settings, TrainConfig, Wrapper};
+
 use super::ending::RECENT;
 use super::trainer::{Tally, Trainer};
 use super::{Entry, Result, RunDirectory, Start, TrainError};
-use crate::algorithm;
 use crate::checkpoint::{Checkpoint, EnvironmentSummary, ResumeState, State};
 use crate::client::{OpenOptions, Session};
 use crate::logging::{Clock, Logs, TimeShares};
 use crate::policy::Policy;
-use crate::proto;
 use crate::rollout::Rollout;
-use perturb_policy::{CollectUntil, Normalisers, Player, RewardNormaliser, Role};
-use perturb_study::Counters;
-use perturb_study::files::write_atomically;
-use perturb_study::records::Comparison;
-use perturb_study::settings::{Base, Common, Settings, TrainConfig, Wrapper};
+use crate::{algorithm, proto};
 
 /// The environments that `config` trains in.
 pub(super) fn options(config: &TrainConfig) -> OpenOptions {
@@ -149,8 +149,8 @@ fn new_trainer<'a>(
 ) -> Result<Trainer<'a>> {
     let State { config, commits, .. } = &mut checkpoint.state;
     let algorithm = algorithm::build(&config.settings, &policy, config.common.seed)?;
-    if !commits.iter().any(|commit| commit == perturb_study::VERSION) {
-        commits.push(perturb_study::VERSION.into());
+    if !commits.iter().any(|commit| commit == perturb_experiment::VERSION) {
+        commits.push(perturb_experiment::VERSION.into());
     }
     let spec = policy.spec();
     let (n_envs, input_size, width) = (config.common.num_envs, spec.observation_size, spec.action.width());

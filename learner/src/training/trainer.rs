@@ -3,6 +3,12 @@
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
+use perturb_checkpoint::Counters;
+use perturb_files::interrupt::StopFlag;
+use perturb_policy::{CollectUntil, Normalisers, Player, PlayerState, PolicySpec};
+use perturb_records::Comparison;
+use perturb_settings::{Common, EpoptConfig, TrainConfig, Wrapper};
+
 use super::ending::{RECENT, is_over};
 use super::{LONG_UPDATE, LastCheckpoint, Outcome, Result, RunDirectory, TrainError};
 use crate::algorithm::{Algorithm, UpdateStats};
@@ -11,11 +17,6 @@ use crate::client::EndedEpisode;
 use crate::logging::{Clock, EpisodeFigures, Logs, Progress, TimeShares};
 use crate::policy::{GradientWorkspace, Policy};
 use crate::rollout::{CollectorState, Rollout};
-use perturb_policy::{CollectUntil, Normalisers, Player, PlayerState, PolicySpec};
-use perturb_study::Counters;
-use perturb_study::interrupt::StopFlag;
-use perturb_study::records::Comparison;
-use perturb_study::settings::{Common, EpoptConfig, TrainConfig, Wrapper};
 
 /// Owns a run's policy, algorithm, logs and checkpoint.
 pub(super) struct Trainer<'a> {

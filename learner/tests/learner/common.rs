@@ -6,8 +6,8 @@ use perturb_learner::policy::Policy;
 use perturb_learner::rollout::Rollout;
 use perturb_policy::PolicySpec;
 use perturb_policy::random::{Purpose, normal, stream};
-use perturb_study::Version;
-use perturb_study::settings::{A2cConfig, PpoConfig};
+use perturb_protocol::Version;
+use perturb_settings::{A2cConfig, PpoConfig};
 
 /// A server with one physics thread.
 pub fn server() -> PrivateServer {

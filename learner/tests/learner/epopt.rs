@@ -2,7 +2,6 @@
 
 use std::collections::{BTreeMap, HashSet};
 
-use crate::common::{bases, connect, contents, moved, options, server};
 use perturb_learner::algorithm::{
     A2c, Algorithm, AlgorithmState, BaseAlgorithm, Epopt, Ppo, Selection, UpdateStats, gae, n_step_returns,
 };
@@ -14,8 +13,10 @@ use perturb_policy::random::{Purpose, normal, stream, uniform};
 use perturb_policy::{
     ActionKind, Actor, Acts, CollectUntil, Inputs, ObservationNormaliser, Player, PolicySpec, RewardNormaliser, Role,
 };
-use perturb_study::settings::{A2cConfig, EpoptConfig, PpoConfig, Ranking};
+use perturb_settings::{A2cConfig, EpoptConfig, PpoConfig, Ranking};
 use perturb_torch::{Sequences, TorchPolicy};
+
+use crate::common::{bases, connect, contents, moved, options, server};
 use proptest::prelude::*;
 use rand_chacha::ChaCha8Rng;
 use rstest::rstest;

@@ -6,7 +6,7 @@ use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Rollout, RolloutStep};
 use perturb_policy::random::{Purpose, normal, stream, uniform};
 use perturb_policy::{ActionKind, Actor, Acts, PolicySpec};
-use perturb_study::settings::{A2cConfig, PpoConfig, Schedule, SettingError};
+use perturb_settings::{A2cConfig, PpoConfig, Schedule, SettingError};
 use perturb_torch::{Sequences, TorchPolicy};
 use rand_chacha::ChaCha8Rng;
 use rstest::rstest;

@@ -1,7 +1,7 @@
 //! What the presets differ in, as trainings and updates do it. docs/algorithms.md has the table, the tests of settings its
 //! values.
 
-use crate::common::{connect, moved, server};
+use perturb_files::interrupt::StopFlag;
 use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::logging::Progress;
@@ -9,8 +9,9 @@ use perturb_learner::rollout::{Rollout, RolloutStep};
 use perturb_learner::training::{RunDirectory, train};
 use perturb_policy::random::{Purpose, normal, stream};
 use perturb_policy::{ActionKind, PolicySpec};
-use perturb_study::interrupt::StopFlag;
-use perturb_study::settings::{A2cConfig, PpoConfig, TrainConfig};
+use perturb_settings::{A2cConfig, PpoConfig, TrainConfig};
+
+use crate::common::{connect, moved, server};
 use rstest::rstest;
 use tempfile::TempDir;
 

@@ -7,7 +7,7 @@ use perturb_learner::policy::Policy;
 use perturb_learner::rollout::{Rollout, RolloutStep};
 use perturb_policy::random::{Purpose, normal, stream, uniform};
 use perturb_policy::{ActionKind, Actor, Acts, PolicySpec, Weights};
-use perturb_study::settings::{A2cConfig, PpoConfig};
+use perturb_settings::{A2cConfig, PpoConfig};
 use perturb_torch::{Evaluated, Sequences, TorchPolicy};
 use rand_chacha::ChaCha8Rng;
 use rstest::rstest;

@@ -1,7 +1,7 @@
 //! RL²: what the policy sees and remembers of a trial, what the update sees of it, what a test counts, and that it learns to
 //! learn.
 
-use crate::common::{bases, connect, contents, moved, options, server};
+use perturb_files::interrupt::StopFlag;
 use perturb_learner::algorithm::{A2c, Algorithm, Ppo, gae};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::{EndedEpisode, OpenOptions, Servers, Session, StepReply};
@@ -11,9 +11,10 @@ use perturb_learner::rollout::{Collector, Normalisers, Rollout, RolloutStep};
 use perturb_learner::training::{RunDirectory, train};
 use perturb_policy::random::{Purpose, stream, uniform};
 use perturb_policy::{ActionKind, Actor, Acts, CollectUntil, Inputs, Player, PolicySpec, Role};
-use perturb_study::Version;
-use perturb_study::interrupt::StopFlag;
-use perturb_study::settings::{self, A2cConfig, PpoConfig, TrainConfig};
+use perturb_protocol::Version;
+use perturb_settings::{self as settings, A2cConfig, PpoConfig, TrainConfig};
+
+use crate::common::{bases, connect, contents, moved, options, server};
 use rand_chacha::ChaCha8Rng;
 
 const TWO: ActionKind = ActionKind::Discrete { n: 2 };

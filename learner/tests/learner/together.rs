@@ -2,14 +2,14 @@
 
 use std::path::Path;
 
+use perturb_files::interrupt::StopFlag;
 use perturb_learner::checkpoint::{Checkpoint, ResumeState};
 use perturb_learner::client::{ActAt, PrivateServer, Servers};
 use perturb_learner::evaluation::{TestOptions, Tester};
 use perturb_learner::logging::Progress;
 use perturb_learner::training::{Entry, RunDirectory, Start, train, train_together};
-use perturb_study::Version;
-use perturb_study::interrupt::StopFlag;
-use perturb_study::settings::TrainConfig;
+use perturb_protocol::Version;
+use perturb_settings::TrainConfig;
 use rstest::rstest;
 
 use crate::common::{connect, server};

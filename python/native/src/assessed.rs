@@ -2,9 +2,8 @@
 
 use std::path::PathBuf;
 
-use perturb_study::records::RecordsError;
-use perturb_study::report::{ReportError, Sources};
-use perturb_study::{Assessed, AssessedError, AssessedPolicy, Known};
+use perturb_records::{Assessed, AssessedError, AssessedPolicy, Known, RecordsError};
+use perturb_report::{ReportError, Sources};
 use pyo3::exceptions::PyOSError;
 use pyo3::prelude::*;
 

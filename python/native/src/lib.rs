@@ -48,8 +48,8 @@ mod _native {
     use super::testing::Tests;
     /// What the set of a heatmap is called.
     #[pymodule_export]
-    const HEATMAP_SET: &str = perturb_study::Heatmap::SET;
+    const HEATMAP_SET: &str = perturb_records::Heatmap::SET;
     /// The most points along a heatmap's axis.
     #[pymodule_export]
-    const MOST_POINTS: usize = perturb_study::MOST_POINTS;
+    const MOST_POINTS: usize = perturb_records::MOST_POINTS;
 }

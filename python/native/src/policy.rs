@@ -4,8 +4,8 @@ use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, TryLockError};
 
 use numpy::{PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
+use perturb_checkpoint::Checkpoint;
 use perturb_policy::{ActionKind, Ended, Outcome};
-use perturb_study::checkpoint::Checkpoint;
 use pyo3::prelude::*;
 
 use crate::failure::{POLICY, UNUSABLE, failure};

@@ -3,12 +3,11 @@
 use std::path::PathBuf;
 
 use numpy::PyArray1;
-use perturb_study::outcomes::{
+use perturb_records::outcomes::{
     Bin, Counted, Outcomes, SHARE, bins, conditional_value_at_risk, success_within, success_within_both, worst_contexts,
 };
-use perturb_study::records::{self, ColumnValues};
-use perturb_study::statistics::bootstrap;
-use perturb_study::{Metric, mean, paper};
+use perturb_records::statistics::{bootstrap, mean};
+use perturb_records::{ColumnValues, Metric, paper};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -33,14 +32,14 @@ type Figures = (u64, f64, (f64, f64), f64, (f64, f64), f64, f64, (f64, f64), Opt
 
 /// The recorded tests of a policy.
 #[pyclass(frozen, module = "perturb._native")]
-pub struct Records(pub(crate) records::Records);
+pub struct Records(pub(crate) perturb_records::Records);
 
 #[pymethods]
 impl Records {
     /// Reads a Parquet file.
     #[staticmethod]
     fn read(path: PathBuf) -> PyResult<Self> {
-        records::Records::read(&path).map(Self).map_err(|error| failure(INVALID, 0, error.to_string()))
+        perturb_records::Records::read(&path).map(Self).map_err(|error| failure(INVALID, 0, error.to_string()))
     }
 
     /// Writes a Parquet file, whole or not at all.
@@ -186,7 +185,7 @@ impl Records {
 /// The 95 % interval of a success rate after Wilson (1927), 0 … 1.
 #[pyfunction]
 pub fn wilson(successes: u64, episodes: u64) -> (f64, f64) {
-    perturb_study::wilson(successes, episodes)
+    perturb_records::statistics::wilson(successes, episodes)
 }
 
 /// The paper's three numbers, Default, Interpolation and Extrapolation, of success rates, %, by scenario, e.g. "DR".

@@ -3,9 +3,11 @@
 use std::collections::{BTreeMap, HashMap};
 use std::path::PathBuf;
 
+use perturb_experiment::Plan;
+use perturb_files as files;
 use perturb_protocol::{Distribution, Interval, Version};
-use perturb_study::sets::{Assignment, Contexts, TestSet, set_of, set_of_csv};
-use perturb_study::{Axis, Heatmap, MOST_POINTS, Plan, files};
+use perturb_records::{Axis, Heatmap, MOST_POINTS};
+use perturb_settings::sets::{Assignment, Contexts, TestSet, set_of, set_of_csv};
 use pyo3::exceptions::PyOSError;
 use pyo3::prelude::*;
 

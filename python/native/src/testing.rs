@@ -5,10 +5,11 @@ use std::sync::Arc;
 use numpy::PyReadonlyArray1;
 use perturb_policy::random::Purpose;
 use perturb_protocol::{EndedEpisode, proto};
-use perturb_study::records::About;
-use perturb_study::sets::{self, TestSet};
-use perturb_study::success::Rule;
-use perturb_study::testing::Counting;
+use perturb_records::About;
+use perturb_records::success::Rule;
+use perturb_records::testing::Counting;
+use perturb_settings::sets;
+use perturb_settings::sets::TestSet;
 use pyo3::prelude::*;
 
 use crate::failure::{INVALID, MALFORMED, UNUSABLE, failure};
@@ -28,7 +29,7 @@ pub struct Tests {
     policy: String,
     episodes_per_trial: u32,
     /// What the first session opened, and what was recorded in it.
-    begun: Option<(Arc<proto::Environment>, perturb_study::records::Records)>,
+    begun: Option<(Arc<proto::Environment>, perturb_records::Records)>,
     counting: Option<Counting>,
 }
 
@@ -76,7 +77,7 @@ impl Tests {
         if let Some(rule) = &self.success {
             about.judge_by(rule).map_err(|error| invalid(&error))?;
         }
-        self.begun = Some((Arc::clone(served), perturb_study::records::Records::new(about)));
+        self.begun = Some((Arc::clone(served), perturb_records::Records::new(about)));
         Ok(())
     }
 

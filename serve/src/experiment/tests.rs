@@ -1,4 +1,4 @@
-use perturb_study::{Folder, Plan};
+use perturb_experiment::{Folder, Plan};
 
 use super::*;
 
@@ -71,7 +71,7 @@ fn cells_with_a_configuration_have_a_page() {
 #[test]
 fn the_fingerprint_covers_all_files_of_a_report() {
     let fixture = ExperimentFixture::new();
-    let record = perturb_study::Failure {
+    let record = perturb_experiment::Failure {
         id: fixture.plan.cells[0].id.clone(),
         reason: "NaN".into(),
         commit: "x".into(),

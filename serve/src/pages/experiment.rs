@@ -4,9 +4,9 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use maud::{Markup, html};
-use perturb_study::Cell;
-use perturb_study::runs::{CellStatus, ExperimentStatus, Kind};
-use perturb_study::words::{duration, grouped};
+use perturb_experiment::Cell;
+use perturb_experiment::runs::{CellStatus, ExperimentStatus, Kind};
+use perturb_text::{duration, grouped};
 use serde_json::json;
 
 use super::{ReportSource, Update, badge, bar, breadcrumbs, chart, faults, pictures, run_link, shown_name, time};

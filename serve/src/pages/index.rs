@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use maud::{Markup, html};
+use perturb_experiment::runs::Kind;
 use perturb_protocol::Address;
-use perturb_study::runs::Kind;
-use perturb_study::words::{duration, grouped};
+use perturb_text::{duration, grouped};
 
 use super::{Update, badge, bar, facts, pictures, run_link, shown_name, time};
 use crate::index::{Index, MAX_FOLDERS, Row};

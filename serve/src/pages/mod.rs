@@ -14,8 +14,8 @@ use axum::http::StatusCode;
 use axum::response::{Html, IntoResponse, Response};
 use chrono::DateTime;
 use maud::{DOCTYPE, Markup, html};
-use perturb_study::runs::Kind;
-use perturb_study::words::shortened;
+use perturb_experiment::runs::Kind;
+use perturb_text::shortened;
 use serde_json::{Map, Value, json};
 
 use crate::cached_loader::LoadError;
@@ -127,7 +127,7 @@ fn document(title: &str, events: &str, breadcrumbs: &Markup, main: &Markup) -> S
                     p #live role="status" { noscript { "Without JavaScript this page does not update itself; reload it to see changes." } }
                 }
                 main { (main) }
-                footer { p { "perturb " (perturb_study::VERSION) ". This page changes no file." } }
+                footer { p { "perturb " (perturb_experiment::VERSION) ". This page changes no file." } }
             }
         }
     }

@@ -1,7 +1,7 @@
 //! Pictures and films on pages.
 
 use maud::{Markup, html};
-use perturb_study::words::grouped;
+use perturb_text::grouped;
 
 use crate::pictures::{Picture, Pictures};
 

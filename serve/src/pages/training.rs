@@ -3,9 +3,10 @@
 use std::path::Path;
 
 use maud::{Markup, html};
-use perturb_study::runs::{Kind, TrainingStatus};
-use perturb_study::words::{duration, grouped, shortened};
-use perturb_study::{CellResult, TestResult};
+use perturb_experiment::CellResult;
+use perturb_experiment::runs::{Kind, TrainingStatus};
+use perturb_records::TestResult;
+use perturb_text::{duration, grouped, shortened};
 use serde_json::json;
 
 use super::{Update, badge, bar, breadcrumbs, chart, facts, faults, pictures, shown_name, time};

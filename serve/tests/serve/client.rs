@@ -5,9 +5,11 @@ use std::net::{SocketAddr, TcpStream};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use perturb_checkpoint::Counters;
+use perturb_experiment::{CellResult, Folder, Plan, Training};
+use perturb_records::TestResult;
 use perturb_serve::{Options, Server};
-use perturb_study::settings::TrainConfig;
-use perturb_study::{CellResult, Counters, Folder, Plan, TestResult, Training};
+use perturb_settings::TrainConfig;
 use tempfile::TempDir;
 
 /// Upper bound of every wait. It is long because the machine may be busy.
@@ -164,7 +166,7 @@ pub fn lines(from: usize, to: usize) -> String {
 }
 
 /// Returns a result of a cell with success rates of 91 % on D, 92 % on R and 93 % on E.
-pub fn result(cell: &perturb_study::Cell) -> CellResult {
+pub fn result(cell: &perturb_experiment::Cell) -> CellResult {
     let test = |(name, percent): (&str, f64)| {
         let result = TestResult {
             episodes: 10,

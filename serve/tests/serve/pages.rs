@@ -1,7 +1,7 @@
 //! Contents of the pages, and when they change.
 
-use perturb_study::files::Lock;
-use perturb_study::{Folder, Plan};
+use perturb_experiment::{Folder, Plan};
+use perturb_files::Lock;
 
 use crate::client::{Place, lines, write, write_training};
 

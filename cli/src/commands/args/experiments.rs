@@ -3,8 +3,8 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use perturb_study::scheduler::slurm::TimeLimit;
-use perturb_study::{Grouping, Selection};
+use perturb_experiment::scheduler::slurm::TimeLimit;
+use perturb_experiment::{Grouping, Selection};
 
 use super::{JsonArgs, ServerArgs, WaitArgs, at_least_one, natural};
 

@@ -3,10 +3,11 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use perturb_protocol::names;
-use perturb_study::sets::Assignment;
-use perturb_study::success::Rule;
-use perturb_study::{MOST_POINTS, ValueError, Version};
+use perturb_protocol::{Version, names};
+use perturb_records::MOST_POINTS;
+use perturb_records::success::Rule;
+use perturb_settings::ValueError;
+use perturb_settings::sets::Assignment;
 
 use super::{JsonArgs, PlayArgs, ServerArgs, WaitArgs, at_least_one, natural, within};
 use crate::video::PIXELS;

@@ -5,9 +5,9 @@ use std::path::PathBuf;
 
 use clap::Args;
 use perturb_learner::client::Address;
-use perturb_study::Version;
-use perturb_study::sets::Assignment;
-use perturb_study::settings::{Architecture, Observe, Preset, Settings};
+use perturb_protocol::Version;
+use perturb_settings::sets::Assignment;
+use perturb_settings::{Architecture, Observe, Preset, Settings};
 
 use super::{JsonArgs, OneOf, PlayArgs, ServerArgs, WaitArgs, at_least_one, natural, within};
 

@@ -6,8 +6,8 @@ use std::process::ExitCode;
 use serde_json::{Value, json};
 
 use perturb_learner::checkpoint::Checkpoint;
-use perturb_study::ledger::{Head, Ledgers, Proof};
-use perturb_study::records::Records;
+use perturb_records::Records;
+use perturb_records::ledger::{Head, Ledgers, Proof};
 
 use super::super::{args::AuditArgs, error::CommandError, error::Result, lasting_servers};
 use super::Tested;

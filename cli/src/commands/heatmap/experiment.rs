@@ -3,20 +3,22 @@
 use std::io::Write;
 use std::path::Path;
 
+use perturb_experiment::{
+    Folder, HeatmapPlace, NoHeatmap, Results, Selected, heatmap_path, heatmap_places, store_heatmap,
+};
+use perturb_files::interrupt::StopFlag;
+use perturb_learner::checkpoint::Checkpoint;
+use perturb_learner::client::Servers;
+use perturb_learner::proto;
+use perturb_protocol::names;
+use perturb_records::HeatmapKind;
+use perturb_report::{heatmap_pictures, save_heatmaps};
+
 use super::{options, test, wanted_axes};
 use crate::commands::args::HeatmapArgs;
 use crate::commands::display::{note, say};
 use crate::commands::error::{CommandError, Result, system};
 use crate::commands::{plan_in, playing_servers};
-use perturb_learner::checkpoint::Checkpoint;
-use perturb_learner::client::Servers;
-use perturb_learner::proto;
-use perturb_protocol::names;
-use perturb_study::interrupt::StopFlag;
-use perturb_study::report::{heatmap_pictures, save_heatmaps};
-use perturb_study::{
-    Folder, HeatmapKind, HeatmapPlace, NoHeatmap, Results, Selected, heatmap_path, heatmap_places, store_heatmap,
-};
 
 /// What became of places.
 #[derive(Default)]

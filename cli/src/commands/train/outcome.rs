@@ -6,8 +6,8 @@ use std::process::ExitCode;
 use perturb_learner::checkpoint::State;
 use perturb_learner::logging::{EpisodeFigures, Progress, TimeShares};
 use perturb_learner::training::{Outcome, RunDirectory, TrainError};
-use perturb_study::settings::TrainConfig;
-use perturb_study::words::quoted;
+use perturb_settings::TrainConfig;
+use perturb_text::quoted;
 use serde_json::json;
 
 use super::super::again::{explain, resume_command};

@@ -3,11 +3,11 @@
 use std::path::Path;
 use std::process::ExitCode;
 
+use perturb_files::interrupt::StopFlag;
+use perturb_files::write_atomically;
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::logging::{EpisodeFigures, Progress};
 use perturb_learner::training::{RunDirectory, is_over, resume};
-use perturb_study::files::write_atomically;
-use perturb_study::interrupt::StopFlag;
 
 use super::super::args::TrainArgs;
 use super::super::display::{Display, note};

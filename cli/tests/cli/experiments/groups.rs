@@ -1,12 +1,13 @@
 //! What is told of the cells of a group, whatever does them.
 
-use super::{Experiment, PLAN};
-use crate::common::{kill, server};
+use perturb_experiment::scheduler::CellEvent;
+use perturb_experiment::{Failure, FailureMark, Folder};
+use perturb_files::interrupt::StopFlag;
 use perturb_learner::cell::{CellOrder, run_cells};
 use perturb_learner::client::Servers;
-use perturb_study::interrupt::StopFlag;
-use perturb_study::scheduler::CellEvent;
-use perturb_study::{Failure, FailureMark, Folder};
+
+use super::{Experiment, PLAN};
+use crate::common::{kill, server};
 
 /// Does these cells together, each with the failure that it may forget, and gives how each ended, in the plan's order.
 fn ends(

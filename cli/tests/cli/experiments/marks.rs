@@ -3,10 +3,11 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use perturb_experiment::Folder;
+use perturb_learner::checkpoint::Checkpoint;
+
 use super::{Experiment, kill_all, succeeded};
 use crate::common::{perturb, stderr, wait_for};
-use perturb_learner::checkpoint::Checkpoint;
-use perturb_study::Folder;
 
 /// Two cells that reach every number of episodes exactly, and one of EPOpt, which learns from fewer episodes than it generates.
 const PLAN: &str = "

@@ -15,8 +15,9 @@ use std::os::unix::process::ExitStatusExt;
 use std::path::PathBuf;
 use std::process::{Child, Command, Output};
 
+use perturb_experiment::{Cell, CellResult, CellState, Folder, Plan};
+
 use crate::common::{is_running, kill, perturb, stderr, wait_for};
-use perturb_study::{Cell, CellResult, CellState, Folder, Plan};
 use tempfile::TempDir;
 
 /// Eight cells of a second or so.

@@ -1,8 +1,9 @@
 //! Lines to compare with.
 
+use perturb_settings::Observe;
+
 use super::{Experiment, succeeded};
 use crate::common::{perturb, stderr};
-use perturb_study::settings::Observe;
 
 /// Six cells of the random policy, two of a learner.
 const PLAN: &str = "

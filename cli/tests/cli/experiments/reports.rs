@@ -4,10 +4,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::Output;
 
+use perturb_experiment::{CellState, Folder};
+use perturb_records::Records;
+
 use super::{Experiment, PLAN, kill_all, succeeded};
 use crate::common::{perturb, stderr, wait_for};
-use perturb_study::records::Records;
-use perturb_study::{CellState, Folder};
 
 #[test]
 fn a_report_is_the_same_however_often_the_run_was_broken_off() {

@@ -3,10 +3,11 @@
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command};
 
+use perturb_experiment::{CellResult, CellState, Counts, Folder, Plan};
+use perturb_learner::client::PrivateServer;
+
 use super::{Experiment, PLAN, children, kill_all, succeeded};
 use crate::common::{child_server, ended, is_running, kill, perturb, stderr, wait_for};
-use perturb_learner::client::PrivateServer;
-use perturb_study::{CellResult, CellState, Counts, Folder, Plan};
 
 #[test]
 fn results_depend_neither_on_jobs_nor_on_groups_nor_on_kills() {
@@ -164,10 +165,10 @@ fn a_result_names_the_program_that_began_its_training_if_it_is_another() {
     let copied = Command::new("cp").arg("-a").args([experiment.out("same"), experiment.out("other")]).status();
     assert!(copied.expect("cp").success());
     let text = std::fs::read_to_string(document("other")).expect("a checkpoint");
-    assert_eq!(text.matches(perturb_study::VERSION).count(), 1, "{text}");
+    assert_eq!(text.matches(perturb_experiment::VERSION).count(), 1, "{text}");
     // That program knew no checksum.
     let mut earlier: serde_json::Value =
-        serde_json::from_str(&text.replace(perturb_study::VERSION, "0.0.9 (abc)")).expect("JSON");
+        serde_json::from_str(&text.replace(perturb_experiment::VERSION, "0.0.9 (abc)")).expect("JSON");
     earlier["format_version"] = 2.into();
     earlier.as_object_mut().expect("entries").remove("crc32c");
     std::fs::write(document("other"), earlier.to_string()).expect("written");

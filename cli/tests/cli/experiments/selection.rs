@@ -2,10 +2,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use perturb_experiment::{Cell, CellState, Folder, SELECTION_TEST, Selection};
+use perturb_records::{FILE, Records};
+
 use super::{Experiment, kill_all, succeeded};
 use crate::common::{perturb, stderr, wait_for};
-use perturb_study::records::{FILE, Records};
-use perturb_study::{Cell, CellState, Folder, SELECTION_TEST, Selection};
 
 /// Four tuning cells, and four of what they select.
 const PLAN: &str = "

@@ -2,11 +2,12 @@
 
 use std::fs::File;
 
+use perturb_experiment::Folder;
+
 use super::{Experiment, kill_all, succeeded};
 use crate::common::{ended, wait_for};
 use crate::guarded::weights;
 use crate::patience::Named;
-use perturb_study::Folder;
 
 /// Two cells of some seconds, one after the other.
 const PLAN: &str = "

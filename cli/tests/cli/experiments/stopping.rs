@@ -1,9 +1,10 @@
 //! Trainings that end by their success rate.
 
+use perturb_experiment::Folder;
+use perturb_learner::checkpoint::Checkpoint;
+
 use super::{Experiment, succeeded};
 use crate::common::{perturb, stderr};
-use perturb_learner::checkpoint::Checkpoint;
-use perturb_study::Folder;
 
 /// Stops when a tenth of its last hundred episodes were successes.
 const PLAN: &str = "

@@ -11,8 +11,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output};
 use std::time::{Duration, Instant};
 
+use perturb_experiment::{Cell, Folder, Plan};
 use perturb_learner::client::PrivateServer;
-use perturb_study::{Cell, Folder, Plan};
 use tempfile::TempDir;
 
 use self::cluster::Cluster;

@@ -1,0 +1,83 @@
+//! The files of a checkpoint: written whole or not at all, read only if they are what was written.
+
+use std::path::{Path, PathBuf};
+
+use perturb_files::{self as files, TEMPORARY_PREFIX, write_atomically};
+use serde::{Deserialize, Serialize};
+
+use super::{CheckpointError, Result};
+
+const ARRAYS_SUFFIX: &str = ".safetensors";
+
+/// Names a file of arrays and says how to tell whether it is whole.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ArraysFile {
+    pub(super) file: String,
+    bytes: u64,
+    crc32c: u32,
+}
+
+impl ArraysFile {
+    /// Writes `content` under a name of its own, which begins with `prefix`: that of [`RESUME_PREFIX`](super::RESUME_PREFIX)
+    /// or of the weights.
+    ///
+    /// # Errors
+    /// The operating system's.
+    pub fn write(directory: &Path, prefix: &str, iterations: u64, content: &[u8]) -> Result<Self> {
+        let crc32c = crc32c::crc32c(content);
+        // The checksum is part of the name: a file that is in use is never written over by another content.
+        let file = format!("{prefix}{iterations:08}-{crc32c:08x}{ARRAYS_SUFFIX}");
+        write_atomically(&directory.join(&file), content)?;
+        Ok(Self { file, bytes: content.len() as u64, crc32c })
+    }
+
+    /// Where it is: in the directory, whatever its name says.
+    pub fn path(&self, directory: &Path) -> PathBuf {
+        directory.join(Path::new(&self.file).file_name().unwrap_or_default())
+    }
+
+    /// Makes sure that it is there, and as long as it was written.
+    ///
+    /// # Errors
+    /// [`CheckpointError`].
+    pub(super) fn require(&self, directory: &Path) -> Result<()> {
+        let path = self.path(directory);
+        let length = std::fs::metadata(&path).map_err(files::io("read", &path))?.len();
+        if length == self.bytes {
+            Ok(())
+        } else {
+            Err(damaged(&path, format!("it has {length} bytes, expected {}", self.bytes)))
+        }
+    }
+
+    /// Its content.
+    ///
+    /// # Errors
+    /// [`CheckpointError`], also if it is not what was written.
+    pub fn read(&self, directory: &Path) -> Result<Vec<u8>> {
+        let path = self.path(directory);
+        let content = files::read(&path)?;
+        if content.len() as u64 != self.bytes || crc32c::crc32c(&content) != self.crc32c {
+            let reason = format!("it has {} bytes, expected {} with another checksum", content.len(), self.bytes);
+            return Err(damaged(&path, reason));
+        }
+        Ok(content)
+    }
+}
+
+/// Deletes files of arrays, beginning with one of `prefixes`, that are not `current`, and what broken-off writes left.
+pub(super) fn remove_others(directory: &Path, prefixes: &[&str], current: &[&str]) -> files::Result<()> {
+    for path in files::list(directory)? {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let arrays = prefixes.iter().any(|prefix| name.starts_with(prefix)) && name.ends_with(ARRAYS_SUFFIX);
+        if (arrays && !current.contains(&name.as_ref())) || name.starts_with(TEMPORARY_PREFIX) {
+            files::delete(&path)?;
+        }
+    }
+    Ok(())
+}
+
+/// Names the file that `reason` makes unusable.
+pub fn damaged(path: &Path, reason: String) -> CheckpointError {
+    CheckpointError::Damaged { path: path.to_owned(), reason }
+}

@@ -1,0 +1,383 @@
+//! Checkpoints: a directory with `checkpoint.json` and the files of arrays that it names, the policy's weights and what
+//! the training needs to go on, which only the learner understands.
+//!
+//! Writing is atomic: the arrays get new names first, then `checkpoint.json`, which names them with their sizes and
+//! checksums, is renamed into place, and only then the old arrays are deleted. Whatever moment the program or the
+//! machine dies at, the directory holds a complete checkpoint, the old one or the new one.
+#![forbid(unsafe_code)]
+
+mod arrays;
+mod counters;
+mod environment;
+mod files;
+mod named;
+
+use std::path::{Path, PathBuf};
+
+use perturb_files::checksum::Sealed;
+use perturb_files::{FileError, checksum, has_file, read_if_there, write_atomically};
+use perturb_policy::{Inputs, Normalisers, ObservationNormaliser, Player, PolicySpec, RewardNormaliser, Role, Weights};
+use perturb_protocol::proto;
+use perturb_settings::{Architecture, TrainConfig};
+use serde::{Deserialize, Serialize};
+
+pub use self::arrays::{Array, Arrays, encode};
+use self::arrays::{decode_weights, encode_weights};
+pub use self::counters::Counters;
+pub use self::environment::{Changed, EnvironmentSummary};
+use self::files::remove_others;
+pub use self::files::{ArraysFile, damaged};
+
+/// Of the JSON's layout; raised when older programs could misread it. Format 1 says beside the configuration what follows
+/// from it, formats 1 and 2 have no checksum.
+const FORMAT_VERSION: u32 = 3;
+/// The first with a checksum.
+const SEALED: u32 = 3;
+/// The file that makes a directory a checkpoint.
+pub const JSON: &str = "checkpoint.json";
+const WEIGHTS_PREFIX: &str = "weights-";
+/// Begins the names of files of what resuming needs.
+pub const RESUME_PREFIX: &str = "resume-";
+
+/// A trained policy with everything that testing needs.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Checkpoint {
+    /// Everything but the weights.
+    pub state: State,
+    /// The shape of the policy; that of [`State::policy`] if it was trained.
+    pub policy: PolicySpec,
+    /// The policy's weights, in the order of [`PolicySpec::layout`].
+    pub weights: Weights,
+}
+
+/// Everything in a checkpoint but the weights.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct State {
+    /// What the environment was like.
+    pub environment_spec: EnvironmentSummary,
+    /// The statistics of observations; `None` if they were not normalised.
+    pub observation_normaliser: Option<ObservationNormaliser>,
+    /// The statistics of rewards; `None` if they were not normalised.
+    pub reward_normaliser: Option<RewardNormaliser>,
+    /// How far the training had come.
+    pub counters: Counters,
+    /// The training's configuration, flat, as in `config.toml`.
+    pub config: TrainConfig,
+    /// The programs that trained, each with its commit, in order and without repetitions; empty in checkpoints of
+    /// earlier programs, which did not say.
+    #[serde(default)]
+    pub commits: Vec<String>,
+}
+
+/// What a training needs beside its policy to go on.
+#[derive(Clone, Debug)]
+pub struct Resume {
+    /// Its file of arrays, whose name begins with [`RESUME_PREFIX`].
+    pub arrays: ArraysFile,
+    /// What stands in `checkpoint.json`.
+    pub document: serde_json::Value,
+}
+
+/// `checkpoint.json`.
+#[derive(Serialize, Deserialize)]
+struct Document {
+    format_version: u32,
+    weights: ArraysFile,
+    /// Not looked into for testing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    resume: Option<serde_json::Value>,
+    #[serde(flatten)]
+    rest: serde_json::Value,
+}
+
+/// Why a checkpoint cannot be written or read.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum CheckpointError {
+    /// The operating system refused a file.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// There is no checkpoint.
+    #[error(
+        "{} holds no checkpoint: expected checkpoint.json there or in its folder checkpoint/; give the --out of a \
+         training, or the name of a policy in results/",
+        path.display()
+    )]
+    Missing {
+        /// What was given.
+        path: PathBuf,
+    },
+    /// A name is the beginning of several.
+    #[error("`{name}` could be any of these policies in {}, give the name or the path of one: {}", folder.display(), names.join(", "))]
+    Several {
+        /// What was given.
+        name: String,
+        /// Where it was looked for.
+        folder: PathBuf,
+        /// What begins so.
+        names: Vec<String>,
+    },
+    /// A file is damaged.
+    #[error("{} is not a usable checkpoint: {reason}", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// Another program wrote it, which may go on with it.
+    #[error(
+        "{} has format {format}, and this program reads 1 to {FORMAT_VERSION}: use the version of perturb that wrote it, or \
+         a copy that is whole",
+        path.display()
+    )]
+    Newer {
+        /// The file.
+        path: PathBuf,
+        /// Its format.
+        format: u64,
+    },
+    /// There is a policy, but not the state of its training.
+    #[error(
+        "the checkpoint in {} can be tested but not resumed: it holds the policy without the state of its training, as \
+         those of earlier versions of perturb; train again with --overwrite",
+        path.display()
+    )]
+    NotResumable {
+        /// The directory.
+        path: PathBuf,
+    },
+}
+
+/// What has gone well unless it was a [`CheckpointError`].
+pub type Result<T> = std::result::Result<T, CheckpointError>;
+
+impl Checkpoint {
+    /// Replaces the checkpoint in `directory`, which is created if it is not there. Without `resume` it can be tested,
+    /// but its training cannot be resumed.
+    ///
+    /// # Errors
+    /// [`CheckpointError::File`]; the earlier checkpoint, if any, is then still there.
+    pub fn save(&self, directory: &Path, resume: Option<Resume>) -> Result<()> {
+        let iterations = self.state.counters.iterations;
+        let (resume_file, resume) = resume.map(|Resume { arrays, document }| (arrays.file, document)).unzip();
+        let weights = encode_weights(&self.weights).map_err(|reason| damaged(directory, reason))?;
+        let weights = ArraysFile::write(directory, WEIGHTS_PREFIX, iterations, &weights)?;
+        let weights_file = weights.file.clone();
+
+        let document = Document {
+            format_version: FORMAT_VERSION,
+            weights,
+            resume,
+            rest: serde_json::to_value(&self.state).map_err(|error| damaged(directory, error.to_string()))?,
+        };
+        let not_written = |error: serde_json::Error| damaged(directory, error.to_string());
+        let sealed = Sealed::new(&document).map_err(not_written)?;
+        let json = serde_json::to_vec_pretty(&sealed).map_err(not_written)?;
+        write_atomically(&directory.join(JSON), &json)?;
+        let current = [weights_file.as_str(), resume_file.as_deref().unwrap_or_default()];
+        Ok(remove_others(directory, &[WEIGHTS_PREFIX, RESUME_PREFIX], &current)?)
+    }
+
+    /// Reads the checkpoint in `path`, or in its folder `checkpoint`; or that of a cell below `results/`, or where the
+    /// variable `PERTURB_RESULTS` says, whose id is `path` or alone begins with it.
+    ///
+    /// # Errors
+    /// [`CheckpointError`], which names the file.
+    pub fn load(path: &Path) -> Result<Self> {
+        let named = named::find(path)?;
+        let (directory, document) = Document::read(named.as_deref().unwrap_or(path))?;
+        Self::of(&directory, document)
+    }
+
+    /// Reads the checkpoint in `path`, or in its folder `checkpoint`, with where that is and what its training needs to go
+    /// on.
+    ///
+    /// # Errors
+    /// [`CheckpointError`], which names the file.
+    pub fn load_resumable(path: &Path) -> Result<(Self, PathBuf, serde_json::Value)> {
+        let (directory, mut document) = Document::read(path)?;
+        let resume = document.resume.take();
+        let checkpoint = Self::of(&directory, document)?;
+        let resume = resume.ok_or_else(|| CheckpointError::NotResumable { path: directory.clone() })?;
+        Ok((checkpoint, directory, resume))
+    }
+
+    /// What `document` in `directory` describes.
+    fn of(directory: &Path, document: Document) -> Result<Self> {
+        let state = State::of(directory, document.rest)?;
+        let policy = state.policy();
+        let bytes = document.weights.read(directory)?;
+        let file = document.weights.path(directory);
+        let weights = decode_weights(&bytes, &policy).map_err(|reason| damaged(&file, reason))?;
+        Ok(Self { state, policy, weights })
+    }
+
+    /// Names the policy: the iterations of its training, and a checksum of its weights. Weights of equal trainings have
+    /// the same name.
+    ///
+    /// # Errors
+    /// What is wrong with the weights.
+    pub fn id(&self) -> std::result::Result<String, String> {
+        let weights = encode_weights(&self.weights)?;
+        Ok(format!("{:08}-{:08x}", self.state.counters.iterations, crc32c::crc32c(&weights)))
+    }
+
+    /// The weights one after the other, in the order of [`PolicySpec::layout`].
+    pub fn flat_weights(&self) -> Vec<f32> {
+        self.weights.iter().flat_map(|array| array.data.iter().copied()).collect()
+    }
+
+    /// The policy as it plays in tests, with sampled actions and frozen statistics, in N = `n_envs` environments whose
+    /// indices are `first_environment_index` and so on. `seed` fixes the actions.
+    ///
+    /// # Errors
+    /// Weights that do not fit.
+    pub fn player(&self, n_envs: usize, seed: u64, first_environment_index: u32) -> perturb_policy::Result<Player> {
+        let Self { state, policy, weights } = self;
+        let normalisers = Normalisers {
+            observations: state.observation_normaliser.clone(),
+            rewards: state.reward_normaliser.clone(),
+        };
+        let episodes_per_trial = state.config.settings.episodes_per_trial();
+        let role = Role::testing(seed, first_environment_index, n_envs);
+        let mut player = Player::new(policy, state.inputs(n_envs), n_envs, episodes_per_trial, normalisers, role);
+        if state.config.settings.is_random() {
+            player = player.uniformly();
+        }
+        policy.check(weights)?;
+        player.load(&self.flat_weights())?;
+        Ok(player)
+    }
+}
+
+impl State {
+    /// Reads that of the checkpoint in `path`, or in its folder `checkpoint`. Of the weights it is only looked whether they
+    /// are there.
+    ///
+    /// # Errors
+    /// [`CheckpointError`], which names the file.
+    pub fn load(path: &Path) -> Result<Self> {
+        let load = || {
+            let (directory, document) = Document::read(path)?;
+            let state = Self::of(&directory, document.rest)?;
+            document.weights.require(&directory)?;
+            Ok(state)
+        };
+        match load() {
+            // A training may have written the next one meanwhile, and deleted the weights of this one.
+            Err(CheckpointError::File(_)) => load(),
+            loaded => loaded,
+        }
+    }
+
+    /// What `checkpoint.json` in `directory` says.
+    fn of(directory: &Path, document: serde_json::Value) -> Result<Self> {
+        let json = directory.join(JSON);
+        let state: Self = serde_json::from_value(document)
+            .map_err(|error| damaged(&json, format!("it is not understood: {error}")))?;
+        state.check().map_err(|reason| damaged(&json, reason))?;
+        Ok(state)
+    }
+
+    /// Whether the statistics are those that the configuration asks for; says what is wrong if they are not.
+    fn check(&self) -> std::result::Result<(), String> {
+        let (common, gamma) = (&self.config.common, self.config.settings.gamma());
+        let observations = match &self.observation_normaliser {
+            Some(normaliser) => normaliser.check(self.environment_spec.observation.len(), self.parameters_seen()),
+            None if common.normalize_observations => Err("there is none".into()),
+            None => Ok(()),
+        };
+        observations.map_err(|reason| format!("observation_normaliser: {reason}"))?;
+        let rewards = match &self.reward_normaliser {
+            Some(normaliser) => {
+                normaliser.check().and_then(|()| normaliser.fits(common.num_envs, gamma, common.reward_return_runs_on))
+            }
+            None if common.normalize_rewards => Err("there is none".into()),
+            None => Ok(()),
+        };
+        rewards.map_err(|reason| format!("reward_normaliser: {reason}"))
+    }
+
+    /// Whether `served` is the environment that this was trained in.
+    ///
+    /// # Errors
+    /// [`Changed`], with the first difference.
+    pub fn check_unchanged(&self, served: &proto::Environment) -> std::result::Result<(), Changed> {
+        let trained = &self.environment_spec;
+        let (what, trained, served) = match EnvironmentSummary::of(served) {
+            None => ("actions", format!("{:?}", trained.action), "none".into()),
+            Some(served) => match trained.difference(&served) {
+                None => return Ok(()),
+                Some(difference) => difference,
+            },
+        };
+        Err(Changed { environment: self.config.common.environment.clone(), what, trained, served })
+    }
+
+    /// How many entries at the end of an observation are parameters.
+    fn parameters_seen(&self) -> usize {
+        if self.config.common.observe.sees_parameters() { self.environment_spec.parameters.len() } else { 0 }
+    }
+
+    /// What normalises observations in training from its beginning, if they are normalised. Parameters that are seen
+    /// are scaled already.
+    pub fn fresh_normaliser(&self) -> Option<ObservationNormaliser> {
+        let (size, parameters) = (self.environment_spec.observation.len(), self.parameters_seen());
+        let fresh = || ObservationNormaliser::new(size.saturating_sub(parameters)).leaving_alone(parameters);
+        self.config.common.normalize_observations.then(fresh)
+    }
+
+    /// The shape of a policy that this was trained with.
+    pub fn policy(&self) -> PolicySpec {
+        if self.config.settings.is_random() {
+            let observation_size = self.inputs(1).size();
+            return PolicySpec {
+                observation_size,
+                action: self.environment_spec.action,
+                hidden: Vec::new(),
+                lstm: None,
+            };
+        }
+        let shape = match self.config.common.architecture {
+            Architecture::Ff => PolicySpec::feed_forward,
+            Architecture::Rc => PolicySpec::recurrent,
+        };
+        shape(self.inputs(1).size(), self.environment_spec.action)
+    }
+
+    /// What the policy gets to see of `n_envs` environments at the start of a trial.
+    pub fn inputs(&self, n_envs: usize) -> Inputs {
+        let EnvironmentSummary { observation, action, .. } = &self.environment_spec;
+        Inputs::new(observation.len(), *action, n_envs, self.config.settings.has_trials())
+    }
+}
+
+impl Document {
+    /// Reads `checkpoint.json` in `path`, or in its folder `checkpoint`; gives the folder, too.
+    fn read(path: &Path) -> Result<(PathBuf, Self)> {
+        let directory = match has_file(&path.join(JSON))? {
+            true => path.to_owned(),
+            false => path.join("checkpoint"),
+        };
+        let json = directory.join(JSON);
+        let text = if has_file(&json)? { read_if_there(&json)? } else { None };
+        let text = text.ok_or_else(|| CheckpointError::Missing { path: path.to_owned() })?;
+        let not_understood = |error: serde_json::Error| damaged(&json, format!("it is not understood: {error}"));
+        let mut value: serde_json::Value = serde_json::from_slice(&text).map_err(not_understood)?;
+        let sealed = checksum::open(&mut value);
+        // Another format may have other entries.
+        let format = value.get("format_version").and_then(serde_json::Value::as_u64);
+        if let Some(format) = format.filter(|format| !(1..=u64::from(FORMAT_VERSION)).contains(format)) {
+            return Err(CheckpointError::Newer { path: json, format });
+        }
+        let document: Self = serde_json::from_value(value).map_err(not_understood)?;
+        if sealed.is_err() || (document.format_version >= SEALED && sealed == Ok(false)) {
+            return Err(damaged(&json, format!("{}; give a copy that is whole", checksum::BROKEN)));
+        }
+        Ok((directory, document))
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,295 @@
+//! What a plan costs, from short measurements.
+//!
+//! A step costs what its environment costs plus what its method costs. So each environment is measured with one
+//! method, and each method in one environment, in groups as large as those of a run; the other pairs follow. How many
+//! steps there are depends on what is learned, so that only the most can be said beforehand; what cells of the same
+//! environment and method took, which are done, says it better: [`Taken`].
+
+use std::collections::HashMap;
+use std::iter::Sum;
+
+use perturb_settings::{Method, TrainConfig, Wrapper};
+
+use crate::folder::Folder;
+use crate::plan::{Cell, Grouping, Plan, distinct};
+use crate::times::Times;
+
+/// Seconds of a process that a step of one environment takes, with all that belongs to it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Speed {
+    /// With rollouts and updates.
+    pub training: f64,
+    /// In testing: without the updates.
+    pub testing: f64,
+}
+
+/// A group of trainings that was measured.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Measurement {
+    /// By its name in the catalogue.
+    pub environment: String,
+    /// What learned.
+    pub method: Method,
+    /// How many trainings there were.
+    pub cells: usize,
+    /// How fast it was.
+    pub speed: Speed,
+}
+
+/// What cells cost at most, if every episode goes on to the step limit. Seconds are those of processes.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Estimate {
+    /// Of EPOpt, also those that it does not learn from.
+    pub training_steps: f64,
+    /// Of RL², those of whole trials.
+    pub testing_steps: f64,
+    /// With rollouts and updates.
+    pub training_seconds: f64,
+    /// Without updates.
+    pub testing_seconds: f64,
+}
+
+impl Estimate {
+    /// Of trainings and tests.
+    pub fn seconds(&self) -> f64 {
+        self.training_seconds + self.testing_seconds
+    }
+}
+
+impl Sum for Estimate {
+    fn sum<I: Iterator<Item = Self>>(estimates: I) -> Self {
+        estimates.fold(Self::default(), |sum, cell| Self {
+            training_steps: sum.training_steps + cell.training_steps,
+            testing_steps: sum.testing_steps + cell.testing_steps,
+            training_seconds: sum.training_seconds + cell.training_seconds,
+            testing_seconds: sum.testing_seconds + cell.testing_seconds,
+        })
+    }
+}
+
+/// The groups of trainings to measure for `cells`, places in the plan: of each environment with its first method, and of
+/// each method in its first environment, as many cells as are in a group of a run, evenly from all over the grid. The
+/// one in its middle is the first.
+pub fn representatives<'a>(plan: &'a Plan, cells: &[usize], grouping: Grouping) -> Vec<Vec<&'a Cell>> {
+    let groups = plan.groups(cells, grouping);
+    let pair_at = |&cell: &usize| pair(&plan.cells[cell]);
+    let mut chosen: Vec<(&str, Method)> = Vec::new();
+    for pair in distinct(cells.iter().map(pair_at)) {
+        if chosen.iter().all(|known| known.0 != pair.0) || chosen.iter().all(|known| known.1 != pair.1) {
+            chosen.push(pair);
+        }
+    }
+    let group_of = |wanted: &(&str, Method)| {
+        let of_pair: Vec<usize> = cells.iter().copied().filter(|cell| pair_at(cell) == *wanted).collect();
+        let middle = of_pair[of_pair.len() / 2];
+        let together = groups.iter().find(|group| group.contains(&middle)).map_or(1, Vec::len).min(of_pair.len());
+        let place = |number: usize| of_pair[(2 * number + 1) * of_pair.len() / (2 * together)];
+        let mut group: Vec<&Cell> = (0..together).map(|number| &plan.cells[place(number)]).collect();
+        group.rotate_left(together / 2);
+        group
+    };
+    chosen.iter().map(group_of).collect()
+}
+
+/// What cells took that are done.
+#[derive(Debug)]
+pub struct Taken<'a> {
+    times: Times<'a>,
+}
+
+impl<'a> Taken<'a> {
+    /// The cells of `plan` that are done in `folder`.
+    pub fn read(plan: &'a Plan, folder: &Folder) -> Self {
+        let mut times = Times::default();
+        for cell in &plan.cells {
+            let place = folder.cell(&cell.id);
+            if let Some(timing) = place.timing().filter(|_| place.is_settled(false)) {
+                times.add(cell, timing.seconds);
+            }
+        }
+        Self { times }
+    }
+
+    /// The mean of those of the same environment and method as `cell`, s of a process; `None` if there are none.
+    pub fn seconds(&self, cell: &Cell) -> Option<f64> {
+        self.times.of_pair(cell)
+    }
+
+    /// How many there are.
+    pub fn cells(&self) -> usize {
+        self.times.cells()
+    }
+}
+
+fn pair(cell: &Cell) -> (&str, Method) {
+    (&cell.config.common.environment, cell.method())
+}
+
+/// What each cell of `plan` costs at most, in its order, given measurements of its [`representatives`] and the step limit
+/// of each environment.
+pub fn estimates(plan: &Plan, measurements: &[Measurement], step_limits: &HashMap<&str, u32>) -> Vec<Estimate> {
+    let mut speeds: HashMap<(&str, Method), Speed> = HashMap::new();
+    let estimate = |cell| {
+        let pair = pair(cell);
+        let speed = *speeds.entry(pair.clone()).or_insert_with(|| speed_of(&pair, measurements));
+        let limit = f64::from(step_limits.get(pair.0).copied().unwrap_or_default());
+        let training_steps = generated_episodes(&cell.config, cell.config.common.episodes) * limit;
+        let testing_steps = tested_episodes(cell) * limit;
+        Estimate {
+            training_steps,
+            testing_steps,
+            training_seconds: training_steps * speed.training,
+            testing_seconds: testing_steps * speed.testing,
+        }
+    };
+    plan.cells.iter().map(estimate).collect()
+}
+
+/// How many episodes a training has had when its budget counts so many: more if it learns from the worst of them only, none
+/// if nothing learns.
+pub fn generated_episodes(config: &TrainConfig, counted: u64) -> f64 {
+    if config.settings.is_random() {
+        return 0.0;
+    }
+    let budget = counted as f64;
+    let Wrapper::Epopt(epopt) = &config.settings.wrapper else { return budget };
+    let full = (epopt.full_iterations as f64 * epopt.episodes_per_iteration as f64).min(budget);
+    full + (budget - full) / epopt.epsilon
+}
+
+/// How many episodes the tests of a cell have, of RL² those of whole trials.
+pub fn tested_episodes(cell: &Cell) -> f64 {
+    let times = cell.tests.sets.len() as f64 * (1.0 + cell.tests.marks.len() as f64);
+    let trials = cell.tests.episodes as f64 * times + cell.tests.selection.unwrap_or_default() as f64;
+    trials * f64::from(cell.config.settings.episodes_per_trial())
+}
+
+/// A pair's speed: measured, or the method's in another environment plus what this environment takes more.
+fn speed_of((environment, method): &(&str, Method), measurements: &[Measurement]) -> Speed {
+    let find = |environment: &str, method: &Method| {
+        measurements.iter().find(|known| known.environment == environment && known.method == *method)
+    };
+    if let Some(known) = find(environment, method) {
+        return known.speed;
+    }
+    let nothing = Speed { training: 0.0, testing: 0.0 };
+    let of_environment = measurements.iter().find(|known| known.environment == *environment);
+    let of_method = measurements.iter().find(|known| known.method == *method);
+    let (Some(of_environment), Some(of_method)) = (of_environment, of_method) else {
+        return of_environment.or(of_method).map_or(nothing, |known| known.speed);
+    };
+    let common = find(&of_method.environment, &of_environment.method).map_or(nothing, |known| known.speed);
+    let combine = |of: fn(&Speed) -> f64| {
+        let (environment, method) = (of(&of_environment.speed), of(&of_method.speed));
+        (environment + method - of(&common)).max(environment).max(method)
+    };
+    Speed { training: combine(|speed| speed.training), testing: combine(|speed| speed.testing) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn plan() -> Plan {
+        let text = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 3\ntest_episodes = 10
+            settings = { episodes = 100 }\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff', 'rc']
+            grid = { n_steps = [5, 10, 15] }\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']
+            settings = { n_steps = 32 }";
+        Plan::parse("test", text.into()).unwrap()
+    }
+
+    fn measured(environment: &str, method: &Method, training: f64) -> Measurement {
+        let speed = Speed { training, testing: training / 4.0 };
+        Measurement { environment: environment.into(), method: method.clone(), cells: 1, speed }
+    }
+
+    #[test]
+    fn each_environment_and_each_method_is_measured_once() {
+        let plan = plan();
+        let all: Vec<usize> = (0..plan.cells.len()).collect();
+        let chosen = |cells: &[usize], most| -> Vec<(String, Vec<i64>)> {
+            let groups = representatives(&plan, cells, Grouping { most, at_a_time: 1 });
+            let steps = |cell: &&Cell| cell.config.table()["n_steps"].as_integer().unwrap_or_default();
+            let name = |cell: &Cell| format!("{} {}", cell.config.common.environment, cell.method());
+            groups.iter().map(|group| (name(group[0]), group.iter().map(steps).collect())).collect()
+        };
+        let names: Vec<String> = chosen(&all, 1).into_iter().map(|(name, _)| name).collect();
+        assert_eq!(names, ["CartPole a2c ff", "CartPole a2c rc", "CartPole ppo ff", "Hopper a2c ff"]);
+        assert_eq!(chosen(&all, 1)[0].1, [10], "the middle of the grid");
+        // Of CartPole with FF there are nine cells of A2C and three of PPO: groups of six.
+        assert_eq!(chosen(&all, 6)[0].1, [10, 15, 15, 5, 5, 10], "all over the grid");
+        assert_eq!(chosen(&all, 6)[2].1.len(), 3, "there are no more");
+        assert_eq!(chosen(&[18, 19], 36), [("CartPole ppo ff".to_owned(), vec![32, 32])], "those that are asked for");
+    }
+
+    #[test]
+    fn what_cells_took_says_what_others_of_the_same_kind_take() {
+        let plan = plan();
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(directory.path());
+        for (cell, seconds, done) in [(0, 10.0, true), (1, 20.0, true), (2, 900.0, false)] {
+            let place = folder.cell(&plan.cells[cell].id);
+            place.write_timing(&crate::folder::Timing { seconds }).unwrap();
+            if done {
+                std::fs::write(place.path().join("result.json"), "x").unwrap();
+            }
+        }
+        let taken = Taken::read(&plan, &folder);
+        assert_eq!(taken.cells(), 2, "a cell without a result took more");
+        assert_eq!((taken.seconds(&plan.cells[5]), taken.seconds(&plan.cells[18])), (Some(15.0), None));
+    }
+
+    #[test]
+    fn costs_of_environments_and_methods_add_up() {
+        let plan = plan();
+        let methods = plan.methods();
+        let [a2c, rc, ppo] = &methods[..] else { panic!() };
+        let measurements = [
+            measured("CartPole", a2c, 3.0),
+            measured("CartPole", rc, 11.0),
+            measured("CartPole", ppo, 4.0),
+            measured("Hopper", a2c, 8.0),
+        ];
+        let of = |environment: &str, method: &Method| speed_of(&(environment, method.clone()), &measurements).training;
+        assert_eq!((of("Hopper", a2c), of("Hopper", rc), of("Hopper", ppo)), (8.0, 16.0, 9.0));
+        let limits = [("Hopper", 1000), ("CartPole", 200)].into();
+        let total: Estimate = estimates(&plan, &measurements, &limits).into_iter().sum();
+        // 3 runs of 3, 3 and 1 configurations; 100 training episodes each.
+        let steps = 3.0 * 7.0 * 100.0 * (200.0 + 1000.0);
+        assert_eq!((total.training_steps, total.testing_steps), (steps, steps * 0.3));
+        let cart_pole = 3.0 * 100.0 * 200.0 * (3.0 * 3.0 + 3.0 * 11.0 + 4.0);
+        let hopper = 3.0 * 100.0 * 1000.0 * (3.0 * 8.0 + 3.0 * 16.0 + 9.0);
+        assert!((total.training_seconds - cart_pole - hopper).abs() < 1e-6 * total.training_seconds);
+        assert!((total.testing_seconds - total.training_seconds * 0.3 / 4.0).abs() < 1e-6 * total.testing_seconds);
+        let cells: Vec<f64> = estimates(&plan, &measurements, &limits).iter().map(Estimate::seconds).collect();
+        // The first is CartPole with A2C: 3 s a step, and a quarter of that in a test.
+        assert!((cells[0] - 100.0 * 200.0 * (3.0 + 0.3 * 3.0 / 4.0)).abs() < 1e-6 * cells[0], "{}", cells[0]);
+        let sum: f64 = cells.iter().sum();
+        assert!(cells.len() == 2 * 21 && (sum - total.seconds()).abs() < 1e-6 * sum);
+    }
+
+    #[test]
+    fn episodes_that_are_not_learned_from_and_episodes_of_a_trial_cost_too() {
+        let text = "environments = ['CartPole']\nversions = ['D']\ntest_versions = ['R']\ntest_episodes = 10
+            settings = { episodes = 15000 }
+            [[algorithm]]\nname = 'epopt-ppo'\narchitectures = ['ff']\nsettings = { epsilon = 0.1 }
+            [[algorithm]]\nname = 'rl2-ppo'\narchitectures = ['rc']\nsettings = { episodes_per_trial = 5 }";
+        let plan = Plan::parse("test", text.into()).unwrap();
+        let estimates = estimates(&plan, &[], &[("CartPole", 1)].into());
+        let steps = |cell: usize| (estimates[cell].training_steps, estimates[cell].testing_steps);
+        // 100 iterations of 100 episodes, and a tenth of each that follows.
+        assert_eq!(steps(0), (10_000.0 + 50_000.0, 10.0));
+        assert_eq!(steps(1), (15_000.0, 50.0));
+    }
+
+    #[test]
+    fn a_slower_environment_is_never_estimated_faster() {
+        let plan = plan();
+        let methods = plan.methods();
+        let [a2c, rc, ppo] = &methods[..] else { panic!() };
+        let measurements =
+            [measured("CartPole", a2c, 3.0), measured("CartPole", rc, 2.0), measured("Hopper", a2c, 8.0)];
+        assert_eq!(speed_of(&("Hopper", rc.clone()), &measurements).training, 8.0);
+        assert_eq!(speed_of(&("Hopper", ppo.clone()), &measurements).training, 8.0, "not measured at all");
+    }
+}

@@ -1,0 +1,316 @@
+//! Training curves: the selected trainings' returns and successes over their episodes and over their steps, averaged over
+//! runs.
+
+use std::path::Path;
+
+use perturb_files::{AnyError, read_if_there};
+use perturb_protocol::Version;
+use perturb_records::TrainedOn;
+use perturb_records::statistics::{Summary, mean};
+use perturb_settings::Method;
+
+use crate::folder::{Folder, FolderError};
+use crate::selection::MethodResults;
+
+/// There is a point for so many episodes of the shortest run …
+const LEAST_EPISODES: usize = 20;
+/// … and at most so many points.
+const MOST_POINTS: usize = 100;
+
+/// By what trainings are compared.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Footing {
+    /// Episodes that ended, also those that EPOpt generates and does not learn from.
+    Episodes,
+    /// Steps of these episodes, of all environments together.
+    Steps,
+}
+
+impl Footing {
+    /// Both.
+    pub const ALL: [Footing; 2] = [Footing::Episodes, Footing::Steps];
+
+    /// What an episode adds.
+    fn of(self, episode: &Episode) -> f64 {
+        match self {
+            Footing::Episodes => 1.0,
+            Footing::Steps => episode.length,
+        }
+    }
+}
+
+impl std::fmt::Display for Footing {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.pad(match self {
+            Footing::Episodes => "episodes",
+            Footing::Steps => "steps",
+        })
+    }
+}
+
+/// The curves of all methods in an environment.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EnvironmentCurves {
+    /// Its name.
+    pub environment: String,
+    /// For each method and training version that has a finished training.
+    pub curves: Vec<Curve>,
+}
+
+/// A method's curve on a training version.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Curve {
+    /// What was trained.
+    pub method: Method,
+    /// Where it was trained.
+    pub version: Version,
+    /// How long its trainings were, and their points, by episodes and by steps.
+    lines: [Line; 2],
+}
+
+/// A curve by one [`Footing`].
+#[derive(Clone, Debug, Default, PartialEq)]
+struct Line {
+    total: f64,
+    points: Vec<Point>,
+}
+
+/// Part of a training.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Point {
+    /// Episodes, or steps, in the middle of it; mean over runs.
+    pub progress: f64,
+    /// The mean undiscounted return of the episodes that had their middle in it, over runs.
+    pub episode_return: Summary,
+    /// The success rate of these episodes, %, over runs.
+    pub success: Summary,
+}
+
+/// A line of `monitor.csv`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Episode {
+    episode_return: f64,
+    /// Steps.
+    length: f64,
+    /// 0 or 1.
+    success: f64,
+}
+
+impl Curve {
+    fn of(method: &Method, version: Version, runs: &[Vec<Episode>]) -> Self {
+        Self { method: method.clone(), version, lines: Footing::ALL.map(|footing| line(runs, footing)) }
+    }
+
+    /// Without points.
+    pub fn new(method: &Method, version: Version) -> Self {
+        Self { method: method.clone(), version, lines: Default::default() }
+    }
+
+    /// Adds a point after all others.
+    pub fn add(&mut self, by: Footing, point: Point) {
+        let line = &mut self.lines[by as usize];
+        line.total = point.progress;
+        line.points.push(point);
+    }
+
+    /// In order.
+    pub fn points(&self, by: Footing) -> &[Point] {
+        &self.lines[by as usize].points
+    }
+
+    /// How long a training was: episodes or steps, mean over runs.
+    pub fn total(&self, by: Footing) -> f64 {
+        self.lines[by as usize].total
+    }
+
+    /// The last point that is not beyond `progress`, or the first of all.
+    pub fn at(&self, by: Footing, progress: f64) -> Option<&Point> {
+        let points = self.points(by);
+        points.get(points.partition_point(|point| point.progress <= progress).saturating_sub(1))
+    }
+}
+
+/// Reads the curves of all selected trainings; those whose `monitor.csv` is gone are left out.
+///
+/// # Errors
+/// [`FolderError`] if a file is there that cannot be read.
+pub fn read_curves(selections: &[MethodResults<'_>], folder: &Folder) -> Result<Vec<EnvironmentCurves>, FolderError> {
+    let mut all = Vec::new();
+    for of_environment in selections.chunk_by(|a, b| a.environment == b.environment) {
+        let mut curves = Vec::new();
+        for selection in of_environment {
+            for version in Version::KNOWN {
+                let runs = read_runs(selection, version, folder)?;
+                if !runs.is_empty() {
+                    curves.push(Curve::of(&selection.method, version, &runs));
+                }
+            }
+        }
+        all.push(EnvironmentCurves { environment: of_environment[0].environment.to_owned(), curves });
+    }
+    Ok(all)
+}
+
+/// The episodes of each run that has some.
+fn read_runs(
+    selection: &MethodResults<'_>,
+    version: Version,
+    folder: &Folder,
+) -> Result<Vec<Vec<Episode>>, FolderError> {
+    let mut runs = Vec::new();
+    for selected in selection.runs.values().filter_map(|run| run.cell_trained_on(TrainedOn::Version(version))) {
+        let episodes = read_monitor(&folder.cell(&selected.cell.id).training().join("monitor.csv"))?;
+        if !episodes.is_empty() {
+            runs.push(episodes);
+        }
+    }
+    Ok(runs)
+}
+
+/// The episodes in the order in which they ended; none without a file.
+fn read_monitor(path: &Path) -> Result<Vec<Episode>, FolderError> {
+    let Some(content) = read_if_there(path)? else { return Ok(Vec::new()) };
+    let damaged = |error: AnyError| FolderError::Damaged { path: path.to_owned(), reason: error.to_string() };
+    parse_monitor(&content).map_err(damaged)
+}
+
+/// Of a study's millions of lines only three fields are looked at.
+fn parse_monitor(content: &[u8]) -> Result<Vec<Episode>, AnyError> {
+    let mut reader = csv::ReaderBuilder::new().comment(Some(b'#')).from_reader(content);
+    let names = reader.headers()?.clone();
+    let place = |name: &str| names.iter().position(|known| known == name).ok_or_else(|| format!("no column {name}"));
+    let places = [place("r")?, place("l")?, place("success")?];
+    let (mut line, mut episodes) = (csv::StringRecord::new(), Vec::new());
+    while reader.read_record(&mut line)? {
+        let number = |place: usize| {
+            let text = line.get(place).unwrap_or_default();
+            text.parse::<f64>().map_err(|error| format!("`{text}` in line {}: {error}", episodes.len() + 1))
+        };
+        let [episode_return, length, success] = places;
+        let (episode_return, length, success) = (number(episode_return)?, number(length)?, number(success)?);
+        episodes.push(Episode { episode_return, length, success });
+    }
+    Ok(episodes)
+}
+
+/// Parts each run evenly by `footing`, and averages each part over runs. What is averaged are equal shares of a training,
+/// since trainings end some episodes after their budget. A part in which no episode had its middle has no point.
+fn line(runs: &[Vec<Episode>], footing: Footing) -> Line {
+    let shortest = runs.iter().map(Vec::len).min().unwrap_or_default();
+    let count = (shortest / LEAST_EPISODES).clamp(usize::from(shortest > 0), MOST_POINTS);
+    let totals: Vec<f64> = runs.iter().map(|run| run.iter().map(|episode| footing.of(episode)).sum()).collect();
+    let total = Summary::of(&totals).map_or(0.0, |total| total.mean);
+    let parts: Vec<Vec<&[Episode]>> =
+        runs.iter().zip(&totals).map(|(run, total)| split(run, count, *total, footing)).collect();
+    let point = |part: usize| {
+        let over_runs = |number: fn(&Episode) -> f64| {
+            let there = parts.iter().map(|run| run[part]).filter(|part| !part.is_empty());
+            Summary::of(&there.map(|part| mean(part.iter().map(number))).collect::<Vec<_>>())
+        };
+        Some(Point {
+            progress: (part as f64 + 0.5) / count as f64 * total,
+            episode_return: over_runs(|episode| episode.episode_return)?,
+            success: over_runs(|episode| 100.0 * episode.success)?,
+        })
+    };
+    Line { total, points: (0..count).filter_map(point).collect() }
+}
+
+/// `count` parts of `run`, by where the middles of its episodes are.
+fn split(run: &[Episode], count: usize, total: f64, footing: Footing) -> Vec<&[Episode]> {
+    let mut before = 0.0;
+    let mut part_of = Vec::with_capacity(run.len());
+    for episode in run {
+        let own = footing.of(episode);
+        part_of.push(((before + own / 2.0) / total * count as f64) as usize);
+        before += own;
+    }
+    let begin = |part: usize| part_of.partition_point(|of| *of < part);
+    (0..count).map(|part| &run[begin(part)..if part + 1 == count { run.len() } else { begin(part + 1) }]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use rstest::rstest;
+
+    use super::*;
+    use crate::plan::Plan;
+
+    const PLAN: &str = "environments = ['CartPole']\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
+
+    fn episodes(count: usize, of: impl Fn(usize) -> (f64, f64, f64)) -> Vec<Episode> {
+        let episode = |(episode_return, length, success)| Episode { episode_return, length, success };
+        (0..count).map(|i| episode(of(i))).collect()
+    }
+
+    #[test]
+    fn a_point_is_a_mean_over_a_part_of_each_run() {
+        // 40 and 43 episodes: two parts of 20 and 20, or 21 and 22.
+        let first = episodes(40, |i| if i < 20 { (1.0, 1.0, 0.0) } else { (3.0, 1.0, 1.0) });
+        let second = episodes(43, |i| if i < 21 { (5.0, 1.0, 1.0) } else { (5.0, 1.0, 0.0) });
+        let point = |progress: f64, mean: f64, std: f64| Point {
+            progress,
+            episode_return: Summary { mean, std: Some(std), runs: 2 },
+            success: Summary { mean: 50.0, std: Some(50.0), runs: 2 },
+        };
+        let expected = [point(10.375, 3.0, 2.0), point(31.125, 4.0, 1.0)];
+        assert_eq!(line(&[first, second], Footing::Episodes), Line { total: 41.5, points: expected.into() });
+    }
+
+    #[test]
+    fn by_steps_long_episodes_weigh_more() {
+        // 30 episodes of 1 step that fail, then 10 of 27 steps that succeed: half of the 300 steps are in the sixth of
+        // these, which has its middle at 30 + 4.5 · 27 = 151.5.
+        let run = episodes(40, |i| if i < 30 { (0.0, 1.0, 0.0) } else { (1.0, 27.0, 1.0) });
+        let rates =
+            |by| line(std::slice::from_ref(&run), by).points.iter().map(|point| point.success.mean).collect::<Vec<_>>();
+        assert_eq!(rates(Footing::Episodes), [0.0, 50.0]);
+        assert_eq!(rates(Footing::Steps), [100.0 * 4.0 / 34.0, 100.0]);
+        assert_eq!(line(&[run], Footing::Steps).total, 300.0);
+    }
+
+    #[test]
+    fn a_part_without_an_episode_has_no_point() {
+        // Of 60 episodes the last has most of the steps: its middle is in the second part of three.
+        let run = episodes(60, |i| (0.0, if i < 59 { 1.0 } else { 121.0 }, 0.0));
+        let method = Plan::parse("test", PLAN.into()).unwrap().methods().remove(0);
+        let curve = Curve::of(&method, Version::D, &[run]);
+        let places = |by| curve.points(by).iter().map(|point| point.progress).collect::<Vec<_>>();
+        assert_eq!(places(Footing::Steps), [30.0, 90.0]);
+        let at = |progress: f64| curve.at(Footing::Steps, progress).unwrap().progress;
+        assert_eq!([0.0, 89.9, 90.0, 999.0].map(at), [30.0, 30.0, 90.0, 90.0]);
+    }
+
+    #[rstest]
+    #[case(0, 0)]
+    #[case(3, 1)]
+    #[case(39, 1)]
+    #[case(400, 20)]
+    #[case(15_008, 100)]
+    fn curves_have_a_hundred_points_at_most_and_one_at_least(#[case] count: usize, #[case] expected: usize) {
+        for by in Footing::ALL {
+            assert_eq!(line(&[episodes(count, |_| (0.0, 3.0, 0.0))], by).points.len(), expected);
+        }
+    }
+
+    #[test]
+    fn without_runs_there_is_no_curve() {
+        assert_eq!(line(&[], Footing::Steps), Line::default());
+    }
+
+    #[test]
+    fn a_monitor_file_is_read_and_a_damaged_one_named() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("monitor.csv");
+        assert!(read_monitor(&path).unwrap().is_empty());
+        std::fs::write(&path, "#{\"t_start\": 1}\nr,l,t,success,terminated,mass\n-1.5,9,0.1,1,0,2\n2,8,0.1,0,1,2\n")
+            .unwrap();
+        let expected = episodes(2, |i| [(-1.5, 9.0, 1.0), (2.0, 8.0, 0.0)][i]);
+        assert_eq!(read_monitor(&path).unwrap(), expected);
+        for (damaged, reason) in [("r,l,success\n1,2,x\n", "`x` in line 1"), ("r,success\n1,1\n", "no column l")] {
+            std::fs::write(&path, damaged).unwrap();
+            let error = read_monitor(&path).unwrap_err().to_string();
+            assert!(error.contains("monitor.csv is not understood") && error.contains(reason), "{error}");
+        }
+    }
+}

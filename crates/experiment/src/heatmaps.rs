@@ -1,0 +1,358 @@
+//! The heatmaps of an experiment: of each policy that was selected in a run, over any two parameters.
+//!
+//! ```text
+//! DIR/heatmaps/ID-X-Y.csv .parquet  of the cell ID, over the parameters X and Y: figures and episodes
+//! DIR/heatmaps/ID-X-Y.json          how they were made; written last
+//! DIR/heatmaps/ID-X-Y-R.…           the same with the other parameters drawn from R
+//! ```
+//!
+//! The record holds checksums of the figures and of the cell's result. Figures of two records, or of a result that has
+//! been replaced since, are therefore never taken for current ones. Pictures are drawn from figures when they are wanted.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+
+use perturb_files::{self as files, delete, read_if_there, write_atomically, write_json};
+use perturb_records::{Axis, Heatmap, HeatmapKind, HeatmapOptions, TrainedOn, heatmap_table};
+use perturb_settings::Method;
+use serde::{Deserialize, Serialize};
+
+use crate::folder::{Folder, FolderError};
+use crate::plan::Cell;
+use crate::selection::{MethodResults, Selected};
+
+/// Of the records; raised when older programs could misread them.
+const FORMAT_VERSION: u32 = 2;
+
+/// A policy that an experiment has heatmaps of, or could have.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HeatmapPlace<'a> {
+    /// The environment's name.
+    pub environment: &'a str,
+    /// What was trained.
+    pub method: &'a Method,
+    /// Where it was trained.
+    pub trained_on: TrainedOn<'a>,
+    /// Counted from 1.
+    pub run: u32,
+    /// What was selected; `None` if nothing has a result.
+    pub selected: Option<Selected<'a>>,
+}
+
+/// `ID-X-Y.json`: what a heatmap shows. It depends on nothing but the results, the program and the settings.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct HeatmapRecord {
+    /// Of this layout.
+    format_version: u32,
+    /// The cell.
+    pub cell: String,
+    /// CRC-32C of its `result.json`.
+    result: String,
+    /// What the checkpoint's weights are called, see the learner's `Checkpoint::id`.
+    pub checkpoint: String,
+    /// Of the training.
+    pub train_seed: u64,
+    /// How it was tested.
+    #[serde(flatten)]
+    pub options: HeatmapOptions,
+    /// x and y.
+    pub axes: [Axis; 2],
+    /// The program's version and the commit that it was built from.
+    pub commit: String,
+    /// CRC-32C of `ID-X-Y.csv`.
+    figures: String,
+}
+
+/// A heatmap that belongs to the current results.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StoredHeatmap {
+    /// How it was made.
+    pub record: HeatmapRecord,
+    /// What it shows.
+    pub heatmap: Heatmap,
+}
+
+/// Why there is no heatmap at a place.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
+pub enum NoHeatmap {
+    /// The training was not done yet.
+    #[error("no heatmap, since this training has no result yet")]
+    NoResult,
+    /// Nor is one that was not made completely.
+    #[error("the heatmap has not been made")]
+    NotMade,
+    /// The result has been replaced.
+    #[error("the heatmap is of an earlier result")]
+    Outdated,
+    /// Means are over the same points and as many episodes.
+    #[error("the heatmap has another grid or other episodes than that of an earlier run")]
+    NotAlike,
+}
+
+/// The policies that a plan has heatmaps of, in the order of `selections`, of what it trains on and of runs.
+pub fn heatmap_places<'a>(selections: &'a [MethodResults<'a>]) -> Vec<HeatmapPlace<'a>> {
+    let mut places = Vec::new();
+    for MethodResults { environment, method, runs, .. } in selections.iter().filter(|row| !row.method.elsewhere) {
+        let trained_on: BTreeSet<TrainedOn<'a>> = runs.values().flat_map(|run| run.0.keys().copied()).collect();
+        for trained_on in trained_on {
+            places.extend(runs.iter().map(|(&run, of_run)| {
+                let selected = of_run.cell_trained_on(trained_on);
+                HeatmapPlace { environment, method, trained_on, run, selected }
+            }));
+        }
+    }
+    places
+}
+
+/// What there are heatmaps over in `folder`, by environment; of results that have been replaced, too.
+///
+/// # Errors
+/// The operating system's.
+pub fn heatmap_kinds<'a>(
+    folder: &Folder,
+    places: &[HeatmapPlace<'a>],
+) -> files::Result<BTreeMap<&'a str, BTreeSet<HeatmapKind>>> {
+    let ids = places.iter().filter_map(|place| Some((place.selected?.cell.id.as_str(), place.environment)));
+    let environments: BTreeMap<&str, &'a str> = ids.collect();
+    let mut kinds: BTreeMap<&str, BTreeSet<HeatmapKind>> = BTreeMap::new();
+    for path in files::list(&folder.path().join("heatmaps"))? {
+        if path.extension().is_none_or(|ending| ending != "json") {
+            continue;
+        }
+        let Some(record) = read_if_there(&path)?.and_then(|text| HeatmapRecord::of(&text)) else { continue };
+        if let Some(environment) = environments.get(record.cell.as_str()) {
+            kinds.entry(environment).or_default().insert(record.options.kind());
+        }
+    }
+    Ok(kinds)
+}
+
+impl HeatmapRecord {
+    /// One that is not understood is made again like one that is not there.
+    fn of(text: &[u8]) -> Option<Self> {
+        serde_json::from_slice(text).ok().filter(|record: &Self| record.format_version == FORMAT_VERSION)
+    }
+}
+
+impl HeatmapPlace<'_> {
+    /// The heatmap of `kind` that is there, or why there is none.
+    ///
+    /// # Errors
+    /// [`FolderError`] if a file is there that cannot be read.
+    pub fn read(&self, folder: &Folder, kind: &HeatmapKind) -> Result<Result<StoredHeatmap, NoHeatmap>, FolderError> {
+        let Some(Selected { cell, .. }) = self.selected else { return Ok(Err(NoHeatmap::NoResult)) };
+        let path = heatmap_path(folder, cell, kind);
+        let record = read_if_there(&path.with_added_extension("json"))?.and_then(|text| HeatmapRecord::of(&text));
+        let Some(record) = record.filter(|record| record.cell == cell.id && record.options.kind() == *kind) else {
+            return Ok(Err(NoHeatmap::NotMade));
+        };
+        if Some(&record.result) != result_checksum(folder, cell)?.as_ref() {
+            return Ok(Err(NoHeatmap::Outdated));
+        }
+        let figures = read_if_there(&path.with_added_extension("csv"))?;
+        let figures = figures.filter(|figures| checksum(figures) == record.figures);
+        let heatmap = figures.and_then(|figures| record.blank(self.environment).with_points(&figures));
+        Ok(heatmap.map_or(Err(NoHeatmap::NotMade), |heatmap| Ok(StoredHeatmap { record, heatmap })))
+    }
+}
+
+impl HeatmapRecord {
+    /// Without points.
+    fn blank(&self, environment: &str) -> Heatmap {
+        let HeatmapOptions { base, grid, episodes, fixed, .. } = self.options.clone();
+        let (environment, axes) = (environment.to_owned(), self.axes.clone());
+        Heatmap { environment, axes, base, fixed, grid, episodes, points: Vec::new() }
+    }
+}
+
+impl std::fmt::Display for HeatmapPlace<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}, {} trained on {}, run {}", self.environment, self.method, self.trained_on, self.run)
+    }
+}
+
+/// Where a heatmap of `cell` is, without the ending.
+pub fn heatmap_path(folder: &Folder, cell: &Cell, kind: &HeatmapKind) -> PathBuf {
+    folder.path().join("heatmaps").join(format!("{}-{kind}", cell.id))
+}
+
+/// Keeps `heatmap` of the policy called `checkpoint` as that of `cell`.
+///
+/// # Errors
+/// The operating system's; then there is none.
+pub fn store_heatmap(
+    folder: &Folder,
+    cell: &Cell,
+    checkpoint: String,
+    options: HeatmapOptions,
+    heatmap: &Heatmap,
+) -> files::Result<()> {
+    let path = heatmap_path(folder, cell, &options.kind());
+    let record_path = path.with_added_extension("json");
+    let result = result_checksum(folder, cell)?;
+    delete(&record_path)?;
+    let figures = heatmap_table(heatmap).to_csv();
+    write_atomically(&path.with_added_extension("csv"), &figures)?;
+    let record = HeatmapRecord {
+        format_version: FORMAT_VERSION,
+        cell: cell.id.clone(),
+        result: result.unwrap_or_default(),
+        checkpoint,
+        train_seed: cell.config.common.seed,
+        options,
+        axes: heatmap.axes.clone(),
+        commit: crate::VERSION.into(),
+        figures: checksum(&figures),
+    };
+    write_json(&record_path, &record)
+}
+
+/// Of a cell's result as it is on the disk.
+fn result_checksum(folder: &Folder, cell: &Cell) -> files::Result<Option<String>> {
+    Ok(read_if_there(&folder.cell(&cell.id).path().join("result.json"))?.map(|content| checksum(&content)))
+}
+
+fn checksum(content: &[u8]) -> String {
+    format!("{:08x}", crc32c::crc32c(content))
+}
+
+#[cfg(test)]
+mod tests {
+    use perturb_protocol::Version;
+
+    use super::*;
+    use crate::fixture;
+    use crate::plan::Plan;
+
+    const PLAN: &str = "environments = ['Pendulum', 'Elsewhere']\nversions = ['D', 'E']\nruns = 2
+        [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
+
+    fn heatmap() -> Heatmap {
+        fixture::heatmap(2, |x, y| (x / 3.0, 100.0 * y / 1.5))
+    }
+
+    fn options(base: Version) -> HeatmapOptions {
+        let Heatmap { axes, grid, episodes, fixed, .. } = heatmap();
+        HeatmapOptions { parameters: axes.map(|axis| axis.name), base, grid, episodes, seed: 1, fixed }
+    }
+
+    #[test]
+    fn a_heatmap_is_current_only_while_it_and_its_result_are_whole() {
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(directory.path());
+        let cell = &plan.cells[0];
+        let result = folder.cell(&cell.id).path().join("result.json");
+        write_atomically(&result, b"{}").unwrap();
+        let (method, done) = (cell.method(), fixture::result(cell, [0.0; 3], 0.0));
+        let place = HeatmapPlace {
+            environment: "Pendulum",
+            method: &method,
+            trained_on: TrainedOn::Version(Version::D),
+            run: 1,
+            selected: Some(Selected { cell, result: &done }),
+        };
+        let kind = options(Version::D).kind();
+        assert_eq!(place.read(&folder, &kind).unwrap(), Err(NoHeatmap::NotMade));
+        let nobody = HeatmapPlace { selected: None, ..place.clone() };
+        assert_eq!(nobody.read(&folder, &kind).unwrap(), Err(NoHeatmap::NoResult));
+
+        let store = || store_heatmap(&folder, cell, "00000001-0a".into(), options(Version::D), &heatmap()).unwrap();
+        store();
+        let path = heatmap_path(&folder, cell, &kind);
+        assert_eq!(path, directory.path().join("heatmaps").join(format!("{}-mass-length", cell.id)));
+        let stored = place.read(&folder, &kind).unwrap().unwrap();
+        assert_eq!((stored.record.cell, stored.record.options), (cell.id.clone(), options(Version::D)));
+        assert_eq!(stored.heatmap, heatmap(), "to the last digit");
+
+        for ending in ["csv", "json"] {
+            let damaged = path.with_added_extension(ending);
+            let content = std::fs::read(&damaged).unwrap();
+            for write in [&content[..content.len() / 2], b""] {
+                std::fs::write(&damaged, write).unwrap();
+                assert_eq!(place.read(&folder, &kind).unwrap(), Err(NoHeatmap::NotMade), "half a {ending}");
+            }
+            std::fs::remove_file(&damaged).unwrap();
+            assert_eq!(place.read(&folder, &kind).unwrap(), Err(NoHeatmap::NotMade), "no {ending}");
+            store();
+            assert_eq!(std::fs::read(&damaged).unwrap(), content, "the same bytes again");
+        }
+        let figures = path.with_added_extension("csv");
+        let text = std::fs::read_to_string(&figures).unwrap();
+        std::fs::write(&figures, text.replace(",50\n", ",51\n")).unwrap();
+        assert_eq!(place.read(&folder, &kind).unwrap(), Err(NoHeatmap::NotMade), "other figures");
+        store();
+        let record = path.with_added_extension("json");
+        let text = std::fs::read_to_string(&record).unwrap();
+        std::fs::write(&record, text.replace("\"format_version\": 2", "\"format_version\": 1")).unwrap();
+        assert_eq!(place.read(&folder, &kind).unwrap(), Err(NoHeatmap::NotMade), "of an older program");
+        store();
+        write_atomically(&result, b"{ }").unwrap();
+        assert_eq!(place.read(&folder, &kind).unwrap(), Err(NoHeatmap::Outdated));
+        store();
+        assert!(place.read(&folder, &kind).unwrap().is_ok());
+        let left: Vec<_> = std::fs::read_dir(directory.path().join("heatmaps")).unwrap().collect();
+        assert_eq!(left.len(), 2, "nothing temporary");
+    }
+
+    #[test]
+    fn heatmaps_of_several_kinds_stand_beside_each_other() {
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(directory.path());
+        let results = fixture::results(&plan, |_| Some(([0.0; 3], 0.0)));
+        let selections = results.select();
+        let places = heatmap_places(&selections);
+        let cell = places[0].selected.unwrap().cell;
+        write_atomically(&folder.cell(&cell.id).path().join("result.json"), b"{}").unwrap();
+        let length_first = |base| {
+            let Heatmap { axes: [x, y], .. } = heatmap();
+            let parameters = [y.name.clone(), x.name.clone()];
+            let axes = [y, x];
+            (HeatmapOptions { parameters, ..options(base) }, Heatmap { axes, base, ..heatmap() })
+        };
+        let drawn = (options(Version::R), Heatmap { base: Version::R, ..heatmap() });
+        let all = [(options(Version::D), heatmap()), drawn, length_first(Version::D)];
+        for (options, heatmap) in &all {
+            store_heatmap(&folder, cell, "1".into(), options.clone(), heatmap).unwrap();
+        }
+        for (options, heatmap) in all {
+            let stored = places[0].read(&folder, &options.kind()).unwrap().unwrap();
+            assert_eq!((stored.record.options, stored.heatmap), (options, heatmap));
+        }
+        // Of another kind than its name says.
+        let of = |base| heatmap_path(&folder, cell, &options(base).kind());
+        for ending in ["csv", "json"] {
+            let [from, to] = [Version::R, Version::E].map(|base| of(base).with_added_extension(ending));
+            std::fs::copy(from, to).unwrap();
+        }
+        assert_eq!(places[0].read(&folder, &options(Version::E).kind()).unwrap(), Err(NoHeatmap::NotMade));
+        // Of a cell that was not selected.
+        let mut elsewhere = plan.cells[1].clone();
+        elsewhere.id = "elsewhere".into();
+        store_heatmap(&folder, &elsewhere, "1".into(), length_first(Version::E).0, &heatmap()).unwrap();
+        std::fs::write(directory.path().join("heatmaps/damaged.json"), "{").unwrap();
+        let kinds = heatmap_kinds(&folder, &places).unwrap();
+        let shown: Vec<String> = kinds["Pendulum"].iter().map(ToString::to_string).collect();
+        assert_eq!(
+            (kinds.len(), shown),
+            (1, ["length-mass", "mass-length", "mass-length-R"].map(str::to_owned).into())
+        );
+    }
+
+    #[test]
+    fn there_is_room_for_what_the_plan_trains_in_all_runs() {
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        let done = |cell: &Cell| (cell.id.starts_with("Pendulum-a2c-ff-D") && cell.run == 1).then_some(([0.0; 3], 0.0));
+        let results = fixture::results(&plan, done);
+        let selections = results.select();
+        let places = heatmap_places(&selections);
+        let shown: Vec<String> = places.iter().map(ToString::to_string).collect();
+        let expected =
+            ["D, run 1", "D, run 2", "E, run 1", "E, run 2"].map(|it| format!("Pendulum, a2c ff trained on {it}"));
+        assert_eq!((&shown[..4], shown.len()), (&expected[..], 8), "none on R");
+        let runs: Vec<_> = places.iter().map(|place| place.selected.map(|selected| selected.cell.run)).collect();
+        assert_eq!(runs[..2], [Some(1), None]);
+        assert!(runs[2..].iter().all(Option::is_none));
+    }
+}

@@ -1,0 +1,47 @@
+//! Experiments: what is asked for, doing it, and what came of it, as plain data.
+//!
+//! - [`Plan`] expands an experiment file to cells, [`Folder`] is where they are kept, [`scheduler`] has processes or a
+//!   cluster do them.
+//! - [`runs`] finds trainings and experiments, and says how far they are.
+//! - [`Results`] reads them back and selects.
+#![forbid(unsafe_code)]
+
+#[cfg(test)]
+extern crate self as perturb_experiment; // by this name fixtures call it in every crate
+
+mod cost;
+mod curves;
+mod external;
+#[cfg(test)]
+mod fixture;
+mod folder;
+mod heatmaps;
+mod plan;
+mod recorded;
+mod reselection;
+pub mod runs;
+pub mod scheduler;
+mod selection;
+mod times;
+mod tuning;
+mod verify;
+
+pub use cost::{Estimate, Measurement, Speed, Taken, estimates, generated_episodes, representatives, tested_episodes};
+pub use curves::{Curve, EnvironmentCurves, Footing, Point, read_curves};
+pub use external::{add_assessed, elsewhere, judged_as_in};
+pub use folder::{
+    CellFolder, CellResult, CellState, Failure, FailureMark, Folder, FolderError, MarkResult, Timing, Training,
+};
+pub use heatmaps::{
+    HeatmapPlace, HeatmapRecord, NoHeatmap, StoredHeatmap, heatmap_kinds, heatmap_path, heatmap_places, store_heatmap,
+};
+pub use plan::{Cell, Counts, Grouping, Plan, PlanError, SELECTION_TEST, Selection, Tests, distinct};
+pub use recorded::Recorded;
+pub use reselection::Reselection;
+pub use selection::{MethodResults, Reported, Results, Selected, SelectedRun, average, interquartile, scores};
+pub use tuning::{Chosen, Tuned, tuned};
+pub use verify::{VerifyError, verify};
+
+/// The version, and the commit that was built, e.g. "0.1.0 (1a2b3c4d5e6f)"; "-dirty" follows a commit whose files were
+/// changed.
+pub const VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), " (", env!("PERTURB_COMMIT"), ")");

@@ -1,0 +1,333 @@
+//! An experiment file as it is written, and what is refused before it is expanded.
+
+use std::collections::BTreeMap;
+
+use perturb_files::AnyError;
+use perturb_protocol::Version;
+use perturb_protocol::names::{self, EnvironmentName};
+use perturb_records::paper::ENVIRONMENTS;
+use perturb_records::success::Rule;
+use perturb_settings::{Preset, ValueError, require, spelled};
+use serde::de::{DeserializeOwned, Error, IntoDeserializer};
+use serde::{Deserialize, Deserializer};
+use toml::Table;
+
+use super::SELECTION_TEST;
+use super::{Selection, distinct};
+
+/// Settings that the plan itself decides for each cell.
+const OWN_KEYS: [&str; 7] = ["preset", "environment", "version", "parameters", "algorithm", "architecture", "seed"];
+/// The most cells of a plan.
+const MOST_CELLS: usize = 1_000_000;
+
+/// The file's keys.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct File {
+    /// What reports of it are headed with (default: methods and environments).
+    pub(super) title: Option<String>,
+    /// What reports say its date is, `2026-11-23`: they depend on no clock (default: none).
+    pub(super) date: Option<toml::value::Datetime>,
+    /// Whose defaults settings have: "perturb" or "paper" (default: `"perturb"`).
+    #[serde(default, deserialize_with = "preset")]
+    preset: Option<Preset>,
+    /// Names of the catalogue.
+    pub(super) environments: Vec<String>,
+    /// What is trained on: "D", "R", "E", "R+E", or names of `sets` (default: `["D", "R", "E"]`).
+    #[serde(default = "all_versions")]
+    pub(super) versions: Vec<String>,
+    /// Who selects of a grid: "paper", the tests that are reported, or "clean", trainings and episodes of their own
+    /// (default: `"paper"`).
+    #[serde(default, deserialize_with = "selection")]
+    pub(super) selection: Selection,
+    /// With "clean" alone: seeds that select, from `seed` on (default: `1`).
+    tuning_runs: Option<u32>,
+    /// With "clean" alone: episodes of each test that selects (default: `test_episodes`).
+    selection_episodes: Option<u64>,
+    /// Repetitions of the whole, each with a seed of its own, at least 1 (default: `1`).
+    #[serde(default = "one")]
+    pub(super) runs: u32,
+    /// The seed of run 1; each further run has the next (default: `1`).
+    #[serde(default = "one")]
+    pub(super) seed: u64,
+    /// Episodes of each test (default: `1000`).
+    #[serde(default = "a_thousand")]
+    pub(super) test_episodes: u64,
+    /// What every policy is tested on: versions, or names of `sets` (default: `["D", "R", "E"]`).
+    #[serde(default = "all_versions")]
+    pub(super) test_versions: Vec<String>,
+    /// Episodes of the budget after which the policy is tested, too, ascending (default: none).
+    #[serde(default)]
+    pub(super) evaluate_at: Vec<u64>,
+    /// Sets of parameters by name, `[sets.NAME]`: `version`, where other parameters come from (default: `"D"`), and by
+    /// parameter its values, or `file`, a CSV file of contexts beside this file.
+    #[serde(default)]
+    pub(super) sets: BTreeMap<String, Table>,
+    /// What decides about success: "text", "code", or by environment one of these or a threshold such as "steps=90"
+    /// (default: `"text"`, of the preset "paper" `"code"`).
+    #[serde(default)]
+    success: Success,
+    /// Settings of every training.
+    #[serde(default)]
+    pub(super) settings: Table,
+    /// What is trained: tables `[[algorithm]]`.
+    pub(super) algorithm: Vec<Block>,
+}
+
+/// What decides about success.
+#[derive(Deserialize)]
+#[serde(untagged, expecting = "\"text\", \"code\", or a table of environments with \"text\", \"code\" or thresholds")]
+enum Success {
+    /// In every environment.
+    All(Rule),
+    /// In these, and as ever in the others.
+    Some(BTreeMap<String, Rule>),
+}
+
+impl Default for Success {
+    fn default() -> Self {
+        Self::Some(BTreeMap::new())
+    }
+}
+
+/// A table `[[algorithm]]`.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Block {
+    /// In place of the file's.
+    #[serde(default, deserialize_with = "preset")]
+    preset: Option<Preset>,
+    /// An algorithm, as of `perturb train --algorithm`.
+    pub(super) name: String,
+    /// "ff", "rc" or both; of RL² "rc" alone.
+    pub(super) architectures: Vec<String>,
+    /// In place of the file's.
+    environments: Option<Vec<String>>,
+    /// In place of the file's.
+    versions: Option<Vec<String>>,
+    /// Settings of these trainings, over those of the file.
+    #[serde(default)]
+    pub(super) settings: Table,
+    /// Lists of values by setting; every combination is a configuration (default: one, of the defaults).
+    #[serde(default)]
+    pub(super) grid: Table,
+}
+
+fn preset<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Preset>, D::Error> {
+    one_of(deserializer, &Preset::NAMES).map(Some)
+}
+
+fn selection<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Selection, D::Error> {
+    one_of(deserializer, &Selection::NAMES)
+}
+
+/// What one of `known` names stands for, however it is spelled.
+fn one_of<'de, T: DeserializeOwned, D: Deserializer<'de>>(
+    deserializer: D,
+    known: &'static [&'static str],
+) -> Result<T, D::Error> {
+    let written = String::deserialize(deserializer)?;
+    let place = names::find(&written, known.iter().copied());
+    T::deserialize(known[place.ok_or_else(|| D::Error::unknown_variant(&written, known))?].into_deserializer())
+}
+
+fn all_versions() -> Vec<String> {
+    Version::ALL.map(|version| version.to_string()).to_vec()
+}
+
+fn one<T: From<u8>>() -> T {
+    T::from(1)
+}
+
+fn a_thousand() -> u64 {
+    1000
+}
+
+impl File {
+    /// Spells names as they are spelled everywhere, and gives the revisions of environments that are asked for. An
+    /// environment that is not of the paper is one that a server has by just this name.
+    pub(super) fn spell(&mut self) -> Result<BTreeMap<String, u32>, AnyError> {
+        self.settings = spelled("[settings]", std::mem::take(&mut self.settings))?;
+        for (index, block) in self.algorithm.iter_mut().enumerate() {
+            let name = format!("[[algorithm]] {} ({})", index + 1, block.name);
+            let place = |table: &str| format!("{name}: [algorithm.{table}]");
+            block.settings = spelled(&place("settings"), std::mem::take(&mut block.settings))?;
+            block.grid = spelled(&place("grid"), std::mem::take(&mut block.grid))?;
+        }
+        let mut revisions = BTreeMap::new();
+        let blocks = || self.algorithm.iter().flat_map(|block| block.environments.iter().flatten());
+        for written in self.environments.iter().chain(blocks()) {
+            let (name, revision) = environment(written);
+            let Some(revision) = revision else { continue };
+            let first = *revisions.entry(name.clone()).or_insert(revision);
+            let expected = format!("as above, perturb/{name}-v{first}");
+            require(first == revision, "environments", format!("`{written}`"), expected)?;
+        }
+        let spell_environments =
+            |names: &mut Vec<String>| names.iter_mut().for_each(|name| *name = environment(name).0);
+        let spell_versions = |names: &mut Vec<String>| {
+            for name in names {
+                *name = name.parse().map_or_else(|_| name.clone(), |version: Version| version.to_string());
+            }
+        };
+        spell_environments(&mut self.environments);
+        spell_versions(&mut self.versions);
+        spell_versions(&mut self.test_versions);
+        for block in &mut self.algorithm {
+            block.environments.iter_mut().for_each(spell_environments);
+            block.versions.iter_mut().for_each(spell_versions);
+        }
+        if let Success::Some(rules) = &mut self.success {
+            for (written, rule) in std::mem::take(rules) {
+                let name = environment(&written).0;
+                let expected = format!("an environment that has no rule yet: {name} has one");
+                require(rules.insert(name, rule).is_none(), "[success]", format!("`{written}`"), expected)?;
+            }
+        }
+        Ok(revisions)
+    }
+
+    /// Those of the file itself, then those that only its tables name.
+    pub(super) fn all_environments(&self) -> Vec<&str> {
+        let own = self.algorithm.iter().flat_map(|block| block.environments.iter().flatten());
+        distinct(self.environments.iter().chain(own).map(String::as_str))
+    }
+
+    pub(super) fn environments_of<'a>(&'a self, block: &'a Block) -> &'a [String] {
+        block.environments.as_ref().unwrap_or(&self.environments)
+    }
+
+    pub(super) fn versions_of<'a>(&'a self, block: &'a Block) -> &'a [String] {
+        block.versions.as_ref().unwrap_or(&self.versions)
+    }
+
+    /// Whose defaults the settings of `block` have.
+    pub(super) fn preset_of(&self, block: &Block) -> Preset {
+        block.preset.or(self.preset).unwrap_or_default()
+    }
+
+    /// What decides about success in tests of `environment` with a preset; `None` for the environment's own rule.
+    pub(super) fn success_in(&self, environment: &str, preset: Preset) -> Option<Rule> {
+        let given = match &self.success {
+            Success::All(rule) => Some(rule),
+            Success::Some(rules) => rules.get(environment),
+        };
+        let usual = if preset == Preset::Paper { Rule::Code } else { Rule::Text };
+        Some(given.cloned().unwrap_or(usual)).filter(|rule| *rule != Rule::Text)
+    }
+
+    /// Runs whose tests select and are not reported.
+    pub(super) fn tuning_runs(&self) -> u32 {
+        if self.selection == Selection::Clean { self.tuning_runs.unwrap_or(1) } else { 0 }
+    }
+
+    /// Episodes of the test that selects and nothing else; `None` if there is none.
+    pub(super) fn selection_episodes(&self) -> Option<u64> {
+        (self.selection == Selection::Clean).then(|| self.selection_episodes.unwrap_or(self.test_episodes))
+    }
+
+    /// Refuses what does not depend on a table `[[algorithm]]`.
+    pub(super) fn check(&self) -> Result<(), ValueError> {
+        let most = i64::MAX as u64 - 2 * u64::from(u32::MAX);
+        require(self.runs > 0, "runs", self.runs, "at least 1")?;
+        self.check_selection()?;
+        let ascending = self.evaluate_at.first() != Some(&0) && self.evaluate_at.is_sorted_by(|a, b| a < b);
+        let expected = "numbers of episodes, at least 1, in ascending order";
+        require(ascending, "evaluate_at", format!("{:?}", self.evaluate_at), expected)?;
+        require(self.seed <= most, "seed", self.seed, format!("at most {most}"))?;
+        require(self.test_episodes > 0, "test_episodes", self.test_episodes, "at least 1")?;
+        require(!self.algorithm.is_empty(), "algorithm", "empty", "one or more tables [[algorithm]]")?;
+        check_list("environments", &self.environments)?;
+        check_list("versions", &self.versions)?;
+        check_list("test_versions", &self.test_versions)?;
+        let environments = self.all_environments();
+        match &self.success {
+            Success::All(Rule::At(threshold)) => {
+                let expected = "\"text\" or \"code\"; a threshold belongs to an environment: [success] NAME = …";
+                Err(ValueError::new("success", threshold, expected))
+            }
+            Success::All(_) => Ok(()),
+            Success::Some(rules) => rules.keys().try_for_each(|name| {
+                let known = environments.contains(&name.as_str());
+                require(known, "[success]", format!("`{name}`"), format!("one of {}", environments.join(", ")))
+            }),
+        }
+    }
+
+    fn check_selection(&self) -> Result<(), ValueError> {
+        for (key, given) in
+            [("tuning_runs", self.tuning_runs.map(u64::from)), ("selection_episodes", self.selection_episodes)]
+        {
+            let Some(given) = given else { continue };
+            let expected = "left out, or beside selection = \"clean\"";
+            require(self.selection == Selection::Clean, key, given, expected)?;
+            require(given > 0, key, given, "at least 1")?;
+        }
+        let key = format!("[sets.{SELECTION_TEST}]");
+        let is_free = self.selection == Selection::Paper || !self.sets.contains_key(SELECTION_TEST);
+        require(is_free, key, format!("`{SELECTION_TEST}`"), "another name: the test that selects has this one")
+    }
+
+    /// Refuses what `block`, which is called `name` in refusals, has beside its grid; `before` cells stand before its own.
+    pub(super) fn check_block(&self, name: &str, block: &Block, before: usize) -> Result<(), ValueError> {
+        let environments = self.environments_of(block);
+        let key = format!("{name}: environments");
+        check_list(&key, environments)?;
+        for environment in environments {
+            require(is_plain(environment), &key, format!("`{environment}`"), "names of letters, digits and _")?;
+        }
+        check_list(&format!("{name}: versions"), self.versions_of(block))?;
+        check_list(&format!("{name}: architectures"), &block.architectures)?;
+        self.check_keys(name, block)?;
+        self.check_size(name, block, before)
+    }
+
+    /// Settings belong to trainings, not to the plan, and stand in one place.
+    fn check_keys(&self, name: &str, block: &Block) -> Result<(), ValueError> {
+        let expected =
+            "left out: the plan's own keys decide it (preset, environments, versions, sets, name, architectures, seed)";
+        for (table, settings) in [
+            ("[settings]".to_owned(), &self.settings),
+            (format!("{name}: [algorithm.settings]"), &block.settings),
+            (format!("{name}: [algorithm.grid]"), &block.grid),
+        ] {
+            for (key, value) in settings {
+                require(!OWN_KEYS.contains(&key.as_str()), format!("{table} {key}"), value, expected)?;
+            }
+        }
+        block.settings.keys().try_for_each(|key| {
+            let expected = "in one of [algorithm.settings] and [algorithm.grid] only";
+            require(!block.grid.contains_key(key), format!("{name}: {key}"), "in both", expected)
+        })
+    }
+
+    /// Refuses more cells than anybody can do, before they fill the memory.
+    fn check_size(&self, name: &str, block: &Block, before: usize) -> Result<(), ValueError> {
+        let lists = [self.environments_of(block), self.versions_of(block), &block.architectures].map(<[_]>::len);
+        let runs = self.runs as usize + self.tuning_runs() as usize;
+        let values = block.grid.values().map(|values| values.as_array().map_or(1, Vec::len));
+        let cells = lists.into_iter().chain([runs]).chain(values).fold(1, usize::saturating_mul);
+        let cells = cells.saturating_add(before);
+        let what =
+            format!("{name}: the number of cells up to here, every combination of [algorithm.grid] in each run,");
+        require(cells <= MOST_CELLS, what, cells, format!("at most {MOST_CELLS}"))
+    }
+}
+
+/// How an environment is spelled, and the revision that is asked for.
+fn environment(written: &str) -> (String, Option<u32>) {
+    let EnvironmentName { name, revision } = EnvironmentName::new(written);
+    let known = names::find(&name, ENVIRONMENTS.into_iter());
+    (known.map_or(name, |place| ENVIRONMENTS[place].to_owned()), revision)
+}
+
+/// A list must name something, and nothing twice.
+fn check_list(key: &str, list: &[String]) -> Result<(), ValueError> {
+    require(!list.is_empty(), key, "empty", "a list of at least one name")?;
+    require(distinct(list.iter()).len() == list.len(), key, list.join(", "), "a list without repetitions")
+}
+
+/// Whether a name is one that can stand in a cell's id.
+pub(super) fn is_plain(name: &str) -> bool {
+    name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
+}

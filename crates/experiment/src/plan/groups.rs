@@ -1,0 +1,120 @@
+//! Which cells one process does together.
+//!
+//! A group's cells have the same environment and architecture and see the same, so that their steps can be one batch,
+//! which only those with short rollouts make: all of a group wait for its slowest. A random policy, which takes none, is no
+//! cell to measure others by. What a cell comes to does not depend on its group.
+
+use std::ops::Range;
+
+use perturb_settings::{Architecture, Observe, Rollouts, TrainConfig};
+
+use super::{Cell, Plan, distinct};
+
+/// How large groups are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Grouping {
+    /// The most cells in one, at least 1.
+    pub most: usize,
+    /// How many groups are done at a time, at least 1: each kind of cells makes a multiple of so many, as far as it has
+    /// cells, so that all processes have work.
+    pub at_a_time: usize,
+}
+
+impl Grouping {
+    /// The most cells in a group, unless said otherwise: with more, a step's fixed cost is small already.
+    pub const USUAL: usize = 36;
+    /// A group for each kind of cells.
+    pub const BY_KIND: Self = Self { most: usize::MAX, at_a_time: 1 };
+
+    /// Cuts so many cells of one kind into groups whose sizes differ by one at most.
+    fn cut(self, cells: usize) -> impl Iterator<Item = Range<usize>> {
+        let groups = cells.div_ceil(self.most.max(1)).next_multiple_of(self.at_a_time.max(1)).min(cells);
+        (0..groups).map(move |group| group * cells / groups..(group + 1) * cells / groups)
+    }
+}
+
+impl Cell {
+    /// Environment, architecture, what is observed, and what rollouts are like: cells that have all in common may be in
+    /// one group.
+    pub fn kind(&self) -> (&str, Architecture, Observe, Rollouts) {
+        let TrainConfig { common, .. } = &self.config;
+        (&common.environment, common.architecture, common.observe, self.config.rollouts())
+    }
+}
+
+impl Plan {
+    /// Puts `cells`, places in the plan in ascending order, into groups: neighbours, which have the most in common, in
+    /// the plan's order. Depends on nothing but the arguments.
+    pub fn groups(&self, cells: &[usize], grouping: Grouping) -> Vec<Vec<usize>> {
+        let mut groups: Vec<Vec<usize>> = Vec::new();
+        for kind in distinct(cells.iter().map(|&cell| self.cells[cell].kind())) {
+            let of_kind: Vec<usize> = cells.iter().copied().filter(|&cell| self.cells[cell].kind() == kind).collect();
+            groups.extend(grouping.cut(of_kind.len()).map(|range| of_kind[range].to_vec()));
+        }
+        groups
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rstest::rstest;
+
+    use super::*;
+
+    #[rstest]
+    #[case::one_process(36, 1, 5, &[5])]
+    #[case::enough_for_all_processes(36, 2, 5, &[2, 3])]
+    #[case::not_more_than_cells(36, 8, 3, &[1, 1, 1])]
+    #[case::no_larger_than_asked_for(36, 1, 100, &[33, 33, 34])]
+    #[case::all_processes_to_the_end(36, 2, 100, &[25, 25, 25, 25])]
+    #[case::alone(1, 2, 3, &[1, 1, 1])]
+    #[case::by_kind(usize::MAX, 1, 100, &[100])]
+    #[case::none(36, 2, 0, &[])]
+    fn cells_of_a_kind_are_cut_evenly(
+        #[case] most: usize,
+        #[case] at_a_time: usize,
+        #[case] cells: usize,
+        #[case] sizes: &[usize],
+    ) {
+        let ranges: Vec<Range<usize>> = Grouping { most, at_a_time }.cut(cells).collect();
+        assert_eq!(ranges.iter().map(Range::len).collect::<Vec<_>>(), sizes);
+        assert!(ranges.into_iter().flatten().eq(0..cells));
+    }
+
+    #[test]
+    fn a_group_has_one_environment_and_one_architecture_and_neighbours() {
+        let text = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 2
+            [[algorithm]]\nname = 'a2c'\narchitectures = ['ff', 'rc']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']
+            settings = { n_steps = 63, n_minibatches = 1 }";
+        let plan = Plan::parse("test", text.into()).unwrap();
+        let all: Vec<usize> = (0..plan.cells.len()).collect();
+        // Of each environment two cells of A2C with FF, two with RC, and two of PPO with FF.
+        let groups = plan.groups(&all, Grouping { most: 3, at_a_time: 1 });
+        assert_eq!(groups, [vec![0, 1], vec![4, 5], vec![2, 3], vec![6, 7], vec![10, 11], vec![8, 9]]);
+        assert_eq!(plan.cells[groups[1][0]].kind(), ("CartPole", Architecture::Ff, Observe::State, Rollouts::Short));
+        let left = plan.groups(&[1, 5, 8, 11], Grouping { most: 36, at_a_time: 1 });
+        assert_eq!(left, [vec![1, 5], vec![8], vec![11]]);
+    }
+
+    #[test]
+    fn cells_with_long_rollouts_are_groups_of_their_own() {
+        let text = "environments = ['CartPole']\nversions = ['D']\nruns = 1
+            [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\ngrid = { n_steps = [32, 64, 128] }
+            [[algorithm]]\nname = 'epopt-a2c'\narchitectures = ['ff']\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff']
+            [[algorithm]]\nname = 'random'\narchitectures = ['ff']";
+        let plan = Plan::parse("test", text.into()).unwrap();
+        let all: Vec<usize> = (0..plan.cells.len()).collect();
+        assert_eq!(plan.groups(&all, Grouping::BY_KIND), [vec![0, 4], vec![1, 2, 3], vec![5]]);
+    }
+
+    #[test]
+    fn cells_of_a_group_see_the_same() {
+        let text = "environments = ['CartPole']\nversions = ['D']\nruns = 2
+            [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\ngrid = { observe = ['state', 'parameters'] }";
+        let plan = Plan::parse("test", text.into()).unwrap();
+        let groups = plan.groups(&[0, 1, 2, 3], Grouping::BY_KIND);
+        assert_eq!(groups, [vec![0, 1], vec![2, 3]], "a session's observations have one length");
+        let methods: Vec<String> = plan.methods().iter().map(ToString::to_string).collect();
+        assert_eq!(methods, ["ppo ff", "ppo ff (sees parameters)"], "each is a row of its own, and selected by itself");
+    }
+}

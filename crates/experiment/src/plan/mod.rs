@@ -1,0 +1,346 @@
+//! An experiment file, and the cells that it expands to.
+//!
+//! A cell is one training and its tests. Cells are the product of environments, algorithms, architectures, grid,
+//! training versions and runs, in this order, the last one varying fastest. All cells of a run have the same seed, so
+//! that two of them differ in nothing but what the file says. With `selection = "clean"` these are tuning cells, which
+//! select what is trained anew.
+
+mod expansion;
+mod file;
+mod groups;
+mod sets;
+
+use std::collections::{BTreeMap, BTreeSet, HashSet};
+use std::path::Path;
+
+use perturb_protocol::{names, proto};
+use serde::{Deserialize, Serialize};
+
+use file::File;
+pub use groups::Grouping;
+use perturb_files::{self as files, AnyError, FileError};
+use perturb_records::TrainedOn;
+use perturb_records::success::{Criterion, Rule};
+use perturb_settings::sets::{Contexts, TestSet, check as check_parameters};
+use perturb_settings::{Method, TrainConfig, ValueError, require};
+
+/// Everything that an experiment file asks for.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    /// The file, as it was written.
+    pub text: String,
+    /// What a report of it is headed with; empty if it does not say.
+    pub title: String,
+    /// Its date, as it is written; empty if it does not say.
+    pub date: String,
+    /// The files beside it that its sets name, with their content.
+    pub beside: BTreeMap<String, Vec<u8>>,
+    /// The revisions of environments that it asks for, `perturb/CartPole-v1`; any of those that are missing.
+    pub revisions: BTreeMap<String, u32>,
+    /// By which rule configurations are selected.
+    pub selection: Selection,
+    /// How often what is reported is repeated, each time with another seed.
+    pub runs: u32,
+    /// How often everything is done before that, with seeds of its own, so that configurations can be selected; 0 if the
+    /// reported tests select.
+    pub tuning_runs: u32,
+    /// All cells that are known before anything is done, tuning cells if there are any. A cell's index is its place here.
+    pub cells: Vec<Cell>,
+    /// What may become a cell when its configuration is selected; indices go on. [`Plan::in_folder`] has those that do.
+    pub candidates: Vec<Cell>,
+}
+
+/// How one configuration of many is selected for a report.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Selection {
+    /// As published: by the tests that are reported.
+    #[default]
+    Paper,
+    /// By selection episodes of trainings on tuning seeds. What is selected is trained anew on other seeds, and tested on
+    /// other episodes.
+    Clean,
+}
+
+impl Selection {
+    /// As they are typed.
+    pub const NAMES: [&'static str; 2] = ["paper", "clean"];
+}
+
+impl std::fmt::Display for Selection {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.pad(Self::NAMES[*self as usize])
+    }
+}
+
+impl std::str::FromStr for Selection {
+    type Err = ValueError;
+
+    fn from_str(text: &str) -> Result<Self, ValueError> {
+        let known =
+            [Selection::Paper, Selection::Clean].into_iter().find(|rule| names::is_spelled(text, &rule.to_string()));
+        known.ok_or_else(|| ValueError::new("selection", format!("`{text}`"), "\"paper\" or \"clean\""))
+    }
+}
+
+/// What results and recorded episodes call the test that selects, and does nothing else.
+pub const SELECTION_TEST: &str = "selection";
+
+/// One training and its tests.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Cell {
+    /// Its place in the plan, from 0.
+    pub index: usize,
+    /// Its name: environment, algorithm, architecture, training version, configuration and seed. It depends on nothing
+    /// else in the plan, so that a cell keeps its results when others are added.
+    pub id: String,
+    /// Names the settings, without environment, version and seed, in eight hexadecimal digits.
+    pub configuration: String,
+    /// Which run it belongs to, from 1; tuning cells have runs of their own.
+    pub run: u32,
+    /// The configuration of the tuning cells that select this one, if it is trained anew; `None` of a cell of the grid.
+    pub tuned_as: Option<String>,
+    /// The name of the plan's own set of parameters, if it is trained on one.
+    pub set: Option<String>,
+    /// What is trained.
+    pub config: TrainConfig,
+    /// How it is tested.
+    pub tests: Tests,
+}
+
+/// How a trained policy is tested.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Tests {
+    /// Episodes of each test.
+    pub episodes: u64,
+    /// On what: versions in the order D, R, E, R+E, then the plan's own sets in theirs.
+    pub sets: Vec<TestSet>,
+    /// Episodes of the test that selects and nothing else, on what was trained on; `None` if there is none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub selection: Option<u64>,
+    /// Episodes of the training's budget, ascending and fewer than it has: the policies of these moments are tested, too.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub marks: Vec<u64>,
+    /// What decides about success; `None` for the environment's own rule.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub success: Option<Rule>,
+}
+
+/// How much a plan asks for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Counts {
+    /// Algorithms with their architectures and settings, whatever the environment.
+    pub configurations: usize,
+    /// Trainings of one run.
+    pub trainings: usize,
+    /// Pairs of a training and a test in one run.
+    pub pairs: usize,
+    /// The same in all runs.
+    pub all_pairs: usize,
+    /// How often the whole is repeated.
+    pub runs: u32,
+}
+
+/// Why an experiment file was refused.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum PlanError {
+    /// It cannot be read.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// It is not TOML, or something in it cannot be.
+    #[error("{path}: {reason}")]
+    Refused {
+        /// As it was given.
+        path: String,
+        /// Names the table, the key and what is accepted.
+        reason: AnyError,
+    },
+}
+
+impl Plan {
+    /// Of a report without an experiment.
+    pub fn without_cells() -> Self {
+        let (selection, cells, candidates) = (Selection::Paper, Vec::new(), Vec::new());
+        let (text, beside, revisions) = (String::new(), BTreeMap::new(), BTreeMap::new());
+        let (title, date) = Default::default();
+        Self { text, title, date, beside, revisions, selection, runs: 0, tuning_runs: 0, cells, candidates }
+    }
+
+    /// Reads and expands the file at `path`.
+    ///
+    /// # Errors
+    /// [`PlanError`], which names the table and the key.
+    pub fn load(path: &Path) -> Result<Self, PlanError> {
+        Self::parse(&path.display().to_string(), files::read_text(path)?)
+    }
+
+    /// The sets of the file at `path`, by their names.
+    ///
+    /// # Errors
+    /// [`PlanError`], which names the table and the key.
+    pub fn own_sets(path: &Path) -> Result<Vec<TestSet>, PlanError> {
+        let refused = |reason: AnyError| PlanError::Refused { path: path.display().to_string(), reason };
+        let text = files::read_text(path)?;
+        let file: File = toml::from_str(&text).map_err(|error| refused(words(&error).into()))?;
+        let folder = path.parent().unwrap_or(Path::new(""));
+        let sets = sets::read(&file.sets, folder, &mut BTreeMap::new()).map_err(|error| refused(error.into()))?;
+        Ok(sets.into_values().filter(|set| set.plain().is_none()).collect())
+    }
+
+    /// The files that it consists of, by their names: `plan.toml` and those that its sets name.
+    pub fn files(&self) -> impl Iterator<Item = (&str, &[u8])> {
+        let beside = self.beside.iter().map(|(name, content)| (name.as_str(), content.as_slice()));
+        beside.chain([("plan.toml", self.text.as_bytes())]) // last: it names the others
+    }
+
+    /// Expands `text`, which `path` names in errors.
+    ///
+    /// # Errors
+    /// [`PlanError`], which names the table and the key.
+    pub fn parse(path: &str, text: String) -> Result<Self, PlanError> {
+        Self::expand(path, text).map_err(|reason| PlanError::Refused { path: path.to_owned(), reason })
+    }
+
+    fn expand(path: &str, text: String) -> Result<Self, AnyError> {
+        let mut file: File = toml::from_str(&text).map_err(|error| words(&error))?;
+        let revisions = file.spell()?;
+        file.check()?;
+        let mut beside = BTreeMap::new();
+        let sets = sets::read(&file.sets, Path::new(path).parent().unwrap_or(Path::new("")), &mut beside)?;
+        let (cells, candidates) = expansion::expand(&file, &sets)?;
+        let (selection, runs, tuning_runs) = (file.selection, file.runs, file.tuning_runs());
+        let title = file.title.unwrap_or_default();
+        let date = file.date.map(|date| date.to_string()).unwrap_or_default();
+        Ok(Self { selection, runs, tuning_runs, cells, candidates, title, date, beside, text, revisions })
+    }
+
+    /// Whether `environment` has the revision, the parameters and thresholds that the plan's cells name for it.
+    ///
+    /// # Errors
+    /// [`ValueError`] for one that it does not take.
+    pub fn check(&self, environment: &proto::Environment) -> Result<(), ValueError> {
+        if let Some(asked) = self.revisions.get(&environment.name) {
+            let (name, served) = (&environment.name, environment.revision);
+            let got = format!("perturb/{name}-v{asked}");
+            require(
+                *asked == served,
+                "an environment",
+                got,
+                format!("the server's perturb/{name}-v{served}, or {name}"),
+            )?;
+        }
+        let (text, code) = (Criterion::of(environment), Criterion::of_code(environment));
+        for cell in self.cells.iter().filter(|cell| cell.config.common.environment == environment.name) {
+            let trained = cell.set.as_deref().unwrap_or_default();
+            check_parameters(trained, &cell.config.common.parameters, environment)?;
+            cell.tests.sets.iter().try_for_each(|set| set.check(environment))?;
+            if let Some(rule) = &cell.tests.success {
+                rule.of(text.as_ref(), code.as_ref())?;
+            }
+        }
+        Ok(())
+    }
+
+    /// How much it asks for, but for what is trained anew.
+    pub fn counts(&self) -> Counts {
+        let of_grid = || self.cells.iter().filter(|cell| cell.tuned_as.is_none());
+        let first = of_grid().filter(|cell| cell.run == 1);
+        let configurations: BTreeSet<_> = first.clone().map(|cell| (cell.method(), &cell.configuration)).collect();
+        Counts {
+            configurations: configurations.len(),
+            trainings: first.clone().count(),
+            pairs: first.map(|cell| cell.tests.sets.len()).sum(),
+            all_pairs: of_grid().map(|cell| cell.tests.sets.len()).sum(),
+            runs: if self.selection == Selection::Clean { self.tuning_runs } else { self.runs },
+        }
+    }
+
+    /// The same results by another rule: as published, a plan's tuning cells are what is reported.
+    ///
+    /// # Errors
+    /// [`ValueError`] for `clean` of a plan that was not made for it.
+    pub fn by(self, rule: Selection) -> Result<Self, ValueError> {
+        match (self.selection, rule) {
+            (Selection::Clean, Selection::Paper) => {
+                let runs = self.tuning_runs;
+                Ok(Self { selection: rule, runs, tuning_runs: 0, candidates: Vec::new(), ..self })
+            }
+            (known, rule) => {
+                let expected = "\"paper\": the plan has no tuning cells; write selection = \"clean\" in its file";
+                require(known == rule, "selection", rule, expected).map(|()| self)
+            }
+        }
+    }
+
+    /// The cell or candidate with this id, or with this index.
+    pub fn find(&self, name: &str) -> Option<&Cell> {
+        let all = || self.cells.iter().chain(&self.candidates);
+        let by_index = |index: usize| all().find(|cell| cell.index == index);
+        all().find(|cell| cell.id == name).or_else(|| name.parse().ok().and_then(by_index))
+    }
+
+    /// The environments, in the plan's order.
+    pub fn environments(&self) -> Vec<&str> {
+        distinct(self.cells.iter().map(|cell| cell.config.common.environment.as_str()))
+    }
+
+    /// The methods, in the plan's order.
+    pub fn methods(&self) -> Vec<Method> {
+        distinct(self.cells.iter().map(Cell::method))
+    }
+
+    /// Whether there is a choice: configurations of one method that are trained on the same.
+    pub fn selects(&self) -> bool {
+        let place = |cell: &&Cell| (cell.config.common.environment.clone(), cell.method(), cell.config.common.version);
+        let places = distinct(self.cells.iter().map(|cell| place(&cell))).len();
+        distinct(self.cells.iter().map(|cell| (place(&cell), &cell.configuration))).len() > places
+    }
+}
+
+impl Cell {
+    /// Its set or version.
+    pub fn trained_on(&self) -> TrainedOn<'_> {
+        self.set.as_deref().map_or(TrainedOn::Version(self.config.common.version), TrainedOn::Set)
+    }
+
+    /// What it is one of, over settings and runs: "CartPole ppo ff, trained on R".
+    pub fn described(&self) -> String {
+        format!("{} {}, trained on {}", self.config.common.environment, self.method(), self.trained_on())
+    }
+
+    /// The test that selects and nothing else, if it has one.
+    pub fn selection_test(&self) -> Option<(TestSet, u64)> {
+        let parameters = Contexts::Drawn(self.config.common.parameters.clone());
+        let set = TestSet { name: SELECTION_TEST.into(), version: self.config.common.version, contexts: parameters };
+        self.tests.selection.map(|episodes| (set, episodes))
+    }
+
+    /// What trains.
+    pub fn method(&self) -> Method {
+        self.config.method()
+    }
+}
+
+/// The elements of `items` without repetitions, in order.
+pub fn distinct<T: Eq + std::hash::Hash + Clone>(items: impl Iterator<Item = T>) -> Vec<T> {
+    let mut seen = HashSet::new();
+    items.filter(|item| seen.insert(item.clone())).collect()
+}
+
+/// What is wrong with a file, without the names that numbers have in this program, and with the key that was probably
+/// meant.
+fn words(error: &toml::de::Error) -> String {
+    let whole = "expected a whole number that is not negative, in digits";
+    let text = ["expected u32", "expected u64"]
+        .iter()
+        .fold(error.to_string().trim().to_owned(), |text, word| text.replace(word, whole));
+    const UNKNOWN_KEY: &str = "unknown field `";
+    let Some((before, names)) = text.split_once(UNKNOWN_KEY) else { return text };
+    let Some((key, known)) = names.split_once('`') else { return text };
+    let hint = names::did_you_mean(key, known.split('`').skip(1).step_by(2)); // between them stand commas
+    format!("{before}{UNKNOWN_KEY}{key}`{hint}{known}")
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,82 @@
+//! The tables `[sets.NAME]` of an experiment file.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use perturb_files::read_if_there;
+use perturb_protocol::Version;
+use perturb_settings::sets::{Assignment, TestSet, set_of, set_of_csv};
+use perturb_settings::{ValueError, require};
+use toml::{Table, Value};
+
+use super::file::is_plain;
+
+/// What a set's table may name beside parameters.
+const VERSION: &str = "version";
+const FILE: &str = "file";
+
+/// The versions and the sets of `tables`, by their names; `beside` gets the files in `folder` that these name.
+pub(super) fn read(
+    tables: &BTreeMap<String, Table>,
+    folder: &Path,
+    beside: &mut BTreeMap<String, Vec<u8>>,
+) -> Result<BTreeMap<String, TestSet>, ValueError> {
+    let mut sets = BTreeMap::from(Version::KNOWN.map(|version| (version.to_string(), version.into())));
+    for (name, table) in tables {
+        let key = format!("[sets.{name}]");
+        let named = !name.is_empty() && is_plain(name);
+        require(named, &key, format!("`{name}`"), "a name of letters, digits and _")?;
+        require(name.parse::<Version>().is_err(), &key, "there already", "another name than D, R, E and R+E")?;
+        let expected = "values of some parameters, or left out: it is a version";
+        require(table.keys().any(|key| key != VERSION), &key, "without parameters", expected)?;
+        let set = read_set(name, table, folder, beside)
+            .map_err(|error| ValueError { what: format!("{key}: {}", error.what), ..error })?;
+        sets.insert(name.clone(), set);
+    }
+    Ok(sets)
+}
+
+fn read_set(
+    name: &str,
+    table: &Table,
+    folder: &Path,
+    beside: &mut BTreeMap<String, Vec<u8>>,
+) -> Result<TestSet, ValueError> {
+    let mut version = Version::D;
+    let mut file = None;
+    let mut assignments: Vec<Assignment> = Vec::new();
+    for (key, value) in table {
+        match (key.as_str(), value) {
+            (VERSION, Value::String(text)) => {
+                version = text.parse().map_err(|_| ValueError::new(key, value, "\"D\", \"R\", \"E\" or \"R+E\""))?;
+            }
+            (FILE, Value::String(name)) => file = Some(name),
+            (VERSION | FILE, _) => return Err(ValueError::new(key, value, "a text")),
+            (_, Value::String(text)) => assignments.push(format!("{key}={text}").parse()?),
+            (_, Value::Integer(_) | Value::Float(_)) => assignments.push(format!("{key}={value}").parse()?),
+            _ => {
+                let expected = "a value, or a text such as \"0.3..0.4\" or \"0.1..1.0/10\"";
+                return Err(ValueError::new(key, value, expected));
+            }
+        }
+    }
+    let Some(file) = file else { return set_of(name, version, assignments) };
+    let expected = "alone: the file's header names the parameters";
+    require(assignments.is_empty(), FILE, "beside parameters", expected)?;
+    let content = content(file, folder).map_err(|got| ValueError::new(FILE, got, "a CSV file beside the plan"))?;
+    let set = set_of_csv(name, version, &content)?;
+    beside.insert(file.clone(), content);
+    Ok(set)
+}
+
+fn content(file: &str, folder: &Path) -> Result<Vec<u8>, String> {
+    if Path::new(file).components().count() != 1 || file.starts_with('.') || !file.ends_with(".csv") {
+        return Err(format!("`{file}`, which is not the name of a file .csv"));
+    }
+    let path = folder.join(file);
+    let refused = |reason: &dyn std::fmt::Display| format!("`{}`, which cannot be read ({reason})", path.display());
+    match read_if_there(&path) {
+        Ok(content) => content.ok_or_else(|| refused(&std::io::Error::from(std::io::ErrorKind::NotFound))),
+        Err(error) => Err(refused(&error.source)),
+    }
+}

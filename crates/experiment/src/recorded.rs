@@ -1,0 +1,47 @@
+//! The recorded episodes of the policies that a report is of.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use perturb_records::Records;
+use perturb_records::outcomes::PolicyOutcomes;
+
+use crate::folder::CellResult;
+use crate::selection::{MethodResults, Reported};
+
+/// The recorded episodes of selected policies, by their cells' ids. Filled while the records are read for
+/// [`verify`](crate::verify::verify), so that no file is read twice.
+#[derive(Clone, Debug, Default)]
+pub struct Recorded {
+    wanted: BTreeSet<String>,
+    policies: BTreeMap<String, PolicyOutcomes>,
+}
+
+impl Recorded {
+    /// Of the cells that `selections` are of; nothing so far.
+    pub fn of(selections: &[MethodResults<'_>]) -> Self {
+        let runs = selections.iter().flat_map(|selection| selection.runs.values());
+        let selected = runs.flat_map(|run| run.0.values().flatten()).filter_map(Reported::cell);
+        Self { wanted: selected.map(|selected| selected.cell.id.clone()).collect(), policies: BTreeMap::new() }
+    }
+
+    /// Keeps what is needed of a cell's `records`, if it is one of those that were selected.
+    pub fn add(&mut self, result: &CellResult, records: &Records) {
+        if self.wanted.contains(&result.id) {
+            let names = result.results.keys().map(String::as_str);
+            self.policies.insert(result.id.clone(), PolicyOutcomes::of(records, names));
+        }
+    }
+
+    /// Of the cells that are wanted: how many have recorded episodes, and how many there are.
+    pub fn count(&self) -> (usize, usize) {
+        (self.policies.len(), self.wanted.len())
+    }
+
+    /// The policy that is reported; `None` without recorded episodes.
+    pub fn policy<'a>(&'a self, reported: &Reported<'a>) -> Option<&'a PolicyOutcomes> {
+        match reported {
+            Reported::Cell(selected) => self.policies.get(&selected.cell.id),
+            Reported::Elsewhere(_, policy) => Some(policy.outcomes()),
+        }
+    }
+}

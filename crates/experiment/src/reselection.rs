@@ -1,0 +1,264 @@
+//! Selection inside the bootstrap: what a number would have been, had chance selected another configuration.
+//!
+//! Each resample draws runs anew within each environment, as one without selection does, and has every selection of the
+//! plan made anew by the plan's rule: the episodes of the tests that select are drawn anew, so that each has a binomial
+//! number of successes with the measured rate, and so are tuning seeds. Reported is what was measured of the configuration
+//! that then comes first, since the highest of several redrawn rates would flatter it a second time: configurations are
+//! selected by other numbers than the reported ones, as Tsamardinos, Greasidou and Borboudakis (2018,
+//! <https://doi.org/10.1007/s10994-018-5714-4>) do.
+//!
+//! By the paper's rule every configuration has been tested in every run. By the clean one a configuration that was not
+//! selected has no reported runs: in the place of each stand the tests of a drawn tuning cell of this configuration.
+
+use std::collections::HashMap;
+
+use perturb_policy::random::{Purpose, stream, uniform};
+use perturb_protocol::Version;
+use perturb_records::statistics::{Bootstrapped, mean, percentile_interval, resample};
+use perturb_records::{Metric, TestResult, TrainedOn};
+use perturb_settings::Method;
+
+use crate::folder::{CellResult, CellState};
+use crate::plan::{Cell, SELECTION_TEST, Selection};
+use crate::selection::{MethodResults, Results, Selected, common_runs};
+
+/// Of the runs, as in the interval without selection.
+const RUNS_SEED: u64 = 1;
+/// Of the selections: drawing them leaves the drawn runs alone.
+const SELECTION_SEED: u64 = 2;
+
+/// All selections of a plan, and among what they are made.
+pub struct Reselection<'a> {
+    contests: HashMap<(&'a str, Method, TrainedOn<'a>, Option<u32>), Contest<'a>>,
+    rule: Selection,
+}
+
+/// A selection, whose candidates are in the plan's order.
+#[derive(Default)]
+struct Contest<'a> {
+    seeds: Vec<u64>,
+    candidates: Vec<Candidate<'a>>,
+}
+
+struct Candidate<'a> {
+    configuration: &'a str,
+    tests: Vec<SelectingTest>,
+}
+
+/// A cell's test that selects.
+struct SelectingTest {
+    seed: u64,
+    successes: Binomial,
+    mean_return: f64,
+    /// Success rates on D, R and E, %, that may be reported.
+    rates: [Option<f64>; 3],
+}
+
+/// A run that is reported, with the places of the selections that it comes from, by what it was trained on.
+struct Reported<'a> {
+    score: f64,
+    selected: [Option<(usize, Selected<'a>)>; 3],
+}
+
+impl<'a> Reselection<'a> {
+    /// Of all results that there are.
+    pub fn of(results: &'a Results<'a>) -> Self {
+        let rule = results.plan.selection;
+        let mut contests = HashMap::new();
+        for (cell, state) in results.plan.cells.iter().zip(&results.states) {
+            let CellState::Done(result) = state else { continue };
+            let name = match rule {
+                Selection::Paper => cell.trained_on().to_string(),
+                Selection::Clean => SELECTION_TEST.into(), // which cells that are trained anew do not have
+            };
+            if let Some(test) = result.results.get(&name) {
+                let contest: &mut Contest<'a> = contests.entry(key(cell, rule, cell.run)).or_default();
+                contest.add(cell, SelectingTest::of(cell, result, test));
+            }
+        }
+        Self { contests, rule }
+    }
+
+    /// The numbers that `statistic` makes of a metric's scores, %, by `selections`, then by the runs that all of them have,
+    /// as [`bootstrap`](perturb_records::statistics::bootstrap) does, but with every selection made anew in each of the `resamples`.
+    pub fn bootstrap(
+        &self,
+        selections: &[&MethodResults<'a>],
+        metric: Metric,
+        resamples: usize,
+        statistic: impl Fn(&[Vec<f64>]) -> Vec<f64>,
+    ) -> Option<Vec<Bootstrapped>> {
+        let (contests, reported) = self.reported(selections, metric);
+        let runs = reported.iter().map(Vec::len).min().filter(|runs| *runs > 0)?;
+        let mut drawn: Vec<Vec<f64>> = reported.iter().map(|runs| runs.iter().map(|run| run.score).collect()).collect();
+        let points = statistic(&drawn);
+        let mut estimates = vec![Vec::with_capacity(resamples); points.len()];
+        let sizes: Vec<usize> = reported.iter().map(Vec::len).collect();
+        let mut rng = stream(SELECTION_SEED, Purpose::Bootstrap);
+        let mut uniform = || uniform(&mut rng);
+        // A run alone can only be drawn again, and says nothing of others.
+        let resamples = if runs > 1 || sizes.iter().any(|size| *size > 1) { resamples } else { 0 };
+        resample(&sizes, resamples, RUNS_SEED, |draws| {
+            let winners: Vec<_> = contests.iter().map(|contest| contest.decide(&mut uniform)).collect();
+            for ((drawn, runs), draws) in drawn.iter_mut().zip(&reported).zip(draws) {
+                for (drawn, &run) in drawn.iter_mut().zip(draws) {
+                    *drawn = runs[run].score_of(metric, &winners, &mut uniform);
+                }
+            }
+            estimates.iter_mut().zip(statistic(&drawn)).for_each(|(estimates, number)| estimates.push(number));
+        });
+        let with_interval = |(point, estimates): (f64, Vec<f64>)| {
+            let interval_95 = (resamples > 0).then(|| percentile_interval(estimates));
+            Bootstrapped { point, interval_95, runs }
+        };
+        Some(points.into_iter().zip(estimates).map(with_interval).collect())
+    }
+
+    /// What is reported, by `selections`, then by run, and what it was selected by.
+    fn reported(
+        &self,
+        selections: &[&MethodResults<'a>],
+        metric: Metric,
+    ) -> (Vec<&Contest<'a>>, Vec<Vec<Reported<'a>>>) {
+        let (mut contests, mut places) = (Vec::new(), HashMap::new());
+        let needs = |version| metric.of(|scenario| (scenario.train != version).then_some(0.0)).is_none();
+        let mut reported: Vec<Vec<Reported<'a>>> = selections.iter().map(|_| Vec::new()).collect();
+        for (number, scores) in common_runs(selections, metric) {
+            for ((runs, selection), score) in reported.iter_mut().zip(selections).zip(scores) {
+                let selected = Version::ALL.map(|version| {
+                    let selected = selection.runs[&number].cell_trained_on(TrainedOn::Version(version));
+                    let selected = selected.filter(|_| needs(version))?;
+                    let key = key(selected.cell, self.rule, number);
+                    let contest = self.contests.get(&key)?;
+                    let place = *places.entry(key).or_insert_with(|| {
+                        contests.push(contest);
+                        contests.len() - 1
+                    });
+                    Some((place, selected))
+                });
+                runs.push(Reported { score, selected });
+            }
+        }
+        (contests, reported)
+    }
+}
+
+/// By the paper's rule each run selects for itself, by the clean one all tuning cells for all runs.
+fn key(cell: &Cell, rule: Selection, run: u32) -> (&str, Method, TrainedOn<'_>, Option<u32>) {
+    let run = (rule == Selection::Paper).then_some(run);
+    (&cell.config.common.environment, cell.method(), cell.trained_on(), run)
+}
+
+impl<'a> Contest<'a> {
+    fn add(&mut self, cell: &'a Cell, test: SelectingTest) {
+        if !self.seeds.contains(&test.seed) {
+            self.seeds.push(test.seed);
+        }
+        match self.candidates.iter_mut().find(|known| known.configuration == cell.configuration) {
+            Some(known) => known.tests.push(test),
+            None => self.candidates.push(Candidate { configuration: &cell.configuration, tests: vec![test] }),
+        }
+    }
+
+    /// The candidate that comes first when episodes and seeds are drawn anew; `None` if none has a drawn seed.
+    fn decide(&self, uniform: &mut impl FnMut() -> f64) -> Option<&Candidate<'a>> {
+        if let [only] = &self.candidates[..] {
+            return Some(only);
+        }
+        let seeds: Vec<u64> = match self.seeds[..] {
+            [only] => vec![only],
+            _ => self.seeds.iter().map(|_| *draw(&self.seeds, uniform)).collect(),
+        };
+        let mut best = None;
+        for candidate in &self.candidates {
+            let rank = candidate.rank(&seeds, uniform);
+            if rank.is_some() && best.is_none_or(|(highest, _)| rank > highest) {
+                best = Some((rank, candidate));
+            }
+        }
+        best.map(|(_, candidate)| candidate)
+    }
+}
+
+impl Candidate<'_> {
+    /// Success rate and mean return over the `seeds` that it has a test of.
+    fn rank(&self, seeds: &[u64], uniform: &mut impl FnMut() -> f64) -> Option<(f64, f64)> {
+        let found = seeds.iter().filter_map(|seed| self.tests.iter().find(|test| test.seed == *seed));
+        let tests: Vec<(f64, f64)> =
+            found.map(|test| (test.successes.draw_percent(uniform()), test.mean_return)).collect();
+        (!tests.is_empty()).then(|| (mean(tests.iter().map(|test| test.0)), mean(tests.iter().map(|test| test.1))))
+    }
+}
+
+impl SelectingTest {
+    fn of(cell: &Cell, result: &CellResult, test: &TestResult) -> Self {
+        Self {
+            seed: cell.config.common.seed,
+            successes: Binomial::of(test),
+            mean_return: test.mean_return,
+            rates: Version::ALL.map(|on| result.results.get(&on.to_string()).map(|test| test.success_percent)),
+        }
+    }
+}
+
+impl Reported<'_> {
+    /// The metric of this run if `winners` had been selected; of what has no such test it stays as it was.
+    fn score_of(&self, metric: Metric, winners: &[Option<&Candidate<'_>>], uniform: &mut impl FnMut() -> f64) -> f64 {
+        let others = self.selected.map(|selected| {
+            let (place, selected) = selected?;
+            let of_tuning = selected.cell.tuned_as.as_ref().unwrap_or(&selected.cell.configuration);
+            let winner = winners[place].filter(|winner| winner.configuration != of_tuning)?;
+            Some(if let [only] = &winner.tests[..] { only } else { draw(&winner.tests, uniform) })
+        });
+        if others.iter().all(Option::is_none) {
+            return self.score;
+        }
+        let score = metric.of(|scenario| match others[scenario.train as usize] {
+            Some(other) => other.rates[scenario.test as usize],
+            None => self.selected[scenario.train as usize]?.1.rate(scenario.test),
+        });
+        score.unwrap_or(self.score)
+    }
+}
+
+fn draw<'t, T>(all: &'t [T], uniform: &mut impl FnMut() -> f64) -> &'t T {
+    &all[(uniform() * all.len() as f64) as usize]
+}
+
+/// How many of n episodes are successes when they are drawn anew from n, k of which were.
+struct Binomial {
+    /// Of 0, 1 … n successes or fewer, not normalised.
+    cumulative: Vec<f64>,
+}
+
+impl Binomial {
+    fn of(test: &TestResult) -> Self {
+        let n = test.episodes as usize;
+        let k = ((test.success_percent * n as f64 / 100.0).round() as usize).min(n);
+        let odds = k as f64 / (n - k) as f64;
+        let mut weights = vec![0.0; n + 1];
+        weights[k] = 1.0; // the most likely number, from which the others follow
+        for i in k..n {
+            weights[i + 1] = weights[i] * (n - i) as f64 / (i + 1) as f64 * odds;
+        }
+        for i in (0..k).rev() {
+            weights[i] = weights[i + 1] * (i + 1) as f64 / (n - i) as f64 / odds;
+        }
+        let sum = |sum: &mut f64, weight: f64| {
+            *sum += weight;
+            Some(*sum)
+        };
+        Self { cumulative: weights.into_iter().scan(0.0, sum).collect() }
+    }
+
+    /// The share of successes, %, at `place` of the distribution, 0 … 1.
+    fn draw_percent(&self, place: f64) -> f64 {
+        let n = self.cumulative.len() - 1;
+        let successes = self.cumulative.partition_point(|below| *below <= place * self.cumulative[n]).min(n);
+        100.0 * successes as f64 / n as f64
+    }
+}
+
+#[cfg(test)]
+#[path = "reselection_tests.rs"]
+mod tests;

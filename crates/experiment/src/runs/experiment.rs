@@ -1,0 +1,364 @@
+//! How far an experiment is.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+use perturb_files::{AnyError, Stamp, is_locked, leads_out, list, read_plain_text};
+use perturb_records::statistics::mean;
+use perturb_text::{grouped, shortened};
+
+use super::{LONGEST_TEXT, RunSummary};
+use crate::cost::Taken;
+use crate::folder::{CellResult, CellState, Folder, FolderError};
+use crate::plan::{Cell, Plan};
+use crate::scheduler::{Rate, Rates};
+
+/// Of more cells it is not followed how far they are.
+const MOST_FOLLOWED: usize = 50_000;
+/// What stands in the place of anything that is behind a link out of the folder that may be shown.
+pub const LEADS_OUT: &str = "a link that leads out of the folder";
+
+/// An experiment, as its folder has it.
+#[derive(Clone, Debug)]
+pub struct ExperimentStatus {
+    /// Where it is.
+    pub folder: Folder,
+    /// With all cells that are known by now.
+    pub plan: Plan,
+    /// Of each cell of the plan, in its order.
+    pub cells: Vec<CellStatus>,
+    /// Of plan.toml, as it was read.
+    stamp: Option<Stamp>,
+    /// Of each cell's result and failure, as they were read.
+    records: Vec<Records>,
+    /// What links may not lead out of.
+    within: Option<PathBuf>,
+}
+
+/// How far a cell is.
+#[derive(Clone, Debug, PartialEq)]
+pub enum CellStatus {
+    /// There is a result.
+    Done(Box<CellResult>),
+    /// It failed, for this reason.
+    Failed(String),
+    /// Its files cannot be read.
+    NotUnderstood(String),
+    /// Somebody works on it.
+    InWork,
+    /// None of these; whether it was begun.
+    Waiting {
+        /// Whether it has a folder.
+        begun: bool,
+    },
+}
+
+/// Of `result.json` and `failure.json`.
+type Records = [Option<Stamp>; 2];
+const RECORDS: [&str; 2] = ["result.json", "failure.json"];
+
+impl ExperimentStatus {
+    /// Of the experiment in `path`.
+    ///
+    /// # Errors
+    /// If the plan cannot be read.
+    pub fn read(path: &Path) -> Result<Self, AnyError> {
+        Self::with(path, None)
+    }
+
+    /// The same to be followed and shown to others: nothing is read that is behind a link out of `root`, in which `path`
+    /// is, itself without links.
+    ///
+    /// # Errors
+    /// If the plan cannot be read, leads out, or has too many cells.
+    pub fn read_within(path: &Path, root: &Path) -> Result<Self, AnyError> {
+        Self::with(path, Some(root.to_owned()))
+    }
+
+    fn with(path: &Path, within: Option<PathBuf>) -> Result<Self, AnyError> {
+        let folder = Folder::new(path);
+        let stamp = Stamp::of(&folder.plan_path());
+        let plan = read_plan(&folder, within.as_deref())?;
+        let (records, cells) = plan.cells.iter().map(|cell| known(&folder, cell, within.as_deref())).unzip();
+        Ok(Self { folder, plan, cells, stamp, records, within })
+    }
+
+    /// Looks again, at what may have changed: the plan, and cells with another result or failure than before, or none.
+    ///
+    /// # Errors
+    /// If the plan cannot be read.
+    pub fn refresh(&mut self) -> Result<(), AnyError> {
+        if Stamp::of(&self.folder.plan_path()) != self.stamp {
+            *self = Self::with(self.folder.path(), self.within.clone())?;
+            return Ok(());
+        }
+        let before = self.count(CellStatus::is_settled);
+        for (place, cell) in self.plan.cells.iter().enumerate() {
+            let records = records(&self.folder, cell);
+            if records != self.records[place] || !self.cells[place].is_settled() {
+                self.cells[place] = status(&self.folder, cell, records, self.within.as_deref());
+                self.records[place] = records;
+            }
+        }
+        // What is selected may have become known.
+        if !self.plan.candidates.is_empty() && self.count(CellStatus::is_settled) != before {
+            self.replan()?;
+        }
+        Ok(())
+    }
+
+    /// Reads the plan again; cells that it had are as they were.
+    fn replan(&mut self) -> Result<(), AnyError> {
+        let within = self.within.as_deref();
+        let plan = read_plan(&self.folder, within)?;
+        let had = self.plan.cells.iter().map(|cell| cell.id.clone());
+        let had = had.zip(self.records.drain(..).zip(self.cells.drain(..)));
+        let mut had: HashMap<String, (Records, CellStatus)> = had.collect();
+        let all =
+            plan.cells.iter().map(|cell| had.remove(&cell.id).unwrap_or_else(|| known(&self.folder, cell, within)));
+        (self.records, self.cells) = all.unzip();
+        self.plan = plan;
+        Ok(())
+    }
+
+    /// When its plan, a result or a failure last changed, s since 1970.
+    pub fn changed(&self) -> i64 {
+        let stamps = self.records.iter().flatten().chain([&self.stamp]).flatten();
+        stamps.map(Stamp::seconds).max().unwrap_or_default()
+    }
+
+    /// How many cells are as `is` says.
+    pub fn count(&self, is: impl Fn(&CellStatus) -> bool) -> usize {
+        self.cells.iter().filter(|cell| is(cell)).count()
+    }
+
+    /// The cells that are done, with their results.
+    pub fn done(&self) -> impl Iterator<Item = (&Cell, &CellResult)> {
+        self.plan.cells.iter().zip(&self.cells).filter_map(|(cell, status)| match status {
+            CellStatus::Done(result) => Some((cell, &**result)),
+            _ => None,
+        })
+    }
+
+    /// Success of the cells that are done, by their kinds.
+    pub fn rates(&self) -> Vec<Rate> {
+        let mut rates = Rates::default();
+        self.done().for_each(|(cell, result)| rates.add(cell, result));
+        rates.list()
+    }
+
+    /// What cells took that are done.
+    pub fn taken(&self) -> Taken<'_> {
+        Taken::read(&self.plan, &self.folder)
+    }
+
+    /// "in work", "finished", "with failures" or "broken off".
+    pub fn state(&self) -> &'static str {
+        let any = |is: fn(&CellStatus) -> bool| self.cells.iter().any(is);
+        match () {
+            () if any(|cell| *cell == CellStatus::InWork) => "in work",
+            () if any(|cell| matches!(cell, CellStatus::Failed(_))) => "with failures",
+            () if self.cells.iter().all(|cell| matches!(cell, CellStatus::Done(_))) => "finished",
+            () => "broken off",
+        }
+    }
+
+    /// In a few figures.
+    pub fn summary(&self) -> RunSummary {
+        let rates: Vec<f64> =
+            self.done().flat_map(|(_, result)| result.results.values().map(|test| test.success_percent)).collect();
+        RunSummary {
+            path: self.folder.path().to_owned(),
+            what: match &self.plan.environments()[..] {
+                few @ ([_] | [_, _]) => few.join(", "),
+                many => format!("{} environments", many.len()), // a line must fit
+            },
+            done: self.done().count() as u64,
+            budget: self.cells.len() as u64,
+            unit: "cells",
+            success_percent: (!rates.is_empty()).then(|| mean(rates.iter().copied())),
+            state: self.state(),
+        }
+    }
+}
+
+impl CellStatus {
+    /// Whether it is done or has failed.
+    pub fn is_settled(&self) -> bool {
+        matches!(self, Self::Done(_) | Self::Failed(_))
+    }
+}
+
+fn read_plan(folder: &Folder, within: Option<&Path>) -> Result<Plan, AnyError> {
+    let path = folder.require_plan()?;
+    if let Some(root) = within {
+        let out = |name: &Path| leads_out(root, folder.path(), name);
+        let tables =
+            list(folder.path())?.into_iter().filter(|path| path.extension().is_some_and(|ending| ending == "csv"));
+        let names =
+            tables.filter_map(|path| Some(path.file_name()?.into())).chain(["plan.toml", "cells"].map(PathBuf::from));
+        for name in names {
+            if out(&name) {
+                return Err(format!("{} is {LEADS_OUT}", name.display()).into());
+            }
+        }
+    }
+    let plan = Plan::parse(&path.display().to_string(), read_plain_text(&path, LONGEST_TEXT)?)?;
+    if within.is_some() && plan.cells.len() > MOST_FOLLOWED {
+        let (cells, most) = (grouped(plan.cells.len()), grouped(MOST_FOLLOWED));
+        return Err(
+            format!("its {cells} cells are too many to follow, expected {most} at most; ask `perturb ls`").into()
+        );
+    }
+    if let Some(root) = within.filter(|_| !plan.candidates.is_empty()) {
+        for cell in &plan.cells {
+            require_within(folder, cell, root)?; // results say which candidates become cells
+        }
+    }
+    Ok(plan.in_folder(folder)?)
+}
+
+/// Refuses a cell whose records are behind a link that leads out.
+fn require_within(folder: &Folder, cell: &Cell, root: &Path) -> Result<(), String> {
+    let place = Path::new("cells").join(&cell.id);
+    let out = RECORDS.into_iter().find(|name| leads_out(root, folder.path(), place.join(name)));
+    out.map_or(Ok(()), |name| Err(format!("{} is {LEADS_OUT}", place.join(name).display())))
+}
+
+fn records(folder: &Folder, cell: &Cell) -> Records {
+    let place = folder.cell(&cell.id);
+    RECORDS.map(|name| Stamp::of(&place.path().join(name)))
+}
+
+fn known(folder: &Folder, cell: &Cell, within: Option<&Path>) -> (Records, CellStatus) {
+    let records = records(folder, cell);
+    (records, status(folder, cell, records, within))
+}
+
+/// How far a cell is that has these records.
+fn status(folder: &Folder, cell: &Cell, records: Records, within: Option<&Path>) -> CellStatus {
+    let place = folder.cell(&cell.id);
+    if records == [None; 2] {
+        let begun = place.path().is_dir();
+        return match begun && is_locked(&place.path().join("lock")) {
+            true => CellStatus::InWork,
+            false => CellStatus::Waiting { begun },
+        };
+    }
+    if let Some(Err(reason)) = within.map(|root| require_within(folder, cell, root)) {
+        return CellStatus::NotUnderstood(reason);
+    }
+    match place.state() {
+        Ok(CellState::Done(result)) => CellStatus::Done(result),
+        Ok(CellState::Failed(failure)) => CellStatus::Failed(shortened(failure.reason)),
+        Ok(CellState::Missing) => CellStatus::Waiting { begun: true }, // deleted in this moment
+        Err(FolderError::Damaged { path, reason }) => {
+            let reason = shortened(reason);
+            CellStatus::NotUnderstood(FolderError::Damaged { path, reason }.to_string())
+        }
+        Err(error) => CellStatus::NotUnderstood(error.to_string()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fixture;
+    use crate::folder::Failure;
+
+    const PLAN: &str = "environments = ['Pendulum']\nversions = ['D']\nruns = 3
+        [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
+
+    #[test]
+    fn cells_are_followed_from_their_beginning_to_their_result() {
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(directory.path());
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        assert!(ExperimentStatus::read(directory.path()).is_err());
+        folder.keep_plan(&plan).unwrap();
+        let mut status = ExperimentStatus::read(directory.path()).unwrap();
+        assert_eq!((status.state(), &status.cells[0]), ("broken off", &CellStatus::Waiting { begun: false }));
+
+        let places: Vec<_> = plan.cells.iter().map(|cell| folder.cell(&cell.id)).collect();
+        let lock = places[0].try_lock().unwrap();
+        status.refresh().unwrap();
+        assert_eq!((status.state(), &status.cells[0]), ("in work", &CellStatus::InWork));
+        drop(lock);
+        status.refresh().unwrap();
+        assert_eq!(status.cells[0], CellStatus::Waiting { begun: true });
+        places[0].write_result(&fixture::result(&plan.cells[0], [90.0, 60.0, 30.0], 1.0)).unwrap();
+        let failure =
+            Failure { id: plan.cells[1].id.clone(), reason: "NaN".into(), commit: "x".into(), begins_anew: true };
+        places[1].write_failure(&failure).unwrap();
+        std::fs::create_dir_all(places[2].path()).unwrap();
+        std::fs::write(places[2].path().join("result.json"), "{").unwrap();
+        status.refresh().unwrap();
+        let summary = status.summary();
+        assert_eq!((summary.state, summary.done, summary.budget), ("with failures", 1, 3));
+        assert_eq!(summary.success_percent, Some(60.0));
+        assert_eq!(status.cells[1], CellStatus::Failed("NaN".into()));
+        assert!(matches!(&status.cells[2], CellStatus::NotUnderstood(why) if why.contains("result.json")));
+        assert_eq!(status.rates()[0].success[0], ("D".to_owned(), 90.0));
+
+        for (cell, place) in plan.cells.iter().zip(&places) {
+            place.write_result(&fixture::result(cell, [90.0, 60.0, 30.0], 1.0)).unwrap();
+        }
+        status.refresh().unwrap();
+        assert_eq!(status.state(), "finished");
+        std::fs::remove_dir_all(places[0].path()).unwrap();
+        status.refresh().unwrap();
+        assert_eq!(status.cells[0], CellStatus::Waiting { begun: false }, "results may go, too");
+        places[1].write_result(&fixture::result(&plan.cells[1], [10.0, 20.0, 30.0], 1.0)).unwrap();
+        status.refresh().unwrap();
+        let again = |known: &CellStatus| matches!(known, CellStatus::Done(result) if result.results["D"].success_percent == 10.0);
+        assert!(again(&status.cells[1]), "results may be others, too");
+        std::fs::write(folder.plan_path(), PLAN.replace("runs = 3", "runs = 2")).unwrap();
+        status.refresh().unwrap();
+        assert_eq!(status.cells.len(), 2, "another plan");
+    }
+
+    #[test]
+    fn what_is_shown_to_others_is_nothing_that_links_lead_out_to() {
+        let directory = tempfile::tempdir().unwrap();
+        let outside = directory.path().join("outside.json");
+        std::fs::write(&outside, "{\"secret\": 7}").unwrap();
+        let root = directory.path().canonicalize().unwrap().join("root");
+        let folder = Folder::new(&root.join("study"));
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        folder.keep_plan(&plan).unwrap();
+        let cell = folder.cell(&plan.cells[0].id);
+        std::fs::create_dir_all(cell.path()).unwrap();
+        std::os::unix::fs::symlink(&outside, cell.path().join("result.json")).unwrap();
+        let read = |within: bool| match within {
+            true => ExperimentStatus::read_within(folder.path(), &root).unwrap(),
+            false => ExperimentStatus::read(folder.path()).unwrap(),
+        };
+        let reason = |status: &ExperimentStatus| match &status.cells[0] {
+            CellStatus::NotUnderstood(reason) => reason.clone(),
+            known => panic!("{known:?}"),
+        };
+        let shown = read(true);
+        assert!(reason(&shown).ends_with("result.json is a link that leads out of the folder"));
+        assert!(reason(&read(false)).contains("secret"), "who asks for it reads it");
+        std::fs::rename(folder.plan_path(), directory.path().join("plan")).unwrap();
+        std::os::unix::fs::symlink(directory.path().join("plan"), folder.plan_path()).unwrap();
+        let error = ExperimentStatus::read_within(folder.path(), &root).unwrap_err().to_string();
+        assert_eq!(error, "plan.toml is a link that leads out of the folder");
+    }
+
+    #[test]
+    fn a_long_reason_is_shortened_and_too_many_cells_are_not_followed() {
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(directory.path());
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        folder.keep_plan(&plan).unwrap();
+        let (id, commit) = (plan.cells[0].id.clone(), "x".into());
+        let failure = Failure { id, reason: "long ".repeat(1000), commit, begins_anew: true };
+        folder.cell(&failure.id).write_failure(&failure).unwrap();
+        let status = ExperimentStatus::read(directory.path()).unwrap();
+        assert!(matches!(&status.cells[0], CellStatus::Failed(reason) if reason.len() < 400));
+        std::fs::write(folder.plan_path(), PLAN.replace("runs = 3", "runs = 50001")).unwrap();
+        let error = ExperimentStatus::read_within(directory.path(), directory.path()).unwrap_err().to_string();
+        assert!(error.contains("50 001 cells are too many to follow"), "{error}");
+    }
+}

@@ -1,0 +1,127 @@
+//! How far a training is.
+
+use std::path::{Path, PathBuf};
+
+use perturb_checkpoint::{CheckpointError, State};
+use perturb_files::{AnyError, is_locked, read_plain_text};
+use perturb_settings::{ConfigError, TrainConfig};
+use perturb_text::shortened;
+
+use super::{LONGEST_TEXT, LastProgress, RunSummary, last_progress};
+
+/// So many episodes decide whether it has had enough success.
+const RECENT: u64 = 100;
+
+/// A training, as its folder has it.
+#[derive(Clone, Debug)]
+pub struct TrainingStatus {
+    /// Where it is.
+    pub path: PathBuf,
+    /// Its settings.
+    pub config: TrainConfig,
+    /// Episodes of the budget: of the last line of the log while it is in work, otherwise of the last checkpoint, from
+    /// which it would go on.
+    pub episodes: u64,
+    /// The last line of its log; `None` before the first.
+    pub progress: Option<LastProgress>,
+    /// Episodes of the last checkpoint; `None` if there is none.
+    pub saved: Option<u64>,
+    /// What is wrong with the checkpoint.
+    pub damaged: Option<String>,
+    /// "in work", "finished", "broken off", "without a checkpoint".
+    pub state: &'static str,
+    /// Whether it has come to its end, by its budget or by its success. It may be in work all the same: what was trained
+    /// in a cell is tested.
+    pub over: bool,
+}
+
+impl TrainingStatus {
+    /// Of the training in `path`.
+    ///
+    /// # Errors
+    /// If `config.toml` is not that of a training.
+    pub fn read(path: &Path) -> Result<Self, AnyError> {
+        let config = read_config(&path.join("config.toml"))?;
+        let progress = last_progress(&path.join("progress.csv"));
+        let checkpoint = State::load(path);
+        let damaged = match &checkpoint {
+            Err(CheckpointError::Missing { .. }) | Ok(_) => None,
+            Err(error) => Some(shortened(error.to_string())),
+        };
+        let saved = checkpoint.ok().map(|state| state.counters.episodes);
+        let (budget, stop) = (config.common.episodes, config.common.stop_at_success);
+        let success = progress.as_ref().and_then(LastProgress::success_percent);
+        let enough = stop > 0.0 && success >= Some(stop) || config.settings.is_random() && saved.is_some();
+        let state = match saved.unwrap_or_default() {
+            _ if is_locked(path) => "in work",
+            saved if saved >= budget || enough => "finished",
+            saved if saved > 0 => "broken off",
+            _ => "without a checkpoint",
+        };
+        let logged = progress.as_ref().and_then(LastProgress::episodes).filter(|_| state == "in work");
+        let episodes = logged.unwrap_or_default().max(saved.unwrap_or_default());
+        let recent = progress.as_ref().and_then(LastProgress::episodes).unwrap_or_default().max(episodes) >= RECENT;
+        let over = saved >= Some(budget) || stop > 0.0 && recent && success >= Some(stop) || state == "finished";
+        Ok(Self { path: path.to_owned(), config, episodes, progress, saved, damaged, state, over })
+    }
+
+    /// What is trained, in a few words.
+    pub fn what(&self) -> String {
+        self.config.to_string()
+    }
+
+    /// In a few figures.
+    pub fn summary(&self) -> RunSummary {
+        RunSummary {
+            path: self.path.clone(),
+            what: self.what(),
+            done: self.episodes,
+            budget: self.config.common.episodes,
+            unit: "episodes",
+            success_percent: self.progress.as_ref().and_then(LastProgress::success_percent),
+            state: self.state,
+        }
+    }
+}
+
+fn read_config(path: &Path) -> Result<TrainConfig, AnyError> {
+    let origin = path.display().to_string();
+    let table = read_plain_text(path, LONGEST_TEXT)?.parse().map_err(|error: toml::de::Error| ConfigError::Syntax {
+        origin: origin.clone(),
+        reason: error.to_string().trim().to_owned(),
+    })?;
+    Ok(TrainConfig::from_table(&origin, table)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use perturb_files::{Lock, write_atomically};
+
+    #[test]
+    fn a_training_in_work_is_as_far_as_its_log_and_otherwise_as_its_checkpoint() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("run");
+        assert!(TrainingStatus::read(&path).is_err());
+        let write = |name: &str, text: &str| write_atomically(&path.join(name), text.as_bytes()).unwrap();
+        write("config.toml", "environment = 'CartPole'\nalgorithm = 'a2c'\nepisodes = 200");
+        write("progress.csv", "rollout/episodes,rollout/success_rate\n120,0.25\n");
+        let read = || TrainingStatus::read(&path).unwrap();
+        let status = read();
+        assert_eq!((status.state, status.episodes, status.saved), ("without a checkpoint", 0, None));
+        let lock = Lock::try_take(&path).unwrap();
+        assert!(!read().over);
+        let summary = read().summary();
+        assert_eq!((summary.state, summary.done, summary.budget), ("in work", 120, 200));
+        assert_eq!((summary.success_percent, summary.what.as_str()), (Some(25.0), "CartPole D a2c ff"));
+        let config = "environment = 'CartPole'\nalgorithm = 'a2c'\nepisodes = 200";
+        write("config.toml", &format!("{config}\nstop_at_success = 25"));
+        let status = read();
+        assert!(status.over && status.state == "in work", "what it has become may be tested now");
+        write("config.toml", config);
+        drop(lock);
+        write("checkpoint/checkpoint.json", "{");
+        let status = read();
+        assert!(status.damaged.unwrap().contains("not a usable checkpoint") && status.state == "without a checkpoint");
+    }
+}

@@ -1,0 +1,419 @@
+//! Cells in processes of this machine, a group in each.
+
+use std::collections::{BTreeMap, HashSet};
+use std::fs::File;
+use std::io::Write;
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::time::Instant;
+
+use perturb_files::{FileError, create_folder, io};
+
+use super::event::{last_words, read_lines, write_line};
+use super::{Backend, CellEvent, News, Offer, Order, OrderedCell, Result};
+use crate::folder::Folder;
+use crate::plan::{Grouping, Plan};
+
+/// Worker processes, each of which takes the locks of its cells itself.
+pub struct Local<'a> {
+    plan: &'a Plan,
+    folder: &'a Folder,
+    grouping: Grouping,
+    command: &'a dyn Fn(usize) -> Command,
+    server: &'a dyn Fn() -> Option<News>,
+    workers: Vec<Worker>,
+    /// What each cell may take at most, s of a process, as far as it was measured.
+    most: Vec<Option<f64>>,
+}
+
+struct Worker {
+    /// The cells without a last line: their places in the plan, by id.
+    cells: BTreeMap<String, usize>,
+    /// Those whose turn has come.
+    begun: HashSet<usize>,
+    /// The lowest number that no other worker has.
+    seat: usize,
+    child: Child,
+    events: File,
+    /// Up to where they were read.
+    offset: u64,
+    log: PathBuf,
+    /// Where its words begin in the log, in bytes.
+    log_start: u64,
+}
+
+impl<'a> Local<'a> {
+    /// `grouping.at_a_time` workers, started by `command` for their seat, the lowest number from 0 that no other
+    /// worker has; each reads an [`Order`] and writes [`Line`](super::Line)s. `server` says what has become of their servers, if
+    /// anything.
+    pub fn new(
+        plan: &'a Plan,
+        folder: &'a Folder,
+        grouping: Grouping,
+        command: &'a dyn Fn(usize) -> Command,
+        server: &'a dyn Fn() -> Option<News>,
+    ) -> Self {
+        Self { plan, folder, grouping, command, server, workers: Vec::new(), most: Vec::new() }
+    }
+
+    /// The same, which knows what cells may take at most, by their places in the plan, s of a process.
+    pub fn with_most(self, most: Vec<Option<f64>>) -> Self {
+        Self { most, ..self }
+    }
+
+    fn start(&self, group: &[Offer]) -> Result<Option<Worker>> {
+        let Some(first) = group.first() else { return Ok(None) };
+        let cells: Vec<OrderedCell> =
+            group.iter().map(|offer| OrderedCell { cell: self.id(offer.cell).into(), retry: offer.retry }).collect();
+        let (log, path) = self.open_logs(group)?;
+        let log_start = log.metadata().map_err(io("read", &path))?.len();
+        let is_free = |seat: &usize| self.workers.iter().all(|worker| worker.seat != *seat);
+        let seat = (0..self.workers.len()).find(is_free).unwrap_or(self.workers.len());
+        let mut command = (self.command)(seat);
+        let program = PathBuf::from(command.get_program());
+        let mut start = || {
+            // A file, not a pipe: nobody has to read while the worker writes.
+            let events = tempfile::tempfile()?;
+            let child = command.stdin(Stdio::piped()).stdout(events.try_clone()?).stderr(log.try_clone()?).spawn()?;
+            Ok((child, events))
+        };
+        let (mut child, events) = start().map_err(io("start a worker process of", &program))?;
+        let order = Order { cells, turn: self.first_turn().wrapping_add(first.group + first.lost_servers) };
+        if let Some(input) = &mut child.stdin {
+            write_line(input, &order);
+        }
+        let cells = group.iter().map(|offer| (self.id(offer.cell).to_owned(), offer.cell)).collect();
+        Ok(Some(Worker { cells, begun: HashSet::new(), seat, child, events, offset: 0, log: path, log_start }))
+    }
+
+    /// The log of a group, which is that of its first cell; the others' say so.
+    fn open_logs(&self, group: &[Offer]) -> Result<(File, PathBuf), FileError> {
+        let open = |offer: &Offer| {
+            let place = self.folder.cell(self.id(offer.cell));
+            create_folder(place.path())?;
+            let path = place.log();
+            let log = File::options().create(true).append(true).open(&path).map_err(io("open", &path))?;
+            Ok((log, path))
+        };
+        let first = open(&group[0])?;
+        for offer in &group[1..] {
+            let (mut log, path) = open(offer)?;
+            let first = self.id(group[0].cell);
+            writeln!(log, "done together with {first}: see ../{first}/log.txt").map_err(io("write", &path))?;
+        }
+        Ok(first)
+    }
+
+    /// Runs of single cells, as a cluster's jobs are, do not all begin with the same of several servers.
+    fn first_turn(&self) -> usize {
+        self.plan.cells.first().map_or(0, |cell| crc32c::crc32c(cell.id.as_bytes()) as usize)
+    }
+
+    fn id(&self, cell: usize) -> &'a str {
+        &self.plan.cells[cell].id
+    }
+}
+
+impl Worker {
+    /// What it has said about its cells since the last call, and whether it has ended.
+    fn news(&mut self) -> std::io::Result<(Vec<News>, bool)> {
+        let status = self.child.try_wait()?; // before its words are read, so that they are the last
+        let mut news = Vec::new();
+        for line in read_lines(&self.events, &mut self.offset)? {
+            let Some(&cell) = self.cells.get(&line.cell) else { continue };
+            if line.event.is_a_turn() {
+                self.begun.insert(cell);
+            }
+            if line.event.is_last() {
+                self.cells.remove(&line.cell);
+            }
+            news.push(News::Event(cell, line.event));
+        }
+        if let Some(status) = status.filter(|_| !self.cells.is_empty()) {
+            let words = last_words(&self.log, self.log_start).map_or_else(String::new, |words| format!(": {words}"));
+            let reason = format!("its process ended with {status}{words}");
+            let mut killed: Vec<usize> = std::mem::take(&mut self.cells).into_values().collect();
+            killed.sort_unstable();
+            news.extend(killed.into_iter().map(|cell| match self.begun.is_empty() || self.begun.contains(&cell) {
+                true => News::Event(cell, CellEvent::Killed { reason: reason.clone() }),
+                // A process that did other cells is no fault of one that had no turn.
+                false => News::Returned(cell),
+            }));
+        }
+        Ok((news, status.is_some()))
+    }
+}
+
+impl Backend for Local<'_> {
+    fn grouping(&self) -> Grouping {
+        self.grouping
+    }
+
+    fn convicts(&self) -> bool {
+        true
+    }
+
+    fn tells_ends(&self) -> bool {
+        true
+    }
+
+    fn poll(&mut self, _now: Instant) -> Result<Vec<News>> {
+        let mut news = Vec::new();
+        for mut worker in std::mem::take(&mut self.workers) {
+            let (said, ended) = worker.news().map_err(io("read what is told about", &worker.log))?;
+            news.extend(said);
+            if !ended {
+                self.workers.push(worker);
+            }
+        }
+        news.extend((self.server)());
+        Ok(news)
+    }
+
+    fn room(&self) -> usize {
+        self.grouping.at_a_time.saturating_sub(self.workers.len())
+    }
+
+    fn begin(&mut self, groups: &[Vec<Offer>]) -> Result<Vec<usize>> {
+        for group in groups {
+            let worker = self.start(group)?;
+            self.workers.extend(worker);
+        }
+        Ok(groups.iter().flatten().map(|offer| offer.cell).collect())
+    }
+
+    fn most(&self, cell: usize) -> Option<f64> {
+        self.most.get(cell).copied().flatten()
+    }
+
+    fn load(&self) -> (String, usize) {
+        let cells: usize = self.workers.iter().map(|worker| worker.cells.len()).sum();
+        let processes = self.workers.len();
+        let shown = if processes == 1 { "1 process".to_owned() } else { format!("{processes} processes") };
+        (format!("{cells} in {shown}"), processes.max(1))
+    }
+
+    /// Asks all workers to stop, and waits for them. They finish their iterations first.
+    fn stop(&mut self) -> Vec<String> {
+        for worker in &mut self.workers {
+            drop(worker.child.stdin.take());
+        }
+        for mut worker in self.workers.drain(..) {
+            let _ = worker.child.wait(); // an error means that it has been waited for
+        }
+        Vec::new()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashMap;
+    use std::time::Duration;
+
+    use super::super::{Announcement, Line, RunEnd, run};
+    use super::*;
+    use perturb_files::interrupt::StopFlag;
+
+    /// Two cells.
+    const PLAN: &str = "environments = ['CartPole']\nversions = ['D']\nruns = 2
+        [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+    /// What every worker of these tests begins with: it reads its order, and works in its cell's folder.
+    const BEGIN: &str = r#"read -r order; id=${order#*:\"}; id=${id%%\"*}; cd "cells/$id"; echo "$order" >>orders
+        echo "$SEAT" >>seats
+        say() { echo "{\"cell\":\"$id\",\"event\":$1}"; };"#;
+
+    struct Ran {
+        end: Result<RunEnd>,
+        lines: Vec<Line>,
+    }
+
+    /// Runs with a shell script as a worker of one cell.
+    fn run_script(folder: &Folder, script: &str, stop: &StopFlag, server: &dyn Fn() -> Option<News>) -> Ran {
+        run_grouped(Grouping { most: 1, at_a_time: 2 }, folder, script, stop, server)
+    }
+
+    fn run_grouped(
+        grouping: Grouping,
+        folder: &Folder,
+        script: &str,
+        stop: &StopFlag,
+        server: &dyn Fn() -> Option<News>,
+    ) -> Ran {
+        run_plan(&Plan::parse("test", PLAN.into()).unwrap(), grouping, folder, script, stop, server)
+    }
+
+    fn run_plan(
+        plan: &Plan,
+        grouping: Grouping,
+        folder: &Folder,
+        script: &str,
+        stop: &StopFlag,
+        server: &dyn Fn() -> Option<News>,
+    ) -> Ran {
+        let command = |seat: usize| {
+            let mut command = Command::new("sh");
+            command.arg("-c").arg(format!("{BEGIN} {script}")).current_dir(folder.path()).env("SEAT", seat.to_string());
+            command
+        };
+        let mut local = Local::new(plan, folder, grouping, &command, server);
+        let mut lines = Vec::new();
+        let mut report = |report: Announcement<'_>| {
+            if let Announcement::Line(line) = report {
+                lines.push(line.clone());
+            }
+        };
+        let end = run(plan, folder, &mut local, &HashMap::new(), Duration::ZERO, stop, &mut report);
+        Ran { end, lines }
+    }
+
+    fn place() -> (tempfile::TempDir, Folder, [String; 2]) {
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(directory.path());
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        (directory, folder, [0, 1].map(|cell: usize| plan.cells[cell].id.clone()))
+    }
+
+    #[test]
+    fn a_worker_reads_its_order_and_its_lines_are_heard() {
+        for at_a_time in [1, 2] {
+            orders_are_read(at_a_time);
+        }
+    }
+
+    fn orders_are_read(at_a_time: usize) {
+        let (_directory, folder, ids) = place();
+        let script = "say '\"server\",\"address\":\"unix:/x\"'; echo x >result.json; say '\"done\"'";
+        let grouping = Grouping { most: 1, at_a_time };
+        let ran = run_grouped(grouping, &folder, script, &StopFlag::default(), &|| None);
+        assert_eq!(ran.end.unwrap(), RunEnd::Finished { failed: Vec::new() });
+        for (number, id) in ids.iter().enumerate() {
+            let orders = std::fs::read_to_string(folder.cell(id).path().join("orders")).unwrap();
+            let order: Order = serde_json::from_str(&orders).unwrap();
+            assert_eq!(order.cells, [OrderedCell { cell: id.clone(), retry: None }]);
+            assert_eq!(
+                order.turn,
+                turn(&ids[0], number),
+                "they go around the servers, also if these are more than workers"
+            );
+            let events: Vec<String> = ran.lines.iter().filter(|line| line.cell == *id).map(said).collect();
+            assert_eq!(events, [r#"{"event":"server","address":"unix:/x"}"#, r#"{"event":"done"}"#]);
+        }
+    }
+
+    fn turn(first: &str, number: usize) -> usize {
+        crc32c::crc32c(first.as_bytes()) as usize + number
+    }
+
+    #[test]
+    fn a_worker_has_the_lowest_seat_that_is_free_and_goes_on_with_the_next_server() {
+        let (_directory, folder, _) = place();
+        let plan = Plan::parse("test", PLAN.replace("runs = 2", "runs = 3")).unwrap();
+        let [first, second, third] = [0, 1, 2].map(|cell: usize| plan.cells[cell].id.clone());
+        // The second works until the others are done, the third loses its first server.
+        let script = format!(
+            r#"case "$id" in
+                {second}) for _ in $(seq 2000); do
+                    [ -e ../{third}/result.json ] && [ -e ../{first}/result.json ] && break; sleep 0.01; done ;;
+                {third}) if [ "$(wc -l <seats)" = 1 ]; then say '"lost_server","reason":"gone"'; exit; fi ;;
+            esac
+            echo x >result.json; say '"done"'"#
+        );
+        let grouping = Grouping { most: 1, at_a_time: 2 };
+        let ran = run_plan(&plan, grouping, &folder, &script, &StopFlag::default(), &|| None);
+        assert_eq!(ran.end.unwrap(), RunEnd::Finished { failed: Vec::new() });
+        let read = |id: &str, name: &str| std::fs::read_to_string(folder.cell(id).path().join(name)).unwrap();
+        assert_eq!([&first, &second, &third].map(|id| read(id, "seats")), ["0\n", "1\n", "0\n0\n"]);
+        let turns = |id: &str| -> Vec<usize> {
+            let orders = read(id, "orders");
+            orders.lines().map(|order| serde_json::from_str::<Order>(order).unwrap().turn).collect()
+        };
+        assert_eq!(turns(&second), [turn(&first, 1)]);
+        assert_eq!(turns(&third), [turn(&first, 2), turn(&first, 3)]);
+    }
+
+    fn said(line: &Line) -> String {
+        serde_json::to_string(&line.event).unwrap()
+    }
+
+    #[test]
+    fn a_worker_without_a_last_line_was_killed_and_its_log_may_say_why() {
+        let (_directory, folder, ids) = place();
+        std::fs::create_dir_all(folder.cell(&ids[1]).path()).unwrap();
+        std::fs::write(folder.cell(&ids[1]).log(), "of an earlier run\n").unwrap();
+        let script = format!("test $id = {} || kill -9 $$; echo no memory >&2; exit 3", ids[0]);
+        let ran = run_script(&folder, &script, &StopFlag::default(), &|| None);
+        assert_eq!(ran.end.unwrap(), RunEnd::Finished { failed: ids.to_vec() });
+        let recorded = "3 attempts in a row have not brought it any further";
+        for (id, how) in ids.iter().zip(["exit status: 3: no memory", "signal: 9 (SIGKILL)"]) {
+            let failure = std::fs::read_to_string(folder.cell(id).path().join("failure.json")).unwrap();
+            assert!(failure.contains(&format!("its process ended with {how}; {recorded}")), "{failure}");
+        }
+    }
+
+    #[test]
+    fn a_worker_does_a_group_and_takes_only_the_cells_in_work_with_it() {
+        let (.., ids) = place();
+        let [first, second] = &ids;
+        // Done with the first, the worker dies; the second is begun again, and where its log was then is said.
+        let script = format!(
+            r#"case "$order" in
+                *{first}*) echo x >result.json; say '"done"'; id={second}; say '"server","address":"unix:/x"'
+                    [ -z "$WORKED" ] || say '"testing","set":"D","episodes":1'; echo "lost" >&2; kill -9 $$ ;;
+                *) echo x >result.json; say '"done"' ;;
+            esac"#
+        );
+        for turn in [false, true] {
+            let (_directory, folder, _) = place();
+            let script = format!("WORKED={}; {script}", if turn { "1" } else { "" });
+            let grouping = Grouping { most: 2, at_a_time: 1 };
+            let ran = run_grouped(grouping, &folder, &script, &StopFlag::default(), &|| None);
+            assert_eq!(ran.end.unwrap(), RunEnd::Finished { failed: Vec::new() });
+            let events = ran.lines.iter().map(|line| (&*line.cell, line.event.to_string()));
+            let killed = || "its process ended with signal: 9 (SIGKILL): lost".to_owned();
+            let mut expected = vec![(&**first, "done".to_owned()), (second, "on unix:/x".to_owned())];
+            if turn {
+                expected.extend([(&**second, "1 test episode on D".to_owned()), (second, killed())]);
+            }
+            expected.push((second, "done".to_owned()));
+            assert_eq!(events.collect::<Vec<_>>(), expected);
+            logs_of_a_group(&folder, &ids);
+        }
+    }
+
+    #[track_caller]
+    fn logs_of_a_group(folder: &Folder, [first, second]: &[String; 2]) {
+        let read = |id: &String, name: &str| std::fs::read_to_string(folder.cell(id).path().join(name)).unwrap();
+        let order: Order = serde_json::from_str(&read(first, "orders")).unwrap();
+        assert_eq!(order.cells.iter().map(|ordered| &ordered.cell).collect::<Vec<_>>(), [first, second]);
+        assert_eq!(read(second, "log.txt"), format!("done together with {first}: see ../{first}/log.txt\n"));
+    }
+
+    #[test]
+    fn a_stopped_run_closes_the_workers_input_and_waits_for_them() {
+        let (_directory, folder, ids) = place();
+        let at = |id: &String, name: &str| folder.cell(id).path().join(name).exists();
+        let stop = StopFlag::default();
+        let ran = std::thread::scope(|scope| {
+            scope.spawn(|| {
+                let start = Instant::now();
+                while !ids.iter().all(|id| at(id, "started")) && start.elapsed() < Duration::from_secs(20) {
+                    std::thread::sleep(Duration::from_millis(10));
+                }
+                stop.raise(2);
+            });
+            run_script(&folder, "echo x >started; cat >/dev/null; echo x >stopped", &stop, &|| None)
+        });
+        assert_eq!(ran.end.unwrap(), RunEnd::Stopped { signal: 2, left: Vec::new() });
+        assert!(ids.iter().all(|id| at(id, "stopped")));
+    }
+
+    #[test]
+    fn the_end_of_the_shared_server_is_that_of_the_run() {
+        let (_directory, folder, _) = place();
+        let stop = StopFlag::default();
+        let ran =
+            run_script(&folder, "cat >/dev/null", &stop, &|| Some(News::NoServer("the private server ended".into())));
+        let message = ran.end.unwrap_err().to_string();
+        assert!(message.starts_with("the run cannot go on without a server: the private server ended;"), "{message}");
+    }
+}

@@ -1,0 +1,612 @@
+//! Doing the cells of a plan: on this machine, or on a cluster.
+//!
+//! [`run()`] is one state machine over a [`Backend`] that begins groups of cells and tells what becomes of each cell:
+//! [`Local`] in processes of this machine, [`slurm`] in jobs. Whatever is told, the folder says what is done: a cell is
+//! settled when its result is there, or a failure that counts. So several runs, of both kinds, may share a folder.
+
+mod event;
+mod local;
+mod pace;
+mod rates;
+mod remaining;
+mod running;
+pub mod slurm;
+
+use std::collections::{HashMap, VecDeque};
+use std::time::{Duration, Instant};
+
+use perturb_files::FileError;
+use perturb_files::interrupt::StopFlag;
+use perturb_text::{count, duration};
+
+use crate::cost::generated_episodes;
+use crate::folder::{CellState, Failure, FailureMark, Folder};
+use crate::plan::{Cell, Grouping, Plan, SELECTION_TEST, Tests};
+use crate::times::Times;
+pub use event::{CellEvent, Line, Order, OrderedCell, Teller, write_line};
+pub use local::Local;
+pub use pace::Pace;
+pub use rates::Rate;
+pub(crate) use rates::Rates;
+pub use remaining::Remaining;
+use remaining::{Left, remaining};
+use running::Running;
+pub use running::RunningGroup;
+use slurm::SlurmError;
+
+/// How often in a row a cell may be broken off without getting any further.
+pub const MOST_ATTEMPTS: u32 = 3;
+/// How often in a row a cell may be without a disk before the run ends, after some fifteen seconds.
+const MOST_FAULTS: u32 = 5;
+/// How long a cell is kept without a server at least before the run ends: one may be started again meanwhile.
+const LEAST_WAIT: Duration = Duration::from_secs(15);
+/// A cell that had a server for so long made some progress: what is lost then is not lost in a row.
+const HAD_A_SERVER: Duration = Duration::from_secs(60);
+/// How long nothing is begun after a cell had no server or no disk; doubled at each time in a row, …
+const PAUSE: Duration = Duration::from_secs(1);
+/// … up to this.
+const LONGEST_PAUSE: Duration = Duration::from_secs(30);
+/// How often the folder is looked at, and it is said how far the run is.
+const LOOK_INTERVAL: Duration = Duration::from_secs(1);
+/// A test episode takes about so much of the time of a training's: there are no updates, and many at a time.
+const TEST_SHARE: f64 = 0.25;
+/// How long this process sleeps at a time.
+const TICK: Duration = Duration::from_millis(50);
+
+/// What does cells.
+pub trait Backend {
+    /// How cells are to be put into groups.
+    fn grouping(&self) -> Grouping;
+    /// Whether a cell that is broken off too often has failed. If not, its machines may be to blame: nothing is
+    /// recorded, and the next run tries again.
+    fn convicts(&self) -> bool;
+    /// Whether it tells of every cell that has begun how it ends, so that a run can wait for that.
+    fn tells_ends(&self) -> bool;
+    /// What has happened since the last call.
+    ///
+    /// # Errors
+    /// The run cannot go on.
+    fn poll(&mut self, now: Instant) -> Result<Vec<News>>;
+    /// How many groups it would take now.
+    fn room(&self) -> usize;
+    /// Begins with some of `groups`, none of them empty, and gives the cells that it took: these, and those that it has
+    /// in work already.
+    ///
+    /// # Errors
+    /// The run cannot go on.
+    fn begin(&mut self, groups: &[Vec<Offer>]) -> Result<Vec<usize>>;
+    /// What it is doing, in a few words, and how many groups at a time.
+    fn load(&self) -> (String, usize);
+    /// What a cell may take at most, s of a process, if it was measured.
+    fn most(&self, _cell: usize) -> Option<f64> {
+        None
+    }
+    /// Ends all that cannot go on without this process, and names what can.
+    fn stop(&mut self) -> Vec<String>;
+}
+
+/// A cell that waits to be done.
+#[derive(Clone, Copy, Debug)]
+pub struct Offer {
+    /// Its place in the plan.
+    pub cell: usize,
+    /// The failure that is forgiven it.
+    pub retry: Option<FailureMark>,
+    /// The number of its group in this run, also if it is offered alone.
+    pub group: usize,
+    /// How many servers it has lost.
+    pub lost_servers: usize,
+    /// What other cells of its environment and learner took, s; `None` before the first.
+    pub seconds: Option<f64>,
+}
+
+/// What a backend has to say. Cells are places in the plan.
+#[derive(Clone, Debug, PartialEq)]
+pub enum News {
+    /// Something happened to a cell.
+    Event(usize, CellEvent),
+    /// A cell was given back before its turn came.
+    Returned(usize),
+    /// The servers are gone, for this reason.
+    NoServer(String),
+    /// A sentence.
+    Note(String),
+}
+
+/// What a run says while it goes on.
+#[derive(Clone, Debug)]
+pub enum Announcement<'a> {
+    /// How far it is.
+    Status(&'a Status),
+    /// A sentence about what happened.
+    Note(&'a str),
+    /// What happened to a cell.
+    Line(&'a Line),
+}
+
+/// How far a run is.
+#[derive(Clone, Debug)]
+pub struct Status {
+    /// Cells of the plan.
+    pub cells: usize,
+    /// Cells with a result.
+    pub done: usize,
+    /// Cells with a failure that counts.
+    pub failed: usize,
+    /// What is being done.
+    pub running: Vec<RunningGroup>,
+    /// What the backend is doing, in a few words.
+    pub doing: String,
+    /// How long it may take; `None` while there is a cell of whose kind nothing is known.
+    pub remaining: Option<Remaining>,
+    /// Success of the cells that are done.
+    pub rates: Vec<Rate>,
+}
+
+/// How a run ended.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum RunEnd {
+    /// All cells have a result or have failed; these have failed.
+    Finished {
+        /// Ids.
+        failed: Vec<String>,
+    },
+    /// This signal ended it. Calling it again goes on.
+    Stopped {
+        /// Its number.
+        signal: i32,
+        /// What goes on without this process: a cluster's jobs.
+        left: Vec<String>,
+    },
+}
+
+/// Why a run cannot go on.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum RunError {
+    /// The folder cannot be read or written, or a worker cannot be started.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// A worker does not know the plan's cells.
+    #[error("a worker refused its order: {0}; did another run replace the folder's plan.toml meanwhile?")]
+    Refused(String),
+    /// The servers are gone.
+    #[error("the run cannot go on without a server: {0}; what is done is kept")]
+    NoServer(String),
+    /// Files of a cell cannot be read or written.
+    #[error("the run cannot go on: {0}; when that is mended, the same command goes on from what was trained")]
+    FileFault(String),
+    /// Cells were tried several times, which did not bring them any further.
+    #[error(
+        "{} without a result after {MOST_ATTEMPTS} attempts, the first is {}: {words}; when that is mended, the same \
+         command tries again",
+        count(ids.len(), "cell"),
+        ids[0]
+    )]
+    GaveUp {
+        /// At least one.
+        ids: Vec<String>,
+        /// How the last attempt at the first one ended.
+        words: String,
+    },
+    /// Slurm cannot do the cells.
+    #[error(transparent)]
+    Slurm(#[from] SlurmError),
+}
+
+type Result<T, E = RunError> = std::result::Result<T, E>;
+
+/// Does every cell of `plan` that has no result in `folder`, also those that had failed as is `forgiven` them, by their ids.
+/// Returns when no cell is left, also none that another run works on. A cell that has lost its server goes on from its last
+/// checkpoint, if need be for `server_wait`, or fifteen seconds, until there is one.
+///
+/// # Errors
+/// [`RunError`]; the backend has then been stopped.
+pub fn run(
+    plan: &Plan,
+    folder: &Folder,
+    backend: &mut dyn Backend,
+    forgiven: &HashMap<String, FailureMark>,
+    server_wait: Duration,
+    stop: &StopFlag,
+    report: &mut dyn FnMut(Announcement<'_>),
+) -> Result<RunEnd> {
+    let mut scheduler = Scheduler { server_wait, ..Scheduler::new(plan, folder, backend, forgiven, report) };
+    let end = loop {
+        match (scheduler.step(Instant::now()), stop.signal()) {
+            (Ok(None), None) => std::thread::sleep(TICK),
+            (Ok(Some(failed)), _) => break Ok(RunEnd::Finished { failed }),
+            (Err(error), None) => break Err(error),
+            // Whoever stops a run may end its servers and commands too.
+            (_, Some(signal)) => break Ok(RunEnd::Stopped { signal, left: scheduler.backend.stop() }),
+        }
+    };
+    scheduler.backend.stop();
+    end
+}
+
+/// What is known of a cell.
+#[derive(Debug, Default)]
+struct Tracked {
+    phase: Phase,
+    /// The number of its group.
+    group: usize,
+    /// It was broken off without getting any further: done alone, it can take no others with it.
+    alone: bool,
+    /// A failure that was there before this run and does not count. One that is recorded later does, whoever tried.
+    forgiven: Option<FailureMark>,
+    /// How often in a row it was broken off without getting any further.
+    attempts: u32,
+    /// Steps of its training that are in a checkpoint, and that were when the last attempt began its training.
+    saved: u64,
+    saved_before: Option<u64>,
+    /// How far this attempt is.
+    pace: Pace,
+    lost_servers: usize,
+    /// How often in a row it had no server, and how long nothing was begun for that.
+    lost_in_a_row: u32,
+    waited: Duration,
+    /// How often in a row it had no disk.
+    faults_in_a_row: u32,
+    /// When something first happened to it in this attempt: before its turn in a job, a cell takes no time; …
+    begun: Option<Instant>,
+    /// … had a server (looking for one, of which many may be silent, is not having one) …
+    served: Option<Instant>,
+    /// … and what happened to it last.
+    last: Option<CellEvent>,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+enum Phase {
+    #[default]
+    Waiting,
+    Running,
+    /// Others work on it.
+    Elsewhere,
+    Done,
+    Failed,
+    /// It was broken off too often.
+    GivenUp,
+}
+
+struct Scheduler<'a> {
+    plan: &'a Plan,
+    folder: &'a Folder,
+    backend: &'a mut dyn Backend,
+    report: &'a mut dyn FnMut(Announcement<'_>),
+    /// By the cells' places in the plan.
+    cells: Vec<Tracked>,
+    /// The cells that wait, in order.
+    queue: VecDeque<usize>,
+    times: Times<'a>,
+    rates: Rates,
+    paused_until: Option<Instant>,
+    server_wait: Duration,
+    look_at: Option<Instant>,
+}
+
+impl<'a> Scheduler<'a> {
+    fn new(
+        plan: &'a Plan,
+        folder: &'a Folder,
+        backend: &'a mut dyn Backend,
+        forgiven: &HashMap<String, FailureMark>,
+        report: &'a mut dyn FnMut(Announcement<'_>),
+    ) -> Self {
+        let forgiven = |id| forgiven.get(id).copied();
+        let cells = plan.cells.iter().map(|cell| Tracked { forgiven: forgiven(&cell.id), ..Tracked::default() });
+        let mut scheduler = Self {
+            plan,
+            folder,
+            backend,
+            report,
+            cells: cells.collect(),
+            queue: VecDeque::new(),
+            times: Times::default(),
+            rates: Rates::default(),
+            paused_until: None,
+            server_wait: Duration::ZERO,
+            look_at: None,
+        };
+        let left: Vec<usize> = (0..plan.cells.len()).filter(|&cell| !scheduler.settled(cell)).collect();
+        let groups = plan.groups(&left, scheduler.backend.grouping());
+        for (number, group) in groups.into_iter().enumerate() {
+            group.iter().for_each(|&cell| scheduler.cells[cell].group = number);
+            scheduler.queue.extend(group);
+        }
+        scheduler
+    }
+
+    /// Takes note of what happened and begins what can be begun. At the end gives the ids of the cells that failed.
+    fn step(&mut self, now: Instant) -> Result<Option<Vec<String>>> {
+        for news in self.backend.poll(now)? {
+            match news {
+                News::Note(sentence) => (self.report)(Announcement::Note(&sentence)),
+                News::NoServer(reason) => return Err(RunError::NoServer(reason)),
+                News::Returned(cell) if self.settled(cell) => {}
+                News::Returned(cell) => self.wait(cell),
+                News::Event(cell, event) => self.hear(cell, event, now)?,
+            }
+        }
+        let looks = self.look_at.is_none_or(|time| now >= time);
+        if looks {
+            self.look(now)?;
+        }
+        self.begin(now)?;
+        let end = self.end();
+        if looks || matches!(end, Ok(Some(_))) {
+            let status = self.status(now);
+            (self.report)(Announcement::Status(&status));
+        }
+        end
+    }
+
+    fn hear(&mut self, cell: usize, event: CellEvent, now: Instant) -> Result<()> {
+        let line = Line { cell: self.id(cell).to_owned(), event: event.clone() };
+        (self.report)(Announcement::Line(&line));
+        let tracked = &mut self.cells[cell];
+        tracked.last = Some(event.clone());
+        tracked.begun.get_or_insert(now);
+        match event {
+            CellEvent::Server { .. } => tracked.served = tracked.served.or(Some(now)),
+            CellEvent::Training { saved, episodes, timesteps } => {
+                tracked.pace.hear(generated_episodes(&self.plan.cells[cell].config, episodes), timesteps);
+                tracked.saved_before.get_or_insert(saved);
+                if saved > tracked.saved {
+                    (tracked.saved, tracked.attempts) = (saved, 0);
+                }
+            }
+            event if event.is_last() && !self.settled(cell) => self.conclude(cell, event, now)?,
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// Decides what becomes of a cell whose attempt ended without settling it.
+    fn conclude(&mut self, cell: usize, end: CellEvent, now: Instant) -> Result<()> {
+        let tracked = &mut self.cells[cell];
+        match end {
+            CellEvent::Busy => tracked.phase = Phase::Elsewhere,
+            CellEvent::Refused { reason } => return Err(RunError::Refused(reason)),
+            CellEvent::Failed { reason } => self.record_failure(cell, reason)?,
+            CellEvent::LostServer { .. } => {
+                if tracked.served.is_some_and(|since| now - since >= HAD_A_SERVER) {
+                    (tracked.lost_in_a_row, tracked.waited) = (0, Duration::ZERO);
+                }
+                tracked.lost_in_a_row += 1;
+                tracked.lost_servers += 1;
+                let pause = pause(tracked.lost_in_a_row);
+                tracked.waited += pause;
+                let (waited, most) = (tracked.waited, self.server_wait.max(LEAST_WAIT));
+                if waited > most {
+                    return Err(RunError::NoServer(format!("{}: {end}", self.id(cell))));
+                } else if self.paused_until.is_none_or(|until| until < now) {
+                    let wait = duration((most + pause - waited).as_secs_f64());
+                    let words = format!("{}: {end}; waiting for it, at most {wait}", self.id(cell));
+                    (self.report)(Announcement::Note(&words));
+                }
+                self.pause(cell, now + pause);
+            }
+            CellEvent::FileFault { .. } => {
+                if tracked.saved_before.is_some_and(|before| tracked.saved > before) {
+                    tracked.faults_in_a_row = 0;
+                }
+                tracked.faults_in_a_row += 1;
+                let pause = pause(tracked.faults_in_a_row);
+                if tracked.faults_in_a_row >= MOST_FAULTS {
+                    return Err(RunError::FileFault(format!("{}: {end}", self.id(cell))));
+                }
+                self.pause(cell, now + pause);
+            }
+            end => {
+                tracked.attempts += 1;
+                tracked.alone = tracked.saved_before.is_none_or(|before| tracked.saved <= before);
+                if tracked.attempts < MOST_ATTEMPTS {
+                    self.wait(cell);
+                } else if self.backend.convicts() {
+                    let times = format!("{MOST_ATTEMPTS} attempts in a row have not brought it any further");
+                    self.record_failure(cell, format!("{end}; {times}"))?;
+                } else {
+                    tracked.phase = Phase::GivenUp;
+                    let id = self.id(cell);
+                    let note = format!("{id} is given up: {MOST_ATTEMPTS} attempts have not brought it any further");
+                    (self.report)(Announcement::Note(&note));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Begins nothing until then, and this cell first: if it cannot go on, the run ends soon, however many cells it has.
+    fn pause(&mut self, cell: usize, until: Instant) {
+        self.paused_until = self.paused_until.max(Some(until));
+        self.cells[cell].phase = Phase::Waiting;
+        self.queue.push_front(cell);
+    }
+
+    /// Records the failure of a worker that could not do so itself.
+    fn record_failure(&mut self, cell: usize, reason: String) -> Result<()> {
+        let place = self.folder.cell(self.id(cell));
+        let Some(_lock) = place.try_lock()? else {
+            self.cells[cell].phase = Phase::Elsewhere;
+            return Ok(());
+        };
+        if !self.settled(cell) {
+            place.write_failure(&Failure {
+                id: self.id(cell).to_owned(),
+                reason,
+                commit: crate::VERSION.into(),
+                begins_anew: false,
+            })?;
+            self.cells[cell].phase = Phase::Failed;
+        }
+        Ok(())
+    }
+
+    /// Whether a cell has a result, or has failed and that counts.
+    fn settled(&mut self, cell: usize) -> bool {
+        let Tracked { phase, forgiven, .. } = &mut self.cells[cell];
+        let place = self.folder.cell(&self.plan.cells[cell].id);
+        if matches!(phase, Phase::Done | Phase::Failed) {
+            return true;
+        } else if place.is_settled(false) {
+            *phase = Phase::Done;
+            if let Some(timing) = place.timing() {
+                self.times.add(&self.plan.cells[cell], timing.seconds);
+            }
+            // One that cannot be read is left out: the report says what is wrong with it.
+            if let Ok(CellState::Done(result)) = place.state() {
+                self.rates.add(&self.plan.cells[cell], &result);
+            }
+        } else if place.failure_mark().is_some_and(|failure| Some(failure) != *forgiven) {
+            *phase = Phase::Failed;
+        }
+        matches!(phase, Phase::Done | Phase::Failed)
+    }
+
+    /// Takes note of what is in the folder, whoever did it, and of cells that others have given up.
+    fn look(&mut self, now: Instant) -> Result<()> {
+        let begun = Instant::now();
+        let waits = self.backend.tells_ends();
+        for cell in 0..self.cells.len() {
+            let Tracked { phase, begun, .. } = self.cells[cell];
+            // Whoever does it for this run has yet to say so: a result is written before that.
+            let is_to_be_told = waits && phase == Phase::Running && begun.is_some();
+            if !is_to_be_told
+                && !self.settled(cell)
+                && self.cells[cell].phase == Phase::Elsewhere
+                && self.folder.cell(self.id(cell)).try_lock()?.is_some()
+            {
+                self.wait(cell);
+            }
+        }
+        // A folder of many cells on a slow file system is not looked at all the time.
+        self.look_at = Some(now + LOOK_INTERVAL.max(begun.elapsed() * 20));
+        Ok(())
+    }
+
+    fn begin(&mut self, now: Instant) -> Result<()> {
+        let room = self.backend.room();
+        if self.paused_until.is_some_and(|end| now < end) {
+            return Ok(());
+        }
+        let mut offers: Vec<Vec<Offer>> = Vec::new();
+        let mut places: HashMap<usize, usize> = HashMap::new();
+        for cell in self.queue.clone() {
+            let Tracked { forgiven: retry, group, alone, lost_servers, .. } = self.cells[cell];
+            let place = places.get(&group).copied().filter(|_| !alone);
+            // Another run may have done it meanwhile.
+            if (place.is_none() && offers.len() >= room) || self.settled(cell) {
+                continue;
+            }
+            let seconds = self.times.of_pair(&self.plan.cells[cell]);
+            let offer = Offer { cell, retry, group, lost_servers, seconds };
+            match place {
+                Some(place) => offers[place].push(offer),
+                None => {
+                    if !alone {
+                        places.insert(group, offers.len());
+                    }
+                    offers.push(vec![offer]);
+                }
+            }
+        }
+        offers.iter_mut().for_each(|group| group.sort_by_key(|offer| offer.cell));
+        if !offers.is_empty() {
+            for cell in self.backend.begin(&offers)? {
+                let tracked = &mut self.cells[cell];
+                tracked.phase = Phase::Running;
+                (tracked.begun, tracked.served, tracked.last, tracked.saved_before) = (None, None, None, None);
+                tracked.pace = Pace::default();
+            }
+        }
+        self.queue.retain(|&cell| self.cells[cell].phase == Phase::Waiting);
+        Ok(())
+    }
+
+    fn wait(&mut self, cell: usize) {
+        self.cells[cell].phase = Phase::Waiting;
+        self.queue.push_back(cell);
+    }
+
+    /// The ids of the cells that failed; `None` while cells are left.
+    fn end(&self) -> Result<Option<Vec<String>>> {
+        let in_phase = |phase| (0..self.cells.len()).filter(move |&cell| self.cells[cell].phase == phase);
+        let left = [Phase::Waiting, Phase::Running, Phase::Elsewhere];
+        if left.into_iter().flat_map(in_phase).next().is_some() {
+            return Ok(None);
+        }
+        let ids = |phase| in_phase(phase).map(|cell| self.id(cell).to_owned()).collect();
+        let Some(first) = in_phase(Phase::GivenUp).next() else { return Ok(Some(ids(Phase::Failed))) };
+        let words = self.cells[first].last.as_ref().map(CellEvent::to_string).unwrap_or_default();
+        Err(RunError::GaveUp { ids: ids(Phase::GivenUp), words })
+    }
+
+    fn status(&self, now: Instant) -> Status {
+        let (doing, at_a_time) = self.backend.load();
+        let number = |phase| self.cells.iter().filter(|cell| cell.phase == phase).count();
+        let (mut running, mut left) = (Running::default(), Vec::new());
+        for (place, (tracked, cell)) in self.cells.iter().zip(&self.plan.cells).enumerate() {
+            let most = self.backend.most(place);
+            match (tracked.phase, &tracked.last, tracked.begun) {
+                (Phase::Running, Some(event), Some(begun)) => {
+                    running.add(cell, (!tracked.alone).then_some(tracked.group), event);
+                    let rest = rest(cell, event, &tracked.pace);
+                    left.push(Left { cell, elapsed: Some((now - begun).as_secs_f64()), rest, most });
+                }
+                (Phase::Waiting | Phase::Running, ..) => left.push(Left { cell, elapsed: None, rest: None, most }),
+                _ => {}
+            }
+        }
+        Status {
+            cells: self.cells.len(),
+            done: number(Phase::Done),
+            failed: number(Phase::Failed),
+            running: running.groups,
+            doing,
+            remaining: remaining(&self.times, &left, at_a_time),
+            rates: self.rates.list(),
+        }
+    }
+
+    fn id(&self, cell: usize) -> &'a str {
+        &self.plan.cells[cell].id
+    }
+}
+
+/// How long nothing is begun after so many losses in a row.
+fn pause(in_a_row: u32) -> Duration {
+    LONGEST_PAUSE.min(PAUSE * (1 << (in_a_row - 1).min(16)))
+}
+
+/// What is left of a cell under way, in terms of what was done of it.
+fn rest(cell: &Cell, event: &CellEvent, pace: &Pace) -> Option<f64> {
+    let training = generated_episodes(&cell.config, cell.config.common.episodes);
+    let testing = test_episodes(cell, None);
+    match event {
+        CellEvent::Training { .. } => pace.left(training + TEST_SHARE * testing),
+        CellEvent::Testing { set, episodes } => {
+            let tested = test_episodes(cell, Some(set)) + *episodes as f64;
+            let done = (training - pace.begun()).max(0.0) + TEST_SHARE * tested; // in this attempt
+            (done > 0.0).then(|| TEST_SHARE * (testing - tested).max(0.0) / done)
+        }
+        _ => None,
+    }
+}
+
+/// Episodes of a cell's tests: all of them, or those before the test of this name.
+fn test_episodes(cell: &Cell, before: Option<&str>) -> f64 {
+    let Tests { episodes, sets, selection, marks, .. } = &cell.tests;
+    let of_mark = marks.iter().map(|mark| format!(" after {mark} episodes"));
+    let names =
+        of_mark.chain([String::new()]).flat_map(|when| sets.iter().map(move |set| format!("{}{when}", set.name)));
+    let mut names = names.chain(selection.map(|_| SELECTION_TEST.to_owned()));
+    let tests = names.position(|name| Some(name.as_str()) == before);
+    match tests {
+        Some(tests) => (tests as u64 * episodes) as f64,
+        None => (((1 + marks.len()) * sets.len()) as u64 * episodes + selection.unwrap_or_default()) as f64,
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,52 @@
+//! How well the policies do of cells that are done.
+
+use std::collections::BTreeMap;
+
+use perturb_text::count;
+
+use crate::folder::CellResult;
+use crate::plan::Cell;
+
+/// Success of the cells of an environment, a learner and what it was trained on: means over settings and runs.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Rate {
+    /// As [`Cell::described`] has it.
+    pub kind: String,
+    /// How many cells.
+    pub cells: usize,
+    /// By the name of the set that was tested, %.
+    pub success: Vec<(String, f64)>,
+}
+
+/// Collects them, in the order of the plan.
+#[derive(Debug, Default)]
+pub(crate) struct Rates(BTreeMap<usize, (Rate, Vec<f64>)>);
+
+impl Rates {
+    /// A cell that is done.
+    pub(crate) fn add(&mut self, cell: &Cell, result: &CellResult) {
+        let kind = cell.described();
+        let known = self.0.iter().find(|(_, (rate, _))| rate.kind == kind).map(|(&index, _)| index);
+        let names = || cell.tests.sets.iter().map(|set| (set.name.clone(), 0.0)).collect();
+        let new = || (Rate { kind: kind.clone(), cells: 0, success: names() }, Vec::new());
+        let (rate, sums) = self.0.entry(known.unwrap_or(cell.index)).or_insert_with(new);
+        rate.cells += 1;
+        sums.resize(rate.success.len(), 0.0);
+        for ((name, mean), sum) in rate.success.iter_mut().zip(sums) {
+            *sum += result.results.get(name).map_or(f64::NAN, |test| test.success_percent);
+            *mean = *sum / rate.cells as f64;
+        }
+    }
+
+    pub(crate) fn list(&self) -> Vec<Rate> {
+        self.0.values().map(|(rate, _)| rate.clone()).collect()
+    }
+}
+
+/// "CartPole ppo ff, trained on R: D 100.0, E 64.1 % (3 cells)".
+impl std::fmt::Display for Rate {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let rates: Vec<String> = self.success.iter().map(|(name, percent)| format!("{name} {percent:.1}")).collect();
+        write!(f, "{}: {} % ({})", self.kind, rates.join(", "), count(self.cells, "cell"))
+    }
+}

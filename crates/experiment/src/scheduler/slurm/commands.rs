@@ -1,0 +1,238 @@
+//! Slurm's commands, and what they answer.
+
+use std::ffi::OsStr;
+use std::fs::File;
+use std::io::{Read, Seek};
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use perturb_files::interrupt::StopFlag;
+
+use super::error::SlurmError;
+use super::job::QueuedJob;
+use super::options::{OptionError, SlurmOptions, text_of};
+use super::submission::Submission;
+
+/// How long Slurm may take to answer.
+const LIMIT: Duration = Duration::from_secs(60);
+/// How often it is looked whether it has.
+const TICK: Duration = Duration::from_millis(20);
+/// What separates the fields of squeue's lines.
+const FIELDS: &str = "%F|%K|%T|%r|%N|%j";
+
+/// Slurm on this machine.
+#[derive(Clone, Debug)]
+pub struct Slurm {
+    directory: Option<PathBuf>,
+    limit: Duration,
+}
+
+impl Default for Slurm {
+    fn default() -> Self {
+        Self { directory: None, limit: LIMIT }
+    }
+}
+
+impl Slurm {
+    /// With the commands in `directory` instead of those on the PATH, which may take `limit` to answer.
+    pub fn in_directory(directory: PathBuf, limit: Duration) -> Self {
+        Self { directory: Some(directory), limit }
+    }
+
+    /// Refuses machines without Slurm's commands.
+    ///
+    /// # Errors
+    /// [`SlurmError::NotInstalled`], or what the commands say.
+    pub fn check(&self, stop: &StopFlag) -> Result<(), SlurmError> {
+        ["sbatch", "squeue", "scontrol"].into_iter().try_for_each(|name| self.call(name, ["--version"], stop).map(drop))
+    }
+
+    /// The jobs of arrays with these names, also those that ended a short time ago.
+    ///
+    /// # Errors
+    /// What squeue says, or that it says nothing.
+    pub(super) fn queue(&self, names: &[&str], stop: &StopFlag) -> Result<Vec<QueuedJob>, SlurmError> {
+        if names.is_empty() {
+            return Ok(Vec::new());
+        }
+        let names = format!("--name={}", names.join(","));
+        let format = format!("--format={FIELDS}");
+        let text = self.call("squeue", ["--array", "--noheader", "--states=all", &format, &names], stop)?;
+        text.lines().filter(|line| !line.trim().is_empty()).map(parse_job).collect()
+    }
+
+    /// How many jobs an array may have.
+    ///
+    /// # Errors
+    /// What scontrol says, or that it says nothing.
+    pub(super) fn most_jobs(&self, stop: &StopFlag) -> Result<usize, SlurmError> {
+        let text = self.call("scontrol", ["show", "config"], stop)?;
+        match parse_setting(&text, "MaxArraySize").map(str::parse::<usize>) {
+            Some(Ok(0)) => Err(SlurmError::NoArrays),
+            Some(Ok(number)) => Ok(number),
+            _ => Err(not_understood("scontrol", "a line MaxArraySize = NUMBER", &text)),
+        }
+    }
+
+    /// Submits; gives the array's number. Not to be stopped: then nobody would know whether it was accepted.
+    ///
+    /// # Errors
+    /// What sbatch says, or that it says nothing.
+    pub(super) fn submit(&self, submission: &Submission, options: &SlurmOptions) -> Result<String, SlurmError> {
+        let arguments = sbatch_arguments(submission, options)?;
+        let text = self.call("sbatch", &arguments, &StopFlag::default())?;
+        // With several clusters: NUMBER;CLUSTER. Plugins may say more on other lines.
+        let number = text.lines().rev().find_map(|line| {
+            let number = line.trim().split(';').next().unwrap_or_default();
+            number.parse::<u64>().ok().map(|_| number.to_owned())
+        });
+        number.ok_or_else(|| not_understood("sbatch", "the number of a job", &text))
+    }
+
+    /// Runs a command to its end, and gives what it printed.
+    fn call<S: AsRef<OsStr>>(
+        &self,
+        name: &'static str,
+        arguments: impl IntoIterator<Item = S>,
+        stop: &StopFlag,
+    ) -> Result<String, SlurmError> {
+        let program = self.directory.as_ref().map_or_else(|| PathBuf::from(name), |directory| directory.join(name));
+        let failed = |source| SlurmError::System { program: name, source };
+        // Files, not pipes: nobody has to read while the command runs.
+        let (mut output, mut errors) = (tempfile::tempfile().map_err(failed)?, tempfile::tempfile().map_err(failed)?);
+        let mut command = Command::new(program);
+        command.args(arguments).stdin(Stdio::null());
+        command.stdout(output.try_clone().map_err(failed)?).stderr(errors.try_clone().map_err(failed)?);
+        // A user's defaults would leave jobs out. sbatch's are welcome: accounts, memory and the like.
+        for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("SQUEUE_")) {
+            command.env_remove(key);
+        }
+        let mut child = command.spawn().map_err(|source| match source.kind() {
+            std::io::ErrorKind::NotFound => SlurmError::NotInstalled { program: name },
+            _ => failed(source),
+        })?;
+        let start = Instant::now();
+        let status = loop {
+            if let Some(status) = child.try_wait().map_err(failed)? {
+                break status;
+            }
+            let stopped = stop.signal().is_some();
+            if stopped || start.elapsed() >= self.limit {
+                let _ = child.kill(); // an error means that it has ended meanwhile
+                let _ = child.wait();
+                return Err(SlurmError::Silent { program: name, limit: start.elapsed().min(self.limit) });
+            }
+            std::thread::sleep(TICK);
+        };
+        let (output, words) = (content(&mut output).map_err(failed)?, content(&mut errors).map_err(failed)?);
+        if status.success() {
+            return Ok(output);
+        }
+        let words = if words.trim().is_empty() { output } else { words };
+        let words = if words.trim().is_empty() { status.to_string() } else { words.trim().to_owned() };
+        Err(SlurmError::Refused { program: name, words })
+    }
+}
+
+/// What is in a file that others have written.
+fn content(file: &mut File) -> std::io::Result<String> {
+    let mut bytes = Vec::new();
+    file.rewind()?;
+    file.read_to_end(&mut bytes)?;
+    Ok(String::from_utf8_lossy(&bytes).into_owned())
+}
+
+fn sbatch_arguments(submission: &Submission, options: &SlurmOptions) -> Result<Vec<String>, OptionError> {
+    let limit = options.array_limit.map_or_else(String::new, |limit| format!("%{limit}"));
+    let path = text_of(&submission.path)?;
+    let mut arguments = vec![
+        "--parsable".to_owned(),
+        format!("--job-name={}", submission.names.name),
+        format!("--array=0-{}{limit}", submission.jobs.len().saturating_sub(1)),
+        "--nodes=1".to_owned(),
+        "--ntasks=1".to_owned(),
+        format!("--cpus-per-task={}", options.task.cores()),
+        "--requeue".to_owned(), // what a lost node did goes back into the queue, also while nobody watches
+        format!("--chdir={path}"),
+        format!("--output={}/%a.jsonl", path.replace('%', "%%")),
+        format!("--error={}/%a.log", path.replace('%', "%%")),
+        "--open-mode=append".to_owned(),
+    ];
+    arguments.extend(options.partition.as_ref().map(|name| format!("--partition={name}")));
+    arguments.extend(options.time.as_ref().map(|limit| format!("--time={}", limit.text())));
+    arguments.push(text_of(&submission.path.join("job.sh"))?.to_owned());
+    Ok(arguments)
+}
+
+fn parse_job(line: &str) -> Result<QueuedJob, SlurmError> {
+    let fields: Vec<&str> = line.trim().split('|').map(str::trim).collect();
+    let [array, index, state, reason, node, name] = fields[..] else {
+        return Err(not_understood("squeue", FIELDS, line));
+    };
+    // CANCELLED may be followed by who did it.
+    let state = state.split([' ', '+']).next().unwrap_or_default();
+    let index = index.parse().map_err(|_| not_understood("squeue", "an index of an array", line))?;
+    let [array, state, reason, node, name] = [array, state, reason, node, name].map(str::to_owned);
+    Ok(QueuedJob { array, index, state, reason, node, name })
+}
+
+/// The value of `KEY = VALUE` in what `scontrol show config` prints.
+fn parse_setting<'a>(text: &'a str, key: &str) -> Option<&'a str> {
+    text.lines().find_map(|line| {
+        let (name, value) = line.split_once('=')?;
+        (name.trim() == key).then(|| value.trim())
+    })
+}
+
+fn not_understood(program: &'static str, expected: &'static str, got: &str) -> SlurmError {
+    let got: String = got.trim().chars().take(200).collect();
+    SlurmError::NotUnderstood { program, expected, got }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::submission::Names;
+    use super::super::tests::options;
+    use super::*;
+
+    #[test]
+    fn squeues_lines_are_understood() {
+        let job = parse_job("17|3|PENDING|Resources||perturb-0-1").unwrap();
+        assert_eq!((job.array.as_str(), job.index, job.reason.as_str(), job.node.as_str()), ("17", 3, "Resources", ""));
+        assert!(job.is_live());
+        for (state, live) in [("RUNNING", true), ("COMPLETING", true), ("REQUEUED", true), ("NODE_FAIL", false)] {
+            assert_eq!(parse_job(&format!("17|3|{state}|None|n1|x")).unwrap().is_live(), live, "{state}");
+        }
+        assert_eq!(parse_job("1|0|CANCELLED by 0|None|n1|x").unwrap().state, "CANCELLED");
+        for line in ["17|3|RUNNING", "17|N/A|RUNNING|None|n1|x", "slurm_load_jobs error"] {
+            let error = parse_job(line).unwrap_err().to_string();
+            assert!(error.contains("squeue") && error.contains(line), "{error}");
+        }
+    }
+
+    #[test]
+    fn scontrols_settings_are_understood() {
+        let text = "MaxArraySize            = 1001\nMaxArraySizeOther = 3\nX\n";
+        assert_eq!(parse_setting(text, "MaxArraySize"), Some("1001"));
+        assert_eq!(parse_setting(text, "MaxArray"), None);
+    }
+
+    #[test]
+    fn sbatch_hears_everything_that_was_asked_for() {
+        let mut options = options();
+        let names = Names { name: "perturb-x-1".into(), job: None };
+        let jobs = vec![vec!["a".into()]; 3];
+        let submission = Submission { number: 1, path: "/shared/100%/slurm/1".into(), jobs, names };
+        let text = sbatch_arguments(&submission, &options).unwrap().join(" ");
+        let expected = "--array=0-2 --nodes=1 --ntasks=1 --cpus-per-task=1 --requeue --chdir=/shared/100%/slurm/1 \
+                        --output=/shared/100%%/slurm/1/%a.jsonl \
+                        --error=/shared/100%%/slurm/1/%a.log --open-mode=append /shared/100%/slurm/1/job.sh";
+        assert!(text.ends_with(expected), "{text}");
+        options.partition = Some("long".into());
+        options.time = Some("1-00".parse().unwrap());
+        options.array_limit = Some(2);
+        let text = sbatch_arguments(&submission, &options).unwrap().join(" ");
+        assert!(text.contains("--array=0-2%2 ") && text.contains(" --partition=long --time=1-00 /shared"), "{text}");
+    }
+}

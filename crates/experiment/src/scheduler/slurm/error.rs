@@ -1,0 +1,61 @@
+//! Why cells cannot be done by Slurm.
+
+use std::time::Duration;
+
+use perturb_files::{AnyError, FileError};
+
+use super::super::count;
+use super::options::OptionError;
+use crate::folder::FolderError;
+
+/// Why cells cannot be done by Slurm.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+#[expect(missing_docs, reason = "the sentences say what the fields are")]
+pub enum SlurmError {
+    /// Slurm's commands are not here.
+    #[error("there is no `{program}` here: start this on a machine that submits to Slurm, or install slurm-client")]
+    NotInstalled { program: &'static str },
+    /// A command could not be run.
+    #[error("cannot run {program}: {source}")]
+    System { program: &'static str, source: std::io::Error },
+    /// Slurm said no.
+    #[error("{program} refused: {words}")]
+    Refused { program: &'static str, words: String },
+    /// Slurm said nothing.
+    #[error("{program} did not answer within {} s; is Slurm's controller up? The same command goes on", limit.as_secs())]
+    Silent {
+        program: &'static str,
+        /// How long it was waited for.
+        limit: Duration,
+    },
+    /// Slurm said something else than expected.
+    #[error("{program} printed `{got}`, expected {expected}")]
+    NotUnderstood { program: &'static str, expected: &'static str, got: String },
+    /// Slurm has no arrays.
+    #[error("this Slurm takes no job arrays (MaxArraySize = 0), which --engine slurm needs; use `perturb run --cell`")]
+    NoArrays,
+    /// An option was refused.
+    #[error(transparent)]
+    Option(#[from] OptionError),
+    /// The folder cannot be read or written.
+    #[error(transparent)]
+    Folder(#[from] FolderError),
+    /// The operating system refused a file.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// It cannot be found out what cells cost.
+    #[error("cannot estimate what cells cost, which says how many a job does: {0}; give --cells-per-job instead")]
+    Cost(AnyError),
+    /// Somebody cancelled everything.
+    #[error(
+        "Slurm job {} was cancelled; the same command submits what has no result again: {}",
+        arrays.join(", "),
+        count(*missing, "cell")
+    )]
+    Cancelled {
+        arrays: Vec<String>,
+        /// How many cells are missing.
+        missing: usize,
+    },
+}

@@ -1,0 +1,156 @@
+//! What was submitted, as it is kept in the folder.
+
+use std::path::{Path, PathBuf};
+
+use perturb_files::{self as files, write_atomically, write_json};
+use serde::{Deserialize, Serialize};
+
+use super::job::QueuedJob;
+use crate::folder;
+use crate::folder::{Folder, FolderError};
+use crate::plan::Plan;
+
+const CELLS: &str = "cells.txt";
+const DOCUMENT: &str = "submission.json";
+
+/// An array that was submitted, or was about to be.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Submission {
+    /// From 1.
+    pub(super) number: u32,
+    /// Where it is kept.
+    pub(super) path: PathBuf,
+    /// The ids of each job's cells, by the job's index in the array.
+    pub(super) jobs: Vec<Vec<String>>,
+    /// Names in Slurm.
+    pub(super) names: Names,
+}
+
+/// `submission.json`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Names {
+    /// The array's name in the queue, which is known before Slurm accepts it: should this process end before it hears
+    /// the number, the next one finds the array by its name.
+    pub(super) name: String,
+    /// The array's number; `None` until it is known.
+    pub(super) job: Option<String>,
+}
+
+/// Where submissions are kept.
+pub(super) fn directory(folder: &Folder) -> PathBuf {
+    folder.path().join("slurm")
+}
+
+/// All submissions, the first one first.
+pub(super) fn list(folder: &Folder) -> Result<Vec<Submission>, FolderError> {
+    let directory = directory(folder);
+    let mut submissions = Vec::new();
+    for number in numbers(&directory)? {
+        submissions.extend(read(&directory.join(number.to_string()), number)?);
+    }
+    Ok(submissions)
+}
+
+/// The numbers of the submissions, also of unfinished ones, in order.
+fn numbers(directory: &Path) -> files::Result<Vec<u32>> {
+    let paths = files::list(directory)?;
+    let mut numbers: Vec<u32> = paths.iter().filter_map(|path| path.file_name()?.to_str()?.parse().ok()).collect();
+    numbers.sort_unstable();
+    Ok(numbers)
+}
+
+/// The submission in `path`; `None` if it was broken off before Slurm could hear of it.
+fn read(path: &Path, number: u32) -> Result<Option<Submission>, FolderError> {
+    let Some(names) = folder::read(&path.join(DOCUMENT))? else { return Ok(None) };
+    let text = files::read_text(&path.join(CELLS))?;
+    let jobs = text.lines().map(|line| line.split(',').map(str::to_owned).collect()).collect();
+    Ok(Some(Submission { number, path: path.to_owned(), jobs, names }))
+}
+
+/// Writes down what is about to be submitted, `submission.json` last.
+pub(super) fn create(
+    folder: &Folder,
+    plan: &Plan,
+    jobs: Vec<Vec<String>>,
+    script: &dyn Fn(&Path) -> Result<String, super::SlurmError>,
+) -> Result<Submission, super::SlurmError> {
+    let directory = directory(folder);
+    let number = numbers(&directory)?.last().map_or(1, |last| last + 1);
+    let path = directory.join(number.to_string());
+    let lines: String = jobs.iter().map(|cells| cells.join(",") + "\n").collect();
+    plan.files().try_for_each(|(name, content)| write_atomically(&path.join(name), content))?;
+    write_atomically(&path.join(CELLS), lines.as_bytes())?;
+    write_atomically(&path.join("job.sh"), script(&path)?.as_bytes())?;
+    // Folders of different places have different names in one queue.
+    let place = crc32c::crc32c(path.as_os_str().as_encoded_bytes());
+    let names = Names { name: format!("perturb-{place:08x}-{number}"), job: None };
+    let submission = Submission { number, path, jobs, names };
+    submission.write()?;
+    Ok(submission)
+}
+
+impl Submission {
+    /// Writes down the number that Slurm gave.
+    pub(super) fn accepted(&mut self, job: &str) -> files::Result<()> {
+        self.names.job = Some(job.to_owned());
+        self.write()
+    }
+
+    /// Whether squeue's `job` is of this array.
+    pub(super) fn has(&self, job: &QueuedJob) -> bool {
+        job.name == self.names.name && self.names.job.as_ref().is_none_or(|array| *array == job.array)
+    }
+
+    /// The lines that job `index` of the array tells.
+    pub(super) fn events(&self, index: usize) -> PathBuf {
+        self.path.join(format!("{index}.jsonl"))
+    }
+
+    /// What else it said.
+    pub(super) fn log(&self, index: usize) -> PathBuf {
+        self.path.join(format!("{index}.log"))
+    }
+
+    /// Deletes what Slurm refused.
+    pub(super) fn forget(&self) -> files::Result<()> {
+        files::delete(&self.path)
+    }
+
+    fn write(&self) -> files::Result<()> {
+        write_json(&self.path.join(DOCUMENT), &self.names)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    #[test]
+    fn submissions_are_numbered_and_read_back() {
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(directory.path());
+        assert!(list(&folder).unwrap().is_empty());
+        let jobs = |ids: &[&[&str]]| -> Vec<Vec<String>> {
+            ids.iter().map(|job| job.iter().map(|id| (*id).to_owned()).collect()).collect()
+        };
+        let plan = "environments = ['Hopper']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+        let plan = Plan::parse("test", plan.into()).unwrap();
+        let script = |_: &Path| Ok("#!/bin/sh\n".to_owned());
+        let mut first = create(&folder, &plan, jobs(&[&["a", "b"], &["c"]]), &script).unwrap();
+        // Broken off before it was complete: its number is not used again.
+        fs::create_dir(super::directory(&folder).join("2")).unwrap();
+        let third = create(&folder, &plan, jobs(&[&["d"]]), &script).unwrap();
+        assert_eq!(third.number, 3);
+        assert_ne!(first.names.name, third.names.name);
+        first.accepted("17").unwrap();
+        assert_eq!(list(&folder).unwrap(), [first.clone(), third.clone()]);
+        assert_eq!(fs::read_to_string(first.path.join("cells.txt")).unwrap(), "a,b\nc\n");
+        third.forget().unwrap();
+        assert_eq!(list(&folder).unwrap(), [first.clone()]);
+        fs::write(first.path.join("submission.json"), "{").unwrap();
+        assert!(list(&folder).unwrap_err().to_string().contains("submission.json is not understood"));
+    }
+}

@@ -1,0 +1,156 @@
+//! The clean rule of selection: what is tuned, what is selected, and which cells follow from that.
+//!
+//! Per environment, method and training version one configuration is selected: the one with the highest success rate in
+//! selection episodes on the version that it was trained on, as the mean over tuning seeds; of equal ones the one with the
+//! higher mean return in the same test, of still equal ones the one that the plan lists first. Nothing is selected before
+//! every tuning cell has a result or has failed. A configuration some of whose cells failed counts with the others', which
+//! [`Chosen::seeds`] tells; one without any result is not selected.
+
+use std::collections::HashMap;
+
+use perturb_records::statistics::mean;
+use perturb_records::{TestResult, TrainedOn};
+use perturb_settings::Method;
+
+use crate::folder::{CellState, Folder, FolderError};
+use crate::plan::{Cell, Plan, SELECTION_TEST};
+
+/// Configurations of which one is selected.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Tuned<'a> {
+    /// The environment's name.
+    pub environment: &'a str,
+    /// What was trained.
+    pub method: Method,
+    /// On what, also in selection episodes.
+    pub trained_on: TrainedOn<'a>,
+    /// Tuning cells.
+    pub cells: usize,
+    /// Of these, cells with a result.
+    pub done: usize,
+    /// Of these, cells that failed.
+    pub failed: usize,
+    /// Tuning seeds.
+    pub seeds: usize,
+    /// What is selected; `None` while cells are left, or if all failed.
+    pub chosen: Option<Chosen<'a>>,
+}
+
+/// A configuration that was selected.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Chosen<'a> {
+    /// Its first tuning cell that has a result.
+    pub cell: &'a Cell,
+    /// The mean success rate in selection episodes, %.
+    pub success_percent: f64,
+    /// Their mean return.
+    pub mean_return: f64,
+    /// On how many tuning seeds it has results.
+    pub seeds: usize,
+}
+
+impl Tuned<'_> {
+    /// Whether every tuning cell has a result or has failed.
+    pub fn is_complete(&self) -> bool {
+        self.done + self.failed == self.cells
+    }
+}
+
+/// What the tuning cells of `plan`, which are in these `states`, select; in the plan's order.
+pub fn tuned<'a>(plan: &'a Plan, states: &'a [CellState]) -> Vec<Tuned<'a>> {
+    let mut groups: Vec<(Tuned<'a>, Vec<Vec<Candidate<'a>>>)> = Vec::new();
+    let mut places = HashMap::new();
+    let mut configurations: HashMap<(usize, &str), usize> = HashMap::new();
+    for (cell, state) in plan.cells.iter().zip(states).filter(|(cell, _)| cell.tests.selection.is_some()) {
+        let (environment, method, trained_on) = kind(cell);
+        let place = *places.entry(kind(cell)).or_insert_with(|| {
+            let (cells, done, failed, seeds, chosen) = (0, 0, 0, plan.tuning_runs as usize, None);
+            let tuned = Tuned { environment, method, trained_on, cells, done, failed, seeds, chosen };
+            groups.push((tuned, Vec::new()));
+            groups.len() - 1
+        });
+        let (tuned, candidates) = &mut groups[place];
+        tuned.cells += 1;
+        tuned.failed += usize::from(matches!(state, CellState::Failed(_)));
+        let CellState::Done(result) = state else { continue };
+        let Some(test) = result.results.get(SELECTION_TEST) else { continue };
+        tuned.done += 1;
+        let configuration = *configurations.entry((place, &cell.configuration)).or_insert_with(|| {
+            candidates.push(Vec::new());
+            candidates.len() - 1
+        });
+        candidates[configuration].push((cell, test));
+    }
+    let select = |(tuned, candidates): (Tuned<'a>, Vec<Vec<Candidate<'a>>>)| {
+        let chosen = candidates.iter().map(|tests| Chosen::of(tests)).reduce(Chosen::better);
+        Tuned { chosen: chosen.filter(|_| tuned.is_complete()), ..tuned }
+    };
+    groups.into_iter().map(select).collect()
+}
+
+/// A tuning cell and its test.
+type Candidate<'a> = (&'a Cell, &'a TestResult);
+
+impl<'a> Chosen<'a> {
+    /// A configuration with its tests, at least one.
+    fn of(tests: &[Candidate<'a>]) -> Self {
+        let over_seeds = |figure: fn(&TestResult) -> f64| mean(tests.iter().map(|(_, test)| figure(test)));
+        Self {
+            cell: tests[0].0,
+            success_percent: over_seeds(|test| test.success_percent),
+            mean_return: over_seeds(|test| test.mean_return),
+            seeds: tests.len(),
+        }
+    }
+
+    /// The better one of two, of which `self` is listed first.
+    fn better(self, other: Self) -> Self {
+        let rank = |chosen: &Self| (chosen.success_percent, chosen.mean_return);
+        if rank(&other) > rank(&self) { other } else { self }
+    }
+}
+
+/// Environment, method and what is trained on: what has one configuration selected.
+fn kind(cell: &Cell) -> (&str, Method, TrainedOn<'_>) {
+    (&cell.config.common.environment, cell.method(), cell.trained_on())
+}
+
+impl Plan {
+    /// The plan with all cells that are known by the results in `folder`: those whose configurations are selected follow
+    /// its own.
+    ///
+    /// # Errors
+    /// [`FolderError`] if a file is there that cannot be read.
+    pub fn in_folder(&self, folder: &Folder) -> Result<Self, FolderError> {
+        self.with_chosen(Some(folder), false)
+    }
+
+    /// The same with as many cells as there will be: others stand in for those that are not known yet.
+    ///
+    /// # Errors
+    /// [`FolderError`] if a file is there that cannot be read.
+    pub fn in_full(&self, folder: Option<&Folder>) -> Result<Self, FolderError> {
+        self.with_chosen(folder, true)
+    }
+
+    fn with_chosen(&self, folder: Option<&Folder>, stand_ins: bool) -> Result<Self, FolderError> {
+        let mut plan = self.clone();
+        if self.candidates.is_empty() {
+            return Ok(plan);
+        }
+        let state = |cell| folder.map_or(Ok(CellState::Missing), |folder| folder.state(cell));
+        let states = self.cells.iter().map(state).collect::<Result<Vec<_>, _>>()?;
+        for tuned in tuned(self, &states) {
+            let known = (tuned.environment, tuned.method, tuned.trained_on);
+            let of_kind: Vec<&Cell> = self.candidates.iter().filter(|cell| kind(cell) == known).collect();
+            let first = of_kind.first().filter(|_| stand_ins).and_then(|cell| cell.tuned_as.as_ref());
+            let chosen = tuned.chosen.map(|chosen| &chosen.cell.configuration).or(first);
+            plan.cells.extend(of_kind.into_iter().filter(|cell| cell.tuned_as.as_ref() == chosen).cloned());
+        }
+        Ok(plan)
+    }
+}
+
+#[cfg(test)]
+#[path = "tuning_tests.rs"]
+mod tests;

@@ -1,0 +1,190 @@
+//! Whether results follow from the episodes that were recorded with them.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use perturb_records::{Agreement, Records, RecordsError, TestResult};
+
+use crate::folder::{CellResult, Folder};
+use crate::selection::Results;
+
+/// Why results are not trusted.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+#[expect(missing_docs, reason = "the sentences say what the fields are")]
+pub enum VerifyError {
+    /// Recorded episodes cannot be read.
+    #[error(transparent)]
+    Records(#[from] RecordsError),
+    /// A test's figures are others than those of its episodes.
+    #[error(
+        "the result of cell {cell} does not follow from its recorded episodes: its test on {test} has {kept} in \
+         result.json, but {recorded} in {file}; delete result.json to have the tests done again",
+        file = perturb_records::FILE
+    )]
+    Test {
+        cell: String,
+        /// The name of the set or version.
+        test: String,
+        kept: Box<TestResult>,
+        /// The figures of the episodes.
+        recorded: Box<TestResult>,
+    },
+    /// Requested and applied parameters were compared with another outcome.
+    #[error(
+        "the result of cell {cell} does not follow from its recorded episodes: requested and applied parameters differ \
+         otherwise; delete result.json to have the tests done again"
+    )]
+    Agreement { cell: String },
+}
+
+/// Computes every result again from its recorded episodes, where they are there, and hands them to `each`; gives how many
+/// results have them.
+///
+/// # Errors
+/// [`VerifyError`] for the first result that is another one.
+pub fn verify(
+    results: &Results<'_>,
+    folder: &Folder,
+    mut each: impl FnMut(&CellResult, &Records),
+) -> Result<usize, VerifyError> {
+    let mut verified = 0;
+    for result in results.done() {
+        let place = folder.cell(&result.id);
+        let of_marks = result.marks.iter().map(|(&mark, of)| (place.mark(mark), &of.results, Some(&of.agreement)));
+        if let Some(records) = follows(result, place.path(), &result.results, result.agreement.as_ref())? {
+            each(result, &records);
+            verified += 1;
+        }
+        of_marks
+            .map(|(path, results, agreement)| follows(result, &path, results, agreement))
+            .collect::<Result<Vec<_>, _>>()?;
+    }
+    Ok(verified)
+}
+
+/// The episodes in `path`, from which these figures of a result then follow; `None` if there are none.
+fn follows(
+    result: &CellResult,
+    path: &Path,
+    results: &BTreeMap<String, TestResult>,
+    agreement: Option<&Agreement>,
+) -> Result<Option<Records>, VerifyError> {
+    let records = match Records::read(&path.join(perturb_records::FILE)) {
+        Err(RecordsError::Missing { .. }) => return Ok(None),
+        records => records?,
+    };
+    for (test, kept) in results {
+        let recorded = records.result(test, None);
+        if recorded != *kept {
+            let (kept, recorded) = (Box::new(kept.clone()), Box::new(recorded));
+            return Err(VerifyError::Test { cell: result.id.clone(), test: test.clone(), kept, recorded });
+        }
+    }
+    if agreement.is_some_and(|agreement| *agreement != records.agreement()) {
+        return Err(VerifyError::Agreement { cell: result.id.clone() });
+    }
+    Ok(Some(records))
+}
+
+#[cfg(test)]
+mod tests {
+    use rstest::rstest;
+
+    use super::*;
+    use crate::fixture;
+    use crate::folder::{CellState, MarkResult};
+    use crate::plan::Plan;
+    use perturb_protocol::Version;
+    use perturb_records::{About, Ending, EpisodeRecord, RecordedTest};
+
+    const PLAN: &str = "environments = ['CartPole']\nversions = ['D']\ntest_versions = ['D']
+        [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
+
+    fn records() -> Records {
+        let episode = |environment_index: u32| EpisodeRecord {
+            set: "D".into(),
+            seed: 7,
+            environment_index,
+            episode_index: 0,
+            requested: Vec::new(),
+            applied: Vec::new(),
+            model_hash: String::new(),
+            episode_return: 0.1 + f64::from(environment_index),
+            length: 10,
+            success: environment_index == 0,
+            ending: Ending::Terminated,
+            achieved: None,
+            also_achieved: None,
+        };
+        let about = About {
+            environment: "CartPole".into(),
+            revision: 0,
+            parameters: Vec::new(),
+            applied: Vec::new(),
+            policy: String::new(),
+            episodes_per_trial: 1,
+            success: None,
+            text_success: None,
+            code_success: None,
+            also: None,
+            tests: Vec::new(),
+        };
+        let mut records = Records::new(about);
+        records.add(RecordedTest { set: Version::D.into(), seed: 7, axes: None }, (0..3).map(episode).collect());
+        records
+    }
+
+    #[rstest]
+    #[case(|_: &mut CellResult| (), None)]
+    #[case(|result: &mut CellResult| result.results.get_mut("D").unwrap().mean_return += 1e-9, Some("its test on D has 3 episodes"))]
+    #[case(|result: &mut CellResult| result.agreement.as_mut().unwrap().episodes = 2, Some("parameters differ otherwise"))]
+    fn a_result_is_that_of_its_recorded_episodes(#[case] change: fn(&mut CellResult), #[case] refused: Option<&str>) {
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(directory.path());
+        let records = records();
+        records.write(&folder.cell(&plan.cells[0].id).path().join(perturb_records::FILE)).unwrap();
+        let mut results = fixture::results(&plan, |_| Some(([0.0; 3], 0.0)));
+        let CellState::Done(result) = &mut results.states[0] else { unreachable!("it is done") };
+        result.results = [("D".to_owned(), records.result("D", None))].into();
+        result.agreement = Some(records.agreement());
+        change(result);
+        let mut handed = 0;
+        match (verify(&results, &folder, |_, records| handed += records.episodes.len()), refused) {
+            (Ok(verified), None) => assert_eq!((verified, handed), (1, 3)),
+            (Err(error), Some(expected)) => {
+                let message = error.to_string();
+                assert!(message.contains(expected) && message.contains(&plan.cells[0].id), "{message}");
+            }
+            (outcome, _) => panic!("{outcome:?}"),
+        }
+    }
+
+    #[test]
+    fn so_is_that_of_an_earlier_moment() {
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let folder = Folder::new(directory.path());
+        let records = records();
+        records.write(&folder.cell(&plan.cells[0].id).mark(5).join(perturb_records::FILE)).unwrap();
+        for (wrong, refused) in [(0.0, false), (1.0, true)] {
+            let mut results = fixture::results(&plan, |_| Some(([0.0; 3], 0.0)));
+            let CellState::Done(result) = &mut results.states[0] else { unreachable!("it is done") };
+            let mut test = records.result("D", None);
+            test.mean_length += wrong;
+            let of_mark = [("D".to_owned(), test)].into();
+            let of_mark = MarkResult { counters: Default::default(), results: of_mark, agreement: records.agreement() };
+            result.marks.insert(5, of_mark);
+            assert_eq!(verify(&results, &folder, |_, _| ()).is_err(), refused);
+        }
+    }
+
+    #[test]
+    fn a_result_of_an_earlier_program_has_no_episodes_to_compare() {
+        let plan = Plan::parse("test", PLAN.into()).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let results = fixture::results(&plan, |_| Some(([0.0; 3], 0.0)));
+        assert_eq!(verify(&results, &Folder::new(directory.path()), |_, _| panic!("none")).unwrap(), 0);
+    }
+}

@@ -1,0 +1,300 @@
+//! Tests of agents that no cell of an experiment trained: what the Python package's `Assessment.save` writes, and what
+//! reports show beside cells.
+//!
+//! ```text
+//! DIR/assessment.json        the agent, and what is known of each of its policies
+//! DIR/episodes.parquet       the recorded tests of a policy; of several episodes-D.parquet and so on
+//! ```
+//!
+//! Every figure follows from the records. How an agent was trained is not known here, so that it has no settings.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use perturb_files::checksum::Sealed;
+use perturb_files::{self as files, FileError, checksum, read_if_there};
+use perturb_protocol::Version;
+use perturb_settings::{Method, Observe, Preset, ValueError};
+use serde::{Deserialize, Serialize};
+
+use crate::outcomes::PolicyOutcomes;
+use crate::records::{FILE, Records, RecordsError};
+use crate::results::TestResult;
+use crate::scenarios::TrainedOn;
+use crate::success::Rule;
+
+/// What says what the files beside it are.
+pub const ASSESSMENT: &str = "assessment.json";
+/// Of `assessment.json`; raised when older programs could misread it.
+const FORMAT_VERSION: u32 = 1;
+
+/// The tests of an agent in one environment.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Assessed {
+    /// What reports call where it comes from: the name of its folder; empty if it was never saved.
+    pub name: String,
+    /// What reports call the agent, e.g. "PPO".
+    pub agent: String,
+    /// At least one, all of one environment, each trained on something else.
+    policies: Vec<AssessedPolicy>,
+}
+
+/// A policy and its recorded tests.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AssessedPolicy {
+    /// What is known of it beside its records.
+    pub known: Known,
+    /// Every episode.
+    pub records: Records,
+    results: BTreeMap<String, TestResult>,
+    outcomes: PolicyOutcomes,
+}
+
+/// What is known of a policy beside its records.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Known {
+    /// Where parameters came from in its training; `None` if that is not known, or was none of the versions.
+    pub trained_on: Option<Version>,
+    /// Steps of its training, of all environments together; `None` if not known.
+    pub timesteps: Option<u64>,
+    /// From which the seeds of the tests follow.
+    pub seed: u64,
+    /// Episodes of each test, as they were asked for.
+    pub episodes: u64,
+    /// What it saw.
+    pub observe: Observe,
+    /// Whether it took the mode of its actions' distribution. `None` if that was its own business.
+    pub deterministic: Option<bool>,
+}
+
+/// `assessment.json`.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Document {
+    format_version: u32,
+    environment: String,
+    agent: String,
+    policies: Vec<Entry>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Entry {
+    file: String,
+    #[serde(flatten)]
+    known: Known,
+}
+
+/// Why an assessment cannot be used.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+#[expect(missing_docs, reason = "the sentences say what the fields are")]
+pub enum AssessedError {
+    /// The operating system refused a file.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// Records are missing or damaged.
+    #[error(transparent)]
+    Records(#[from] RecordsError),
+    /// There is none.
+    #[error("{} holds no assessment: {ASSESSMENT} is not there; give the folder of Assessment.save", path.display())]
+    Missing { path: PathBuf },
+    /// It is damaged, or of a program that is too different.
+    #[error("{} is damaged: {reason}", path.display())]
+    Damaged {
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// It has another format.
+    #[error("{} has format {got}; this program reads {FORMAT_VERSION}", path.display())]
+    Format { path: PathBuf, got: u64 },
+    /// Policies that are not those of one agent in one environment.
+    #[error("an assessment is of policies in one environment, each trained on something else: {got}")]
+    Mixed {
+        /// What is not so.
+        got: String,
+    },
+    /// Something is there.
+    #[error("{} is not empty; {instead}", path.display())]
+    NotEmpty {
+        path: PathBuf,
+        /// What to do.
+        instead: &'static str,
+    },
+}
+
+type Result<T> = std::result::Result<T, AssessedError>;
+
+impl AssessedPolicy {
+    /// Of its records.
+    pub fn new(known: Known, records: Records) -> Self {
+        let names = || records.about.tests.iter().map(|test| test.set.name.as_str());
+        let results = names().map(|name| (name.to_owned(), records.result(name, None))).collect();
+        let outcomes = PolicyOutcomes::of(&records, names());
+        Self { known, records, results, outcomes }
+    }
+
+    /// The figures of its test on a set or version; `None` if it was not tested there.
+    pub fn test(&self, tested_on: &str) -> Option<&TestResult> {
+        self.results.get(tested_on)
+    }
+
+    /// Its episodes.
+    pub fn outcomes(&self) -> &PolicyOutcomes {
+        &self.outcomes
+    }
+
+    /// The file of its records in an assessment's folder.
+    pub fn file_name(&self) -> String {
+        let of = |version: Version| format!("episodes-{}.parquet", version.file_name());
+        self.known.trained_on.map_or_else(|| FILE.to_owned(), of)
+    }
+
+    /// What it was trained on.
+    pub fn trained_on<'a>(&self) -> TrainedOn<'a> {
+        self.known.trained_on.map_or(TrainedOn::Unknown, TrainedOn::Version)
+    }
+}
+
+impl Assessed {
+    /// Of at least one policy.
+    ///
+    /// # Errors
+    /// [`AssessedError::Mixed`].
+    pub fn new(name: String, agent: String, policies: Vec<AssessedPolicy>) -> Result<Self> {
+        let environments: BTreeSet<&str> = policies.iter().map(|it| it.records.about.environment.as_str()).collect();
+        let trained: BTreeSet<_> = policies.iter().map(AssessedPolicy::trained_on).collect();
+        if environments.len() != 1 {
+            let listed = environments.into_iter().collect::<Vec<_>>().join(" and ");
+            let got = if listed.is_empty() { "there is none".into() } else { format!("they are of {listed}") };
+            return Err(AssessedError::Mixed { got });
+        }
+        if trained.len() != policies.len() {
+            return Err(AssessedError::Mixed { got: "two were trained on the same".into() });
+        }
+        Ok(Self { name, agent, policies })
+    }
+
+    /// In what it was tested.
+    pub fn environment(&self) -> &str {
+        &self.policies[0].records.about.environment
+    }
+
+    /// Its policies.
+    pub fn policies(&self) -> &[AssessedPolicy] {
+        &self.policies
+    }
+
+    /// The row of reports that it belongs to.
+    pub fn method(&self) -> Method {
+        Method {
+            algorithm: self.agent.clone(),
+            architecture: String::new(),
+            episodes_per_trial: None,
+            preset: Preset::default(),
+            observe: self.policies[0].known.observe,
+            elsewhere: true,
+        }
+    }
+
+    /// Whether there is an assessment in the folder `path`.
+    pub fn is_in(path: &Path) -> bool {
+        path.join(ASSESSMENT).is_file()
+    }
+
+    /// Reads what is in the folder `path`.
+    ///
+    /// # Errors
+    /// [`AssessedError`], which names the file.
+    pub fn read(path: &Path) -> Result<Self> {
+        let json = path.join(ASSESSMENT);
+        let Some(text) = read_if_there(&json)? else { return Err(AssessedError::Missing { path: path.to_owned() }) };
+        let broken = |reason: String| AssessedError::Damaged { path: json.clone(), reason };
+        let damaged = |error: serde_json::Error| broken(error.to_string());
+        let mut value: serde_json::Value = serde_json::from_slice(&text).map_err(damaged)?;
+        match value.get("format_version").and_then(serde_json::Value::as_u64) {
+            Some(got) if got != u64::from(FORMAT_VERSION) => return Err(AssessedError::Format { path: json, got }),
+            _ => {}
+        }
+        checksum::open(&mut value).map_err(|reason| broken(reason.into()))?;
+        let document: Document = serde_json::from_value(value).map_err(damaged)?;
+        let mut policies = Vec::new();
+        for Entry { file, known } in document.policies {
+            // A file's name is that of one beside this, whatever is said of its folder.
+            let file = Path::new(&file).file_name().unwrap_or_default();
+            let policy = AssessedPolicy::new(known, Records::read(&path.join(file))?);
+            if file != policy.file_name().as_str() {
+                let reason =
+                    format!("the records of its policy are in {}, expected {}", file.display(), policy.file_name());
+                return Err(AssessedError::Damaged { path: json, reason });
+            }
+            policies.push(policy);
+        }
+        let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+        Self::new(name, document.agent, policies)
+    }
+
+    /// Writes it into the folder `path`, which must be new or empty unless it holds an assessment that may be overwritten.
+    /// Of that one the records go, and nothing else that is in the folder.
+    ///
+    /// # Errors
+    /// [`AssessedError`]. Nothing is deleted before all is written: what was overwritten in part has the former
+    /// `assessment.json`, and in a new folder there is none.
+    pub fn write(&self, path: &Path, overwrite: bool) -> Result<()> {
+        let (json, is_one) = (path.join(ASSESSMENT), Self::is_in(path));
+        let replaced = overwrite && is_one;
+        if !replaced && !files::list(path)?.is_empty() {
+            let instead = if is_one { "overwrite=True replaces it" } else { "name another folder" };
+            return Err(AssessedError::NotEmpty { path: path.to_owned(), instead });
+        }
+        let former = records_named_in(&json)?;
+        let mut entries = Vec::new();
+        for policy in &self.policies {
+            let file = policy.file_name();
+            policy.records.write(&path.join(&file))?;
+            entries.push(Entry { file, known: policy.known.clone() });
+        }
+        let (environment, agent) = (self.environment().to_owned(), self.agent.clone());
+        let document = Document { format_version: FORMAT_VERSION, environment, agent, policies: entries };
+        let sealed = Sealed::new(&document).map_err(|error| files::io("write", &json)(error.into()))?;
+        files::write_json(&json, &sealed)?;
+        let is_kept = |file: &str| document.policies.iter().any(|entry| entry.file == file);
+        let gone = former.iter().filter(|file| !is_kept(file));
+        Ok(gone.map(|file| path.join(file)).try_for_each(|path| files::delete(&path))?)
+    }
+
+    /// The same with success judged by `rule`.
+    ///
+    /// # Errors
+    /// [`ValueError`] if the episodes cannot be judged by it.
+    pub fn judged_by(self, rule: &Rule) -> std::result::Result<Self, ValueError> {
+        let judge = |policy: AssessedPolicy| {
+            let same = policy.records.about.criterion(rule).ok() == policy.records.about.success;
+            let records = if same { policy.records } else { policy.records.judged_by(rule)? };
+            Ok(AssessedPolicy::new(policy.known, records))
+        };
+        let Self { name, agent, policies } = self;
+        let policies = policies
+            .into_iter()
+            .map(judge)
+            .collect::<std::result::Result<_, ValueError>>()
+            .map_err(|error| ValueError { what: format!("{name}: {}", error.what), ..error })?;
+        Ok(Self { name, agent, policies })
+    }
+}
+
+/// The records that the document `json` names, files beside it; none if it is not there or cannot be understood.
+fn records_named_in(json: &Path) -> Result<BTreeSet<String>> {
+    let text = read_if_there(json)?.unwrap_or_default();
+    let mut value = serde_json::from_slice(&text).unwrap_or_default();
+    // What was changed names its files all the same.
+    let _ = checksum::open(&mut value);
+    let entries = serde_json::from_value(value).map_or_else(|_| Vec::new(), |document: Document| document.policies);
+    let names = entries.iter().filter_map(|entry| Path::new(&entry.file).file_name()?.to_str());
+    let is_records = |name: &&str| name.starts_with("episodes") && name.ends_with(".parquet");
+    Ok(names.filter(is_records).map(str::to_owned).collect())
+}
+
+#[cfg(test)]
+#[path = "assessed_tests.rs"]
+mod tests;

@@ -1,0 +1,342 @@
+//! What servers' ledgers prove of a policy: that its training drew from what it says, and never from its test sets.
+//!
+//! Who trained is known by tokens: the names under which the training's seed was drawn. Whatever these drew before the
+//! training's end may have been learned from, in whichever session.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write as _;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use perturb_protocol::ledger::{Begin, Draws, End, Entry, Event, Read, Who, read};
+use perturb_protocol::proto;
+use perturb_protocol::region::Region;
+use perturb_settings::Common;
+
+use crate::records::{RecordedTest, Records};
+
+/// Ledgers of one or several servers, whose chains hold.
+#[derive(Debug, Default)]
+pub struct Ledgers {
+    heads: Vec<Head>,
+    /// One for each environment that began.
+    drawn: Vec<Drawn>,
+    /// Those of each address in a session.
+    at: BTreeMap<(Session, u64, u32), Address>,
+    refused: Vec<Refused>,
+    /// When each beginning of each server was over, whether or not it said so.
+    over: Vec<Option<Moment>>,
+    /// A line that contradicts itself.
+    defect: Option<(u64, &'static str)>,
+}
+
+/// What environments of one seed and index drew in a session.
+#[derive(Debug, Default)]
+struct Address {
+    /// Which of `drawn` have not ended.
+    open: Vec<usize>,
+    /// What ended of them so far. Only when all have is it known of which.
+    ends: Vec<(Option<u64>, Moment)>,
+    /// Which had ended last.
+    closed: Vec<usize>,
+}
+
+/// The most environments that a line may name.
+const MOST_ENVS: u32 = 1 << 22;
+
+/// Where a ledger ends now.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Head {
+    /// Its file.
+    pub path: PathBuf,
+    /// Lines.
+    pub lines: u64,
+    /// The last one's digest.
+    pub digest: String,
+    /// Bytes behind it, of a line that is being written or was not finished.
+    pub unfinished: u64,
+}
+
+/// What was found of one policy.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub struct Proof {
+    /// Under which tokens' names its training drew, `None` where none was needed; empty if no ledger has it.
+    pub tokens: BTreeSet<Option<String>>,
+    /// Sessions of its training.
+    pub sessions: usize,
+    /// What speaks against it, each in a sentence.
+    pub against: Vec<String>,
+    /// What its tokens were refused until its end, each in a sentence.
+    pub refused: Vec<String>,
+}
+
+/// A session: which beginning of which server, and its number there.
+type Session = (usize, u64);
+
+/// Where a line stands.
+#[derive(Debug, Clone)]
+struct Line {
+    at: Moment,
+    session: Session,
+    who: Who,
+}
+
+/// When something was written: by its place in its ledger, and between ledgers by the clock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Moment {
+    ledger: usize,
+    n: u64,
+    unix_ms: u64,
+}
+
+impl Moment {
+    fn is_before(self, other: Self) -> bool {
+        if self.ledger == other.ledger { self.n <= other.n } else { self.unix_ms <= other.unix_ms }
+    }
+}
+
+/// An environment that began to draw.
+#[derive(Debug)]
+struct Drawn {
+    line: Arc<Line>,
+    seed: u64,
+    index: u32,
+    /// The first episode …
+    first: u64,
+    /// … and the last, if it is known; none at all if nothing was drawn.
+    last: Last,
+    /// When the last was begun.
+    ended: Option<Moment>,
+    region: Arc<Region>,
+}
+
+/// The last episode that was begun.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Last {
+    None,
+    Episode(u64),
+    Unknown,
+}
+
+/// What a session wanted to draw from.
+#[derive(Debug)]
+struct Refused {
+    line: Line,
+    region: Region,
+    reason: String,
+}
+
+impl Ledgers {
+    /// Reads ledgers and checks their chains. Each digest that is `known` from elsewhere must be one of a line.
+    ///
+    /// # Errors
+    /// In a sentence, the first that cannot be read or believed.
+    pub fn read(paths: &[PathBuf], known: &[String]) -> Result<Self, String> {
+        let (mut ledgers, mut missing) = (Self::default(), known.iter().collect::<Vec<_>>());
+        for path in paths {
+            let ledger = ledgers.heads.len();
+            let read = read(path, |entry, digest| {
+                missing.retain(|known| *known != digest);
+                ledgers.take(ledger, entry);
+            });
+            let Read { chain, unfinished, .. } = read.map_err(|error| error.to_string())?;
+            if let Some((n, what)) = ledgers.defect {
+                return Err(format!("line {} of {} {what}", n + 1, path.display()));
+            }
+            if ledgers.heads.iter().any(|head| head.digest == chain.head()) {
+                return Err(format!("{} was given already, by this or another name", path.display()));
+            }
+            ledgers.heads.push(Head {
+                path: path.clone(),
+                lines: chain.lines(),
+                digest: chain.head().into(),
+                unfinished,
+            });
+        }
+        match missing.first() {
+            Some(digest) => Err(format!("no line has the digest {digest}: the ledger is another, or was written anew")),
+            None => Ok(ledgers),
+        }
+    }
+
+    /// Where each of them ends now.
+    pub fn heads(&self) -> &[Head] {
+        &self.heads
+    }
+
+    fn take(&mut self, ledger: usize, Entry { n, unix_ms, event }: Entry) {
+        let at = Moment { ledger, n, unix_ms };
+        if n == 0 && !matches!(event, Event::Began { .. }) {
+            self.defect = Some((n, "does not say that a server began"));
+            return;
+        }
+        let beginning = self.over.len().saturating_sub(1);
+        let line = |who: Who| Line { at, session: (beginning, who.session), who };
+        match event {
+            Event::Began { .. } => {
+                // The one before it, of the same ledger, ended by then.
+                if n > 0
+                    && let Some(over) = self.over.last_mut()
+                {
+                    over.get_or_insert(at);
+                }
+                self.over.push(None);
+            }
+            Event::Ended => self.over.last_mut().into_iter().for_each(|over| *over = Some(at)),
+            Event::Refused { who, region, reason } => self.refused.push(Refused { line: line(who), region, reason }),
+            Event::Draws(draws) => self.take_draws(line(draws.who.clone()), draws),
+        }
+    }
+
+    /// What a line ends it ends before it begins something.
+    fn take_draws(&mut self, line: Line, Draws { regions, begins, ends, .. }: Draws) {
+        let named = begins.iter().map(|begin| begin.count).chain(ends.iter().map(|end| end.count));
+        if named.fold(0, u32::saturating_add) > MOST_ENVS {
+            self.defect = Some((line.at.n, "names more environments than a session has"));
+            return;
+        }
+        for End { seed, index, count, episode } in ends {
+            for index in (0..count).map(|offset| index.saturating_add(offset)) {
+                self.end_one((line.session, seed, index), (episode, line.at));
+            }
+        }
+        let (line, regions) = (Arc::new(line), regions.into_iter().map(Arc::new).collect::<Vec<_>>());
+        for Begin { seed, index, count, region, episode: first } in begins {
+            let Some(region) = regions.get(region as usize) else {
+                self.defect = Some((line.at.n, "names a region that it does not have"));
+                return;
+            };
+            for index in (0..count).map(|offset| index.saturating_add(offset)) {
+                self.at.entry((line.session, seed, index)).or_default().open.push(self.drawn.len());
+                let (line, region) = (Arc::clone(&line), Arc::clone(region));
+                self.drawn.push(Drawn { line, seed, index, first, last: Last::Unknown, ended: None, region });
+            }
+        }
+    }
+
+    fn end_one(&mut self, address: (Session, u64, u32), end: (Option<u64>, Moment)) {
+        let address = self.at.entry(address).or_default();
+        address.ends.push(end);
+        // Where nothing was open, what had ended went on after all.
+        let went_on = address.open.is_empty();
+        if address.ends.len() < address.open.len() {
+            return;
+        }
+        if !went_on {
+            address.closed = std::mem::take(&mut address.open);
+        }
+        let ends = std::mem::take(&mut address.ends);
+        let last =
+            ends.iter().map(|(episode, _)| episode.map_or(Last::None, Last::Episode)).max().unwrap_or(Last::None);
+        for &which in &address.closed {
+            let drawn = &mut self.drawn[which];
+            drawn.last = if went_on { drawn.last.max(last) } else { last };
+            drawn.ended = Some(end.1);
+        }
+    }
+
+    /// What they say of a policy that was trained in an environment as `training` says, for so many episodes, and of its
+    /// recorded tests.
+    pub fn prove(
+        &self,
+        training: &Common,
+        episodes: u64,
+        environment: &proto::Environment,
+        records: &Records,
+    ) -> Proof {
+        let claimed = Region::of(environment, training.version, &training.parameters);
+        // Other trainings with its seed, on something else, are told by what they draw from.
+        let is_own = |drawn: &&Drawn| {
+            drawn.line.who.environment == environment.name
+                && drawn.last != Last::None
+                && drawn.seed == training.seed
+                && (drawn.index as usize) < training.num_envs
+                && drawn.region.is_within([&claimed])
+                && claimed.is_within([&*drawn.region])
+        };
+        let own: Vec<&Drawn> = self.drawn.iter().filter(is_own).collect();
+        let sessions: BTreeSet<Session> = own.iter().map(|drawn| drawn.line.session).collect();
+        let tokens = own.iter().map(|drawn| drawn.line.who.token.clone()).collect();
+        let mut proof = Proof { tokens, sessions: sessions.len(), ..Proof::default() };
+        let drawn = own.iter().map(|drawn| drawn.episodes()).fold(0, u64::saturating_add);
+        if drawn < episodes || own.is_empty() {
+            let name =
+                format!("{}, seed {}, trained on {}", training.environment, training.seed, training.trained_on());
+            let few =
+                format!("of the {episodes} episodes of its training, {name}, {drawn} were drawn: give all ledgers");
+            proof.against.push(few);
+        }
+        // A session that did not say how far it came went on as long as its server.
+        let end = |drawn: &&Drawn| drawn.ended.or(self.over.get(drawn.line.session.0).copied().flatten());
+        let ends: Vec<Option<Moment>> = own.iter().map(end).collect();
+        let is_its = |line: &Line| {
+            line.who.environment == environment.name
+                && proof.tokens.contains(&line.who.token)
+                && ends.iter().any(|end| end.is_none_or(|end| line.at.is_before(end)))
+        };
+        for test in &records.about.tests {
+            let set = &test.set.name;
+            let others = tested(environment, test, &claimed);
+            let overlaps = |region: &Region| others.iter().any(|other| other.overlaps(region));
+            let mut said: Option<Moment> = None;
+            for drawn in self.drawn.iter().filter(|drawn| drawn.last != Last::None && is_its(&drawn.line)) {
+                let what = if said == Some(drawn.line.at) {
+                    continue;
+                } else if drawn.has_episode(test, records) {
+                    format!("episodes of the test on {set}")
+                } else if !drawn.region.is_within([&claimed]) && overlaps(&drawn.region) {
+                    format!("{}, of the test set {set},", drawn.region)
+                } else {
+                    continue;
+                };
+                let what = format!("{what} had been drawn before the training ended");
+                proof.against.push(self.sentence(&drawn.line, &what));
+                said = Some(drawn.line.at);
+            }
+        }
+        let refused = self.refused.iter().filter(|refused| is_its(&refused.line));
+        let refused =
+            refused.map(|Refused { line, region, reason }| self.sentence(line, &format!("{region} refused: {reason}")));
+        proof.refused = refused.collect();
+        proof
+    }
+
+    fn sentence(&self, line: &Line, what: &str) -> String {
+        let Line { at: Moment { ledger, n, unix_ms }, who, .. } = line;
+        let path = self.heads.get(*ledger).map(|head| head.path.display().to_string()).unwrap_or_default();
+        let mut sentence = format!("line {} of {path}: {what}", n + 1);
+        let token = who.token.as_ref().map_or("without a token".into(), |token| format!("by the token {token:?}"));
+        // A string takes it.
+        let _ = write!(sentence, ", {token}, {} s after 1970", unix_ms / 1000);
+        sentence
+    }
+}
+
+/// What a test draws from, context by context, where that is not what the training draws from, too.
+fn tested(environment: &proto::Environment, test: &RecordedTest, claimed: &Region) -> Vec<Region> {
+    let of = |context| Region::of(environment, test.set.version, &test.set.parameters(context));
+    test.set.listed().iter().map(of).filter(|region| !region.is_within([claimed])).collect()
+}
+
+impl Drawn {
+    /// How many episodes it drew; if that is not known, no end of them.
+    fn episodes(&self) -> u64 {
+        match self.last {
+            Last::None => 0,
+            Last::Episode(last) => last.saturating_sub(self.first).saturating_add(u64::from(last >= self.first)),
+            Last::Unknown => u64::MAX,
+        }
+    }
+
+    /// Whether it may have drawn a recorded episode of a test.
+    fn has_episode(&self, test: &RecordedTest, records: &Records) -> bool {
+        let may = |episode: u64| match self.last {
+            Last::None => false,
+            Last::Episode(last) => (self.first..=last).contains(&episode),
+            Last::Unknown => self.first <= episode,
+        };
+        let its = records.episodes.iter().filter(|record| record.set == test.set.name && record.seed == test.seed);
+        self.seed == test.seed
+            && its.filter(|record| record.environment_index == self.index).any(|record| may(record.episode_index))
+    }
+}

@@ -1,0 +1,75 @@
+//! What the recorded episodes of selected policies say: of the worst of them, of success over a parameter, and over the
+//! threshold of success.
+
+mod partition;
+mod sweeps;
+mod worst;
+
+use std::collections::BTreeMap;
+
+use crate::records::{RecordedParameter, RecordedTest, Records};
+use crate::success::Criterion;
+
+use perturb_settings::sets::Contexts;
+pub use sweeps::{Bin, Counted, bins, success_within, success_within_both};
+pub use sweeps::{success_at, thresholds};
+pub use worst::{SHARE, conditional_value_at_risk, worst_contexts};
+
+/// The tests of a policy.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PolicyOutcomes {
+    /// In the order of [`Outcomes::parameters`].
+    pub parameters: Vec<RecordedParameter>,
+    /// What counted as a success; `None` if the server did not say.
+    pub success: Option<Criterion>,
+    tests: BTreeMap<String, Outcomes>,
+}
+
+/// The n episodes of a test, in their order.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Outcomes {
+    /// `[P, n]`: requested values of each parameter.
+    pub parameters: Vec<Vec<f64>>,
+    /// Which of the set's contexts each episode had, where the set lists them.
+    pub contexts: Option<Vec<usize>>,
+    /// Undiscounted.
+    pub returns: Vec<f64>,
+    /// Whether each was a success.
+    pub successes: Vec<bool>,
+    /// What each achieved of what the criterion compares; `None` if nothing.
+    pub achieved: Vec<Option<f64>>,
+}
+
+impl PolicyOutcomes {
+    /// Of the tests on sets with these names.
+    pub fn of<'a>(records: &Records, names: impl Iterator<Item = &'a str>) -> Self {
+        let tests = names.map(|name| (name.to_owned(), Outcomes::of(records, name))).collect();
+        Self { parameters: records.about.parameters.clone(), success: records.about.success.clone(), tests }
+    }
+
+    /// Its test on a set; `None` if there was none.
+    pub fn test(&self, tested_on: &str) -> Option<&Outcomes> {
+        self.tests.get(tested_on).filter(|outcomes| !outcomes.returns.is_empty())
+    }
+}
+
+impl Outcomes {
+    /// Of the test on the set called `name`; empty if there was none.
+    pub fn of(records: &Records, name: &str) -> Self {
+        let rows = || records.of(name);
+        let parameter =
+            |place: usize| rows().map(|row| row.requested.get(place).copied().unwrap_or(f64::NAN)).collect();
+        let listed = |test: &RecordedTest| match &test.set.contexts {
+            Contexts::Listed(contexts) if test.set.name == name => Some(contexts.len()),
+            _ => None,
+        };
+        let contexts = records.about.tests.iter().find_map(listed);
+        Self {
+            parameters: (0..records.about.parameters.len()).map(parameter).collect(),
+            contexts: contexts.map(|n| rows().map(|row| row.environment_index as usize % n).collect()),
+            returns: rows().map(|row| row.episode_return).collect(),
+            successes: rows().map(|row| row.success).collect(),
+            achieved: rows().map(|row| row.achieved).collect(),
+        }
+    }
+}

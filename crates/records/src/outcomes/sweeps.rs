@@ -1,0 +1,185 @@
+//! Success over a parameter, and over the threshold of success.
+
+use super::Outcomes;
+use crate::statistics::wilson;
+use crate::success::Criterion;
+
+/// Parts of a parameter's range.
+const BINS: f64 = 10.0;
+/// Steps from the lowest threshold to the highest.
+const THRESHOLDS: usize = 40;
+
+/// Values from `low` on and below `high`, which the last one of an interval includes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Bin {
+    /// Belongs to it.
+    pub low: f64,
+    /// Does not, but in the last one.
+    pub high: f64,
+}
+
+/// Successes among episodes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counted {
+    /// Of the episodes.
+    pub successes: u64,
+    /// All.
+    pub episodes: u64,
+}
+
+impl Counted {
+    /// %; NaN without episodes.
+    pub fn rate(self) -> f64 {
+        100.0 * self.successes as f64 / self.episodes as f64
+    }
+
+    /// The 95 % interval of [`Counted::rate`] after Wilson (1927), [low, high], %.
+    pub fn interval(self) -> [f64; 2] {
+        let (low, high) = wilson(self.successes, self.episodes);
+        [100.0 * low, 100.0 * high]
+    }
+
+    /// The same; `None` without episodes.
+    pub fn known(self) -> Option<[f64; 2]> {
+        (self.episodes > 0).then(|| self.interval())
+    }
+
+    fn of(successes: impl Iterator<Item = bool>) -> Self {
+        successes.fold(Self::default(), |Self { successes, episodes }, success| Self {
+            successes: successes + u64::from(success),
+            episodes: episodes + 1,
+        })
+    }
+}
+
+impl std::iter::Sum for Counted {
+    fn sum<I: Iterator<Item = Self>>(all: I) -> Self {
+        all.fold(Self::default(), |a, b| Self {
+            successes: a.successes + b.successes,
+            episodes: a.episodes + b.episodes,
+        })
+    }
+}
+
+/// Equal parts of the range that the parameter at `place` has in `tests`, ten if it has values everywhere. Where a tenth of
+/// the range has none, as between E's two intervals, a part ends and another begins. None if it does not vary.
+pub fn bins<'a>(tests: impl Iterator<Item = &'a Outcomes>, place: usize) -> Vec<Bin> {
+    let values = tests.filter_map(|outcomes| outcomes.parameters.get(place)).flatten();
+    let mut values: Vec<f64> = values.copied().filter(|value| value.is_finite()).collect();
+    values.sort_unstable_by(f64::total_cmp);
+    let range = values.last().zip(values.first()).map_or(0.0, |(high, low)| high - low);
+    if range == 0.0 {
+        return Vec::new();
+    }
+    let width = range / BINS;
+    let of_interval = |values: &[f64]| {
+        let (low, high) = (values[0], values[values.len() - 1]);
+        let count = ((high - low) / width).round().max(1.0) as usize;
+        let edge = move |index: usize| {
+            if index == count { high } else { low + (high - low) * index as f64 / count as f64 }
+        };
+        (0..count).map(move |index| Bin { low: edge(index), high: edge(index + 1) })
+    };
+    values.chunk_by(|a, b| b - a < width).flat_map(of_interval).collect()
+}
+
+/// The episodes of `outcomes` by the bins that the parameter at `place` lies in.
+pub fn success_within(outcomes: &Outcomes, place: usize, bins: &[Bin]) -> Vec<Counted> {
+    let mut counted = vec![Counted::default(); bins.len()];
+    let values = outcomes.parameters.get(place).into_iter().flatten();
+    for (value, success) in values.zip(&outcomes.successes) {
+        if let Some(bin) = counted.get_mut(bin_of(*value, bins)) {
+            bin.episodes += 1;
+            bin.successes += u64::from(*success);
+        }
+    }
+    counted
+}
+
+/// The episodes of `outcomes` by the bins that two parameters lie in, those at `x` and `y`: `[Y, X]`, in a row. Nothing if
+/// one of them does not vary.
+pub fn success_within_both(outcomes: &Outcomes, [x, y]: [usize; 2], [over_x, over_y]: [&[Bin]; 2]) -> Vec<Counted> {
+    let mut counted = vec![Counted::default(); over_x.len() * over_y.len()];
+    let values = |place: usize| outcomes.parameters.get(place).into_iter().flatten();
+    for ((x, y), success) in values(x).zip(values(y)).zip(&outcomes.successes) {
+        if let Some(cell) = counted.get_mut(bin_of(*y, over_y) * over_x.len() + bin_of(*x, over_x)) {
+            cell.episodes += 1;
+            cell.successes += u64::from(*success);
+        }
+    }
+    counted
+}
+
+/// The place of the bin that `value` lies in.
+fn bin_of(value: f64, bins: &[Bin]) -> usize {
+    bins.partition_point(|bin| bin.low <= value).saturating_sub(1)
+}
+
+/// Thresholds over all that was achieved in `tests`, in ascending order, with the one of `criterion` among them; whole
+/// ones of what is counted. None if nothing was achieved.
+pub fn thresholds<'a>(tests: impl Iterator<Item = &'a Outcomes>, criterion: &Criterion) -> Vec<f64> {
+    let achieved = tests.flat_map(|outcomes| outcomes.achieved.iter().flatten());
+    let (low, high) = achieved.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (low.min(*x), high.max(*x)));
+    if low > high {
+        return Vec::new();
+    }
+    let at = |step: usize| low + (high - low) * step as f64 / THRESHOLDS as f64;
+    let shown = |threshold: f64| if criterion.unit == "1" { threshold.round() } else { threshold };
+    let mut all: Vec<f64> = (0..=THRESHOLDS).map(|step| shown(at(step))).chain([criterion.threshold]).collect();
+    all.sort_unstable_by(f64::total_cmp);
+    all.dedup();
+    all
+}
+
+/// The episodes of `outcomes`, judged by another threshold.
+pub fn success_at(outcomes: &Outcomes, criterion: &Criterion, threshold: f64) -> Counted {
+    let criterion = Criterion { threshold, ..criterion.clone() };
+    Counted::of(outcomes.achieved.iter().map(|achieved| criterion.holds(*achieved)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::success::Side;
+
+    fn outcomes() -> Outcomes {
+        Outcomes {
+            parameters: vec![vec![1.0; 4], vec![0.15, 0.95, 1.0, 0.0]],
+            returns: vec![0.0; 4],
+            successes: vec![true, false, true, true],
+            achieved: vec![Some(10.0), None, Some(90.0), Some(80.0)],
+            contexts: None,
+        }
+    }
+
+    #[test]
+    fn an_episode_counts_in_the_bin_of_its_parameter() {
+        let spread = Outcomes { parameters: vec![(0..=100).map(f64::from).collect()], ..Outcomes::default() };
+        let even = bins([&spread].into_iter(), 0);
+        assert_eq!((even.len(), even[0], even[9]), (10, Bin { low: 0.0, high: 10.0 }, Bin { low: 90.0, high: 100.0 }));
+        // From 0 to 30 and from 80 to 100.
+        let tenth = |from: u32, to: u32| (from..=to).map(|value| f64::from(value) / 100.0).collect::<Vec<_>>();
+        let gap = Outcomes { parameters: vec![Vec::new(), [tenth(0, 30), tenth(80, 100)].concat()], ..outcomes() };
+        let bins = bins([&gap].into_iter(), 1);
+        let edges: Vec<(f64, f64)> = bins.iter().map(|bin| (bin.low, bin.high)).collect();
+        assert_eq!((edges.len(), edges[0].0, edges[2].1, edges[3].0, edges[4].1), (5, 0.0, 0.3, 0.8, 1.0));
+        let counted = success_within(&outcomes(), 1, &bins);
+        let of = |bin: usize| (counted[bin].successes, counted[bin].episodes);
+        assert_eq!([0, 1, 2, 3, 4].map(of), [(1, 1), (1, 1), (0, 0), (0, 0), (1, 2)], "0.95 fails");
+        assert!(super::bins([&outcomes()].into_iter(), 0).is_empty(), "it does not vary");
+        assert_eq!(counted.into_iter().sum::<Counted>(), Counted { successes: 3, episodes: 4 });
+    }
+
+    #[test]
+    fn what_achieved_nothing_is_a_success_at_no_threshold() {
+        let criterion =
+            Criterion { quantity: "steps".into(), unit: "1".into(), side: Side::AtMost, threshold: 33.3, most: None };
+        let thresholds = thresholds([&outcomes()].into_iter(), &criterion);
+        assert_eq!((thresholds[0], thresholds[1], thresholds.last().copied()), (10.0, 12.0, Some(90.0)));
+        assert!(thresholds.contains(&33.3) && thresholds.is_sorted());
+        let rate = |threshold| success_at(&outcomes(), &criterion, threshold).rate();
+        assert_eq!([9.0, 10.0, 80.0, 90.0].map(rate), [0.0, 25.0, 50.0, 75.0]);
+        let nothing = Outcomes { achieved: vec![None], ..outcomes() };
+        assert!(super::thresholds([&nothing].into_iter(), &criterion).is_empty());
+    }
+}

@@ -1,0 +1,380 @@
+//! Recorded test episodes: what each was asked to run with, what it ran with, and what came of it.
+//!
+//! One Parquet file holds the tests of one policy. Every figure of a result follows from it, at any threshold of success,
+//! and each episode can be played again from its address: seed, environment index and episode index.
+
+mod columns;
+mod parquet;
+
+pub use columns::ColumnValues;
+pub use parquet::{FILE, RecordsError};
+
+use perturb_protocol::{EndedEpisode, proto};
+use perturb_settings::ValueError;
+use perturb_settings::sets::TestSet;
+use serde::{Deserialize, Serialize};
+
+use crate::axis::Axis;
+use crate::results::TestResult;
+use crate::statistics::{mean, wilson};
+use crate::success::{Criterion, Rule};
+
+/// Requested and applied values may differ by this share of the requested one: physics rounds what it derives.
+pub const ROUNDING: f64 = 1e-9;
+
+/// The recorded tests of a policy.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Records {
+    /// What they have in common.
+    pub about: About,
+    /// In the order of the tests, within one in that of environment and episode indices.
+    pub episodes: Vec<EpisodeRecord>,
+}
+
+/// What the recorded episodes of a policy have in common.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct About {
+    /// The environment's name.
+    pub environment: String,
+    /// Its revision.
+    pub revision: u32,
+    /// Its parameters, in the order of the requested values.
+    pub parameters: Vec<RecordedParameter>,
+    /// The names of the quantities that were read back, in the order of the applied values.
+    pub applied: Vec<String>,
+    /// Names the policy: its checkpoint's id.
+    pub policy: String,
+    /// Episodes in a trial, of which the last is recorded; 1 without trials.
+    pub episodes_per_trial: u32,
+    /// What counted as a success; `None` if the server's word was taken, which did not say what it compares.
+    pub success: Option<Criterion>,
+    /// The rule of the paper's text; `None` in records of programs that knew no other.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub text_success: Option<Criterion>,
+    /// That of the paper's published code; `None` likewise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub code_success: Option<Criterion>,
+    /// The quantity of [`EpisodeRecord::also_achieved`], where the two rules compare different ones.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub also: Option<String>,
+    /// The tests, in order.
+    pub tests: Vec<RecordedTest>,
+}
+
+/// A parameter of recorded episodes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RecordedParameter {
+    /// Its name.
+    pub name: String,
+    /// Its unit; "1" if dimensionless.
+    pub unit: String,
+    /// The quantity that reads it back; empty if its server did not say.
+    pub applied: String,
+}
+
+/// A test.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RecordedTest {
+    /// What the policy was tested on.
+    pub set: TestSet,
+    /// Of its environments and actions.
+    pub seed: u64,
+    /// Of the test of a heatmap: x and y. `None` of any other, and in records of programs that did not write it yet.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub axes: Option<[Axis; 2]>,
+}
+
+/// How an episode ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ending {
+    /// The task ended it.
+    Terminated,
+    /// The step limit ended it.
+    Truncated,
+    /// The physics came to numbers that are not finite.
+    Diverged,
+}
+
+/// An episode of a test.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EpisodeRecord {
+    /// The name of the set that it was a test on.
+    pub set: String,
+    /// With the two indices that follow its address.
+    pub seed: u64,
+    /// Among those that were tested together, from 0.
+    pub environment_index: u32,
+    /// Counts the environment's episodes from 0.
+    pub episode_index: u64,
+    /// The parameters that were drawn or given, in the order of [`About::parameters`].
+    pub requested: Vec<f64>,
+    /// What was read back from the physics, in the order of [`About::applied`].
+    pub applied: Vec<f64>,
+    /// SHA-256 of the model; empty without one.
+    pub model_hash: String,
+    /// The undiscounted sum of its rewards.
+    pub episode_return: f64,
+    /// Its number of steps.
+    pub length: u32,
+    /// Whether it was a success.
+    pub success: bool,
+    /// How it ended.
+    pub ending: Ending,
+    /// What it achieved of what the criterion compares; `None` if nothing.
+    pub achieved: Option<f64>,
+    /// What it achieved of [`About::also`]; `None` if nothing, or if there is no such quantity.
+    pub also_achieved: Option<f64>,
+}
+
+/// How far requested and applied parameters agree.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Agreement {
+    /// Episodes in which all parameters were compared.
+    pub episodes: u64,
+    /// The largest difference; `None` if nothing was compared.
+    pub largest: Option<Difference>,
+}
+
+/// A parameter that was asked for, and what the physics had instead.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Difference {
+    /// By its name in the catalogue.
+    pub parameter: String,
+    /// What was asked for.
+    pub requested: f64,
+    /// What was read back.
+    pub applied: f64,
+    /// The difference as a share of the requested value; of a requested 0, itself.
+    pub relative: f64,
+}
+
+impl About {
+    /// Of a policy in `environment`, without tests so far.
+    pub fn new(environment: &proto::Environment, policy: String, episodes_per_trial: u32) -> Self {
+        let parameter = |parameter: &proto::Parameter| RecordedParameter {
+            name: parameter.name.clone(),
+            unit: parameter.unit.clone(),
+            applied: parameter.applied.clone(),
+        };
+        let (text, code) = (Criterion::of(environment), Criterion::of_code(environment));
+        let quantities = text.as_ref().zip(code.as_ref()).map(|(text, code)| (&text.quantity, &code.quantity));
+        let also = quantities.filter(|(text, code)| text != code).map(|(_, code)| code.clone());
+        Self {
+            environment: environment.name.clone(),
+            revision: environment.revision,
+            parameters: environment.parameters.iter().map(parameter).collect(),
+            applied: environment.applied.iter().map(|quantity| quantity.name.clone()).collect(),
+            policy,
+            episodes_per_trial,
+            success: text.clone(),
+            text_success: code.as_ref().and(text),
+            code_success: code,
+            also,
+            tests: Vec::new(),
+        }
+    }
+
+    /// The criterion by `rule`.
+    ///
+    /// # Errors
+    /// [`ValueError`] for one that these episodes cannot be judged by.
+    pub fn criterion(&self, rule: &Rule) -> Result<Criterion, ValueError> {
+        rule.of(self.text_success.as_ref().or(self.success.as_ref()), self.code_success.as_ref())
+    }
+
+    /// Has `rule` decide about success in what is to be recorded.
+    ///
+    /// # Errors
+    /// Those of [`About::criterion`].
+    pub fn judge_by(&mut self, rule: &Rule) -> Result<(), ValueError> {
+        let criterion = self.criterion(rule)?;
+        if self.also.as_ref() == Some(&criterion.quantity) {
+            self.also = self.success.take().map(|before| before.quantity);
+        }
+        self.success = Some(criterion);
+        Ok(())
+    }
+
+    /// What an episode achieved of what decides about success, and of the environment's other quantity if it has two.
+    fn achieved(&self, end: &EndedEpisode) -> (Option<f64>, Option<f64>) {
+        let text = (end.achieved, self.also.is_some().then_some(end.code_achieved).flatten());
+        if self.is_judged_by_code() { (text.1, text.0) } else { text }
+    }
+
+    /// Whether [`EpisodeRecord::achieved`] is what the code's rule compares, and another one than the text's does.
+    pub fn is_judged_by_code(&self) -> bool {
+        let quantity = |criterion: &Option<Criterion>| criterion.as_ref().map(|it| it.quantity.clone());
+        self.also.is_some() && quantity(&self.success) == quantity(&self.code_success)
+    }
+}
+
+impl EpisodeRecord {
+    /// Of a test on `set` whose environments have `seed`.
+    pub fn of(about: &About, set: &str, seed: u64, end: EndedEpisode) -> Self {
+        let (achieved, also_achieved) = about.achieved(&end);
+        Self {
+            set: set.to_owned(),
+            seed,
+            environment_index: end.environment_index,
+            episode_index: end.episode_index,
+            ending: match (end.diverged, end.terminated) {
+                (true, _) => Ending::Diverged,
+                (false, true) => Ending::Terminated,
+                (false, false) => Ending::Truncated,
+            },
+            requested: end.receipt.requested,
+            applied: end.receipt.applied,
+            model_hash: end.receipt.model_hash,
+            episode_return: end.episode_return,
+            length: end.length,
+            success: about.success.as_ref().map_or(end.success, |criterion| criterion.holds(achieved)),
+            achieved,
+            also_achieved,
+        }
+    }
+}
+
+impl Records {
+    /// Nothing recorded so far.
+    pub fn new(about: About) -> Self {
+        Self { about, episodes: Vec::new() }
+    }
+
+    /// Adds a test.
+    pub fn add(&mut self, test: RecordedTest, episodes: Vec<EpisodeRecord>) {
+        self.about.tests.push(test);
+        self.episodes.extend(episodes);
+    }
+
+    /// Adds other tests of the same policy.
+    pub fn append(&mut self, other: Self) {
+        self.about.tests.extend(other.about.tests);
+        self.episodes.extend(other.episodes);
+    }
+
+    /// The episodes of the test on the set called `name`.
+    pub fn of<'a>(&'a self, name: &'a str) -> impl Iterator<Item = &'a EpisodeRecord> + Clone {
+        self.episodes.iter().filter(move |episode| episode.set == name)
+    }
+
+    /// The figures of the test on the set called `name`; with `criterion`, which must be of a recorded quantity, successes are
+    /// judged anew.
+    pub fn result(&self, name: &str, criterion: Option<&Criterion>) -> TestResult {
+        let success =
+            |episode: &EpisodeRecord| criterion.map_or(episode.success, |c| c.holds(self.achieved(episode, c)));
+        let episodes: Vec<&EpisodeRecord> = self.of(name).collect();
+        let n = episodes.len() as u64;
+        let successes = episodes.iter().filter(|episode| success(episode)).count() as u64;
+        let (low, high) = wilson(successes, n);
+        TestResult {
+            episodes: n,
+            success_percent: 100.0 * successes as f64 / n as f64,
+            success_percent_95: [100.0 * low, 100.0 * high],
+            mean_return: mean(episodes.iter().map(|episode| episode.episode_return)),
+            mean_length: mean(episodes.iter().map(|episode| f64::from(episode.length))),
+        }
+    }
+
+    /// The same episodes with `rule` in the place of what decided about success.
+    ///
+    /// # Errors
+    /// Those of [`About::criterion`].
+    pub fn judged_by(mut self, rule: &Rule) -> Result<Self, ValueError> {
+        let criterion = self.about.criterion(rule)?;
+        let swaps = self.about.also.as_ref() == Some(&criterion.quantity);
+        for episode in &mut self.episodes {
+            if swaps {
+                std::mem::swap(&mut episode.achieved, &mut episode.also_achieved);
+            }
+            episode.success = criterion.holds(episode.achieved);
+        }
+        self.about.judge_by(rule)?;
+        Ok(self)
+    }
+
+    /// What an episode achieved of what `criterion` compares.
+    pub fn achieved(&self, episode: &EpisodeRecord, criterion: &Criterion) -> Option<f64> {
+        if self.about.also.as_ref() == Some(&criterion.quantity) { episode.also_achieved } else { episode.achieved }
+    }
+
+    /// Compares what every episode was asked to run with and what it ran with.
+    pub fn agreement(&self) -> Agreement {
+        let comparison = Comparison::with(&self.about);
+        let of = |episode: &EpisodeRecord| comparison.largest(&episode.requested, &episode.applied);
+        let largest = self.episodes.iter().filter_map(of).max_by(|a, b| a.relative.total_cmp(&b.relative));
+        let episodes = if comparison.is_complete() { self.episodes.len() as u64 } else { 0 };
+        Agreement { episodes, largest }
+    }
+}
+
+/// Compares requested with applied parameters.
+#[derive(Clone, Debug)]
+pub struct Comparison {
+    /// The parameters' names, and where the quantity that reads each back is among the applied values; `None` if the
+    /// server does not say.
+    parameters: Vec<(String, Option<usize>)>,
+}
+
+impl Comparison {
+    fn with(about: &About) -> Self {
+        let place = |parameter: &RecordedParameter| about.applied.iter().position(|name| *name == parameter.applied);
+        let parameters = about.parameters.iter().map(|parameter| (parameter.name.clone(), place(parameter)));
+        Self { parameters: parameters.collect() }
+    }
+
+    /// For the receipts of `environment`.
+    pub fn of(environment: &proto::Environment) -> Self {
+        Self::with(&About::new(environment, String::new(), 1))
+    }
+
+    /// The largest difference that is more than rounding.
+    pub fn real_difference(&self, requested: &[f64], applied: &[f64]) -> Option<Difference> {
+        self.largest(requested, applied).filter(Difference::is_real)
+    }
+
+    /// Whether every parameter is read back.
+    fn is_complete(&self) -> bool {
+        self.parameters.iter().all(|(_, place)| place.is_some())
+    }
+
+    /// The largest difference in a receipt; `None` if nothing is read back. A value that is missing differs.
+    fn largest(&self, requested: &[f64], applied: &[f64]) -> Option<Difference> {
+        let value = |values: &[f64], place: usize| values.get(place).copied().unwrap_or(f64::NAN);
+        let compared = self.parameters.iter().enumerate().filter_map(|(index, (name, place))| {
+            let (requested, applied) = (value(requested, index), value(applied, (*place)?));
+            Some((name, requested, applied, relative(requested, applied)))
+        });
+        let largest = compared.max_by(|a, b| a.3.total_cmp(&b.3));
+        largest.map(|(name, requested, applied, relative)| Difference {
+            parameter: name.clone(),
+            requested,
+            applied,
+            relative,
+        })
+    }
+}
+
+/// A difference as a share of the requested value; of a requested 0, itself.
+fn relative(requested: f64, applied: f64) -> f64 {
+    let difference = (applied - requested).abs();
+    // Positive, so that NaN counts as the largest of all.
+    let relative = if requested == 0.0 { difference } else { difference / requested.abs() };
+    if relative.is_nan() { f64::NAN } else { relative }
+}
+
+impl Difference {
+    /// Whether it is more than rounding. NaN is.
+    pub fn is_real(&self) -> bool {
+        self.relative.is_nan() || self.relative > ROUNDING
+    }
+}
+
+impl std::fmt::Display for Difference {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { parameter, requested, applied, .. } = self;
+        write!(f, "the parameter {parameter} was requested as {requested}, but the physics ran with {applied}")
+    }
+}
+
+#[cfg(test)]
+mod tests;

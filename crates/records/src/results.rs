@@ -1,0 +1,25 @@
+//! What tests come to.
+
+use serde::{Deserialize, Serialize};
+
+/// Figures over test episodes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TestResult {
+    /// Of RL², the last one of each trial.
+    pub episodes: u64,
+    /// The share of the episodes that were successes.
+    pub success_percent: f64,
+    /// The 95 % Wilson interval of `success_percent`, [low, high], %.
+    pub success_percent_95: [f64; 2],
+    /// Mean undiscounted return, never normalised.
+    pub mean_return: f64,
+    /// Mean number of steps.
+    pub mean_length: f64,
+}
+
+impl std::fmt::Display for TestResult {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { episodes, success_percent, mean_return, mean_length, .. } = self;
+        write!(f, "{episodes} episodes, success {success_percent} %, return {mean_return}, length {mean_length}")
+    }
+}

@@ -1,0 +1,149 @@
+//! The paper's protocol: versions, scenarios and metrics.
+
+use std::fmt;
+
+use serde::Deserialize;
+
+use crate::statistics::geometric_mean;
+
+use perturb_protocol::Version;
+
+/// The paper's versions, and those others that there is something of: lines to compare with.
+pub fn versions(is_there: impl Fn(Version) -> bool) -> Vec<Version> {
+    Version::KNOWN.into_iter().filter(|version| Version::ALL.contains(version) || is_there(*version)).collect()
+}
+
+/// What a policy is trained on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum TrainedOn<'a> {
+    /// D, R, E or R+E.
+    Version(Version),
+    /// The plan's own set of that name.
+    Set(&'a str),
+    /// Something that is not known, or none of these: of policies that were trained elsewhere.
+    Unknown,
+}
+
+/// What stands where it is not known what was trained on.
+const UNKNOWN: &str = "unknown";
+
+impl TrainedOn<'_> {
+    /// Its name where a file has it.
+    pub fn file_name(&self) -> &str {
+        match self {
+            TrainedOn::Version(version) => version.file_name(),
+            TrainedOn::Set(name) => name,
+            TrainedOn::Unknown => UNKNOWN,
+        }
+    }
+}
+
+impl std::fmt::Display for TrainedOn<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            TrainedOn::Version(version) => version.fmt(f),
+            TrainedOn::Set(name) => name.fmt(f),
+            TrainedOn::Unknown => UNKNOWN.fmt(f),
+        }
+    }
+}
+
+/// Training on one version and testing on another, e.g. "DR".
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Scenario {
+    /// Where the policy was trained.
+    pub train: Version,
+    /// Where it is tested.
+    pub test: Version,
+}
+
+impl Scenario {
+    /// The nine pairs: DD, DR, DE, RD, … EE.
+    pub fn all() -> impl Iterator<Item = Scenario> {
+        Self::of(&Version::ALL, &Version::ALL)
+    }
+
+    /// All pairs of what was trained on and tested on.
+    pub fn of(trained: &[Version], tested: &[Version]) -> impl Iterator<Item = Scenario> {
+        trained.iter().flat_map(|&train| tested.iter().map(move |&test| Scenario { train, test }))
+    }
+}
+
+impl fmt::Display for Scenario {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}{}", self.train, self.test)
+    }
+}
+
+/// One of the paper's three numbers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Metric {
+    /// The success rate of DD.
+    Default,
+    /// The success rate of RR.
+    Interpolation,
+    /// The geometric mean of the success rates of DR, DE and RE.
+    Extrapolation,
+}
+
+impl Metric {
+    /// All, in the paper's order.
+    pub const ALL: [Metric; 3] = [Metric::Default, Metric::Interpolation, Metric::Extrapolation];
+
+    /// What Extrapolation is the geometric mean of.
+    pub const EXTRAPOLATION: [Scenario; 3] = [
+        Scenario { train: Version::D, test: Version::R },
+        Scenario { train: Version::D, test: Version::E },
+        Scenario { train: Version::R, test: Version::E },
+    ];
+
+    /// The metric from the success rates of scenarios; `None` if one that it needs has none.
+    pub fn of(self, rate_of: impl Fn(Scenario) -> Option<f64>) -> Option<f64> {
+        use Version::{D, R};
+        let rate = |train, test| rate_of(Scenario { train, test });
+        match self {
+            Metric::Default => rate(D, D),
+            Metric::Interpolation => rate(R, R),
+            Metric::Extrapolation => {
+                let rates: Option<Vec<f64>> = Self::EXTRAPOLATION.into_iter().map(&rate_of).collect();
+                Some(geometric_mean(&rates?))
+            }
+        }
+    }
+}
+
+impl fmt::Display for Metric {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Debug::fmt(self, f)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_nine_scenarios_are_named_by_training_and_testing() {
+        let names: Vec<String> = Scenario::all().map(|scenario| scenario.to_string()).collect();
+        assert_eq!(names, ["DD", "DR", "DE", "RD", "RR", "RE", "ED", "ER", "EE"]);
+    }
+
+    #[test]
+    fn metrics_take_their_scenarios() {
+        let rate = |scenario: Scenario| match scenario.to_string().as_str() {
+            "DD" => Some(90.0),
+            "RR" => Some(70.0),
+            "DR" => Some(20.0),
+            "DE" => Some(40.0),
+            "RE" => Some(10.0),
+            _ => None,
+        };
+        assert_eq!((Metric::Default.of(rate), Metric::Interpolation.of(rate)), (Some(90.0), Some(70.0)));
+        let extrapolation = Metric::Extrapolation.of(rate).unwrap();
+        assert!((extrapolation - 20.0).abs() < 1e-12, "the third root of 20 · 40 · 10");
+        for needed in ["DR", "DE", "RE"] {
+            assert_eq!(Metric::Extrapolation.of(|s| rate(s).filter(|_| s.to_string() != needed)), None, "{needed}");
+        }
+    }
+}

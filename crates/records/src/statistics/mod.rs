@@ -1,0 +1,69 @@
+//! Figures over runs: means and deviations, and with bootstrap intervals what Agarwal et al. (2021, arXiv:2108.13264)
+//! recommend; paired comparisons.
+//!
+//! Runs are grouped in strata: the scores of an environment's runs each. All are equal to rliable's on the same data, which
+//! `rliable_tests.rs` compares.
+
+mod aggregates;
+mod bootstrap;
+mod means;
+mod paired;
+
+pub use aggregates::{interquartile_mean, optimality_gap, probability_of_improvement, profile};
+pub use bootstrap::{Bootstrapped, are_enough, bootstrap, percentile_interval, resample};
+pub use means::{geometric_mean, mean, wilson};
+pub use paired::{holm, sign_flip_p};
+
+/// Mean and deviation over runs.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Summary {
+    /// Arithmetic mean.
+    pub mean: f64,
+    /// Standard deviation with n in the denominator, not n - 1: that is what the paper's tables hold. Its 0.06 ± 0.12 %
+    /// over five runs of 1000 episodes can only be the rates 0.3, 0, 0, 0, 0, whose deviation with n - 1 were 0.13.
+    /// `None` of a single run, which has none, and where it is not known.
+    pub std: Option<f64>,
+    /// How many there are.
+    pub runs: usize,
+}
+
+impl Summary {
+    /// Of `numbers`; `None` if there are none.
+    pub fn of(numbers: &[f64]) -> Option<Self> {
+        if numbers.is_empty() {
+            return None;
+        }
+        let n = numbers.len() as f64;
+        let mean = numbers.iter().sum::<f64>() / n;
+        let variance = numbers.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / n;
+        Some(Self { mean, std: (numbers.len() > 1).then_some(variance.sqrt()), runs: numbers.len() })
+    }
+}
+
+impl std::fmt::Display for Summary {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{:.1}", self.mean)?;
+        self.std.map_or(Ok(()), |std| write!(f, " ± {std:.1}"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_deviation_is_the_papers() {
+        // RL²-A2C on CartPole: 0.06 ± 0.12 % Interpolation over five runs of 1000 episodes.
+        let summary = Summary::of(&[0.3, 0.0, 0.0, 0.0, 0.0]).unwrap();
+        assert_eq!(
+            (format!("{:.2} ± {:.2}", summary.mean, summary.std.unwrap()), summary.runs),
+            ("0.06 ± 0.12".into(), 5)
+        );
+        assert_eq!(Summary::of(&[]), None);
+        assert_eq!(Summary::of(&[7.0]).unwrap().to_string(), "7.0", "one run does not deviate from itself");
+        assert_eq!(Summary::of(&[7.0, 7.0]).unwrap().to_string(), "7.0 ± 0.0");
+    }
+}
+
+#[cfg(test)]
+mod rliable_tests;

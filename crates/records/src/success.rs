@@ -1,0 +1,248 @@
+//! When an episode counts as a success.
+
+use std::fmt;
+use std::str::FromStr;
+
+use perturb_protocol::names::find;
+use perturb_protocol::proto;
+use serde::{Deserialize, Serialize};
+
+use perturb_settings::{ValueError, require};
+
+/// What is counted, not measured.
+const STEPS: [&str; 2] = ["steps", "steps_in_a_row"];
+
+/// A success achieved the threshold, or was better than it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Criterion {
+    /// What an episode achieves, e.g. "steps" or "distance".
+    pub quantity: String,
+    /// Its unit; "1" for steps.
+    pub unit: String,
+    /// On which side of the threshold successes are.
+    pub side: Side,
+    /// In the quantity's unit.
+    pub threshold: f64,
+    /// The most that an episode can come to: its step limit, if steps are compared. Of thresholds beyond it nothing is
+    /// known.
+    #[serde(default)]
+    pub most: Option<f64>,
+}
+
+/// A side of a threshold, which itself belongs to it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Side {
+    /// The threshold or more.
+    AtLeast,
+    /// The threshold or less.
+    AtMost,
+}
+
+/// A threshold of one's own, written `steps=90`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Threshold {
+    /// What is compared with it.
+    pub quantity: String,
+    /// In the quantity's unit.
+    pub value: f64,
+}
+
+/// What decides about success in a test, written `text`, `code` or `steps=90`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum Rule {
+    /// The environment's own, which is that of the paper's text.
+    Text,
+    /// That of the paper's published code.
+    Code,
+    /// Either of them with another threshold, whichever compares that quantity.
+    At(Threshold),
+}
+
+/// What a refusal calls a threshold.
+const THRESHOLD: &str = "the success threshold";
+
+impl Criterion {
+    /// That of `environment`, after the paper's text; `None` if its server does not say.
+    pub fn of(environment: &proto::Environment) -> Option<Self> {
+        Self::read(environment.success.as_ref()?, environment.step_limit)
+    }
+
+    /// That of the paper's published code; `None` if the server does not say.
+    pub fn of_code(environment: &proto::Environment) -> Option<Self> {
+        Self::read(environment.code_success.as_ref()?, environment.step_limit)
+    }
+
+    fn read(success: &proto::Success, step_limit: u32) -> Option<Self> {
+        let side = match success.comparison() {
+            proto::Comparison::Unspecified => return None,
+            proto::Comparison::AtLeast => Side::AtLeast,
+            proto::Comparison::AtMost => Side::AtMost,
+        };
+        let (quantity, unit) = (success.quantity.clone(), success.unit.clone());
+        let most = STEPS.contains(&quantity.as_str()).then(|| f64::from(step_limit));
+        Some(Self { quantity, unit, side, threshold: success.threshold, most })
+    }
+
+    /// The same with another threshold.
+    ///
+    /// # Errors
+    /// [`ValueError`] if that is one of another quantity.
+    pub fn with(&self, threshold: &Threshold) -> Result<Self, ValueError> {
+        let expected = format!("one of {}, e.g. {}={}", self.quantity, self.quantity, self.threshold);
+        require(threshold.quantity == self.quantity, THRESHOLD, threshold, expected)?;
+        let most = self.most.unwrap_or(f64::INFINITY);
+        require(threshold.value <= most, THRESHOLD, threshold, format!("at most {most}, the step limit"))?;
+        Ok(Self { threshold: threshold.value, ..self.clone() })
+    }
+
+    /// Whether an episode that achieved this is a success; one that achieved nothing is none.
+    pub fn holds(&self, achieved: Option<f64>) -> bool {
+        achieved.is_some_and(|achieved| match self.side {
+            Side::AtLeast => achieved >= self.threshold,
+            Side::AtMost => achieved <= self.threshold,
+        })
+    }
+}
+
+impl Rule {
+    /// The criterion by this rule; `text` and `code` are the environment's.
+    ///
+    /// # Errors
+    /// [`ValueError`] if it is one of another quantity, or if the server does not say what is compared.
+    pub fn of(&self, text: Option<&Criterion>, code: Option<&Criterion>) -> Result<Criterion, ValueError> {
+        let unknown = |expected| move || ValueError::new("the rule of success", self, expected);
+        match self {
+            Self::Code => {
+                code.cloned().ok_or_else(unknown("left out: the server does not say what the paper's code asks"))
+            }
+            Self::Text | Self::At(_) => {
+                let text =
+                    text.ok_or_else(unknown("left out: the server does not say what its success rule compares"))?;
+                let Self::At(threshold) = self else { return Ok(text.clone()) };
+                let other = code.filter(|code| code.quantity == threshold.quantity && text.quantity != code.quantity);
+                other.unwrap_or(text).with(threshold)
+            }
+        }
+    }
+}
+
+impl fmt::Display for Criterion {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let side = match self.side {
+            Side::AtLeast => "at least",
+            Side::AtMost => "at most",
+        };
+        let unit = if self.unit == "1" { String::new() } else { format!(" {}", self.unit) };
+        write!(f, "{} {side} {}{unit}", self.quantity, self.threshold)
+    }
+}
+
+impl fmt::Display for Threshold {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}={}", self.quantity, self.value)
+    }
+}
+
+impl fmt::Display for Rule {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Text => f.write_str("text"),
+            Self::Code => f.write_str("code"),
+            Self::At(threshold) => threshold.fmt(f),
+        }
+    }
+}
+
+impl FromStr for Rule {
+    type Err = ValueError;
+
+    fn from_str(text: &str) -> Result<Self, ValueError> {
+        match find(text.trim(), ["text", "code"].into_iter()) {
+            Some(0) => Ok(Self::Text),
+            Some(_) => Ok(Self::Code),
+            None => text.parse().map(Self::At),
+        }
+    }
+}
+
+impl TryFrom<String> for Rule {
+    type Error = ValueError;
+
+    fn try_from(text: String) -> Result<Self, ValueError> {
+        text.parse()
+    }
+}
+
+impl From<Rule> for String {
+    fn from(rule: Rule) -> Self {
+        rule.to_string()
+    }
+}
+
+impl FromStr for Threshold {
+    type Err = ValueError;
+
+    fn from_str(text: &str) -> Result<Self, ValueError> {
+        let text = text.trim();
+        let wrong = || ValueError::new(THRESHOLD, format!("`{text}`"), "text, code, or QUANTITY=NUMBER, e.g. steps=90");
+        let (quantity, value) = text.split_once('=').ok_or_else(wrong)?;
+        let value = value.trim().parse::<f64>().ok().filter(|value| value.is_finite()).ok_or_else(wrong)?;
+        Ok(Self { quantity: quantity.trim().to_owned(), value })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn steps(side: Side, threshold: f64) -> Criterion {
+        Criterion { quantity: "steps".into(), unit: "1".into(), side, threshold, most: Some(500.0) }
+    }
+
+    #[test]
+    fn a_threshold_belongs_to_its_side() {
+        let (most, least) = (steps(Side::AtMost, 80.0), steps(Side::AtLeast, 80.0));
+        for (achieved, at_most, at_least) in
+            [(Some(79.0), true, false), (Some(80.0), true, true), (Some(81.0), false, true), (None, false, false)]
+        {
+            assert_eq!((most.holds(achieved), least.holds(achieved)), (at_most, at_least), "{achieved:?}");
+        }
+        assert_eq!(most.to_string(), "steps at most 80");
+    }
+
+    #[test]
+    fn a_rule_is_the_texts_the_codes_or_one_of_them_with_another_threshold() {
+        let text = steps(Side::AtLeast, 100.0);
+        let code = Criterion { quantity: "steps_in_a_row".into(), threshold: 90.0, ..text.clone() };
+        let of = |rule: &str| rule.parse::<Rule>().unwrap().of(Some(&text), Some(&code)).unwrap();
+        assert_eq!((of("text"), of("code")), (text.clone(), code.clone()));
+        assert_eq!(of("steps=80"), Criterion { threshold: 80.0, ..text.clone() });
+        assert_eq!(of("steps_in_a_row=70"), Criterion { threshold: 70.0, ..code.clone() });
+        let refused = |rule: &str| rule.parse::<Rule>().unwrap().of(Some(&text), None).unwrap_err().to_string();
+        assert_eq!(
+            refused("code"),
+            "the rule of success is code, but must be left out: the server does not say what the paper's code asks"
+        );
+        assert!(refused("steps_in_a_row=70").contains("must be one of steps"), "nobody counts them");
+        for rule in ["text", "code", "steps=90"] {
+            assert_eq!(rule.parse::<Rule>().unwrap().to_string(), rule);
+        }
+        assert_eq!(" Code".parse::<Rule>().unwrap(), Rule::Code, "as other names are spelled");
+    }
+
+    #[test]
+    fn another_threshold_must_be_of_the_same_quantity() {
+        let criterion = steps(Side::AtMost, 80.0);
+        assert_eq!(criterion.with(&"steps=90".parse().unwrap()).unwrap().threshold, 90.0);
+        let error = criterion.with(&"distance=90".parse().unwrap()).unwrap_err().to_string();
+        assert_eq!(error, "the success threshold is distance=90, but must be one of steps, e.g. steps=80");
+        let error = criterion.with(&"steps=501".parse().unwrap()).unwrap_err().to_string();
+        assert_eq!(error, "the success threshold is steps=501, but must be at most 500, the step limit");
+        for text in ["90", "steps=", "steps=x", "steps=nan"] {
+            assert!(text.parse::<Threshold>().unwrap_err().to_string().contains("QUANTITY=NUMBER"), "{text}");
+        }
+    }
+}

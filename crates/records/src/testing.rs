@@ -1,0 +1,273 @@
+//! Which episodes a test plays, and how they are recorded, whoever plays them: equal policies have equal records.
+
+use perturb_policy::random::{Purpose, stream};
+use perturb_protocol::region::{self, Region};
+use perturb_protocol::{Distribution, EndedEpisode, Version, proto};
+use perturb_settings::sets::{Context, TestSet};
+use rand::Rng;
+
+use crate::heatmap::Heatmap;
+use crate::records::{Difference, EpisodeRecord, RecordedTest, Records};
+
+/// The most environments that are tested together, unless a set has more contexts.
+const MOST_ENVS: usize = 100;
+
+/// Why a test's episodes are not recorded.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+#[expect(missing_docs, reason = "the sentences say what the fields are")]
+pub enum NotRecorded {
+    /// Episodes did not run with the parameters that they were to run with.
+    #[error("testing on {set}: {difference}; its results would be of another environment: mend the server")]
+    NotApplied { set: String, difference: Difference },
+    /// The server requested something else of its physics than it was asked for.
+    #[error(
+        "testing on {set}: the server was asked for {parameter} in {asked}, but its receipt says {got}; mend the server"
+    )]
+    NotRequested { set: String, parameter: String, asked: String, got: f64 },
+}
+
+/// The seed of the test environments on `version`.
+///
+/// It is the first, second, third or fourth number (D, R, E, R+E) of the stream of `seed` for `purpose`, which is
+/// [`Purpose::TestEnvironments`] or [`Purpose::SelectionEnvironments`], so that a policy never meets its training episodes
+/// again, whatever seeds are used, nor those that selected it, and the versions are independent. Sets have the seed of
+/// their base version: what differs between two of them is parameters, not initial states.
+pub fn environment_seed(purpose: Purpose, seed: u64, version: Version) -> u64 {
+    let mut rng = stream(seed, purpose);
+    let drawn: [u64; Version::KNOWN.len()] = std::array::from_fn(|_| rng.next_u64());
+    drawn[version as usize]
+}
+
+/// `[N]` how many trials each environment is tested for. Environment i has context i modulo their number, and every
+/// context equally many episodes, at least 1; `contexts` is at least 1.
+fn quotas(episodes: u64, contexts: usize) -> Vec<u64> {
+    let each = episodes.div_ceil(contexts as u64).max(1);
+    // One context has as many environments as it can use, each of several its share.
+    let copies = ((MOST_ENVS / contexts) as u64).clamp(1, each);
+    (0..copies).flat_map(|i| vec![each / copies + u64::from(i < each % copies); contexts]).collect()
+}
+
+/// A test under way: of each environment the first trials count, and of each the last episode. Counting the first to end
+/// instead would favour short ones.
+#[derive(Clone, Debug)]
+pub struct Counting {
+    test: RecordedTest,
+    quotas: Vec<u64>,
+    episodes_per_trial: u32,
+    counted: Vec<EndedEpisode>,
+}
+
+impl Counting {
+    /// Of `episodes` episodes on `set`, of a test with `seed` for `purpose`, see [`environment_seed`]. Of a trial of
+    /// several episodes the last one counts.
+    pub fn new(set: TestSet, purpose: Purpose, seed: u64, episodes: u64, episodes_per_trial: u32) -> Self {
+        let quotas = quotas(episodes, set.listed().len());
+        let seed = environment_seed(purpose, seed, set.version);
+        Self { test: RecordedTest { set, seed, axes: None }, quotas, episodes_per_trial, counted: Vec::new() }
+    }
+
+    /// The test, with the seed of its environments.
+    pub fn test(&self) -> &RecordedTest {
+        &self.test
+    }
+
+    /// N.
+    pub fn num_envs(&self) -> usize {
+        self.quotas.len()
+    }
+
+    /// Takes the episodes that `ended` in some steps. Those that do not count are passed over.
+    pub fn take(&mut self, ended: impl IntoIterator<Item = EndedEpisode>) {
+        let Self { quotas, episodes_per_trial, .. } = self;
+        let counts = |end: &EndedEpisode| {
+            end.episode_in_trial + 1 == *episodes_per_trial
+                && quotas.get(end.slot).is_some_and(|quota| end.trial_index < *quota)
+        };
+        self.counted.extend(ended.into_iter().filter(counts));
+    }
+
+    /// Episodes that were counted, and how many there are to be.
+    pub fn progress(&self) -> (u64, u64) {
+        (self.counted.len() as u64, self.quotas.iter().sum())
+    }
+
+    /// Adds the episodes to `records`, which are of policies in `environment`.
+    ///
+    /// # Errors
+    /// [`NotRecorded`], if the server played something else; nothing was added then.
+    pub fn finish(self, environment: &proto::Environment, records: &mut Records) -> Result<(), NotRecorded> {
+        let Self { mut test, mut counted, .. } = self;
+        test.axes = Heatmap::axes_of(&test.set, environment);
+        counted.sort_by_key(|end| (end.environment_index, end.episode_index));
+        let contexts = test.set.listed();
+        let asked: Vec<_> = contexts.iter().map(|context| asked(environment, &test.set, context)).collect();
+        for end in &counted {
+            check_requested(environment, &test.set, &asked[end.slot % contexts.len()], &end.receipt.requested)?;
+        }
+        let record = |end| EpisodeRecord::of(&records.about, &test.set.name, test.seed, end);
+        let episodes = counted.into_iter().map(record).collect();
+        let mut added = Records::new(records.about.clone());
+        added.episodes = episodes;
+        if let Some(difference) = added.agreement().largest.filter(Difference::is_real) {
+            return Err(NotRecorded::NotApplied { set: test.set.name, difference });
+        }
+        records.add(test, added.episodes);
+        Ok(())
+    }
+}
+
+/// What each parameter may be in a context of a set, in a trial of each part of its version.
+fn asked(environment: &proto::Environment, set: &TestSet, context: &Context) -> Vec<Vec<Distribution>> {
+    let region = Region::of(environment, set.version, &set.parameters(context));
+    let in_order = |values: &region::Box| {
+        environment.parameters.iter().filter_map(|parameter| values.get(&parameter.name).cloned()).collect()
+    };
+    region.boxes().iter().map(in_order).collect()
+}
+
+/// Whether the server requested of its physics what it was asked for: all parameters of one part of the version.
+fn check_requested(
+    environment: &proto::Environment,
+    set: &TestSet,
+    asked: &[Vec<Distribution>],
+    requested: &[f64],
+) -> Result<(), NotRecorded> {
+    let Some(index) = wrong(asked, requested) else { return Ok(()) };
+    let sets: Vec<String> = asked.iter().map(|asked| asked[index].to_string()).collect();
+    Err(NotRecorded::NotRequested {
+        set: set.name.clone(),
+        parameter: environment.parameters[index].name.clone(),
+        asked: sets.join(", like all others, or in "),
+        got: requested.get(index).copied().unwrap_or(f64::NAN),
+    })
+}
+
+/// The first parameter that is not what it may be in any of the parts, all of whose parameters belong together.
+fn wrong(asked: &[Vec<Distribution>], requested: &[f64]) -> Option<usize> {
+    let in_part = |asked: &Vec<Distribution>| {
+        let requested = requested.iter().copied().chain(std::iter::repeat(f64::NAN));
+        asked.iter().zip(requested).position(|(asked, got)| !asked.contains(got))
+    };
+    let wrongs: Option<Vec<usize>> = asked.iter().map(in_part).collect();
+    wrongs?.into_iter().max()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::records::{About, Ending};
+
+    fn environment() -> proto::Environment {
+        let drawn = |low, high| Some(proto::Distribution { intervals: vec![proto::Interval { low, high }] });
+        let length = proto::Parameter {
+            name: "length".into(),
+            unit: "m".into(),
+            applied: "length".into(),
+            low: 0.0,
+            high: 9.0,
+            default_value: 1.0,
+            random: drawn(0.5, 2.0),
+            extreme: drawn(3.0, 4.0),
+            ..Default::default()
+        };
+        let applied = vec![proto::Quantity { name: "length".into(), unit: "m".into() }];
+        proto::Environment { name: "Toy".into(), parameters: vec![length], applied, ..Default::default() }
+    }
+
+    fn end(slot: u32, trial_index: u64, length: f64, applied: f64) -> EndedEpisode {
+        let episode =
+            proto::Episode { environment_index: slot, trial_index, episode_index: trial_index, episode_in_trial: 0 };
+        let receipt = proto::Receipt { requested: vec![length], applied: vec![applied], model_hash: String::new() };
+        let end = proto::EpisodeEnd {
+            episode: Some(episode),
+            r#return: f64::from(slot),
+            length: 7,
+            success: true,
+            receipt: Some(receipt),
+            ..Default::default()
+        };
+        EndedEpisode::of(end, slot as usize, slot == 0).unwrap()
+    }
+
+    fn finished(version: Version, ends: &[EndedEpisode]) -> Result<Records, NotRecorded> {
+        let mut records = Records::new(About::new(&environment(), "policy".into(), 1));
+        let mut counting = Counting::new(version.into(), Purpose::TestEnvironments, 1, 2, 1);
+        for end in ends {
+            counting.take([end.clone()]);
+        }
+        counting.finish(&environment(), &mut records)?;
+        Ok(records)
+    }
+
+    #[test]
+    fn the_first_episodes_of_each_environment_count_in_their_order() {
+        let records = finished(Version::D, &[end(1, 0, 1.0, 1.0), end(1, 1, 1.0, 1.0), end(0, 0, 1.0, 1.0)]).unwrap();
+        let told: Vec<(u32, u64, Ending)> =
+            records.episodes.iter().map(|row| (row.environment_index, row.episode_index, row.ending)).collect();
+        assert_eq!(told, [(0, 0, Ending::Terminated), (1, 0, Ending::Truncated)]);
+        assert_eq!(records.about.tests[0].seed, environment_seed(Purpose::TestEnvironments, 1, Version::D));
+    }
+
+    #[test]
+    fn what_did_not_run_as_it_was_asked_to_is_no_record() {
+        assert!(finished(Version::E, &[end(0, 0, 3.5, 3.5)]).is_ok());
+        for (version, end, part) in [
+            (Version::E, end(0, 0, 1.0, 1.0), "asked for length in [3, 4], but its receipt says 1"),
+            (Version::RE, end(0, 0, 2.5, 2.5), "length in [0.5, 2], like all others, or in [3, 4]"),
+            (Version::E, end(0, 0, 3.5, 3.6), "length was requested as 3.5, but the physics ran with 3.6"),
+        ] {
+            let error = finished(version, &[end]).unwrap_err().to_string();
+            assert!(error.contains(part), "{error}");
+        }
+    }
+
+    #[test]
+    fn all_parameters_of_an_episode_are_of_one_part_of_its_version() {
+        let part = |low, high| vec!["low..high".replace("low", low).replace("high", high).parse().unwrap(); 2];
+        let (r, e) = (part("1", "2"), part("2", "3"));
+        let both = [r, e];
+        assert_eq!([wrong(&both, &[1.5, 1.0]), wrong(&both, &[2.5, 3.0])], [None, None]);
+        assert_eq!(wrong(&both, &[1.5, 2.5]), Some(1), "the second is not of R, the first not of E");
+        assert_eq!(wrong(&both, &[4.0, 1.5]), Some(0));
+        assert_eq!(
+            (wrong(&both[..1], &[1.5, 2.5]), wrong(&both[..1], &[1.5])),
+            (Some(1), Some(1)),
+            "nor is what is missing"
+        );
+    }
+
+    #[test]
+    fn every_environment_gets_its_share_beforehand() {
+        assert_eq!(quotas(3, 1), [1, 1, 1]);
+        assert_eq!(quotas(1000, 1), vec![10; 100]);
+        let uneven = quotas(250, 1);
+        assert_eq!((uneven.len(), uneven.iter().sum::<u64>()), (100, 250));
+        assert_eq!((uneven[0], uneven[49], uneven[50], uneven[99]), (3, 3, 2, 2));
+    }
+
+    #[test]
+    fn every_context_gets_equally_many_episodes() {
+        for (episodes, contexts, each) in
+            [(10, 5, 2), (11, 5, 3), (1, 5, 1), (1000, 1600, 1), (1000, 3, 334), (7, 100, 1)]
+        {
+            let quotas = quotas(episodes, contexts);
+            for context in 0..contexts {
+                let own: u64 = quotas.iter().skip(context).step_by(contexts).sum();
+                assert_eq!(own, each, "{episodes} episodes in {contexts} contexts");
+            }
+            assert!(quotas.len() <= MOST_ENVS.max(contexts) && quotas.iter().all(|&quota| quota > 0));
+        }
+    }
+
+    #[test]
+    fn test_environments_have_seeds_of_their_own() {
+        let of = |purpose| {
+            (0..100).flat_map(move |seed| Version::KNOWN.map(|version| environment_seed(purpose, seed, version)))
+        };
+        let seeds: Vec<u64> = of(Purpose::TestEnvironments).chain(of(Purpose::SelectionEnvironments)).collect();
+        let distinct: std::collections::HashSet<u64> = seeds.iter().copied().collect();
+        assert_eq!(distinct.len(), 800, "those of a test never select");
+        assert!(seeds.iter().all(|&seed| seed > 1000), "none is a seed that people train with");
+    }
+}

@@ -1,0 +1,18 @@
+//! Reports of experiments: tables, pictures and pages.
+//!
+//! - [`Report`] compares results, in tables and on a page; [`plot`] draws.
+#![forbid(unsafe_code)]
+
+mod against_training;
+#[cfg(test)]
+#[path = "../../experiment/src/fixture.rs"]
+mod fixture;
+mod heatmap_policies;
+pub mod plot;
+mod report;
+
+pub use heatmap_policies::{PolicyHeatmap, policies_side_by_side};
+pub use report::{
+    Drawing, Figure, FigureData, Figures, HeatmapPicture, Picture, Report, ReportError, Sources, Whole, curves_table,
+    heatmap_pictures, html, save_heatmaps,
+};

@@ -1,0 +1,116 @@
+//! Training curves: three panels, D, R and E, below each other; and R+E, if anything is trained on it.
+
+use std::ops::Range;
+
+use perturb_experiment::{Curve, EnvironmentCurves, Footing, Point, distinct};
+use perturb_protocol::Version;
+use perturb_records::statistics::Summary;
+use perturb_records::versions;
+use perturb_settings::Method;
+
+use super::panels::{Panel, PanelLine, PanelPoint, Panels, RATES, index_of};
+
+/// What a picture shows over episodes or steps.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Quantity {
+    /// The mean undiscounted return.
+    Return,
+    /// The success rate, %.
+    Success,
+}
+
+impl Quantity {
+    /// Both.
+    pub const ALL: [Quantity; 2] = [Quantity::Return, Quantity::Success];
+
+    fn of(self, point: &Point) -> Summary {
+        match self {
+            Quantity::Return => point.episode_return,
+            Quantity::Success => point.success,
+        }
+    }
+}
+
+impl std::fmt::Display for Quantity {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.pad(match self {
+            Quantity::Return => "return",
+            Quantity::Success => "success",
+        })
+    }
+}
+
+/// The picture of training curves, a panel for each version that is trained on.
+pub fn draw_curves(curves: &EnvironmentCurves, quantity: Quantity, by: Footing) -> Panels {
+    draw(curves, None, quantity, by)
+}
+
+/// The picture of tests of what was trained on a version, a panel for each version that is tested on.
+pub(crate) fn draw_tests(curves: &EnvironmentCurves, trained_on: Version, quantity: Quantity) -> Panels {
+    draw(curves, Some(trained_on), quantity, Footing::Episodes)
+}
+
+/// `trained_on` is `None` of training curves.
+fn draw(curves: &EnvironmentCurves, trained_on: Option<Version>, quantity: Quantity, by: Footing) -> Panels {
+    let methods = distinct(curves.curves.iter().map(|curve| curve.method.clone()));
+    let what = match quantity {
+        Quantity::Return => "mean return",
+        Quantity::Success => "success rate, %",
+    };
+    let environment = &curves.environment;
+    let shown = what.trim_end_matches(", %");
+    let of = match trained_on {
+        None => format!("{environment}: {shown} while training, over {by}"),
+        Some(version) => format!("{environment}, trained on {version}: {shown} in tests after so many episodes"),
+    };
+    let (x, y) = ranges(&curves.curves, quantity, by);
+    let versions = versions(|version| curves.curves.iter().any(|curve| curve.version == version));
+    let panel = |version: Version| Panel {
+        caption: format!("{} {version}", if trained_on.is_some() { "tested on" } else { "trained on" }),
+        x_name: by.to_string(),
+        x: x.clone(),
+        y_name: what.into(),
+        y: y.clone(),
+        lines: curves
+            .curves
+            .iter()
+            .filter(|curve| curve.version == version)
+            .map(|curve| line(curve, quantity, by, &methods))
+            .collect(),
+        mark: None,
+    };
+    Panels {
+        title: of,
+        panels: versions.into_iter().map(panel).collect(),
+        legend: methods.iter().map(ToString::to_string).collect(),
+        note: "Lines: means over runs; bands: their standard deviation.".into(),
+    }
+}
+
+fn line(curve: &Curve, quantity: Quantity, by: Footing, methods: &[Method]) -> PanelLine {
+    let point = |point: &Point| {
+        let Summary { mean, std, .. } = quantity.of(point);
+        let std = std.unwrap_or_default();
+        PanelPoint { x: point.progress, y: mean, low: mean - std, high: mean + std }
+    };
+    PanelLine { index: index_of(methods, &curve.method), points: curve.points(by).iter().map(point).collect() }
+}
+
+/// The values that all panels share.
+fn ranges(curves: &[Curve], quantity: Quantity, by: Footing) -> (Range<f64>, Range<f64>) {
+    let longest = curves.iter().map(|curve| curve.total(by)).fold(0.0, f64::max);
+    let x = 0.0..if longest > 0.0 { longest } else { 1.0 };
+    if quantity == Quantity::Success {
+        return (x, RATES);
+    }
+    let values = curves.iter().flat_map(|curve| curve.points(by)).map(|point| quantity.of(point));
+    let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), summary| {
+        let std = summary.std.unwrap_or_default();
+        (low.min(summary.mean - std), high.max(summary.mean + std))
+    });
+    if low > high {
+        return (x, 0.0..1.0);
+    }
+    let margin = 0.04 * (high - low).max(1e-3 * high.abs()).max(1e-9);
+    (x, low - margin..high + margin)
+}

@@ -1,0 +1,53 @@
+//! Dashed lines, cut into their dashes with operations that round alike everywhere. plotters cuts them with the C
+//! library's `hypotf`: as its version rounds, and on Debian 12 one that needs a newer glibc than all the rest.
+
+/// The dashes of the line through these points, each a line of its own. It begins with a whole dash, and goes on around
+/// corners. Lengths are in the unit of the points, and above 0.
+pub(super) fn dashes(points: &[(f64, f64)], dash: f64, gap: f64) -> Vec<Vec<(f64, f64)>> {
+    let mut done = Vec::new();
+    let mut current: Vec<(f64, f64)> = points.iter().take(1).copied().collect();
+    let (mut in_dash, mut left) = (true, dash);
+    for ends in points.windows(2) {
+        let ((x, y), (dx, dy)) = (ends[0], (ends[1].0 - ends[0].0, ends[1].1 - ends[0].1));
+        let length = (dx * dx + dy * dy).sqrt();
+        let mut walked = 0.0;
+        while length - walked >= left {
+            walked += left;
+            current.push((x + dx * walked / length, y + dy * walked / length));
+            if in_dash {
+                done.push(std::mem::take(&mut current));
+            }
+            in_dash = !in_dash;
+            left = if in_dash { dash } else { gap };
+        }
+        left -= length - walked;
+        if in_dash {
+            current.push(ends[1]);
+        }
+    }
+    if current.len() > 1 {
+        done.push(current);
+    }
+    done
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn dashes_and_gaps_take_turns_around_corners() {
+        let corner = [(0.0, 0.0), (10.0, 0.0), (10.0, 9.0)];
+        let expected =
+            [vec![(0.0, 0.0), (4.0, 0.0)], vec![(7.0, 0.0), (10.0, 0.0), (10.0, 1.0)], vec![(10.0, 4.0), (10.0, 8.0)]];
+        assert_eq!(dashes(&corner, 4.0, 3.0), expected);
+        assert_eq!(dashes(&corner, 100.0, 3.0), [corner]);
+    }
+
+    #[test]
+    fn a_line_without_length_has_no_dashes_that_end() {
+        assert_eq!(dashes(&[], 4.0, 3.0), Vec::<Vec<(f64, f64)>>::new());
+        assert_eq!(dashes(&[(1.0, 1.0)], 4.0, 3.0), Vec::<Vec<(f64, f64)>>::new());
+        assert_eq!(dashes(&[(1.0, 1.0), (1.0, 1.0)], 4.0, 3.0), [[(1.0, 1.0), (1.0, 1.0)]]);
+    }
+}

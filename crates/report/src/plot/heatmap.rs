@@ -1,0 +1,327 @@
+//! Heatmaps side by side, of policies that were trained on different things: mean return and, below it, success over two
+//! parameters, with the boxes of R and E and the default. All share their axes, and each of the two its colours.
+
+mod scale;
+mod surfaces;
+
+use std::ops::Range;
+
+use perturb_records::statistics::mean;
+use perturb_records::{Axis, Heatmap, HeatmapPoint};
+use plotters::coord::Shift;
+use plotters::prelude::*;
+
+use super::canvas::{Canvas, INSIDE, LINE, LineStyle, MARGIN, Place, Side, TICK, text_width, wrapped};
+use super::colours::viridis;
+use super::frame::{Frame, NAME, NUMBERS, y_numbers_width};
+use super::{Plot, PlotError, WIDTH, drawing};
+pub use scale::common_returns;
+
+/// The most panels in a row; if there are more, rows have fewer.
+const MOST: usize = 4;
+const FEWER: usize = 3;
+/// Widest, lowest and highest panel.
+const WIDEST: f64 = 210.0;
+const HEIGHTS: Range<f64> = 96.0..150.0;
+/// Between panels, and between what stands below each other.
+const GAP: f64 = 9.0;
+/// How high the colours are in their scale.
+const BAR: f64 = 10.0;
+/// The outlines of R's box and of E's, each within another, so that they are seen on every colour.
+const RANDOM: [LineStyle; 2] = [outline(BLACK, 4), outline(WHITE, 2)];
+const EXTREME: [LineStyle; 2] = [outline(WHITE, 4), outline(RGBColor(200, 30, 30), 2)];
+/// As much as a box stays inside, so that it is seen whole.
+const WITHIN: f64 = 2.0;
+/// The legend's samples.
+const SAMPLE: (f64, f64) = (24.0, 14.0);
+
+const fn outline(colour: RGBColor, width: u32) -> LineStyle {
+    LineStyle { colour, width, dashes: None }
+}
+
+/// Heatmaps over the same two parameters.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HeatmapPanels {
+    /// Above all: what it is of, and how it was made.
+    pub title: Vec<String>,
+    /// x and y.
+    pub axes: [Axis; 2],
+    /// The scale of mean returns.
+    pub returns: Range<f64>,
+    /// From left to right.
+    pub columns: Vec<HeatmapColumn>,
+}
+
+/// One of several heatmaps.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HeatmapColumn {
+    /// What it is of.
+    pub caption: String,
+    /// What is shown, or why nothing is.
+    pub content: Result<Heatmap, String>,
+}
+
+/// What is shown.
+struct Quantity {
+    name: &'static str,
+    range: Range<f64>,
+    value: fn(&HeatmapPoint) -> f64,
+}
+
+/// What the legend has.
+const KEY: [&str; 3] = ["box of R, random", "box of E, extreme", "D, default"];
+
+impl Plot for HeatmapPanels {
+    fn height(&self) -> u32 {
+        let quantity: f64 = GAP + LINE + NUMBERS + self.rows().map(|row| self.row_height(row)).sum::<f64>();
+        let texts = LINE * (self.title_lines().len() + 1) as f64;
+        (2.0 * MARGIN + texts + 2.0 * quantity + self.key_places().1 + GAP).ceil() as u32
+    }
+
+    fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError> {
+        let canvas = Canvas::new(area, scale)?;
+        let mut top = canvas.lines(&self.title_lines(), (MARGIN, MARGIN), Side::Left)?;
+        let [x, y] = &self.axes;
+        let quantities = [
+            Quantity { name: "mean return", range: self.returns.clone(), value: |point| point.mean_return },
+            Quantity { name: "success rate, %", range: 0.0..100.0, value: |point| point.success_percent },
+        ];
+        for quantity in &quantities {
+            top += GAP;
+            canvas.colours(quantity, self.frame(0, top).left, top)?;
+            top += LINE + NUMBERS;
+            for row in self.rows() {
+                let captions = self.caption_lines(row);
+                for (column, (of, caption)) in row.iter().zip(&captions).enumerate() {
+                    let frame = self.frame(column, top + LINE * most(&captions));
+                    let first = frame.top - LINE * caption.len() as f64;
+                    canvas.lines(caption, (frame.middle().0, first), Side::Middle)?;
+                    match &of.content {
+                        Ok(heatmap) => self.panel(&canvas, &frame, heatmap, quantity)?,
+                        Err(why) => canvas.apology(&frame, why)?,
+                    }
+                    canvas.frame(&frame, false)?;
+                    canvas.x_ticks(&frame, true)?;
+                    canvas.y_ticks(&frame, column == 0)?;
+                    if column == 0 {
+                        canvas.upright(&label(y), (MARGIN + LINE / 2.0, frame.middle().1))?;
+                    }
+                }
+                top += self.row_height(row);
+            }
+        }
+        let middle = self.frame(0, 0.0).left + self.row_width() / 2.0;
+        canvas.text(&label(x), (middle, top - GAP + LINE / 2.0), Side::Middle)?;
+        self.key(&canvas, top + LINE)
+    }
+
+    /// The surfaces, thousands of rectangles, as a path for each colour.
+    fn finish(&self, svg: String) -> String {
+        surfaces::as_paths(&svg)
+    }
+}
+
+/// The most lines that one of several texts has.
+fn most(texts: &[Vec<String>]) -> f64 {
+    texts.iter().map(Vec::len).max().unwrap_or(0) as f64
+}
+
+fn label(axis: &Axis) -> String {
+    if axis.unit == "1" { axis.name.clone() } else { format!("{}, {}", axis.name, axis.unit) }
+}
+
+impl HeatmapPanels {
+    fn title_lines(&self) -> Vec<String> {
+        self.title.iter().flat_map(|title| wrapped(title, INSIDE)).collect()
+    }
+
+    fn per_row(&self) -> usize {
+        if self.columns.len() > MOST { FEWER } else { self.columns.len().max(1) }
+    }
+
+    fn rows(&self) -> std::slice::Chunks<'_, HeatmapColumn> {
+        self.columns.chunks(self.per_row())
+    }
+
+    /// A panel's.
+    fn size(&self) -> (f64, f64) {
+        let [_, y] = &self.axes;
+        let left = MARGIN + NAME + y_numbers_width(&(y.low..y.high), HEIGHTS.start);
+        let columns = self.per_row() as f64;
+        // Half of the last number is beyond its frame.
+        let width = (f64::from(WIDTH) - left - MARGIN - 2.0 - GAP * (columns - 1.0)) / columns;
+        (width.min(WIDEST), width.clamp(HEIGHTS.start, HEIGHTS.end))
+    }
+
+    /// Of a panel in a row.
+    fn frame(&self, column: usize, top: f64) -> Frame {
+        let [x, y] = &self.axes;
+        let (width, height) = self.size();
+        let left = MARGIN + NAME + y_numbers_width(&(y.low..y.high), height) + column as f64 * (width + GAP);
+        Frame { left, top, width, height, x: x.low..x.high, y: y.low..y.high }
+    }
+
+    fn row_width(&self) -> f64 {
+        let columns = self.per_row().min(self.columns.len().max(1)) as f64;
+        columns * self.size().0 + (columns - 1.0) * GAP
+    }
+
+    fn caption_lines(&self, row: &[HeatmapColumn]) -> Vec<Vec<String>> {
+        row.iter().map(|of| wrapped(&of.caption, self.size().0)).collect()
+    }
+
+    fn row_height(&self, row: &[HeatmapColumn]) -> f64 {
+        LINE * most(&self.caption_lines(row)) + self.size().1 + NUMBERS + GAP
+    }
+
+    fn panel<DB: DrawingBackend>(
+        &self,
+        canvas: &Canvas<'_, DB>,
+        frame: &Frame,
+        heatmap: &Heatmap,
+        quantity: &Quantity,
+    ) -> Result<(), PlotError> {
+        canvas.surface(frame, heatmap, quantity)?;
+        let [x, y] = &self.axes;
+        for (lines, x_pairs, y_pairs) in [(EXTREME, &x.extreme, &y.extreme), (RANDOM, &x.random, &y.random)] {
+            for &(left, right) in x_pairs {
+                for &(bottom, top) in y_pairs {
+                    let inside = |(x, y): Place| {
+                        let x = x.clamp(frame.left + WITHIN, frame.right() - WITHIN);
+                        (x, y.clamp(frame.top + WITHIN, frame.bottom() - WITHIN))
+                    };
+                    let corners = [(frame.x(left), frame.y(top)), (frame.x(right), frame.y(bottom))];
+                    canvas.outline(corners.map(inside), lines)?;
+                }
+            }
+        }
+        let shown = |axis: &Axis| (axis.low..=axis.high).contains(&axis.default);
+        if shown(x) && shown(y) { canvas.mark((frame.x(x.default), frame.y(y.default))) } else { Ok(()) }
+    }
+
+    /// Where the legend's samples are, from its top, and how high it is.
+    fn key_places(&self) -> ([Place; 3], f64) {
+        let (mut x, mut y) = (MARGIN, GAP);
+        let places = KEY.map(|name| {
+            let width = SAMPLE.0 + 6.0 + text_width(name) + 14.0;
+            if x > MARGIN && x + width > MARGIN + INSIDE + 14.0 {
+                (x, y) = (MARGIN, y + LINE + 2.0);
+            }
+            let place = (x, y);
+            x += width;
+            place
+        });
+        (places, y + LINE)
+    }
+
+    fn key<DB: DrawingBackend>(&self, canvas: &Canvas<'_, DB>, top: f64) -> Result<(), PlotError> {
+        for (index, (name, (x, y))) in KEY.into_iter().zip(self.key_places().0).enumerate() {
+            let (left, above) = (x, top + y + (LINE - SAMPLE.1) / 2.0);
+            let corners = [(left, above), (left + SAMPLE.0, above + SAMPLE.1)];
+            // On a colour of the surface, since white lines are not seen on white.
+            canvas.rectangle(corners, viridis(0.4).filled())?;
+            let middle = (left + SAMPLE.0 / 2.0, above + SAMPLE.1 / 2.0);
+            match index {
+                0 => canvas.outline(corners, RANDOM)?,
+                1 => canvas.outline(corners, EXTREME)?,
+                _ => canvas.mark(middle)?,
+            }
+            canvas.text(name, (left + SAMPLE.0 + 6.0, middle.1), Side::Left)?;
+        }
+        Ok(())
+    }
+}
+
+impl<DB: DrawingBackend> Canvas<'_, DB> {
+    /// The colours of a heatmap: neighbours of one colour are one rectangle.
+    fn surface(&self, frame: &Frame, heatmap: &Heatmap, quantity: &Quantity) -> Result<(), PlotError> {
+        let ((left, top), (right, bottom)) =
+            (self.at((frame.left, frame.top)), self.at((frame.right(), frame.bottom())));
+        let (width, height, grid) = (right - left, bottom - top, heatmap.grid as i32);
+        let edge = |length: i32, index: usize| length * index as i32 / grid;
+        // Behind them what is between: printers that smooth edges let it through.
+        let (low, high) = (quantity.range.start, quantity.range.end);
+        let shares =
+            heatmap.points.iter().map(|point| (((quantity.value)(point) - low) / (high - low)).clamp(0.0, 1.0));
+        let corners = [
+            (frame.left, frame.top),
+            (frame.right(), frame.top),
+            (frame.right(), frame.bottom()),
+            (frame.left, frame.bottom()),
+        ];
+        self.polygon(&corners, viridis(mean(shares)).filled())?;
+        let range = &quantity.range;
+        let colour =
+            |point: &HeatmapPoint| viridis(((quantity.value)(point) - range.start) / (range.end - range.start));
+        for (line, points) in heatmap.points.chunks(heatmap.grid).enumerate() {
+            let (below, above) = (bottom - edge(height, line), bottom - edge(height, line + 1));
+            let mut from = 0;
+            for same in points.chunk_by(|a, b| colour(a) == colour(b)) {
+                let corners = [(left + edge(width, from), above), (left + edge(width, from + same.len()), below)];
+                self.area.draw(&Rectangle::new(corners, colour(&same[0]).filled())).map_err(drawing)?;
+                from += same.len();
+            }
+        }
+        Ok(())
+    }
+
+    /// In place of a panel that there is not.
+    fn apology(&self, frame: &Frame, why: &str) -> Result<(), PlotError> {
+        let (right, bottom) = (frame.right(), frame.bottom());
+        self.line(&[(frame.left, frame.top), (right, frame.top), (right, bottom)], TICK)?;
+        let mut lines = wrapped(why, frame.width - 4.0);
+        if LINE * lines.len() as f64 > frame.height {
+            lines = vec!["missing".into()]; // the caption of its figure says why
+        }
+        let first = frame.middle().1 - LINE * lines.len() as f64 / 2.0;
+        self.lines(&lines, (frame.middle().0, first), Side::Middle).map(|_| ())
+    }
+
+    /// A box, in one line within another.
+    fn outline(&self, [(left, top), (right, bottom)]: [Place; 2], lines: [LineStyle; 2]) -> Result<(), PlotError> {
+        for line in lines {
+            // Each side by itself, with the corners: a path around would not be closed, in a PNG.
+            let half = f64::from(line.width) / 2.0;
+            for y in [top, bottom] {
+                self.line(&[(left - half, y), (right + half, y)], line)?;
+            }
+            for x in [left, right] {
+                self.line(&[(x, top - half), (x, bottom + half)], line)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// The default: a ring in black within a white one.
+    fn mark(&self, at: Place) -> Result<(), PlotError> {
+        [(WHITE, 5), (BLACK, 2)]
+            .into_iter()
+            .try_for_each(|(colour, width)| self.circle(at, 4.0, self.stroke(colour, width)))
+    }
+
+    /// What is shown, and beside it the scale of its colours.
+    fn colours(&self, quantity: &Quantity, left: f64, top: f64) -> Result<(), PlotError> {
+        self.text(quantity.name, (left, top + LINE / 2.0), Side::Left)?;
+        let from = left + text_width("success rate, %") + 14.0;
+        let frame = Frame {
+            left: from,
+            top: top + (LINE - BAR) / 2.0,
+            width: f64::from(WIDTH) - MARGIN - 10.0 - from,
+            height: BAR,
+            x: quantity.range.clone(),
+            y: 0.0..1.0,
+        };
+        let ((x, above), (right, below)) = (self.at((frame.left, frame.top)), self.at((frame.right(), frame.bottom())));
+        let steps = 100;
+        for step in 0..steps {
+            let place = |step: i32| x + (right - x) * step / steps;
+            let colour = viridis(f64::from(step) / f64::from(steps - 1));
+            let corners = [(place(step), above), (place(step + 1), below)];
+            self.area.draw(&Rectangle::new(corners, colour.filled())).map_err(drawing)?;
+        }
+        self.x_ticks(&frame, true)
+    }
+}
+
+#[cfg(test)]
+mod tests;

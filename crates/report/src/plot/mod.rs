@@ -1,0 +1,135 @@
+//! Pictures, as SVG and PNG.
+//!
+//! All are made for a printed column: as wide as one, with texts that are read there, and what does not fit beside each
+//! other below each other, so that they fit a telephone as well. Lines have the colours of Okabe and Ito and dashes, which
+//! print keeps; surfaces have viridis. Ticks are round in all of them.
+
+mod canvas;
+mod colours;
+mod curves;
+mod dashes;
+mod frame;
+mod heatmap;
+pub(crate) mod intervals;
+pub(crate) mod panels;
+mod ticks;
+
+use std::path::Path;
+use std::sync::OnceLock;
+
+use plotters::coord::Shift;
+use plotters::prelude::*;
+use plotters::style::{FontStyle, register_font};
+
+pub use colours::{is_dark, shade};
+pub(crate) use curves::draw_tests;
+pub use curves::{Quantity, draw_curves};
+pub use heatmap::{HeatmapColumn, HeatmapPanels, common_returns};
+pub use intervals::Intervals;
+pub use panels::Panels;
+use perturb_experiment::FolderError;
+use perturb_files::interrupt::Scratch;
+use perturb_files::{self as files, FileError, io, write_atomically};
+
+/// DejaVu Sans, cut down to the letters that pictures have; its licence is beside it.
+const FONT: &[u8] = include_bytes!("../../data/fonts/DejaVuSans-subset.ttf");
+/// What the font is called in an SVG.
+pub const FAMILY: &str = "sans-serif";
+/// How wide a picture is, in units. An SVG is shown with a pixel of CSS for each, and printed in a column of 85 mm.
+pub const WIDTH: u32 = 360;
+/// SVG has so many steps in a unit, so that lines are smooth in print, too.
+const SVG_SCALE: u32 = 4;
+/// PNG has so many pixels for one unit: 320 an inch in a column.
+pub const PNG_SCALE: u32 = 3;
+
+/// Why a picture could not be made.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum PlotError {
+    /// The plotting library refused.
+    #[error("cannot draw: {0}")]
+    Draw(String),
+    /// A file cannot be written.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// The folder cannot be read.
+    #[error(transparent)]
+    Folder(#[from] FolderError),
+}
+
+/// What any backend can draw, [`WIDTH`] wide. Everything is in units times `scale`.
+pub trait Plot {
+    /// Its height.
+    fn height(&self) -> u32;
+
+    /// Draws it.
+    ///
+    /// # Errors
+    /// The backend's.
+    fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>, scale: u32) -> Result<(), PlotError>;
+
+    /// What becomes of its SVG.
+    fn finish(&self, svg: String) -> String {
+        svg
+    }
+}
+
+/// A picture as SVG.
+///
+/// # Errors
+/// [`PlotError::Draw`].
+pub fn svg(plot: &impl Plot) -> Result<String, PlotError> {
+    load_font()?;
+    let mut text = String::new();
+    let (width, height) = (WIDTH, plot.height());
+    let steps = (width * SVG_SCALE, height * SVG_SCALE);
+    {
+        let area = SVGBackend::with_string(&mut text, steps).into_drawing_area();
+        plot.draw(&area, SVG_SCALE)?;
+        area.present().map_err(drawing)?;
+    }
+    // The library takes steps for pixels; its `viewBox` stays.
+    let size = |(width, height): (u32, u32)| format!("width=\"{width}\" height=\"{height}\"");
+    Ok(plot.finish(text.replacen(&size(steps), &size((width, height)), 1)))
+}
+
+/// A picture as PNG, with [`PNG_SCALE`] pixels for each unit.
+///
+/// # Errors
+/// [`PlotError`].
+pub fn png(plot: &impl Plot) -> Result<Vec<u8>, PlotError> {
+    load_font()?;
+    // The library encodes to files only.
+    let scratch = Scratch::new().map_err(io("create a folder in", &std::env::temp_dir()))?;
+    let path = scratch.path().join("picture.png");
+    let area = BitMapBackend::new(&path, (WIDTH * PNG_SCALE, plot.height() * PNG_SCALE)).into_drawing_area();
+    plot.draw(&area, PNG_SCALE)?;
+    area.present().map_err(drawing)?;
+    Ok(files::read(&path)?)
+}
+
+/// Writes a picture as SVG and as PNG, each in one piece: `path` with these endings.
+///
+/// # Errors
+/// [`PlotError`].
+pub fn save(plot: &impl Plot, path: &Path) -> Result<(), PlotError> {
+    for (ending, content) in [("svg", svg(plot)?.into_bytes()), ("png", png(plot)?)] {
+        write_atomically(&path.with_added_extension(ending), &content)?;
+    }
+    Ok(())
+}
+
+/// Makes the font known to the library, once.
+pub fn load_font() -> Result<(), PlotError> {
+    static LOADED: OnceLock<bool> = OnceLock::new();
+    let loaded = LOADED.get_or_init(|| register_font(FAMILY, FontStyle::Normal, FONT).is_ok());
+    if *loaded { Ok(()) } else { Err(PlotError::Draw("the font is damaged".into())) }
+}
+
+/// What a backend of the plotting library refused.
+pub fn drawing(error: impl std::fmt::Display) -> PlotError {
+    PlotError::Draw(error.to_string())
+}
+
+#[cfg(test)]
+mod tests;

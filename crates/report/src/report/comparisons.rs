@@ -1,0 +1,190 @@
+//! Each two methods compared: by runs of the same seed in the same environments.
+
+use perturb_experiment::{MethodResults, scores};
+use perturb_records::Metric;
+use perturb_records::statistics::{Bootstrapped, holm, mean, probability_of_improvement, sign_flip_p};
+use perturb_settings::Method;
+use perturb_text::Table;
+
+use super::columns::MethodColumns;
+use super::scope::Scope;
+use super::{MISSING, Report};
+
+/// Resamples of a bootstrap; there are hundreds of comparisons, of two numbers each.
+const RESAMPLES: usize = 10_000;
+/// Of fewer runs nothing can be said about other runs.
+const LEAST_RUNS: usize = 2;
+/// What stands for all environments together.
+const ALL: &str = "all";
+
+/// Two methods by a metric, over the runs that both have in each of the environments.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Comparison {
+    /// Its name, or [`ALL`].
+    environment: String,
+    x: Method,
+    y: Method,
+    metric: Metric,
+    /// Of x less y, percentage points, mean over environments and runs.
+    difference: Bootstrapped,
+    /// The probability that a run of x is better than one of y.
+    improvement: Bootstrapped,
+    pairs: usize,
+    p: f64,
+    /// Corrected for all comparisons of the same environment.
+    corrected: f64,
+}
+
+/// All comparisons over all environments, then, if there are several, those in each of them.
+pub(super) fn comparisons(scope: &Scope<'_>, selections: &[MethodResults<'_>]) -> Vec<Comparison> {
+    let environments = &scope.averaged;
+    if let [environment] = environments[..] {
+        return of(scope, selections, environment, &[environment]);
+    }
+    let each = environments.iter().flat_map(|environment| of(scope, selections, environment, &[environment]));
+    of(scope, selections, ALL, environments).into_iter().chain(each).collect()
+}
+
+/// The family of comparisons over some environments. Reference lines are not in it: each would cost the others' p-values; nor
+/// are agents that were trained elsewhere, whose runs have no seeds in common with others.
+fn of(scope: &Scope<'_>, selections: &[MethodResults<'_>], name: &str, environments: &[&str]) -> Vec<Comparison> {
+    let mut methods = scope.methods.clone();
+    methods.retain(|method| !method.is_reference() && !method.elsewhere);
+    let found = |method: &Method| -> Option<Vec<&MethodResults<'_>>> {
+        let of = |environment| selections.iter().find(|of| of.environment == environment && of.method == *method);
+        environments.iter().map(|environment| of(*environment)).collect()
+    };
+    let mut family = Vec::new();
+    for (index, x) in methods.iter().enumerate() {
+        for y in &methods[index + 1..] {
+            let (Some(of_x), Some(of_y)) = (found(x), found(y)) else { continue };
+            let both = [of_x, of_y].concat();
+            let compared = |metric| compare(name, [x, y], metric, &scores(&both, metric));
+            family.extend(Metric::ALL.into_iter().filter_map(compared));
+        }
+    }
+    let corrected = holm(&family.iter().map(|comparison| comparison.p).collect::<Vec<_>>());
+    family.iter_mut().zip(corrected).for_each(|(comparison, corrected)| comparison.corrected = corrected);
+    family
+}
+
+/// `scores` are those of x in each environment, then those of y.
+fn compare(environment: &str, [x, y]: [&Method; 2], metric: Metric, scores: &[Vec<f64>]) -> Option<Comparison> {
+    let (of_x, of_y) = scores.split_at(scores.len() / 2);
+    let difference = |(x, y): (&Vec<f64>, &Vec<f64>)| x.iter().zip(y).map(|(x, y)| x - y).collect();
+    let differences: Vec<Vec<f64>> = of_x.iter().zip(of_y).map(difference).collect();
+    let pairs = differences.concat();
+    if differences.first()?.len() < LEAST_RUNS {
+        return None;
+    }
+    let improvement = |strata: &[Vec<f64>]| {
+        let (x, y) = strata.split_at(strata.len() / 2);
+        probability_of_improvement(x, y)
+    };
+    let p = sign_flip_p(&pairs, 1);
+    Some(Comparison {
+        environment: environment.into(),
+        x: x.clone(),
+        y: y.clone(),
+        metric,
+        difference: Bootstrapped::of(&differences, RESAMPLES, 1, |strata| mean(strata.concat().into_iter()))?,
+        improvement: Bootstrapped::of(scores, RESAMPLES, 1, improvement)?,
+        pairs: pairs.len(),
+        p,
+        corrected: p,
+    })
+}
+
+impl Report<'_> {
+    /// Over all environments; `None` if there is nothing to compare.
+    pub(super) fn comparisons_table(&self) -> Option<Table> {
+        let first = self.comparisons.first()?;
+        let of_all = self.comparisons.chunk_by(|a, b| a.environment == b.environment).next()?;
+        let title = format!(
+            "Methods compared in pairs, {}: differences in percentage points and probabilities of improvement with 95 % \
+             stratified bootstrap intervals, p of sign flips, corrected after Holm for the {} comparisons",
+            if first.environment == ALL { "all environments" } else { &first.environment },
+            of_all.len()
+        );
+        let table = Table::of(title, of_all)
+            .text("X", |row| &row.x)
+            .text("Y", |row| &row.y)
+            .text("metric", |row| row.metric)
+            .number("X − Y", |row| row.difference)
+            .number("P(X > Y)", |row| format!("{:.2}", row.improvement))
+            .number("pairs", |row| row.pairs)
+            .number("p", |row| shown(row.p))
+            .number("corrected", |row| shown(row.corrected))
+            .build();
+        Some(table)
+    }
+
+    pub(super) fn comparisons_file(&self) -> Table {
+        let end = |number: &Bootstrapped, end: usize| {
+            number.interval_95.map(|interval| interval[end].to_string()).unwrap_or_default()
+        };
+        Table::of("comparisons.csv", &self.comparisons)
+            .text("environment", |row| &row.environment)
+            .method_as("x_", |row| &row.x)
+            .method_as("y_", |row| &row.y)
+            .text("metric", |row| row.metric)
+            .number("pairs", |row| row.pairs)
+            .number("difference", |row| row.difference.point)
+            .number("difference_low_95", move |row| end(&row.difference, 0))
+            .number("difference_high_95", move |row| end(&row.difference, 1))
+            .number("improvement", |row| row.improvement.point)
+            .number("improvement_low_95", move |row| end(&row.improvement, 0))
+            .number("improvement_high_95", move |row| end(&row.improvement, 1))
+            .number("p", |row| row.p)
+            .number("p_holm", |row| row.corrected)
+            .build()
+    }
+}
+
+/// A p-value, to three decimals.
+fn shown(p: f64) -> String {
+    if p < 0.0005 {
+        "< 0.001".into()
+    } else if p.is_nan() {
+        MISSING.into()
+    } else {
+        format!("{p:.3}")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn runs_of_the_same_seed_are_pairs() {
+        let plan = "environments = ['CartPole']\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff', 'rc']";
+        let methods = perturb_experiment::Plan::parse("test", plan.into()).unwrap().methods();
+        let compared = |scores: &[Vec<f64>]| compare(ALL, [&methods[0], &methods[1]], Metric::Default, scores);
+        // Two environments: x is better by 1 in each run, however far runs lie apart.
+        let [x, y] = [0.0, 1.0].map(|less| [10.0, 50.0, 90.0].map(|score| score - less).to_vec());
+        let comparison = compared(&[x.clone(), x.clone(), y.clone(), y]).unwrap();
+        assert_eq!((comparison.difference.point, comparison.difference.interval_95), (1.0, Some([1.0, 1.0])));
+        assert_eq!((comparison.pairs, comparison.p), (6, 2_f64.powi(-5)));
+        // Unpaired, a run is better than its own and those below it: 3 + 2 + 1 of 9.
+        assert!((comparison.improvement.point - 6.0 / 9.0).abs() < 1e-12);
+        assert_eq!(compared(&[vec![1.0], vec![2.0]]), None, "one run says nothing of others");
+    }
+
+    #[test]
+    fn a_reference_line_changes_no_comparison() {
+        let learners =
+            "environments = ['CartPole']\nruns = 3\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff', 'rc']";
+        let of = |text: String| {
+            let plan = perturb_experiment::Plan::parse("test", text).unwrap();
+            let rate =
+                |cell: &perturb_experiment::Cell| 10.0 * f64::from(cell.run) + cell.method().to_string().len() as f64;
+            let results = crate::fixture::results(&plan, |cell| Some(([rate(cell); 3], 1.0)));
+            let selections = results.select();
+            comparisons(&Scope::of(&plan, &selections), &selections)
+        };
+        let without = of(learners.into());
+        assert_eq!(without.len(), Metric::ALL.len());
+        assert_eq!(of(format!("{learners}\n[[algorithm]]\nname = 'random'\narchitectures = ['ff']")), without);
+    }
+}

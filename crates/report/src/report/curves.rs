@@ -1,0 +1,27 @@
+//! Training curves as lines of a file.
+
+use perturb_experiment::{EnvironmentCurves, Footing};
+use perturb_text::Table;
+
+use super::columns::MethodColumns;
+
+/// A line for each point.
+pub fn curves_table(all: &[EnvironmentCurves]) -> Table {
+    let curves = all.iter().flat_map(|of| of.curves.iter().map(|curve| (&of.environment, curve)));
+    let by = curves.flat_map(|(environment, curve)| Footing::ALL.map(|by| (environment, curve, by)));
+    let lines: Vec<_> = by
+        .flat_map(|(environment, curve, by)| curve.points(by).iter().map(move |point| (environment, curve, by, point)))
+        .collect();
+    Table::of("curves.csv", &lines)
+        .text("environment", |(environment, ..)| environment)
+        .method(|(_, curve, ..)| &curve.method)
+        .text("train", |(_, curve, ..)| curve.version)
+        .number("runs", |(.., point)| point.success.runs)
+        .text("by", |(_, _, by, _)| by)
+        .number("progress", |(.., point)| point.progress)
+        .number("return_mean", |(.., point)| point.episode_return.mean)
+        .number("return_std", |(.., point)| point.episode_return.std.unwrap_or_default())
+        .number("success_mean", |(.., point)| point.success.mean)
+        .number("success_std", |(.., point)| point.success.std.unwrap_or_default())
+        .build()
+}

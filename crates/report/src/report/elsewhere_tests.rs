@@ -1,0 +1,147 @@
+use perturb_experiment::Plan;
+use perturb_protocol::Version;
+use perturb_records::Assessed;
+
+use super::*;
+use crate::fixture;
+use crate::report::{Report, ReportError, Sources};
+
+const PLAN: &str = "environments = ['CartPole', 'Pendulum']\nruns = 2
+    [[algorithm]]\nname = 'ppo'\narchitectures = ['ff', 'rc']";
+
+/// What a report of `plan`'s results beside `assessed` says, by `of`.
+fn report<T>(plan: &Plan, assessed: &[Assessed], of: impl Fn(&Report<'_>) -> T) -> T {
+    let results = fixture::results(plan, |cell| Some(([f64::from(cell.run) + 90.0, 70.0, 50.0], 1.0)));
+    let mut selections = results.select();
+    let recorded = perturb_experiment::Recorded::of(&selections);
+    perturb_experiment::add_assessed(&mut selections, assessed);
+    of(&Report::new(&results, &selections, &recorded, &[]))
+}
+
+fn lines_of<'t>(text: &'t str, part: &str) -> Vec<&'t str> {
+    text.lines().filter(|line| line.contains(part)).collect()
+}
+
+#[test]
+fn an_agent_stands_in_the_tables_and_changes_no_other_row() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let agent = fixture::assessed("PPO", "CartPole", &[Some(Version::D), Some(Version::R)], [200, 190, 100]);
+    let without = report(&plan, &[], |report| report.markdown());
+    let with = report(&plan, &[agent], |report| report.markdown());
+    let cells = |text: &str| -> Vec<Vec<String>> {
+        let rows = text.lines().filter(|line| line.starts_with("| ppo"));
+        rows.map(|line| line.split('|').map(|cell| cell.trim().to_owned()).collect()).collect()
+    };
+    assert!(!cells(&without).is_empty());
+    assert_eq!(cells(&with), cells(&without));
+    let rows = lines_of(&with, "| PPO (trained elsewhere)");
+    // Metrics; Extrapolation; two scenarios of what it was trained on; the worst tenth of both.
+    assert_eq!(rows.len(), 1 + 1 + 2 + 2, "{rows:#?}");
+    let metrics: Vec<&str> = rows[0].split('|').map(str::trim).collect();
+    assert_eq!(metrics[2..5], ["100.0", "–", "–"], "the paper has no such method: {}", rows[0]);
+    assert_eq!(metrics[5], "50.0");
+    assert_eq!(metrics[11..13], ["1", "–"], "runs and cells: {}", rows[0]);
+    assert!(with.contains("1 agent was trained elsewhere"), "{with}");
+    let known = lines_of(&with, "PPO 01234567");
+    assert_eq!(known.len(), 2);
+    assert!(known[0].contains("100000") && known[0].contains("steps at least 195") && known[0].contains("mine"));
+}
+
+#[test]
+fn an_agent_whose_training_is_not_known_has_tests_but_no_scenario() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let agent = fixture::assessed("PPO", "Pendulum", &[None], [200, 190, 100]);
+    let text = report(&plan, &[agent], |report| report.markdown());
+    let rows = lines_of(&text, "PPO (trained elsewhere)");
+    // The worst tenth, and tests on D, R and E that are no scenario.
+    assert_eq!(rows.len(), 1 + 3, "{rows:#?}");
+    assert!(rows.iter().all(|row| row.contains("unknown")), "{rows:#?}");
+}
+
+#[test]
+fn what_only_a_later_run_was_trained_on_has_its_rows() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let agents = [&[Some(Version::D)][..], &[Some(Version::D), None]]
+        .map(|trained_on| fixture::assessed("PPO", "Pendulum", trained_on, [200, 190, 100]));
+    let text = report(&plan, &agents, |report| report.markdown());
+    let rows = lines_of(&text, "PPO (trained elsewhere)").into_iter().filter(|row| row.contains("unknown"));
+    // The worst tenth, and tests on D, R and E that are no scenario.
+    assert_eq!(rows.count(), 1 + 3, "{text}");
+}
+
+#[test]
+fn agents_are_averaged_where_they_have_all_environments_and_files_tell_them_apart() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let everywhere = ["CartPole", "Pendulum"]
+        .map(|name| fixture::assessed("PPO", name, &[Some(Version::D), Some(Version::R)], [200, 190, 100]));
+    let lines = |assessed: &[Assessed], file: &str| {
+        report(&plan, assessed, |report| {
+            let table = report.files().into_iter().find(|table| table.title == file).unwrap();
+            String::from_utf8(table.to_csv()).unwrap()
+        })
+    };
+    assert_eq!(lines_of(&lines(&everywhere[..1], "iqm.csv"), "PPO").len(), 0);
+    assert_eq!(lines_of(&lines(&everywhere, "iqm.csv"), "PPO,,,true,").len(), 3);
+    let further = [fixture::assessed("PPO", "Acrobot", &[Some(Version::D), Some(Version::R)], [100; 3])];
+    for file in ["iqm.csv", "profiles.csv"] {
+        let more = [&everywhere[..], &further].concat();
+        assert_eq!(lines(&more, file), lines(&everywhere, file), "averages are over the plan's environments");
+    }
+    let two_runs = [everywhere.clone(), everywhere].concat();
+    assert_eq!(lines_of(&lines(&two_runs, "iqm.csv"), "PPO,,,true,Default,2").len(), 1);
+    assert_eq!(lines_of(&lines(&two_runs, "comparisons.csv"), "PPO").len(), 0, "its runs have no seed in common");
+    let scenarios = lines(&two_runs[..1], "scenarios.csv");
+    assert_eq!(lines_of(&scenarios, "PPO,,,true,").len(), 6, "{scenarios}");
+    assert!(!lines(&[], "scenarios.csv").contains("elsewhere"), "files of experiments alone are as they were");
+}
+
+#[test]
+fn assessments_alone_have_a_page_with_their_curves_and_no_word_of_cells() {
+    let assessed = vec![fixture::assessed("P<PO", "CartPole", &[Some(Version::D)], [200, 190, 100])];
+    let page =
+        Sources { assessed, ..Sources::default() }.read(|whole| whole.page().map_err(ReportError::from)).unwrap();
+    for there in
+        ["P&lt;PO (trained elsewhere)", "id=\"scenarios\"", "id=\"elsewhere\"", "<svg", "Success over parameters"]
+    {
+        assert!(page.contains(there), "{there}");
+    }
+    for not_there in ["cells are done", "Selection:", "id=\"cells\"", "id=\"heatmaps\"", "id=\"curves\"", "P<PO"] {
+        assert!(!page.contains(not_there), "{not_there}");
+    }
+}
+
+#[test]
+fn a_folder_is_an_experiment_or_an_assessment() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut sources = Sources::default();
+    let refused = sources.add(directory.path()).unwrap_err().to_string();
+    assert!(refused.contains("neither an experiment"), "{refused}");
+    let agent = fixture::assessed("PPO", "CartPole", &[None], [200; 3]);
+    agent.write(&directory.path().join("agent"), false).unwrap();
+    sources.add(&directory.path().join("agent")).unwrap();
+    for name in ["one", "two"] {
+        let folder = perturb_experiment::Folder::new(&directory.path().join(name));
+        folder.keep_plan(&Plan::parse("test", PLAN.into()).unwrap()).unwrap();
+    }
+    sources.add(&directory.path().join("one")).unwrap();
+    assert_eq!((sources.assessed.len(), sources.folder.is_some()), (1, true));
+    let refused = sources.add(&directory.path().join("two")).unwrap_err().to_string();
+    assert!(refused.contains("are both experiments"), "{refused}");
+}
+
+#[test]
+fn another_revision_is_told() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let agent = fixture::assessed("PPO", "CartPole", &[None], [200; 3]);
+    assert!(!report(&plan, std::slice::from_ref(&agent), |report| report.text(usize::MAX)).contains("revision"));
+    let mut results = fixture::results(&plan, |_| Some(([90.0; 3], 1.0)));
+    for state in &mut results.states {
+        let perturb_experiment::CellState::Done(result) = state else { unreachable!("all are done") };
+        result.training.environment_revision = 2;
+    }
+    let assessed = [agent];
+    let mut selections = results.select();
+    perturb_experiment::add_assessed(&mut selections, &assessed);
+    let told = overview(&results, &selections);
+    assert!(told[1].contains("tested in revision 1 of CartPole, others in revision 2"), "{told:?}");
+}

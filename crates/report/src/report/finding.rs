@@ -1,0 +1,243 @@
+//! What an experiment found, as one figure: Default, Interpolation and Extrapolation with intervals, beside the paper's.
+
+use perturb_experiment::{Selection, distinct};
+use perturb_records::statistics::Bootstrapped;
+use perturb_records::{Metric, Scenario};
+use perturb_text::{Table, count};
+
+use super::columns::MethodColumns;
+use super::numbers::{AVERAGE, MethodMetrics, or_empty};
+use super::pictures::{Drawing, Picture};
+use super::{MISSING, Report};
+use crate::plot::intervals::{Group, IntervalRow};
+use crate::plot::{Intervals, panels};
+
+impl<'a> Report<'a> {
+    /// What the page opens with: all environments together; where nothing can be said of these, or there is one alone, each.
+    pub(super) fn finding_pictures(&self) -> Vec<Picture> {
+        self.opening_rows().into_iter().map(|rows| self.finding_picture(rows)).collect()
+    }
+
+    /// The same in words: a sentence or two for each picture.
+    pub(super) fn finding_sentences(&self) -> Vec<String> {
+        let rows = self.opening_rows().into_iter();
+        rows.filter_map(|rows| Some(format!("{}: {}", self.finding_of(rows), finding_sentence(rows)?))).collect()
+    }
+
+    /// Of each environment, where the page opens with all together.
+    pub(super) fn environment_pictures(&self) -> Vec<Picture> {
+        if !self.has_average() {
+            return Vec::new();
+        }
+        self.each_environment().map(|rows| self.finding_picture(rows)).collect()
+    }
+
+    fn opening_rows(&self) -> Vec<&[MethodMetrics<'a>]> {
+        if self.has_average() { vec![&self.averages] } else { self.each_environment().collect() }
+    }
+
+    fn has_average(&self) -> bool {
+        self.scope.averaged.len() > 1 && self.averages.iter().any(|row| !row.ours.is_empty())
+    }
+
+    fn each_environment(&self) -> impl Iterator<Item = &[MethodMetrics<'a>]> {
+        self.metrics.chunk_by(|a, b| a.environment == b.environment)
+    }
+
+    /// What rows are of: an environment, or the average of several.
+    fn finding_of(&self, rows: &[MethodMetrics<'_>]) -> String {
+        if rows[0].environment != AVERAGE {
+            return rows[0].environment.to_owned();
+        }
+        let environments = match self.scope.averaged.len() {
+            2 => listed(&self.scope.averaged),
+            several => count(several, "environment"),
+        };
+        format!("Average over {environments}")
+    }
+
+    /// Numbers of all environments together and of each, with their intervals.
+    pub(super) fn finding_file(&self) -> Table {
+        let averages = self.averages.iter().filter(|_| self.has_average());
+        finding_table("finding.csv", &averages.chain(&self.metrics).collect::<Vec<_>>())
+    }
+
+    fn finding_picture(&self, rows: &[MethodMetrics<'_>]) -> Picture {
+        let is_average = rows[0].environment == AVERAGE;
+        let of = self.finding_of(rows);
+        let file = if is_average { "finding".to_owned() } else { format!("{of}-finding") };
+        let over = if is_average { "environments and runs" } else { "runs" };
+        let of_rows = |has: &dyn Fn(&MethodMetrics<'_>) -> bool| rows.iter().any(has);
+        let intervals = match of_rows(&|row| row.means.values().any(|mean| mean.interval_95.is_some())) {
+            true if is_average => " with 95 % stratified bootstrap intervals",
+            true => " with 95 % bootstrap intervals",
+            false => "",
+        };
+        let papers = if of_rows(&|row| !row.papers.is_empty()) { ", beside the paper's means" } else { "" };
+        let conditional = match self.plan.selection {
+            Selection::Paper if !intervals.is_empty() && self.plan.selects() => {
+                " The intervals are those of the configurations that were selected, whatever else might have been."
+            }
+            _ => "",
+        };
+        let group = |metric: Metric| Group {
+            name: metric.to_string(),
+            rows: rows.iter().map(|row| self.finding_row(row, metric)).collect(),
+        };
+        let drawing = Intervals {
+            title: format!("{of}: where policies were trained, and elsewhere"),
+            x_name: "success rate, %".into(),
+            x: panels::RATES,
+            groups: Metric::ALL.map(group).into(),
+            legend: [
+                format!("mean over {over}"),
+                "95 % bootstrap interval of it".into(),
+                "the paper's mean, of five runs".into(),
+            ],
+            note: too_few(rows).unwrap_or_default(),
+        };
+        let said = too_few(rows).map(|few| format!(" {few}")).unwrap_or_default();
+        Picture {
+            environment: if is_average { String::new() } else { rows[0].environment.to_owned() },
+            name: format!("{of}: Default, Interpolation and Extrapolation of each method"),
+            caption: format!(
+                "{of}: Default, Interpolation and Extrapolation; means over {over}{intervals}{papers}.{said}{conditional}"
+            ),
+            data: finding_table(&format!("{file}.csv"), &rows.iter().collect::<Vec<_>>()),
+            file,
+            drawing: Drawing::Intervals(drawing),
+        }
+    }
+
+    fn finding_row(&self, row: &MethodMetrics<'_>, metric: Metric) -> IntervalRow {
+        IntervalRow {
+            name: row.method.to_string(),
+            index: panels::index_of(&self.scope.methods, &row.method),
+            point: row.means.get(&metric).map(|mean| mean.point),
+            interval: row.means.get(&metric).and_then(|mean| mean.interval_95),
+            other: row.papers.get(&metric).map(|paper| paper.mean),
+        }
+    }
+}
+
+/// Who extrapolates best, by how much, and what Extrapolation is beside Default; `None` if no method has it. Those whose
+/// numbers are written alike are first together, and none is best. A number of one run alone says so, and where
+/// there is one, nothing is called best. Of the random policy, which has learned nothing that could be lost, nothing is said.
+fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
+    let learned: Vec<_> = rows.iter().filter(|row| !row.method.is_random()).collect();
+    let mean = |row: &MethodMetrics<'_>, metric| row.means.get(&metric).copied();
+    let both = |row: &MethodMetrics<'_>| Some((mean(row, Metric::Default)?, mean(row, Metric::Extrapolation)?));
+    let mut ranked: Vec<_> =
+        learned.iter().filter_map(|row| both(row).map(|(default, its)| (*row, default, its))).collect();
+    ranked.sort_by(|(.., a), (.., b)| b.point.total_cmp(&a.point));
+    let &(best, default, extrapolation) = ranked.first()?;
+    let numbers = format!("Extrapolation of {} and Default of {}", shown(extrapolation), shown(default));
+    let zeros = zero_sentence(ranked.iter().filter(|(.., its)| its.point == 0.0).map(|(row, ..)| *row));
+    if ranked.len() == 1 {
+        return Some(format!("{} comes to {numbers}.{zeros}", best.method));
+    }
+    let written = |its: &Bootstrapped| format!("{:.1}", its.point);
+    let number = written(&extrapolation);
+    let (first, others) = ranked.split_at(ranked.partition_point(|(.., its)| written(its) == number));
+    let some_of_one_run = ranked.iter().any(|(.., its)| its.runs == 1);
+    let claimed = if some_of_one_run { "comes out first" } else { "generalises best" };
+    let found = match first {
+        _ if number == "0.0" => "none extrapolates: each has Extrapolation of 0.0 %".to_owned(),
+        [_] => format!("{} {claimed}, with {numbers}", best.method),
+        _ => format!(
+            "none {claimed}: {} come to the same Extrapolation, {}",
+            listed(&first.iter().map(|(row, ..)| row.method.to_string()).collect::<Vec<_>>()),
+            listed(&distinct(first.iter().map(|(.., its)| shown(*its)))),
+        ),
+    };
+    let next = others.first().map(|(row, _, its)| {
+        let lowest = first.iter().map(|(.., its)| Some(its.interval_95?[0])).reduce(|a, b| Some(a?.min(b?)));
+        let intervals = match (lowest.flatten(), its.interval_95) {
+            (Some(low), Some([_, high])) if high < low => ", and their intervals are apart",
+            (Some(_), Some(_)) => ", and their intervals overlap",
+            _ => "",
+        };
+        format!("; next is {}, with Extrapolation of {}{intervals}", row.method, shown(*its))
+    });
+    let of = if ranked.len() < learned.len() { format!(" of {}", learned.len()) } else { String::new() };
+    let differences: Vec<f64> = ranked.iter().map(|(_, default, its)| rounded(its.point - default.point)).collect();
+    let [least, most] = [f64::min, f64::max].map(|of| differences.iter().copied().reduce(of).unwrap_or_default());
+    Some(format!(
+        "of {}{of} methods {found}{}. Extrapolation less Default is {least:+.1} to {most:+.1} points.{zeros}",
+        ranked.len(),
+        next.unwrap_or_default(),
+    ))
+}
+
+/// Whose Extrapolation is 0 although it has successes elsewhere, and by what; empty if it is so of none.
+fn zero_sentence<'a, 'm: 'a>(rows: impl Iterator<Item = &'a MethodMetrics<'m>>) -> String {
+    let by = |row: &MethodMetrics<'_>| {
+        let zeros: Vec<String> = row.zeros.iter().map(Scenario::to_string).collect();
+        format!("for {} {}", row.method, listed(&zeros))
+    };
+    let methods: Vec<String> = rows.filter(|row| !row.zeros.is_empty()).map(by).collect();
+    if methods.is_empty() {
+        return String::new();
+    }
+    format!(" Extrapolation is a geometric mean, and 0 in a run where one of its three is: {}.", methods.join(", "))
+}
+
+fn shown(mean: Bootstrapped) -> String {
+    match mean.interval_95 {
+        Some([low, high]) => format!("{:.1} % [{:.1}, {:.1}]", mean.point, low + 0.0, high + 0.0), // no negative zero
+        None if mean.runs == 1 => format!("{:.1} % (1 run)", mean.point),
+        None => format!("{:.1} %", mean.point),
+    }
+}
+
+/// As it is shown, without a negative zero.
+fn rounded(points: f64) -> f64 {
+    (10.0 * points).round() / 10.0 + 0.0
+}
+
+fn finding_table(name: &str, rows: &[&MethodMetrics<'_>]) -> Table {
+    let lines: Vec<_> = rows.iter().flat_map(|row| Metric::ALL.map(|metric| (*row, metric))).collect();
+    let mean = |(row, metric): &(&MethodMetrics<'_>, Metric)| row.means.get(metric).copied();
+    let end = move |line: &(&MethodMetrics<'_>, Metric), which: usize| {
+        or_empty(mean(line).and_then(|mean| Some(mean.interval_95?[which])))
+    };
+    Table::of(name, &lines)
+        .text("environment", |(row, _)| row.environment)
+        .method(|(row, _)| &row.method)
+        .text("metric", |(_, metric)| metric)
+        .number("runs", move |line| mean(line).map_or(0, |mean| mean.runs))
+        .number("mean", move |line| or_empty(mean(line).map(|mean| mean.point)))
+        .number("low_95", move |line| end(line, 0))
+        .number("high_95", move |line| end(line, 1))
+        .number("paper_mean", |(row, metric)| or_empty(row.papers.get(metric).map(|paper| paper.mean)))
+        .build()
+}
+
+/// Which numbers have no interval; `None` if all have.
+fn too_few(rows: &[MethodMetrics<'_>]) -> Option<String> {
+    let all: Vec<&Bootstrapped> = rows.iter().flat_map(|row| row.means.values()).collect();
+    let without: Vec<_> = all.iter().filter(|mean| mean.interval_95.is_none()).collect();
+    let runs = distinct(without.iter().map(|mean| mean.runs)).into_iter().map(|runs| count(runs, "run"));
+    let runs = listed(&runs.collect::<Vec<_>>());
+    match without.len() {
+        0 => None,
+        some if some == all.len() => Some(format!("No intervals: too few seeds ({runs}).")),
+        _ => Some(format!("Where there is no interval: too few seeds ({runs}).")),
+    }
+}
+
+/// As a sentence has them.
+pub(super) fn listed(names: &[impl AsRef<str>]) -> String {
+    match names {
+        [] => MISSING.to_owned(),
+        [one] => one.as_ref().to_owned(),
+        [before @ .., last] => {
+            let before: Vec<&str> = before.iter().map(AsRef::as_ref).collect();
+            format!("{} and {}", before.join(", "), last.as_ref())
+        }
+    }
+}
+
+#[cfg(test)]
+#[path = "finding_tests.rs"]
+mod tests;

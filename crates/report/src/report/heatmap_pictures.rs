@@ -1,0 +1,328 @@
+//! Pictures of heatmaps, of an experiment and of agents that were trained elsewhere: one for each environment, pair of
+//! parameters, and method.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
+use std::path::Path;
+
+use perturb_experiment::{
+    Folder, FolderError, HeatmapPlace, HeatmapRecord, MethodResults, NoHeatmap, Reported, distinct, heatmap_kinds,
+    heatmap_places,
+};
+use perturb_files::{delete, list, write_atomically};
+use perturb_records::{Heatmap, HeatmapKind, HeatmapPoint, TrainedOn};
+use perturb_settings::Method;
+use perturb_text::{Table, count};
+
+use super::figure::{Figure, FigureData};
+use super::pictures::file_name;
+use crate::plot::{HeatmapColumn, HeatmapPanels, PlotError, common_returns, save, svg};
+
+/// What a method's policies do over two parameters: a column for each thing that they were trained on, the mean over runs.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HeatmapPicture {
+    /// The environment's name.
+    pub environment: String,
+    /// What its files are called, without their endings.
+    pub file: String,
+    /// A few words for those who do not see it.
+    pub name: String,
+    /// What it shows, or why it is missing.
+    pub caption: String,
+    /// `None` if nothing is there.
+    pub panels: Option<HeatmapPanels>,
+    /// What is shown, as `FILE.csv`.
+    pub figures: Table,
+    /// Heatmaps that it could be of.
+    pub wanted: usize,
+    /// Why others of these are not there.
+    pub missing: Vec<NoHeatmap>,
+}
+
+/// A picture in the making: its scale is that of all of its environment.
+struct Draft<'a> {
+    environment: &'a str,
+    method: &'a Method,
+    kind: Option<&'a HeatmapKind>,
+    columns: Vec<Column<'a>>,
+}
+
+/// The policies that were trained on the same.
+struct Column<'a> {
+    trained_on: TrainedOn<'a>,
+    /// Policies that there are, with a heatmap or without.
+    policies: usize,
+    origins: Vec<Origin>,
+    missing: Vec<(u32, NoHeatmap)>,
+    mean: Option<Heatmap>,
+}
+
+/// A policy's heatmap, or why there is none.
+#[derive(Clone)]
+struct Shown<'a> {
+    trained_on: TrainedOn<'a>,
+    run: u32,
+    content: Result<(Heatmap, Origin), NoHeatmap>,
+}
+
+/// How a heatmap was made.
+#[derive(Clone)]
+struct Origin {
+    seed: u64,
+    /// Of the program; `None` if that is not known.
+    commit: Option<String>,
+}
+
+/// Those of the cells that belong to `selections`, which are in `folder`, and of the agents among them that were trained
+/// elsewhere; without pictures where cells have none.
+///
+/// # Errors
+/// [`FolderError`] if a file is there that cannot be read.
+pub fn heatmap_pictures(
+    selections: &[MethodResults<'_>],
+    folder: Option<&Folder>,
+) -> Result<Vec<HeatmapPicture>, FolderError> {
+    let places = heatmap_places(selections);
+    let of_cells = folder.map_or_else(|| Ok(BTreeMap::new()), |folder| heatmap_kinds(folder, &places))?;
+    let mut pictures = Vec::new();
+    for rows in selections.chunk_by(|a, b| a.environment == b.environment) {
+        let environment = rows[0].environment;
+        let places: Vec<_> = places.iter().filter(|place| place.environment == environment).collect();
+        let elsewhere: Vec<_> = rows.iter().map(|row| (&row.method, shown_elsewhere(row))).collect();
+        let kinds_elsewhere = elsewhere.iter().flat_map(|(_, shown)| shown.iter().map(|(kind, _)| kind));
+        let kinds: BTreeSet<&HeatmapKind> =
+            of_cells.get(environment).into_iter().flatten().chain(kinds_elsewhere).collect();
+        let mut kinds: Vec<Option<&HeatmapKind>> = kinds.into_iter().map(Some).collect();
+        if kinds.is_empty() {
+            kinds.push(None);
+        }
+        let mut drafts = Vec::new();
+        for kind in kinds {
+            for places in places.chunk_by(|a, b| a.method == b.method) {
+                let shown = places.iter().map(|place| shown(place, folder, kind)).collect::<Result<Vec<_>, _>>()?;
+                drafts.push(Draft::of((environment, places[0].method), kind, shown));
+            }
+            for (method, shown) in &elsewhere {
+                let shown = shown.iter().filter(|(of, _)| Some(of) == kind).map(|(_, shown)| shown.clone());
+                drafts.push(Draft::of((environment, method), kind, shown.collect()));
+            }
+        }
+        drafts.retain(|draft| !draft.columns.is_empty());
+        let means = drafts.iter().flat_map(|draft| &draft.columns).filter_map(|column| column.mean.as_ref());
+        let returns = common_returns(environment, means);
+        pictures.extend(drafts.iter().map(|draft| draft.picture(&returns)));
+    }
+    Ok(pictures)
+}
+
+/// The heatmap of a cell.
+fn shown<'a>(
+    place: &HeatmapPlace<'a>,
+    folder: Option<&Folder>,
+    kind: Option<&HeatmapKind>,
+) -> Result<Shown<'a>, FolderError> {
+    let read = match folder.zip(kind) {
+        Some((folder, kind)) => place.read(folder, kind)?,
+        None => Err(if place.selected.is_some() { NoHeatmap::NotMade } else { NoHeatmap::NoResult }),
+    };
+    let origin = |record: HeatmapRecord| Origin { seed: record.options.seed, commit: Some(record.commit) };
+    let content = read.map(|stored| (stored.heatmap, origin(stored.record)));
+    Ok(Shown { trained_on: place.trained_on, run: place.run, content })
+}
+
+/// The heatmaps of an agent that was trained elsewhere, in the order of cells' ones; of a row of cells none.
+fn shown_elsewhere<'a>(row: &MethodResults<'a>) -> Vec<(HeatmapKind, Shown<'a>)> {
+    let mut all = Vec::new();
+    for (&run, of_run) in &row.runs {
+        for (&trained_on, reported) in &of_run.0 {
+            let Some(Reported::Elsewhere(_, policy)) = reported else { continue };
+            let Some(heatmap) = Heatmap::recorded(&policy.records) else { continue };
+            let origin = Origin { seed: policy.known.seed, commit: None };
+            all.push((heatmap.kind(), Shown { trained_on, run, content: Ok((heatmap, origin)) }));
+        }
+    }
+    all.sort_by_key(|(_, shown)| (shown.trained_on, shown.run));
+    all
+}
+
+impl<'a> Draft<'a> {
+    /// Of policies in the order of what they were trained on.
+    fn of((environment, method): (&'a str, &'a Method), kind: Option<&'a HeatmapKind>, shown: Vec<Shown<'a>>) -> Self {
+        let mut columns: Vec<Column<'a>> = Vec::new();
+        // All of a picture have the points of its first.
+        let mut first: Option<Heatmap> = None;
+        for shown in shown.chunk_by(|a, b| a.trained_on == b.trained_on) {
+            let (trained_on, policies) = (shown[0].trained_on, shown.len());
+            let (mut origins, mut missing, mut heatmaps) = (Vec::new(), Vec::new(), Vec::new());
+            for Shown { run, content, .. } in shown.iter().cloned() {
+                match content {
+                    Ok((heatmap, origin)) => {
+                        let alike = [first.get_or_insert_with(|| heatmap.clone()).clone(), heatmap.clone()];
+                        if Heatmap::mean(&alike).is_some() {
+                            origins.push(origin);
+                            heatmaps.push(heatmap);
+                        } else {
+                            missing.push((run, NoHeatmap::NotAlike));
+                        }
+                    }
+                    Err(why) => missing.push((run, why)),
+                }
+            }
+            columns.push(Column { trained_on, policies, origins, missing, mean: Heatmap::mean(&heatmaps) });
+        }
+        Self { environment, method, kind, columns }
+    }
+
+    fn picture(&self, returns: &Range<f64>) -> HeatmapPicture {
+        let Self { environment, method, kind, columns } = self;
+        let over = kind.map_or_else(String::new, |kind| {
+            let HeatmapKind { parameters: [x, y], base } = kind;
+            let drawn = if *base == perturb_protocol::Version::D {
+                String::new()
+            } else {
+                format!(", the others drawn from {base}")
+            };
+            format!(" over {x} and {y}{drawn}")
+        });
+        let of = format!("{environment}, {method}: mean return and success{over}");
+        let first = columns.iter().find_map(|column| column.mean.as_ref());
+        let tested = first.map(|Heatmap { grid, episodes, .. }| {
+            format!("{grid} × {grid} points of {}", count(*episodes as usize, "episode"))
+        });
+        let panels = first.zip(tested.as_ref()).map(|(heatmap, tested)| HeatmapPanels {
+            title: vec![format!("{environment}, {method}"), format!("{tested} of each policy; {}", heatmap.others())],
+            axes: heatmap.axes.clone(),
+            returns: returns.clone(),
+            columns: columns.iter().map(Column::panel).collect(),
+        });
+        HeatmapPicture {
+            environment: (*environment).to_owned(),
+            file: kind.map_or_else(String::new, |kind| format!("{environment}-{}-heatmap-{kind}", file_name(method))),
+            caption: tested.map_or_else(|| format!("{of}: {}.", self.why()), |tested| self.caption(&of, &tested)),
+            name: of,
+            panels,
+            figures: self.figures(),
+            wanted: columns.iter().map(|column| column.policies).sum(),
+            missing: columns.iter().flat_map(|column| column.missing.iter().map(|(_, why)| *why)).collect(),
+        }
+    }
+
+    /// Why nothing is there.
+    fn why(&self) -> String {
+        said(self.columns.iter().flat_map(|column| &column.missing))
+    }
+
+    fn caption(&self, of: &str, tested: &str) -> String {
+        let origins = || self.columns.iter().flat_map(|column| &column.origins);
+        let seeds: BTreeSet<u64> = origins().map(|origin| origin.seed).collect();
+        let commits: BTreeSet<&str> = origins().filter_map(|origin| origin.commit.as_deref()).collect();
+        let columns: Vec<String> = self.columns.iter().map(Column::told).collect();
+        format!(
+            "{of}. Means over runs: {}. {tested} of each policy, test {} {}.{}",
+            columns.join("; "),
+            if seeds.len() == 1 { "seed" } else { "seeds" },
+            listed(seeds),
+            if commits.is_empty() { String::new() } else { format!(" perturb {}.", listed(commits)) }
+        )
+    }
+
+    /// A line for each column and point.
+    fn figures(&self) -> Table {
+        let of_column = |column: &'_ Column<'a>| {
+            let (trained_on, runs) = (column.trained_on.to_string(), column.origins.len());
+            let points = column.mean.iter().flat_map(|mean| mean.points.clone());
+            points.map(move |point| (trained_on.clone(), runs, point)).collect::<Vec<_>>()
+        };
+        let lines: Vec<(String, usize, HeatmapPoint)> = self.columns.iter().flat_map(of_column).collect();
+        let [x, y] = self.kind.map_or_else(Default::default, |kind| kind.parameters.clone());
+        Table::of(self.environment, &lines)
+            .text("train", |(trained_on, ..)| trained_on)
+            .number("runs", |(_, runs, _)| runs)
+            .number(x, |(.., point)| point.x)
+            .number(y, |(.., point)| point.y)
+            .number("mean_return", |(.., point)| point.mean_return)
+            .number("success_percent", |(.., point)| point.success_percent)
+            .build()
+    }
+}
+
+impl Column<'_> {
+    fn panel(&self) -> HeatmapColumn {
+        let content = self.mean.clone().ok_or_else(|| said(self.missing.iter()));
+        HeatmapColumn { caption: format!("trained on {}, {}", self.trained_on, self.runs()), content }
+    }
+
+    /// How many runs are there.
+    fn runs(&self) -> String {
+        match (self.origins.len(), self.policies) {
+            (there, all) if there == all => count(all, "run"),
+            (there, all) => format!("{there} of {}", count(all, "run")),
+        }
+    }
+
+    fn told(&self) -> String {
+        let told = format!("{} trained on {}", self.runs(), self.trained_on);
+        let why = |(run, why): &(u32, NoHeatmap)| format!("run {run}: {why}");
+        match self.missing.iter().map(why).collect::<Vec<_>>() {
+            missing if missing.is_empty() => told,
+            missing => format!("{told} ({})", missing.join(", ")),
+        }
+    }
+}
+
+impl HeatmapPicture {
+    /// As the page shows it.
+    pub(super) fn figure(&self) -> Result<Figure, PlotError> {
+        let Self { environment, file, name, caption, panels, figures, .. } = self.clone();
+        let picture = match panels {
+            Some(panels) => FigureData::Svg { svg: svg(&panels)?, csv: figures.to_csv() },
+            None => FigureData::Missing,
+        };
+        Ok(Figure { environment, file, name, caption, picture })
+    }
+
+    /// Writes it into the folder `out` as SVG, PNG and CSV; whether there is something to write.
+    ///
+    /// # Errors
+    /// [`PlotError`].
+    fn save(&self, out: &Path) -> Result<bool, PlotError> {
+        let Some(panels) = &self.panels else { return Ok(false) };
+        save(panels, &out.join(&self.file))?;
+        write_atomically(&out.join(format!("{}.csv", self.file)), &self.figures.to_csv())?;
+        Ok(true)
+    }
+}
+
+/// Writes `pictures` into the folder `out`, and deletes those that it has of heatmaps that are gone; the names, without
+/// endings, of what was written.
+///
+/// # Errors
+/// [`PlotError`].
+pub fn save_heatmaps<'a>(pictures: &'a [HeatmapPicture], out: &Path) -> Result<Vec<&'a str>, PlotError> {
+    let mut written = Vec::new();
+    for picture in pictures {
+        if picture.save(out)? {
+            written.push(picture.file.as_str());
+        }
+    }
+    for path in list(out)? {
+        let name = path.file_stem().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        if name.contains("-heatmap-") && !written.contains(&name.as_str()) {
+            delete(&path)?;
+        }
+    }
+    Ok(written)
+}
+
+/// Reasons, each once.
+fn said<'a>(missing: impl Iterator<Item = &'a (u32, NoHeatmap)>) -> String {
+    distinct(missing.map(|(_, why)| why.to_string())).join("; ")
+}
+
+fn listed(items: impl IntoIterator<Item = impl ToString>) -> String {
+    items.into_iter().map(|item| item.to_string()).collect::<Vec<_>>().join(", ")
+}
+
+#[cfg(test)]
+#[path = "heatmap_pictures_tests.rs"]
+mod tests;

@@ -1,0 +1,222 @@
+use perturb_experiment::{Cell, Plan, add_assessed, store_heatmap};
+use perturb_protocol::Version;
+use perturb_records::{Assessed, AssessedPolicy, HeatmapOptions, RecordedTest};
+use perturb_settings::sets::{Context, Contexts, TestSet};
+
+use super::*;
+use crate::fixture;
+
+const PLAN: &str = "environments = ['Pendulum', 'Elsewhere']\nruns = 2
+    [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+
+/// A folder in which everything has a result, whose heatmaps are those that `heatmap` makes of a cell.
+fn folder(plan: &Plan, heatmap: impl Fn(&Cell) -> Option<Heatmap>) -> tempfile::TempDir {
+    let directory = tempfile::tempdir().unwrap();
+    let folder = Folder::new(directory.path());
+    for cell in &plan.cells {
+        write_atomically(&folder.cell(&cell.id).path().join("result.json"), b"{}").unwrap();
+        if let Some(heatmap) = heatmap(cell) {
+            store(&folder, cell, &heatmap);
+        }
+    }
+    directory
+}
+
+fn store(folder: &Folder, cell: &Cell, heatmap: &Heatmap) {
+    let Heatmap { axes, base, grid, episodes, fixed, .. } = heatmap.clone();
+    let (parameters, seed) = (axes.map(|axis| axis.name), cell.config.common.seed);
+    let options = HeatmapOptions { parameters, base, grid, episodes, seed, fixed };
+    store_heatmap(folder, cell, "1".into(), options, heatmap).unwrap();
+}
+
+fn pictures(plan: &Plan, folder: &Folder) -> Vec<HeatmapPicture> {
+    let results = fixture::results(plan, |_| Some(([0.0; 3], 0.0)));
+    heatmap_pictures(&results.select(), Some(folder)).unwrap()
+}
+
+fn is_of(cell: &Cell, environment: &str, algorithm: &str) -> bool {
+    (cell.config.common.environment.as_str(), cell.method().algorithm.as_str()) == (environment, algorithm)
+}
+
+/// Better on the side of what it was trained on, the second run by 40 points.
+fn trained(cell: &Cell) -> Heatmap {
+    let of_run = 20.0 * f64::from(cell.run * 2 - 1);
+    let reach = [0.3, 0.5, 0.9][cell.config.common.version as usize];
+    fixture::heatmap(6, |mass, length| {
+        let far = (mass - 1.0).hypot(length - 1.0);
+        let success = (100.0 - (far - reach).max(0.0) * 200.0 - of_run).clamp(0.0, 100.0);
+        (-1600.0 + 14.0 * success - 90.0 * mass, success)
+    })
+}
+
+#[test]
+fn a_picture_is_of_the_mean_over_runs_and_says_how_many() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    // Of A2C both runs on D, the first on R, nothing on E.
+    let version = |cell: &Cell| cell.config.common.version;
+    let is_there = |cell: &Cell| version(cell) == Version::D || (version(cell) == Version::R && cell.run == 1);
+    let made = |cell: &Cell| (is_of(cell, "Pendulum", "a2c") && is_there(cell)).then(|| trained(cell));
+    let directory = folder(&plan, made);
+    let pictures = pictures(&plan, &Folder::new(directory.path()));
+    assert_eq!(pictures.len(), 4, "of two environments and methods");
+    let picture = &pictures[0];
+    let panels = picture.panels.as_ref().unwrap();
+    let captions: Vec<&str> = panels.columns.iter().map(|column| column.caption.as_str()).collect();
+    assert_eq!(captions, ["trained on D, 2 runs", "trained on R, 1 of 2 runs", "trained on E, 0 of 2 runs"]);
+    let runs: Vec<Heatmap> = plan.cells.iter().filter_map(made).collect();
+    assert_eq!(
+        panels.columns[0].content.as_ref().unwrap(),
+        &Heatmap::mean(&[runs[0].clone(), runs[1].clone()]).unwrap()
+    );
+    assert_eq!(panels.columns[1].content.as_ref().unwrap(), &runs[2]);
+    assert_eq!(panels.columns[2].content, Err("the heatmap has not been made".into()));
+    assert_eq!(
+        picture.caption.replace(perturb_experiment::VERSION, "VERSION"),
+        "Pendulum, a2c ff: mean return and success over mass and length. Means over runs: 2 runs trained on D; 1 of 2 runs \
+         trained on R (run 2: the heatmap has not been made); 0 of 2 runs trained on E (run 1: the heatmap has not been \
+         made, run 2: the heatmap has not been made). 6 × 6 points of 20 episodes of each policy, test seeds 1, 2. perturb \
+         VERSION."
+    );
+    assert_eq!((picture.wanted, picture.missing.len()), (6, 3));
+    let csv = String::from_utf8(picture.figures.to_csv()).unwrap();
+    assert!(csv.starts_with("train,runs,mass,length,mean_return,success_percent\nD,2,0.5833333333333334,"), "{csv}");
+    assert_eq!((csv.lines().count(), csv.lines().filter(|line| line.starts_with("R,1,")).count()), (73, 36));
+
+    let nothing = &pictures[1];
+    assert_eq!((&nothing.panels, nothing.missing.len()), (&None, 6), "nothing of PPO");
+    assert_eq!(
+        nothing.caption,
+        "Pendulum, ppo ff: mean return and success over mass and length: the heatmap has not been made."
+    );
+    let out = tempfile::tempdir().unwrap();
+    let others = ["iqm.csv", "Pendulum-a2c-ff-heatmap-mass-length-R.svg"];
+    for name in others {
+        write_atomically(&out.path().join(name), b"").unwrap();
+    }
+    assert_eq!(save_heatmaps(&pictures, out.path()).unwrap(), ["Pendulum-a2c-ff-heatmap-mass-length"]);
+    let names = ["svg", "png", "csv"].map(|ending| format!("Pendulum-a2c-ff-heatmap-mass-length.{ending}"));
+    assert!(names.iter().all(|name| out.path().join(name).exists()));
+    assert!(out.path().join(others[0]).exists(), "not a heatmap's");
+    assert_eq!(std::fs::read_dir(out.path()).unwrap().count(), 4, "the picture of a heatmap that is gone is gone, too");
+    insta::with_settings!({ prepend_module_to_snapshot => false }, {
+        insta::assert_snapshot!("heatmap", svg(panels).unwrap());
+    });
+}
+
+#[test]
+fn returns_have_the_environments_scale_or_that_of_all_that_is_shown_of_another() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let of = |cell: &Cell| match cell.config.common.environment.as_str() {
+        "Pendulum" if cell.method().algorithm == "a2c" => -1600.0,
+        "Pendulum" => -200.0,
+        _ => 5.0,
+    };
+    let directory = folder(&plan, |cell| Some(fixture::heatmap(2, |mass, _| (of(cell) + mass, 0.0))));
+    let folder = Folder::new(directory.path());
+    // Over other parameters, of one of them.
+    let cell = plan.cells.iter().find(|cell| is_of(cell, "Pendulum", "ppo")).unwrap();
+    store(&folder, cell, &Heatmap { base: Version::R, ..fixture::heatmap(3, |_, _| (-9000.0, 0.0)) });
+    let pictures = pictures(&plan, &folder);
+    let scales: Vec<_> = pictures
+        .iter()
+        .filter_map(|picture| Some((picture.file.as_str(), picture.panels.as_ref()?.returns.clone())))
+        .collect();
+    let (pendulum, elsewhere) = (-1600.0..-200.0, 5.7..6.3);
+    assert_eq!(
+        scales,
+        [
+            ("Pendulum-a2c-ff-heatmap-mass-length", pendulum.clone()),
+            ("Pendulum-ppo-ff-heatmap-mass-length", pendulum.clone()),
+            ("Pendulum-ppo-ff-heatmap-mass-length-R", pendulum),
+            ("Elsewhere-a2c-ff-heatmap-mass-length", elsewhere.clone()),
+            ("Elsewhere-ppo-ff-heatmap-mass-length", elsewhere),
+        ]
+    );
+    let drawn = pictures.iter().find(|picture| picture.file == "Pendulum-ppo-ff-heatmap-mass-length-R").unwrap();
+    assert!(drawn.caption.contains("over mass and length, the others drawn from R."), "{}", drawn.caption);
+    assert!(drawn.panels.as_ref().unwrap().title[1].ends_with("other parameters drawn from R"));
+}
+
+#[test]
+fn only_heatmaps_of_the_same_points_and_as_many_episodes_are_in_a_mean() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let first = fixture::heatmap(2, |_, _| (0.0, 0.0));
+    for other in [fixture::heatmap(3, |_, _| (9.0, 9.0)), Heatmap { episodes: 5, ..first.clone() }] {
+        let directory = folder(&plan, |cell| Some(if cell.run == 1 { first.clone() } else { other.clone() }));
+        let pictures = pictures(&plan, &Folder::new(directory.path()));
+        let panels = pictures[0].panels.as_ref().unwrap();
+        assert!(panels.columns.iter().all(|column| column.content.as_ref() == Ok(&first)));
+        assert_eq!(pictures[0].missing, [NoHeatmap::NotAlike; 3]);
+        assert!(pictures[0].caption.contains("1 of 2 runs trained on E (run 2: the heatmap has another grid"));
+    }
+}
+
+#[test]
+fn of_an_experiment_without_heatmaps_it_is_said_why() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let directory = tempfile::tempdir().unwrap();
+    let folder = Folder::new(directory.path());
+    let results = fixture::results(&plan, |cell| is_of(cell, "Pendulum", "a2c").then_some(([0.0; 3], 0.0)));
+    let pictures = heatmap_pictures(&results.select(), Some(&folder)).unwrap();
+    let captions: Vec<&str> = pictures.iter().map(|picture| picture.caption.as_str()).collect();
+    assert_eq!(captions.len(), 4);
+    assert_eq!(captions[0], "Pendulum, a2c ff: mean return and success: the heatmap has not been made.");
+    assert!(
+        captions[1..].iter().all(|caption| caption.ends_with("no heatmap, since this training has no result yet."))
+    );
+    assert!(
+        pictures.iter().all(|picture| picture.panels.is_none() && picture.wanted == 6 && picture.missing.len() == 6)
+    );
+}
+
+/// An agent whose policies were tested over mass and length, four episodes a point: of each what it was trained on, and how
+/// many of the four were successes.
+fn agent(policies: &[(Version, u32)]) -> Assessed {
+    let trained_on: Vec<_> = policies.iter().map(|(version, _)| Some(*version)).collect();
+    let tested = fixture::assessed("pushes", "Pendulum", &trained_on, [1; 3]);
+    let with_heatmap = |(policy, (_, successes)): (&AssessedPolicy, &(Version, u32))| {
+        let axes = fixture::heatmap(2, |_, _| (0.0, 0.0)).axes;
+        let contexts = Contexts::Listed(Heatmap::contexts(&axes, 2, &Context::new()));
+        let set = TestSet { name: Heatmap::SET.into(), version: Version::D, contexts };
+        let mut records = policy.records.clone();
+        let episode = |index| fixture::episode(Heatmap::SET, index, 0.0, 1, index / 4 < *successes);
+        records.add(RecordedTest { set, seed: 9, axes: Some(axes) }, (0..16).map(episode).collect());
+        AssessedPolicy::new(policy.known.clone(), records)
+    };
+    let policies = tested.policies().iter().zip(policies).map(with_heatmap).collect();
+    Assessed::new(tested.name.clone(), tested.agent.clone(), policies).unwrap()
+}
+
+#[test]
+fn agents_that_were_trained_elsewhere_have_pictures_beside_cells_ones() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let directory = folder(&plan, |cell| is_of(cell, "Pendulum", "a2c").then(|| trained(cell)));
+    let results = fixture::results(&plan, |_| Some(([0.0; 3], 0.0)));
+    let assessed = [agent(&[(Version::D, 2), (Version::E, 3)]), agent(&[(Version::D, 4)])];
+    let mut selections = results.select();
+    let alone = heatmap_pictures(&selections, Some(&Folder::new(directory.path()))).unwrap();
+    add_assessed(&mut selections, &assessed);
+    let pictures = heatmap_pictures(&selections, Some(&Folder::new(directory.path()))).unwrap();
+    let (here, elsewhere): (Vec<_>, Vec<_>) = pictures.into_iter().partition(|it| !it.name.contains("pushes"));
+    assert_eq!(here, alone, "those of cells are the same");
+    assert_eq!(elsewhere.len(), 1);
+    let panels = elsewhere[0].panels.as_ref().unwrap();
+    let captions: Vec<&str> = panels.columns.iter().map(|column| column.caption.as_str()).collect();
+    assert_eq!(captions, ["trained on D, 2 runs", "trained on E, 1 run"]);
+    let success = |column: usize| panels.columns[column].content.as_ref().unwrap().points[0].success_percent;
+    assert_eq!((success(0), success(1)), (75.0, 75.0), "the mean over runs, and of one");
+    assert!(elsewhere[0].caption.contains("2 × 2 points of 4 episodes of each policy, test seed 1."));
+    assert!(!elsewhere[0].caption.contains("perturb"), "whose program it was is not known");
+
+    // By itself, without an experiment.
+    let mut selections = Vec::new();
+    add_assessed(&mut selections, &assessed);
+    assert_eq!(heatmap_pictures(&selections, None).unwrap(), elsewhere);
+    // What was tested on other sets has none.
+    let mut others = assessed[1].policies()[0].clone();
+    others.records.about.tests.iter_mut().for_each(|test| test.axes = None);
+    let others = [Assessed::new(String::new(), "other".into(), vec![others]).unwrap()];
+    let mut selections = Vec::new();
+    add_assessed(&mut selections, &others);
+    assert_eq!(heatmap_pictures(&selections, None).unwrap(), []);
+}

@@ -1,0 +1,200 @@
+//! The numbers of a report, beside the paper's.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use perturb_experiment::{MethodResults, Reselection, SelectedRun, average, interquartile, scores};
+use perturb_records::outcomes::Counted;
+use perturb_records::statistics::{Bootstrapped, Summary, are_enough, interquartile_mean, mean, optimality_gap};
+use perturb_records::{Metric, Scenario, TestResult, TrainedOn, paper};
+use perturb_settings::Method;
+
+use super::scope::{Scope, has_scenarios, version};
+
+/// Resamples of a bootstrap, as many as rliable takes.
+const RESAMPLES: usize = 50_000;
+/// Of one that selects anew, hundreds of times in each of them.
+const RESELECTIONS: usize = 10_000;
+/// Of the means that the page opens with, of each environment and of all.
+const MEANS: usize = 10_000;
+/// The best success rate, %, from which the optimality gap is.
+const BEST: f64 = 100.0;
+/// What stands for all environments together, here and in the paper.
+pub(super) const AVERAGE: &str = "Average";
+
+/// A method's metrics in an environment, or over all; a metric that is not known is not there.
+pub(super) struct MethodMetrics<'a> {
+    pub(super) environment: &'a str,
+    pub(super) method: Method,
+    pub(super) ours: BTreeMap<Metric, Summary>,
+    pub(super) papers: BTreeMap<Metric, Summary>,
+    /// Whether one can be compared with the other.
+    pub(super) comparable: bool,
+    /// The means of `ours` again, with intervals where there are enough runs for one.
+    pub(super) means: BTreeMap<Metric, Bootstrapped>,
+    /// Of the three that Extrapolation is the geometric mean of, those that alone make it 0 in a run.
+    pub(super) zeros: BTreeSet<Scenario>,
+    /// Of all environments only.
+    pub(super) iqms: BTreeMap<Metric, Bootstrapped>,
+    /// Likewise.
+    pub(super) gaps: BTreeMap<Metric, Bootstrapped>,
+    /// Both once more, with every selection made anew in each resample.
+    pub(super) reselected: BTreeMap<Metric, [Bootstrapped; 2]>,
+    pub(super) done: usize,
+    pub(super) cells: usize,
+}
+
+/// A test that the paper has no place for: of a policy that was trained on one of the plan's own sets, or on one.
+pub(super) struct SetTest<'a> {
+    pub(super) environment: &'a str,
+    pub(super) method: &'a Method,
+    pub(super) trained_on: TrainedOn<'a>,
+    pub(super) tested_on: &'a str,
+    pub(super) success: Option<Summary>,
+    pub(super) mean_return: Option<Summary>,
+}
+
+impl MethodMetrics<'_> {
+    /// Ours less the paper's, if that says something.
+    pub(super) fn difference(&self, metric: Metric) -> Option<f64> {
+        self.comparable.then_some(())?;
+        Some(self.ours.get(&metric)?.mean - self.papers.get(&metric)?.mean)
+    }
+
+    /// How many runs all metrics have.
+    pub(super) fn runs(&self) -> usize {
+        least(|metric| self.ours.get(&metric).map(|summary| summary.runs))
+    }
+
+    /// How many runs all interquartile means have.
+    pub(super) fn iqm_runs(&self) -> usize {
+        least(|metric| self.iqms.get(&metric).map(|iqm| iqm.runs))
+    }
+}
+
+/// Of each selection.
+pub(super) fn metrics<'a>(selections: &[MethodResults<'a>]) -> Vec<MethodMetrics<'a>> {
+    let of_selection = |selection: &MethodResults<'a>| MethodMetrics {
+        environment: selection.environment,
+        method: selection.method.clone(),
+        ours: known(|metric| selection.summary(metric)),
+        papers: known(|metric| paper::number(selection.environment, &selection.method, metric)),
+        comparable: paper::is_comparable(selection.environment),
+        means: known(|metric| mean_with_interval(&[selection], metric)),
+        zeros: zeros(&[selection]),
+        iqms: BTreeMap::new(),
+        gaps: BTreeMap::new(),
+        reselected: BTreeMap::new(),
+        done: selection.done,
+        cells: selection.cells,
+    };
+    selections.iter().filter(|row| has_scenarios(row)).map(of_selection).collect()
+}
+
+/// Averaged over the plan's environments.
+pub(super) fn averages<'a>(
+    scope: &Scope<'_>,
+    selections: &[MethodResults<'a>],
+    reselection: &Reselection<'a>,
+) -> Vec<MethodMetrics<'static>> {
+    let environments = &scope.averaged;
+    let is_everywhere = |method: &Method| {
+        let is_there = |name: &&str| selections.iter().any(|row| row.environment == *name && row.method == *method);
+        environments.iter().all(is_there)
+    };
+    let of_method = |method: Method| {
+        let is_averaged = |row: &&MethodResults<'_>| environments.contains(&row.environment);
+        let found: Vec<_> = selections.iter().filter(|row| row.method == method).filter(is_averaged).collect();
+        let everywhere = is_everywhere(&method);
+        let gap = |strata: &[Vec<f64>]| optimality_gap(strata, BEST);
+        let both = |strata: &[Vec<f64>]| vec![interquartile_mean(strata), gap(strata)];
+        let reselected = |metric| reselection.bootstrap(&found, metric, RESELECTIONS, both)?.try_into().ok();
+        let gap = |metric| Bootstrapped::of(&scores(&found, metric), RESAMPLES, 1, gap);
+        MethodMetrics {
+            environment: AVERAGE,
+            ours: known(|metric| average(&found, metric).filter(|_| everywhere)),
+            papers: known(|metric| paper::average(environments, &method, metric)),
+            comparable: environments.iter().all(|environment| paper::is_comparable(environment)),
+            means: known(|metric| mean_with_interval(&found, metric).filter(|_| everywhere)),
+            zeros: zeros(&found),
+            iqms: known(|metric| interquartile(&found, metric, RESAMPLES).filter(|_| everywhere)),
+            gaps: known(|metric| gap(metric).filter(|_| everywhere)),
+            reselected: known(|metric| reselected(metric).filter(|_| everywhere && !method.elsewhere)),
+            done: found.iter().map(|selection| selection.done).sum(),
+            cells: found.iter().map(|selection| selection.cells).sum(),
+            method,
+        }
+    };
+    // An agent that was tested in some environments has no average over all.
+    let methods = scope.methods.iter().filter(|method| !method.elsewhere || is_everywhere(method));
+    methods.cloned().map(of_method).collect()
+}
+
+/// In the order of `selections`, of what they were trained on, and of the plan's tests.
+pub(super) fn set_tests<'a>(scope: &Scope<'a>, selections: &'a [MethodResults<'a>]) -> Vec<SetTest<'a>> {
+    let mut tests = Vec::new();
+    for selection in selections {
+        // A run of an agent that was trained elsewhere may lack what another one has.
+        let trained: BTreeSet<TrainedOn<'a>> = selection.runs.values().flat_map(|run| run.0.keys().copied()).collect();
+        for trained_on in trained {
+            let is_of_set = !matches!(trained_on, TrainedOn::Version(_));
+            let names = scope.tested_on.iter().filter(|name| is_of_set || version(name).is_none());
+            let is_wanted = |test: &SetTest<'_>| !test.method.elsewhere || test.success.is_some();
+            tests.extend(
+                names
+                    .map(|&tested_on| SetTest {
+                        environment: selection.environment,
+                        method: &selection.method,
+                        trained_on,
+                        tested_on,
+                        success: selection.test(trained_on, tested_on, |test| test.success_percent),
+                        mean_return: selection.test(trained_on, tested_on, |test| test.mean_return),
+                    })
+                    .filter(is_wanted),
+            );
+        }
+    }
+    tests
+}
+
+/// The test episodes of a scenario, of all runs together.
+pub(super) fn counted(selection: &MethodResults<'_>, Scenario { train, test }: Scenario) -> Counted {
+    let trained = selection.runs.values().filter_map(|run| run.trained_on(TrainedOn::Version(train)));
+    let tests = trained.filter_map(|selected| selected.test(&test.to_string()));
+    let of = |test: &TestResult| Counted {
+        successes: (test.success_percent * test.episodes as f64 / 100.0).round() as u64,
+        episodes: test.episodes,
+    };
+    tests.map(of).sum()
+}
+
+/// A field of a file.
+pub(super) fn or_empty(number: Option<impl ToString>) -> String {
+    number.map(|number| number.to_string()).unwrap_or_default()
+}
+
+fn known<T>(of: impl Fn(Metric) -> Option<T>) -> BTreeMap<Metric, T> {
+    Metric::ALL.into_iter().filter_map(|metric| Some((metric, of(metric)?))).collect()
+}
+
+/// Over environments and the runs that all of them have. A resample of few runs is too often the lowest or the highest of
+/// them alone for an interval to be more than these two.
+fn mean_with_interval(selections: &[&MethodResults<'_>], metric: Metric) -> Option<Bootstrapped> {
+    let strata = scores(selections, metric);
+    let mean = Bootstrapped::of(&strata, MEANS, 1, |strata| mean(strata.concat().into_iter()))?;
+    Some(Bootstrapped { interval_95: mean.interval_95.filter(|_| are_enough(&strata)), ..mean })
+}
+
+/// What has no success in a run where another of the three has.
+fn zeros(selections: &[&MethodResults<'_>]) -> BTreeSet<Scenario> {
+    let of_run = |run: &SelectedRun<'_>| {
+        let zero = |scenario: &Scenario| Some((*scenario, run.rate(*scenario)? == 0.0));
+        let three: Option<Vec<(Scenario, bool)>> = Metric::EXTRAPOLATION.iter().map(zero).collect();
+        let three = three.filter(|three| !three.iter().all(|(_, is_zero)| *is_zero)).unwrap_or_default();
+        three.into_iter().filter_map(|(scenario, is_zero)| is_zero.then_some(scenario))
+    };
+    selections.iter().flat_map(|selection| selection.runs.values()).flat_map(of_run).collect()
+}
+
+fn least(runs: impl Fn(Metric) -> Option<usize>) -> usize {
+    Metric::ALL.into_iter().map(|metric| runs(metric).unwrap_or(0)).min().unwrap_or(0)
+}

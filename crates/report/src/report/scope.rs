@@ -1,0 +1,51 @@
+//! What a report has rows and columns of: what its plan says, and agents that were trained elsewhere.
+
+use perturb_experiment::{MethodResults, Plan, distinct, elsewhere};
+use perturb_protocol::Version;
+use perturb_records::TrainedOn;
+use perturb_settings::Method;
+
+/// Environments, methods and tests of a report, in its order.
+#[derive(Clone, Debug)]
+pub(super) struct Scope<'a> {
+    /// Over which methods are averaged: the plan's; of a report without one all.
+    pub(super) averaged: Vec<&'a str>,
+    /// All that have rows.
+    pub(super) environments: Vec<&'a str>,
+    /// All that have rows.
+    pub(super) methods: Vec<Method>,
+    /// The names of what was tested on, versions first.
+    pub(super) tested_on: Vec<&'a str>,
+}
+
+impl<'a> Scope<'a> {
+    pub(super) fn of(plan: &'a Plan, selections: &[MethodResults<'a>]) -> Self {
+        let environments = distinct(selections.iter().map(|row| row.environment));
+        let averaged = if plan.cells.is_empty() { environments.clone() } else { plan.environments() };
+        let of_plan = plan.cells.iter().take(1).flat_map(|cell| &cell.tests.sets);
+        let assessed = elsewhere(selections);
+        let of_others = assessed.iter().flat_map(|(_, policy, _)| &policy.records.about.tests).map(|test| &test.set);
+        let mut tested_on = distinct(of_plan.chain(of_others).map(|set| set.name.as_str()));
+        tested_on.sort_by_key(|name| version(name).map_or(Version::KNOWN.len(), |version| version as usize));
+        Self { averaged, environments, methods: distinct(selections.iter().map(|row| row.method.clone())), tested_on }
+    }
+}
+
+/// The version of that name.
+pub(super) fn version(name: &str) -> Option<Version> {
+    Version::KNOWN.into_iter().find(|version| version.to_string() == name)
+}
+
+/// Whether a row has places among the scenarios: nobody knows what some agents were trained on.
+pub(super) fn has_scenarios(row: &MethodResults<'_>) -> bool {
+    !row.method.elsewhere || Version::KNOWN.into_iter().any(|version| is_trained_on(row, version))
+}
+
+/// Whether a row of tables of scenarios is wanted: of agents that were trained elsewhere what was trained on is all.
+pub(super) fn has_scenarios_of(row: &MethodResults<'_>, version: Version) -> bool {
+    !row.method.elsewhere || is_trained_on(row, version)
+}
+
+fn is_trained_on(row: &MethodResults<'_>, version: Version) -> bool {
+    row.runs.values().any(|run| run.0.contains_key(&TrainedOn::Version(version)))
+}

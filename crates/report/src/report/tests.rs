@@ -1,0 +1,377 @@
+use perturb_experiment::{CellState, Failure, Folder, MarkResult, SELECTION_TEST};
+use perturb_protocol::Version;
+use perturb_records::{Agreement, Difference, Metric, TestResult};
+use rstest::rstest;
+
+use super::*;
+use crate::fixture;
+
+const PLAN: &str = "
+environments = ['CartPole', 'Pendulum']
+runs = 2
+test_episodes = 50
+settings = { episodes = 300 }
+[[algorithm]]
+name = 'a2c'
+architectures = ['ff']
+[[algorithm]]
+name = 'rl2-ppo'
+architectures = ['rc']
+versions = ['D', 'R']
+";
+
+/// One method, which is trained on D and on a set of the plan, and tested on D, R, E and two sets.
+const SETS: &str = "
+environments = ['CartPole']
+versions = ['D', 'long']
+test_versions = ['D', 'R', 'E', 'long', 'corners']
+[sets.long]
+length = '0.7..0.8'
+[sets.corners]
+length = '0.1..1.0/2'
+[[algorithm]]
+name = 'ppo'
+architectures = ['ff']
+";
+
+/// The first run of A2C on D failed; RL²-PPO has nothing on Pendulum, nor a second run.
+fn results(plan: &Plan) -> Results<'_> {
+    let mut results = fixture::results(plan, |cell| {
+        let common = &cell.config.common;
+        let known = cell.config.settings.name() == "a2c" || (common.environment == "CartPole" && cell.run == 1);
+        let easier = match common.version {
+            Version::D => [90.0, 40.0, 20.0],
+            Version::R => [80.0, 70.0, 30.0],
+            Version::E | Version::RE => [33.3, 50.0, 60.0],
+        };
+        known.then(|| (easier.map(|rate| rate + f64::from(cell.run)), 1.0))
+    });
+    let (id, commit) = (plan.cells[0].id.clone(), String::new());
+    results.states[0] =
+        CellState::Failed(Failure { id, reason: "NaN in <loss> | after\n9 updates".into(), commit, begins_anew: true });
+    results
+}
+
+fn figures() -> Figures {
+    let drawn = || FigureData::Svg { svg: "<svg></svg>".into(), csv: "x,y\n1,2\n".into() };
+    let figure = |environment: &str, picture: FigureData| Figure {
+        environment: environment.into(),
+        file: format!("{environment}-return"),
+        name: format!("{environment}: return"),
+        caption: "Mean & deviation".into(),
+        picture,
+    };
+    Figures {
+        finding: vec![figure("", drawn())],
+        metrics: vec![figure("CartPole", drawn())],
+        profiles: vec![figure("", drawn())],
+        curves: vec![figure("CartPole", drawn())],
+        marks: Vec::new(),
+        no_curves: vec!["Pendulum: no training with a result has its monitor.csv.".into()],
+        heatmaps: vec![figure("CartPole", drawn()), figure("CartPole", FigureData::Missing)],
+        no_heatmaps: vec!["1 of 2. `perturb heatmap DIR` makes them.".into()],
+        ..Figures::default()
+    }
+}
+
+/// The name of a snapshot is that of its file, so that files can move with the module.
+#[rstest]
+#[case("text", |report: &Report<'_>| report.text(usize::MAX))]
+#[case("markdown", |report: &Report<'_>| report.markdown())]
+#[case("csv", |report: &Report<'_>| {
+    let lines = |table: Table| format!("{}\n{}", table.title, String::from_utf8(table.to_csv()).unwrap());
+    let files = report.files().into_iter().filter(|table| table.title != "profiles.csv"); // hundreds of lines
+    files.map(lines).collect::<Vec<_>>().join("\n")
+})]
+#[case("html", |report: &Report<'_>| html(report, &figures()).replace(html::STYLE, "").replace("><", ">\n<"))]
+fn a_report_has_all_its_numbers(#[case] name: &str, #[case] document: fn(&Report<'_>) -> String) {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let results = results(&plan);
+    let selections = results.select();
+    let recorded = Recorded::default();
+    let report = Report::new(&results, &selections, &recorded, &[]);
+    insta::with_settings!({ prepend_module_to_snapshot => false, omit_expression => true }, {
+        insta::assert_snapshot!(name, document(&report));
+    });
+}
+
+#[test]
+fn tests_on_own_sets_have_a_table_and_leave_the_papers_numbers_alone() {
+    let plan = Plan::parse("test", SETS.into()).unwrap();
+    let mut results = fixture::results(&plan, |_| Some(([90.0, 40.0, 20.0], 1.0)));
+    for (state, relative) in results.states.iter_mut().zip([0.0, 2e-16]) {
+        let CellState::Done(result) = state else { unreachable!("all are done") };
+        let test = result.results["D"].clone();
+        for (name, success_percent) in [("long", 75.0), ("corners", 55.0)] {
+            result.results.insert(name.into(), TestResult { success_percent, ..test.clone() });
+        }
+        let largest = Difference { parameter: "length".into(), requested: 0.7, applied: 0.7, relative };
+        result.agreement = Some(Agreement { episodes: 4000, largest: Some(largest) });
+    }
+    let selections = results.select();
+    let recorded = Recorded::default();
+    let report = Report::new(&results, &selections, &recorded, &[]);
+    insta::assert_snapshot!(report.set_table().unwrap().to_text(), @r"
+     environment  method  trained on  tested on  success, %  mean return  runs
+     CartPole     ppo ff  D           long             75.0          1.0     1
+     CartPole     ppo ff  D           corners          55.0          1.0     1
+     CartPole     ppo ff  long        D                90.0          1.0     1
+     CartPole     ppo ff  long        R                40.0          1.0     1
+     CartPole     ppo ff  long        E                20.0          1.0     1
+     CartPole     ppo ff  long        long             75.0          1.0     1
+     CartPole     ppo ff  long        corners          55.0          1.0     1
+    ");
+    assert_eq!((selections.len(), selections[0].cells), (1, 1), "selected among those that are trained on versions");
+    assert!(report.files().iter().any(|file| file.title == "sets.csv"));
+    let told = "compared in 8000 of 10000 test episodes; the largest relative difference is 2.0e-16, of length.";
+    assert!(report.overview.iter().any(|line| line.contains(told)), "{:?}", report.overview);
+}
+
+#[test]
+fn tests_at_marks_have_a_table_with_the_end_as_its_last_line() {
+    let text =
+        "environments = ['CartPole']\nversions = ['R']\nruns = 2\nevaluate_at = [5, 20]\nsettings = { episodes = 50 }
+        [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+    let plan = Plan::parse("test", text.into()).unwrap();
+    let mut results = fixture::results(&plan, |cell| Some(([90.0, 40.0, 20.0 + f64::from(cell.run)], 1.0)));
+    let CellState::Done(result) = &mut results.states[0] else { unreachable!("it is done") };
+    for mark in [5, 20] {
+        let success_percent = mark as f64;
+        let test = TestResult { success_percent, mean_return: -success_percent, ..result.results["D"].clone() };
+        let agreement = Agreement { episodes: 1, largest: None };
+        let of_mark = MarkResult { counters: Default::default(), results: [("E".to_owned(), test)].into(), agreement };
+        result.marks.insert(mark, of_mark);
+    }
+    let selections = results.select();
+    let recorded = Recorded::default();
+    let report = Report::new(&results, &selections, &recorded, &[]);
+    insta::assert_snapshot!(report.marks_table().unwrap().to_text(), @r"
+     environment  method  trained on  episodes        on D        on R        on E
+     CartPole     ppo ff  R                  5     missing     missing         5.0
+     CartPole     ppo ff  R                 20     missing     missing        20.0
+     CartPole     ppo ff  R                 50  90.0 ± 0.0  40.0 ± 0.0  21.5 ± 0.5
+    ");
+    let marks = report.files().into_iter().find(|table| table.title == "marks.csv").unwrap();
+    let marks = String::from_utf8(marks.to_csv()).unwrap();
+    assert!(
+        marks.contains("CartPole,ppo,ff,,R,20,E,1,20,,-20\n") && marks.contains("R,50,E,2,21.5,0.5,1\n"),
+        "{marks}"
+    );
+    let figures = Figures::draw(&report, &[], &[]).unwrap();
+    let names: Vec<&str> = figures.marks.iter().map(|figure| figure.name.as_str()).collect();
+    assert_eq!(names.len(), 2, "return and success");
+    assert_eq!(names[1], "CartPole, trained on R: success in tests after so many episodes");
+    let FigureData::Svg { svg, .. } = &figures.marks[1].picture else { unreachable!("it is drawn") };
+    assert!(svg.contains("tested on E") && svg.contains("CartPole, trained on R: success rate in"), "{svg}");
+    let page = html(&report, &figures);
+    assert!(page.contains("id=\"marks\"") && page.contains(names[0]));
+    let without = fixture::results(&plan, |_| Some(([90.0, 40.0, 20.0], 1.0)));
+    let selections = without.select();
+    assert!(Report::new(&without, &selections, &recorded, &[]).marks_table().is_none());
+}
+
+/// Two configurations and two tuning seeds. One cell of what is selected failed; what is trained on E waits, and on R nothing
+/// can be selected.
+#[test]
+fn a_clean_report_names_its_rule_its_seeds_and_what_was_selected() {
+    let text = "environments = ['CartPole']\nselection = 'clean'\ntuning_runs = 2\nruns = 2\nselection_episodes = 70
+        [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\ngrid = { n_steps = [64, 128] }";
+    let plan = Plan::parse("test", text.into()).unwrap();
+    let directory = tempfile::tempdir().unwrap();
+    let folder = Folder::new(directory.path());
+    let n_steps = |cell: &Cell| cell.config.table()["n_steps"].as_integer();
+    for cell in plan.cells.iter().chain(&plan.candidates) {
+        let (version, seed) = (cell.config.common.version, cell.config.common.seed);
+        let place = folder.cell(&cell.id);
+        let selected = n_steps(cell) == Some(128);
+        if version == Version::R || (version, selected, seed) == (Version::D, true, 2) {
+            place
+                .write_failure(&Failure {
+                    id: cell.id.clone(),
+                    reason: "NaN".into(),
+                    commit: "x".into(),
+                    begins_anew: true,
+                })
+                .unwrap();
+        } else if (version, selected, seed) != (Version::E, true, 2) {
+            let mut result = fixture::result(cell, [if selected { 10.0 } else { 90.0 } + seed as f64, 5.0, 0.0], 1.0);
+            let test =
+                TestResult { success_percent: if selected { 75.0 } else { 25.0 }, ..result.results["D"].clone() };
+            result.results.insert(SELECTION_TEST.into(), test);
+            place.write_result(&result).unwrap();
+        }
+    }
+    let plan = plan.in_folder(&folder).unwrap();
+    let results = Results::read(&plan, &folder).unwrap();
+    let selections = results.select();
+    let recorded = Recorded::default();
+    let report = Report::new(&results, &selections, &recorded, &[]);
+    let told = report.overview.join("\n");
+    for part in [
+        "Selection: `clean`. Configurations were selected by 70 selection episodes of every training on seeds 1 to 2; \
+         those that are reported were trained anew on seeds 3 to 4, and tested on other episodes.",
+        "1 of 3 selections wait for tuning cells: CartPole ppo ff on E.",
+        "1 of 3 selections have nothing to select, since all their tuning cells failed: CartPole ppo ff on R.",
+        "1 of 3 selections are of configurations some of whose tuning cells failed: CartPole ppo ff on D (1 of 2 tuning \
+         seeds).",
+    ] {
+        assert!(told.contains(part), "{told}");
+    }
+    let table = |title: &str| report.files().into_iter().find(|table| table.title == title).unwrap();
+    let rows: Vec<String> =
+        String::from_utf8(table("tuning.csv").to_csv()).unwrap().lines().map(str::to_owned).collect();
+    assert!(
+        rows[1].starts_with("CartPole,ppo,ff,,D,4,3,1,CartPole-ppo-ff-D-") && rows[1].contains("-s1,1,75,1,"),
+        "{rows:?}"
+    );
+    assert!(rows[1].contains("n_steps=128") && !rows[1].contains("seed"), "{rows:?}");
+    assert_eq!(rows[2..], ["CartPole,ppo,ff,,R,4,0,4,,0,,,", "CartPole,ppo,ff,,E,4,3,0,,0,,,"]);
+    let metrics = String::from_utf8(table("metrics.csv").to_csv()).unwrap();
+    // 13 and 14 of what was trained anew, not the 90s that were not selected.
+    assert!(metrics.contains("CartPole,ppo,ff,,Default,2,13.5,0.5"), "{metrics}");
+    assert!(
+        report.markdown().contains("| CartPole    | ppo ff | D          | CartPole-ppo-ff-D-"),
+        "{}",
+        report.markdown()
+    );
+}
+
+#[rstest]
+#[case("", None)]
+#[case(
+    "settings = { episodes = 300 }\ntest_episodes = 50",
+    Some("300 episodes in a training, where the paper has 15000, and 50 in a test")
+)]
+#[case("test_episodes = 999", Some("999 in a test, where it has 1000"))]
+fn other_budgets_than_the_papers_are_told(#[case] given: &str, #[case] told: Option<&str>) {
+    let text = format!("environments = ['CartPole']\n{given}\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']");
+    let budgets = budgets(&Plan::parse("test", text).unwrap());
+    assert_eq!(budgets.is_some(), told.is_some());
+    assert!(budgets.unwrap_or_default().contains(told.unwrap_or_default()));
+}
+
+#[test]
+fn a_single_row_lacks_cells_and_several_lack_them() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let told = |missing: &[&str]| {
+        let results = fixture::results(&plan, |cell| {
+            let Cell { config, .. } = cell;
+            let is_missing = config.settings.name() == "a2c" && missing.contains(&config.common.environment.as_str());
+            (!is_missing).then_some(([50.0; 3], 1.0))
+        });
+        let selections = results.select();
+        Report::new(&results, &selections, &Recorded::default(), &[]).overview.join("\n")
+    };
+    assert!(told(&["Pendulum"]).contains("1 of 4 rows lacks cells; the column"));
+    assert!(told(&["Pendulum", "CartPole"]).contains("2 of 4 rows lack cells; the column"));
+}
+
+#[test]
+fn what_is_not_done_is_missing_and_has_no_colour() {
+    let plan = Plan::parse("test", PLAN.into()).unwrap();
+    let results = fixture::results(&plan, |_| None);
+    let selections = results.select();
+    let recorded = Recorded::default();
+    let report = Report::new(&results, &selections, &recorded, &[]);
+    let tables = report.number_tables().filter(|table| table.columns.len() > 4);
+    let entries: Vec<_> = tables.flat_map(|table| table.rows.into_iter().flatten()).collect();
+    assert!(entries.iter().all(|entry| entry.heat.is_none()));
+    assert_eq!(entries.iter().filter(|entry| entry.text == MISSING).count(), 3 * (4 + 2 + 2 + 2) + 4 * 4 + 9 * 4);
+}
+
+/// What is trained on both is a line to compare with.
+#[test]
+fn what_is_trained_on_r_and_e_is_a_row_of_scenarios_and_in_none_of_the_papers_numbers() {
+    let plan = |versions: &str| {
+        let text = format!(
+            "environments = ['CartPole']\nversions = ['D', 'R', 'E'{versions}]\ntest_versions = ['D', 'R', 'E']\n\
+             runs = 2\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']"
+        );
+        Plan::parse("test", text).unwrap()
+    };
+    let (with, without) = (plan(", 'R+E'"), plan(""));
+    let [with, without] = [&with, &without].map(|plan| {
+        let rates = |cell: &Cell| {
+            [90.0, 40.0, f64::from(cell.run)].map(|rate| rate / (1.0 + f64::from(cell.config.common.version as u8)))
+        };
+        let results = fixture::results(plan, |cell| Some((rates(cell), 1.0)));
+        let selections = results.select();
+        let recorded = Recorded::default();
+        let report = Report::new(&results, &selections, &recorded, &[]);
+        let lines = |table: &Table| table.to_markdown().lines().map(ToOwned::to_owned).collect::<Vec<String>>();
+        let scenarios = report.scenario_tables().iter().flat_map(&lines).collect::<Vec<_>>();
+        let file = report.files().into_iter().find(|file| file.title == "scenarios.csv").unwrap();
+        let metrics = report.metrics.iter().map(|row| format!("{:?} {:?} {:?}", row.ours, row.iqms, row.gaps));
+        (scenarios, lines(&file), metrics.collect::<Vec<_>>())
+    });
+    assert_eq!(with.2, without.2, "Default, Interpolation and Extrapolation come from D, R and E");
+    for (with, without, more) in [(with.0, without.0, 1), (with.1, without.1, 3)] {
+        let (of_both, others): (Vec<_>, Vec<_>) = with.into_iter().partition(|line| line.contains("R+E"));
+        assert_eq!((of_both.len(), others), (more, without));
+        assert!(of_both[0].contains("22.5"), "a quarter of 90: {}", of_both[0]);
+    }
+}
+
+#[test]
+fn files_tell_two_presets_of_a_method_apart() {
+    let plan = |preset: &str| {
+        let text = format!(
+            "environments = ['CartPole']\nversions = ['D']\nruns = 2\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\n\
+             [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\n{preset}"
+        );
+        Plan::parse("test", text).unwrap()
+    };
+    let (both, one) = (plan("preset = 'paper'"), plan("settings = { learning_rate = 1e-3 }"));
+    let seeing = plan("settings = { observe = 'parameters' }");
+    for (plan, name, expected) in
+        [(&both, "preset", true), (&one, "preset", false), (&seeing, "observe", true), (&both, "observe", false)]
+    {
+        let results = fixture::results(plan, |cell| Some(([90.0, 40.0, f64::from(cell.run)], 1.0)));
+        let selections = results.select();
+        let recorded = Recorded::default();
+        for file in Report::new(&results, &selections, &recorded, &[]).files() {
+            // Of a pair, one side alone is of another preset.
+            let columns = file.columns.iter().filter(|column| column.name.ends_with(name)).count();
+            // Reference lines are not compared in pairs.
+            let compared = file.columns.iter().any(|column| column.name.starts_with("x_"));
+            assert_eq!(columns, usize::from(expected && !(name == "observe" && compared)), "{}", file.title);
+        }
+    }
+}
+
+/// What follows a rule that is not closed is read as part of it, and no browser says so.
+#[test]
+fn every_rule_of_the_style_is_closed() {
+    let depths: Vec<i32> = super::html::STYLE
+        .chars()
+        .scan(0, |depth, char| {
+            *depth += i32::from(char == '{') - i32::from(char == '}');
+            Some(*depth)
+        })
+        .collect();
+    assert_eq!(depths.last(), Some(&0));
+    assert!(depths.iter().all(|depth| (0..=2).contains(depth)), "only a medium has rules inside");
+}
+
+#[test]
+fn robots_of_another_engine_have_the_papers_numbers_beside_them_and_no_difference() {
+    let plan = |environments: &str| {
+        let rest = "runs = 2\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\n";
+        Plan::parse("test", format!("environments = {environments}\n{rest}")).unwrap()
+    };
+    for (environments, expected) in [
+        ("['CartPole', 'Pendulum']", [true, true, true]),
+        ("['CartPole', 'Hopper']", [true, false, false]),
+        ("['HalfCheetah', 'Hopper']", [false, false, false]),
+    ] {
+        let plan = plan(environments);
+        let results = fixture::results(&plan, |_| Some(([90.0, 70.0, 50.0], 1.0)));
+        let selections = results.select();
+        let recorded = perturb_experiment::Recorded::of(&selections);
+        let report = Report::new(&results, &selections, &recorded, &[]);
+        let rows: Vec<_> = report.metrics.iter().chain(&report.averages).collect();
+        assert!(rows.iter().all(|row| row.papers.contains_key(&Metric::Default)));
+        let has_difference: Vec<bool> = rows.iter().map(|row| row.difference(Metric::Default).is_some()).collect();
+        assert_eq!(has_difference, expected, "{environments}");
+    }
+}

@@ -1,0 +1,12 @@
+//! The settings of a training, and the sets of parameters that policies are trained and tested on.
+#![forbid(unsafe_code)]
+
+pub mod sets;
+mod settings;
+mod value_error;
+
+pub use settings::{
+    A2cConfig, Architecture, Base, Common, ConfigError, EpoptConfig, Method, Observe, PpoConfig, Preset, Ranking,
+    Rl2Config, Rollouts, Schedule, SettingError, Settings, TrainConfig, Wrapper, spelled,
+};
+pub use value_error::{ValueError, require};

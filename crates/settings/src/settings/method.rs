@@ -1,0 +1,79 @@
+//! What is trained: an algorithm with its architecture.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use super::{Observe, Preset};
+
+/// An algorithm with its architecture and, of RL², the episodes in a trial: a row of the paper's tables.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct Method {
+    /// E.g. "ppo".
+    pub algorithm: String,
+    /// "ff" or "rc".
+    pub architecture: String,
+    /// `None` of algorithms without trials.
+    pub episodes_per_trial: Option<u32>,
+    /// Whose defaults the settings have.
+    #[serde(default, skip_serializing_if = "Preset::is_default")]
+    pub preset: Preset,
+    /// What its policies see.
+    #[serde(default, skip_serializing_if = "Observe::is_default")]
+    pub observe: Observe,
+    /// Whether it is an agent that no cell trained: `algorithm` is what its assessment calls it, and no more is known.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub elsewhere: bool,
+}
+
+impl Method {
+    /// Whether it learns nothing.
+    pub fn is_random(&self) -> bool {
+        self.algorithm == "random" && !self.elsewhere
+    }
+
+    /// Whether it is a line to compare with: it learns nothing, or sees what others have to find out.
+    pub fn is_reference(&self) -> bool {
+        self.is_random() || self.observe.sees_parameters()
+    }
+}
+
+impl fmt::Display for Method {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.is_random() {
+            f.write_str("random policy (reference)")?;
+        } else if self.elsewhere {
+            f.write_str(&self.algorithm)?;
+        } else {
+            write!(f, "{} {}", self.algorithm, self.architecture)?;
+        }
+        self.episodes_per_trial.map_or(Ok(()), |episodes| write!(f, " N={episodes}"))?;
+        let preset = (!self.preset.is_default()).then(|| self.preset.to_string());
+        let sees = self.observe.note().map(str::to_owned);
+        let elsewhere = self.elsewhere.then(|| "trained elsewhere".to_owned());
+        let notes = preset.into_iter().chain(elsewhere).chain(sees).collect::<Vec<_>>().join(", ");
+        if notes.is_empty() { Ok(()) } else { write!(f, " ({notes})") }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_name_says_in_what_a_method_differs_from_others() {
+        let rl2 = Method {
+            algorithm: "rl2-ppo".into(),
+            architecture: "rc".into(),
+            episodes_per_trial: Some(2),
+            preset: Preset::Perturb,
+            observe: Observe::State,
+            elsewhere: false,
+        };
+        assert_eq!(rl2.to_string(), "rl2-ppo rc N=2");
+        let seeing = |preset| Method { preset, observe: Observe::Parameters, ..rl2.clone() }.to_string();
+        assert_eq!(seeing(Preset::Perturb), "rl2-ppo rc N=2 (sees parameters)");
+        assert_eq!(seeing(Preset::Paper), "rl2-ppo rc N=2 (paper, sees parameters)");
+        assert_eq!(Method { preset: Preset::Paper, ..rl2 }.to_string(), "rl2-ppo rc N=2 (paper)");
+    }
+}

@@ -1,0 +1,461 @@
+//! The configuration of a training: flat, by the field's names.
+//!
+//! The algorithm's defaults in the preset come first, over them `--config FILE.toml`, over that the command line: flags and
+//! `--set key=value`, which may not contradict each other. The result is written to `config.toml` of the run; given back with
+//! `--config` it repeats the run.
+
+mod algorithms;
+mod architecture;
+mod defaults;
+mod error;
+mod method;
+mod observe;
+mod preset;
+
+mod base_and_wrapper;
+
+pub use algorithms::{A2cConfig, EpoptConfig, PpoConfig, Ranking, Rl2Config, Schedule};
+pub use architecture::Architecture;
+pub use base_and_wrapper::{Base, Rollouts, Settings, Wrapper};
+pub use error::{ConfigError, SettingError};
+pub use method::Method;
+pub use observe::Observe;
+pub use preset::Preset;
+
+use std::collections::{BTreeSet, HashMap};
+use std::path::Path;
+use std::sync::LazyLock;
+
+use config::{Config, File, FileFormat};
+use serde::{Deserialize, Serialize};
+use toml::{Table, Value};
+
+use perturb_files as files;
+use perturb_protocol::{Distribution, Version, names};
+
+use crate::sets::Parameters;
+use crate::value_error::{ValueError, require};
+
+/// The most environments of one training.
+const MOST_ENVS: usize = 65_536;
+/// The key of [`Common::parameters`].
+const PARAMETERS: &str = "parameters";
+/// The key of [`Settings::name`].
+const ALGORITHM: &str = "algorithm";
+/// The key of [`Common::preset`].
+const PRESET: &str = "preset";
+/// The key of [`Common::observe`].
+const OBSERVE: &str = "observe";
+/// The key of [`Common::architecture`].
+const ARCHITECTURE: &str = "architecture";
+
+impl Common {
+    /// What it is trained on, e.g. "D", or "D with length [0.3, 0.4]".
+    pub fn trained_on(&self) -> String {
+        let own = self.parameters.iter().map(|(name, values)| format!("{name} {values}"));
+        match own.collect::<Vec<_>>() {
+            own if own.is_empty() => self.version.to_string(),
+            own => format!("{} with {}", self.version, own.join(", ")),
+        }
+    }
+}
+
+/// Everything that decides what a training does. Two trainings with equal configurations give equal bytes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "Table", into = "Table")]
+pub struct TrainConfig {
+    /// What every training has.
+    pub common: Common,
+    /// What the algorithm has.
+    pub settings: Settings,
+}
+
+/// Settings that every training has.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Common {
+    /// Which defaults the other settings have: "perturb" or "paper" (default: `"perturb"`).
+    pub preset: Preset,
+    /// The environment's name in the catalogue. Has no default.
+    pub environment: String,
+    /// Where its parameters come from while training.
+    pub version: Version,
+    /// What replaces the version's distributions of some parameters while training, e.g. `length = "0.8..1.0"` in the
+    /// table `[parameters]` (default: nothing).
+    #[serde(default, skip_serializing_if = "Parameters::is_empty")]
+    pub parameters: Parameters,
+    /// What acts.
+    pub architecture: Architecture,
+    /// What the policy sees: "state", or "parameters" for the environment's present parameters beside it, in training
+    /// and in tests (default: `"state"`). It is written only where it is not the default: settings from before it stay
+    /// what they were.
+    #[serde(default, skip_serializing_if = "Observe::is_default")]
+    pub observe: Observe,
+    /// Training ends after the iteration in which this many episodes have ended, at least 1 (default: `15000`). EPOpt
+    /// counts those that it learned from.
+    pub episodes: u64,
+    /// Fixes all randomness, 0 … 2⁶³-1 (default: `1`).
+    pub seed: u64,
+    /// N: environments that are stepped together, 1 … 65536 (default: `16`, `8` with PPO FF, `25` with EPOpt; paper:
+    /// `1`).
+    /// More makes a step cheaper and updates rarer.
+    pub num_envs: usize,
+    /// Whether observations are normalised by their running mean and variance (default: `true`).
+    pub normalize_observations: bool,
+    /// Standard deviation of normal noise that is added to every number of an observation in training, after normalisation
+    /// if there is any, 0 … 100 (default: `0`). Tests have none. It is written only where it is not the default: settings
+    /// from before it stay what they were.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub observation_noise: f64,
+    /// Whether rewards are divided by the running deviation of the discounted return (default: `true`).
+    pub normalize_rewards: bool,
+    /// Whether that discounted return runs on over the ends of episodes, as in the reference, instead of starting again from 0
+    /// (default: `false`; paper: `true`).
+    pub reward_return_runs_on: bool,
+    /// Iterations between two lines of progress.csv, at least 1 (default: `100` with A2C and RL²-A2C, else `1`). A line has the
+    /// figures of the last update, and means over the last 100 ended episodes.
+    pub log_interval: u64,
+    /// Ended episodes between two checkpoints, at least 1 (default: `500`). The first iteration and the last always
+    /// write one.
+    pub checkpoint_interval: u64,
+    /// Training ends, too, after the iteration in which the last 100 ended episodes have this success rate, 0 … 100 %
+    /// (default: `0`, which is never). Longer training can lose what generalises. It is written only where it is not the
+    /// default: settings from before it stay what they were.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub stop_at_success: f64,
+}
+
+fn is_zero(number: &f64) -> bool {
+    *number == 0.0
+}
+
+impl TrainConfig {
+    /// Merges and checks a TOML file and, over it, the command line: pairs `key=value`, and flags by the keys of the file.
+    ///
+    /// # Errors
+    /// [`ConfigError`], which names the key and what is accepted.
+    pub fn load(file: Option<&Path>, sets: &[String], flags: Table) -> Result<Self, ConfigError> {
+        let mut layers: Vec<(String, Table)> = Vec::new();
+        if let Some(path) = file {
+            let shown = path.display().to_string();
+            tracing::debug!("settings are read from {shown}");
+            let table = files::read_text(path)?.parse::<Table>().map_err(|error| ConfigError::Syntax {
+                origin: shown.clone(),
+                reason: error.to_string().trim().to_owned(),
+            })?;
+            let table = spelled(&shown, table)?;
+            layers.push((shown, table));
+        }
+        let mut typed: Vec<(String, Table)> = Vec::new();
+        for set in sets {
+            let origin = format!("--set {set}");
+            let table = spelled(&origin, parse_set(set)?)?;
+            typed.push((origin, table));
+        }
+        typed.extend(flags.into_iter().map(|(key, value)| (flag(&key, &value), Table::from_iter([(key, value)]))));
+        refuse_contradictions(&typed)?;
+        layers.append(&mut typed);
+        resolve(layers)
+    }
+
+    /// The configuration as TOML, every setting of it.
+    pub fn to_toml(&self) -> String {
+        // Serialisation of plain numbers, booleans and names cannot fail.
+        toml::to_string(&self.full_table()).unwrap_or_default()
+    }
+
+    /// The configuration as a flat table, which [`TrainConfig::from_table`] reads back. Of the preset that stands if none is
+    /// named it lacks settings that are younger than some results and as they were before.
+    pub fn table(&self) -> Table {
+        let mut table = self.full_table();
+        if self.common.preset.is_default() {
+            preset::leave_out_younger(&mut table);
+        }
+        table
+    }
+
+    fn full_table(&self) -> Table {
+        let mut table = Table::try_from(&self.common).unwrap_or_default();
+        table.insert(ALGORITHM.into(), self.settings.name().into());
+        table.extend(self.settings.table());
+        table
+    }
+
+    /// Reads a flat table; defaults stand for what it lacks.
+    ///
+    /// # Errors
+    /// [`ConfigError`], which names the key and what is accepted.
+    pub fn from_table(origin: &str, table: Table) -> Result<Self, ConfigError> {
+        resolve(vec![(origin.to_owned(), spelled(origin, table)?)])
+    }
+
+    /// The configuration with every key that one of its algorithm may have, as reports compare them.
+    pub fn complete_table(&self) -> Table {
+        let mut table = defaults_of(self);
+        table.extend(self.full_table());
+        table
+    }
+
+    /// What it learns from.
+    pub fn rollouts(&self) -> Rollouts {
+        if self.common.observation_noise > 0.0 { Rollouts::Noisy } else { self.settings.rollouts() }
+    }
+
+    /// What trains.
+    pub fn method(&self) -> Method {
+        let Self { common, settings } = self;
+        Method {
+            algorithm: settings.name().to_owned(),
+            architecture: common.architecture.to_string(),
+            episodes_per_trial: settings.has_trials().then(|| settings.episodes_per_trial()),
+            preset: common.preset,
+            observe: common.observe,
+            elsewhere: false,
+        }
+    }
+
+    fn validate(&self) -> Result<(), ConfigError> {
+        let Common { episodes, num_envs, log_interval, checkpoint_interval, .. } = self.common;
+        if self.common.environment.is_empty() {
+            return Err(ConfigError::NoEnvironment);
+        }
+        for (key, value, most) in [
+            ("episodes", episodes, u64::MAX),
+            ("num_envs", num_envs as u64, MOST_ENVS as u64),
+            ("log_interval", log_interval, u64::MAX),
+            ("checkpoint_interval", checkpoint_interval, u64::MAX),
+        ] {
+            let expected = if most == u64::MAX { "at least 1".to_owned() } else { format!("between 1 and {most}") };
+            require((1..=most).contains(&value), key, value, expected)?;
+        }
+        let noise = self.common.observation_noise;
+        require((0.0..=100.0).contains(&noise), "observation_noise", noise, "a standard deviation, 0 … 100")?;
+        let rate = self.common.stop_at_success;
+        require((0.0..=100.0).contains(&rate), "stop_at_success", rate, "a success rate, 0 … 100 %")?;
+        let architecture = self.common.architecture;
+        if self.settings.has_trials() && architecture == Architecture::Ff {
+            return Err(ConfigError::NeedsMemory { algorithm: self.settings.name() });
+        }
+        self.settings.validate(architecture, num_envs)
+    }
+}
+
+/// "Hopper R ppo ff": what is trained, in a few words.
+impl std::fmt::Display for TrainConfig {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Common { environment, version, .. } = &self.common;
+        write!(f, "{environment} {version} {}", self.method())
+    }
+}
+
+impl TryFrom<Table> for TrainConfig {
+    type Error = ConfigError;
+
+    fn try_from(table: Table) -> Result<Self, ConfigError> {
+        Self::from_table("the configuration", table)
+    }
+}
+
+impl From<TrainConfig> for Table {
+    fn from(config: TrainConfig) -> Self {
+        config.table()
+    }
+}
+
+/// A flag as it was typed, but for its values.
+fn flag(key: &str, value: &Value) -> String {
+    let name = if key == "environment" { "env".to_owned() } else { key.replace('_', "-") };
+    match value {
+        Value::Table(_) => format!("--{name}"),
+        Value::String(text) => format!("--{name} {text}"),
+        value => format!("--{name} {value}"),
+    }
+}
+
+/// Refuses a command line that says two things of one setting: nobody can know which was meant.
+fn refuse_contradictions(typed: &[(String, Table)]) -> Result<(), ConfigError> {
+    let same = |a: &Value, b: &Value| match (a, b) {
+        (Value::String(a), Value::String(b)) => names::is_spelled(a, b),
+        (a, b) => a == b,
+    };
+    let all = || typed.iter().flat_map(|(origin, table)| table.iter().map(move |entry| (origin, entry)));
+    for (index, (origin, (key, value))) in all().enumerate() {
+        if let Some((first, _)) = all().take(index).find(|(_, (known, other))| *known == key && !same(other, value)) {
+            return Err(ConfigError::Contradiction { first: first.clone(), second: origin.clone() });
+        }
+    }
+    Ok(())
+}
+
+/// A table with its keys as they are usually spelled. Those that no algorithm has stay as they are.
+///
+/// # Errors
+/// [`ConfigError::Contradiction`] for a key that is there in two spellings.
+pub fn spelled(origin: &str, table: Table) -> Result<Table, ConfigError> {
+    let known = &*ALL_KEYS;
+    let mut spelled = Table::new();
+    let mut written: HashMap<String, String> = HashMap::new();
+    for (key, value) in table {
+        let name =
+            names::find(&key, known.iter().map(String::as_str)).map_or_else(|| key.clone(), |i| known[i].clone());
+        if let Some(first) = written.insert(name.clone(), key.clone()) {
+            return Err(ConfigError::Contradiction { first: format!("{origin}: {first}"), second: key });
+        }
+        spelled.insert(name, value);
+    }
+    Ok(spelled)
+}
+
+/// The keys of all algorithms.
+static ALL_KEYS: LazyLock<Vec<String>> = LazyLock::new(|| {
+    let of = |settings| defaults_of(&defaults::of(settings, Architecture::Rc, Preset::default()));
+    let keys: BTreeSet<String> = Settings::all().into_iter().flat_map(of).map(|(key, _)| key).collect();
+    keys.into_iter().collect()
+});
+
+/// Every key that a configuration of this kind may have, with its default.
+fn defaults_of(config: &TrainConfig) -> Table {
+    let mut defaults = config.full_table();
+    // By default they are not written.
+    defaults.insert(PARAMETERS.into(), Value::Table(Table::new()));
+    defaults.insert("stop_at_success".into(), 0.0.into());
+    if !config.settings.is_random() {
+        defaults.insert("observation_noise".into(), 0.0.into());
+        defaults.insert("weight_decay".into(), 0.0.into());
+    }
+    defaults.insert(OBSERVE.into(), Observe::default().to_string().into());
+    defaults
+}
+
+/// The names that the setting `key` may have; `None` if it is no choice between names.
+fn choices(key: &str) -> Option<Vec<&'static str>> {
+    Some(match key {
+        ALGORITHM => Settings::names().to_vec(),
+        "version" => Version::NAMES.to_vec(),
+        ARCHITECTURE => Architecture::NAMES.to_vec(),
+        "learning_rate_schedule" => vec!["constant", "linear"],
+        PRESET => Preset::NAMES.to_vec(),
+        OBSERVE => Observe::NAMES.to_vec(),
+        "rank_by" => vec!["raw", "normalized"],
+        _ => return None,
+    })
+}
+
+/// Lays `layers` over the defaults of the algorithm that they name.
+fn resolve(mut layers: Vec<(String, Table)>) -> Result<TrainConfig, ConfigError> {
+    // Names are spelled as usual from here on.
+    for (key, value) in layers.iter_mut().flat_map(|(_, table)| table.iter_mut()) {
+        let known = choices(key).unwrap_or_default();
+        if let Some(place) = value.as_str().and_then(|written| names::find(written, known.iter().copied())) {
+            *value = known[place].into();
+        }
+    }
+    let named = |key: &str| layers.iter().rev().find_map(|(_, table)| table.get(key));
+    let algorithm = named(ALGORITHM).cloned().unwrap_or_else(|| "ppo".into());
+    let algorithm = Settings::all()[choice(ALGORITHM, &algorithm, &Settings::names())?].clone();
+    let name = algorithm.name();
+    let architecture = match named(ARCHITECTURE) {
+        None => algorithm.default_architecture(),
+        Some(value) => Architecture::ALL[choice(ARCHITECTURE, value, &Architecture::NAMES)?],
+    };
+    let preset = match named(PRESET) {
+        None => Preset::default(),
+        Some(value) => Preset::ALL[choice(PRESET, value, &Preset::NAMES)?],
+    };
+    let config = defaults::of(algorithm, architecture, preset);
+    let defaults = defaults_of(&config);
+    for (origin, table) in &layers {
+        for (key, value) in table {
+            check(origin, key, value, &defaults, name)?;
+        }
+    }
+    let mut builder = Config::builder().add_source(source(&defaults));
+    for (_, table) in &layers {
+        builder = builder.add_source(source(table));
+    }
+    let merged: Table = builder.build()?.try_deserialize()?;
+    let wrong = |error: toml::de::Error| ConfigError::Syntax {
+        origin: "the configuration".into(),
+        reason: error.to_string().trim().replace('\n', ", "),
+    };
+    let settings = config.settings.read(&merged).map_err(wrong)?;
+    let config = TrainConfig { common: merged.try_into().map_err(wrong)?, settings };
+    config.validate()?;
+    Ok(config)
+}
+
+/// `key=value`, with the value in TOML; a value that is not TOML is a text.
+fn parse_set(set: &str) -> Result<Table, ConfigError> {
+    let Some((key, value)) = set.split_once('=') else {
+        let reason = "expected key=value, e.g. --set learning_rate=3e-4".into();
+        return Err(ConfigError::Syntax { origin: format!("--set {set}"), reason });
+    };
+    let (key, value) = (key.trim(), value.trim());
+    let parsed = format!("value = {value}").parse::<Table>().ok().filter(|table| table.len() == 1);
+    let value = parsed.and_then(|mut table| table.remove("value")).unwrap_or_else(|| Value::String(value.to_owned()));
+    Ok(Table::from_iter([(key.to_owned(), value)]))
+}
+
+/// A layer for the `config` crate.
+fn source(table: &Table) -> File<config::FileSourceString, FileFormat> {
+    File::from_str(&toml::to_string(table).unwrap_or_default(), FileFormat::Toml)
+}
+
+/// Whether `key` exists and `value` has the type of its default.
+fn check(origin: &str, key: &str, value: &Value, defaults: &Table, algorithm: &'static str) -> Result<(), ConfigError> {
+    let Some(default) = defaults.get(key) else {
+        let keys = || defaults.keys().map(String::as_str);
+        let hint = others_setting(key).unwrap_or_else(|| names::did_you_mean(key, keys()));
+        let keys = keys().collect::<Vec<_>>().join(", ");
+        return Err(ConfigError::UnknownKey { origin: origin.to_owned(), key: key.to_owned(), hint, algorithm, keys });
+    };
+    let choices = choices(key);
+    let expected = match (default, value) {
+        _ if choices.is_some() => return choice(key, value, &choices.unwrap_or_default()).map(drop),
+        (Value::Float(_), Value::Float(_) | Value::Integer(_)) => return Ok(()),
+        (Value::Integer(_), Value::Integer(0..)) => return Ok(()),
+        (Value::Boolean(_), Value::Boolean(_)) | (Value::String(_), Value::String(_)) => return Ok(()),
+        (Value::Table(_), Value::Table(parameters)) => return check_parameters(parameters),
+        (Value::Table(_), _) => "a table of parameters and their values",
+        (Value::Float(_), _) => "a number",
+        (Value::Integer(_), Value::Float(number)) if number.fract() == 0.0 && (0.0..1e15).contains(number) => {
+            let expected = format!("a whole number that is not negative, in digits: {number}");
+            return Err(ValueError::new(key, value, expected).into());
+        }
+        (Value::Integer(_), _) => "a whole number that is not negative",
+        (Value::Boolean(_), _) => "true or false",
+        _ => "a text",
+    };
+    Err(ValueError::new(key, value, expected).into())
+}
+
+/// "; it is a setting of rl2-a2c, rl2-ppo", if it is one of some algorithms.
+fn others_setting(key: &str) -> Option<String> {
+    let has = |settings: &Settings| {
+        defaults_of(&defaults::of(settings.clone(), Architecture::Rc, Preset::default())).contains_key(key)
+    };
+    let having = Settings::all().into_iter().filter(has);
+    let names: Vec<&str> = having.map(|settings| settings.name()).collect();
+    (!names.is_empty()).then(|| format!("; it is a setting of {}", names.join(", ")))
+}
+
+/// Whether every value of the table `[parameters]` is a distribution.
+fn check_parameters(parameters: &Table) -> Result<(), ConfigError> {
+    let expected = "a value, or a text such as \"0.3..0.4\" or \"0.3..0.4,0.8..0.9\"";
+    for (name, value) in parameters {
+        let is_distribution = value.clone().try_into::<Distribution>().is_ok();
+        require(is_distribution, format!("{PARAMETERS}.{name}"), value, expected)?;
+    }
+    Ok(())
+}
+
+/// The place of a value among a few names.
+fn choice(key: &str, value: &Value, known: &[&str]) -> Result<usize, ConfigError> {
+    known.iter().position(|name| value.as_str() == Some(name)).ok_or_else(|| {
+        let hint = names::did_you_mean(value.as_str().unwrap_or_default(), known.iter().copied());
+        let known: Vec<String> = known.iter().map(|name| format!("\"{name}\"")).collect();
+        ValueError::new(key, value, format!("one of {}{hint}", known.join(", "))).into()
+    })
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,32 @@
+//! The refusal of a value, whoever wrote it: in a plan, a configuration, a set or a threshold.
+
+use std::fmt::Display;
+
+/// A value that cannot be.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{what} is {got}, but must be {expected}")]
+pub struct ValueError {
+    /// Which value of what.
+    pub what: String,
+    /// What was given.
+    pub got: String,
+    /// What is accepted.
+    pub expected: String,
+}
+
+impl ValueError {
+    /// The refusal of `got`, which was given for `what`.
+    pub fn new(what: impl Into<String>, got: impl Display, expected: impl Into<String>) -> Self {
+        Self { what: what.into(), got: got.to_string(), expected: expected.into() }
+    }
+}
+
+/// Refuses a value unless it is `accepted`.
+pub fn require(
+    accepted: bool,
+    what: impl Into<String>,
+    got: impl Display,
+    expected: impl Into<String>,
+) -> Result<(), ValueError> {
+    if accepted { Ok(()) } else { Err(ValueError::new(what, got, expected)) }
+}
