@@ -4,6 +4,7 @@ use super::*;
 use crate::act::Acts;
 use crate::objective::Surrogate;
 use crate::random::{Purpose, stream};
+use crate::spec::ActionKind;
 
 const O: usize = 2;
 const ACTION: ActionKind = ActionKind::Discrete { n: 2 };
