@@ -20,6 +20,7 @@ pub struct Policy {
 
 /// Buffers in which gradients of feed-forward policies of one shape are computed.
 pub struct GradientWorkspace {
+    spec: PolicySpec,
     backend: Box<dyn GradientBackend>,
     /// `[P]`.
     gradient: Vec<f32>,
@@ -69,11 +70,15 @@ impl Policy {
             return Ok(None);
         }
         let backend = gradient_backend(&self.spec, 1)?;
-        Ok(Some(GradientWorkspace { backend, gradient: vec![0.0; self.weights.len()] }))
+        Ok(Some(GradientWorkspace { spec: self.spec.clone(), backend, gradient: vec![0.0; self.weights.len()] }))
     }
 
-    /// Swaps in another gradient workspace. Policies of one shape that share one find it in the processor's caches.
+    /// Swaps in another gradient workspace, if it is of this policy's shape. Policies that share one find it in the processor's
+    /// caches.
     pub fn swap_workspace(&mut self, other: &mut GradientWorkspace) {
+        if other.spec != self.spec {
+            return;
+        }
         std::mem::swap(&mut self.backend, &mut other.backend);
         std::mem::swap(&mut self.gradient, &mut other.gradient);
         self.backend.weights_changed();
