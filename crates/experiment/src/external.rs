@@ -33,18 +33,18 @@ pub fn add_assessed<'a>(selections: &mut Vec<MethodResults<'a>>, assessed: &'a [
             place
         });
         let runs = &mut selections[place].runs;
-        let has = |run: &SelectedRun<'_>, policy: &AssessedPolicy| run.0.contains_key(&policy.trained_on());
+        let has = |run: &SelectedRun<'_>, policy: &AssessedPolicy| run.selected.contains_key(&policy.trained_on());
         let is_free = |run: &SelectedRun<'_>| !one.policies().iter().any(|policy| has(run, policy));
         let run = (1..).find(|run: &u32| runs.get(run).is_none_or(is_free)).unwrap_or_default();
         let reported = |policy: &'a AssessedPolicy| (policy.trained_on(), Some(Reported::Elsewhere(one, policy)));
-        runs.entry(run).or_default().0.extend(one.policies().iter().map(reported));
+        runs.entry(run).or_default().selected.extend(one.policies().iter().map(reported));
     }
 }
 
 /// The agents of `selections` that something else trained, with their policies and the numbers of their runs, in order.
 pub fn elsewhere<'a>(selections: &[MethodResults<'a>]) -> Vec<(&'a Assessed, &'a AssessedPolicy, u32)> {
     let runs = selections.iter().flat_map(|row| &row.runs);
-    let policies = runs.flat_map(|(run, of)| of.0.values().flatten().map(|reported| (*run, reported)));
+    let policies = runs.flat_map(|(run, of)| of.selected.values().flatten().map(|reported| (*run, reported)));
     let elsewhere = policies.filter_map(|(run, reported)| match reported {
         Reported::Elsewhere(agent, policy) => Some((*agent, *policy, run)),
         Reported::Cell(_) => None,

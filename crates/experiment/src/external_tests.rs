@@ -26,7 +26,8 @@ fn agents_are_rows_behind_those_of_their_environment_and_their_assessments_are_r
         ["CartPole a2c ff", "CartPole PPO (trained elsewhere)", "Pendulum a2c ff", "Acrobot SAC (trained elsewhere)"]
     );
     let trained = |row: &MethodResults<'_>| {
-        let runs = row.runs.iter().map(|(run, of)| (*run, of.0.keys().map(ToString::to_string).collect::<String>()));
+        let runs =
+            row.runs.iter().map(|(run, of)| (*run, of.selected.keys().map(ToString::to_string).collect::<String>()));
         runs.collect::<Vec<_>>()
     };
     assert_eq!(trained(&selections[1]), [(1, "DR".to_owned()), (2, "DR".to_owned())]);
@@ -49,7 +50,7 @@ fn no_run_has_a_part_of_an_assessment(#[case] assessments: &str, #[case] expecte
     let assessed: Vec<_> = assessments.split(',').map(assessed).collect();
     let mut selections = Vec::new();
     add_assessed(&mut selections, &assessed);
-    let runs = selections[0].runs.values().map(|run| run.0.keys().map(ToString::to_string).collect::<String>());
+    let runs = selections[0].runs.values().map(|run| run.selected.keys().map(ToString::to_string).collect::<String>());
     assert_eq!(runs.collect::<Vec<_>>().join(","), expected);
     let reported = elsewhere(&selections);
     for one in &assessed {

@@ -93,7 +93,7 @@ pub enum NoHeatmap {
 pub fn heatmap_places<'a>(selections: &'a [MethodResults<'a>]) -> Vec<HeatmapPlace<'a>> {
     let mut places = Vec::new();
     for MethodResults { environment, method, runs, .. } in selections.iter().filter(|row| !row.method.elsewhere) {
-        let trained_on: BTreeSet<TrainedOn<'a>> = runs.values().flat_map(|run| run.0.keys().copied()).collect();
+        let trained_on: BTreeSet<TrainedOn<'a>> = runs.values().flat_map(|run| run.selected.keys().copied()).collect();
         for trained_on in trained_on {
             places.extend(runs.iter().map(|(&run, of_run)| {
                 let selected = of_run.cell_trained_on(trained_on);

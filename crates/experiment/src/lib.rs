@@ -38,7 +38,10 @@ pub use heatmaps::{
 pub use plan::{Cell, Counts, Grouping, Plan, PlanError, SELECTION_TEST, Selection, Tests, distinct};
 pub use recorded::Recorded;
 pub use reselection::Reselection;
-pub use selection::{MethodResults, Reported, Results, Selected, SelectedRun, average, interquartile, scores};
+pub use selection::{
+    MethodResults, Reported, Results, Selected, SelectedRun, TieRange, average, average_tie_range, interquartile,
+    scores,
+};
 pub use tuning::{Chosen, Tuned, tuned};
 pub use verify::{VerifyError, verify};
 

@@ -20,7 +20,7 @@ impl Recorded {
     /// Of the cells that `selections` are of; nothing so far.
     pub fn of(selections: &[MethodResults<'_>]) -> Self {
         let runs = selections.iter().flat_map(|selection| selection.runs.values());
-        let selected = runs.flat_map(|run| run.0.values().flatten()).filter_map(Reported::cell);
+        let selected = runs.flat_map(|run| run.selected.values().flatten()).filter_map(Reported::cell);
         Self { wanted: selected.map(|selected| selected.cell.id.clone()).collect(), policies: BTreeMap::new() }
     }
 

@@ -160,7 +160,8 @@ impl<'a> Contest<'a> {
         }
     }
 
-    /// The candidate that comes first when episodes and seeds are drawn anew; `None` if none has a drawn seed.
+    /// The candidate with the highest rank when episodes and seeds are drawn again, one of several that tie at random;
+    /// `None` if no candidate has a drawn seed.
     fn decide(&self, uniform: &mut impl FnMut() -> f64) -> Option<&Candidate<'a>> {
         if let [only] = &self.candidates[..] {
             return Some(only);
@@ -169,14 +170,23 @@ impl<'a> Contest<'a> {
             [only] => vec![only],
             _ => self.seeds.iter().map(|_| *draw(&self.seeds, uniform)).collect(),
         };
-        let mut best = None;
+        let (mut highest, mut best) = (None, Vec::new());
         for candidate in &self.candidates {
             let rank = candidate.rank(&seeds, uniform);
-            if rank.is_some() && best.is_none_or(|(highest, _)| rank > highest) {
-                best = Some((rank, candidate));
+            if rank.is_none() || rank < highest {
+                continue;
             }
+            if rank > highest {
+                highest = rank;
+                best.clear();
+            }
+            best.push(candidate);
         }
-        best.map(|(_, candidate)| candidate)
+        match best[..] {
+            [] => None,
+            [only] => Some(only),
+            _ => Some(*draw(&best, uniform)),
+        }
     }
 }
 
@@ -202,7 +212,7 @@ impl SelectingTest {
 }
 
 impl Reported<'_> {
-    /// The metric of this run if `winners` had been selected; of what has no such test it stays as it was.
+    /// The metric of this run if `winners` had been selected; the reported score if a test is missing.
     fn score_of(&self, metric: Metric, winners: &[Option<&Candidate<'_>>], uniform: &mut impl FnMut() -> f64) -> f64 {
         let others = self.selected.map(|selected| {
             let (place, selected) = selected?;
@@ -210,9 +220,6 @@ impl Reported<'_> {
             let winner = winners[place].filter(|winner| winner.configuration != of_tuning)?;
             Some(if let [only] = &winner.tests[..] { only } else { draw(&winner.tests, uniform) })
         });
-        if others.iter().all(Option::is_none) {
-            return self.score;
-        }
         let score = metric.of(|scenario| match others[scenario.train as usize] {
             Some(other) => other.rates[scenario.test as usize],
             None => self.selected[scenario.train as usize]?.1.rate(scenario.test),

@@ -2,10 +2,11 @@
 //!
 //! By the clean rule, what is reported are the cells that were trained anew ([`tuned`](super::tuned) says how they are
 //! selected). By the paper's rule every cell may be: per environment, method, training version and run, one configuration is selected: the one with the highest success
-//! rate when tested on the version that it was trained on. Of equal ones the one with the higher mean return in the same
-//! test is taken, of still equal ones the one that the plan lists first; so is it where that version was not tested. Like
-//! in the paper, the test that selects is the test that is reported; with a large grid that makes Default and
-//! Interpolation look a little better than they are.
+//! rate when tested on the version that it was trained on. Ties go to the higher mean return in the same test.
+//! Configurations that still tie are all reported: numbers are means over them, since the rule cannot choose among them.
+//! The first of them in the plan's order stands for them where one cell is needed, as in `selected.csv` and heatmaps. It
+//! is also taken where the training version was not tested. Like in the paper, the selecting test is also the reported
+//! one; with a large grid that makes Default and Interpolation a little optimistic.
 
 use std::collections::BTreeMap;
 
@@ -42,9 +43,25 @@ pub struct MethodResults<'a> {
     pub runs: BTreeMap<u32, SelectedRun<'a>>,
 }
 
-/// What is reported of a run, by all that the plan trains on; `None` where nothing has a result yet.
+/// What is reported of a run.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct SelectedRun<'a>(pub BTreeMap<TrainedOn<'a>, Option<Reported<'a>>>);
+pub struct SelectedRun<'a> {
+    /// The selected policy for each training version or set; `None` while there is no result.
+    pub selected: BTreeMap<TrainedOn<'a>, Option<Reported<'a>>>,
+    /// Other cells whose selecting test equals that of the selected one, in the plan's order.
+    pub tied: BTreeMap<TrainedOn<'a>, Vec<Selected<'a>>>,
+}
+
+/// How far a metric depends on the choice among tied configurations.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TieRange {
+    /// The largest number of choices in any run: of tied configurations, or of pairs of these.
+    pub choices: usize,
+    /// The metric with the lowest choice in every run, averaged over runs, %.
+    pub low: f64,
+    /// The metric with the highest choice in every run, averaged over runs, %.
+    pub high: f64,
+}
 
 /// A policy whose tests are reported.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -125,7 +142,7 @@ impl<'a> MethodResults<'a> {
         self.cells += is_papers;
         self.done += is_papers * usize::from(matches!(state, CellState::Done(_)));
         for run in 1..=runs {
-            self.runs.entry(run).or_default().0.entry(cell.trained_on()).or_insert_with(|| {
+            self.runs.entry(run).or_default().selected.entry(cell.trained_on()).or_insert_with(|| {
                 self.cells += is_papers;
                 None
             });
@@ -135,20 +152,37 @@ impl<'a> MethodResults<'a> {
     /// Takes `cell` into account, which comes after all cells that the plan lists before it.
     fn consider(&mut self, cell: &'a Cell, state: &'a CellState) {
         let is_papers = usize::from(cell.set.is_none());
-        let best = self.runs.entry(cell.run).or_default().0.entry(cell.trained_on()).or_default();
+        let run = self.runs.entry(cell.run).or_default();
+        let best = run.selected.entry(cell.trained_on()).or_default();
         let CellState::Done(result) = state else { return };
         self.done += is_papers;
         let candidate = Selected { cell, result };
-        if best.and_then(|best| best.cell()).is_none_or(|best| candidate.rank() > best.rank()) {
+        let best_rank = best.and_then(|best| best.cell()).map(|best| best.rank());
+        if best_rank.is_none_or(|best_rank| candidate.rank() > best_rank) {
             *best = Some(Reported::Cell(candidate));
+            run.tied.remove(&cell.trained_on());
+        } else if candidate.rank().is_some() && best_rank == Some(candidate.rank()) {
+            run.tied.entry(cell.trained_on()).or_default().push(candidate);
         }
     }
 
-    /// A metric of each run that has it, %, by the run's number.
+    /// A metric of each run that has it, %, by the run's number; the mean over tied configurations.
     pub fn metric(&self, metric: Metric) -> BTreeMap<u32, f64> {
-        let of_run =
-            |(&number, run): (&u32, &SelectedRun<'_>)| Some((number, metric.of(|scenario| run.rate(scenario))?));
+        let of_run = |(&number, run): (&u32, &SelectedRun<'_>)| {
+            let values = run.metric_by_choice(metric);
+            (!values.is_empty()).then(|| (number, mean(values.into_iter())))
+        };
         self.runs.iter().filter_map(of_run).collect()
+    }
+
+    /// How far a metric depends on the choice among tied configurations; `None` if no run that has it has a tie.
+    pub fn tie_range(&self, metric: Metric) -> Option<TieRange> {
+        let by_run = self.runs.values().map(|run| run.metric_by_choice(metric));
+        let by_run: Vec<Vec<f64>> = by_run.filter(|values| !values.is_empty()).collect();
+        let choices = by_run.iter().map(Vec::len).max().filter(|choices| *choices > 1)?;
+        let low = mean(by_run.iter().map(|values| values.iter().copied().fold(f64::INFINITY, f64::min)));
+        let high = mean(by_run.iter().map(|values| values.iter().copied().fold(f64::NEG_INFINITY, f64::max)));
+        Some(TieRange { choices, low, high })
     }
 
     /// A metric's mean and deviation over runs, %.
@@ -161,17 +195,62 @@ impl<'a> MethodResults<'a> {
         self.test(TrainedOn::Version(train), &test.to_string(), |test| test.success_percent)
     }
 
-    /// A figure of the tests on a set or version, over runs.
+    /// A figure of the tests on a set or version, over runs; in a run the mean over tied configurations.
     pub fn test(&self, trained_on: TrainedOn<'_>, tested_on: &str, figure: fn(&TestResult) -> f64) -> Option<Summary> {
-        let of_run = |run: &SelectedRun<'_>| run.trained_on(trained_on)?.test(tested_on).map(figure);
+        let of_run = |run: &SelectedRun<'_>| run.mean_over_ties(trained_on, tested_on, figure);
         Summary::of(&self.runs.values().filter_map(of_run).collect::<Vec<_>>())
     }
 }
 
 impl<'a> SelectedRun<'a> {
-    /// What was trained on this.
+    /// The selected policy that was trained on this; the first of tied ones.
     pub fn trained_on(&self, trained_on: TrainedOn<'_>) -> Option<Reported<'a>> {
-        self.0.get(&trained_on).copied().flatten()
+        self.selected.get(&trained_on).copied().flatten()
+    }
+
+    /// The selected policy that was trained on this, and those that tie with it, in the plan's order.
+    pub fn tied_on(&self, trained_on: TrainedOn<'_>) -> Vec<Reported<'a>> {
+        let tied = self.tied.get(&trained_on).into_iter().flatten().copied().map(Reported::Cell);
+        self.trained_on(trained_on).into_iter().chain(tied).collect()
+    }
+
+    /// The mean of a figure over tied configurations; `None` if one of them was not tested there.
+    fn mean_over_ties(
+        &self,
+        trained_on: TrainedOn<'_>,
+        tested_on: &str,
+        figure: fn(&TestResult) -> f64,
+    ) -> Option<f64> {
+        let figures: Option<Vec<f64>> =
+            self.tied_on(trained_on).iter().map(|reported| reported.test(tested_on).map(figure)).collect();
+        figures.filter(|figures| !figures.is_empty()).map(|figures| mean(figures.into_iter()))
+    }
+
+    /// A metric for each choice among tied configurations, %; empty if the run does not have it.
+    fn metric_by_choice(&self, metric: Metric) -> Vec<f64> {
+        let choices = Version::ALL.map(|train| {
+            // The metric does not depend on a policy without whose scenarios it is known.
+            let matters = metric.of(|scenario| (scenario.train != train).then_some(0.0)).is_none();
+            let tied = self.tied_on(TrainedOn::Version(train)).into_iter().map(Some).take(if matters {
+                usize::MAX
+            } else {
+                1
+            });
+            let tied: Vec<Option<Reported<'a>>> = tied.collect();
+            if tied.is_empty() { vec![None] } else { tied }
+        });
+        let [on_d, on_r, on_e] = &choices;
+        let mut values = Vec::new();
+        for d in on_d {
+            for r in on_r {
+                for e in on_e {
+                    let chosen = [d, r, e];
+                    let rate = |Scenario { train, test }| chosen[train as usize].as_ref()?.rate(test);
+                    values.extend(metric.of(rate));
+                }
+            }
+        }
+        values
     }
 
     /// The cell that was trained on this; `None` of an agent that was trained elsewhere.
@@ -179,9 +258,9 @@ impl<'a> SelectedRun<'a> {
         self.trained_on(trained_on)?.cell()
     }
 
-    /// The success rate of a scenario, %; `None` if nothing was tested there.
+    /// The success rate of a scenario, %, as the mean over tied configurations; `None` if nothing was tested there.
     pub fn rate(&self, Scenario { train, test }: Scenario) -> Option<f64> {
-        self.trained_on(TrainedOn::Version(train))?.rate(test)
+        self.mean_over_ties(TrainedOn::Version(train), &test.to_string(), |test| test.success_percent)
     }
 }
 
@@ -235,6 +314,19 @@ impl<'a> Selected<'a> {
 pub fn average(selections: &[&MethodResults<'_>], metric: Metric) -> Option<Summary> {
     let runs = common_runs(selections, metric);
     Summary::of(&runs.into_iter().map(|(_, numbers)| mean(numbers.into_iter())).collect::<Vec<_>>())
+}
+
+/// How far [`average`] depends on the choice among tied configurations; `None` without a tie.
+pub fn average_tie_range(selections: &[&MethodResults<'_>], metric: Metric) -> Option<TieRange> {
+    let ranges: Vec<Option<TieRange>> = selections.iter().map(|selection| selection.tie_range(metric)).collect();
+    let choices = ranges.iter().flatten().map(|range| range.choices).max()?;
+    let mut ends = [0.0; 2];
+    for (selection, range) in selections.iter().zip(ranges) {
+        let without_ties = selection.summary(metric)?.mean;
+        let of_environment = range.map_or([without_ties; 2], |range| [range.low, range.high]);
+        ends.iter_mut().zip(of_environment).for_each(|(end, value)| *end += value / selections.len() as f64);
+    }
+    Some(TieRange { choices, low: ends[0], high: ends[1] })
 }
 
 /// The interquartile mean of a metric over the environments of `selections` and the runs that all of them have, with

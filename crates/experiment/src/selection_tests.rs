@@ -117,7 +117,7 @@ fn metrics_are_those_computed_by_hand() {
 }
 
 #[test]
-fn of_equal_configurations_the_return_and_then_the_plan_decide() {
+fn return_breaks_ties_and_the_rest_is_averaged() {
     let plan = plan();
     // A and B are told apart by their rates on R.
     let on_r = |name: &str| [100.0, if name == "A" { 1.0 } else { 2.0 }, 0.0];
@@ -132,7 +132,11 @@ fn of_equal_configurations_the_return_and_then_the_plan_decide() {
     };
     assert_eq!(chosen(&by_return), [Some(1.0), Some(2.0)]);
     let equal = |_: &str, _: Version, name: &str, _: u32| Some((on_r(name), 5.0));
-    assert_eq!(chosen(&equal), [Some(1.0), Some(1.0)], "A is listed first");
+    assert_eq!(chosen(&equal), [Some(1.5), Some(1.5)], "the mean of A and B");
+    let results = results(&plan, &equal);
+    let selections = results.select();
+    let first = selections[0].runs[&1].cell_trained_on(TrainedOn::Version(Version::D)).unwrap();
+    assert!(is_a(first.cell), "A is listed first and stands for both");
 }
 
 #[test]
@@ -156,4 +160,54 @@ fn what_is_missing_is_missing_and_never_zero() {
     assert_eq!(interquartile(&both, Metric::Default, 10), None);
     assert_summary(average(&both, Metric::Interpolation), 45.0, 0.0, 1);
     assert_eq!(average(&[], Metric::Default), None);
+}
+
+/// Both configurations have 100 % and the same return on what they were trained on; on the other versions they differ.
+fn tied(_: &str, version: Version, name: &str, _: u32) -> Option<([f64; 3], f64)> {
+    let rates = match (version, name) {
+        (Version::D, "A") => [100.0, 40.0, 10.0],
+        (Version::D, _) => [100.0, 90.0, 80.0],
+        (Version::R, "A") => [20.0, 100.0, 30.0],
+        (Version::R, _) => [20.0, 100.0, 70.0],
+        (Version::E, _) => [0.0, 0.0, 50.0],
+        (Version::RE, _) => return None,
+    };
+    Some((rates, 7.0))
+}
+
+#[test]
+fn numbers_are_means_over_tied_configurations() {
+    let plan = plan();
+    let results = results(&plan, &tied);
+    let selections = results.select();
+    let cart_pole = &selections[0];
+    assert_summary(cart_pole.summary(Metric::Default), 100.0, 0.0, 2);
+    assert_eq!(cart_pole.tie_range(Metric::Default), Some(TieRange { choices: 2, low: 100.0, high: 100.0 }));
+    let extrapolation = |dr: f64, de: f64, re: f64| (dr * de * re).cbrt();
+    let choices = [
+        extrapolation(40.0, 10.0, 30.0),
+        extrapolation(40.0, 10.0, 70.0),
+        extrapolation(90.0, 80.0, 30.0),
+        extrapolation(90.0, 80.0, 70.0),
+    ];
+    close(cart_pole.summary(Metric::Extrapolation).unwrap().mean, choices.iter().sum::<f64>() / 4.0);
+    let range = cart_pole.tie_range(Metric::Extrapolation).unwrap();
+    assert_eq!(range.choices, 4);
+    close(range.low, choices[0]);
+    close(range.high, choices[3]);
+    assert_summary(cart_pole.scenario(Scenario { train: Version::D, test: Version::E }), 45.0, 0.0, 2);
+    let selections: Vec<&MethodResults<'_>> = selections.iter().collect();
+    close(average_tie_range(&selections, Metric::Extrapolation).unwrap().low, choices[0]);
+}
+
+#[test]
+fn a_higher_return_decides_before_a_tie() {
+    let plan = plan();
+    let results = results(&plan, &|environment, version, name, run| {
+        let (rates, _) = tied(environment, version, name, run)?;
+        Some((rates, if name == "A" { 8.0 } else { 7.0 }))
+    });
+    let selections = results.select();
+    assert_eq!(selections[0].tie_range(Metric::Extrapolation), None);
+    assert_summary(selections[0].scenario(Scenario { train: Version::D, test: Version::E }), 10.0, 0.0, 2);
 }

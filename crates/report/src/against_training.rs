@@ -29,7 +29,7 @@ pub(crate) fn against_training<'a>(selections: &'a [MethodResults<'a>]) -> Vec<M
     let mut tests = Vec::new();
     for selection in selections {
         let trained_on: BTreeSet<TrainedOn<'a>> =
-            selection.runs.values().flat_map(|run| run.0.keys().copied()).collect();
+            selection.runs.values().flat_map(|run| run.selected.keys().copied()).collect();
         for trained_on in trained_on {
             let selected: Vec<Selected<'a>> =
                 selection.runs.values().filter_map(|run| run.cell_trained_on(trained_on)).collect();

@@ -37,11 +37,18 @@ impl Report<'_> {
     fn metrics_file(&self) -> Table {
         let rows = self.metrics.iter().chain(&self.averages);
         let lines: Vec<_> = rows.flat_map(|row| Metric::ALL.map(|metric| (row, metric))).collect();
-        Table::of("metrics.csv", &lines)
+        let mut table = Table::of("metrics.csv", &lines)
             .text("environment", |(row, _)| row.environment)
             .method(|(row, _)| &row.method)
             .text("metric", |(_, metric)| metric)
-            .summary(|(row, metric)| row.ours.get(metric).copied())
+            .summary(|(row, metric)| row.ours.get(metric).copied());
+        if self.has_ties() {
+            table = table
+                .number("tied_choices", |(row, metric)| row.ties.get(metric).map_or(1, |range| range.choices))
+                .number("ties_low", |(row, metric)| or_empty(row.ties.get(metric).map(|range| range.low)))
+                .number("ties_high", |(row, metric)| or_empty(row.ties.get(metric).map(|range| range.high)));
+        }
+        table
             .number("paper_mean", |(row, metric)| or_empty(row.papers.get(metric).map(|paper| paper.mean)))
             .number("paper_std", |(row, metric)| or_empty(row.papers.get(metric).and_then(|paper| paper.std)))
             .number("difference", |(row, metric)| or_empty(row.difference(*metric)))

@@ -134,7 +134,7 @@ fn shown<'a>(
 fn shown_elsewhere<'a>(row: &MethodResults<'a>) -> Vec<(HeatmapKind, Shown<'a>)> {
     let mut all = Vec::new();
     for (&run, of_run) in &row.runs {
-        for (&trained_on, reported) in &of_run.0 {
+        for (&trained_on, reported) in &of_run.selected {
             let Some(Reported::Elsewhere(_, policy)) = reported else { continue };
             let Some(heatmap) = Heatmap::recorded(&policy.records) else { continue };
             let origin = Origin { seed: policy.known.seed, commit: None };

@@ -97,7 +97,8 @@ fn metrics(report: &Report<'_>, figures: &[Figure]) -> Vec<Subsection> {
         let figures: Vec<&Figure> = figures.iter().filter(|figure| figure.environment == title).collect();
         Subsection { title, content: html! { (content) @if !figures.is_empty() { (figure_grid(&figures)) } } }
     };
-    report.metrics_tables().into_iter().map(with_figure).collect()
+    let ties = report.ties_table().map(|table| table_subsection(&table, false));
+    report.metrics_tables().into_iter().map(with_figure).chain(ties).collect()
 }
 
 fn page(report: &Report<'_>, finding: &[Figure], sections: &[&Section]) -> Markup {

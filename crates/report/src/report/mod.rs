@@ -149,7 +149,8 @@ impl<'a> Report<'a> {
     }
 
     fn number_tables(&self) -> impl Iterator<Item = Table> {
-        let papers = self.metrics_tables().into_iter().chain(self.iqm_table()).chain(self.gap_table());
+        let papers =
+            self.metrics_tables().into_iter().chain(self.ties_table()).chain(self.iqm_table()).chain(self.gap_table());
         let scenarios = self.extrapolation_tables().into_iter().chain(self.scenario_tables());
         papers.chain(scenarios).chain(self.set_table()).chain(self.marks_table())
     }
@@ -157,7 +158,7 @@ impl<'a> Report<'a> {
     /// All cells that numbers come from.
     fn selected(&self) -> Vec<Selected<'a>> {
         let runs = self.selections.iter().flat_map(|selection| selection.runs.values());
-        runs.flat_map(|run| run.0.values().flatten()).filter_map(Reported::cell).collect()
+        runs.flat_map(|run| run.selected.values().flatten()).filter_map(Reported::cell).collect()
     }
 }
 

@@ -2,7 +2,9 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use perturb_experiment::{MethodResults, Reselection, SelectedRun, average, interquartile, scores};
+use perturb_experiment::{
+    MethodResults, Reselection, SelectedRun, TieRange, average, average_tie_range, interquartile, scores,
+};
 use perturb_records::outcomes::Counted;
 use perturb_records::statistics::{Bootstrapped, Summary, are_enough, interquartile_mean, mean, optimality_gap};
 use perturb_records::{Metric, Scenario, TestResult, TrainedOn, paper};
@@ -26,6 +28,8 @@ pub(super) struct MethodMetrics<'a> {
     pub(super) environment: &'a str,
     pub(super) method: Method,
     pub(super) ours: BTreeMap<Metric, Summary>,
+    /// How far `ours` depend on the choice among tied configurations.
+    pub(super) ties: BTreeMap<Metric, TieRange>,
     pub(super) papers: BTreeMap<Metric, Summary>,
     /// Whether one can be compared with the other.
     pub(super) comparable: bool,
@@ -77,6 +81,7 @@ pub(super) fn metrics<'a>(selections: &[MethodResults<'a>]) -> Vec<MethodMetrics
         environment: selection.environment,
         method: selection.method.clone(),
         ours: known(|metric| selection.summary(metric)),
+        ties: known(|metric| selection.tie_range(metric)),
         papers: known(|metric| paper::number(selection.environment, &selection.method, metric)),
         comparable: paper::is_comparable(selection.environment),
         means: known(|metric| mean_with_interval(&[selection], metric)),
@@ -112,6 +117,7 @@ pub(super) fn averages<'a>(
         MethodMetrics {
             environment: AVERAGE,
             ours: known(|metric| average(&found, metric).filter(|_| everywhere)),
+            ties: known(|metric| average_tie_range(&found, metric).filter(|_| everywhere)),
             papers: known(|metric| paper::average(environments, &method, metric)),
             comparable: environments.iter().all(|environment| paper::is_comparable(environment)),
             means: known(|metric| mean_with_interval(&found, metric).filter(|_| everywhere)),
@@ -134,7 +140,8 @@ pub(super) fn set_tests<'a>(scope: &Scope<'a>, selections: &'a [MethodResults<'a
     let mut tests = Vec::new();
     for selection in selections {
         // A run of an agent that was trained elsewhere may lack what another one has.
-        let trained: BTreeSet<TrainedOn<'a>> = selection.runs.values().flat_map(|run| run.0.keys().copied()).collect();
+        let trained: BTreeSet<TrainedOn<'a>> =
+            selection.runs.values().flat_map(|run| run.selected.keys().copied()).collect();
         for trained_on in trained {
             let is_of_set = !matches!(trained_on, TrainedOn::Version(_));
             let names = scope.tested_on.iter().filter(|name| is_of_set || version(name).is_none());
@@ -156,9 +163,9 @@ pub(super) fn set_tests<'a>(scope: &Scope<'a>, selections: &'a [MethodResults<'a
     tests
 }
 
-/// The test episodes of a scenario, of all runs together.
+/// The test episodes of a scenario, of all runs and tied configurations together.
 pub(super) fn counted(selection: &MethodResults<'_>, Scenario { train, test }: Scenario) -> Counted {
-    let trained = selection.runs.values().filter_map(|run| run.trained_on(TrainedOn::Version(train)));
+    let trained = selection.runs.values().flat_map(|run| run.tied_on(TrainedOn::Version(train)));
     let tests = trained.filter_map(|selected| selected.test(&test.to_string()));
     let of = |test: &TestResult| Counted {
         successes: (test.success_percent * test.episodes as f64 / 100.0).round() as u64,

@@ -47,5 +47,5 @@ pub(super) fn has_scenarios_of(row: &MethodResults<'_>, version: Version) -> boo
 }
 
 fn is_trained_on(row: &MethodResults<'_>, version: Version) -> bool {
-    row.runs.values().any(|run| run.0.contains_key(&TrainedOn::Version(version)))
+    row.runs.values().any(|run| run.selected.contains_key(&TrainedOn::Version(version)))
 }

@@ -49,6 +49,30 @@ impl Report<'_> {
             .build()
     }
 
+    /// Whether a number is a mean over tied configurations.
+    pub(super) fn has_ties(&self) -> bool {
+        self.metrics.iter().any(|row| !row.ties.is_empty())
+    }
+
+    /// The numbers that are means over tied configurations, with their ranges; `None` without ties.
+    pub(super) fn ties_table(&self) -> Option<Table> {
+        let rows = self.averages.iter().filter(|_| self.scope.averaged.len() > 1).chain(&self.metrics);
+        let rows: Vec<_> =
+            rows.flat_map(|row| row.ties.iter().map(move |(metric, range)| (row, metric, range))).collect();
+        rows.first()?;
+        let title = "Means over configurations that tie in the selecting test, and their range from the lowest to the \
+                     highest choice in every run";
+        let table = Table::of(title, &rows)
+            .text("environment", |(row, ..)| row.environment)
+            .text("method", |(row, ..)| &row.method)
+            .text("metric", |(_, metric, _)| metric)
+            .number("choices", |(.., range)| range.choices)
+            .number("mean", |(row, metric, _)| or(MISSING, row.ours.get(metric).map(|it| format!("{:.1}", it.mean))))
+            .number("range", |(.., range)| format!("{:.1} … {:.1}", range.low, range.high))
+            .build();
+        Some(table)
+    }
+
     pub(super) fn iqm_table(&self) -> Option<Table> {
         let title = "Interquartile mean over all environments and the runs that all of them have, with its 95 % stratified \
                      bootstrap interval, and the interval with every selection made anew in each resample";
@@ -134,7 +158,7 @@ impl Report<'_> {
     /// The paper's, and R+E if the plan trains on it.
     pub(super) fn trained_versions(&self) -> Vec<Version> {
         let runs = || self.selections.iter().flat_map(|selection| selection.runs.values());
-        versions(|version| runs().any(|run| run.0.contains_key(&TrainedOn::Version(version))))
+        versions(|version| runs().any(|run| run.selected.contains_key(&TrainedOn::Version(version))))
     }
 
     /// The paper's, and R+E if the plan tests on it.

@@ -27,7 +27,8 @@ impl<'a> Trained<'a> {
 pub(super) fn trained<'a>(selections: &'a [MethodResults<'a>], recorded: &'a Recorded) -> Vec<Vec<Trained<'a>>> {
     let of_selection = |selection: &'a MethodResults<'a>| {
         // A run of an agent that was trained elsewhere may lack what another one has.
-        let all: BTreeSet<TrainedOn<'a>> = selection.runs.values().flat_map(|run| run.0.keys().copied()).collect();
+        let all: BTreeSet<TrainedOn<'a>> =
+            selection.runs.values().flat_map(|run| run.selected.keys().copied()).collect();
         all.into_iter().map(|trained_on| {
             let selected = selection.runs.values().filter_map(|run| run.trained_on(trained_on));
             let policies = selected.filter_map(|selected| recorded.policy(&selected)).collect();
