@@ -2,9 +2,9 @@
 
 use pulp::Simd;
 
-use crate::kernel::{Kernel, Rows, RowsFrom, run};
+use crate::kernel::{Kernel, Rows, RowsFrom, call, run};
 use crate::math::{sigmoid, tanh};
-use crate::perceptron::{Layer, Perceptron, take};
+use crate::perceptron::{Forward, Layer, Perceptron, take};
 use crate::spec::PolicySpec;
 
 /// Hidden layers, an LSTM and two heads, with the memory of every environment.
@@ -128,7 +128,8 @@ impl Kernel for Step<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let (network, n) = (self.network, self.n);
-        network.hidden.forward(simd, &network.observations, 0..n, &mut network.hidden_layers);
+        let (inputs, outputs) = (&network.observations, &mut network.hidden_layers[..]);
+        call(simd, Forward { network: &network.hidden, inputs, rows: 0..n, outputs });
         let x = network.hidden_layers.last().unwrap_or(&network.observations);
         for row in 0..n {
             network.inputs.row_mut(row)[..network.hidden_size].copy_from_slice(&x.row(row)[..network.hidden_size]);

@@ -8,7 +8,7 @@ use crate::act::Actor;
 use crate::act_ff::{Activations, BLOCK, Networks};
 use crate::error::{Error, Result, check_length};
 use crate::gradient::{ActingOutputs, Batch, GradientBackend};
-use crate::kernel::{Kernel, run};
+use crate::kernel::{Kernel, call, run};
 use crate::losses::Losses;
 use crate::objective::{Acting, Gaussian, Objective, Outputs, Sample};
 use crate::perceptron::{Backward, Forward};
@@ -331,8 +331,9 @@ impl Differentiation<'_> {
             for (b, &i) in indices.iter().enumerate() {
                 observations.row_mut(b)[..size].copy_from_slice(&samples.observations[i as usize * size..][..size]);
             }
-            networks.policy.forward(simd, observations, 0..n, policy_layers);
-            networks.value.forward(simd, observations, 0..n, value_layers);
+            let (inputs, rows) = (&*observations, 0..n);
+            call(simd, Forward { network: &networks.policy, inputs, rows: rows.clone(), outputs: policy_layers });
+            call(simd, Forward { network: &networks.value, inputs, rows, outputs: value_layers });
         }
         let (heads, values) = (&policy_layers[policy_layers.len() - 1], &value_layers[value_layers.len() - 1]);
         let (n_outputs, width) = (spec.action.outputs(), spec.action.width());

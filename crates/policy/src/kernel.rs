@@ -18,19 +18,28 @@ pub(crate) trait Kernel {
     fn run<S: Simd>(self, simd: S);
 }
 
+struct Compiled<K>(K);
+
+impl<K: Kernel> WithSimd for Compiled<K> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        // Every x86-64 processor has vectors of four numbers.
+        if S::F32_LANES == 1 { self.0.run(Scalar128b) } else { self.0.run(simd) }
+    }
+}
+
 /// Does `kernel` with the widest vectors that this processor has.
 pub(crate) fn run(kernel: impl Kernel) {
-    struct Compiled<K>(K);
-    impl<K: Kernel> WithSimd for Compiled<K> {
-        type Output = ();
-
-        #[inline(always)]
-        fn with_simd<S: Simd>(self, simd: S) {
-            // Every x86-64 processor has vectors of four numbers.
-            if S::F32_LANES == 1 { self.0.run(Scalar128b) } else { self.0.run(simd) }
-        }
-    }
     Arch::new().dispatch(Compiled(kernel));
+}
+
+/// Does `kernel`, a part of another one, with the vectors of that one. The code is compiled once for each kind of vector unit,
+/// and not once for each place that calls it.
+#[inline(never)]
+pub(crate) fn call<S: Simd>(simd: S, kernel: impl Kernel) {
+    simd.vectorize(Compiled(kernel));
 }
 
 /// [`LANES`] that `n` numbers fill.

@@ -41,7 +41,7 @@ impl Layer {
     /// bias + Σ_i input_i weight_i of `rows`, added up in order of i.
     #[inline(always)]
     pub(crate) fn apply<S: Simd>(&self, simd: S, from: &Rows, rows: Range<usize>, to: &mut Rows) {
-        self.matrix.factor().apply(simd, from, rows, Some(&self.biases), to);
+        self.matrix.factor().apply_here(simd, from, rows, Some(&self.biases), to);
     }
 }
 
@@ -81,7 +81,7 @@ impl Perceptron {
 
     /// Computes every layer's outputs, one of `outputs` each, for `rows` of `inputs`.
     #[inline(always)]
-    pub(crate) fn forward<S: Simd>(&self, simd: S, inputs: &Rows, rows: Range<usize>, outputs: &mut [Rows]) {
+    fn forward<S: Simd>(&self, simd: S, inputs: &Rows, rows: Range<usize>, outputs: &mut [Rows]) {
         for (i, layer) in self.layers.iter().enumerate() {
             let (below, own) = outputs.split_at_mut(i);
             layer.apply(simd, below.last().unwrap_or(inputs), rows.clone(), &mut own[0]);

@@ -12,7 +12,7 @@ use std::ops::Range;
 
 use pulp::Simd;
 
-use crate::kernel::{LANES, Lane, Rows, lanes};
+use crate::kernel::{Kernel, LANES, Lane, Rows, call, lanes};
 
 /// A sum's start where there is none.
 const ZERO: Lane = [0.0; LANES];
@@ -72,8 +72,20 @@ impl<'a> Factor<'a> {
 
     /// `rows` of `from` times this: to_b = start + Σ_i from_bi weights_i, added up in order of i. `start` has one lane for
     /// each of outputs.
-    #[inline(always)]
     pub(crate) fn apply<S: Simd>(
+        self,
+        simd: S,
+        from: &Rows,
+        rows: Range<usize>,
+        start: Option<&[Lane]>,
+        to: &mut Rows,
+    ) {
+        call(simd, Apply { factor: self, from, rows, start, to });
+    }
+
+    /// The same, compiled into what calls it.
+    #[inline(always)]
+    pub(crate) fn apply_here<S: Simd>(
         self,
         simd: S,
         from: &Rows,
@@ -220,6 +232,23 @@ impl<'a> Factor<'a> {
     }
 }
 
+/// Arguments of [`Factor::apply`].
+struct Apply<'a> {
+    factor: Factor<'a>,
+    from: &'a Rows,
+    rows: Range<usize>,
+    start: Option<&'a [Lane]>,
+    to: &'a mut Rows,
+}
+
+impl Kernel for Apply<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Apply { factor, from, rows, start, to } = self;
+        factor.apply_here(simd, from, rows, start, to);
+    }
+}
+
 /// Transposes `block` [[`LANES`], columns], four columns at a time; says how many of them could be.
 fn transpose(block: &[f32], columns: &mut [Lane]) -> usize {
     let width = columns.len();
@@ -256,8 +285,37 @@ fn transpose_tile(rows: [[f32; 4]; 4]) -> [[f32; 4]; 4] {
 
 /// Puts Σ_b deltas_bo inputs_bi, over the first `n` rows in order of b, in `sums` [outputs, `size`]; with `ADD` it goes on
 /// with the sums that are there.
-#[inline(always)]
 pub(crate) fn outer<S: Simd, const ADD: bool>(
+    simd: S,
+    sums: &mut [f32],
+    size: usize,
+    deltas: &Rows,
+    inputs: &Rows,
+    n: usize,
+) {
+    call(simd, Outer::<ADD> { sums, size, deltas, inputs, n });
+}
+
+/// Arguments of [`outer`].
+struct Outer<'a, const ADD: bool> {
+    sums: &'a mut [f32],
+    size: usize,
+    deltas: &'a Rows,
+    inputs: &'a Rows,
+    n: usize,
+}
+
+impl<const ADD: bool> Kernel for Outer<'_, ADD> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Outer { sums, size, deltas, inputs, n } = self;
+        outer_here::<S, ADD>(simd, sums, size, deltas, inputs, n);
+    }
+}
+
+/// The same, compiled into what calls it.
+#[inline(always)]
+fn outer_here<S: Simd, const ADD: bool>(
     simd: S,
     sums: &mut [f32],
     size: usize,
