@@ -1,7 +1,9 @@
 # perturb's commands; `make` alone lists them. Each installs what it lacks and can be run again.
 
-# Debian 12's packages: a compiler, libclang for bindgen, MuJoCo.
-PACKAGES := build-essential pkg-config libclang-dev libmujoco-dev
+# Debian 12's packages: a compiler, MuJoCo.
+PACKAGES := build-essential pkg-config libmujoco-dev
+# `make generate`, and the test that generated files are up to date, read MuJoCo's headers with libclang.
+CLANG_PACKAGES := libclang-dev
 # perturb-recurrent needs libtorch and a BLAS that is not the slow reference one.
 TORCH_PACKAGES := libtorch-dev libopenblas0-pthread
 # What draws Hopper and HalfCheetah: OpenGL without a display, in software. The server runs without it.
@@ -14,6 +16,8 @@ QEMU := qemu-user
 FAKETIME := libfaketime
 # What encodes the .mp4 files of `perturb video`, some 60 MB; everything else but the site runs without it.
 FFMPEG := ffmpeg
+# Packages that perturb-server and perturb compile in two versions: ring, ahash and tempfile each need another getrandom.
+TWICE := getrandom
 CARGO_DENY_VERSION := 0.20.2
 TARGET := $(or $(CARGO_TARGET_DIR),target)
 PROGRAMS := $(TARGET)/release
@@ -53,6 +57,10 @@ export OPENBLAS_NUM_THREADS := 1
 # form is the server without MuJoCo.
 ALL := --workspace --release --locked
 WITHOUT_MUJOCO := --package perturb --no-default-features --release --locked
+# Its tests look at what the server does, not at how fast it is, and compile in half the time.
+WITHOUT_MUJOCO_TEST := $(WITHOUT_MUJOCO) --config profile.release.package.perturb.opt-level=1
+# Tests mostly wait, for time-outs and for each other: so many at a time.
+TEST_THREADS := $(shell echo $$((3 * $$(nproc))))
 
 # Installs those of the Debian packages $(1) that are missing.
 define install
@@ -74,7 +82,7 @@ missing=; \
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help deps torch-deps opengl toolchain build recurrent build-all install install-recurrent demo all-pairs report-check serve-test test slurm-test kill-test \
+.PHONY: help deps all-deps opengl toolchain build generate recurrent build-all install install-recurrent demo all-pairs report-check serve-test test slurm-test kill-test \
 	load-test bounds-test attack-test faults-test asan-test qemu-test simulation-test slurm-acceptance lint bench fuzz fuzz-keep \
 	bench-peers audit cargo-deny metrics-test otel-test python-test interrupts-test wheel wheel-test python-acceptance \
 	bench-python python-venv docs docs-test docker docker-base docker-test
@@ -85,8 +93,8 @@ help: ## this list
 deps: toolchain ## install the missing Debian packages, with sudo if need be
 	@$(call install,$(PACKAGES))
 
-torch-deps: deps
-	@$(call install,$(TORCH_PACKAGES))
+all-deps: deps
+	@$(call install,$(TORCH_PACKAGES) $(CLANG_PACKAGES))
 
 opengl:
 	@$(call install,$(OPENGL))
@@ -97,14 +105,17 @@ toolchain:
 build: deps ## compile the programs perturb-server and perturb
 	cargo build $(ALL) --bin perturb-server --bin perturb
 
-recurrent: torch-deps ## compile perturb-recurrent too, which trains recurrent policies with libtorch; minutes
+recurrent: deps ## compile perturb-recurrent too, which trains recurrent policies with libtorch; minutes
+	@$(call install,$(TORCH_PACKAGES))
 	cargo build $(ALL) --bin perturb-server --bin perturb --bin perturb-recurrent
 
-build-all: torch-deps
+# What tests, lints and benches of the whole workspace need.
+build-all: all-deps
 	cargo build $(ALL)
 
 install: build ## copy the programs, manual pages and completions to PREFIX, by default ~/.local
 	install -D --target-directory $(PREFIX)/bin $(addprefix $(PROGRAMS)/,perturb perturb-server)
+	strip --strip-debug $(PREFIX)/bin/perturb $(PREFIX)/bin/perturb-server
 	mkdir -p $(PREFIX)/share/man/man1 $(PREFIX)/share/bash-completion/completions $(PREFIX)/share/zsh/site-functions \
 		$(PREFIX)/share/fish/vendor_completions.d
 	$(PROGRAMS)/perturb --quiet man $(PREFIX)/share/man/man1
@@ -120,8 +131,9 @@ install: build ## copy the programs, manual pages and completions to PREFIX, by 
 
 install-recurrent: recurrent install ## install perturb-recurrent too, which trains recurrent policies with libtorch
 	install -D --target-directory $(PREFIX)/bin $(PROGRAMS)/perturb-recurrent
+	strip --strip-debug $(PREFIX)/bin/perturb-recurrent
 
-demo: build opengl ## train Hopper on default and on random physics, and see what still works; some three minutes
+demo: build opengl ## train Hopper on default and on random physics, and see what still works; a minute or two
 	$(PROGRAMS)/perturb demo $(DEMO_ARGS)
 
 all-pairs: recurrent ## train and test every algorithm and architecture on every environment, shortly
@@ -139,14 +151,15 @@ metrics-test: build opengl ## have a Prometheus, which it installs, watch a serv
 	@$(call install,prometheus python3)
 	python3 docker/grafana/check.py $(PROGRAMS)
 
-otel-test: torch-deps ## build the server with traces, and test that they come to a collector
+otel-test: all-deps ## build the server with traces, and test that they come to a collector
 	cargo test $(ALL) --features perturb/otel --test server traces::
 
 test: export PERTURB_TEST_DM_ENV_RPC_PYTHON := $(abspath $(DM_ENV_RPC))/bin/python
-test: torch-deps opengl $(DM_ENV_RPC)/installed ## run all tests, then those of the server without MuJoCo
+test: export RUST_TEST_THREADS := $(TEST_THREADS)
+test: all-deps opengl $(DM_ENV_RPC)/installed ## run all tests, then those of the server without MuJoCo
 	@$(call install,$(FFMPEG))
 	cargo test $(ALL)
-	cargo test $(WITHOUT_MUJOCO)
+	cargo test $(WITHOUT_MUJOCO_TEST)
 
 slurm-test: build-all ## do a plan on a real Slurm of two nodes, started for it, one of which dies
 	@$(call install,$(SLURM_PACKAGES))
@@ -174,10 +187,13 @@ qemu-test: build-all ## train on emulated processors, to the same weights as on 
 	@$(call install,$(QEMU))
 	PERTURB_QEMU_REQUIRED=1 cargo test $(ALL) --test cli processors::
 
+generate: all-deps ## write the generated files anew, after an edit of a .proto file or of crates/mujoco/src/shim.h
+	cargo run $(ALL) --bin perturb-generate
+
 slurm-acceptance: ## the same with experiments/quick.toml
 	PERTURB_SLURM_PLAN=$(CURDIR)/experiments/quick.toml $(MAKE) slurm-test
 
-lint: torch-deps cargo-deny ## check formatting, names, import cycles, clippy, documentation and dependencies
+lint: all-deps cargo-deny ## check formatting, names, import cycles, clippy, documentation and dependencies
 	cargo fmt --all --check
 	cargo run --quiet --release --locked --package perturb-lint
 	cargo clippy $(ALL) --all-targets -- -D warnings
@@ -185,6 +201,9 @@ lint: torch-deps cargo-deny ## check formatting, names, import cycles, clippy, d
 	cargo clippy --release --locked --package perturb-simulation --features turmoil --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc $(ALL) --no-deps --lib
 	cargo deny --locked check bans licenses sources
+	@twice=$$(cargo tree --locked --package perturb --package perturb-cli --edges normal,build --prefix none | \
+		awk 'NF { print $$1, $$2 }' | sort -u | cut -d ' ' -f 1 | uniq -d | grep -vxE '$(TWICE)'); \
+		[ -z "$$twice" ] || { echo "perturb-server and perturb compile two versions of:" $$twice >&2; exit 1; }
 
 bench: build-all opengl ## measure throughput, latency and memory
 	cargo bench --workspace --locked --bench '*' -- $(BENCH_ARGS)
@@ -352,7 +371,7 @@ fuzz-keep: ## keep, of what fuzz found that clients may send, as few inputs in f
 	done
 
 attack-test: export PERTURB_FUZZ_MOST_GROWN_MB = 20
-attack-test: torch-deps ## a million mutated requests and a hundred thousand snapshots, which may take no memory along; minutes
+attack-test: all-deps ## a million mutated requests and a hundred thousand snapshots, which may take no memory along; minutes
 	PERTURB_FUZZ_INPUTS=1000000 cargo test $(ALL) --package perturb-fuzz --test corpus -- --nocapture --exact requests
 	PERTURB_FUZZ_INPUTS=100000 cargo test $(ALL) --package perturb-fuzz --test corpus -- --nocapture --exact snapshots
 

@@ -8,7 +8,7 @@ RUN docker/skeleton.sh /skeleton
 
 FROM rust:1.95-bookworm AS build
 RUN apt-get update \
-    && apt-get install --yes --no-install-recommends libclang-dev libmujoco-dev pkg-config \
+    && apt-get install --yes --no-install-recommends libmujoco-dev pkg-config \
     && rm -rf /var/lib/apt/lists/*
 # Debug information would be three quarters of the program; names of functions stay.
 ENV CARGO_PROFILE_RELEASE_DEBUG=false

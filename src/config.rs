@@ -10,6 +10,7 @@ use std::{
     path::{Path, PathBuf},
     time::Duration,
 };
+use tracing_subscriber::filter::{LevelFilter, Targets};
 
 const ENV_PREFIX: &str = "PERTURB_SERVER";
 /// A day. The transport adds the interval to the present, which must not overflow.
@@ -478,7 +479,7 @@ impl Config {
         if let Some(address) = self.metrics.as_ref().filter(others).filter(|_| !self.insecure) {
             return Err(Error::InsecureMetrics { address: address.written() });
         }
-        if tracing_subscriber::EnvFilter::try_new(&self.log).is_err() {
+        if self.log.parse::<Targets>().is_err() {
             return refuse("log", &self.log, "error, warn, info, debug, trace, or a filter such as perturb=debug");
         }
         Ok(self)
@@ -486,10 +487,10 @@ impl Config {
 
     /// The filter in full. A level is that of this program's own lines: what its libraries say mostly follows from what
     /// clients send, and of that only errors are logged unless a filter asks for more.
-    pub fn filter(&self) -> String {
-        match self.log.parse::<tracing::level_filters::LevelFilter>() {
-            Ok(level) => format!("{},perturb={level}", level.min(tracing::level_filters::LevelFilter::ERROR)),
-            Err(_) => self.log.clone(),
+    pub fn filter(&self) -> Targets {
+        match self.log.parse::<LevelFilter>() {
+            Ok(level) => Targets::new().with_default(level.min(LevelFilter::ERROR)).with_target("perturb", level),
+            Err(_) => self.log.parse().unwrap_or_default(), // `Config::load` has refused wrong filters
         }
     }
 
@@ -552,6 +553,7 @@ mod tests {
             ("perturb=debug", "perturb=debug"),
             ("warn,h2=trace", "warn,h2=trace"),
         ] {
+            let filter: Targets = filter.parse().unwrap();
             assert_eq!(Config { log: log.into(), ..Config::default() }.filter(), filter);
         }
     }

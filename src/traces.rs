@@ -12,7 +12,7 @@ use std::{
 use tokio::{runtime::Builder, sync::oneshot};
 use tracing::{Level, Subscriber};
 use tracing_subscriber::{
-    EnvFilter, Layer, filter::Targets, fmt, layer::SubscriberExt, registry::LookupSpan, util::SubscriberInitExt,
+    Layer, filter::Targets, fmt, layer::SubscriberExt, registry::LookupSpan, util::SubscriberInitExt,
 };
 
 /// Where the collector is, as OpenTelemetry names the variable.
@@ -39,10 +39,9 @@ impl Drop for Traces {
 ///
 /// # Errors
 /// If the variables are wrong, or the system starts no thread.
-pub fn init(filter: &str) -> Result<Option<Traces>, Box<dyn Error>> {
+pub fn init(filter: Targets) -> Result<Option<Traces>, Box<dyn Error>> {
     let (traces, spans) = start()?.unzip();
-    let lines =
-        fmt::layer().with_writer(io::stderr).with_ansi(io::stderr().is_terminal()).with_filter(EnvFilter::new(filter));
+    let lines = fmt::layer().with_writer(io::stderr).with_ansi(io::stderr().is_terminal()).with_filter(filter);
     tracing_subscriber::registry().with(lines).with(spans).try_init()?;
     Ok(traces)
 }

@@ -1,13 +1,13 @@
-//! Finds MuJoCo 2.2.2, generates bindings from its headers and compiles the shim.
+//! Finds MuJoCo 2.2.2 and compiles the shim.
 
 use std::{
-    env, fs, panic,
+    env, fs,
     path::{Path, PathBuf},
     process,
 };
 
 const VERSION: &str = "222";
-const INSTALL: &str = "apt-get install libmujoco-dev libclang-dev";
+const INSTALL: &str = "apt-get install libmujoco-dev";
 
 fn main() {
     for file in ["shim.c", "shim.h", "kinematics.c", "kinematics.h"] {
@@ -20,7 +20,6 @@ fn main() {
     println!("cargo:rerun-if-changed={}", header.display());
     check_version(&header);
     println!("cargo:rustc-link-search=native={}", library_folder(&prefix).display());
-    generate_bindings(&include);
     let mut shim = cc::Build::new();
     shim.files(["src/shim.c", "src/kinematics.c"]).include(&include).std("c11").opt_level(2);
     // Debian's MuJoCo fuses no products and sums, and kinematics.c has to come to its bytes.
@@ -55,34 +54,5 @@ fn library_folder(prefix: &Path) -> PathBuf {
     match folders.iter().find(|folder| folder.join("libmujoco.so").exists()) {
         Some(folder) => folder.clone(),
         None => fail(format!("MuJoCo's library libmujoco.so is missing below {}: run `{INSTALL}`.", prefix.display())),
-    }
-}
-
-fn generate_bindings(include: &Path) {
-    // bindgen panics where libclang is missing; the hook keeps its trace out of the message.
-    panic::set_hook(Box::new(|_| {}));
-    let generated = panic::catch_unwind(|| {
-        bindgen::Builder::default()
-            .header("src/shim.h")
-            .clang_arg(format!("-I{}", include.display()))
-            .allowlist_function(
-                "perturb_mj[rv]?_.*|mj_version|mj_deleteModel|mj_deleteData|mj_name2id|mj_objectVelocity",
-            )
-            .allowlist_function("mjv_defaultOption|mjv_defaultScene|mjv_freeScene|mjr_defaultContext")
-            .allowlist_type("mjtWarning|mjtObj|mjtCamera")
-            .allowlist_var("mjVERSION_HEADER")
-            .generate_comments(false)
-            .generate()
-    });
-    drop(panic::take_hook());
-    let written = match generated {
-        Ok(Ok(bindings)) => env::var("OUT_DIR")
-            .map_err(|error| error.to_string())
-            .and_then(|out| bindings.write_to_file(Path::new(&out).join("bindings.rs")).map_err(|e| e.to_string())),
-        Ok(Err(error)) => Err(error.to_string()),
-        Err(_) => Err("libclang is missing".into()),
-    };
-    if let Err(error) = written {
-        fail(format!("The bindings of MuJoCo cannot be generated ({error}): run `{INSTALL}`."))
     }
 }

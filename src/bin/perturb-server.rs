@@ -22,6 +22,8 @@ use tokio::{
     signal::unix::{SignalKind, signal},
     sync::oneshot,
 };
+#[cfg(not(feature = "otel"))]
+use tracing_subscriber::{layer::SubscriberExt, util::SubscriberInitExt};
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
@@ -51,14 +53,15 @@ fn main() -> ExitCode {
         }
     };
     #[cfg(not(feature = "otel"))]
-    tracing_subscriber::fmt()
-        .with_writer(io::stderr)
-        .with_ansi(io::IsTerminal::is_terminal(&io::stderr()))
-        .with_env_filter(tracing_subscriber::EnvFilter::new(config.filter()))
-        .log_internal_errors(false) // they would go to standard error, which is what fails, and end the program
-        .init();
+    {
+        let lines = tracing_subscriber::fmt::layer()
+            .with_writer(io::stderr)
+            .with_ansi(io::IsTerminal::is_terminal(&io::stderr()))
+            .log_internal_errors(false); // they would go to standard error, which is what fails, and end the program
+        tracing_subscriber::registry().with(lines).with(config.filter()).init();
+    }
     #[cfg(feature = "otel")]
-    let _traces = match perturb::traces::init(&config.filter()) {
+    let _traces = match perturb::traces::init(config.filter()) {
         Ok(traces) => traces,
         Err(error) => {
             complain(format_args!("traces cannot be sent: {error}; correct the variables OTEL_…"));

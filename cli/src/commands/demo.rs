@@ -88,9 +88,13 @@ impl Demo<'_> {
              neither has met.\n",
             environment.name
         )?;
-        let trained =
-            TRAINED_ON.into_iter().map(|version| self.train(&environment.name, version)).collect::<Result<Vec<_>>>()?;
-        writeln!(out, "{}\n", rates_table(&trained).to_text())?;
+        let mut trained = Vec::new();
+        for version in TRAINED_ON {
+            let policy = self.train(&environment.name, version)?;
+            writeln!(out, "{}", first_result(&policy))?;
+            trained.push(policy);
+        }
+        writeln!(out, "\n{}\n", rates_table(&trained).to_text())?;
         writeln!(out, "{}\n", self.papers_table(&environment.name, &trained).to_text())?;
         writeln!(
             out,
@@ -193,6 +197,7 @@ impl Demo<'_> {
         let mut films = Vec::new();
         for (what, version, success) in wanted {
             let path = self.out.join(if success { "success.gif" } else { "failure.gif" });
+            note(format_args!("filming {what}"));
             let Some(seed) = self.episode(checkpoint, version, success)? else {
                 let kind = if success { "success" } else { "failure" };
                 note(format_args!("no film of a {kind}: none of {TRIES} episodes on {version} was one"));
@@ -229,6 +234,12 @@ impl Demo<'_> {
         footage.thinning().into_iter().for_each(note);
         Ok(())
     }
+}
+
+/// Sentence about one policy, which is printed before the other one is trained.
+fn first_result(policy: &Trained) -> String {
+    let rates: Vec<_> = policy.rates.iter().map(|(test, rate)| format!("{rate:.1} % on {test}")).collect();
+    format!("Trained on {}, the policy succeeds in {}.", policy.version, rates.join(", "))
 }
 
 fn rates_table(trained: &[Trained]) -> Table {

@@ -14,7 +14,7 @@ use perturb_settings::TrainConfig;
 use perturb_text::{duration, grouped};
 
 /// How often a plain line is printed.
-const LINE_INTERVAL: Duration = Duration::from_secs(10);
+const LINE_INTERVAL: Duration = Duration::from_secs(5);
 /// Of so many groups of cells in work, and of so many kinds that are done, a terminal shows what is known.
 const MOST_SHOWN: usize = 8;
 /// The time that is left is not told before so much has passed: it would be a guess.

@@ -39,30 +39,31 @@ use error::{CommandError, Result};
 use perturb_experiment::{Folder, Plan};
 use perturb_files::interrupt::end_on_signals;
 use perturb_learner::client::{ActAt, Address, PrivateServer, ServerWait, Servers};
+use tracing::Level;
+use tracing_subscriber::filter::Targets;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
 
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
     let cli = Cli::of_process();
     let usual = match (cli.quiet, cli.verbose) {
-        (true, _) => "error",
-        (_, 0) => "warn",
+        (true, _) => Targets::new().with_default(Level::ERROR),
+        (_, 0) => Targets::new().with_default(Level::WARN),
         // Targets that begin so are perturb's own; others are for RUST_LOG.
-        (_, 1) => "warn,perturb=debug",
-        _ => "warn,perturb=trace",
+        (_, 1) => Targets::new().with_default(Level::WARN).with_target("perturb", Level::DEBUG),
+        _ => Targets::new().with_default(Level::WARN).with_target("perturb", Level::TRACE),
     };
     if cli.quiet {
         display::be_quiet();
     }
-    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new(usual));
+    let named = std::env::var("RUST_LOG").ok().and_then(|filter| filter.parse::<Targets>().ok());
+    let filter = named.unwrap_or(usual);
     let no_color = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
     let colours = std::io::stderr().is_terminal() && !no_color; // a worker's is a file
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_ansi(colours)
-        .with_writer(|| BesideBar)
-        .log_internal_errors(false) // they would go to standard error, which is what fails, and end the program
-        .init();
+    let lines =
+        tracing_subscriber::fmt::layer().with_ansi(colours).with_writer(|| BesideBar).log_internal_errors(false); // they would go to standard error, which is what fails, and end the program
+    tracing_subscriber::registry().with(lines).with(filter).init();
     PrivateServer::have_heard(display::say);
     if matches!(cli.command, Command::Envs(_) | Command::Report(_) | Command::Curves(_) | Command::Serve(_)) {
         // They have nothing to finish; the others look at a flag.

@@ -1,4 +1,4 @@
-//! Generated declarations of MuJoCo and of the shim.
+//! Generated declarations of MuJoCo and of the shim. After an edit of `shim.h`, or to use more of MuJoCo, run `make generate`.
 #![allow(
     missing_docs,
     non_camel_case_types,
@@ -11,4 +11,4 @@
 // Generated code: its unsafe blocks, if any, come from bindgen.
 #![allow(clippy::undocumented_unsafe_blocks)]
 
-include!(concat!(env!("OUT_DIR"), "/bindings.rs"));
+include!("bindings.rs");

@@ -41,21 +41,23 @@ pub use stream::{Ask, Stream};
 pub use version::{UnknownVersion, Version};
 
 /// The protocols: generated from `proto`, whose comments specify every field. `perturb.v1` is here at the top.
+///
+/// After an edit of a .proto file run `make generate`.
 #[allow(missing_docs, clippy::all)]
 pub mod proto {
-    tonic::include_proto!("perturb.v1");
+    include!("generated/perturb.v1.rs");
 
     /// DeepMind's protocol between agents and environments.
     pub mod dm_env_rpc {
         /// Its first version.
         pub mod v1 {
-            tonic::include_proto!("dm_env_rpc.v1");
+            include!("generated/dm_env_rpc.v1.rs");
 
             /// Its extensions.
             pub mod extensions {
                 /// Values by name.
                 pub mod properties {
-                    tonic::include_proto!("dm_env_rpc.v1.extensions.properties");
+                    include!("generated/dm_env_rpc.v1.extensions.properties.rs");
                 }
             }
         }
@@ -65,10 +67,10 @@ pub mod proto {
     pub mod google {
         /// Errors.
         pub mod rpc {
-            tonic::include_proto!("google.rpc");
+            include!("generated/google.rpc.rs");
         }
     }
 
     /// The encoded descriptors of all protocols, for server reflection.
-    pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
+    pub const DESCRIPTORS: &[u8] = include_bytes!("generated/descriptors.bin");
 }

@@ -38,8 +38,8 @@ pub struct Cli {
     /// Say nothing on standard error but warnings and errors.
     #[arg(short, long, global = true, conflicts_with = "verbose")]
     pub quiet: bool,
-    /// Say on standard error what perturb does; twice: all that it can say of it. RUST_LOG, a filter of tracing's, says
-    /// exactly what, also of its libraries.
+    /// Say on standard error what perturb does; twice: all that it can say of it. RUST_LOG, e.g.
+    /// warn,h2=debug, says exactly what, also of its libraries.
     #[arg(short, long, global = true, action = ArgAction::Count)]
     pub verbose: u8,
     #[command(subcommand)]

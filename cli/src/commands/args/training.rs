@@ -114,7 +114,7 @@ pub struct DemoArgs {
     #[arg(long, value_name = "N", default_value_t = 5000, value_parser = at_least_one::<u64>)]
     pub episodes: u64,
     /// Episodes of each test.
-    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = at_least_one::<u64>)]
+    #[arg(long, value_name = "N", default_value_t = 300, value_parser = at_least_one::<u64>)]
     pub test_episodes: u64,
     /// Fixes all randomness.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = natural::<u64>)]

@@ -28,8 +28,7 @@ pub use heatmap::{HeatmapColumn, HeatmapPanels, common_returns};
 pub use intervals::Intervals;
 pub use panels::Panels;
 use perturb_experiment::FolderError;
-use perturb_files::interrupt::Scratch;
-use perturb_files::{self as files, FileError, io, write_atomically};
+use perturb_files::{FileError, write_atomically};
 
 /// DejaVu Sans, cut down to the letters that pictures have; its licence is beside it.
 const FONT: &[u8] = include_bytes!("../../data/fonts/DejaVuSans-subset.ttf");
@@ -99,13 +98,21 @@ pub fn svg(plot: &impl Plot) -> Result<String, PlotError> {
 /// [`PlotError`].
 pub fn png(plot: &impl Plot) -> Result<Vec<u8>, PlotError> {
     load_font()?;
-    // The library encodes to files only.
-    let scratch = Scratch::new().map_err(io("create a folder in", &std::env::temp_dir()))?;
-    let path = scratch.path().join("picture.png");
-    let area = BitMapBackend::new(&path, (WIDTH * PNG_SCALE, plot.height() * PNG_SCALE)).into_drawing_area();
-    plot.draw(&area, PNG_SCALE)?;
-    area.present().map_err(drawing)?;
-    Ok(files::read(&path)?)
+    let (width, height) = (WIDTH * PNG_SCALE, plot.height() * PNG_SCALE);
+    let mut pixels = vec![0; 3 * width as usize * height as usize];
+    {
+        let area = BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area();
+        plot.draw(&area, PNG_SCALE)?;
+        area.present().map_err(drawing)?;
+    }
+    let mut file = Vec::new();
+    let mut encoder = png::Encoder::new(&mut file, width, height);
+    encoder.set_color(png::ColorType::Rgb);
+    encoder.set_depth(png::BitDepth::Eight);
+    let mut writer = encoder.write_header().map_err(drawing)?;
+    writer.write_image_data(&pixels).map_err(drawing)?;
+    writer.finish().map_err(drawing)?;
+    Ok(file)
 }
 
 /// Writes a picture as SVG and as PNG, each in one piece: `path` with these endings.
