@@ -1,25 +1,25 @@
-//! Finds out which commit is built. Every package that tells it runs this.
+//! Build script that finds the commit. Every package that prints its commit uses it.
 
 use std::error::Error;
 use std::path::Path;
 use std::process::Command;
 
-/// Names the commit where there is no repository to ask, e.g. in a container.
+/// Environment variable with the commit, for builds without a repository, e.g. in a container.
 const VARIABLE: &str = "PERTURB_COMMIT";
-/// What the programs are made of, from the top of the repository.
+/// Files and folders from which the programs are built, relative to the repository's root.
 const SOURCES: [&str; 9] = ["Cargo.lock", "cli", "crates", "learner", "models", "proto", "recurrent", "serve", "src"];
 
 fn main() -> Result<(), Box<dyn Error>> {
     println!("cargo:rerun-if-env-changed={VARIABLE}");
-    let commit = std::env::var(VARIABLE).ok().or_else(described).unwrap_or_else(|| "unknown commit".into());
+    let commit = std::env::var(VARIABLE).ok().or_else(git_description).unwrap_or_else(|| "unknown commit".into());
     println!("cargo:rustc-env={VARIABLE}={commit}");
     Ok(())
 }
 
-/// The commit that is checked out, with "-dirty" if the programs' files differ from it.
-fn described() -> Option<String> {
+/// Returns the commit that is checked out, with "-dirty" if the programs' files differ from it.
+fn git_description() -> Option<String> {
     let top = git(".", &["rev-parse", "--show-toplevel"])?;
-    let log = git(&top, &["rev-parse", "--git-path", "logs/HEAD"])?; // grows with every commit and checkout
+    let log = git(&top, &["rev-parse", "--git-path", "logs/HEAD"])?; // changes with every commit and checkout
     for path in [log.as_str()].iter().chain(&SOURCES).map(|path| Path::new(&top).join(path)) {
         if path.exists() {
             println!("cargo:rerun-if-changed={}", path.display());

@@ -1,9 +1,9 @@
-"""perturb's training beside its peers', in turns: perturb, peer, perturb, peer, …, each a training from its beginning.
+"""Compares the speed of perturb's training with its peers', in alternating rounds with new weights.
 
 compare.py [--rounds N] [--perturb PROGRAM] [--purejaxrl CLONE] [PART OF A CONTEST'S NAME]
 
-Prints environment steps a second, medians of the rounds, and perturb's ratio to each peer. README.md says what is equal
-in all and what is not.
+Prints environment steps per second, medians of the rounds, and perturb's ratio to each peer. README.md describes what
+is equal in all and what is not.
 """
 
 import argparse
@@ -24,7 +24,7 @@ HERE = Path(__file__).parent
 
 @contextmanager
 def started(peer: Peer, index: int, purejaxrl: Path) -> Iterator[subprocess.Popen[str]]:
-    """A peer in a contest, as a process of its own that waits for seeds once it has imported and compiled."""
+    """Start a peer as a process. It waits for seeds after it has imported and compiled."""
     command = [sys.executable, str(HERE / peer.script), str(index), str(purejaxrl)]
     environ = os.environ | peer.environ
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environ)
@@ -36,7 +36,7 @@ def started(peer: Peer, index: int, purejaxrl: Path) -> Iterator[subprocess.Pope
 
 
 def answer(process: subprocess.Popen[str]) -> str:
-    """The next line of a peer."""
+    """Return the next line of a peer."""
     line = process.stdout.readline()
     if not line:
         raise SystemExit(f"{' '.join(process.args)} ended early; its error is above")
@@ -44,7 +44,7 @@ def answer(process: subprocess.Popen[str]) -> str:
 
 
 def compare(index: int, rounds: int, program: Path, purejaxrl: Path) -> None:
-    """Measures one contest and prints it."""
+    """Measure one contest and print the result."""
     contest = CONTESTS[index]
     print(f"{contest.name}: {contest.steps} steps, {contest.updates} updates", flush=True)
     rates: dict[str, list[float]] = {"perturb": []}
@@ -64,19 +64,19 @@ def compare(index: int, rounds: int, program: Path, purejaxrl: Path) -> None:
 
 
 def report(rates: dict[str, list[float]]) -> None:
-    """Medians, the ratios of perturb's to the others, and the least and the greatest ratio of a round."""
+    """Print medians, the ratios of perturb's to the others, and the smallest and largest ratio of a round."""
     ours = rates["perturb"]
     for name, measured in rates.items():
         line = f"  {name}: median {statistics.median(measured):,.0f} steps/s"
         if measured is not ours:
             rounds = [own / other for own, other in zip(ours, measured, strict=True)]
             ratio = statistics.median(ours) / statistics.median(measured)
-            line += f"; perturb at {ratio:.2f} of it, in single rounds {min(rounds):.2f} … {max(rounds):.2f}"
+            line += f"; perturb has {ratio:.2f} of it, in single rounds {min(rounds):.2f} to {max(rounds):.2f}"
         print(line, flush=True)
 
 
 def main() -> None:
-    """Compares in every contest that was asked for."""
+    """Compare in every selected contest."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("contest", nargs="?", default="", help="a part of its name")
     parser.add_argument("--rounds", type=int, default=5)

@@ -1,11 +1,11 @@
-"""What is compared: trainings that do the same work in perturb and in its peers, and how a peer is asked for them."""
+"""The contests: trainings that do the same work in perturb and in its peers."""
 
 import json
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 
-# perturb's names and defaults; each contender translates them. A learning rate is constant.
+# Settings with perturb's names and defaults, which each peer translates. Learning rates are constant.
 PPO = {
     "learning_rate": 3e-4,
     "n_epochs": 10,
@@ -32,16 +32,16 @@ A2C = {
 
 @dataclass(frozen=True)
 class Peer:
-    """A program of this folder that trains as its first argument, a contest's index, says."""
+    """A program of this folder. Its first argument is the index of the contest for which it trains."""
 
     name: str
     script: str
-    # The process's variables beside those that it inherits.
+    # Environment variables in addition to the inherited ones.
     environ: dict[str, str] = field(default_factory=dict)
 
 
 PUREJAXRL = Peer("PureJaxRL", "with_purejaxrl.py")
-# XLA without its newer runtime for CPUs, JAX's default: faster with networks as small as these.
+# XLA without its newer CPU runtime, which is JAX's default but slower with networks as small as these.
 PUREJAXRL_WITHOUT_THUNKS = replace(
     PUREJAXRL,
     name="PureJaxRL, thunk runtime off",
@@ -52,7 +52,7 @@ STABLE_BASELINES3 = Peer("stable-baselines3", "with_stable_baselines3.py")
 
 @dataclass(frozen=True)
 class Contest:
-    """One training: separate policy and value networks of 64 × 64 tanh units, from new weights to `steps`."""
+    """A training of `steps` steps from new weights, with separate policy and value networks of 64 × 64 tanh units."""
 
     algorithm: str
     environment: str
@@ -60,61 +60,61 @@ class Contest:
     n_steps: int
     iterations: int
     peers: tuple[Peer, ...]
-    # Steps of the last episodes. Without learning CartPole's last some 20. HalfCheetah's end early in perturb, where it
-    # can fall, and never in Gymnasium.
-    least_length: float
+    # Minimum mean length of the last episodes, in steps. CartPole's last about 20 without learning. HalfCheetah's end
+    # early in perturb, where it can fall, and never in Gymnasium.
+    min_length: float
 
     @property
     def name(self) -> str:
-        """As the ids of the other benches."""
+        """Id of the contest, in the form of the other benchmarks' ids."""
         return f"{self.algorithm}_ff/{self.environment}/{self.num_envs}x{self.n_steps}"
 
     @property
     def settings(self) -> dict[str, float]:
-        """The algorithm's."""
+        """Settings of the algorithm."""
         return PPO if self.algorithm == "ppo" else A2C
 
     @property
     def steps(self) -> int:
-        """Steps of all environments in one training."""
+        """Number of steps of all environments in one training."""
         return self.iterations * self.num_envs * self.n_steps
 
     @property
     def updates(self) -> int:
-        """Steps of the optimiser in one training."""
+        """Number of optimiser steps in one training."""
         return self.iterations * (PPO["n_epochs"] * PPO["n_minibatches"] if self.algorithm == "ppo" else 1)
 
 
 CONTESTS = [
-    Contest("ppo", "CartPole", 8, 128, iterations=200, peers=(PUREJAXRL, PUREJAXRL_WITHOUT_THUNKS), least_length=60),
+    Contest("ppo", "CartPole", 8, 128, iterations=200, peers=(PUREJAXRL, PUREJAXRL_WITHOUT_THUNKS), min_length=60),
     # perturb logs every 100th iteration of A2C.
-    Contest("a2c", "CartPole", 16, 5, iterations=1500, peers=(STABLE_BASELINES3,), least_length=60),
-    Contest("ppo", "HalfCheetah", 8, 128, iterations=60, peers=(STABLE_BASELINES3,), least_length=100),
+    Contest("a2c", "CartPole", 16, 5, iterations=1500, peers=(STABLE_BASELINES3,), min_length=60),
+    Contest("ppo", "HalfCheetah", 8, 128, iterations=60, peers=(STABLE_BASELINES3,), min_length=100),
 ]
 
 
 @dataclass(frozen=True)
 class Training:
-    """What a training came to."""
+    """Result of a training."""
 
     steps: int
     updates: int
-    # Mean of the last episodes.
+    # Mean length of the last episodes, in steps.
     episode_length: float
     seconds: float
 
     def rate(self, contest: Contest) -> float:
-        """Environment steps a second, of a training that did the contest's work and learned from it."""
+        """Return environment steps per second. Fail if the training did other work or did not learn."""
         assert self.steps == contest.steps, f"{self.steps} steps in place of {contest.steps}"
         assert self.updates == contest.updates, f"{self.updates} updates in place of {contest.updates}"
-        assert self.episode_length >= contest.least_length, (
-            f"episodes last {self.episode_length} steps, expected {contest.least_length} or more"
+        assert self.episode_length >= contest.min_length, (
+            f"episodes last {self.episode_length} steps, expected {contest.min_length} or more"
         )
         return self.steps / self.seconds
 
 
 def serve(remark: str, train: Callable[[int], Training]) -> None:
-    """Trains once for every seed on standard input, so that a peer is imported and compiled once for all rounds."""
+    """Train once for every seed on standard input, so that a peer is imported and compiled once for all rounds."""
     print(remark, flush=True)
     for seed in sys.stdin:
         print(json.dumps(asdict(train(int(seed)))), flush=True)

@@ -1,4 +1,4 @@
-"""perturb's side: the program as everybody runs it, with a server of its own, logs and checkpoints."""
+"""Trains with perturb as users run it, with a private server, logs and checkpoints."""
 
 import csv
 import io
@@ -10,13 +10,14 @@ from pathlib import Path
 
 from contests import Contest, Training
 
-# More than any contest reaches: a training counts episodes, a contest steps.
+# Budget in episodes. No contest reaches it, because contests count steps.
 EPISODES = 1_000_000_000
-LONGEST_TRAINING = 300.0
+# Time after which a training counts as failed, in seconds.
+TRAINING_TIMEOUT = 300.0
 
 
 def train(program: Path, contest: Contest, seed: int) -> Training:
-    """Trains until progress.csv tells of the contest's last step, then stops the program."""
+    """Train until progress.csv has the contest's last step, then stops the program."""
     settings = {"num_envs": contest.num_envs, "n_steps": contest.n_steps, **contest.settings}
     settings["learning_rate_schedule"] = '"constant"'
     with tempfile.TemporaryDirectory() as directory:
@@ -45,12 +46,12 @@ def train(program: Path, contest: Contest, seed: int) -> Training:
 
 
 def wait_for(process: subprocess.Popen[bytes], path: Path, steps: int) -> dict[str, str]:
-    """The line of progress.csv at `steps`."""
-    deadline = time.monotonic() + LONGEST_TRAINING
+    """Return the line of progress.csv at `steps`."""
+    deadline = time.monotonic() + TRAINING_TIMEOUT
     while time.monotonic() < deadline:
         if process.poll() is not None:
             raise RuntimeError("perturb ended before the contest did")
-        # Seldom enough to cost the training nothing; its seconds are its own.
+        # Polling is rare enough to cost the training nothing. The training measures its own seconds.
         time.sleep(0.1)
         if not path.exists():
             continue
@@ -58,4 +59,4 @@ def wait_for(process: subprocess.Popen[bytes], path: Path, steps: int) -> dict[s
         for line in csv.DictReader(io.StringIO(complete)):
             if int(line["time/total_timesteps"]) >= steps:
                 return line
-    raise RuntimeError(f"perturb took more than {LONGEST_TRAINING:.0f} s")
+    raise RuntimeError(f"perturb took more than {TRAINING_TIMEOUT:.0f} s")

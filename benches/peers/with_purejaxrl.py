@@ -1,4 +1,4 @@
-"""PureJaxRL's side: its ppo.py as it is, on all cores, compiled before it is timed.
+"""Trains with PureJaxRL's unchanged ppo.py on all cores. It is compiled before the measurement.
 
 with_purejaxrl.py CONTEST CLONE: the contest's index, and a clone of github.com/luchris429/purejaxrl.
 """
@@ -12,7 +12,7 @@ from contests import CONTESTS, PPO, Training, serve
 
 contest = CONTESTS[int(sys.argv[1])]
 sys.path.insert(0, str(Path(sys.argv[2]) / "purejaxrl"))
-# Imported by its wrappers for environments that are not Gymnax's, and large.
+# PureJaxRL's wrappers import these large packages for environments that are not Gymnax's.
 for name in ("brax", "brax.envs", "brax.envs.wrappers", "brax.envs.wrappers.training", "navix"):
     sys.modules[name] = ModuleType(name)
 sys.modules["brax.envs.wrappers.training"].EpisodeWrapper = None
@@ -23,7 +23,7 @@ import ppo  # noqa: E402
 
 assert contest.algorithm == "ppo"
 assert PPO["clip_range"] == PPO["clip_range_vf"], "PureJaxRL has one range for both"
-assert PPO["adam_eps"] == 1e-5, "PureJaxRL's own"
+assert PPO["adam_eps"] == 1e-5, "PureJaxRL has this value fixed"
 compiled = jax.jit(
     ppo.make_train(
         {
@@ -54,7 +54,7 @@ def train(seed: int) -> Training:
     start = time.perf_counter()
     outcome = jax.block_until_ready(compiled(key))
     seconds = time.perf_counter() - start
-    # Per iteration, step and environment: the length of the last episode that ended.
+    # Length of the last finished episode, for each iteration, step and environment.
     lengths = outcome["metrics"]["returned_episode_lengths"]
     return Training(
         steps=lengths.size,

@@ -1,6 +1,6 @@
-"""stable-baselines3's side: its A2C or PPO in one process, with the number of PyTorch threads that is fastest.
+"""Trains with stable-baselines3's A2C or PPO in one process, with the fastest number of PyTorch threads.
 
-Its environments are in that process too, which is its default and faster than processes of their own.
+The environments are in the same process, which is its default and faster than separate processes.
 with_stable_baselines3.py CONTEST: the contest's index.
 """
 
@@ -10,7 +10,7 @@ import time
 from dataclasses import replace
 from typing import Any
 
-# Gymnax brings the old gym, which stable-baselines3 would import, only to have it complain of its age.
+# Gymnax installs the old gym. stable-baselines3 would import it and print a warning about its age.
 sys.modules["gym"] = None  # type: ignore[assignment]
 
 import stable_baselines3  # noqa: E402
@@ -19,12 +19,12 @@ from contests import CONTESTS, Contest, Training, serve  # noqa: E402
 from stable_baselines3.common.env_util import make_vec_env  # noqa: E402
 from stable_baselines3.common.vec_env import VecNormalize  # noqa: E402
 
-# Gymnasium's, with perturb's time limits.
+# Gymnasium's environments with perturb's time limits.
 ENVIRONMENTS = {"CartPole": ("CartPole-v1", 200), "HalfCheetah": ("HalfCheetah-v5", 1000)}
 
 
 def algorithm(contest: Contest, env: VecNormalize, seed: int) -> Any:
-    """A new one; its networks are 64 × 64 tanh units, and its learning rate constant, by default."""
+    """Return a new model. By default its networks have 64 × 64 tanh units, and its learning rate is constant."""
     settings = dict(contest.settings)
     own: dict[str, Any] = {"policy": "MlpPolicy", "env": env, "n_steps": contest.n_steps, "seed": seed, "device": "cpu"}
     if contest.algorithm == "a2c":
@@ -37,7 +37,7 @@ def algorithm(contest: Contest, env: VecNormalize, seed: int) -> Any:
 
 
 def train(contest: Contest, seed: int) -> Training:
-    """Trains once, with observations and rewards normalised as perturb's."""
+    """Train once, with observations and rewards normalised like perturb's."""
     name, limit = ENVIRONMENTS[contest.environment]
     env = VecNormalize(
         make_vec_env(name, n_envs=contest.num_envs, seed=seed, env_kwargs={"max_episode_steps": limit}),
@@ -58,7 +58,7 @@ def train(contest: Contest, seed: int) -> Training:
 
 
 def fastest(contest: Contest) -> int:
-    """Threads of PyTorch's, one or as many as there are cores, after a short training with each."""
+    """Return the faster number of PyTorch threads, one or the number of cores, by a short training with each."""
     short = replace(contest, iterations=contest.iterations // 20)
     seconds = {}
     for threads in [1, len(os.sched_getaffinity(0))] * 2:

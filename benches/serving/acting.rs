@@ -1,8 +1,8 @@
-//! What it costs that the server plays, beside computing the policy's actions alone.
+//! Cost of acting on the server, compared with computing the policy's actions alone.
 
 use super::{
     Failure, ROUNDS,
-    client::{Client, Process, SEED},
+    client::{Client, SEED, ServerProcess},
     median,
 };
 use perturb::proto;
@@ -12,20 +12,21 @@ use perturb_policy::{
 };
 use std::time::Instant;
 
+/// Number of environments.
 const BATCH: usize = 8;
-/// CartPole's.
+/// Size of CartPole's observation.
 const OBSERVATION: usize = 4;
 const ACTION: ActionKind = ActionKind::Discrete { n: 2 };
-/// Steps in a reply.
+/// Number of steps in a reply.
 const STEPS: u32 = 1024;
 
-/// The figure's name.
+/// Returns the figure's name.
 pub(crate) fn id(lstm: Option<usize>) -> &'static str {
     if lstm.is_some() { "act/CartPole/8/RC" } else { "act/CartPole/8/FF" }
 }
 
-/// A policy of the paper's size in 8 CartPoles.
-pub(crate) async fn played(lstm: Option<usize>) -> Result<(), Failure> {
+/// Measures a policy of the paper's size in 8 CartPoles.
+pub(crate) async fn measure(lstm: Option<usize>) -> Result<(), Failure> {
     let spec = match lstm {
         None => PolicySpec::feed_forward(OBSERVATION, ACTION),
         Some(_) => PolicySpec::recurrent(OBSERVATION, ACTION),
@@ -34,7 +35,7 @@ pub(crate) async fn played(lstm: Option<usize>) -> Result<(), Failure> {
     let weights: Vec<f32> = arrays.into_iter().flat_map(|array| array.data).collect();
     let steps = if lstm.is_some() { STEPS / 16 } else { STEPS };
 
-    let server = Process::server(1)?;
+    let server = ServerProcess::server(1)?;
     let mut client = Client::open(&server.socket, "CartPole", BATCH).await?;
     let mut request = proto::Act {
         weights: weights.iter().flat_map(|x| x.to_le_bytes()).collect(),
@@ -50,18 +51,19 @@ pub(crate) async fn played(lstm: Option<usize>) -> Result<(), Failure> {
     };
     client.act(proto::Act { policy: Some(policy), ..request.clone() }, steps).await?;
     request.weights.clear();
-    let mut player = alone(&spec, &weights)?;
-    let (mut each, mut computed) = (Vec::new(), Vec::new());
+    let mut player = local_player(&spec, &weights)?;
+    let mut step_times = Vec::new();
+    let mut computed = Vec::new();
     for _ in 0..ROUNDS {
-        each.push(client.act(request.clone(), steps).await? * 1e6 / f64::from(steps));
+        step_times.push(client.act(request.clone(), steps).await? * 1e6 / f64::from(steps));
         computed.push(compute(&mut player, steps)? * 1e6 / f64::from(steps));
     }
-    let (each, computed) = (median(&mut each), median(&mut computed));
-    println!("{:<22} {each:>12.2} us a step of 8, of which {computed:.2} are the policy's", id(lstm));
+    let (step, computed) = (median(&mut step_times), median(&mut computed));
+    println!("{:<22} {step:>12.2} us a step of 8, of which {computed:.2} are the policy's", id(lstm));
     Ok(())
 }
 
-fn alone(spec: &PolicySpec, weights: &[f32]) -> Result<Player, Failure> {
+fn local_player(spec: &PolicySpec, weights: &[f32]) -> Result<Player, Failure> {
     let inputs = Inputs::new(OBSERVATION, ACTION, BATCH, false);
     let mut player = Player::new(spec, inputs, BATCH, 1, Normalisers::default(), Role::training(SEED));
     player.load(weights)?;
@@ -69,7 +71,7 @@ fn alone(spec: &PolicySpec, weights: &[f32]) -> Result<Player, Failure> {
     Ok(player)
 }
 
-/// Acts and observes the same again and again. Returns the seconds.
+/// Acts and observes repeatedly, always the same observation. Returns the seconds.
 fn compute(player: &mut Player, steps: u32) -> Result<f64, Failure> {
     let outcome = Outcome {
         observations: &[0.02; BATCH * OBSERVATION],

@@ -1,4 +1,4 @@
-//! A server in a process of its own, and a client that steps its environments with random actions.
+//! A server process, and a client that steps its environments with random actions.
 
 use super::Failure;
 use bytes::Bytes;
@@ -15,7 +15,7 @@ use std::{
     time::Instant,
 };
 
-/// The seed of every session.
+/// Seed of every session.
 pub(crate) const SEED: u64 = 1;
 
 /// A session that steps with random actions.
@@ -52,7 +52,7 @@ impl Client {
         Ok(start.elapsed().as_secs_f64())
     }
 
-    /// Steps with these actions, up to `in_flight` requests on their way. Returns the last observations.
+    /// Steps with these actions and up to `in_flight` requests without a reply. Returns the last observations.
     pub(crate) async fn play(&mut self, actions: &[Bytes], in_flight: usize) -> Result<Bytes, Failure> {
         let (mut sent, mut last) = (0, Bytes::new());
         for received in 0..actions.len() {
@@ -68,7 +68,7 @@ impl Client {
         Ok(last)
     }
 
-    /// Has the server play. Returns the seconds.
+    /// Lets the server act for `steps` steps. Returns the seconds.
     pub(crate) async fn act(&mut self, request: proto::Act, steps: u32) -> Result<f64, Failure> {
         let start = Instant::now();
         let acted = self.session.ask(request).await?;
@@ -76,14 +76,14 @@ impl Client {
         Ok(start.elapsed().as_secs_f64())
     }
 
-    /// Asks for a picture and waits for it.
+    /// Requests a picture and waits for it.
     pub(crate) async fn draw(&mut self) -> Result<(), Failure> {
         let picture = self.session.ask(proto::Render::default()).await?;
         assert_eq!((picture.width, picture.height, picture.pixels.len()), (480, 480, 480 * 480 * 3));
         Ok(())
     }
 
-    /// The next step's.
+    /// Returns the random actions of the next step.
     pub(crate) fn actions(&mut self) -> Bytes {
         let mut bytes = Vec::with_capacity(4 * self.batch * width(self.spec));
         for _ in 0..self.batch * width(self.spec) {
@@ -98,7 +98,7 @@ impl Client {
     }
 }
 
-/// The numbers in an action.
+/// Returns the number of values in an action.
 pub(crate) fn width(spec: &EnvironmentSpec) -> usize {
     match spec.action {
         ActionSpace::Discrete(_) => 1,
@@ -106,7 +106,7 @@ pub(crate) fn width(spec: &EnvironmentSpec) -> usize {
     }
 }
 
-/// A small generator for actions: their quality does not matter here.
+/// A small random number generator for actions. Its quality does not matter here.
 struct Noise(u64);
 
 impl Noise {
@@ -120,23 +120,23 @@ impl Noise {
     }
 }
 
-/// A server process with a socket of its own.
-pub(crate) struct Process {
+/// A server process with its own socket.
+pub(crate) struct ServerProcess {
     child: Child,
     pub(crate) socket: PathBuf,
-    /// Where it said that it listens.
+    /// Address that the server has printed.
     pub(crate) address: String,
     _directory: tempfile::TempDir,
 }
 
-impl Process {
+impl ServerProcess {
     pub(crate) fn server(workers: usize) -> Result<Self, Failure> {
         let mut command = Command::new(env!("CARGO_BIN_EXE_perturb-server"));
         command.args(["--log", "warn", "--workers", &workers.to_string()]);
         Self::start(command, |socket| vec!["--listen".into(), format!("unix:{}", socket.display())])
     }
 
-    /// One with a TCP port in place of a socket.
+    /// Starts a server with a TCP port in place of a socket.
     pub(crate) fn tcp(flags: &[(&str, &Path)]) -> Result<Self, Failure> {
         let mut command = Command::new(env!("CARGO_BIN_EXE_perturb-server"));
         command.args(["--log", "warn", "--workers", "1"]);
@@ -161,12 +161,12 @@ impl Process {
         Ok(Self { child, socket, address, _directory: directory })
     }
 
-    /// Where the system tells of it.
+    /// Returns the process's folder in /proc.
     pub(crate) fn proc(&self) -> PathBuf {
         format!("/proc/{}", self.child.id()).into()
     }
 
-    /// Resident bytes.
+    /// Returns the resident memory, in bytes.
     pub(crate) fn resident(&self) -> Result<f64, Failure> {
         let status = fs::read_to_string(self.proc().join("status"))?;
         let line = status.lines().find(|line| line.starts_with("VmRSS:")).ok_or("no VmRSS")?;
@@ -174,7 +174,7 @@ impl Process {
     }
 }
 
-impl Drop for Process {
+impl Drop for ServerProcess {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();

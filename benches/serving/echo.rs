@@ -1,19 +1,19 @@
-//! What a round trip costs without a server behind it.
+//! An echo server, for the cost of a round trip without a real server.
 
 use super::Failure;
 use bytes::Bytes;
 use perturb::proto::{
     self, SessionRequest, SessionResponse,
     perturb_server::{Perturb, PerturbServer},
-    session_request::Request as Ask,
-    session_response::Response as Answer,
+    session_request::Request as RequestKind,
+    session_response::Response as ResponseKind,
 };
 use std::{path::Path, pin::Pin};
 use tokio::net::UnixListener;
 use tokio_stream::{Stream, StreamExt, wrappers::UnixListenerStream};
 use tonic::{Request, Response, Status, Streaming, transport::Server};
 
-/// Answers every step with a reply of the same size as the server's, made in advance.
+/// Answers every step with a prepared reply of the same size as the server's.
 struct Echo;
 
 #[tonic::async_trait]
@@ -40,8 +40,8 @@ impl Perturb for Echo {
         };
         let responses = requests.into_inner().map(move |request| {
             let response = match request?.request {
-                Some(Ask::Open(_)) => Answer::Opened(proto::Opened::default()),
-                _ => Answer::Stepped(reply.clone()),
+                Some(RequestKind::Open(_)) => ResponseKind::Opened(proto::Opened::default()),
+                _ => ResponseKind::Stepped(reply.clone()),
             };
             Ok(SessionResponse { response: Some(response) })
         });
@@ -49,7 +49,7 @@ impl Perturb for Echo {
     }
 }
 
-/// Answers on the socket until it is killed.
+/// Serves at the socket until the process is killed.
 pub(crate) async fn serve(socket: &Path) -> Result<(), Failure> {
     let listener = UnixListener::bind(socket)?;
     println!("listening");

@@ -1,34 +1,38 @@
-//! What encryption costs: a batch's steps over TCP, with TLS beside without.
+//! Cost of encryption: the steps of a batch over TCP, with TLS and without.
 
 use super::{
     Failure, ROUNDS,
-    client::{Client, Process},
+    client::{Client, ServerProcess},
     median,
 };
-use perturb_faults::certificates::{Authority, Pair};
+use perturb_faults::certificates::{Authority, CertificateFiles};
 use perturb_protocol::{Address, Connection, Patience, credentials::Credentials};
 
-/// CartPole in batches of so many.
-pub(crate) async fn stepped(batch: usize) -> Result<(), Failure> {
+/// Measures CartPole in batches of `batch`.
+pub(crate) async fn measure(batch: usize) -> Result<(), Failure> {
+    /// Number of steps of a round.
     const TRIPS: usize = 400;
     let directory = tempfile::tempdir()?;
-    let Pair { cert, key } = Authority::new("bench").issue(directory.path(), "server", &["127.0.0.1"], 2200);
-    let (plain, encrypted) = (Process::tcp(&[])?, Process::tcp(&[("--tls-cert", &cert), ("--tls-key", &key)])?);
-    let mut bare = Client::on(&connected(&plain.address, Credentials::default()).await?, "CartPole", batch).await?;
+    let CertificateFiles { cert, key } =
+        Authority::new("bench").issue(directory.path(), "server", &["127.0.0.1"], 2200);
+    let (plain, encrypted) =
+        (ServerProcess::tcp(&[])?, ServerProcess::tcp(&[("--tls-cert", &cert), ("--tls-key", &key)])?);
+    let mut plain_client =
+        Client::on(&connect(&plain.address, Credentials::default()).await?, "CartPole", batch).await?;
     let credentials = Credentials::knowing(&cert)?;
-    let mut hidden = Client::on(&connected(&encrypted.address, credentials).await?, "CartPole", batch).await?;
-    let (mut plains, mut ratios) = (Vec::new(), Vec::new());
+    let mut encrypted_client = Client::on(&connect(&encrypted.address, credentials).await?, "CartPole", batch).await?;
+    let (mut plain_times, mut ratios) = (Vec::new(), Vec::new());
     for _ in 0..ROUNDS {
-        let (plain, encrypted) = (bare.run(TRIPS).await?, hidden.run(TRIPS).await?);
-        plains.push(plain / TRIPS as f64 * 1e6);
+        let (plain, encrypted) = (plain_client.run(TRIPS).await?, encrypted_client.run(TRIPS).await?);
+        plain_times.push(plain / TRIPS as f64 * 1e6);
         ratios.push(encrypted / plain);
     }
-    let (plain, ratio) = (median(&mut plains), median(&mut ratios));
+    let (plain, ratio) = (median(&mut plain_times), median(&mut ratios));
     println!("tls/CartPole/{batch:<9} {plain:>12.1} us a step by TCP, with TLS {ratio:.2} of that");
     Ok(())
 }
 
-async fn connected(address: &str, credentials: Credentials) -> Result<Connection, Failure> {
+async fn connect(address: &str, credentials: Credentials) -> Result<Connection, Failure> {
     let address: Address = address.parse()?;
     Ok(Connection::open_as(&address, Patience::default(), credentials).await?)
 }

@@ -1,13 +1,13 @@
-//! What serving costs, each figure beside its yardstick of the same run:
+//! Cost of serving. Each figure has a reference from the same run:
 //!
-//! - CartPole, batch 256, over a Unix socket, against a bare tonic echo of the same payload;
+//! - CartPole, batch 256, over a Unix socket, against a plain tonic echo server with the same payload;
 //! - Hopper and HalfCheetah, batches of 64, 256 and 1024, two workers, against MuJoCo's timesteps alone ([`robots`]);
 //! - CartPole over TCP with TLS, against without ([`encrypted`]);
 //! - the round trip of one environment, and the memory of one Hopper;
-//! - CartPole, 8 environments that the server plays with a policy, against computing its actions alone ([`acting`]);
-//! - pictures of each environment, 480 × 480 pixels, and what the server's memory grows by with them.
+//! - CartPole, 8 environments in which the server acts with a policy, against computing the actions alone ([`acting`]);
+//! - pictures of each environment, 480 × 480 pixels, and the server's memory growth by them.
 //!
-//! Servers are processes of their own: `perturb-server`, and this program with the argument `echo` and a socket.
+//! Servers are separate processes: `perturb-server`, and this program with the argument `echo` and a socket.
 
 mod acting;
 mod client;
@@ -16,13 +16,14 @@ mod encrypted;
 #[cfg(feature = "mujoco")]
 mod robots;
 
-use client::{Client, Process};
+use client::{Client, ServerProcess};
 use perturb::tasks;
 use std::{env, time::Instant};
 
 type Failure = Box<dyn std::error::Error>;
 
-/// Yardstick and served loop take turns, in short rounds, so that a busy neighbour disturbs both; medians are printed.
+/// Number of rounds. Reference and server alternate in short rounds, so that other load disturbs both. Medians are
+/// printed.
 const ROUNDS: usize = 25;
 
 fn main() -> Result<(), Failure> {
@@ -42,12 +43,12 @@ fn main() -> Result<(), Failure> {
         }
         #[cfg(feature = "mujoco")]
         for (spec, make) in [
-            (&tasks::hopper::SPEC, tasks::hopper::hopper as robots::Make),
+            (&tasks::hopper::SPEC, tasks::hopper::hopper as robots::MakeRobot),
             (&tasks::half_cheetah::SPEC, tasks::half_cheetah::half_cheetah),
         ] {
             for batch in [64, 256, 1024] {
                 if wanted(&format!("step/{}/{batch}", spec.name)) {
-                    robots::served(spec, make, batch).await?;
+                    robots::measure(spec, make, batch).await?;
                 }
             }
         }
@@ -56,12 +57,12 @@ fn main() -> Result<(), Failure> {
         }
         for batch in [1, 256] {
             if wanted(&format!("tls/CartPole/{batch}")) {
-                encrypted::stepped(batch).await?;
+                encrypted::measure(batch).await?;
             }
         }
         for lstm in [None, Some(256)] {
             if wanted(acting::id(lstm)) {
-                acting::played(lstm).await?;
+                acting::measure(lstm).await?;
             }
         }
         if wanted("memory/Hopper") {
@@ -76,11 +77,11 @@ fn main() -> Result<(), Failure> {
     })
 }
 
-/// (a) CartPole in batches of 256 against the echo.
+/// Measures CartPole in batches of 256 against the echo server.
 async fn classic() -> Result<(), Failure> {
     const BATCH: usize = 256;
     const TRIPS: usize = 800;
-    let (server, echo) = (Process::server(1)?, Process::echo()?);
+    let (server, echo) = (ServerProcess::server(1)?, ServerProcess::echo()?);
     let mut served = Client::open(&server.socket, "CartPole", BATCH).await?;
     let mut bare = Client::open(&echo.socket, "CartPole", BATCH).await?;
     let (mut ratios, mut steps) = (Vec::new(), Vec::new());
@@ -95,10 +96,10 @@ async fn classic() -> Result<(), Failure> {
     Ok(())
 }
 
-/// (b) One environment.
+/// Measures the round trip of one environment.
 async fn round_trip() -> Result<(), Failure> {
     const TRIPS: usize = 20_000;
-    let server = Process::server(1)?;
+    let server = ServerProcess::server(1)?;
     let mut client = Client::open(&server.socket, "CartPole", 1).await?;
     client.run(TRIPS / 10).await?;
     let mut micros = Vec::with_capacity(TRIPS);
@@ -106,18 +107,18 @@ async fn round_trip() -> Result<(), Failure> {
         micros.push(client.run(1).await? * 1e6);
     }
     micros.sort_by(f64::total_cmp);
-    let at = |q: f64| micros[(q * (TRIPS - 1) as f64) as usize];
-    println!("round_trip/CartPole/1  {:>12.1} us p50, {:.1} us p99", at(0.5), at(0.99));
+    let quantile = |q: f64| micros[(q * (TRIPS - 1) as f64) as usize];
+    println!("round_trip/CartPole/1  {:>12.1} us p50, {:.1} us p99", quantile(0.5), quantile(0.99));
     Ok(())
 }
 
-/// (c) Resident memory of a Hopper, stepped so that its pages are in use.
+/// Measures the resident memory of a Hopper, after steps that use all its pages.
 async fn memory() -> Result<(), Failure> {
     const BATCH: usize = 2000;
     if tasks::catalogue().find("Hopper").is_err() {
         return Ok(());
     }
-    let server = Process::server(2)?;
+    let server = ServerProcess::server(2)?;
     Client::open(&server.socket, "Hopper", 1).await?.run(10).await?;
     let before = server.resident()?;
     let mut client = Client::open(&server.socket, "Hopper", BATCH).await?;
@@ -127,14 +128,15 @@ async fn memory() -> Result<(), Failure> {
     Ok(())
 }
 
-/// (d) Pictures of one environment, each asked for after the last came.
+/// Measures pictures of one environment, one request at a time.
 async fn pictures(name: &'static str) -> Result<(), Failure> {
     const PICTURES: usize = 10;
-    let server = Process::server(1)?;
+    let server = ServerProcess::server(1)?;
     let mut client = Client::open(&server.socket, name, 1).await?;
     client.run(10).await?;
     let before = server.resident()?;
-    client.draw().await?; // the first one loads the driver
+    // The first picture loads the driver.
+    client.draw().await?;
     let mut rates = Vec::new();
     for _ in 0..ROUNDS {
         let start = Instant::now();

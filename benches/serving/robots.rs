@@ -1,15 +1,16 @@
-//! What serving Hopper and HalfCheetah costs beside physics: the server's CPU time an environment step, and its steps in
-//! a second, against the bare loop: MuJoCo's timesteps (mj_step) of the same environments with the same actions, one
-//! environment after the other, and nothing else. The environments' own timesteps are shorter, for they leave out a search
-//! and walk over bodies in one piece.
+//! Cost of serving Hopper and HalfCheetah in addition to physics.
 //!
-//! A server of two workers is asked in a closed loop, where each request waits for the reply to the last and the
-//! workers wait with it, and with two requests in flight, where they do not. Server and bare loops take turns, in rounds
-//! of the same steps; medians over the rounds are printed.
+//! The figures are the server's CPU time for each environment step and its steps per second. The reference is the bare
+//! loop: MuJoCo's timesteps (mj_step) of the same environments with the same actions, one environment after the other.
+//! The environments' own timesteps are shorter, because they skip a search and visit bodies in one pass.
+//!
+//! A server of two workers is measured in a closed loop, where each request waits for the previous reply, and with two
+//! requests in flight. Server and bare loops alternate in rounds of the same steps. The medians over the rounds are
+//! printed.
 
 use crate::{
     Failure,
-    client::{Client, Process, SEED, width},
+    client::{Client, SEED, ServerProcess, width},
     median,
 };
 use bytes::Bytes;
@@ -21,19 +22,22 @@ use perturb::{
 use perturb_mujoco::Simulation;
 use std::{fs, ops::Range, path::Path, thread, time::Instant};
 
+/// Number of rounds.
 const ROUNDS: usize = 15;
 /// Environment steps of a round.
 const STEPS: usize = 1 << 14;
+/// MuJoCo's timesteps of an environment step.
 const N_SUBSTEPS: usize = 4;
 
-/// Makes one of the robots.
-pub(crate) type Make = fn() -> Result<Walker, perturb::env::Error>;
+/// A function that makes one of the robots.
+pub(crate) type MakeRobot = fn() -> Result<Walker, perturb::env::Error>;
 
 /// Prints the figures of one robot and batch size.
-pub(crate) async fn served(spec: &'static EnvironmentSpec, make: Make, batch: usize) -> Result<(), Failure> {
-    let server = Process::server(2)?;
+pub(crate) async fn measure(spec: &'static EnvironmentSpec, make: MakeRobot, batch: usize) -> Result<(), Failure> {
+    let server = ServerProcess::server(2)?;
     let mut client = Client::open(&server.socket, spec.name, batch).await?;
-    let mut halves = [Part::new(spec, make, 0..batch / 2)?, Part::new(spec, make, batch / 2..batch)?];
+    let mut halves =
+        [LocalEnvironments::new(spec, make, 0..batch / 2)?, LocalEnvironments::new(spec, make, batch / 2..batch)?];
     let mut kinds = [("closed loop", 1, Vec::new()), ("two requests in flight", 2, Vec::new())];
     for _ in 0..ROUNDS {
         for (_, in_flight, rounds) in &mut kinds {
@@ -45,13 +49,13 @@ pub(crate) async fn served(spec: &'static EnvironmentSpec, make: Make, batch: us
             let seen = client.play(&actions, *in_flight).await?;
             let served = Cost { wall: start.elapsed().as_secs_f64(), cpu: process_cpu(&server.proc())? - cpu };
             halves.iter_mut().for_each(|half| half.check(&seen));
-            rounds.push(Round { bare, at_once, in_process, served });
+            rounds.push(RoundCosts { bare, at_once, in_process, served });
         }
     }
     let id = format!("step/{}/{batch}", spec.name);
     for (kind, _, rounds) in kinds {
-        let of = |figure: fn(&Round) -> f64| median(&mut rounds.iter().map(figure).collect::<Vec<_>>());
-        let micros = |figure: fn(&Round) -> f64| of(figure) * 1e6 / STEPS as f64;
+        let median_of = |figure: fn(&RoundCosts) -> f64| median(&mut rounds.iter().map(figure).collect::<Vec<_>>());
+        let micros = |figure: fn(&RoundCosts) -> f64| median_of(figure) * 1e6 / STEPS as f64;
         println!(
             "{id:<22} {:>8.2} us of CPU time, {:.2} us of time an env step, {kind}",
             micros(|round| round.served.cpu),
@@ -59,52 +63,52 @@ pub(crate) async fn served(spec: &'static EnvironmentSpec, make: Make, batch: us
         );
         println!(
             "{id:<22} {:>8.3} of the CPU time of one bare loop ({:.2} us), {:.3} of two at once ({:.2} us)",
-            of(|round| round.served.cpu / round.bare.cpu),
+            median_of(|round| round.served.cpu / round.bare.cpu),
             micros(|round| round.bare.cpu),
-            of(|round| round.served.cpu / round.at_once.cpu),
+            median_of(|round| round.served.cpu / round.at_once.cpu),
             micros(|round| round.at_once.cpu)
         );
         println!(
             "{id:<22} {:>8.3} of the steps/s of two bare loops at once, which have {:.2} of twice those of one",
-            of(|round| round.at_once.wall / round.served.wall),
-            of(|round| round.bare.wall / (2.0 * round.at_once.wall))
+            median_of(|round| round.at_once.wall / round.served.wall),
+            median_of(|round| round.bare.wall / (2.0 * round.at_once.wall))
         );
         println!(
             "{id:<22} {:>8.3} of the CPU time of one bare loop without the server, in this process",
-            of(|round| round.in_process.cpu / round.bare.cpu)
+            median_of(|round| round.in_process.cpu / round.bare.cpu)
         );
     }
     Ok(())
 }
 
-/// What the same steps took, by each way.
-struct Round {
+/// Costs of the same steps in each way.
+struct RoundCosts {
     bare: Cost,
-    /// Two bare loops, half of the environments each.
+    /// Two bare loops at the same time, with half of the environments each.
     at_once: Cost,
     /// The environments one after the other, without a server.
     in_process: Cost,
     served: Cost,
 }
 
-/// Seconds.
+/// CPU time and elapsed time, in seconds.
 struct Cost {
     cpu: f64,
     wall: f64,
 }
 
-/// Seconds that a process, a folder of /proc, has computed so far.
+/// Returns the CPU seconds of a process, given by its folder in /proc.
 fn process_cpu(process: &Path) -> Result<f64, Failure> {
     fs::read_dir(process.join("task"))?.map(|thread| thread_cpu(&thread?.path())).sum()
 }
 
-/// Seconds that a thread, a folder of /proc, has computed so far.
+/// Returns the CPU seconds of a thread, given by its folder in /proc.
 fn thread_cpu(thread: &Path) -> Result<f64, Failure> {
     let nanoseconds = fs::read_to_string(thread.join("schedstat"))?;
     Ok(nanoseconds.split(' ').next().ok_or("no schedstat")?.parse::<f64>()? * 1e-9)
 }
 
-/// What it took this thread.
+/// Measures the cost of `work` on this thread.
 fn timed(work: impl FnOnce() -> Result<(), Failure>) -> Result<Cost, Failure> {
     let this = Path::new("/proc/thread-self");
     let (start, cpu) = (Instant::now(), thread_cpu(this)?);
@@ -112,13 +116,18 @@ fn timed(work: impl FnOnce() -> Result<(), Failure>) -> Result<Cost, Failure> {
     Ok(Cost { wall: start.elapsed().as_secs_f64(), cpu: thread_cpu(this)? - cpu })
 }
 
-fn one_by_one(halves: &mut [Part; 2], run: impl Fn(&mut Part) -> Result<(), Failure>) -> Result<Cost, Failure> {
+fn one_by_one(
+    halves: &mut [LocalEnvironments; 2],
+    run: impl Fn(&mut LocalEnvironments) -> Result<(), Failure>,
+) -> Result<Cost, Failure> {
     timed(|| halves.iter_mut().try_for_each(run))
 }
 
-fn at_once(halves: &mut [Part; 2], actions: &[Bytes]) -> Result<Cost, Failure> {
+fn at_once(halves: &mut [LocalEnvironments; 2], actions: &[Bytes]) -> Result<Cost, Failure> {
     let start = Instant::now();
-    let bare = |half: &mut Part| timed(|| half.bare(actions)).map(|cost| cost.cpu).map_err(|error| error.to_string());
+    let bare = |half: &mut LocalEnvironments| {
+        timed(|| half.bare(actions)).map(|cost| cost.cpu).map_err(|error| error.to_string())
+    };
     let [a, b] = halves;
     let (a, b) = thread::scope(|scope| {
         let other = scope.spawn(|| bare(b));
@@ -127,23 +136,23 @@ fn at_once(halves: &mut [Part; 2], actions: &[Bytes]) -> Result<Cost, Failure> {
     Ok(Cost { cpu: a? + b?, wall: start.elapsed().as_secs_f64() })
 }
 
-/// Some of a batch's environments in this process, and their bare loop.
-struct Part {
+/// Some environments of a batch in this process, with their bare loop.
+struct LocalEnvironments {
     spec: &'static EnvironmentSpec,
     first: usize,
     environments: Vec<Episodes>,
     observations: Vec<f32>,
-    /// Of the bare loop.
+    /// Simulation of the bare loop.
     simulation: Simulation,
-    /// Of each environment, before the round and after it.
+    /// State of each environment before the round, and after it.
     states: Vec<(Vec<f64>, Vec<f64>)>,
     initial: Vec<f64>,
-    /// The episodes that began in the round: environment, trip and state.
+    /// Episodes that began in the round: environment, step and state.
     begun: Vec<(usize, usize, Vec<f64>)>,
 }
 
-impl Part {
-    fn new(spec: &'static EnvironmentSpec, make: Make, range: Range<usize>) -> Result<Self, Failure> {
+impl LocalEnvironments {
+    fn new(spec: &'static EnvironmentSpec, make: MakeRobot, range: Range<usize>) -> Result<Self, Failure> {
         let environment = |index: usize| {
             let distributions = spec.distributions(Version::D);
             let settings =
@@ -170,14 +179,14 @@ impl Part {
         })
     }
 
-    /// The action of an environment on a trip.
+    /// Returns the action of an environment at a step.
     fn action<'a>(&self, actions: &'a [Bytes], environment: usize, trip: usize) -> impl Iterator<Item = f32> + use<'a> {
         let width = width(self.spec);
         let own = &actions[trip][4 * width * (self.first + environment)..][..4 * width];
         own.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes))
     }
 
-    /// The environments' steps, one environment after the other.
+    /// Steps the environments, one after the other.
     fn step(&mut self, actions: &[Bytes]) -> Result<(), Failure> {
         let (mut terms, n) = (vec![0.0; self.spec.reward_terms.len()], self.spec.observation.len());
         let mut action = vec![0.0; width(self.spec)];
@@ -197,7 +206,7 @@ impl Part {
         Ok(())
     }
 
-    /// MuJoCo's timesteps in [`Self::step`], which came before.
+    /// Runs MuJoCo's timesteps of the preceding [`Self::step`].
     fn bare(&mut self, actions: &[Bytes]) -> Result<(), Failure> {
         let power = self.spec.parameters[0].default;
         let mut begun = self.begun.iter().peekable();
@@ -218,22 +227,23 @@ impl Part {
         Ok(())
     }
 
-    /// Goes on to the next round, if environments, bare loop and server, of whom this was seen, came to the same.
+    /// Checks that environments, bare loop and server, which sent the observations `seen`, agree. Then begins the next
+    /// round.
     fn check(&mut self, seen: &[u8]) {
         let own: Vec<u8> = self.observations.iter().flat_map(|value| value.to_le_bytes()).collect();
         assert!(
             seen[4 * self.first * self.spec.observation.len()..].starts_with(&own),
-            "the server saw something else"
+            "the server's observations differ"
         );
         for (environment, (before, after)) in self.environments.iter().zip(&mut self.states) {
             let qpos = positions(environment);
-            assert_eq!(after[1..=qpos.len()], qpos, "the bare loop went elsewhere");
+            assert_eq!(after[1..=qpos.len()], qpos, "the bare loop's positions differ");
             before.copy_from_slice(after);
         }
     }
 }
 
-/// The state of an environment at the beginning of an episode: at rest.
+/// Returns the state of an environment at the start of an episode, at rest.
 fn started(initial: &[f64], environment: &Episodes) -> Vec<f64> {
     let (mut state, qpos) = (initial.to_vec(), positions(environment));
     state[1..=qpos.len()].copy_from_slice(&qpos);

@@ -1,4 +1,4 @@
-//! What the learner reads back: checkpoints, recorded episodes, experiment files.
+//! Fuzz targets for files: checkpoints, recorded episodes, ledgers and experiment files.
 
 use std::sync::LazyLock;
 
@@ -11,13 +11,14 @@ use perturb_records::ledger::Ledgers;
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
-use crate::seeds::{POLICY, kept};
+use crate::seeds::{POLICY, repository_path};
 
-/// More cells than these would only take time.
-const MOST_BYTES_OF_A_PLAN: usize = 4096;
+/// Maximum size of an experiment file. Larger ones would only take more time.
+const MAX_PLAN_BYTES: usize = 4096;
 
-/// A checkpoint: two bytes that say how long its `checkpoint.json` is, that, and its weights. Checksums are made good, as
-/// by somebody who wrote the files on purpose. What is read is played.
+/// Loads a checkpoint: two bytes for the length of its `checkpoint.json`, the file, and the weights.
+///
+/// Checksums are corrected, as an attacker would do. A checkpoint that loads is played.
 pub fn checkpoints(data: &[u8]) {
     let Some((length, rest)) = data.split_first_chunk::<2>() else { return };
     let (document, weights) = rest.split_at(usize::from(u16::from_le_bytes(*length)).min(rest.len()));
@@ -38,7 +39,7 @@ pub fn checkpoints(data: &[u8]) {
     }
 }
 
-/// Recorded episodes, judged if they can be read.
+/// Reads recorded episodes, and computes the success rates if that succeeds.
 pub fn records(data: &[u8]) {
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("episodes.parquet");
@@ -50,10 +51,11 @@ pub fn records(data: &[u8]) {
     }
 }
 
-/// A ledger's lines without their digests, which are made good; what is read is held against a policy that is kept.
+/// Reads the lines of a ledger, whose digests are added. If that succeeds, it checks a stored policy against the
+/// ledger.
 pub fn ledgers(data: &[u8]) {
-    static KEPT: LazyLock<(Checkpoint, Records)> = LazyLock::new(|| {
-        let policy = kept(POLICY);
+    static POLICY_WITH_RECORDS: LazyLock<(Checkpoint, Records)> = LazyLock::new(|| {
+        let policy = repository_path(POLICY);
         let checkpoint = Checkpoint::load(&policy.join("training/checkpoint")).expect("a checkpoint");
         (checkpoint, Records::read(&policy.join("episodes.parquet")).expect("recorded"))
     });
@@ -68,22 +70,22 @@ pub fn ledgers(data: &[u8]) {
     let file = folder.path().join("ledger");
     std::fs::write(&file, ledger).expect("a file");
     if let Ok(ledgers) = Ledgers::read(&[file], &[]) {
-        let (checkpoint, records) = &*KEPT;
+        let (checkpoint, records) = &*POLICY_WITH_RECORDS;
         let training = &checkpoint.state.config.common;
-        let environment = listed(&training.environment);
+        let environment = find_environment(&training.environment);
         let _ = ledgers.prove(training, checkpoint.state.counters.episodes, &environment, records);
     }
 }
 
-/// An environment of the catalogue.
-fn listed(name: &str) -> perturb::proto::Environment {
+/// Returns an environment of the catalogue.
+fn find_environment(name: &str) -> perturb::proto::Environment {
     let listing = perturb::server::listing(&tasks::catalogue(), &Config::default()).expect("models load");
     listing.environments.into_iter().find(|environment| environment.name == name).expect("it is there")
 }
 
-/// An experiment file.
+/// Parses an experiment file.
 pub fn plans(data: &[u8]) {
-    if let Some(text) = std::str::from_utf8(data).ok().filter(|text| text.len() <= MOST_BYTES_OF_A_PLAN) {
+    if let Some(text) = std::str::from_utf8(data).ok().filter(|text| text.len() <= MAX_PLAN_BYTES) {
         let _ = Plan::parse("plan.toml", text.to_owned());
     }
 }

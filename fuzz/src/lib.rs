@@ -1,6 +1,7 @@
-//! What strangers may send to a server or write into files, as functions of bytes. None may panic, hang, or change what
-//! somebody else gets. libFuzzer drives them (`make fuzz`, with AddressSanitizer), and so does a test, for seconds and
-//! with any compiler.
+//! Fuzz targets: functions of the bytes that untrusted clients send or that files contain.
+//!
+//! No input may panic, hang, or change what another client gets. libFuzzer runs them (`make fuzz`, with
+//! AddressSanitizer), and so does a test, for a few seconds and with any compiler.
 
 mod files;
 mod seeds;
@@ -10,15 +11,15 @@ pub use files::{checkpoints, ledgers, plans, records};
 pub use seeds::{replies, seeds};
 pub use server::{connections, requests, snapshots, worlds};
 
-/// Something that takes a stranger's bytes.
+/// A function of untrusted bytes.
 pub struct Target {
-    /// The name of its program and of its folder in `corpus/`.
+    /// Name of its program and of its folder in `corpus/`.
     pub name: &'static str,
-    /// Hands it the bytes.
+    /// Runs it on an input.
     pub run: fn(&[u8]),
 }
 
-/// All that are attacked.
+/// All fuzz targets.
 pub const TARGETS: [Target; 8] = [
     Target { name: "requests", run: requests },
     Target { name: "snapshots", run: snapshots },

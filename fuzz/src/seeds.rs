@@ -1,4 +1,4 @@
-//! What is mutated: bytes that are taken as they are.
+//! Valid inputs, which fuzzers mutate.
 
 use std::path::Path;
 
@@ -17,26 +17,26 @@ use perturb::tasks;
 use perturb_policy::{ActionKind, PolicySpec};
 use prost::Message;
 
-use crate::server::{answers, frame, framed, head, open, steps};
+use crate::server::{client_bytes, frame, framed, open, replies_to, steps};
 
-/// A policy that is kept, with a recorded test.
+/// A stored policy with a recorded test.
 pub(crate) const POLICY: &str = "results/beyond/confirm-2/cells/CartPole-ppo-ff-R-9bd6546b-s7";
 
-/// Those of the target of this name.
+/// Returns the valid inputs of a target by its name.
 pub fn seeds(name: &str) -> Vec<Vec<u8>> {
     let environments = tasks::catalogue();
     let names = || environments.names();
     match name {
         "requests" => names().flat_map(sessions).collect(),
-        "snapshots" => names().enumerate().flat_map(|(choice, name)| saved(choice, name)).collect(),
+        "snapshots" => names().enumerate().flat_map(|(choice, name)| snapshots(choice, name)).collect(),
         "worlds" => names().map(world).collect(),
         "connections" => vec![
-            head(&[open("CartPole", 2), steps("CartPole", 2, 2)].concat()),
-            head(&[]),
+            client_bytes(&[open("CartPole", 2), steps("CartPole", 2, 2)].concat()),
+            client_bytes(&[]),
             b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n".to_vec(),
         ],
         "checkpoints" => {
-            let folder = kept(POLICY).join("training/checkpoint");
+            let folder = repository_path(POLICY).join("training/checkpoint");
             let document = std::fs::read(folder.join("checkpoint.json")).expect("a checkpoint");
             let weights = std::fs::read_dir(folder).expect("its folder").flatten();
             let weights = weights.map(|file| file.path()).find(|path| path.extension().is_some_and(|it| it != "json"));
@@ -46,20 +46,23 @@ pub fn seeds(name: &str) -> Vec<Vec<u8>> {
             let length = u16::try_from(document.len()).expect("a short document");
             vec![[&length.to_le_bytes(), document.as_bytes(), &weights].concat()]
         }
-        "records" => vec![std::fs::read(kept(POLICY).join("episodes.parquet")).expect("recorded")],
+        "records" => vec![std::fs::read(repository_path(POLICY).join("episodes.parquet")).expect("recorded")],
         "plans" => ["quick", "classic-ff", "classic-rc", "paper", "beyond/confirm-2", "questions/pendulum"]
-            .map(|name| std::fs::read(kept("experiments").join(name).with_extension("toml")).expect("a file"))
+            .map(|name| {
+                std::fs::read(repository_path("experiments").join(name).with_extension("toml")).expect("a file")
+            })
             .to_vec(),
         "ledgers" => vec![include_str!("ledger.jsonl").into()],
         _ => Vec::new(),
     }
 }
 
-pub(crate) fn kept(path: &str) -> std::path::PathBuf {
+/// Returns the path of a file of the repository.
+pub(crate) fn repository_path(path: &str) -> std::path::PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
 }
 
-/// Sessions with a request of each kind.
+/// Returns sessions with a request of each kind.
 fn sessions(environment: &str) -> [Vec<u8>; 3] {
     let environments = tasks::catalogue();
     let spec = environments.find(environment).expect("it has one");
@@ -101,16 +104,16 @@ fn sessions(environment: &str) -> [Vec<u8>; 3] {
     [usual.concat(), [groups, steps(environment, 4, 2)].concat(), acting]
 }
 
-/// Snapshots at the beginning, and some steps later.
-fn saved(choice: usize, environment: &str) -> Vec<Vec<u8>> {
+/// Returns snapshots of the start and of a few steps later.
+fn snapshots(choice: usize, environment: &str) -> Vec<Vec<u8>> {
     let snapshot = || framed(Request::Snapshot(Snapshot::default()));
     let body = [open(environment, 1), snapshot(), steps(environment, 1, 5), snapshot()].concat();
-    let replies = answers(body).into_iter().map(|reply| SessionResponse::decode(&reply[..]).expect("a reply"));
+    let replies = replies_to(body).into_iter().map(|reply| SessionResponse::decode(&reply[..]).expect("a reply"));
     let choice = u8::try_from(choice).expect("few environments");
     let snapshots = replies.filter_map(|reply| match reply.response {
         Some(Response::Snapshot(taken)) => {
-            let (saved, _checksum) = taken.snapshots[0].split_last_chunk::<4>()?;
-            Some([&[choice][..], saved].concat())
+            let (snapshot, _checksum) = taken.snapshots[0].split_last_chunk::<4>()?;
+            Some([&[choice][..], snapshot].concat())
         }
         _ => None,
     });
@@ -119,7 +122,7 @@ fn saved(choice: usize, environment: &str) -> Vec<Vec<u8>> {
     found
 }
 
-/// A world that is made, joined, stepped, reset, left and destroyed.
+/// Returns requests that create, join, step, reset, leave and destroy a world.
 fn world(environment: &str) -> Vec<u8> {
     let text = |text: &str| rpc::Tensor {
         payload: Some(rpc::tensor::Payload::Strings(rpc::tensor::StringArray { array: vec![text.into()] })),
@@ -141,9 +144,9 @@ fn world(environment: &str) -> Vec<u8> {
     messages.iter().flat_map(|message| frame(message)).collect()
 }
 
-/// How many replies a session's seed gets, and those that refuse something.
+/// Returns the number of replies to a session's input, and the messages of those that are errors.
 pub fn replies(seed: &[u8]) -> (usize, Vec<String>) {
-    let replies = answers(seed.to_vec());
+    let replies = replies_to(seed.to_vec());
     let refusal = |reply: &Vec<u8>| match SessionResponse::decode(&reply[..]).expect("a reply").response {
         Some(Response::Error(error)) => Some(error.message),
         _ => None,

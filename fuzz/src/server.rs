@@ -1,5 +1,6 @@
-//! The server, in this process, attacked over its socket. After each attack a bystander asks what it asked before, of
-//! both robots and a classic task, and must get the same bytes.
+//! Fuzz targets for the server, which runs in this process and listens at a socket.
+//!
+//! After each input a bystander runs the same sessions of both robots and a classic task, and must get the same bytes.
 
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -17,23 +18,24 @@ use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::UnixStream;
 use tokio::runtime::{Builder, Runtime};
 
-/// Longer than any answer takes on a busy machine, under a sanitizer.
-const PATIENCE: Duration = Duration::from_secs(60);
-/// Longer than a client thinks about what it sends.
-const PAUSE: Duration = Duration::from_millis(300);
-/// Calls' paths.
+/// Upper bound of an answer's time on a busy machine with a sanitizer.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(60);
+/// Silence after which a client has sent everything.
+const CLIENT_SILENCE: Duration = Duration::from_millis(300);
+/// Path of the calls that open sessions.
 const SESSION: &str = "/perturb.v1.Perturb/Session";
+/// Path of dm_env_rpc's calls.
 const PROCESS: &str = "/dm_env_rpc.v1.Environment/Process";
-/// gRPC's code of a server's own mistake.
+/// The gRPC code of internal errors.
 const INTERNAL: &str = "13";
 
-/// The body of a session's stream: frames with requests.
+/// Sends the body of a session's stream: frames with requests.
 pub fn requests(data: &[u8]) {
     attack(|socket| exchange(socket, SESSION, data.to_vec()));
 }
 
-/// A byte that chooses an environment, and a snapshot for it without its checksum, which is made good. What is taken is
-/// stepped.
+/// Restores a snapshot: a byte that selects an environment, and a snapshot without its checksum, which is added. A
+/// restored environment is stepped.
 pub fn snapshots(data: &[u8]) {
     let Some((&choice, snapshot)) = data.split_first() else { return };
     let environments = tasks::catalogue();
@@ -45,16 +47,16 @@ pub fn snapshots(data: &[u8]) {
     attack(|socket| exchange(socket, SESSION, body));
 }
 
-/// The body of a dm_env_rpc stream.
+/// Sends the body of a dm_env_rpc stream.
 pub fn worlds(data: &[u8]) {
     attack(|socket| exchange(socket, PROCESS, data.to_vec()));
 }
 
-/// All that a client ever sends.
+/// Sends all bytes of a connection.
 pub fn connections(data: &[u8]) {
     attack(async |socket| {
         let mut connection = UnixStream::connect(socket).await.expect("the server listens");
-        // It may hang up at any time.
+        // The server may close the connection at any time.
         let _ = connection.write_all(data).await;
         let _ = connection.shutdown().await;
         let mut answer = Vec::new();
@@ -63,18 +65,18 @@ pub fn connections(data: &[u8]) {
     });
 }
 
-/// A request in its frame.
+/// Returns a request in its frame.
 pub(crate) fn framed(request: Request) -> Vec<u8> {
     frame(&SessionRequest { request: Some(request) }.encode_to_vec())
 }
 
-/// A message in its frame.
+/// Returns a message in its frame.
 pub(crate) fn frame(message: &[u8]) -> Vec<u8> {
     let length = u32::try_from(message.len()).expect("a short message");
     [&[0][..], &length.to_be_bytes(), message].concat()
 }
 
-/// Opens a session of `n` environments.
+/// Returns the request that opens a session of `n` environments.
 pub(crate) fn open(environment: &str, n: u32) -> Vec<u8> {
     framed(Request::Open(Open {
         environment: environment.into(),
@@ -86,17 +88,17 @@ pub(crate) fn open(environment: &str, n: u32) -> Vec<u8> {
     }))
 }
 
-/// Steps a session of `n` environments so many times.
-pub(crate) fn steps(environment: &str, n: usize, times: usize) -> Vec<u8> {
+/// Returns `count` steps of a session of `n` environments.
+pub(crate) fn steps(environment: &str, n: usize, count: usize) -> Vec<u8> {
     let width = match environment {
         "Hopper" => 3,
         "HalfCheetah" => 6,
         _ => 1,
     };
-    framed(Request::Step(Step { actions: vec![0; 4 * width * n].into() })).repeat(times)
+    framed(Request::Step(Step { actions: vec![0; 4 * width * n].into() })).repeat(count)
 }
 
-/// Runs an attack, and looks whether the server is as before.
+/// Runs an attack, and checks that a bystander gets the same replies as before.
 fn attack<F: AsyncFnOnce(&'static Path) -> Vec<u8>>(attack: F) {
     thread_local! {
         static CLIENT: Runtime = Builder::new_current_thread().enable_all().build().expect("a runtime");
@@ -104,14 +106,14 @@ fn attack<F: AsyncFnOnce(&'static Path) -> Vec<u8>>(attack: F) {
     let socket = socket();
     CLIENT.with(|client| {
         client.block_on(async {
-            tokio::time::timeout(PATIENCE, attack(socket)).await.expect("an answer, or the connection's end");
-            let seen = tokio::time::timeout(PATIENCE, bystander(socket)).await.expect("an answer to a bystander");
+            tokio::time::timeout(ANSWER_TIMEOUT, attack(socket)).await.expect("an answer, or the connection's end");
+            let seen = tokio::time::timeout(ANSWER_TIMEOUT, bystander(socket)).await.expect("an answer to a bystander");
             assert!(seen == *expected(), "a bystander got other bytes");
         });
     });
 }
 
-/// Where the server listens, which is started first.
+/// Returns the server's socket. The first call starts the server.
 fn socket() -> &'static Path {
     static SOCKET: OnceLock<PathBuf> = OnceLock::new();
     SOCKET.get_or_init(|| {
@@ -136,7 +138,7 @@ fn socket() -> &'static Path {
     })
 }
 
-/// What a bystander gets of a server that nobody attacked.
+/// Returns the replies to a bystander before any attack.
 fn expected() -> &'static Vec<u8> {
     static EXPECTED: OnceLock<Vec<u8>> = OnceLock::new();
     EXPECTED.get_or_init(|| {
@@ -157,8 +159,8 @@ async fn bystander(socket: &Path) -> Vec<u8> {
     seen
 }
 
-/// The replies to a session's stream with this body.
-pub(crate) fn answers(body: Vec<u8>) -> Vec<Vec<u8>> {
+/// Returns the replies to a session's stream with this body.
+pub(crate) fn replies_to(body: Vec<u8>) -> Vec<Vec<u8>> {
     let runtime = Builder::new_current_thread().enable_all().build().expect("a runtime");
     let bytes = runtime.block_on(exchange(socket(), SESSION, body));
     let mut rest = &bytes[..];
@@ -172,8 +174,8 @@ pub(crate) fn answers(body: Vec<u8>) -> Vec<Vec<u8>> {
     replies
 }
 
-/// All that a client sends for a session's stream with this body, before it has heard anything.
-pub(crate) fn head(body: &[u8]) -> Vec<u8> {
+/// Returns all bytes that a client sends for a session's stream with this body, before it receives anything.
+pub(crate) fn client_bytes(body: &[u8]) -> Vec<u8> {
     let runtime = Builder::new_current_thread().enable_all().build().expect("a runtime");
     runtime.block_on(async {
         let (ours, mut theirs) = tokio::io::duplex(1 << 16);
@@ -181,8 +183,8 @@ pub(crate) fn head(body: &[u8]) -> Vec<u8> {
         tokio::spawn(async move { call(ours, SESSION, body).await });
         let mut sent = vec![0; 1 << 16];
         let mut length = 0;
-        // It has said all once it waits.
-        while let Ok(Ok(more)) = tokio::time::timeout(PAUSE, theirs.read(&mut sent[length..])).await {
+        // The client has sent everything when it waits.
+        while let Ok(Ok(more)) = tokio::time::timeout(CLIENT_SILENCE, theirs.read(&mut sent[length..])).await {
             length += more;
         }
         sent.truncate(length);
@@ -190,7 +192,7 @@ pub(crate) fn head(body: &[u8]) -> Vec<u8> {
     })
 }
 
-/// The bytes of the replies to a call with this body.
+/// Returns the bytes of the replies to a call with this body.
 async fn exchange(socket: &Path, path: &str, body: Vec<u8>) -> Vec<u8> {
     let connection = loop {
         match UnixStream::connect(socket).await {
@@ -211,7 +213,7 @@ async fn call<T: AsyncRead + AsyncWrite + Unpin + Send + 'static>(connection: T,
         .header("te", "trailers");
     let (response, mut upwards) = client.send_request(request.body(()).expect("a request"), false).expect("a stream");
     let mut replies = Vec::new();
-    // The server may have had enough before it has all.
+    // The server may end the call before it has the whole body.
     let _ = upwards.send_data(body.into(), true);
     if let Ok(response) = response.await {
         let mut downwards = response.into_body();

@@ -1,4 +1,5 @@
-//! Every attack for some seconds: seeds and the corpus as they are, and mutated at random, from a printed seed.
+//! Runs every fuzz target for some seconds, on the valid inputs, on the corpus, and on random mutations from a printed
+//! seed.
 
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -10,19 +11,19 @@ use perturb_fuzz::{TARGETS, Target, replies, seeds};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
-/// Mutated inputs of each target, unless `PERTURB_FUZZ_INPUTS` says how many.
-const INPUTS: u64 = 200;
-/// Where nothing else runs in this process, the most memory that is taken after the first tenth of all inputs and not
-/// given back, MB: `make attack-test`.
-const MOST_GROWN: &str = "PERTURB_FUZZ_MOST_GROWN_MB";
+/// Default number of mutated inputs of each target; `PERTURB_FUZZ_INPUTS` changes it.
+const DEFAULT_INPUTS: u64 = 200;
+/// Environment variable with the maximum memory growth after the first tenth of all inputs, in MB. It needs a process
+/// in which nothing else runs: `make attack-test`.
+const MAX_GROWTH_VARIABLE: &str = "PERTURB_FUZZ_MOST_GROWN_MB";
 
-/// What each target is attacked with at present.
+/// Seed of the current input of each target.
 static SEEDS: Mutex<BTreeMap<String, u64>> = Mutex::new(BTreeMap::new());
 
 fn attack(name: &str) {
     static HOOK: Once = Once::new();
     HOOK.call_once(|| {
-        // A panic on one of the server's threads would only end that, and what tests print goes with the process.
+        // A panic on a thread of the server would end that thread only. Tests' output is lost when the process aborts.
         std::panic::set_hook(Box::new(|panic| {
             let seeds = SEEDS.lock().unwrap_or_else(PoisonError::into_inner);
             let again = "each is repeated by PERTURB_FUZZ_SEED=SEED PERTURB_FUZZ_INPUTS=1";
@@ -38,36 +39,36 @@ fn attack(name: &str) {
     let inputs: Vec<Vec<u8>> = seeds(name).into_iter().chain(found).collect();
     assert!(!inputs.is_empty());
     inputs.iter().for_each(|input| run(input));
-    let number = |name: &str, usual| std::env::var(name).map_or(usual, |text| text.parse().expect("a number"));
-    let (count, first) = (number("PERTURB_FUZZ_INPUTS", INPUTS), number("PERTURB_FUZZ_SEED", 1));
+    let number = |name: &str, default| std::env::var(name).map_or(default, |text| text.parse().expect("a number"));
+    let (count, first) = (number("PERTURB_FUZZ_INPUTS", DEFAULT_INPUTS), number("PERTURB_FUZZ_SEED", 1));
     let (start, mut at_first) = (Instant::now(), 0);
     let tenth = (count / 10).max(1);
     for seed in first..first + count {
         if seed == first + tenth {
             at_first = memory();
         }
-        if count > INPUTS && (seed - first).is_multiple_of(tenth) {
+        if count > DEFAULT_INPUTS && (seed - first).is_multiple_of(tenth) {
             eprintln!("{name}: {} of {count} inputs in {:.0?}", seed - first, start.elapsed());
         }
         SEEDS.lock().unwrap_or_else(PoisonError::into_inner).insert(name.to_owned(), seed);
         run(&mutated(&inputs, &mut ChaCha8Rng::seed_from_u64(seed)));
     }
-    let most = number(MOST_GROWN, u64::MAX).saturating_mul(1_000_000);
-    let grown = memory().saturating_sub(at_first);
-    println!("{name}: {count} inputs in {:.0?}, {} kB more since the first tenth", start.elapsed(), grown >> 10);
-    assert!(grown < most, "{name}: {grown} bytes were taken and not given back");
+    let limit = number(MAX_GROWTH_VARIABLE, u64::MAX).saturating_mul(1_000_000);
+    let growth = memory().saturating_sub(at_first);
+    println!("{name}: {count} inputs in {:.0?}, {} kB more since the first tenth", start.elapsed(), growth >> 10);
+    assert!(growth < limit, "{name}: memory grew by {growth} bytes");
 }
 
-/// Bytes of this process that are in memory.
+/// Returns the resident memory of this process, in bytes.
 fn memory() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").expect("Linux");
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).expect("a size");
     line.trim_end_matches("kB").trim().parse::<u64>().expect("kB") << 10
 }
 
-/// One of these, changed in a few places.
+/// Returns one of the inputs with a few changes.
 fn mutated(inputs: &[Vec<u8>], random: &mut ChaCha8Rng) -> Vec<u8> {
-    let below = |random: &mut ChaCha8Rng, most: usize| random.next_u64() as usize % most.max(1);
+    let below = |random: &mut ChaCha8Rng, end: usize| random.next_u64() as usize % end.max(1);
     let mut input = inputs[below(random, inputs.len())].clone();
     for _ in 0..=below(random, 4) {
         let (at, length) = (below(random, input.len()), below(random, 16));

@@ -86,7 +86,7 @@ def test_so_they_do_for_policies_that_remember(
 
 
 def test_so_they_do_on_sets_of_ones_own_and_with_another_rule(tmp_path: Path, server: str) -> None:
-    own = ["--parameters", "length=0.3..0.4,0.8..0.9", "mass=0.1", "--base", "E", "--success", "steps=90"]
+    own = ["--parameters", "length=0.3..0.4,0.8..0.9", "mass=0.1", "--base-version", "E", "--success", "steps=90"]
     evaluated(CART_POLE, tmp_path / "records", server, "--episodes", "20", *own)
     policy = perturb.load_policy(CART_POLE)
     assessment = perturb.assess(

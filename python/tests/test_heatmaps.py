@@ -15,7 +15,7 @@ from .test_policy import CART_POLE, PENDULUM
 @pytest.mark.parametrize("checkpoint", [CART_POLE, PENDULUM])
 def test_a_test_over_two_parameters_is_that_of_the_program(checkpoint: Path, tmp_path: Path, server: str) -> None:
     made = str(tmp_path / "made")
-    arguments = ("--grid", "3", "--episodes", "2", "--seed", "5", "--base", "R", "--out", made, "--server", server)
+    arguments = ("--grid", "3", "--episodes", "2", "--seed", "5", "--base-version", "R", "--out", made, "--server", server)
     run("heatmap", "--checkpoint", str(checkpoint), *arguments)
     policy = perturb.load_policy(checkpoint)
     over = perturb.sets.heatmap(policy.environment, points=3, base="R")

@@ -120,7 +120,7 @@ def test_perturbs_own_policies_are_replayed_by_both(tmp_path: Path, server: str)
         "audit", str(saved), "--checkpoint", str(CART_POLE), str(other), "--server", server, "--episodes", "10"
     )
     assert "20 of 20 episodes of 2 policies have the same bytes" in output
-    assert "trained on E: function upright is no checkpoint that was given; Assessment.audit" in output
+    assert "trained on E: no --checkpoint has the id function upright; Assessment.audit" in output
     output = run("audit", str(saved), "--server", server, status=2)
     assert "no policy of" in output
 

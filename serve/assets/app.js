@@ -1,11 +1,11 @@
-// What a page does by itself: hears of changes, puts new parts in their places, draws curves. Read-only, like its server.
+// Script of the pages: receives events, replaces changed parts and draws curves. It changes nothing on the server.
 "use strict";
 
 (() => {
-  // Okabe and Ito's colours, which differ for everybody.
+  // Okabe and Ito's colours, for all kinds of colour vision.
   const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d00", "#7f7f7f"];
   const NARROWEST = 200, HEIGHT = 220;
-  // What is drawn of a training, by the names of the places.
+  // Charts of a training, by the names of their elements.
   const CURVES = {
     return: { colour: 0 },
     success: { colour: 2, range: [0, 100] },
@@ -31,7 +31,7 @@
     live.dataset.state = state;
   }
 
-  // Times of day as the reader has them.
+  // Shows times in the reader's time zone.
   function localTimes(within) {
     for (const element of within.querySelectorAll("time[datetime]")) {
       element.title = element.textContent;
@@ -58,7 +58,7 @@
     };
   }
 
-  // Draws, or draws again if another kind of plot is there.
+  // Draws a chart. Replaces an existing plot of another kind.
   function plot(figure, key, data, make) {
     const place = figure.querySelector(".plot");
     const known = plots.get(figure);
@@ -72,7 +72,7 @@
     sizes.observe(place);
   }
 
-  // There is nothing to draw any more: the run was begun anew.
+  // Removes the chart, because the run was begun anew and has no data.
   function clear(figure) {
     const known = plots.get(figure), place = figure.querySelector(".plot");
     if (!known) return;
@@ -105,7 +105,7 @@
     figure.dataset.reach = curve[by][curve[by].length - 1];
   }
 
-  // The curves of the cells in work, one colour for a kind.
+  // Draws the curves of the cells in work, with one colour for each kind.
   function drawCells(figure, cells) {
     figure.parentElement.hidden = cells.length === 0;
     if (cells.length === 0) return clear(figure);
@@ -149,7 +149,7 @@
     }
   });
 
-  // The report is as high as it needs to be, and comes again when it is another one.
+  // Adapts the report's height to its content, and reloads a changed report.
   const report = document.querySelector("iframe.report");
   let reported = 0, later = null;
   function fit() {
@@ -170,14 +170,14 @@
     new ResizeObserver(fit).observe(report.parentElement);
   }
 
-  // What tells elements of one kind apart: where they lead, or what they show.
+  // Returns a key that identifies an element among others of its kind: its address or its text.
   const keyOf = (node) =>
     node.nodeType !== Node.ELEMENT_NODE ? null
       : node.getAttribute("href") ?? node.getAttribute("src") ?? node.querySelector("[href], [src]")?.getAttribute("href")
         ?? node.querySelector("[src]")?.getAttribute("src") ?? null;
   const alike = (a, b) => a.nodeType === b.nodeType && a.nodeName === b.nodeName && keyOf(a) === keyOf(b);
 
-  // Makes `old` like `fresh` and touches only what differs: what has the focus, is clicked or plays stays what it is.
+  // Changes `old` to `fresh`, but only where they differ, so that focus, clicks and playing films are not disturbed.
   function become(old, fresh) {
     if (old.isEqualNode(fresh)) return;
     if (old.nodeType !== Node.ELEMENT_NODE) {
@@ -194,7 +194,7 @@
     for (const child of [...fresh.childNodes]) {
       const found = left.findIndex((old) => alike(old, child));
       const [old] = found < 0 ? [] : left.splice(found, 1);
-      // What was passed over comes later or not at all.
+      // Skipped elements are moved later or removed.
       if (old && found === 0) become(old, child);
       else if (old) {
         const gone = left.splice(0, found);
@@ -234,7 +234,7 @@
     document.body.dataset.updates = Number(document.body.dataset.updates ?? 0) + 1;
   }
 
-  // A page that nobody sees keeps no connection: a browser has few for a server.
+  // Hidden pages close their connection, because browsers allow only few connections to a server.
   let source = null;
   function listen() {
     if (source || document.hidden) return;

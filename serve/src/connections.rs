@@ -21,8 +21,8 @@ use tower_service::Service;
 pub(crate) struct ConnectionLimits {
     /// Number of open connections. A browser opens about six. Further clients wait until a connection is free.
     max_connections: usize,
-    /// Time in which a client must send the head of a request. It counts from the connection's start, or from the end of
-    /// the previous response.
+    /// Time in which a client must send the head of a request. It counts from the connection's start, or from the end
+    /// of the previous response.
     head_timeout: Duration,
     /// Time after which the kernel closes a connection whose client takes none of the bytes that wait for it.
     write_timeout: Duration,
@@ -78,7 +78,8 @@ mod tests {
     /// Upper bound of every wait; the machine may be busy.
     const DEADLINE: Duration = Duration::from_secs(30);
 
-    /// Serves a short page at `/`, one that takes longer than the head's timeout at `/slow`, and a large one at `/large`.
+    /// Serves a short page at `/`, one that takes longer than the head's timeout at `/slow`, and a large one at
+    /// `/large`.
     async fn start() -> SocketAddr {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();

@@ -119,8 +119,8 @@ impl EpisodeLog {
         self.groups.iter().map(|group| group.episodes).sum()
     }
 
-    /// Returns the mean length in steps and the speed in steps per second of the last tenth of the time. Returns `None` before
-    /// there are episodes.
+    /// Returns the mean length in steps and the speed in steps per second of the last tenth of the time. Returns `None`
+    /// before there are episodes.
     pub(crate) fn recent(&self) -> Option<(f64, f64)> {
         let end = self.groups.last()?.end;
         let is_old = |group: &EpisodeGroup| end - group.end >= MIN_SPEED_SECONDS.max(end / 10.0);
@@ -207,8 +207,8 @@ impl EpisodeLog {
 
 /// Returns the steps per second of each part.
 ///
-/// A training writes its episodes in blocks, with the time of writing. So consecutive parts share a speed until enough time
-/// has passed.
+/// A training writes its episodes in blocks, with the time of writing. So consecutive parts share a speed until enough
+/// time has passed.
 fn speeds(parts: &[EpisodeGroup]) -> Vec<Option<f64>> {
     let end = parts.last().map_or(0.0, |last| last.end);
     let mut speeds = Vec::new();

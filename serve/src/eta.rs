@@ -38,8 +38,8 @@ impl Eta {
         self.0.clear();
     }
 
-    /// Returns the remaining seconds at the speed since the first sample. `weights` are the cells' durations relative to each
-    /// other. Returns `None` before there is enough progress.
+    /// Returns the remaining seconds at the speed since the first sample. `weights` are the cells' durations relative
+    /// to each other. Returns `None` before there is enough progress.
     pub(crate) fn remaining_seconds(&self, now: Instant, shares: &[f32], weights: &[f64]) -> Option<f64> {
         let (start, then) = self.0.front()?;
         let time = now.duration_since(*start);

@@ -282,8 +282,8 @@ fn test_cost(cell: &Cell) -> f64 {
     TEST_SHARE * tested_episodes(cell)
 }
 
-/// Returns the duration of each cell relative to the others: the measured seconds of its kind, or an estimate by the number
-/// of its episodes.
+/// Returns the duration of each cell relative to the others: the measured seconds of its kind, or an estimate by the
+/// number of its episodes.
 fn weights(status: &ExperimentStatus) -> Vec<f64> {
     let taken = status.taken();
     let cells = &status.plan.cells;

@@ -69,7 +69,8 @@ pub(crate) async fn send(root: Root, relative: RelativePath, headers: &HeaderMap
     Some(response)
 }
 
-/// Opens the plain file at `path`, whose links are resolved already. Fails if a part of the path has become a link since.
+/// Opens the plain file at `path`, whose links are resolved already. Fails if a part of the path has become a link
+/// since.
 fn open(path: &Path) -> std::io::Result<(File, Metadata)> {
     let opened = open_plain(path)?;
     match std::fs::read_link(format!("/proc/self/fd/{}", opened.0.as_raw_fd()))? == path {

@@ -70,7 +70,8 @@ pub(crate) fn router(state: Arc<AppState>) -> Router {
         .with_state(state)
 }
 
-/// Refuses methods that change something and requests that another site caused. Adds the security headers to each response.
+/// Refuses methods that change something and requests that another site caused. Adds the security headers to each
+/// response.
 async fn guard(State(state): State<Arc<AppState>>, request: Request, next: Next) -> Response {
     let mut response = if !matches!(*request.method(), Method::GET | Method::HEAD) {
         let mut response =
@@ -100,8 +101,8 @@ async fn guard(State(state): State<Arc<AppState>>, request: Request, next: Next)
     response
 }
 
-/// Tells whether a page of another site embeds a picture, frame or script from here. That page would see nothing, but could
-/// have files read all the time. Links are followed from any site.
+/// Tells whether a page of another site embeds a picture, frame or script from here. That page would see nothing, but
+/// could have files read all the time. Links are followed from any site.
 fn is_embedded_by_another_site(headers: &HeaderMap) -> bool {
     let header_text = |name: &str| headers.get(name).and_then(|value| value.to_str().ok());
     let is_link =
@@ -109,8 +110,8 @@ fn is_embedded_by_another_site(headers: &HeaderMap) -> bool {
     matches!(header_text("sec-fetch-site"), Some("cross-site" | "same-site")) && !is_link
 }
 
-/// Tells whether the request names this machine as localhost or by a loopback address. Another site could let its own name
-/// lead here, and its pages would then have the same origin.
+/// Tells whether the request names this machine as localhost or by a loopback address. Another site could let its own
+/// name lead here, and its pages would then have the same origin.
 fn is_local(headers: &HeaderMap, uri: &Uri) -> bool {
     let host =
         headers.get(header::HOST).and_then(|host| host.to_str().ok()).or(uri.authority().map(|host| host.as_str()));

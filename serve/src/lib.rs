@@ -2,10 +2,10 @@
 //!
 //! - [`Server`] listens. `connections` limits connections, `http` routes requests and keeps other sites out.
 //! - `paths` and `files` send files of the served folder.
-//! - `publisher` reads the files of open pages and sends changes as server-sent events. `cached_loader` limits how often files
-//!   are read, `runs` keeps the state of each run between two readings.
-//! - `training`, `experiment`, `index` and `pictures` read runs. `tail` and `curve` follow a growing log, `eta` estimates the
-//!   remaining time, `report` builds reports, `server_status` polls a server of environments.
+//! - `publisher` reads the files of open pages and sends changes as server-sent events. `cached_loader` limits how
+//!   often files are read, `runs` keeps the state of each run between two readings.
+//! - `training`, `experiment`, `index` and `pictures` read runs. `tail` and `curve` follow a growing log, `eta`
+//!   estimates the remaining time, `report` builds reports, `server_status` polls a server of environments.
 //! - `pages` makes HTML of all this.
 #![forbid(unsafe_code)]
 

@@ -48,8 +48,8 @@ impl Root {
         &self.given
     }
 
-    /// Returns the absolute path of `relative` without symbolic links. Returns `None` if nothing is there, or if it is not
-    /// below the folder.
+    /// Returns the absolute path of `relative` without symbolic links. Returns `None` if nothing is there, or if it is
+    /// not below the folder.
     pub(crate) fn resolve(&self, relative: &RelativePath) -> Option<PathBuf> {
         let real = self.path.join(&relative.0).canonicalize().ok()?;
         self.relative(&real).map(|_| real)
@@ -63,7 +63,8 @@ impl Root {
 }
 
 impl RelativePath {
-    /// Decodes the path in an address, whose bytes may be written as `%41`. Returns `None` for invalid and hidden paths.
+    /// Decodes the path in an address, whose bytes may be written as `%41`. Returns `None` for invalid and hidden
+    /// paths.
     pub(crate) fn decode(text: &str) -> Option<Self> {
         let text = text.strip_suffix('/').unwrap_or(text);
         let mut path = PathBuf::new();

@@ -38,8 +38,8 @@ impl Pictures {
     }
 }
 
-/// Finds the pictures in one folder, in the order of their names. At most `max_shown` files are opened, the others counted.
-/// A picture that is there in two formats is shown once.
+/// Finds the pictures in one folder, in the order of their names. At most `max_shown` files are opened, the others
+/// counted. A picture that is there in two formats is shown once.
 pub(crate) fn scan_folder(relative: &RelativePath, path: &Path, max_shown: usize) -> Pictures {
     let mut found = Pictures::default();
     let listed = files::list(path).unwrap_or_default(); // sorted

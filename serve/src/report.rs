@@ -21,7 +21,8 @@ const MIN_REBUILD_INTERVAL: Duration = Duration::from_secs(5);
 const REBUILD_INTERVAL_FACTOR: u32 = 10;
 /// Longest time that a request waits for a report.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(60);
-/// Time after which a build no longer delays other reports. It may hang, for example in a file system that does not answer.
+/// Time after which a build no longer delays other reports. It may hang, for example in a file system that does not
+/// answer.
 const BUILD_TIMEOUT: Duration = Duration::from_secs(120);
 /// Message for requests that have waited too long.
 const STILL_BUILDING: &str = "it is still being built; load this page again in a minute";
@@ -54,8 +55,8 @@ struct CachedReport {
 }
 
 impl CachedReport {
-    /// Tells whether the report is up to date, or too recent to be built again. A failed build is repeated although the files
-    /// have not changed, because its cause may be gone.
+    /// Tells whether the report is up to date, or too recent to be built again. A failed build is repeated although the
+    /// files have not changed, because its cause may be gone.
     fn is_usable(&self, fingerprint: u64) -> bool {
         let interval = MIN_REBUILD_INTERVAL.max(self.build_time * REBUILD_INTERVAL_FACTOR);
         self.page.is_ok() && self.fingerprint == fingerprint || self.at.elapsed() < interval
@@ -80,8 +81,8 @@ impl ReportCache {
         }
     }
 
-    /// Returns the fingerprint of the report that would be sent now. It is `fingerprint`, which the files have, or an earlier
-    /// one.
+    /// Returns the fingerprint of the report that would be sent now. It is `fingerprint`, which the files have, or an
+    /// earlier one.
     pub(crate) fn fingerprint(&self, folder: &Path, fingerprint: u64) -> u64 {
         let reports = self.reports();
         reports
@@ -90,7 +91,8 @@ impl ReportCache {
             .map_or(fingerprint, |report| report.fingerprint)
     }
 
-    /// Returns the report of the experiment in `folder`, whose files have this `fingerprint`, or the reason why there is none.
+    /// Returns the report of the experiment in `folder`, whose files have this `fingerprint`, or the reason why there
+    /// is none.
     pub(crate) async fn page(self: &Arc<Self>, folder: &Path, fingerprint: u64) -> Result<Arc<str>, String> {
         let (this, folder) = (Arc::clone(self), folder.to_owned());
         let Ok(permit) = Arc::clone(&self.waiting).try_acquire_owned() else {

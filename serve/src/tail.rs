@@ -7,8 +7,8 @@ use perturb_files::{Stamp, open_plain};
 
 /// Number of bytes that one call reads at most; the next call reads on. Longer lines are not read.
 pub(crate) const MAX_READ_BYTES: u64 = 64 << 20;
-/// Number of bytes before the read position that are compared with the file, to notice that it was truncated and has grown
-/// again.
+/// Number of bytes before the read position that are compared with the file, to notice that it was truncated and has
+/// grown again.
 const CONTEXT_BYTES: usize = 64;
 
 /// The read position in a growing file.

@@ -1,5 +1,6 @@
-//! `perturb demo`: the paper's question, small. Does a policy still work where it was not trained, and does it help to
-//! train on random physics?
+//! `perturb demo`: a small version of the paper's experiment.
+//!
+//! Does a policy still work where it was not trained, and does training on random physics help?
 
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -24,26 +25,30 @@ use perturb_text::{Table, duration, grouped};
 use super::args::DemoArgs;
 use super::display::{Display, note};
 use super::error::{CommandError, Result, system};
-use super::{lasting_servers, refuse_file, signal_code, threads};
+use super::{reconnecting_servers, refuse_file, signal_code, threads};
 use crate::video::{VideoError, VideoFile, VideoOptions, film};
 
-/// The paper's budgets.
+/// Training episodes of the paper's results.
 const PAPER_EPISODES: u64 = 15_000;
+/// Test episodes of the paper's results.
 const PAPER_TEST_EPISODES: u64 = 1000;
+/// Runs of the paper's results.
 const PAPER_RUNS: u64 = 5;
-/// What policies are trained on.
+/// Versions on which policies are trained.
 const TRAINED_ON: [Version; 2] = [Version::D, Version::R];
-/// Points along each axis of the heatmap, and episodes at each.
+/// Number of points along each axis of the heatmap.
 const GRID: usize = 12;
+/// Number of test episodes at each point of the heatmap.
 const POINT_EPISODES: u64 = 5;
-/// Episodes that are looked through for one to film.
-const TRIES: u64 = 20;
-/// Width and height of the films' pictures, and steps from one to the next: a robot's takes some 60 ms to draw.
+/// Maximum number of test episodes that are searched for one to film.
+const MAX_TRIES: u64 = 20;
+/// Width and height of the films.
 const PIXELS: (u32, u32) = (240, 240);
-const EVERY: u32 = 8;
+/// Steps between two frames of the films. Drawing a robot takes some 60 ms.
+const FRAME_STEPS: u32 = 8;
 
-/// A policy that was trained, and its success by what it was tested on, %.
-struct Trained {
+/// A trained policy with its success rate on each version, in percent.
+struct DemoPolicy {
     version: Version,
     checkpoint: Checkpoint,
     rates: BTreeMap<Version, f64>,
@@ -59,19 +64,19 @@ struct Demo<'a> {
 pub(super) fn run(args: &DemoArgs) -> Result<ExitCode> {
     let start = Instant::now();
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let usual = || PathBuf::from(format!("runs/demo-{}", chrono::Utc::now().format("%Y%m%d-%H%M%S")));
-    let out = args.out.clone().unwrap_or_else(usual);
+    let default_folder = || PathBuf::from(format!("runs/demo-{}", chrono::Utc::now().format("%Y%m%d-%H%M%S")));
+    let out = args.out.clone().unwrap_or_else(default_folder);
     refuse_file(&out)?;
     if !perturb_files::list(&out)?.is_empty() {
-        let message = format!("{} is not empty: give the demo another --out, or delete that", out.display());
+        let message = format!("{} is not empty: give another --out, or delete that folder", out.display());
         return Err(CommandError::Usage(message));
     }
-    let demo = Demo { args, servers: lasting_servers(&args.server, args.wait)?, stop, out };
+    let demo = Demo { args, servers: reconnecting_servers(&args.server, args.wait)?, stop, out };
     match demo.run(start) {
         Ok(()) => Ok(ExitCode::SUCCESS),
         Err(error) => {
             let Some(signal) = error.signal() else { return Err(error) };
-            note(format_args!("stopped by signal {signal}; what is done is kept in {}", demo.out.display()));
+            note(format_args!("stopped by signal {signal}; finished parts are kept in {}", demo.out.display()));
             Ok(signal_code(signal))
         }
     }
@@ -95,14 +100,14 @@ impl Demo<'_> {
             trained.push(policy);
         }
         writeln!(out, "\n{}\n", rates_table(&trained).to_text())?;
-        writeln!(out, "{}\n", self.papers_table(&environment.name, &trained).to_text())?;
+        writeln!(out, "{}\n", self.comparison_table(&environment.name, &trained).to_text())?;
         writeln!(
             out,
             "Default is trained and tested on D, Interpolation on R; Extrapolation is the\n\
              geometric mean of D tested on R, D on E and R on E.\n"
         )?;
         if ["Hopper", "HalfCheetah"].contains(&environment.name.as_str()) {
-            writeln!(out, "The paper's robots ran in another simulator: compare losses, not numbers.\n")?;
+            writeln!(out, "The paper's robots ran in another simulator, so compare differences, not numbers.\n")?;
         }
         writeln!(out, "{}", conclusion(&trained))?;
         let heatmap = self.heatmap(&trained, environment.heatmap_axes.clone())?;
@@ -115,7 +120,7 @@ impl Demo<'_> {
     }
 
     /// Trains a policy and tests it on every version.
-    fn train(&self, environment: &str, version: Version) -> Result<Trained> {
+    fn train(&self, environment: &str, version: Version) -> Result<DemoPolicy> {
         let DemoArgs { episodes, test_episodes, seed, .. } = *self.args;
         let settings = [
             format!("environment={environment}"),
@@ -125,7 +130,7 @@ impl Demo<'_> {
         ];
         let config = TrainConfig::load(None, &settings, toml::Table::new())?;
         let directory = RunDirectory::choose(&self.out.join(format!("trained-on-{version}")), false)?;
-        let mut display = Display::of_training(config.to_string(), &config, 0, 0);
+        let mut display = Display::for_training(config.to_string(), &config, 0, 0);
         let report = |progress: &Progress| display.training(progress);
         let outcome = train(&self.servers, &config, &directory, threads(None), &self.stop, report)?;
         drop(display);
@@ -134,16 +139,16 @@ impl Demo<'_> {
         }
         let mut rates = BTreeMap::new();
         for set in Version::ALL {
-            let mut display = Display::of_episodes(format!("trained on {version}, testing on {set}"), test_episodes);
+            let mut display = Display::for_episodes(format!("trained on {version}, testing on {set}"), test_episodes);
             let report = |episodes| display.episodes(episodes);
             let result = test(&self.servers, &outcome.checkpoint, set, test_episodes, seed, &self.stop, report)?;
             rates.insert(set, result.success_percent);
         }
-        Ok(Trained { version, checkpoint: outcome.checkpoint, rates })
+        Ok(DemoPolicy { version, checkpoint: outcome.checkpoint, rates })
     }
 
-    /// The paper's figures beside those of here, each with what it cost.
-    fn papers_table(&self, environment: &str, trained: &[Trained]) -> Table {
+    /// Compares the results with the paper's, each with its number of runs and episodes.
+    fn comparison_table(&self, environment: &str, trained: &[DemoPolicy]) -> Table {
         let rates: BTreeMap<Scenario, f64> = trained
             .iter()
             .flat_map(|one| one.rates.iter().map(|(&test, &rate)| (Scenario { train: one.version, test }, rate)))
@@ -156,28 +161,28 @@ impl Demo<'_> {
             "here" => here(metric).map(|percent| format!("{percent:.1}")),
             _ => paper::number(environment, &method, metric).map(|number| number.to_string()),
         };
-        let of = |metric| move |row: &(&str, u64, u64, u64)| shown(row.0, metric).unwrap_or_else(|| "–".into());
+        let column = |metric| move |row: &(&str, u64, u64, u64)| shown(row.0, metric).unwrap_or_else(|| "–".into());
         Table::of("", &rows)
             .text("success, %", |(row, ..)| *row)
             .number("runs", |(_, runs, ..)| runs)
             .number("episodes", |(.., episodes, _)| grouped(*episodes as usize))
             .number("tested", |(.., tested)| grouped(*tested as usize))
-            .number("Default", of(Metric::Default))
-            .number("Interpolation", of(Metric::Interpolation))
-            .number("Extrapolation", of(Metric::Extrapolation))
+            .number("Default", column(Metric::Default))
+            .number("Interpolation", column(Metric::Interpolation))
+            .number("Extrapolation", column(Metric::Extrapolation))
             .build()
     }
 
-    /// Both policies over two parameters, side by side.
-    fn heatmap(&self, trained: &[Trained], axes: Vec<String>) -> Result<Option<(&'static str, PathBuf)>> {
+    /// Draws the success of both policies over two parameters, side by side.
+    fn heatmap(&self, trained: &[DemoPolicy], axes: Vec<String>) -> Result<Option<(&'static str, PathBuf)>> {
         let Ok(parameters) = <[String; 2]>::try_from(axes) else { return Ok(None) };
         let seed = self.args.seed;
         let (grid, episodes, base, fixed) = (GRID, POINT_EPISODES, Version::D, Context::new());
         let options = HeatmapOptions { parameters, base, grid, episodes, seed, fixed };
         let mut policies = Vec::new();
-        for Trained { version, checkpoint, .. } in trained {
+        for DemoPolicy { version, checkpoint, .. } in trained {
             let total = (GRID * GRID) as u64 * POINT_EPISODES;
-            let mut display = Display::of_episodes(format!("trained on {version}, heatmap"), total);
+            let mut display = Display::for_episodes(format!("trained on {version}, heatmap"), total);
             let report = &mut |episodes| display.episodes(episodes);
             let (heatmap, _) = heatmap(&self.servers, checkpoint, &options, &self.stop, report)?;
             let config = &checkpoint.state.config;
@@ -190,22 +195,24 @@ impl Demo<'_> {
         Ok(Some(("success over two parameters", path)))
     }
 
-    /// The policy that was trained on D: an episode on D that goes well, and one on E that does not.
+    /// Films the policy that was trained on D: a success on D and a failure on E.
     fn films(&self, checkpoint: &Checkpoint) -> Result<Vec<(&'static str, PathBuf)>> {
-        let wanted =
-            [("a success on D of what was trained there", Version::D, true), ("its failure on E", Version::E, false)];
+        let wanted = [
+            ("success of the policy trained on D", Version::D, true),
+            ("failure of this policy on E", Version::E, false),
+        ];
         let mut films = Vec::new();
         for (what, version, success) in wanted {
             let path = self.out.join(if success { "success.gif" } else { "failure.gif" });
             note(format_args!("filming {what}"));
-            let Some(seed) = self.episode(checkpoint, version, success)? else {
+            let Some(seed) = self.find_episode(checkpoint, version, success)? else {
                 let kind = if success { "success" } else { "failure" };
-                note(format_args!("no film of a {kind}: none of {TRIES} episodes on {version} was one"));
+                note(format_args!("no film of a {kind}: none of {MAX_TRIES} episodes on {version} was one"));
                 continue;
             };
             match self.film(checkpoint, version, seed, &path) {
                 Ok(()) => films.push((what, path)),
-                // A server without OpenGL draws no robots, and says what is missing.
+                // A server without OpenGL cannot draw robots. The error names what is missing.
                 Err(VideoError::Test(TestError::Client(error @ ClientError::Refused { .. }))) => {
                     note(format_args!("no films: {error}"));
                     break;
@@ -216,9 +223,9 @@ impl Demo<'_> {
         Ok(films)
     }
 
-    /// The seed of an episode that ends so.
-    fn episode(&self, checkpoint: &Checkpoint, version: Version, success: bool) -> Result<Option<u64>> {
-        for seed in self.args.seed..self.args.seed + TRIES {
+    /// Searches for the seed of an episode with this outcome.
+    fn find_episode(&self, checkpoint: &Checkpoint, version: Version, success: bool) -> Result<Option<u64>> {
+        for seed in self.args.seed..self.args.seed + MAX_TRIES {
             let result = test(&self.servers, checkpoint, version, 1, seed, &self.stop, |_| {})?;
             if (result.success_percent > 0.0) == success {
                 return Ok(Some(seed));
@@ -229,30 +236,30 @@ impl Demo<'_> {
 
     fn film(&self, checkpoint: &Checkpoint, version: Version, seed: u64, path: &Path) -> Result<(), VideoError> {
         let options =
-            VideoOptions { sets: vec![version.into()], episodes: 1, seed, size: PIXELS, fps: None, every: EVERY };
+            VideoOptions { sets: vec![version.into()], episodes: 1, seed, size: PIXELS, fps: None, every: FRAME_STEPS };
         let footage = film(&self.servers, checkpoint, &options, VideoFile::create(path)?, &self.stop, &mut |_| {})?;
         footage.thinning().into_iter().for_each(note);
         Ok(())
     }
 }
 
-/// Sentence about one policy, which is printed before the other one is trained.
-fn first_result(policy: &Trained) -> String {
+/// Returns a sentence about one policy, which is printed before the other one is trained.
+fn first_result(policy: &DemoPolicy) -> String {
     let rates: Vec<_> = policy.rates.iter().map(|(test, rate)| format!("{rate:.1} % on {test}")).collect();
     format!("Trained on {}, the policy succeeds in {}.", policy.version, rates.join(", "))
 }
 
-fn rates_table(trained: &[Trained]) -> Table {
+fn rates_table(trained: &[DemoPolicy]) -> Table {
     let mut table = Table::of("", trained).text("success, %", |one| format!("trained on {}", one.version));
     for test in Version::ALL {
-        let shown = move |one: &Trained| one.rates.get(&test).map_or_else(String::new, |rate| format!("{rate:.1}"));
+        let shown = move |one: &DemoPolicy| one.rates.get(&test).map_or_else(String::new, |rate| format!("{rate:.1}"));
         table = table.number(format!("tested on {test}"), shown);
     }
     table.build()
 }
 
-/// What the table says.
-fn conclusion(trained: &[Trained]) -> String {
+/// Returns the tables' content in a sentence.
+fn conclusion(trained: &[DemoPolicy]) -> String {
     let rate = |policy: usize, test| trained[policy].rates.get(&test).copied().unwrap_or_default();
     let [dd, dr, de] = Version::ALL.map(|test| rate(0, test));
     let [_, rr, re] = Version::ALL.map(|test| rate(1, test));

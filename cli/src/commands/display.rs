@@ -1,4 +1,4 @@
-//! How far something is, on standard error: a bar on a terminal, which fits its width, plain lines elsewhere.
+//! Progress on standard error: a bar on a terminal, which fits its width, and plain lines elsewhere.
 
 use std::io::{IsTerminal, Write};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,19 +13,19 @@ use perturb_learner::logging::{EpisodeFigures, Progress};
 use perturb_settings::TrainConfig;
 use perturb_text::{duration, grouped};
 
-/// How often a plain line is printed.
+/// Time between two plain lines.
 const LINE_INTERVAL: Duration = Duration::from_secs(5);
-/// Of so many groups of cells in work, and of so many kinds that are done, a terminal shows what is known.
-const MOST_SHOWN: usize = 8;
-/// The time that is left is not told before so much has passed: it would be a guess.
-const LEAST_ELAPSED: Duration = Duration::from_secs(1);
+/// Maximum number of groups of cells in work that a terminal shows, and of kinds of finished cells.
+const MAX_SHOWN: usize = 8;
+/// Time before the first estimate of the remaining time; earlier ones would be guesses.
+const MIN_ELAPSED: Duration = Duration::from_secs(1);
 
-/// Whether nothing is said but errors.
+/// Whether only warnings and errors are printed.
 static QUIET: AtomicBool = AtomicBool::new(false);
-/// The bar that is on the terminal.
-static SHOWN: Mutex<Option<MultiProgress>> = Mutex::new(None);
+/// The bar on the terminal, if there is one.
+static CURRENT_BAR: Mutex<Option<MultiProgress>> = Mutex::new(None);
 
-/// Has [`note`] and displays say nothing from now on.
+/// Suppresses [`note`] and progress from now on.
 pub(super) fn be_quiet() {
     QUIET.store(true, Ordering::Relaxed);
 }
@@ -34,36 +34,37 @@ pub(super) fn is_quiet() -> bool {
     QUIET.load(Ordering::Relaxed)
 }
 
-/// A sentence on standard error, unless nobody wants to hear it.
+/// Prints a sentence on standard error, unless --quiet is given.
 pub(super) fn note(sentence: impl std::fmt::Display) {
     if !is_quiet() {
         say(sentence);
     }
 }
 
-/// A line on standard error, even for those who want to hear nothing. That nobody reads it is no reason to stop.
+/// Prints a line on standard error, also with --quiet. Ignores errors, since a closed standard error is no reason to
+/// stop.
 pub(super) fn say(line: impl std::fmt::Display) {
-    let _ = writeln!(BesideBar, "{line}");
+    let _ = writeln!(AboveBar, "{line}");
 }
 
-/// Standard error, where lines go above the bar that is shown there.
-pub(super) struct BesideBar;
+/// Writes to standard error, above the bar on the terminal.
+pub(super) struct AboveBar;
 
-impl Write for BesideBar {
+impl Write for AboveBar {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
         self.write_all(bytes)?;
         Ok(bytes.len())
     }
 
     fn write_all(&mut self, bytes: &[u8]) -> std::io::Result<()> {
-        match &*shown() {
-            // Its `suspend` would panic where the terminal is gone.
+        match &*current_bar() {
+            // `suspend` would panic if the terminal is gone.
             Some(bar) => bar.println(String::from_utf8_lossy(bytes).trim_end_matches('\n')),
             None => std::io::stderr().write_all(bytes),
         }
     }
 
-    /// A line that came in pieces would be several.
+    /// Writes the whole text at once, because each piece would become a line.
     fn write_fmt(&mut self, words: std::fmt::Arguments<'_>) -> std::io::Result<()> {
         self.write_all(words.to_string().as_bytes())
     }
@@ -73,28 +74,28 @@ impl Write for BesideBar {
     }
 }
 
-fn shown() -> MutexGuard<'static, Option<MultiProgress>> {
-    SHOWN.lock().unwrap_or_else(PoisonError::into_inner)
+fn current_bar() -> MutexGuard<'static, Option<MultiProgress>> {
+    CURRENT_BAR.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Columns of the terminal that results are printed on, if they are.
+/// Returns the width of the terminal on standard output, in columns; `None` if it is no terminal.
 pub(super) fn terminal_width() -> Option<usize> {
     std::io::stdout().is_terminal().then(|| usize::from(console::Term::stdout().size().1))
 }
 
-/// The episodes of a training or a test, or the cells of a run.
+/// The progress of a training or a test in episodes, or of a run in cells.
 pub(super) struct Display {
     bar: Option<Bar>,
     what: String,
     unit: &'static str,
     total: u64,
-    /// Of a training: its pace, and how many episodes it generates.
+    /// For a training: its speed, and the number of episodes that it generates.
     pace: Option<(Pace, f64)>,
     start: Instant,
     last_line: Option<Instant>,
 }
 
-/// A bar with lines below it, which are cut where the terminal ends.
+/// A bar with lines below it, which are cut at the terminal's width.
 struct Bar {
     all: MultiProgress,
     bar: ProgressBar,
@@ -102,40 +103,41 @@ struct Bar {
 }
 
 impl Display {
-    /// Of a training that has had so many episodes and steps.
-    pub(super) fn of_training(what: String, config: &TrainConfig, episodes: u64, timesteps: u64) -> Self {
+    /// Makes the display of a training that begins after this number of episodes and steps.
+    pub(super) fn for_training(what: String, config: &TrainConfig, episodes: u64, timesteps: u64) -> Self {
         let budget = config.common.episodes;
         let mut pace = Pace::default();
         pace.hear(generated_episodes(config, episodes), timesteps);
-        let mut display = Self::of_episodes(what, budget);
+        let mut display = Self::for_episodes(what, budget);
         display.pace = Some((pace, generated_episodes(config, budget)));
         display
     }
 
-    /// Of `what`, which has `total` episodes.
-    pub(super) fn of_episodes(what: impl Into<String>, total: u64) -> Self {
+    /// Makes the display of a task with `total` episodes.
+    pub(super) fn for_episodes(what: impl Into<String>, total: u64) -> Self {
         Self::new(format!("{} ", what.into()), "episodes", total)
     }
 
-    /// Of a run of so many cells.
-    pub(super) fn of_cells(total: usize) -> Self {
+    /// Makes the display of a run with `total` cells.
+    pub(super) fn for_cells(total: usize) -> Self {
         Self::new(String::new(), "cells", total as u64)
     }
 
     fn new(what: String, unit: &'static str, total: u64) -> Self {
         let bar = (std::io::stderr().is_terminal() && !is_quiet()).then(|| Bar::new(&what, total));
-        // What is over soon needs no line.
+        // Short tasks print no line.
         let last_line = (unit == "episodes").then(Instant::now);
         Self { bar, what, unit, total, pace: None, start: Instant::now(), last_line }
     }
 
-    /// After an iteration of a training.
+    /// Shows the progress after an iteration of a training.
     pub(super) fn training(&mut self, progress: &Progress) {
         let mut figures = Vec::new();
         if let Some((pace, total)) = &mut self.pace {
             pace.hear(progress.generated_episodes as f64, progress.timesteps);
-            let (left, least) = (pace.left(*total), if pace.is_least(*total) { "at least " } else { "" });
-            figures.extend(self.left(left).map(|left| format!("{least}{left}")));
+            let ratio = pace.left(*total);
+            let bound = if pace.is_least(*total) { "at least " } else { "" };
+            figures.extend(self.remaining_time(ratio).map(|time| format!("{bound}{time}")));
         }
         if let Some(EpisodeFigures { episode_return, success, .. }) = progress.recent {
             figures.push(format!("success {:.0} %, return {episode_return:.1}", 100.0 * success));
@@ -144,14 +146,15 @@ impl Display {
         self.show(progress.episodes, &figures, Vec::new);
     }
 
-    /// So many episodes.
+    /// Shows the number of finished episodes.
     pub(super) fn episodes(&mut self, episodes: u64) {
-        let rest = self.total.saturating_sub(episodes) as f64 / episodes as f64;
-        let left = self.left((episodes > 0).then_some(rest));
-        self.show(episodes, &Vec::from_iter(left), Vec::new);
+        let ratio = self.total.saturating_sub(episodes) as f64 / episodes as f64;
+        let time = self.remaining_time((episodes > 0).then_some(ratio));
+        self.show(episodes, &Vec::from_iter(time), Vec::new);
     }
 
-    /// How far a run is, and on a terminal what is done with its groups of cells, and what came of those that are done.
+    /// Shows the progress of a run. A terminal also shows the groups of cells in work, and the success of finished
+    /// cells.
     pub(super) fn cells(&mut self, status: &Status) {
         let Status { done, failed, running, doing, remaining, rates, .. } = status;
         let mut figures = vec![doing.clone()];
@@ -159,22 +162,22 @@ impl Display {
             figures.push(format!("{failed} failed"));
         }
         if let Some(left) = remaining {
-            let most = if left.at_most { "at most " } else { "" };
-            figures.push(format!("{most}{} left", duration(left.time.as_secs_f64())));
+            let bound = if left.at_most { "at most " } else { "" };
+            figures.push(format!("{bound}{} left", duration(left.time.as_secs_f64())));
         }
         let lines = || {
-            let mut lines = first(running.iter().map(|group| format!("  {group}")).collect());
-            lines.extend(first(rates.iter().map(|rate| format!("  done: {rate}")).collect()));
+            let mut lines = first_lines(running.iter().map(|group| format!("  {group}")).collect());
+            lines.extend(first_lines(rates.iter().map(|rate| format!("  done: {rate}")).collect()));
             lines
         };
         self.show((done + failed) as u64, &figures, lines);
     }
 
-    /// "3 min 10 s left", given what is left in terms of what is done.
-    fn left(&self, rest: Option<f64>) -> Option<String> {
+    /// Returns a text such as "3 min 10 s left". `ratio` is the remaining work divided by the finished work.
+    fn remaining_time(&self, ratio: Option<f64>) -> Option<String> {
         let elapsed = self.start.elapsed();
-        let rest = rest.filter(|rest| rest.is_finite() && elapsed >= LEAST_ELAPSED)?;
-        Some(format!("{} left", duration(elapsed.as_secs_f64() * rest)))
+        let ratio = ratio.filter(|ratio| ratio.is_finite() && elapsed >= MIN_ELAPSED)?;
+        Some(format!("{} left", duration(elapsed.as_secs_f64() * ratio)))
     }
 
     fn show(&mut self, position: u64, figures: &[String], lines: impl FnOnce() -> Vec<String>) {
@@ -192,17 +195,17 @@ impl Display {
     }
 }
 
-/// As many of these figures as fit a line, the first in any case: half a figure would be another one.
+/// Joins as many whole figures as fit into `width`, at least the first. A cut figure could be mistaken for another one.
 fn fitting(figures: &[String], width: usize) -> String {
     let fits = |n: &usize| console::measure_text_width(&figures[..*n].join(", ")) <= width;
     let n = (1..=figures.len()).rev().find(fits).unwrap_or(1);
     figures[..n].join(", ")
 }
 
-/// As many lines as are shown, and how many more there are.
-fn first(mut lines: Vec<String>) -> Vec<String> {
-    let more = lines.len().saturating_sub(MOST_SHOWN);
-    lines.truncate(MOST_SHOWN);
+/// Keeps [`MAX_SHOWN`] lines and adds a line with the number of the others.
+fn first_lines(mut lines: Vec<String>) -> Vec<String> {
+    let more = lines.len().saturating_sub(MAX_SHOWN);
+    lines.truncate(MAX_SHOWN);
     lines.extend((more > 0).then(|| format!("  and {more} more")));
     lines
 }
@@ -211,9 +214,9 @@ impl Bar {
     fn new(what: &str, total: u64) -> Self {
         let all = MultiProgress::new();
         let bar = ProgressBar::new(total).with_style(style("{prefix}{wide_bar} {percent:>3} %"));
-        // Setting the prefix would draw the bar by itself, and nobody would wipe that away.
+        // Setting the prefix later would draw the bar once more, and that copy would stay.
         let bar = all.add(bar.with_prefix(what.to_owned()));
-        *shown() = Some(all.clone());
+        *current_bar() = Some(all.clone());
         Self { all, bar, lines: Vec::new() }
     }
 
@@ -221,16 +224,16 @@ impl Bar {
         while self.lines.len() < lines.len() {
             self.lines.push(self.all.add(ProgressBar::no_length().with_style(style("{wide_msg}"))));
         }
-        for gone in self.lines.drain(lines.len()..) {
-            gone.finish_and_clear();
-            self.all.remove(&gone);
+        for unused in self.lines.drain(lines.len()..) {
+            unused.finish_and_clear();
+            self.all.remove(&unused);
         }
         self.bar.set_position(position);
         self.lines.iter().zip(lines).for_each(|(line, words)| line.set_message(words));
     }
 }
 
-/// A style that is written here, and can be understood.
+/// Returns the style of a template. All templates are in this file and valid.
 fn style(template: &str) -> ProgressStyle {
     ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar())
 }
@@ -240,8 +243,9 @@ impl Drop for Display {
         if let Some(Bar { all, bar, lines }) = &self.bar {
             lines.iter().for_each(ProgressBar::finish_and_clear);
             bar.finish_and_clear();
-            let _ = all.clear(); // the terminal is gone
-            *shown() = None;
+            // It fails if the terminal is gone.
+            let _ = all.clear();
+            *current_bar() = None;
         }
     }
 }
@@ -251,7 +255,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_line_has_whole_figures_as_many_as_fit() {
+    fn a_line_has_as_many_whole_figures_as_fit() {
         let figures = ["2 935/5 000 episodes", "1 min 1 s left", "27 529 steps/s"].map(String::from);
         let whole = figures.join(", ");
         assert_eq!(fitting(&figures, whole.len()), whole);

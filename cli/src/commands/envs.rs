@@ -51,7 +51,7 @@ fn print(out: &mut impl Write, environment: &Environment) -> std::io::Result<()>
     writeln!(out, "{}\n", parameters.build().to_text())
 }
 
-/// Intervals as mathematicians write them.
+/// Formats intervals as in `[0.3, 0.4] ∪ [0.8, 0.9]`.
 fn show(distribution: Option<&Distribution>) -> String {
     let intervals = distribution.map(|distribution| distribution.intervals.as_slice()).unwrap_or_default();
     let texts = intervals.iter().map(|interval| format!("[{}, {}]", interval.low, interval.high));

@@ -1,4 +1,4 @@
-//! Why a command fails, and with which exit status.
+//! Errors of commands, with their exit status.
 
 use std::io::ErrorKind;
 
@@ -21,27 +21,27 @@ use crate::video::VideoError;
 
 pub(super) type Result<T, E = CommandError> = std::result::Result<T, E>;
 
-/// Why a command failed. Its sentence holds those of its causes.
+/// A command has failed. The message includes the messages of its causes.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum CommandError {
-    /// A mistake of the person who typed the command.
+    /// The command line is wrong.
     #[error("{0}")]
     Usage(String),
     #[error("{0}")]
     Failed(String),
     #[error("cannot {action}: {source}")]
     System { action: &'static str, source: std::io::Error },
-    /// Standard output takes no more.
+    /// Standard output cannot be written.
     #[error("cannot write: {0}")]
     Output(#[from] std::io::Error),
-    /// One of several heatmaps.
+    /// A heatmap of an experiment has failed.
     #[error("{place}: {source}")]
-    Place { place: String, source: Box<CommandError> },
+    Heatmaps { place: String, source: Box<CommandError> },
     #[error(transparent)]
     Assessed(#[from] AssessedError),
     #[error(transparent)]
     Audit(#[from] AuditError),
-    #[error("{}", with_place(.0))]
+    #[error("{}", with_searched_folders(.0))]
     Checkpoint(#[from] CheckpointError),
     #[error(transparent)]
     Client(#[from] ClientError),
@@ -86,10 +86,10 @@ pub(super) enum CommandError {
 }
 
 impl CommandError {
-    /// The signal that ended the command, if one did.
+    /// Returns the signal that ended the command, if one did.
     pub(super) fn signal(&self) -> Option<i32> {
         match self {
-            Self::Place { source, .. } => source.signal(),
+            Self::Heatmaps { source, .. } => source.signal(),
             Self::Test(error)
             | Self::Audit(AuditError::Test(error))
             | Self::Measure(MeasureError::Test(error))
@@ -102,7 +102,7 @@ impl CommandError {
         }
     }
 
-    /// Whether something that was given is missing or wrong, so that nothing was begun.
+    /// Tells whether an argument or file is missing or wrong, so that nothing was begun.
     pub(super) fn is_usage(&self) -> bool {
         match self {
             Self::Usage(_)
@@ -136,7 +136,7 @@ impl CommandError {
         }
     }
 
-    /// Whether nobody reads any further, which is how `perturb envs | head` ends.
+    /// Tells whether the reader of the output has gone, as in `perturb envs | head`.
     pub(super) fn is_closed_pipe(&self) -> bool {
         match self {
             Self::Output(error) | Self::File(FileError { source: error, .. }) => error.kind() == ErrorKind::BrokenPipe,
@@ -145,8 +145,8 @@ impl CommandError {
     }
 }
 
-/// The error, which ends with results/ if nothing is found, and where that is; of one name that is near, a question.
-fn with_place(error: &CheckpointError) -> String {
+/// Adds the searched folders to the error about a missing checkpoint. Asks about the single similar name.
+fn with_searched_folders(error: &CheckpointError) -> String {
     match error {
         CheckpointError::Missing { .. } => {
             format!("{error} of the working directory, or in the folder that PERTURB_RESULTS names")
@@ -158,12 +158,12 @@ fn with_place(error: &CheckpointError) -> String {
     }
 }
 
-/// Says what the operating system refused.
+/// Makes an error of an operating system call. `action` completes the sentence "cannot …".
 pub(super) fn system(action: &'static str) -> impl FnOnce(std::io::Error) -> CommandError {
     move |source| CommandError::System { action, source }
 }
 
-/// Whether --server, or what was asked of it, was wrong from the beginning.
+/// Tells whether --server or the request to it was wrong from the beginning.
 fn is_wrong_server(error: &ClientError) -> bool {
     matches!(
         error,
@@ -178,7 +178,7 @@ fn is_wrong_server(error: &ClientError) -> bool {
     )
 }
 
-/// Whether the directory of a run was the wrong one.
+/// Tells whether the directory of a run was wrong.
 fn is_wrong_directory(error: &RunDirectoryError) -> bool {
     match error {
         RunDirectoryError::File(error) => is_wrong_file(error),
@@ -188,7 +188,7 @@ fn is_wrong_directory(error: &RunDirectoryError) -> bool {
     }
 }
 
-/// Whether a file cannot be where it was given, rather than that the disk is full or broken.
+/// Tells whether the path of a file is wrong, rather than the disk full or broken.
 fn is_wrong_file(error: &FileError) -> bool {
     matches!(
         error.source.kind(),
@@ -207,15 +207,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn that_there_is_no_policy_says_where_it_was_looked_for_and_which_was_meant() {
+    fn a_missing_policy_is_reported_with_the_searched_folders() {
         let missing = CommandError::from(CheckpointError::Missing { path: "nothing".into() }).to_string();
-        let place = "in results/ of the working directory, or in the folder that PERTURB_RESULTS names";
-        assert!(missing.starts_with("nothing holds no checkpoint: ") && missing.ends_with(place), "{missing}");
-        let of = |names: &[&str]| {
+        let folders = "in results/ of the working directory, or in the folder that PERTURB_RESULTS names";
+        assert!(missing.starts_with("nothing holds no checkpoint: ") && missing.ends_with(folders), "{missing}");
+        let several = |names: &[&str]| {
             let names = names.iter().map(ToString::to_string).collect();
             CommandError::from(CheckpointError::Several { name: "s77".into(), folder: "results".into(), names })
         };
-        assert_eq!(of(&["a/cells/s7"]).to_string(), "there is no policy `s77` in results (did you mean `a/cells/s7`?)");
-        assert!(of(&["a", "b"]).to_string().contains("could be any of these policies"));
+        assert_eq!(
+            several(&["a/cells/s7"]).to_string(),
+            "there is no policy `s77` in results (did you mean `a/cells/s7`?)"
+        );
+        assert!(several(&["a", "b"]).to_string().contains("could be any of these policies"));
     }
 }

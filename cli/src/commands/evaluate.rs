@@ -22,24 +22,25 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
     args.json.check()?;
     args.records.as_deref().map_or(Ok(()), require_writable)?;
     let checkpoint = Checkpoint::load(&args.checkpoint)?;
-    let sets = sets::tested(&args.versions, &args.set)?;
+    let sets = sets::test_sets(&args.versions, &args.set)?;
     let seed = args.seed.unwrap_or(checkpoint.state.config.common.seed);
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = playing_servers(&args.play)?;
     let (state, config) = (&checkpoint.state, &checkpoint.state.config);
     let common = &config.common;
     let environment = servers.environment(&common.environment)?;
-    let spelled = |set| sets::spelled_set(set, &environment);
-    let sets = sets.into_iter().map(spelled).collect::<Result<Vec<_>, _>>()?;
+    let normalize = |set| sets::normalize_set(set, &environment);
+    let sets = sets.into_iter().map(normalize).collect::<Result<Vec<_>, _>>()?;
     let (text, code) = (Criterion::of(&environment), Criterion::of_code(&environment));
     let success =
-        args.success.as_ref().map(|rule| sets::spelled_rule(rule, text.as_ref(), code.as_ref())).transpose()?;
-    let options = TestOptions { episodes: args.episodes, seed, selects: args.selection, success };
+        args.success.as_ref().map(|rule| sets::normalize_rule(rule, text.as_ref(), code.as_ref())).transpose()?;
+    let options = TestOptions { episodes: args.episodes, seed, selects: args.selection_episodes, success };
     let tester = Tester::new(&servers, &checkpoint, options)?;
     let mut display: Option<(String, Display)> = None;
     let mut report = |set: &TestSet, episodes| {
         if display.as_ref().is_none_or(|(name, _)| *name != set.name) {
-            display = Some((set.name.clone(), Display::of_episodes(format!("testing on {}", set.name), args.episodes)));
+            display =
+                Some((set.name.clone(), Display::for_episodes(format!("testing on {}", set.name), args.episodes)));
         }
         if let Some((_, display)) = &mut display {
             display.episodes(episodes);
@@ -80,7 +81,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
     Ok(())
 }
 
-/// The result as JSON: who was tested, and the figures of each set.
+/// Returns the result as JSON: the policy and the figures of each set.
 fn document(state: &State, evaluation_seed: u64, results: &[(String, TestResult)]) -> Value {
     let results: Map<String, Value> = results.iter().map(|(set, result)| (set.clone(), json!(result))).collect();
     let TrainConfig { common, settings } = &state.config;

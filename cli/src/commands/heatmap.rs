@@ -25,33 +25,34 @@ use super::{playing_servers, sets};
 pub(super) fn run(args: &HeatmapArgs) -> Result<()> {
     match &args.dir {
         Some(directory) => experiment::run(args, directory),
-        None => of_checkpoints(args),
+        None => draw_checkpoints(args),
     }
 }
 
-/// Of some policies.
-fn of_checkpoints(args: &HeatmapArgs) -> Result<()> {
+/// Tests the policies of --checkpoint and draws their heatmaps side by side.
+fn draw_checkpoints(args: &HeatmapArgs) -> Result<()> {
     let checkpoints = args.checkpoint.iter().map(|path| Checkpoint::load(path)).collect::<Result<Vec<_>, _>>()?;
     let name = one_environment(&args.checkpoint, &checkpoints)?;
     if let Some(twice) = (1..args.checkpoint.len()).find(|&i| args.checkpoint[..i].contains(&args.checkpoint[i])) {
         let path = args.checkpoint[twice].display();
-        return Err(CommandError::Usage(format!("--checkpoint names {path} twice: a mean is over different policies")));
+        return Err(CommandError::Usage(format!("--checkpoint names {path} twice: give different policies")));
     }
     if !args.records.is_empty() && args.records.len() != checkpoints.len() {
         let (files, policies) = (args.records.len(), checkpoints.len());
-        let message =
-            format!("--records has {files} files for {policies} policies; give one for each --checkpoint, in order");
+        let message = format!(
+            "--records has {files} files for {policies} policies; give one file for each --checkpoint, in the same order"
+        );
         return Err(CommandError::Usage(message));
     }
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = playing_servers(&args.play)?;
     let environment = servers.environment(&name)?;
-    let mut kind = HeatmapKind { parameters: wanted_axes(args, &environment)?, base: args.base };
+    let mut kind = HeatmapKind { parameters: axes(args, &environment)?, base: args.base_version };
     let recorded = args.records.iter().map(|path| Records::read(path)).collect::<Result<Vec<_>, _>>()?;
     if let Some(base) = recorded.first().and_then(Heatmap::base_of) {
         kind.base = base;
     }
-    let fixed = sets::spelled("--parameters", fixed(args)?, &environment)?;
+    let fixed = sets::normalize("--parameters", fixed_parameters(args)?, &environment)?;
     let path = args.out.clone().unwrap_or_else(|| default_path(&checkpoints, &kind));
     require_writable(&path.with_added_extension("csv"))?;
     let mut out = std::io::stdout();
@@ -62,8 +63,8 @@ fn of_checkpoints(args: &HeatmapArgs) -> Result<()> {
         } else {
             let options = HeatmapOptions { fixed: fixed.clone(), ..options(args, &kind, &checkpoint.state.config) };
             let (heatmap, records) = test(&servers, checkpoint, &options, &stop)?;
-            let ending = if checkpoints.len() > 1 { format!("{}.parquet", index + 1) } else { "parquet".into() };
-            let path = path.with_added_extension(ending);
+            let extension = if checkpoints.len() > 1 { format!("{}.parquet", index + 1) } else { "parquet".into() };
+            let path = path.with_added_extension(extension);
             records.write(&path)?;
             writeln!(out, "{}", path.display())?;
             heatmap
@@ -73,81 +74,82 @@ fn of_checkpoints(args: &HeatmapArgs) -> Result<()> {
         policies.push(PolicyHeatmap { method, trained_on, seed: config.common.seed, heatmap });
     }
     let (panels, figures) = policies_side_by_side(&policies).ok_or_else(|| {
-        let message = "the recorded episodes are over other points, or more of them, in one file than in another: give \
-                       those of one call";
+        let message = "the files of --records have different points or numbers of episodes: give the files of one call";
         CommandError::Failed(message.into())
     })?;
     let svg = plot::svg(&panels)?.into_bytes();
-    for (ending, content) in [("csv", figures.to_csv()), ("svg", svg), ("png", plot::png(&panels)?)] {
-        let path = path.with_added_extension(ending);
+    for (extension, content) in [("csv", figures.to_csv()), ("svg", svg), ("png", plot::png(&panels)?)] {
+        let path = path.with_added_extension(extension);
         write_atomically(&path, &content)?;
         writeln!(out, "{}", path.display())?;
     }
     Ok(())
 }
 
-/// The environment that all policies are of.
+/// Returns the environment of all policies. Refuses policies of several environments.
 fn one_environment(paths: &[PathBuf], checkpoints: &[Checkpoint]) -> Result<String> {
-    let of = |checkpoint: &Checkpoint| checkpoint.state.config.common.environment.clone();
-    let named: Vec<(&Path, String)> = paths.iter().map(PathBuf::as_path).zip(checkpoints.iter().map(of)).collect();
+    let environment = |checkpoint: &Checkpoint| checkpoint.state.config.common.environment.clone();
+    let named: Vec<(&Path, String)> =
+        paths.iter().map(PathBuf::as_path).zip(checkpoints.iter().map(environment)).collect();
     let Some((first, name)) = named.first() else {
-        return Err(CommandError::Usage("give the directory of an experiment, or --checkpoint".into()));
+        return Err(CommandError::Usage("give the folder of an experiment, or --checkpoint".into()));
     };
     match named.iter().find(|(_, other)| other != name) {
         None => Ok(name.clone()),
         Some((path, other)) => Err(CommandError::Usage(format!(
-            "{} was trained in {name}, {} in {other}: a picture is of one environment, give its policies alone",
+            "{} was trained in {name}, {} in {other}: give policies of one environment",
             first.display(),
             path.display()
         ))),
     }
 }
 
-/// The two parameters that are asked for, or those over which an environment's heatmaps usually are.
-fn wanted_axes(args: &HeatmapArgs, environment: &proto::Environment) -> Result<[String; 2]> {
+/// Returns the parameters of --x and --y, or else the environment's own choice.
+fn axes(args: &HeatmapArgs, environment: &proto::Environment) -> Result<[String; 2]> {
     if let (Some(x), Some(y)) = (&args.x, &args.y) {
         return Ok([axis(x, environment)?, axis(y, environment)?]);
     }
     environment.heatmap_axes.clone().try_into().map_err(|_| {
-        let message = format!("give --x and --y: it is not known which of {}'s to show", environment.name);
+        let message = format!("give --x and --y: {} has no default axes", environment.name);
         CommandError::Usage(message)
     })
 }
 
-/// The parameter that is written so, however it is spelled.
+/// Returns the name of an environment's parameter, which may be written in any case.
 fn axis(written: &str, environment: &proto::Environment) -> Result<String> {
     let known = environment.parameters.iter().map(|parameter| parameter.name.as_str());
-    names::find(written, known.clone()).map(|place| environment.parameters[place].name.clone()).ok_or_else(|| {
+    names::find(written, known.clone()).map(|index| environment.parameters[index].name.clone()).ok_or_else(|| {
         let (hint, name) = (names::did_you_mean(written, known.clone()), &environment.name);
         let known = known.collect::<Vec<_>>().join(", ");
-        CommandError::Usage(format!("`{written}` cannot be an axis{hint}: expected two of {name}'s parameters {known}"))
+        CommandError::Usage(format!("`{written}` cannot be an axis{hint}: give two of {name}'s parameters, {known}"))
     })
 }
 
-/// The values of other parameters.
-fn fixed(args: &HeatmapArgs) -> Result<Context> {
+/// Returns the values of --parameters.
+fn fixed_parameters(args: &HeatmapArgs) -> Result<Context> {
     let value = |(name, values): (String, Distribution)| match values.range() {
         (low, high) if low == high => Ok((name, low)),
-        _ => Err(CommandError::Usage(format!(
-            "--parameters {name} has more than one value; --x and --y are what varies"
-        ))),
+        _ => {
+            Err(CommandError::Usage(format!("--parameters {name} has more than one value; only --x and --y may vary")))
+        }
     };
-    sets::drawn(Version::D, &args.parameters)?.drawn().into_iter().map(value).collect()
+    sets::drawn_set(Version::D, &args.parameters)?.drawn().into_iter().map(value).collect()
 }
 
-/// In the working directory: a training's folder has nothing in it that its training did not write.
+/// Returns the default path of the files. It is in the working directory, because a training's folder has only its own
+/// files.
 fn default_path(checkpoints: &[Checkpoint], kind: &HeatmapKind) -> PathBuf {
     let TrainConfig { common, settings } = &checkpoints[0].state.config;
     let Common { environment, architecture, version, parameters, seed, .. } = common;
     if checkpoints.len() > 1 {
         return format!("{environment}-{}-policies-{kind}", checkpoints.len()).into();
     }
-    let own = if parameters.is_empty() { "" } else { "-own" };
+    let suffix = if parameters.is_empty() { "" } else { "-own" };
     let version = version.file_name();
-    format!("{environment}-{}-{architecture}-{version}{own}-s{seed}-{kind}", settings.name()).into()
+    format!("{environment}-{}-{architecture}-{version}{suffix}-s{seed}-{kind}", settings.name()).into()
 }
 
-/// How to test what was trained with these settings.
+/// Returns the options of a test of a policy with the settings `trained`.
 fn options(args: &HeatmapArgs, kind: &HeatmapKind, trained: &TrainConfig) -> HeatmapOptions {
     HeatmapOptions {
         parameters: kind.parameters.clone(),
@@ -166,6 +168,6 @@ fn test(
     stop: &StopFlag,
 ) -> Result<(Heatmap, Records)> {
     let HeatmapOptions { parameters: [x, y], grid, episodes, .. } = options;
-    let mut display = Display::of_episodes(format!("testing over {x} and {y}"), (grid * grid) as u64 * episodes);
+    let mut display = Display::for_episodes(format!("testing over {x} and {y}"), (grid * grid) as u64 * episodes);
     Ok(heatmap(servers, checkpoint, options, stop, &mut |episodes| display.episodes(episodes))?)
 }

@@ -1,4 +1,4 @@
-//! `--json`: what came of a command, for other programs.
+//! `--json`: results of commands for other programs.
 
 use std::fs::File;
 use std::io::Write;
@@ -10,33 +10,33 @@ use serde::Serialize;
 use super::args::JsonArgs;
 use super::error::Result;
 
-/// What stands for standard output.
+/// Name of standard output.
 const STANDARD_OUTPUT: &str = "-";
 
-/// The file that `path` names; `None` for standard output.
+/// Returns the file that `path` names; `None` for standard output.
 fn file(path: &Path) -> Option<&Path> {
     (path != Path::new(STANDARD_OUTPUT)).then_some(path)
 }
 
-/// Where lines go that tell what happens, as it does: a new file, or standard output.
-pub(super) fn lines(path: &Path) -> Result<Box<dyn Write>> {
+/// Opens the output for event lines: a new file, or standard output.
+pub(super) fn event_writer(path: &Path) -> Result<Box<dyn Write>> {
     let Some(path) = file(path) else { return Ok(Box::new(std::io::stdout())) };
     require_writable(path)?;
     Ok(Box::new(File::create(path).map_err(io("write", path))?))
 }
 
 impl JsonArgs {
-    /// Refuses a file that cannot be written, before anything begins.
+    /// Refuses a file that cannot be written, before the command begins.
     pub(super) fn check(&self) -> Result<()> {
         Ok(self.json.as_deref().and_then(file).map_or(Ok(()), require_writable)?)
     }
 
-    /// Whether standard output has JSON, and nothing else.
+    /// Tells whether standard output has JSON and nothing else.
     pub(super) fn is_printed(&self) -> bool {
         self.json.as_deref().is_some_and(|path| file(path).is_none())
     }
 
-    /// Prints or writes the document, if that is asked for.
+    /// Prints or writes the document if --json is given.
     pub(super) fn write(&self, document: impl Serialize) -> Result<()> {
         match self.json.as_deref().map(file) {
             None => Ok(()),

@@ -9,8 +9,9 @@ use super::args::LsArgs;
 use super::display::terminal_width;
 use super::error::{CommandError, Result};
 
-/// Below the list.
-const SUCCESS: &str = "\nsuccess: a training's last 100 episodes, all tests of an experiment's done cells";
+/// Explanation of the column `success`, printed below the list.
+const SUCCESS_NOTE: &str =
+    "\nsuccess: of a training's last 100 episodes, or of all tests of an experiment's finished cells";
 
 pub(super) fn run(args: &LsArgs) -> Result<()> {
     args.json.check()?;
@@ -24,11 +25,12 @@ pub(super) fn run(args: &LsArgs) -> Result<()> {
     }
     let mut out = std::io::stdout();
     if found.is_empty() {
-        return Ok(writeln!(out, "{} holds neither trainings nor experiments", args.dir.display())?);
+        return Ok(writeln!(out, "{} has no trainings and no experiments", args.dir.display())?);
     }
     let done = |found: &RunSummary| {
         if found.unit.is_empty() {
-            return String::new(); // it is not understood
+            // Runs that are not understood have no unit.
+            return String::new();
         }
         let number = |number: u64| grouped(number as usize);
         format!("{} of {} {}", number(found.done), number(found.budget), found.unit)
@@ -41,14 +43,14 @@ pub(super) fn run(args: &LsArgs) -> Result<()> {
         .text("state", |found| found.state);
     let table = table.build().to_text();
     if terminal_width().is_none_or(|width| table.lines().all(|line| line.chars().count() <= width)) {
-        return Ok(writeln!(out, "{table}\n{SUCCESS}")?);
+        return Ok(writeln!(out, "{table}\n{SUCCESS_NOTE}")?);
     }
-    // A table would be broken where the terminal ends.
+    // The terminal would wrap a table that is wider than itself.
     for found in &found {
         let success = found.success_percent.map(|percent| format!("success {percent:.1} %"));
         let words = [found.what.clone(), done(found), success.unwrap_or_default(), found.state.to_owned()];
         let words: Vec<String> = words.into_iter().filter(|words| !words.is_empty()).collect();
         writeln!(out, "{}\n  {}", found.path.display(), words.join(", "))?;
     }
-    Ok(writeln!(out, "{SUCCESS}")?)
+    Ok(writeln!(out, "{SUCCESS_NOTE}")?)
 }

@@ -1,11 +1,10 @@
-//! The command line: `perturb envs | ls | serve | train | evaluate | demo | plan | run | report | curves |
-//! heatmap | video | audit | rates | completions | man`.
+//! The command line: `perturb envs | ls | serve | train | evaluate | demo | plan | run | report | curves | heatmap |
+//! video | audit | rescore | completions | man`.
 //!
-//! Results go to standard output, everything else to standard error. Exit status: 0 done; 1 failed (of `audit`: an
-//! episode came out otherwise, too); 2 something that was given is missing or wrong, and nothing was begun; 128 + the
-//! signal's number if Ctrl-C or SIGTERM ended it.
+//! Results go to standard output, everything else to standard error. Exit status: 0 success; 1 failure, for `audit`
+//! also a different episode; 2 an argument or file is missing or wrong, and nothing was begun; 128 + N if signal N
+//! ended it.
 
-mod again;
 mod args;
 mod audit;
 mod cells;
@@ -18,9 +17,10 @@ mod heatmap;
 mod json;
 mod ls;
 mod plan;
-mod rates;
 mod recurrent;
 mod report;
+mod rescore;
+mod resume_hint;
 mod run;
 mod serve;
 mod sets;
@@ -34,7 +34,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use args::{Cli, Command, PlayArgs, ServerArgs, WaitArgs};
-use display::{BesideBar, note};
+use display::{AboveBar, note};
 use error::{CommandError, Result};
 use perturb_experiment::{Folder, Plan};
 use perturb_files::interrupt::end_on_signals;
@@ -46,47 +46,56 @@ use tracing_subscriber::util::SubscriberInitExt;
 
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
-    let cli = Cli::of_process();
-    let usual = match (cli.quiet, cli.verbose) {
+    let cli = Cli::from_process(|warning| {
+        // A program that replaces itself by perturb-recurrent has printed the warning already.
+        if !recurrent::is_replacement() {
+            display::say(format_args!("perturb: {warning}"));
+        }
+    });
+    let default_filter = match (cli.quiet, cli.verbose) {
         (true, _) => Targets::new().with_default(Level::ERROR),
         (_, 0) => Targets::new().with_default(Level::WARN),
-        // Targets that begin so are perturb's own; others are for RUST_LOG.
+        // Targets that begin with `perturb` are this project's; RUST_LOG can select others.
         (_, 1) => Targets::new().with_default(Level::WARN).with_target("perturb", Level::DEBUG),
         _ => Targets::new().with_default(Level::WARN).with_target("perturb", Level::TRACE),
     };
     if cli.quiet {
         display::be_quiet();
     }
-    let named = std::env::var("RUST_LOG").ok().and_then(|filter| filter.parse::<Targets>().ok());
-    let filter = named.unwrap_or(usual);
+    let given_filter = std::env::var("RUST_LOG").ok().and_then(|filter| filter.parse::<Targets>().ok());
+    let filter = given_filter.unwrap_or(default_filter);
     let no_color = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
-    let colours = std::io::stderr().is_terminal() && !no_color; // a worker's is a file
-    let lines =
-        tracing_subscriber::fmt::layer().with_ansi(colours).with_writer(|| BesideBar).log_internal_errors(false); // they would go to standard error, which is what fails, and end the program
+    let colours = std::io::stderr().is_terminal() && !no_color;
+    let lines = tracing_subscriber::fmt::layer()
+        .with_ansi(colours)
+        .with_writer(|| AboveBar)
+        // They would go to standard error, which is what has failed, and would end the program.
+        .log_internal_errors(false);
     tracing_subscriber::registry().with(lines).with(filter).init();
     PrivateServer::have_heard(display::say);
     if matches!(cli.command, Command::Envs(_) | Command::Report(_) | Command::Curves(_) | Command::Serve(_)) {
-        // They have nothing to finish; the others look at a flag.
-        let _ = end_on_signals(); // without it they end as any program does
+        // These commands have nothing to finish. The others check a flag.
+        // If it fails, signals end them as they end any program.
+        let _ = end_on_signals();
     }
-    let done = |()| ExitCode::SUCCESS;
+    let success = |()| ExitCode::SUCCESS;
     let result = match cli.command {
-        Command::Envs(args) => envs::run(&args).map(done),
-        Command::Ls(args) => ls::run(&args).map(done),
-        Command::Serve(args) => serve::run(&args).map(done),
+        Command::Envs(args) => envs::run(&args).map(success),
+        Command::Ls(args) => ls::run(&args).map(success),
+        Command::Serve(args) => serve::run(&args).map(success),
         Command::Train(args) => train::run(&args),
-        Command::Evaluate(args) => evaluate::run(&args).map(done),
+        Command::Evaluate(args) => evaluate::run(&args).map(success),
         Command::Demo(args) => demo::run(&args),
-        Command::Plan(args) => plan::run(&args).map(done),
+        Command::Plan(args) => plan::run(&args).map(success),
         Command::Run(args) => run::run(&args),
-        Command::Report(args) => report::run(&args).map(done),
-        Command::Curves(args) => report::curves(&args).map(done),
-        Command::Heatmap(args) => heatmap::run(&args).map(done),
-        Command::Video(args) => video::run(&args).map(done),
+        Command::Report(args) => report::run(&args).map(success),
+        Command::Curves(args) => report::curves(&args).map(success),
+        Command::Heatmap(args) => heatmap::run(&args).map(success),
+        Command::Video(args) => video::run(&args).map(success),
         Command::Audit(args) => audit::run(&args),
-        Command::Rates(args) => rates::run(&args).map(done),
-        Command::Completions(args) => shell::completions(&args).map(done),
-        Command::Man(args) => shell::man(&args).map(done),
+        Command::Rescore(args) => rescore::run(&args).map(success),
+        Command::Completions(args) => shell::completions(&args).map(success),
+        Command::Man(args) => shell::man(&args).map(success),
     };
     result.unwrap_or_else(|error| fail(&error))
 }
@@ -99,12 +108,12 @@ fn fail(error: &CommandError) -> ExitCode {
     error.signal().map_or(ExitCode::from(if error.is_usage() { 2 } else { 1 }), signal_code)
 }
 
-/// The exit status of a command that this signal ended.
+/// Returns the exit status of a command that this signal ended.
 fn signal_code(number: i32) -> ExitCode {
     ExitCode::from(u8::try_from(128 + number).unwrap_or(1))
 }
 
-/// The servers that were named, or one of our own.
+/// Connects to the servers that were named, or starts a private one.
 fn servers(args: &ServerArgs) -> Result<Servers> {
     let servers = if args.server.is_empty() {
         Servers::local(args.workers)?
@@ -112,18 +121,19 @@ fn servers(args: &ServerArgs) -> Result<Servers> {
         refuse_workers(args)?;
         Servers::connect(&args.server)?
     };
-    let whose = if args.server.is_empty() { "a server of its own" } else { "a server that was named" };
-    servers.addresses().iter().for_each(|address| tracing::debug!("connected to {address}, {whose}"));
+    let kind = if args.server.is_empty() { "a private server" } else { "a server given by --server" };
+    servers.addresses().iter().for_each(|address| tracing::debug!("connected to {address}, {kind}"));
     Ok(servers)
 }
 
-/// The same, for what goes on when they are lost and come back.
-fn lasting_servers(args: &ServerArgs, wait: WaitArgs) -> Result<Servers> {
+/// Returns [`servers`] that are waited for when they are lost.
+fn reconnecting_servers(args: &ServerArgs, wait: WaitArgs) -> Result<Servers> {
     Ok(servers(args)?.with_wait(ServerWait { limit: wait.time(), tell: |sentence| note(sentence) }))
 }
 
-/// The servers of `jobs` processes at a time: those that were named, which all share, or a private one for each, since
-/// one thread of a server speaks to all its clients, and processes with short steps would wait for each other.
+/// Returns the servers for `jobs` simultaneous processes: the ones that were named, which all processes share, or a
+/// private one for each process. A server's single transport thread serves all its clients, so processes with short
+/// steps would wait for each other.
 fn servers_of_jobs(args: &ServerArgs, jobs: usize) -> Result<(Vec<PrivateServer>, Vec<Address>)> {
     if !args.server.is_empty() {
         refuse_workers(args)?;
@@ -136,60 +146,63 @@ fn servers_of_jobs(args: &ServerArgs, jobs: usize) -> Result<(Vec<PrivateServer>
     Ok((servers, addresses))
 }
 
-/// Physics threads of each of the private servers of `jobs` processes: one a core, or fewer where all together would have
-/// more than two a core. With two cores, two processes took the same time with one or two threads each, and the last
-/// one, which has both cores, a quarter less with two.
+/// Returns the number of physics threads for each of `jobs` private servers: one for each core, or fewer if all servers
+/// together would have more than two for each core.
+///
+/// On two cores, two processes took the same time with one thread each and with two. The last process, which has both
+/// cores for itself, took a quarter less time with two.
 fn workers_of_each(jobs: usize, cores: usize) -> usize {
     (2 * cores / jobs.max(1)).clamp(1, cores)
 }
 
-/// Servers for those that play.
+/// Returns the servers for a command that trains or tests.
 fn playing_servers(args: &PlayArgs) -> Result<Servers> {
     let act = if args.act == "client" { ActAt::Client } else { ActAt::Server };
-    Ok(lasting_servers(&args.server, args.wait)?.with_act(act))
+    Ok(reconnecting_servers(&args.server, args.wait)?.with_act(act))
 }
 
-/// The plan of an experiment, with all cells that are known.
+/// Returns the plan of an experiment's folder, with the cells that its tuning has selected so far.
 fn plan_in(folder: &Folder) -> Result<Plan> {
     Ok(Plan::load(&folder.require_plan()?)?.in_folder(folder)?)
 }
 
-/// Refuses a file that is not there, and a folder, with what to give; a pipe will do.
+/// Refuses a missing file and a folder, with a remedy. Pipes are accepted.
 fn require_file(path: &Path, remedy: &str) -> Result<()> {
     let wrong = match path.metadata() {
         Ok(metadata) if metadata.is_dir() => format!("{} is a folder", path.display()),
         Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
             format!("there is no file {}", path.display())
         }
-        _ => return Ok(()), // whoever reads it says what else is wrong
+        // Other problems are reported by whoever reads the file.
+        _ => return Ok(()),
     };
     Err(CommandError::Usage(format!("{wrong}: {remedy}")))
 }
 
-/// Refuses a place for results that is a file, or below one.
+/// Refuses a folder for results that is a file, or below a file.
 fn refuse_file(out: &Path) -> Result<()> {
-    let file = out.ancestors().find(|place| place.exists()).filter(|place| !place.is_dir());
+    let file = out.ancestors().find(|path| path.exists()).filter(|path| !path.is_dir());
     match file {
         None => Ok(()),
         Some(file) if file == out => {
             Err(CommandError::Usage(format!("--out {} is a file; give a directory", out.display())))
         }
         Some(file) => Err(CommandError::Usage(format!(
-            "--out {} cannot be made, {} is a file; give another directory",
+            "--out {} cannot be made because {} is a file; give another directory",
             out.display(),
             file.display()
         ))),
     }
 }
 
-/// The plan in a file that was given.
+/// Reads the plan in an experiment file.
 fn load_plan(path: &Path) -> Result<Plan> {
-    require_file(path, "give an experiment file; docs/experiments.md says what is in one, experiments/ has some")?;
-    tracing::debug!("the plan is read from {}", path.display());
+    require_file(path, "give an experiment file; docs/experiments.md describes them, and experiments/ has examples")?;
+    tracing::debug!("reading the plan from {}", path.display());
     Ok(Plan::load(path)?)
 }
 
-/// One a core, if nothing is asked for.
+/// Returns the number of threads of an update; by default one for each core.
 fn threads(wanted: Option<u16>) -> usize {
     wanted.map_or_else(cores, usize::from)
 }
@@ -198,10 +211,10 @@ fn cores() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }
 
-/// Servers that were named have their threads already.
+/// Refuses --workers together with --server, because running servers have their threads already.
 fn refuse_workers(args: &ServerArgs) -> Result<()> {
     if args.workers.is_some() {
-        let message = "--workers is for the server that perturb starts itself; give it to perturb-server instead";
+        let message = "--workers is for a private server; give it to perturb-server instead";
         return Err(CommandError::Usage(message.into()));
     }
     Ok(())
@@ -214,7 +227,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn results_go_neither_to_a_file_nor_below_one() {
+    fn files_are_refused_as_folders_of_results() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("file");
         std::fs::write(&file, "").unwrap();
@@ -226,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_is_asked_for_is_there_and_no_folder() {
+    fn missing_files_and_folders_are_refused_as_files() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("file");
         let refused = |path: &Path| require_file(path, "give one").unwrap_err().to_string();
@@ -247,7 +260,7 @@ mod tests {
     #[case(2, 64, 64)]
     #[case(64, 64, 2)]
     #[case::nothing_to_do(0, 2, 2)]
-    fn private_servers_together_have_two_threads_a_core_at_most(
+    fn private_servers_have_at_most_two_threads_for_each_core(
         #[case] jobs: usize,
         #[case] cores: usize,
         #[case] each: usize,

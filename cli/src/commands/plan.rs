@@ -19,16 +19,16 @@ use super::{cores, load_plan, recurrent, servers_of_jobs};
 
 pub(super) fn run(args: &PlanArgs) -> Result<()> {
     let plan = load_plan(&args.file)?;
-    if args.measure > 0 && !args.json.is_printed() && args.missing.is_none() {
+    if args.measure > 0 && !args.json.is_printed() && args.unfinished_in.is_none() {
         recurrent::prepare_for(&plan)?;
     }
     let mut out = std::io::stdout();
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    if args.json.json.is_some() && !args.cells && args.missing.is_none() {
-        return Err(CommandError::Usage("--json lists cells: give --cells or --missing DIR with it".into()));
+    if args.json.json.is_some() && !args.cells && args.unfinished_in.is_none() {
+        return Err(CommandError::Usage("--json lists cells: give --cells or --unfinished-in DIR with it".into()));
     }
     args.json.check()?;
-    let folder = args.missing.as_deref().map(Folder::new);
+    let folder = args.unfinished_in.as_deref().map(Folder::new);
     let known = folder.as_ref().map_or_else(|| Ok(plan.clone()), |folder| plan.in_folder(folder))?;
     let listed: Vec<&Cell> = match &folder {
         Some(folder) => known.cells.iter().filter(|cell| !folder.cell(&cell.id).is_settled(true)).collect(),
@@ -45,17 +45,18 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     if folder.is_some() {
         return Ok(());
     }
-    let from = args.from.as_deref().map(Folder::new);
-    from.iter().try_for_each(|folder| folder.require_plan().map(drop))?;
-    let known = plan.in_full(from.as_ref())?;
+    let timings_from = args.timings_from.as_deref().map(Folder::new);
+    timings_from.iter().try_for_each(|folder| folder.require_plan().map(drop))?;
+    let known = plan.in_full(timings_from.as_ref())?;
     let grouping = Grouping { most: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
     let all: Vec<usize> = (0..known.cells.len()).collect();
     let groups = known.groups(&all, grouping);
     let groups_shown = groups_line(&groups, grouping);
     let grouping = Grouping { at_a_time: grouping.at_a_time.min(groups.len()), ..grouping };
     let (_private, addresses) = servers_of_jobs(&args.server, grouping.at_a_time)?;
-    let (servers, _) = Servers::connect_to_some(&addresses)?; // what is wrong with others the run will tell
-    let limits = step_limits(&servers, &known)?; // refuses environments that there are not
+    // The run itself reports servers that do not answer.
+    let (servers, _) = Servers::connect_to_some(&addresses)?;
+    let limits = step_limits(&servers, &known)?;
     let counts = plan.counts();
     writeln!(
         out,
@@ -67,60 +68,61 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
         count(counts.runs as usize, "run"),
         if plan.selection == Selection::Clean { " to select from" } else { "" }
     )?;
-    let anew = &known.cells[plan.cells.len()..];
-    if let Some(pairs) = anew.first().map(|cell| cell.tests.sets.len()) {
-        let (cells, runs) = (anew.len(), plan.runs as usize);
+    let second_stage = &known.cells[plan.cells.len()..];
+    if let Some(pairs) = second_stage.first().map(|cell| cell.tests.sets.len()) {
+        let (cells, runs) = (second_stage.len(), plan.runs as usize);
         let are = if cells / runs == 1 { "is" } else { "are" };
-        let trained = format!("{} {are} selected and trained anew", grouped(cells / runs));
+        let trained = format!("{} {are} selected and trained on new seeds", grouped(cells / runs));
         writeln!(out, "{trained}, {} with {}", counted(cells * pairs, "train/test pair"), count(runs, "run"))?;
     }
     writeln!(out, "{groups_shown}")?;
-    let taken = from.map(|folder| (folder.clone(), Taken::read(&known, &folder)));
-    estimate(args, &known, grouping, taken.as_ref(), (&servers, &limits), &stop)
+    let measured = timings_from.map(|folder| (folder.clone(), Taken::read(&known, &folder)));
+    estimate(args, &known, grouping, measured.as_ref(), (&servers, &limits), &stop)
 }
 
-/// "24 cells in 4 groups of 5 to 7, 2 at a time".
+/// Returns a text such as "24 cells in 4 groups of 5 to 7, 2 at a time".
 fn groups_line(groups: &[Vec<usize>], Grouping { at_a_time, .. }: Grouping) -> String {
     let sizes = || groups.iter().map(Vec::len);
-    let (least, most) = (sizes().min().unwrap_or_default(), sizes().max().unwrap_or_default());
-    let sizes_shown = if least == most { most.to_string() } else { format!("{least} to {most}") };
+    let min = sizes().min().unwrap_or_default();
+    let max = sizes().max().unwrap_or_default();
+    let sizes_shown = if min == max { max.to_string() } else { format!("{min} to {max}") };
     let (cells, number) = (cells(sizes().sum()), counted(groups.len(), "group"));
     format!("{cells} in {number} of {sizes_shown}, {} at a time", at_a_time.min(groups.len()))
 }
 
-/// Prints what the plan costs: as cells took that are done, otherwise at most, by measurements.
+/// Prints what the plan costs: from the durations of finished cells, and an upper bound by measurements for the others.
 fn estimate(
     args: &PlanArgs,
     plan: &Plan,
     grouping: Grouping,
-    taken: Option<&(Folder, Taken<'_>)>,
+    finished: Option<&(Folder, Taken<'_>)>,
     (servers, limits): (&Servers, &HashMap<&str, u32>),
     stop: &StopFlag,
 ) -> Result<()> {
     let mut out = std::io::stdout();
-    let as_others = |cell: &Cell| taken.and_then(|(_, taken)| taken.seconds(cell));
+    let measured_seconds = |cell: &Cell| finished.and_then(|(_, timings)| timings.seconds(cell));
     let (known, unknown): (Vec<usize>, Vec<usize>) =
-        (0..plan.cells.len()).partition(|&cell| as_others(&plan.cells[cell]).is_some());
-    let mut seconds: Vec<Option<f64>> = plan.cells.iter().map(as_others).collect();
-    if let Some((folder, taken)) = taken {
+        (0..plan.cells.len()).partition(|&cell| measured_seconds(&plan.cells[cell]).is_some());
+    let mut seconds: Vec<Option<f64>> = plan.cells.iter().map(measured_seconds).collect();
+    if let Some((folder, timings)) = finished {
         let known_seconds: f64 = seconds.iter().flatten().sum();
         writeln!(
             out,
-            "\nas those of the same environment and method took of {} in {}: {}, {}",
-            count(taken.cells(), "cell"),
+            "\nby the durations of {} of the same environment and method in {}: {}, {}",
+            count(timings.cells(), "finished cell"),
             folder.path().display(),
             cells(known.len()),
             duration(known_seconds)
         )?;
     }
-    if args.measure == 0 && taken.is_some() && !unknown.is_empty() {
+    if args.measure == 0 && finished.is_some() && !unknown.is_empty() {
         writeln!(out, "not measured: {}", cells(unknown.len()))?;
     }
     if args.measure > 0 && !unknown.is_empty() {
         let measurements = measurements(args, plan, grouping, &unknown, servers, stop, &mut out)?;
         let estimates = estimates(plan, &measurements, limits);
         unknown.iter().for_each(|&cell| seconds[cell] = Some(estimates[cell].seconds()));
-        print_most(&mut out, unknown.len(), &unknown.iter().map(|&cell| estimates[cell]).sum())?;
+        print_upper_bound(&mut out, unknown.len(), &unknown.iter().map(|&cell| estimates[cell]).sum())?;
     }
     if seconds.iter().all(Option::is_some) {
         let jobs = grouping.at_a_time;
@@ -128,17 +130,17 @@ fn estimate(
             let seconds: f64 = cells.filter_map(|cell| seconds[cell]).sum();
             format!("{}, {} with --jobs {jobs}", duration(seconds), duration(seconds / jobs as f64))
         };
-        writeln!(out, "\nin all: {}", total(&mut (0..seconds.len())))?;
-        if let Some((folder, _)) = taken {
+        writeln!(out, "\ntotal: {}", total(&mut (0..seconds.len())))?;
+        if let Some((folder, _)) = finished {
             let left = |&cell: &usize| !folder.cell(&plan.cells[cell].id).is_settled(true);
             let left: Vec<usize> = (0..seconds.len()).filter(left).collect();
-            writeln!(out, "what is left there, {}: {}", cells(left.len()), total(&mut left.iter().copied()))?;
+            writeln!(out, "unfinished there, {}: {}", cells(left.len()), total(&mut left.iter().copied()))?;
         }
     }
     Ok(())
 }
 
-/// Measures the representatives of `cells`, and prints how fast they were.
+/// Measures the representatives of `cells` and prints their speeds.
 fn measurements(
     args: &PlanArgs,
     plan: &Plan,
@@ -152,7 +154,7 @@ fn measurements(
     let jobs = grouping.at_a_time;
     writeln!(
         out,
-        "\nmeasured: {} for some {} s each, with settings from all over their grid, in {}",
+        "\nmeasured: {} for about {} s each, with settings from the whole grid, in {}",
         count(groups.len(), "group"),
         args.measure,
         if jobs == 1 { "1 process".to_owned() } else { format!("{jobs} processes at once, steps/s of each") }
@@ -163,7 +165,7 @@ fn measurements(
     Ok(measurements)
 }
 
-/// The step limits of the plan's environments. Refuses plans that do not fit them.
+/// Returns the step limits of the plan's environments. Refuses unknown environments and plans that do not fit them.
 pub(super) fn step_limits<'a>(servers: &Servers, plan: &'a Plan) -> Result<HashMap<&'a str, u32>> {
     let limit = |name: &'a str| {
         let environment = servers.environment(name)?;
@@ -184,11 +186,11 @@ fn speeds(measurements: &[Measurement]) -> Table {
         .build()
 }
 
-fn print_most(out: &mut impl Write, number: usize, estimate: &Estimate) -> std::io::Result<()> {
+fn print_upper_bound(out: &mut impl Write, number: usize, estimate: &Estimate) -> std::io::Result<()> {
     writeln!(
         out,
-        "\nat most, if every episode lasts until the step limit: {}, {:.2e} steps of training, {:.2e} of testing,\n\
-         which take {} as measured: {} of training, {} of testing",
+        "\nat most, if every episode lasts until the step limit: {}, {:.2e} steps of training, {:.2e} of testing;\n\
+         at the measured speed {}: {} of training, {} of testing",
         cells(number),
         estimate.training_steps,
         estimate.testing_steps,
@@ -198,7 +200,7 @@ fn print_most(out: &mut impl Write, number: usize, estimate: &Estimate) -> std::
     )
 }
 
-/// "1 cell", "1 200 cells".
+/// Returns a text such as "1 cell" or "1 200 cells".
 fn cells(number: usize) -> String {
     counted(number, "cell")
 }
@@ -208,7 +210,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn groups_are_said_in_a_line() {
+    fn groups_are_described_in_a_line() {
         let line = |sizes: &[usize], at_a_time| {
             let groups: Vec<Vec<usize>> = sizes.iter().map(|&size| vec![0; size]).collect();
             groups_line(&groups, Grouping { most: 36, at_a_time })

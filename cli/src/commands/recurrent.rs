@@ -1,5 +1,6 @@
-//! Becoming `perturb-recurrent`: this program with libtorch, which takes most of a second to load and which only the
-//! gradients of recurrent policies need.
+//! Replaces this process by `perturb-recurrent`, which is this program with libtorch.
+//!
+//! Only the gradients of recurrent policies need libtorch, which takes most of a second to load.
 
 use std::ffi::OsStr;
 use std::os::unix::process::CommandExt;
@@ -12,21 +13,21 @@ use perturb_settings::Architecture;
 
 use super::error::{CommandError, Result, system};
 
-/// The name of the program that has libtorch, beside this one.
+/// Name of the program with libtorch, in the same folder as this one.
 const PROGRAM: &str = "perturb-recurrent";
-/// Tells that program which version it was started by.
+/// Environment variable with the version of the program that started `perturb-recurrent`.
 const STARTED_BY: &str = "PERTURB_STARTED_BY";
-/// How many threads OpenBLAS has, which reads it when it is loaded, before `main`.
-const THREADS: &str = "OPENBLAS_NUM_THREADS";
+/// Environment variable with the number of OpenBLAS's threads. OpenBLAS reads it before `main`.
+const OPENBLAS_THREADS: &str = "OPENBLAS_NUM_THREADS";
 
-/// Goes on as `perturb-recurrent` if the `architecture` is to be trained, from the beginning, with the same arguments and the
-/// same process number. Comes back if that needs no libtorch, or if this is that program.
+/// Starts again as `perturb-recurrent`, with the same arguments and process id, if training `architecture` needs
+/// libtorch. Returns if it does not, or if this is that program.
 ///
-/// Makes sure that OpenBLAS computes on one thread: its threads cost more than they bring with networks this small, and
-/// sums depend on their number. What the variable has already may stay, unless `one_thread` must be.
+/// Sets OpenBLAS to one thread, because more threads cost time with networks this small, and sums depend on their
+/// number. A value that the user has set is kept unless `one_thread` requires one thread.
 ///
 /// # Errors
-/// The program is not there, or was not built together with this one.
+/// [`CommandError::Usage`] if `perturb-recurrent` is missing or of another version.
 pub(super) fn prepare(architecture: Architecture, one_thread: bool) -> Result<()> {
     if architecture == Architecture::Ff {
         return Ok(());
@@ -40,7 +41,7 @@ pub(super) fn prepare(architecture: Architecture, one_thread: bool) -> Result<()
             )));
         }
     }
-    let threads = std::env::var_os(THREADS);
+    let threads = std::env::var_os(OPENBLAS_THREADS);
     let threads_fit = threads.as_ref().is_some_and(|value| !one_thread || value == "1");
     if has_recurrent() && threads_fit {
         return Ok(());
@@ -62,28 +63,33 @@ pub(super) fn prepare(architecture: Architecture, one_thread: bool) -> Result<()
     )))
 }
 
-/// The same for all cells of a plan.
+/// Calls [`prepare`] for the cells of a plan.
 ///
 /// # Errors
-/// Those of [`prepare`].
+/// See [`prepare`].
 pub(super) fn prepare_for(plan: &Plan) -> Result<()> {
     let cells = || plan.cells.iter().chain(&plan.candidates);
-    let any = cells().find(|cell| cell.config.common.architecture != Architecture::Ff);
-    // An experiment's results must not depend on what a cluster's profile exports.
-    prepare(any.map_or(Architecture::Ff, |cell| cell.config.common.architecture), true)
+    let recurrent = cells().find(|cell| cell.config.common.architecture != Architecture::Ff);
+    // The results of an experiment must not depend on variables that a cluster's profile exports.
+    prepare(recurrent.map_or(Architecture::Ff, |cell| cell.config.common.architecture), true)
 }
 
-/// Makes a program that is started compute on one thread, whatever the variable is here.
+/// Sets OpenBLAS to one thread in a program that is started.
 pub(super) fn set_one_thread(command: &mut Command) {
-    command.env(THREADS, "1");
+    command.env(OPENBLAS_THREADS, "1");
 }
 
-/// The program `perturb`, which a job is to begin with: it becomes the other one where it must.
-pub(super) fn usual_program() -> Result<PathBuf> {
+/// Tells whether this process has replaced `perturb`.
+pub(super) fn is_replacement() -> bool {
+    std::env::var_os(STARTED_BY).is_some()
+}
+
+/// Returns the path of `perturb`, with which jobs start. It replaces itself where that is needed.
+pub(super) fn perturb_program() -> Result<PathBuf> {
     let program = current()?;
     Ok(if has_recurrent() { program.with_file_name("perturb") } else { program })
 }
 
 fn current() -> Result<PathBuf> {
-    std::env::current_exe().map_err(system("find out where this program is"))
+    std::env::current_exe().map_err(system("find the path of this program"))
 }

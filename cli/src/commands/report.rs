@@ -25,16 +25,16 @@ pub(super) fn run(args: &ReportArgs) -> Result<()> {
     Ok(())
 }
 
-/// Writes tables and pictures and, with `page`, everything as HTML; returns the tables as text, and where they are.
+/// Writes tables and pictures, and with `page` also everything as HTML. Returns the tables as text, and their folder.
 pub(super) fn write(sources: Sources, out: Option<PathBuf>, page: Option<&Path>) -> Result<(String, PathBuf)> {
     let out = match out {
         Some(out) => out,
-        None => usual_place(&sources)?,
+        None => default_folder(&sources)?,
     };
     refuse_file(&out)?;
-    // The folder of the tables is made.
-    let inside = |page: &Path| page.parent().is_some_and(|folder| folder.starts_with(&out));
-    page.filter(|page| !inside(page)).map_or(Ok(()), require_writable)?;
+    // A page inside of the tables' folder needs no check, because that folder is created.
+    let is_inside = |page: &Path| page.parent().is_some_and(|folder| folder.starts_with(&out));
+    page.filter(|page| !is_inside(page)).map_or(Ok(()), require_writable)?;
     sources.read(|whole| {
         let report = &whole.report;
         write_atomically(&out.join("report.md"), report.markdown().as_bytes())?;
@@ -50,15 +50,16 @@ pub(super) fn write(sources: Sources, out: Option<PathBuf>, page: Option<&Path>)
     })
 }
 
-/// In the folder of the experiment, which keeps what is its own alone.
-fn usual_place(sources: &Sources) -> Result<PathBuf> {
+/// Returns the folder report/ of the experiment. It is refused for assessments, which do not belong to the experiment.
+fn default_folder(sources: &Sources) -> Result<PathBuf> {
     let Some(folder) = sources.folder.as_ref().filter(|_| sources.assessed.is_empty()) else {
-        let message = "give --out: a report with assessments does not go into an experiment's folder";
+        let message = "give --out: a report with assessments is not written to an experiment's folder";
         return Err(CommandError::Usage(message.into()));
     };
     let mut out = folder.path().join("report");
     if let Some(rule) = sources.another_rule()? {
-        out = out.join(rule.to_string()); // beside what the plan asks for
+        // The plan's own report stays.
+        out = out.join(rule.to_string());
     }
     Ok(out)
 }
@@ -77,10 +78,10 @@ pub(super) fn curves(args: &CurvesArgs) -> Result<()> {
             note(format_args!("{}: no finished training with a monitor.csv", curves.environment));
             continue;
         }
-        for (by, ending) in [(Footing::Episodes, ""), (Footing::Steps, "-steps")] {
+        for (axis, suffix) in [(Footing::Episodes, ""), (Footing::Steps, "-steps")] {
             for quantity in Quantity::ALL {
-                let path = out.join(format!("{}-{quantity}{ending}", curves.environment));
-                save(&draw_curves(curves, quantity, by), &path)?;
+                let path = out.join(format!("{}-{quantity}{suffix}", curves.environment));
+                save(&draw_curves(curves, quantity, axis), &path)?;
                 writeln!(stdout, "{}.svg and .png", path.display())?;
             }
         }

@@ -15,15 +15,14 @@ pub(super) fn run(args: &ServeArgs) -> Result<()> {
         let server = Server::bind(&options).await?;
         let address = server.address();
         if !address.ip().is_loopback() {
-            let warning = "anybody who reaches this address can see everything in the folder: there is neither \
-                           authentication nor encryption; and so can any site that somebody who reaches it opens in a \
-                           browser, as names are not checked: prefer 127.0.0.1 and `ssh -L`";
+            let warning = "there is no authentication and no encryption: everybody who reaches this address can see \
+                           the whole folder, and so can any web site that they open; prefer 127.0.0.1 and `ssh -L`";
             say(format_args!("perturb: {warning}"));
         }
         let mut out = std::io::stdout();
         writeln!(out, "http://{address}")?;
         out.flush()?;
-        note(format_args!("showing {} there; Ctrl-C ends it", args.dir.display()));
+        note(format_args!("serving {}; Ctrl-C stops it", args.dir.display()));
         match server.run().await {}
     })
 }

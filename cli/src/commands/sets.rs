@@ -1,4 +1,4 @@
-//! The sets of parameters that are typed.
+//! Sets of parameters from the command line.
 
 use std::collections::BTreeMap;
 
@@ -13,51 +13,53 @@ use super::args::SetArgs;
 use super::error::{CommandError, Result};
 use super::require_file;
 
-/// What a set that is typed is called.
-const NAME: &str = "parameters";
+/// Name of the set of --parameters.
+const PARAMETERS_SET: &str = "parameters";
 
-/// What to test on: `versions`, and the set that is typed; without either, all versions.
-pub(super) fn tested(versions: &[Version], args: &SetArgs) -> Result<Vec<TestSet>> {
+/// Returns the sets to test on: `versions` and the sets in `args`; all versions if there are none.
+pub(super) fn test_sets(versions: &[Version], args: &SetArgs) -> Result<Vec<TestSet>> {
     let mut versions = versions.to_vec();
     versions.sort_unstable();
     versions.dedup();
     let mut sets: Vec<TestSet> = versions.into_iter().map(TestSet::from).collect();
     if !args.parameters.is_empty() {
-        sets.push(set_of(NAME, args.base, args.parameters.clone())?);
+        sets.push(set_of(PARAMETERS_SET, args.base_version, args.parameters.clone())?);
     }
     if let Some(path) = &args.contexts {
         let name = path.file_stem().unwrap_or_default().to_string_lossy();
         if name.parse::<Version>().is_ok() {
-            let message = format!("{}: call the file otherwise, {name} is a version", path.display());
+            let message = format!("{}: rename the file, because {name} is the name of a version", path.display());
             return Err(CommandError::Usage(message));
         }
         require_file(path, "give a CSV file whose header names parameters, with a row for each context")?;
-        sets.push(set_of_csv(&name, args.base, &read(path)?)?);
+        sets.push(set_of_csv(&name, args.base_version, &read(path)?)?);
     }
     Ok(if sets.is_empty() { Version::ALL.map(TestSet::from).to_vec() } else { sets })
 }
 
-/// The set of `version` in which the parameters that are typed are drawn.
-pub(super) fn drawn(version: Version, parameters: &[Assignment]) -> Result<TestSet> {
+/// Returns the set of `version` with these parameters replaced. Grids are refused.
+pub(super) fn drawn_set(version: Version, parameters: &[Assignment]) -> Result<TestSet> {
     if parameters.is_empty() {
         return Ok(version.into());
     }
-    let set = set_of(NAME, version, parameters.to_vec())?;
+    let set = set_of(PARAMETERS_SET, version, parameters.to_vec())?;
     match set.contexts {
         Contexts::Drawn(_) => Ok(set),
         Contexts::Listed(_) => Err(CommandError::Usage(
-            "--parameters has the points of a grid here; give values or intervals, as length=0.8..0.9".into(),
+            "--parameters must not have the points of a grid here; give values or intervals, e.g. length=0.8..0.9"
+                .into(),
         )),
     }
 }
 
-/// The parameter of `environment` that is written so, however it is spelled; `option` is where it was written.
+/// Returns the name of an environment's parameter, which may be written in any case. `option` names the option for the
+/// error.
 ///
 /// # Errors
-/// It has no such parameter; the one that was probably meant is said.
+/// [`ValueError`] if there is no such parameter, with the name that was probably meant.
 pub(super) fn parameter<'a>(option: &str, written: &str, environment: &'a Environment) -> Result<&'a str, ValueError> {
     let known = environment.parameters.iter().map(|parameter| parameter.name.as_str());
-    names::find(written, known.clone()).and_then(|place| known.clone().nth(place)).ok_or_else(|| {
+    names::find(written, known.clone()).and_then(|index| known.clone().nth(index)).ok_or_else(|| {
         let hint = names::did_you_mean(written, known.clone());
         ValueError {
             what: format!("{option}: a parameter of {}", environment.name),
@@ -67,51 +69,51 @@ pub(super) fn parameter<'a>(option: &str, written: &str, environment: &'a Enviro
     })
 }
 
-/// The `values` of parameters by the names that `environment` has for them.
+/// Returns `values` with the parameters' names as `environment` spells them.
 ///
 /// # Errors
-/// Those of [`parameter`]; one that is there in two spellings.
-pub(super) fn spelled<T>(
+/// See [`parameter`]. A parameter in two spellings is refused, too.
+pub(super) fn normalize<T>(
     option: &str,
     values: BTreeMap<String, T>,
     environment: &Environment,
 ) -> Result<BTreeMap<String, T>, ValueError> {
-    let mut spelled = BTreeMap::new();
+    let mut normalized = BTreeMap::new();
     for (written, value) in values {
         let name = parameter(option, &written, environment)?;
-        if spelled.insert(name.to_owned(), value).is_some() {
+        if normalized.insert(name.to_owned(), value).is_some() {
             let (got, expected) = ("given twice".into(), "given once".into());
             return Err(ValueError { what: format!("{option}: {name}"), got, expected });
         }
     }
-    Ok(spelled)
+    Ok(normalized)
 }
 
-/// The same of a set's parameters.
-pub(super) fn spelled_set(set: TestSet, environment: &Environment) -> Result<TestSet, ValueError> {
+/// Calls [`normalize`] on a set's parameters.
+pub(super) fn normalize_set(set: TestSet, environment: &Environment) -> Result<TestSet, ValueError> {
     let TestSet { name, version, contexts } = set;
     let contexts = match contexts {
-        Contexts::Drawn(parameters) => Contexts::Drawn(spelled(&name, parameters, environment)?),
+        Contexts::Drawn(parameters) => Contexts::Drawn(normalize(&name, parameters, environment)?),
         Contexts::Listed(contexts) => {
-            let spelled = contexts.into_iter().map(|context| spelled(&name, context, environment));
-            Contexts::Listed(spelled.collect::<Result<_, _>>()?)
+            let contexts = contexts.into_iter().map(|context| normalize(&name, context, environment));
+            Contexts::Listed(contexts.collect::<Result<_, _>>()?)
         }
     };
     Ok(TestSet { name, version, contexts })
 }
 
-/// The rule with its quantity as `text` or `code`, the criteria of an environment, have it.
+/// Returns the rule with its quantity spelled as in `text` or `code`, the criteria of an environment.
 ///
 /// # Errors
-/// Those of [`Rule::of`], with the quantity that was probably meant.
-pub(super) fn spelled_rule(
+/// [`ValueError`] if the environment has no such quantity, with the one that was probably meant.
+pub(super) fn normalize_rule(
     rule: &Rule,
     text: Option<&Criterion>,
     code: Option<&Criterion>,
 ) -> Result<Rule, ValueError> {
     let Rule::At(Threshold { quantity, value }) = rule else { return Ok(rule.clone()) };
     let known = text.into_iter().chain(code).map(|criterion| criterion.quantity.as_str());
-    if let Some(name) = names::find(quantity, known.clone()).and_then(|place| known.clone().nth(place)) {
+    if let Some(name) = names::find(quantity, known.clone()).and_then(|index| known.clone().nth(index)) {
         return Ok(Rule::At(Threshold { quantity: name.to_owned(), value: *value }));
     }
     let hint = names::did_you_mean(quantity, known);
@@ -132,10 +134,10 @@ mod tests {
     }
 
     #[test]
-    fn parameters_are_spelled_as_one_likes() {
+    fn parameters_may_be_spelled_in_any_case() {
         let set = |texts: &[&str]| {
             let assignments = texts.iter().map(|text| text.parse().unwrap()).collect();
-            spelled_set(set_of("own", Version::D, assignments).unwrap(), &cart_pole())
+            normalize_set(set_of("own", Version::D, assignments).unwrap(), &cart_pole())
         };
         assert_eq!(set(&["Length=0.5", "MASS=1,2"]).unwrap(), set(&["length=0.5", "mass=1,2"]).unwrap());
         assert_eq!(set(&["Length=0.5..1"]).unwrap(), set(&["length=0.5..1"]).unwrap());
@@ -147,12 +149,12 @@ mod tests {
     }
 
     #[test]
-    fn a_threshold_is_spelled_as_one_likes() {
+    fn thresholds_may_be_spelled_in_any_case() {
         let (quantity, unit, side) = ("steps".to_owned(), "1".into(), Side::AtLeast);
         let text = Criterion { quantity, unit, side, threshold: 100.0, most: None };
         let code = Criterion { quantity: "steps_in_a_row".into(), ..text.clone() };
         let read =
-            |rule: &str| spelled_rule(&rule.parse().unwrap(), Some(&text), Some(&code)).map(|rule| rule.to_string());
+            |rule: &str| normalize_rule(&rule.parse().unwrap(), Some(&text), Some(&code)).map(|rule| rule.to_string());
         for (written, rule) in [("STEPS=90", "steps=90"), ("Steps-in-a-row=9", "steps_in_a_row=9"), ("code", "code")] {
             assert_eq!(read(written).unwrap(), rule);
         }
@@ -161,7 +163,7 @@ mod tests {
             refused,
             "the success threshold is step=3, but must be one of steps, e.g. steps=100 (did you mean `steps`?)"
         );
-        let unknown = spelled_rule(&"steps=3".parse().unwrap(), None, None).unwrap_err().to_string();
+        let unknown = normalize_rule(&"steps=3".parse().unwrap(), None, None).unwrap_err().to_string();
         assert!(unknown.contains("does not say what its success rule compares"), "{unknown}");
     }
 }

@@ -11,40 +11,41 @@ use perturb_learner::measure::measure;
 use perturb_text::count;
 
 use super::args::{RunArgs, ServerArgs};
-use super::cells::Doing;
+use super::cells::PlanRunner;
 use super::display::note;
 use super::error::{Result, system};
 use super::plan::step_limits;
 use super::{recurrent, refuse_workers, servers_of_jobs};
 
-/// How long each group of trainings is measured.
-const MEASURE: Duration = Duration::from_secs(2);
-/// How often Slurm is asked: its controller has others to answer too.
+/// Time of measurement for each group of trainings.
+const MEASURE_TIME: Duration = Duration::from_secs(2);
+/// Time between two requests to Slurm, whose controller serves other users, too.
 const QUEUE_INTERVAL: Duration = Duration::from_secs(15);
 
 pub(super) fn run(args: &RunArgs, plan: Plan, stop: &StopFlag) -> Result<ExitCode> {
-    recurrent::prepare_for(&plan)?; // costs are measured here
-    let path = std::path::absolute(&args.out).map_err(system("find out where --out is"))?;
+    // The durations of cells are measured in this process.
+    recurrent::prepare_for(&plan)?;
+    let path = std::path::absolute(&args.out).map_err(system("find the absolute path of --out"))?;
     let folder = Folder::new(&path);
     let options = options(args)?;
     options.check(&path)?;
     let slurm = Slurm::default();
     slurm.check(stop)?;
-    // Which environments there are, and what they cost, is found out here, with servers as a job has them: those that
-    // jobs share may be out of reach.
+    // Environments and durations are checked here with private servers like those of a job, because the servers that
+    // jobs share may be unreachable from this machine.
     step_limits(&Servers::local(args.server.workers)?, &plan)?;
     let grouping = Grouping { most: args.group, at_a_time: options.task.jobs };
-    let as_in_a_job = ServerArgs { server: Vec::new(), workers: Some(options.task.workers) };
-    let mut doing = Doing::begin(args, plan, &folder, stop)?;
-    while let Some(plan) = doing.next()? {
+    let job_servers = ServerArgs { server: Vec::new(), workers: Some(options.task.workers) };
+    let mut runner = PlanRunner::begin(args, plan, &folder, stop)?;
+    while let Some(plan) = runner.next_round()? {
         let costs = || {
-            let (_private, addresses) = servers_of_jobs(&as_in_a_job, grouping.at_a_time)?;
+            let (_private, addresses) = servers_of_jobs(&job_servers, grouping.at_a_time)?;
             let (servers, _) = Servers::connect_to_some(&addresses)?;
-            Ok(costs(&servers, &plan, grouping, stop)?)
+            Ok(cell_seconds(&servers, &plan, grouping, stop)?)
         };
-        doing.run(&plan, &mut Jobs::new(&plan, &folder, &slurm, &options, &costs, stop))?;
+        runner.run(&plan, &mut Jobs::new(&plan, &folder, &slurm, &options, &costs, stop))?;
     }
-    doing.end()
+    runner.finish()
 }
 
 fn options(args: &RunArgs) -> Result<SlurmOptions> {
@@ -54,7 +55,7 @@ fn options(args: &RunArgs) -> Result<SlurmOptions> {
     }
     let jobs = args.jobs.unwrap_or(1);
     let task = Task {
-        program: recurrent::usual_program()?,
+        program: recurrent::perturb_program()?,
         jobs,
         group: args.group,
         workers: args.server.workers.unwrap_or(1),
@@ -72,15 +73,15 @@ fn options(args: &RunArgs) -> Result<SlurmOptions> {
     })
 }
 
-/// What each cell may cost, from a short measurement here.
-fn costs(servers: &Servers, plan: &Plan, grouping: Grouping, stop: &StopFlag) -> Result<Vec<f64>> {
+/// Returns an upper bound of each cell's duration in seconds, from a short measurement on this machine.
+fn cell_seconds(servers: &Servers, plan: &Plan, grouping: Grouping, stop: &StopFlag) -> Result<Vec<f64>> {
     let all: Vec<usize> = (0..plan.cells.len()).collect();
     let groups = representatives(plan, &all, grouping);
     let groups_shown = count(groups.len(), "group");
-    note(format_args!("measuring what cells cost: {groups_shown} for {} s each", MEASURE.as_secs()));
+    note(format_args!("measuring the duration of cells: {groups_shown} for {} s each", MEASURE_TIME.as_secs()));
     let mut measurements = Vec::new();
     for group in groups {
-        measurements.push(measure(servers, &group, grouping.at_a_time, MEASURE, stop)?);
+        measurements.push(measure(servers, &group, grouping.at_a_time, MEASURE_TIME, stop)?);
     }
     let limits = step_limits(servers, plan)?;
     Ok(estimates(plan, &measurements, &limits).iter().map(Estimate::seconds).collect())

@@ -23,15 +23,15 @@ use super::{playing_servers, recurrent, refuse_file, require_file, sets, threads
 pub(super) fn run(args: &TrainArgs) -> Result<ExitCode> {
     args.json.check()?;
     match &args.resume {
-        Some(path) => resume::go_on(args, path),
-        None => begin(args),
+        Some(path) => resume::resume_run(args, path),
+        None => begin_run(args),
     }
 }
 
-/// A new run.
-fn begin(args: &TrainArgs) -> Result<ExitCode> {
+/// Begins a new run.
+fn begin_run(args: &TrainArgs) -> Result<ExitCode> {
     if args.extend.is_some() {
-        let message = "--extend is for a run that is there: give --resume DIR with it, or --episodes for a new one";
+        let message = "--extend is for an existing run: give --resume DIR with it, or --episodes for a new run";
         return Err(CommandError::Usage(message.into()));
     }
     let remedy = "give a TOML file of settings, e.g. the config.toml of an earlier run";
@@ -44,26 +44,26 @@ fn begin(args: &TrainArgs) -> Result<ExitCode> {
         return Err(CommandError::Usage(message));
     }
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let chosen = args.out.as_deref().map(|out| RunDirectory::choose(out, args.overwrite)).transpose()?;
+    let given_directory = args.out.as_deref().map(|out| RunDirectory::choose(out, args.overwrite)).transpose()?;
     let servers = playing_servers(&args.play)?;
-    let environment = servers.environment_seen(&config.common)?; // its refusal lists the names
-    config.common.environment = environment.name.clone(); // however it was spelled
+    let environment = servers.environment_seen(&config.common)?;
+    config.common.environment = environment.name.clone();
     config.common.parameters =
-        sets::spelled("--parameters", std::mem::take(&mut config.common.parameters), &environment)?;
+        sets::normalize("--parameters", std::mem::take(&mut config.common.parameters), &environment)?;
     perturb_settings::sets::check("--parameters", &config.common.parameters, &environment)?;
-    let directory = match chosen {
+    let directory = match given_directory {
         Some(directory) => directory,
-        None => RunDirectory::choose(&usual_directory(&config)?, false)?,
+        None => RunDirectory::choose(&create_default_directory(&config)?, false)?,
     };
-    let mut display = Display::of_training(config.to_string(), &config, 0, 0);
+    let mut display = Display::for_training(config.to_string(), &config, 0, 0);
     let report = |progress: &Progress| display.training(progress);
     let outcome = train(&servers, &config, &directory, threads(args.threads), &stop, report);
     drop(display);
-    outcome::end(args, &config, &directory, outcome)
+    outcome::finish(args, &config, &directory, outcome)
 }
 
-/// Makes the folder of a run that nobody gave a place: another one for each, also of those that begin in the same second.
-fn usual_directory(config: &TrainConfig) -> Result<PathBuf> {
+/// Creates a new folder for a run without --out. Runs that begin in the same second get different folders.
+fn create_default_directory(config: &TrainConfig) -> Result<PathBuf> {
     let runs = Path::new("runs");
     create_folder(runs)?;
     let time = chrono::Utc::now().format("%Y%m%d-%H%M%S");
@@ -72,25 +72,25 @@ fn usual_directory(config: &TrainConfig) -> Result<PathBuf> {
     for path in names.map(|name| runs.join(name)) {
         match std::fs::create_dir(&path) {
             Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
-            made => return Ok(made.map(|()| path.clone()).map_err(io("create", &path))?),
+            created => return Ok(created.map(|()| path.clone()).map_err(io("create", &path))?),
         }
     }
     unreachable!("there is a number for each run")
 }
 
-/// The settings among the flags.
+/// Returns the settings that options give.
 fn flags(args: &TrainArgs) -> Result<Table> {
     let text = |value: &Option<String>| value.clone().map(Value::String);
     let number = |name: &str, value: Option<u64>| {
-        let refuse = |value| CommandError::Usage(format!("--{name} {value} is too large: the most is {}", i64::MAX));
+        let refuse = |value| CommandError::Usage(format!("--{name} {value} is too large: the maximum is {}", i64::MAX));
         value.map(|value| i64::try_from(value).map(Value::Integer).map_err(|_| refuse(value))).transpose()
     };
-    let own = sets::drawn(args.version.unwrap_or(Version::D), &args.parameters)?.drawn();
-    let own = Table::try_from(own).map_err(|error| CommandError::Usage(error.to_string()))?;
+    let parameters = sets::drawn_set(args.version.unwrap_or(Version::D), &args.parameters)?.drawn();
+    let parameters = Table::try_from(parameters).map_err(|error| CommandError::Usage(error.to_string()))?;
     let settings = [
         ("environment", text(&args.env)),
         ("version", text(&args.version.map(|version| version.to_string()))),
-        ("parameters", (!own.is_empty()).then_some(Value::Table(own))),
+        ("parameters", (!parameters.is_empty()).then_some(Value::Table(parameters))),
         ("preset", text(&args.preset)),
         ("algorithm", text(&args.algorithm)),
         ("architecture", text(&args.architecture)),

@@ -12,14 +12,14 @@ use super::error::{CommandError, Result, system};
 use super::{servers, sets};
 use crate::video::{Footage, Format, VideoFile, VideoOptions, film};
 
-/// Of a whole episode so many pictures are drawn for a contact sheet, which takes few: a robot's takes some 60 ms.
-const MOMENTS: u32 = 500;
+/// Maximum number of frames of an episode that are drawn for a contact sheet. Drawing a robot takes some 60 ms.
+const MAX_SHEET_FRAMES: u32 = 500;
 
 pub(super) fn run(args: &VideoArgs) -> Result<()> {
-    let is_sheet = Format::of(&args.out)? == Format::Png;
+    let is_sheet = Format::from_path(&args.out)? == Format::Png;
     if is_sheet && args.fps.is_some() {
         return Err(CommandError::Usage(
-            "--fps is how fast a film is shown: leave it out, or write a .gif or .mp4".into(),
+            "--fps is the speed of a film: leave it out, or write a .gif or .mp4 file".into(),
         ));
     }
     let file = VideoFile::create(&args.out)?;
@@ -28,21 +28,20 @@ pub(super) fn run(args: &VideoArgs) -> Result<()> {
     let servers = servers(&args.server)?;
     let width = args.width.unwrap_or(if is_sheet { 240 } else { 480 });
     let environment = servers.environment(&checkpoint.state.config.common.environment)?;
-    let sets = args
-        .version
-        .iter()
-        .map(|&version| -> Result<_> { Ok(sets::spelled_set(sets::drawn(version, &args.parameters)?, &environment)?) });
+    let sets = args.version.iter().map(|&version| -> Result<_> {
+        Ok(sets::normalize_set(sets::drawn_set(version, &args.parameters)?, &environment)?)
+    });
     let options = VideoOptions {
         sets: sets.collect::<Result<_>>()?,
         episodes: args.episodes,
         seed: args.seed.unwrap_or(checkpoint.state.config.common.seed),
         size: (width, args.height.unwrap_or(width)),
         fps: args.fps,
-        every: if is_sheet { (checkpoint.state.environment_spec.step_limit / MOMENTS).max(1) } else { 1 },
+        every: if is_sheet { (checkpoint.state.environment_spec.step_limit / MAX_SHEET_FRAMES).max(1) } else { 1 },
     };
     let names: Vec<&str> = options.sets.iter().map(|set| &*set.name).collect();
     let total = args.episodes.saturating_mul(names.len() as u64);
-    let mut display = Display::of_episodes(format!("filming on {}", names.join(", ")), total);
+    let mut display = Display::for_episodes(format!("filming on {}", names.join(", ")), total);
     let footage = film(&servers, &checkpoint, &options, file, &stop, &mut |episodes| display.episodes(episodes))?;
     drop(display);
     if let Some(sentence) = footage.thinning() {
@@ -61,17 +60,17 @@ pub(super) fn run(args: &VideoArgs) -> Result<()> {
             parameters.collect::<Vec<_>>().join(" ")
         });
     writeln!(out, "{}", table.build().to_text())?;
-    let what = if is_sheet { sheet(&footage) } else { figures(&footage) };
-    Ok(writeln!(out, "{}: {what}", args.out.display())?)
+    let summary = if is_sheet { sheet_summary(&footage) } else { film_summary(&footage) };
+    Ok(writeln!(out, "{}: {summary}", args.out.display())?)
 }
 
-/// What a contact sheet has.
-fn sheet(Footage { frames, size: (width, height), .. }: &Footage) -> String {
+/// Describes a contact sheet.
+fn sheet_summary(Footage { frames, size: (width, height), .. }: &Footage) -> String {
     format!("moments out of {frames} frames, on {width} × {height} pixels")
 }
 
-/// How many frames there are, how fast they are shown, and how fast they were made.
-fn figures(footage: &Footage) -> String {
+/// Describes a film: its frames, its speed, and how fast it was made.
+fn film_summary(footage: &Footage) -> String {
     let Footage { frames, size: (width, height), speed, total, waiting, writing, .. } = footage;
     let milliseconds = |time: &std::time::Duration| 1e3 * time.as_secs_f64() / *frames as f64;
     format!(

@@ -1,16 +1,16 @@
-//! What encoders of all formats do.
+//! The interface of the encoders of all formats.
 
-/// What encodes frames to a file.
+/// Encodes frames to a file.
 pub(super) trait Encode {
-    /// Of the whole picture, width and height in pixels.
+    /// Returns the width and height of the whole picture, in pixels.
     fn size(&self) -> (u32, u32);
 
-    /// Adds a frame `[height, width, 3]` that is shown for about so many `seconds`.
+    /// Adds a frame `[height, width, 3]` that is shown for about `seconds`.
     fn write(&mut self, frame: &[u8], seconds: f64) -> std::io::Result<()>;
 
-    /// The frames that came are an episode.
+    /// Marks the end of an episode.
     fn end_episode(&mut self) {}
 
-    /// Completes the file, which shows one frame of so many: 1 if it shows all.
+    /// Completes the file. Returns n if it shows every n-th frame; 1 if it shows all.
     fn finish(self: Box<Self>) -> std::io::Result<u16>;
 }

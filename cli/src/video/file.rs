@@ -1,4 +1,4 @@
-//! The file of a video, which appears whole or not at all.
+//! The file of a video. It appears when it is complete.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -11,25 +11,25 @@ use super::VideoError;
 use super::encode::Encode;
 use super::gif::{self, GifEncoder};
 use super::mp4::{self, Mp4Encoder};
-use super::sheet::{Grid, SheetEncoder};
+use super::sheet::{EpisodeGrid, SheetEncoder};
 
-/// How a video is encoded.
+/// Format of a video.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
-    /// `.gif`: 256 colours, at most 2 MB, and needs nothing.
+    /// `.gif`: 256 colours, at most 2 MB. Needs no other program.
     Gif,
-    /// `.mp4`: H.264, by the program ffmpeg.
+    /// `.mp4`: H.264, encoded by the program ffmpeg.
     Mp4,
-    /// `.png`: a contact sheet, with some frames of each episode; needs nothing.
+    /// `.png`: a contact sheet with some frames of each episode. Needs no other program.
     Png,
 }
 
 impl Format {
-    /// The format that the ending of `path` stands for, in upper or lower case.
+    /// Returns the format for the extension of `path`, in upper or lower case.
     ///
     /// # Errors
     /// [`VideoError::Extension`].
-    pub fn of(path: &Path) -> Result<Self, VideoError> {
+    pub fn from_path(path: &Path) -> Result<Self, VideoError> {
         let ending = path.extension().map(|ending| ending.to_ascii_lowercase());
         match ending.as_ref().and_then(|ending| ending.to_str()) {
             Some("gif") => Ok(Self::Gif),
@@ -40,7 +40,7 @@ impl Format {
     }
 }
 
-/// A video that is to be written: a hidden file in the same folder until it is whole, deleted if it never is.
+/// A video that will be written. It is a hidden file in the same folder until it is complete, and deleted otherwise.
 #[derive(Debug)]
 pub struct VideoFile {
     path: PathBuf,
@@ -49,13 +49,12 @@ pub struct VideoFile {
 }
 
 impl VideoFile {
-    /// Makes sure that `path` can be written before anything is played. A video that is there is
-    /// replaced at the end.
+    /// Checks that `path` can be written before any episode is played. An existing video is replaced at the end.
     ///
     /// # Errors
     /// [`VideoError::Extension`], [`VideoError::NoFfmpeg`] and [`VideoError::File`].
     pub fn create(path: &Path) -> Result<Self, VideoError> {
-        let format = Format::of(path)?;
+        let format = Format::from_path(path)?;
         require_writable(path)?;
         if format == Format::Mp4 {
             mp4::find_ffmpeg()?;
@@ -63,13 +62,13 @@ impl VideoFile {
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
         let temporary = tempfile::Builder::new()
             .prefix(".perturb-video-")
-            .permissions(fs::Permissions::from_mode(0o666)) // as any file; the umask takes its part
+            .permissions(fs::Permissions::from_mode(0o666)) // like other files, less the umask
             .tempfile_in(folder)
             .map_err(io("write to", folder))?;
         Ok(Self { path: path.to_owned(), format, temporary })
     }
 
-    /// How long a frame is shown of which there should be `fps` in a second, s.
+    /// Returns how long a frame is shown at `fps` frames per second, in seconds.
     pub fn frame_seconds(&self, fps: f64) -> f64 {
         match self.format {
             Format::Gif => f64::from(gif::delay(1.0 / fps)) / 100.0,
@@ -77,13 +76,13 @@ impl VideoFile {
         }
     }
 
-    /// Begins to encode frames of `size`, width and height in pixels, both even. One is shown for 1 / `fps` seconds, or for
-    /// a whole multiple of it; in a GIF for whole hundredths of a second. A contact sheet has a place for each episode of
-    /// `grid`.
+    /// Begins to encode frames of `size`: width and height in pixels, both even. Each frame is shown for 1 / `fps`
+    /// seconds or a whole multiple of it; in a GIF for whole hundredths of a second. A contact sheet has a place for
+    /// each episode of `grid`.
     ///
     /// # Errors
     /// [`VideoError::Encode`].
-    pub fn begin(self, size: (u32, u32), fps: f64, grid: Grid) -> Result<VideoWriter, VideoError> {
+    pub fn begin(self, size: (u32, u32), fps: f64, grid: EpisodeGrid) -> Result<VideoWriter, VideoError> {
         let (path, failed) = (self.temporary.path(), encoding(&self.path));
         let encoder: Box<dyn Encode> = match self.format {
             Format::Gif => Box::new(GifEncoder::new(path, size, fps).map_err(failed)?),
@@ -94,20 +93,20 @@ impl VideoFile {
     }
 }
 
-/// A video that is being written.
+/// A video during encoding.
 pub struct VideoWriter {
-    // Dropped in this order: the encoder before the file that it writes to.
+    // Fields are dropped in this order: the encoder must go before the file that it writes to.
     encoder: Box<dyn Encode>,
     file: VideoFile,
 }
 
 impl VideoWriter {
-    /// Of the video, width and height in pixels.
+    /// Returns the width and height of the video, in pixels.
     pub fn size(&self) -> (u32, u32) {
         self.encoder.size()
     }
 
-    /// Adds a frame `[height, width, 3]` that is shown for about so many `seconds`, but at least as long as any.
+    /// Adds a frame `[height, width, 3]` that is shown for about `seconds`, at least one frame's time.
     ///
     /// # Errors
     /// [`VideoError::Encode`].
@@ -115,15 +114,15 @@ impl VideoWriter {
         self.encoder.write(frame, seconds).map_err(encoding(&self.file.path))
     }
 
-    /// The frames since the last call are an episode.
+    /// Marks the frames since the last call as an episode.
     pub fn end_episode(&mut self) {
         self.encoder.end_episode();
     }
 
-    /// Completes the video and puts it into its place. Returns of how many frames it shows one: 1 if it shows all.
+    /// Completes the video and moves it to its path. Returns n if it shows every n-th frame; 1 if it shows all.
     ///
     /// # Errors
-    /// [`VideoError::Encode`] and [`VideoError::File`]; a video that was there before is then still there.
+    /// [`VideoError::Encode`] and [`VideoError::File`]. An existing video is kept then.
     pub fn finish(self) -> Result<u16, VideoError> {
         let VideoFile { path, temporary, .. } = self.file;
         let shown_every = self.encoder.finish().map_err(encoding(&path))?;
@@ -132,7 +131,7 @@ impl VideoWriter {
     }
 }
 
-/// Names the video in an encoder's error.
+/// Adds the video's path to an encoder's error.
 fn encoding(path: &Path) -> impl FnOnce(std::io::Error) -> VideoError {
     |source| VideoError::Encode { path: path.to_owned(), source }
 }
@@ -146,10 +145,10 @@ mod tests {
         for (name, format) in
             [("a.gif", Format::Gif), ("a/b.c.mp4", Format::Mp4), ("A.GIF", Format::Gif), ("a.png", Format::Png)]
         {
-            assert_eq!(Format::of(Path::new(name)).unwrap(), format, "{name}");
+            assert_eq!(Format::from_path(Path::new(name)).unwrap(), format, "{name}");
         }
         for name in ["a", "a.avi", ".gif", "gif", "a.mp4.txt"] {
-            assert!(Format::of(Path::new(name)).unwrap_err().to_string().contains(".mp4 or .gif"), "{name}");
+            assert!(Format::from_path(Path::new(name)).unwrap_err().to_string().contains(".mp4 or .gif"), "{name}");
         }
     }
 
@@ -162,14 +161,16 @@ mod tests {
         let frame = [7; 2 * 2 * 3];
         let names = || fs::read_dir(folder.path().join("new")).unwrap().count();
 
-        let mut writer = VideoFile::create(&path).unwrap().begin((2, 2), 10.0, Grid { sets: 1, episodes: 1 }).unwrap();
+        let mut writer =
+            VideoFile::create(&path).unwrap().begin((2, 2), 10.0, EpisodeGrid { sets: 1, episodes: 1 }).unwrap();
         writer.write(&frame, 0.1).unwrap();
         assert_eq!((names(), path.exists()), (1, false), "a hidden file");
         drop(writer);
         assert_eq!(names(), 0);
 
         fs::write(&path, "the one before").unwrap();
-        let mut writer = VideoFile::create(&path).unwrap().begin((2, 2), 10.0, Grid { sets: 1, episodes: 1 }).unwrap();
+        let mut writer =
+            VideoFile::create(&path).unwrap().begin((2, 2), 10.0, EpisodeGrid { sets: 1, episodes: 1 }).unwrap();
         writer.write(&frame, 0.1).unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"the one before");
         writer.finish().unwrap();

@@ -11,67 +11,67 @@ use perturb_policy::{Ended, Player};
 use perturb_records::success::Criterion;
 use perturb_settings::sets::TestSet;
 
-use super::panel::{Panel, Shown, ShownEnding, parameter};
-use super::{Grid, VideoError, VideoFile, VideoWriter};
+use super::caption::{Caption, CaptionText, ShownEnding, parameter};
+use super::{EpisodeGrid, VideoError, VideoFile, VideoWriter};
 
-/// The end of an episode stays for so many seconds.
-const HOLD: f64 = 2.0;
+/// Time that the last frame of an episode is shown, in seconds.
+const LAST_FRAME_SECONDS: f64 = 2.0;
 
-/// What to film.
+/// Options of a film.
 #[derive(Clone, Debug)]
 pub struct VideoOptions {
-    /// Where parameters come from, at least one: versions, or sets whose parameters are drawn.
+    /// Sets of parameters, at least one: versions, or sets whose parameters are drawn.
     pub sets: Vec<TestSet>,
-    /// How many episodes on each, at least 1.
+    /// Number of episodes on each set, at least 1.
     pub episodes: u64,
-    /// Fixes all randomness.
+    /// Random seed.
     pub seed: u64,
-    /// Of the pictures, in pixels, [`super::PIXELS`]; frames are higher by the text below.
+    /// Width and height of the pictures, within [`super::PIXELS`]. Frames are higher by the text below.
     pub size: (u32, u32),
-    /// Frames shown in a second, more than 0; `None` is real time.
+    /// Frames per second, more than 0; `None` for real time.
     pub fps: Option<f64>,
-    /// Steps from one frame to the next, at least 1; the first state and the last are always shown.
+    /// Steps between two frames, at least 1. The first and the last state are always shown.
     pub every: u32,
 }
 
-/// An episode that was filmed.
+/// Figures of a filmed episode.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Filmed {
-    /// What set its parameters are from.
+    /// Name of the set that its parameters are from.
     pub set: String,
-    /// The parameters' names and values, in the catalogue's order.
+    /// Names and values of the parameters, in the catalogue's order.
     pub parameters: Vec<(String, f64)>,
-    /// The undiscounted sum of its rewards.
+    /// Undiscounted sum of the rewards.
     pub episode_return: f64,
-    /// Its number of steps.
+    /// Number of steps.
     pub length: u32,
     /// Whether it was a success.
     pub success: bool,
 }
 
-/// What was filmed, and how fast.
+/// Figures of a finished film.
 #[derive(Clone, Debug, Default)]
 pub struct Footage {
-    /// In order: those of the first set, of the second, …
+    /// Episodes in order: of the first set, of the second set, …
     pub episodes: Vec<Filmed>,
-    /// One for each step, or for some of them, and one for each episode's start.
+    /// Number of frames: one for each shown step, and one for each episode's start.
     pub frames: u64,
-    /// Of so many of them the video shows one: 1 if it shows all.
+    /// The video shows every n-th frame; 1 if it shows all.
     pub shown_every: u16,
-    /// Of the video, width and height in pixels.
+    /// Width and height of the video, in pixels.
     pub size: (u32, u32),
-    /// Simulated seconds that pass in one second of the video: 1 is real time.
+    /// Simulated seconds per second of the video; 1 is real time.
     pub speed: f64,
-    /// From the first request to the finished file.
+    /// Time from the first request to the finished file.
     pub total: Duration,
-    /// The part of it that passed with waiting for the server.
+    /// Time of waiting for the server.
     pub waiting: Duration,
-    /// The part of it that passed with drawing text, encoding and writing.
+    /// Time of drawing text, encoding and writing.
     pub writing: Duration,
 }
 
 impl Footage {
-    /// What is to be said of a video that does not show all frames.
+    /// Returns a sentence about a video that does not show all frames.
     pub fn thinning(&self) -> Option<String> {
         (self.shown_every > 1).then(|| {
             format!(
@@ -83,15 +83,15 @@ impl Footage {
     }
 }
 
-/// Plays `options.episodes` episodes on each set with the policy of `checkpoint`, sampled actions and frozen statistics,
-/// and writes them to `file`: a frame of the start of each episode and one after each step. Calls `report` with the number
-/// of episodes done.
+/// Plays `options.episodes` episodes on each set and writes them to `file`: a frame of each episode's start, and one
+/// after each shown step. The policy of `checkpoint` samples its actions and does not update its statistics. Calls
+/// `report` with the number of finished episodes.
 ///
-/// On each set it is environment 0 of a test with the same seed: what is filmed of one episode is what a test of one episode sees. Of
-/// a policy that was trained in trials all episodes of a trial are filmed, and the policy remembers them.
+/// The film has environment 0 of a test with the same seed, so a film of one episode shows what a test of one episode
+/// plays. For a policy that was trained in trials all episodes of a trial are filmed, and the policy remembers them.
 ///
 /// # Errors
-/// [`VideoError`]; the file is then not there.
+/// [`VideoError`]. No file is left then.
 pub fn film(
     servers: &Servers,
     checkpoint: &Checkpoint,
@@ -101,14 +101,14 @@ pub fn film(
     report: &mut dyn FnMut(u64),
 ) -> Result<Footage, VideoError> {
     let start = Instant::now();
-    let (mut footage, mut place) = (Footage::default(), Place::Empty(file));
+    let (mut footage, mut output) = (Footage::default(), FilmOutput::Empty(file));
     for set in &options.sets {
         let mut film = Film::open(servers, checkpoint, options, set, footage)?;
-        let mut writer = place.begin(&mut film)?;
+        let mut writer = output.begin(&mut film)?;
         film.run(&mut writer, stop, report)?;
-        (footage, place) = (film.footage, Place::Begun(writer));
+        (footage, output) = (film.footage, FilmOutput::Begun(writer));
     }
-    if let Place::Begun(writer) = place {
+    if let FilmOutput::Begun(writer) = output {
         let completing = Instant::now();
         footage.shown_every = writer.finish()?;
         footage.writing += completing.elapsed();
@@ -117,38 +117,38 @@ pub fn film(
     Ok(footage)
 }
 
-/// Where frames go, whose size the first film knows.
-enum Place {
+/// Output of the frames. Their size is known at the first film.
+enum FilmOutput {
     Empty(VideoFile),
     Begun(VideoWriter),
 }
 
-impl Place {
+impl FilmOutput {
     fn begin(self, film: &mut Film<'_>) -> Result<VideoWriter, VideoError> {
         let file = match self {
             Self::Empty(file) => file,
             Self::Begun(writer) => return Ok(writer),
         };
         film.footage.speed = film.frame_seconds() / file.frame_seconds(film.fps);
-        let grid = Grid { sets: film.options.sets.len(), episodes: film.options.episodes as usize };
-        let writer = file.begin(film.panel.size(), film.fps, grid)?;
+        let grid = EpisodeGrid { sets: film.options.sets.len(), episodes: film.options.episodes as usize };
+        let writer = file.begin(film.caption.size(), film.fps, grid)?;
         film.footage.size = writer.size();
         Ok(writer)
     }
 }
 
-/// What follows a state.
-enum Next {
+/// The request after a state.
+enum NextRequest {
     Step,
     Episode,
     Nothing,
 }
 
-/// A policy that acts and is filmed.
+/// Films a policy on one set.
 struct Film<'a> {
     options: &'a VideoOptions,
     set: &'a TestSet,
-    /// Episodes that the sets before have.
+    /// Number of episodes of the previous sets.
     before: usize,
     state: &'a State,
     single: Single<'a>,
@@ -157,11 +157,11 @@ struct Film<'a> {
     ended: Vec<Ended>,
     reply: StepReply,
     begun: BegunEpisode,
-    panel: Panel,
-    shown: Shown,
-    /// Whether a picture of the present state was asked for, and of the next one.
+    caption: Caption,
+    caption_text: CaptionText,
+    /// Whether a picture of the current state was requested, and of the next state.
     pictured: [bool; 2],
-    /// The last picture.
+    /// Last picture.
     last: Option<Picture>,
     frame: Vec<u8>,
     fps: f64,
@@ -169,7 +169,7 @@ struct Film<'a> {
 }
 
 impl<'a> Film<'a> {
-    /// At the start of the first episode, whose picture has been asked for.
+    /// Opens the environment and requests the picture of the first episode's start.
     fn open(
         servers: &'a Servers,
         checkpoint: &'a Checkpoint,
@@ -191,7 +191,7 @@ impl<'a> Film<'a> {
             format!("{}, trained on {}", state.config.method(), state.config.common.trained_on()),
         );
         let rule = Criterion::of(&environment).map_or_else(String::new, |criterion| format!("success: {criterion}"));
-        let panel = Panel::new(options.size, title, rule.replace('_', " "), environment.parameters.len())?;
+        let caption = Caption::new(options.size, title, rule.replace('_', " "), environment.parameters.len())?;
         let mut film = Self {
             options,
             set,
@@ -201,14 +201,14 @@ impl<'a> Film<'a> {
             player,
             ended: Vec::new(),
             reply,
-            shown: Shown::default(),
+            caption_text: CaptionText::default(),
             pictured: [true, true],
             last: None,
             frame: Vec::new(),
             fps: options.fps.unwrap_or(1.0 / (f64::from(options.every) * environment.control_timestep)),
             footage,
             begun,
-            panel,
+            caption,
             environment,
         };
         film.announce();
@@ -226,41 +226,42 @@ impl<'a> Film<'a> {
             if let Some(signal) = stop.signal() {
                 return Err(TestError::Stopped { signal }.into());
             }
-            // The next step is on its way before the picture of this state is there: server and learner work at once.
+            // The next step is requested before the picture of this state arrives, so that server and client work in
+            // parallel.
             let next = self.request_next()?;
             self.expose(writer)?;
             match next {
-                Next::Step => self.step()?,
-                Next::Episode => self.begin()?,
-                Next::Nothing => return Ok(()),
+                NextRequest::Step => self.step()?,
+                NextRequest::Episode => self.begin()?,
+                NextRequest::Nothing => return Ok(()),
             }
             report(self.footage.episodes.len() as u64);
         }
     }
 
-    /// Episodes on this set.
+    /// Returns the number of episodes on this set.
     fn episodes(&self) -> usize {
         self.footage.episodes.len() - self.before
     }
 
-    /// How much simulated time a frame stands for, s.
+    /// Returns the simulated time of a frame, in seconds.
     fn frame_seconds(&self) -> f64 {
         f64::from(self.options.every) * self.environment.control_timestep
     }
 
-    /// Asks for what follows the present state, and for a picture of that if it is to be shown.
-    fn request_next(&mut self) -> Result<Next, VideoError> {
+    /// Requests the next state, and a picture of it if it will be shown.
+    fn request_next(&mut self) -> Result<NextRequest, VideoError> {
         self.pictured[1] = true;
-        let next = if self.shown.ending.is_none() {
+        let next = if self.caption_text.ending.is_none() {
             let action = self.player.act().map_err(TestError::Numbers)?;
             self.single.request_step(action)?;
-            self.pictured[1] = (self.shown.step + 1).is_multiple_of(self.options.every);
-            Next::Step
+            self.pictured[1] = (self.caption_text.step + 1).is_multiple_of(self.options.every);
+            NextRequest::Step
         } else if (self.episodes() as u64) < self.options.episodes {
             self.single.request_reset()?;
-            Next::Episode
+            NextRequest::Episode
         } else {
-            return Ok(Next::Nothing);
+            return Ok(NextRequest::Nothing);
         };
         if self.pictured[1] {
             self.request_picture()?;
@@ -273,25 +274,25 @@ impl<'a> Film<'a> {
         Ok(self.single.request_picture(width, height)?)
     }
 
-    /// Takes the picture of the present state, if one was asked for, and writes its frame.
+    /// Receives the picture of the current state, if one was requested, and writes its frame.
     fn expose(&mut self, writer: &mut VideoWriter) -> Result<(), VideoError> {
         if !self.pictured[0] {
             return Ok(());
         }
         let asked = Instant::now();
         let picture = match (self.single.picture(), &self.last) {
-            // Physics that diverged ends its episode and cannot be drawn: the picture before it stays.
+            // A diverged state ends its episode and cannot be drawn. The last picture is shown again.
             (Err(ClientError::Refused { code, .. }), Some(last))
-                if code == tonic::Code::FailedPrecondition && self.shown.ending.is_some() =>
+                if code == tonic::Code::FailedPrecondition && self.caption_text.ending.is_some() =>
             {
                 last.clone()
             }
             (picture, _) => picture?,
         };
         let came = Instant::now();
-        self.panel.compose(&picture, &self.shown, &mut self.frame)?;
-        let is_end = self.shown.ending.is_some();
-        writer.write(&self.frame, if is_end { HOLD } else { 0.0 })?;
+        self.caption.compose(&picture, &self.caption_text, &mut self.frame)?;
+        let is_end = self.caption_text.ending.is_some();
+        writer.write(&self.frame, if is_end { LAST_FRAME_SECONDS } else { 0.0 })?;
         if is_end {
             writer.end_episode();
         }
@@ -302,23 +303,23 @@ impl<'a> Film<'a> {
         Ok(())
     }
 
-    /// Takes the outcome of a step.
+    /// Receives the result of a step.
     fn step(&mut self) -> Result<(), VideoError> {
         let asked = Instant::now();
         self.single.stepped(&mut self.reply)?;
         self.footage.waiting += asked.elapsed();
         self.pictured[0] = self.pictured[1];
-        let Self { reply, shown, player, ended, .. } = self;
+        let Self { reply, caption_text, player, ended, .. } = self;
         player.observe(&reply.all().outcome(ended), None).map_err(TestError::Numbers)?;
-        shown.step += 1;
-        shown.time = f64::from(shown.step) * self.environment.control_timestep;
-        shown.episode_return += f64::from(reply.rewards[0]);
+        caption_text.step += 1;
+        caption_text.time = f64::from(caption_text.step) * self.environment.control_timestep;
+        caption_text.episode_return += f64::from(reply.rewards[0]);
         let Some(end) = reply.ended.pop() else { return Ok(()) };
-        shown.episode_return = end.episode_return;
+        caption_text.episode_return = end.episode_return;
         let truncated = reply.truncated[0];
-        shown.ending = Some(ShownEnding { success: end.success, terminated: end.terminated, truncated });
+        caption_text.ending = Some(ShownEnding { success: end.success, terminated: end.terminated, truncated });
         if let (Some(rule), Some(achieved)) = (&self.environment.success, end.achieved) {
-            shown.achieved = parameter(&rule.quantity.replace('_', " "), achieved, &rule.unit);
+            caption_text.achieved = parameter(&rule.quantity.replace('_', " "), achieved, &rule.unit);
         }
         let names = self.environment.parameters.iter().map(|parameter| parameter.name.clone());
         self.footage.episodes.push(Filmed {
@@ -329,13 +330,14 @@ impl<'a> Film<'a> {
             success: end.success,
         });
         if !self.pictured[0] {
-            self.request_picture()?; // nothing else has been asked for yet
+            // No other request is under way.
+            self.request_picture()?;
             self.pictured[0] = true;
         }
         Ok(())
     }
 
-    /// Takes the start of the next episode.
+    /// Receives the start of the next episode.
     fn begin(&mut self) -> Result<(), VideoError> {
         let asked = Instant::now();
         self.begun = self.single.begun(&mut self.reply.observations)?;
@@ -346,7 +348,7 @@ impl<'a> Film<'a> {
         Ok(())
     }
 
-    /// Shows the episode that has begun.
+    /// Updates the caption for the new episode.
     fn announce(&mut self) {
         let (number, episodes) = (self.episodes() + 1, self.options.episodes);
         let trial = match self.state.config.settings.episodes_per_trial() {
@@ -354,10 +356,10 @@ impl<'a> Film<'a> {
             _ => format!(", trial {}", self.begun.trial_index + 1),
         };
         let parameters = self.environment.parameters.iter().zip(&self.begun.parameters);
-        self.shown = Shown {
+        self.caption_text = CaptionText {
             episode: format!("episode {number} of {episodes}{trial}"),
             parameters: parameters.map(|(known, value)| parameter(&known.name, *value, &known.unit)).collect(),
-            ..Shown::default()
+            ..CaptionText::default()
         };
     }
 }

@@ -1,4 +1,4 @@
-//! Frames as a GIF.
+//! Encodes frames as a GIF.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -9,35 +9,35 @@ use gif::{DisposalMethod, Encoder, Frame, Repeat};
 use super::encode::Encode;
 use super::palette::{Palette, UNCHANGED};
 
-/// The largest GIF: pages that show one, and mails, rarely take more.
-const MOST_BYTES: usize = 2_000_000;
-/// A shorter delay, in hundredths of a second, is what many programs take for "as slow as they like".
-const SHORTEST: f64 = 2.0;
-/// Of so many frames one is shown: as few as it takes.
+/// Maximum size of a GIF. Web pages and mails often refuse larger ones.
+const MAX_BYTES: usize = 2_000_000;
+/// Minimum delay of a frame, in hundredths of a second. Many programs show shorter delays much slower.
+const MIN_DELAY: f64 = 2.0;
+/// Numbers n of films that show every n-th frame. The film with the most frames that fits is written.
 const STRIDES: [u16; 19] = [1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24, 32, 64, 128, 256, 512, 1024, 4096, 16_384];
-/// Bytes before the frames and after them: the screen, 256 colours, that it is repeated, the end.
-const FRAME_FREE: usize = 13 + 3 * 256 + 19 + 1;
-/// Bytes of a frame beside its data: how long and where it is shown, and the end of its data.
-const FRAME_HEAD: usize = 8 + 10 + 2;
+/// Bytes of a file without frames: screen, 256 colours, repetition and end.
+const FILE_OVERHEAD_BYTES: usize = 13 + 3 * 256 + 19 + 1;
+/// Bytes of a frame other than its data: delay, position and end.
+const FRAME_OVERHEAD_BYTES: usize = 8 + 10 + 2;
 
-/// How long a GIF shows a frame that should be seen for so many `seconds`: in whole hundredths of a second.
+/// Returns the delay of a frame that should be shown for `seconds`, in whole hundredths of a second.
 pub(super) fn delay(seconds: f64) -> u16 {
-    (100.0 * seconds).round().clamp(SHORTEST, f64::from(u16::MAX)) as u16
+    (100.0 * seconds).round().clamp(MIN_DELAY, f64::from(u16::MAX)) as u16
 }
 
-/// Writes a GIF that is repeated for ever, of at most [`MOST_BYTES`].
+/// Writes a GIF of at most [`MAX_BYTES`] that repeats for ever.
 ///
-/// How many frames fit is known at the end, when they are gone. So several films are made at once, with fewer and fewer
-/// frames; one that is too large is forgotten, and the fullest that is left is written. Each takes the memory of a whole
-/// one and of a frame.
+/// The number of frames that fit is known only at the end. So several films are encoded at once, each with fewer
+/// frames. Films that become too large are dropped, and the one with the most frames is written. Each film takes the
+/// memory of a whole GIF and of a frame.
 pub(super) struct GifEncoder {
     file: File,
     size: (u16, u16),
     seconds: f64,
     palette: Option<Palette>,
-    /// The present frame: of each pixel the index in the palette.
+    /// Palette index of each pixel of the current frame.
     indices: Vec<u8>,
-    /// The length of the frames so far, in hundredths of a second.
+    /// Total duration of the frames so far, in hundredths of a second.
     time: u64,
     films: Vec<Thinned>,
 }
@@ -48,7 +48,7 @@ impl GifEncoder {
             u16::try_from(pixels).map_err(|_| io::Error::other(format!("a GIF has no {pixels} pixels in a row")))
         };
         let (size, seconds) = ((fits(width)?, fits(height)?), 1.0 / fps);
-        // So short that the delay of a frame can be written, even if one that is held comes in between.
+        // The delay must fit its field, also when an episode's last frame comes in between.
         let fits =
             |stride: &u16| *stride == 1 || u32::from(*stride) * u32::from(delay(seconds)) <= u32::from(u16::MAX / 2);
         let films = STRIDES.into_iter().filter(fits).map(|stride| Thinned::new(stride, delay(seconds))).collect();
@@ -73,10 +73,10 @@ impl Encode for GifEncoder {
         for film in &mut self.films {
             film.add(&self.indices, width, self.time, delay);
         }
-        self.films.retain(|film| film.bytes <= MOST_BYTES);
+        self.films.retain(|film| film.bytes <= MAX_BYTES);
         self.time += u64::from(delay);
         if self.films.is_empty() {
-            let megabytes = MOST_BYTES / 1_000_000;
+            let megabytes = MAX_BYTES / 1_000_000;
             return Err(io::Error::other(format!(
                 "it does not fit into a GIF of {megabytes} MB: give smaller pictures or fewer episodes, or write an .mp4"
             )));
@@ -98,32 +98,32 @@ impl Encode for GifEncoder {
     }
 }
 
-/// A film of every `stride`-th frame.
+/// A film that shows every `stride`-th frame.
 struct Thinned {
     stride: u16,
-    /// The frame is shown that is seen at each multiple of it, in hundredths of a second, and any that is held.
+    /// Time between shown frames, in hundredths of a second. Last frames of episodes are shown, too.
     interval: u64,
-    /// What a frame takes that is not.
+    /// Duration of a frame that is not held.
     usual: u16,
-    /// Compressed.
+    /// Compressed frames.
     frames: Vec<Frame<'static>>,
-    /// Of the file, so far.
+    /// Size of the file so far.
     bytes: usize,
-    /// What is seen after the last of `frames`.
+    /// Pixels that are visible after the last of `frames`.
     seen: Vec<u8>,
 }
 
 impl Thinned {
     fn new(stride: u16, delay: u16) -> Self {
         let interval = u64::from(stride) * u64::from(delay);
-        Self { stride, interval, usual: delay, frames: Vec::new(), bytes: FRAME_FREE, seen: Vec::new() }
+        Self { stride, interval, usual: delay, frames: Vec::new(), bytes: FILE_OVERHEAD_BYTES, seen: Vec::new() }
     }
 
-    /// Adds a frame that is to be seen from `time` on, or shows the one before it longer.
+    /// Adds a frame that is shown from `time` on, or extends the frame before it.
     fn add(&mut self, indices: &[u8], width: usize, time: u64, delay: u16) {
         if delay > self.usual || time.next_multiple_of(self.interval) < time + u64::from(delay) {
             let frame = changes(&mut self.seen, indices, width);
-            self.bytes += FRAME_HEAD + frame.buffer.len() + frame.buffer.len().div_ceil(255);
+            self.bytes += FRAME_OVERHEAD_BYTES + frame.buffer.len() + frame.buffer.len().div_ceil(255);
             self.frames.push(frame);
         }
         if let Some(last) = self.frames.last_mut() {
@@ -132,9 +132,10 @@ impl Thinned {
     }
 }
 
-/// The rectangle of what changes, compressed, from what is `seen`, nothing at first, to `indices`, which then are.
+/// Returns the compressed rectangle of the pixels that differ between `seen` and `indices`, and updates `seen`. At
+/// first `seen` is empty.
 fn changes(seen: &mut Vec<u8>, indices: &[u8], width: usize) -> Frame<'static> {
-    seen.resize(indices.len(), UNCHANGED); // which no pixel is
+    seen.resize(indices.len(), UNCHANGED); // no pixel has this index
     let (mut left, mut right, mut top, mut bottom) = (width, 0, usize::MAX, 0);
     for (row, (seen, new)) in seen.chunks_exact(width).zip(indices.chunks_exact(width)).enumerate() {
         let differs = |(seen, new)| seen != new;
@@ -144,7 +145,7 @@ fn changes(seen: &mut Vec<u8>, indices: &[u8], width: usize) -> Frame<'static> {
         (top, bottom) = (top.min(row), row + 1);
     }
     if bottom == 0 {
-        (left, right, top, bottom) = (0, 1, 0, 1); // a frame has a pixel
+        (left, right, top, bottom) = (0, 1, 0, 1); // a frame must have a pixel
     }
     let mut buffer = Vec::with_capacity((right - left) * (bottom - top));
     for row in top..bottom {
@@ -164,7 +165,7 @@ fn changes(seen: &mut Vec<u8>, indices: &[u8], width: usize) -> Frame<'static> {
         ..Frame::default()
     };
     frame.make_lzw_pre_encoded();
-    frame.buffer.to_mut().shrink_to_fit(); // there was room for half of the pixels
+    frame.buffer.to_mut().shrink_to_fit(); // the buffer was made for half of the pixels
     frame
 }
 
@@ -176,7 +177,7 @@ mod tests {
         Box::new(GifEncoder::new(&folder.path().join("a.gif"), size, fps).unwrap())
     }
 
-    /// What is seen, and for how long, and how many pixels were written for it.
+    /// Returns the visible pixels, their duration, and the number of written pixels of each frame.
     fn decoded(folder: &tempfile::TempDir) -> Vec<(Vec<u8>, u16, usize)> {
         let mut options = gif::DecodeOptions::new();
         options.set_color_output(gif::ColorOutput::RGBA);
@@ -194,7 +195,7 @@ mod tests {
         frames
     }
 
-    /// Frames of `pixels` grey pixels, which differ all.
+    /// Returns frames of `pixels` grey pixels, all of which differ.
     fn noise(pixels: usize) -> impl FnMut() -> Vec<u8> {
         let mut state = 1_u32;
         move || {
@@ -222,10 +223,10 @@ mod tests {
     }
 
     #[test]
-    fn only_what_changes_is_written_and_what_was_drawn_is_seen() {
+    fn only_changed_pixels_are_written() {
         let folder = tempfile::tempdir().unwrap();
         let mut encoder = encoder(&folder, (40, 30), 10.0);
-        // A square on a ground of several colours stands still for a frame, and moves.
+        // A square on a background of several colours stands still for a frame and then moves.
         let drawn: Vec<Vec<u8>> = [0, 0, 3, 17, 35]
             .map(|place| {
                 let is_square = |x: usize, y: usize| (place..place + 5).contains(&x) && (9..12).contains(&y);
@@ -244,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_film_shows_fewer_frames_fits_and_takes_as_long() {
+    fn a_long_film_shows_fewer_frames_in_the_same_time() {
         let folder = tempfile::tempdir().unwrap();
         let mut encoder = encoder(&folder, (200, 200), 50.0);
         let mut noise = noise(200 * 200);
@@ -252,12 +253,12 @@ mod tests {
         for (index, frame) in drawn.iter().enumerate() {
             encoder.write(frame, if index % 100 == 99 { 2.0 } else { 0.0 }).unwrap();
             let kept: usize = encoder.films.iter().flat_map(|film| &film.frames).map(|frame| frame.buffer.len()).sum();
-            assert!(kept <= STRIDES.len() * MOST_BYTES, "no more is kept than of each film a whole one");
+            assert!(kept <= STRIDES.len() * MAX_BYTES, "no more is kept than of each film a whole one");
         }
         let (counted, stride) = (encoder.films[0].bytes, encoder.films[0].stride);
         assert_eq!(encoder.finish().unwrap(), stride);
         let bytes = std::fs::metadata(folder.path().join("a.gif")).unwrap().len() as usize;
-        assert!(stride > 1 && bytes <= counted && counted <= MOST_BYTES && bytes > MOST_BYTES / 2, "{stride}: {bytes}");
+        assert!(stride > 1 && bytes <= counted && counted <= MAX_BYTES && bytes > MAX_BYTES / 2, "{stride}: {bytes}");
         let frames = decoded(&folder);
         assert_eq!(frames.iter().map(|frame| u32::from(frame.1)).sum::<u32>(), 3 * (99 * 2 + 200));
         for end in [99, 199, 299] {
@@ -269,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_that_is_held_is_shown_however_few_others_are() {
+    fn last_frames_of_episodes_are_always_shown() {
         let mut film = Thinned::new(256, 2);
         for frame in 0..200_u64 {
             let held = frame == 150;

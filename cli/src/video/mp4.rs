@@ -1,4 +1,4 @@
-//! Frames as an MP4, by the program ffmpeg.
+//! Encodes frames as an MP4 with the program ffmpeg.
 
 use std::fs::File;
 use std::io::{self, Read, Seek, Write};
@@ -10,10 +10,10 @@ use super::VideoError;
 use super::encode::Encode;
 
 const PROGRAM: &str = "ffmpeg";
-/// Constant quality: lower is better and larger; text stays clean at this one.
+/// Constant rate factor. Lower values are better and larger; text stays readable at this value.
 const QUALITY: &str = "20";
 
-/// Makes sure that ffmpeg is there and has an encoder for H.264.
+/// Checks that ffmpeg is installed and has an encoder for H.264.
 ///
 /// # Errors
 /// [`VideoError::NoFfmpeg`].
@@ -29,10 +29,10 @@ pub(super) fn find_ffmpeg() -> Result<(), VideoError> {
     Err(VideoError::NoFfmpeg { reason: format!("this `{PROGRAM}` has none") })
 }
 
-/// Hands frames to an ffmpeg, which ends with this value.
+/// Sends frames to an ffmpeg process, which is ended when this value is dropped.
 pub(super) struct Mp4Encoder {
     child: Child,
-    /// What ffmpeg says: in a file, since nobody reads a pipe while frames are written.
+    /// Standard error of ffmpeg. It is a file, since nobody would read a pipe while frames are written.
     words: File,
     size: (u32, u32),
     fps: f64,
@@ -46,23 +46,23 @@ impl Mp4Encoder {
             .args(["-hide_banner", "-loglevel", "error", "-y"])
             .args(["-f", "rawvideo", "-pixel_format", "rgb24", "-video_size", &size_text, "-framerate", &fps_text])
             .args(["-i", "pipe:0"])
-            // What every player can show; RGB is turned into the colours of HD video, and says so.
+            // All players support this format. RGB is converted to the colours of HD video, which the file states.
             .args(["-c:v", "libx264", "-crf", QUALITY, "-pix_fmt", "yuv420p", "-vf", "scale=out_color_matrix=bt709"])
             .args(["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"])
-            // The index comes first, so that a browser shows it before it has all.
+            // The index comes first, so that browsers can start before they have the whole file.
             .args(["-movflags", "+faststart", "-f", "mp4"])
             .arg(path)
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
             .stderr(words.try_clone()?)
-            // Ctrl-C is for this process, which then ends ffmpeg.
+            // Ctrl-C is handled by this process, which then ends ffmpeg.
             .process_group(0)
             .spawn()
             .map_err(|error| io::Error::other(format!("`{PROGRAM}` cannot be started: {error}")))?;
         Ok(Self { child, words, size, fps })
     }
 
-    /// Why ffmpeg ended.
+    /// Returns the reason why ffmpeg ended.
     fn failure(&mut self) -> io::Error {
         drop(self.child.stdin.take());
         let status = self.child.wait().map_or_else(|error| error.to_string(), |status| status.to_string());
@@ -81,7 +81,7 @@ impl Encode for Mp4Encoder {
     }
 
     fn write(&mut self, frame: &[u8], seconds: f64) -> io::Result<()> {
-        // Frames of H.264 all take the same time; equal ones take no room.
+        // All frames of H.264 have the same duration. Repeated frames take almost no space.
         for _ in 0..((seconds * self.fps).round() as u64).max(1) {
             let written = self.child.stdin.as_mut().map_or(Ok(()), |pipe| pipe.write_all(frame));
             if written.is_err() {
@@ -102,7 +102,7 @@ impl Encode for Mp4Encoder {
 
 impl Drop for Mp4Encoder {
     fn drop(&mut self) {
-        // Both fail only if it has ended.
+        // Both calls fail only if ffmpeg has ended already.
         self.child.kill().ok();
         self.child.wait().ok();
     }

@@ -1,30 +1,30 @@
-//! The colours of a GIF: one palette for all its frames, so that what stays as it is keeps its colour.
+//! The palette of a GIF. All frames share it, so that unchanged pixels keep their colour.
 
 use std::cmp::Reverse;
 use std::collections::HashMap;
 
-/// What stands for "as it was": of all indices the first, so that few colours take few bits.
+/// Index of unchanged pixels. It is the first one, so that few colours take few bits.
 pub(super) const UNCHANGED: u8 = 0;
-/// A GIF's, of which one is no colour.
-const MOST: usize = 255;
-/// So many colours are learned from the first frame; the other places are for what comes later.
-const LEARNED: usize = 128;
-/// A later colour takes one of them if it is at least so far from all, of 255 steps of red, green or blue: farther and
-/// farther when there are few left.
-const NEW: u32 = 16;
+/// Maximum number of colours. A GIF has 256 indices, of which one is [`UNCHANGED`].
+const MAX_COLOURS: usize = 255;
+/// Number of colours that are learned from the first frame. The others are for later frames.
+const FIRST_FRAME_COLOURS: usize = 128;
+/// Minimum distance of a new colour from all others, in steps of 0 to 255 of red, green or blue. It grows when few
+/// colours are left.
+const MIN_NEW_DISTANCE: u32 = 16;
 
 type Colour = [u8; 3];
 
-/// Up to 255 colours, and which of them is nearest to each of all.
+/// Up to 255 colours, with the nearest of them for every colour.
 pub(super) struct Palette {
     colours: Vec<Colour>,
-    /// Index of each colour that was met, by its 24 bits, else 0. The zeros take no memory before they are written.
+    /// Index of each colour that was used, by its 24 bits; 0 for the others. Untouched zeros take no memory.
     met: Vec<u8>,
 }
 
 impl Palette {
-    /// Of a frame `[height, width, 3]`: all its colours if there are few, else some that are near all of them, and
-    /// nearer to those of many pixels, such as a sky.
+    /// Makes the palette of a frame `[height, width, 3]`: all its colours if there are few, else colours near to all of
+    /// them. They are nearer to colours of many pixels, such as the sky.
     pub(super) fn learn(frame: &[u8]) -> Self {
         let mut counts = HashMap::new();
         for colour in frame.as_chunks().0 {
@@ -36,7 +36,7 @@ impl Palette {
         Self { colours, met: vec![UNCHANGED; 1 << 24] }
     }
 
-    /// Red, green and blue of each index.
+    /// Returns red, green and blue of each index.
     pub(super) fn bytes(&self) -> Vec<u8> {
         let unchanged = [0; 3];
         std::iter::once(&unchanged).chain(&self.colours).flatten().copied().collect()
@@ -56,12 +56,12 @@ impl Palette {
     }
 
     fn index(&mut self, colour: Colour) -> u8 {
-        let later = self.colours.len().saturating_sub(LEARNED) as u32;
-        let new = NEW.max(later / 2).pow(2);
+        let later = self.colours.len().saturating_sub(FIRST_FRAME_COLOURS) as u32;
+        let new = MIN_NEW_DISTANCE.max(later / 2).pow(2);
         let distances = self.colours.iter().map(|&known| distance(known, colour));
         let nearest = distances.enumerate().min_by_key(|&(_, distance)| distance);
         let place = match nearest {
-            Some((place, distance)) if distance < new || self.colours.len() == MOST => place,
+            Some((place, distance)) if distance < new || self.colours.len() == MAX_COLOURS => place,
             _ => {
                 self.colours.push(colour);
                 self.colours.len() - 1
@@ -71,13 +71,14 @@ impl Palette {
     }
 }
 
-/// Colours that are at least so far `apart`, those of 16 pixels half as far; `None` if they are too many.
+/// Selects colours that are at least `apart`; colours of 16 pixels and more only half as far. Returns `None` if there
+/// are too many.
 fn spread(all: &[(Colour, u32)], apart: u64) -> Option<Vec<Colour>> {
     let mut colours: Vec<Colour> = Vec::new();
     for &(colour, count) in all {
         let is_far = |&other: &Colour| u64::from(distance(colour, other)).pow(2) * u64::from(count) >= apart.pow(4);
         if colours.iter().all(is_far) {
-            if colours.len() == LEARNED {
+            if colours.len() == FIRST_FRAME_COLOURS {
                 return None;
             }
             colours.push(colour);
@@ -86,7 +87,7 @@ fn spread(all: &[(Colour, u32)], apart: u64) -> Option<Vec<Colour>> {
     Some(colours)
 }
 
-/// The square of the distance.
+/// Returns the squared distance.
 fn distance(a: Colour, b: Colour) -> u32 {
     a.iter().zip(b).map(|(&a, b)| u32::from(a.abs_diff(b)).pow(2)).sum()
 }
@@ -95,7 +96,7 @@ fn distance(a: Colour, b: Colour) -> u32 {
 mod tests {
     use super::*;
 
-    /// What is shown of a frame.
+    /// Returns the shown colours of a frame.
     fn shown(palette: &mut Palette, frame: &[u8]) -> Vec<u8> {
         let mut indices = Vec::new();
         palette.indices(frame, &mut indices);
@@ -105,7 +106,7 @@ mod tests {
 
     #[test]
     fn few_colours_are_all_kept() {
-        let frame: Vec<u8> = (0..LEARNED as u8).flat_map(|level| [level, 255 - level, 7]).collect();
+        let frame: Vec<u8> = (0..FIRST_FRAME_COLOURS as u8).flat_map(|level| [level, 255 - level, 7]).collect();
         let mut palette = Palette::learn(&frame);
         assert_eq!(shown(&mut palette, &frame), frame);
         let later = [[0, 158, 115], [213, 94, 0], [255, 255, 255]].concat();
@@ -114,13 +115,13 @@ mod tests {
     }
 
     #[test]
-    fn of_many_colours_none_is_far_from_what_is_shown() {
+    fn every_colour_is_near_a_colour_of_the_palette() {
         let frame: Vec<u8> = (0..64 * 64).flat_map(|n| [n % 64 * 4, n / 64 * 4, 90].map(|value| value as u8)).collect();
         let mut palette = Palette::learn(&frame);
         let seen = shown(&mut palette, &frame);
         let far = |a: &[u8], b: &[u8]| distance([a[0], a[1], a[2]], [b[0], b[1], b[2]]);
         let worst = frame.chunks(3).zip(seen.chunks(3)).map(|(a, b)| far(a, b)).max().unwrap();
-        assert!(worst <= 32 * 32, "{worst}"); // 128 places on a square of 255 are 23 apart
+        assert!(worst <= 32 * 32, "{worst}"); // 128 colours on a square of 255 are 23 apart
         for later in (0..=u8::MAX).flat_map(|red| (0..=u8::MAX).step_by(5).map(move |green| [red, green, red ^ green]))
         {
             shown(&mut palette, &later);

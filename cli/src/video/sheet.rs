@@ -1,4 +1,4 @@
-//! Episodes as a contact sheet: one picture, with a few moments of each.
+//! Encodes episodes as a contact sheet: one picture with a few moments of each episode.
 
 use std::fs::File;
 use std::io::{self, BufWriter};
@@ -6,66 +6,70 @@ use std::path::{Path, PathBuf};
 
 use super::encode::Encode;
 
-/// Pictures in a row, which the sets of parameters share, …
-const ROW: usize = 6;
-/// … but each has its start and its end.
-const LEAST: usize = 2;
-/// Of an episode so many frames are kept, and half of them forgotten when there are more.
-const KEPT: usize = 64;
-/// Between moments and between sets, in pixels; white.
-const SEAM: usize = 2;
-const GAP: usize = 8;
-/// The largest sheet: 256 MiB while it is made.
-const MOST_BYTES: usize = 1 << 28;
+/// Number of pictures in a row, which all sets of parameters share.
+const PICTURES_PER_ROW: usize = 6;
+/// Minimum number of pictures of an episode: its start and its end.
+const MIN_PICTURES: usize = 2;
+/// Maximum number of frames of an episode in memory. When it is exceeded, every second one is dropped.
+const MAX_FRAMES: usize = 64;
+/// Distance between the pictures of an episode, in pixels.
+const PICTURE_GAP: usize = 2;
+/// Distance between sets, in pixels.
+const SET_GAP: usize = 8;
+/// Maximum size of a sheet in memory: 256 MiB.
+const MAX_BYTES: usize = 1 << 28;
 
-/// How many episodes a film has.
+/// Numbers of sets and episodes of a film.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Grid {
-    /// Sets of parameters: they stand side by side in a sheet.
+pub struct EpisodeGrid {
+    /// Number of sets of parameters. A sheet has them side by side.
     pub sets: usize,
-    /// Of each set: they stand below each other.
+    /// Number of episodes of each set. A sheet has them below each other.
     pub episodes: usize,
 }
 
-impl Grid {
-    /// Pictures of an episode.
-    fn moments(self) -> usize {
-        (ROW / self.sets.max(1)).max(LEAST)
+impl EpisodeGrid {
+    /// Returns the number of pictures of an episode.
+    fn pictures(self) -> usize {
+        (PICTURES_PER_ROW / self.sets.max(1)).max(MIN_PICTURES)
     }
 
-    /// What they take in a row, in pixels, if each is so wide.
-    fn across(self, width: usize) -> usize {
-        self.moments() * (width + SEAM) - SEAM
+    /// Returns the width of an episode's pictures together, in pixels. `width` is that of a picture.
+    fn episode_width(self, width: usize) -> usize {
+        self.pictures() * (width + PICTURE_GAP) - PICTURE_GAP
     }
 }
 
-/// Writes a PNG with a row for each episode, evenly spaced moments of it from the first to the last.
+/// Writes a PNG with evenly spaced frames of each episode, from the first to the last.
 pub(super) struct SheetEncoder {
     path: PathBuf,
-    grid: Grid,
-    /// Of a frame and of the sheet, width and height in pixels.
+    grid: EpisodeGrid,
+    /// Width and height of a frame, in pixels.
     frame: (usize, usize),
+    /// Width and height of the sheet, in pixels.
     sheet: (usize, usize),
     pixels: Vec<u8>,
-    /// Episodes that are on the sheet.
+    /// Number of episodes on the sheet.
     done: usize,
-    /// Of the present one: every `stride`-th of its `count` frames, and the last.
+    /// Every `stride`-th frame of the current episode.
     kept: Vec<Vec<u8>>,
     stride: usize,
+    /// Number of frames of the current episode so far.
     count: usize,
+    /// Last frame of the current episode.
     last: Vec<u8>,
 }
 
 impl SheetEncoder {
-    pub(super) fn new(path: &Path, (width, height): (u32, u32), grid: Grid) -> io::Result<Self> {
+    pub(super) fn new(path: &Path, (width, height): (u32, u32), grid: EpisodeGrid) -> io::Result<Self> {
         let frame = (width as usize, height as usize);
-        let across = (grid.across(frame.0) + GAP).saturating_mul(grid.sets).saturating_sub(GAP);
-        let sheet = (across, frame.1.saturating_mul(grid.episodes));
+        let width = (grid.episode_width(frame.0) + SET_GAP).saturating_mul(grid.sets).saturating_sub(SET_GAP);
+        let sheet = (width, frame.1.saturating_mul(grid.episodes));
         let bytes = sheet.0.saturating_mul(sheet.1).saturating_mul(3);
-        if bytes > MOST_BYTES {
-            let (most, megabytes) = (MOST_BYTES >> 20, bytes >> 20);
+        if bytes > MAX_BYTES {
+            let (max, megabytes) = (MAX_BYTES >> 20, bytes >> 20);
             return Err(io::Error::other(format!(
-                "a sheet of {} × {} pixels takes {megabytes} MiB, expected at most {most}: give fewer episodes or smaller pictures",
+                "a sheet of {} × {} pixels takes {megabytes} MiB, expected at most {max}: give fewer episodes or smaller pictures",
                 sheet.0, sheet.1
             )));
         }
@@ -74,11 +78,11 @@ impl SheetEncoder {
         Ok(Self { path: path.to_owned(), grid, frame, sheet, pixels, done: 0, kept, stride: 1, count: 0, last })
     }
 
-    /// Puts a frame of the present episode where its `moment` has its place.
-    fn place(&mut self, frame: &[u8], moment: usize) {
+    /// Copies a frame of the current episode to the position `index` of its row.
+    fn copy_to_sheet(&mut self, frame: &[u8], index: usize) {
         let (width, height) = self.frame;
         let (set, episode) = (self.done / self.grid.episodes, self.done % self.grid.episodes);
-        let x = set * (self.grid.across(width) + GAP) + moment * (width + SEAM);
+        let x = set * (self.grid.episode_width(width) + SET_GAP) + index * (width + PICTURE_GAP);
         for (row, from) in frame.chunks_exact(3 * width).enumerate() {
             let start = 3 * ((episode * height + row) * self.sheet.0 + x);
             self.pixels[start..start + from.len()].copy_from_slice(from);
@@ -98,7 +102,7 @@ impl Encode for SheetEncoder {
             return Err(io::Error::other(format!("a frame has {has}, expected {expected} in one of {:?}", self.grid)));
         }
         if self.count.is_multiple_of(self.stride) {
-            if self.kept.len() == KEPT {
+            if self.kept.len() == MAX_FRAMES {
                 let mut index = 0;
                 self.kept.retain(|_| {
                     index += 1;
@@ -115,13 +119,13 @@ impl Encode for SheetEncoder {
     }
 
     fn end_episode(&mut self) {
-        let moments = self.grid.moments().min(self.count);
+        let pictures = self.grid.pictures().min(self.count);
         let (kept, last) = (std::mem::take(&mut self.kept), std::mem::take(&mut self.last));
-        for moment in 0..moments {
-            let index = moment * (self.count - 1) / (moments - 1).max(1);
-            let near = (index + self.stride / 2) / self.stride;
-            let is_last = moment + 1 == moments;
-            self.place(if is_last { &last } else { kept.get(near).unwrap_or(&last) }, moment);
+        for picture in 0..pictures {
+            let frame = picture * (self.count - 1) / (pictures - 1).max(1);
+            let nearest = (frame + self.stride / 2) / self.stride;
+            let is_last = picture + 1 == pictures;
+            self.copy_to_sheet(if is_last { &last } else { kept.get(nearest).unwrap_or(&last) }, picture);
         }
         self.done += 1;
         (self.stride, self.count) = (1, 0);
@@ -143,8 +147,8 @@ impl Encode for SheetEncoder {
 mod tests {
     use super::*;
 
-    /// The frames' first bytes on a sheet of frames of 2 × 1 pixels: of each row, of each picture.
-    fn sheet(grid: Grid, lengths: &[usize]) -> Vec<Vec<u8>> {
+    /// Returns the first byte of each picture in each row, on a sheet of frames of 2 × 1 pixels.
+    fn sheet(grid: EpisodeGrid, lengths: &[usize]) -> Vec<Vec<u8>> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.png");
         let mut encoder = SheetEncoder::new(&path, (2, 1), grid).unwrap();
@@ -160,41 +164,45 @@ mod tests {
         let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
         reader.next_frame(&mut pixels).unwrap();
         assert_eq!(size, (reader.info().width, reader.info().height));
-        // A seam is as wide as a frame.
+        // The gap between pictures is as wide as a frame here.
         let row = |row: &[u8]| row.chunks(6).map(|frame| frame[0]).collect();
         pixels.chunks(3 * size.0 as usize).map(row).collect()
     }
 
     #[test]
-    fn moments_are_evenly_spaced_from_the_first_to_the_last() {
+    fn pictures_are_evenly_spaced_over_the_episode() {
         let one = |length| -> Vec<u8> {
-            let row = sheet(Grid { sets: 1, episodes: 1 }, &[length]).concat();
-            assert!(row.iter().skip(1).step_by(2).all(|&seam| seam == 255), "{row:?}");
+            let row = sheet(EpisodeGrid { sets: 1, episodes: 1 }, &[length]).concat();
+            assert!(row.iter().skip(1).step_by(2).all(|&gap| gap == 255), "{row:?}");
             row.into_iter().step_by(2).collect()
         };
-        assert_eq!(one(100), [0, 20, 40, 60, 80, 99], "to a few frames: 19, 39, 59 and 79 are between those kept");
+        assert_eq!(
+            one(100),
+            [0, 20, 40, 60, 80, 99],
+            "within a few frames: 19, 39, 59 and 79 lie between the frames in memory"
+        );
         assert_eq!(one(6), [0, 16, 33, 50, 66, 83]);
-        assert_eq!(one(3), [0, 33, 66, 255, 255, 255], "no more than there are");
+        assert_eq!(one(3), [0, 33, 66, 255, 255, 255], "an episode of three frames");
         assert_eq!(one(1), [0, 255, 255, 255, 255, 255]);
         let long = one(10_000);
         assert!(long.iter().zip([0, 20, 40, 60, 80, 99]).all(|(a, b)| a.abs_diff(b) <= 2), "{long:?}");
     }
 
     #[test]
-    fn sets_stand_side_by_side_and_episodes_below_each_other() {
-        let rows = sheet(Grid { sets: 2, episodes: 2 }, &[3, 4, 5, 6]);
+    fn sets_are_side_by_side_and_episodes_below() {
+        let rows = sheet(EpisodeGrid { sets: 2, episodes: 2 }, &[3, 4, 5, 6]);
         let gap = [255; 4];
         assert_eq!(rows[0], [&[0, 255, 33, 255, 66][..], &gap, &[0, 255, 40, 255, 80]].concat());
         assert_eq!(rows[1], [&[0, 255, 25, 255, 75][..], &gap, &[0, 255, 33, 255, 83]].concat());
     }
 
     #[test]
-    fn what_does_not_fit_is_refused() {
+    fn oversized_sheets_and_wrong_frames_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.png");
-        let error = SheetEncoder::new(&path, (2048, 2100), Grid { sets: 3, episodes: 1000 }).err().unwrap();
+        let error = SheetEncoder::new(&path, (2048, 2100), EpisodeGrid { sets: 3, episodes: 1000 }).err().unwrap();
         assert!(error.to_string().contains("expected at most 256: give fewer episodes"), "{error}");
-        let mut encoder = SheetEncoder::new(&path, (2, 1), Grid { sets: 1, episodes: 1 }).unwrap();
+        let mut encoder = SheetEncoder::new(&path, (2, 1), EpisodeGrid { sets: 1, episodes: 1 }).unwrap();
         assert!(encoder.write(&[0; 5], 0.0).unwrap_err().to_string().contains("5 bytes"));
         encoder.write(&[0; 6], 0.0).unwrap();
         encoder.end_episode();

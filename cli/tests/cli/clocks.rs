@@ -11,11 +11,11 @@ use crate::common::{ended, perturb, stderr};
 use crate::guarded::weights;
 use crate::patience::PPO_CART_POLE;
 
-/// Set to 1, libfaketime must be there.
+/// Environment variable. With the value 1 the test fails if libfaketime is missing.
 const REQUIRED: &str = "PERTURB_FAKETIME_REQUIRED";
-/// Debian's package.
+/// Library of Debian's package.
 const LIBRARY: &str = "faketime/libfaketime.so.1";
-/// By how much the time of day is off, one after the other.
+/// Offsets of the time of day, one after the other.
 const JUMPS: [&str; 5] = ["+0", "-2h", "+400d", "-30d", "+3s"];
 
 fn library() -> Option<PathBuf> {
@@ -29,7 +29,7 @@ fn train(out: &Path, clock: Option<(&Path, &Path)>) -> Child {
     let mut command = perturb(&["train", "--threads", "1", "--workers", "1", "--config"]);
     command.arg(settings).arg("--out").arg(out);
     if let Some((library, clock)) = clock {
-        // The time of day alone jumps; what counts seconds goes on, as it does on a machine whose clock is set.
+        // Only the time of day jumps. The monotonic clock continues, as on a machine whose clock is set.
         command.env("LD_PRELOAD", library).env("FAKETIME_TIMESTAMP_FILE", clock);
         command.env("FAKETIME_NO_CACHE", "1").env("FAKETIME_DONT_FAKE_MONOTONIC", "1").env("DONT_FAKE_MONOTONIC", "1");
     }
@@ -37,7 +37,7 @@ fn train(out: &Path, clock: Option<(&Path, &Path)>) -> Child {
 }
 
 #[test]
-fn a_clock_that_jumps_changes_no_weight_and_holds_nobody_up() {
+fn clock_jumps_change_no_weights_and_cause_no_waits() {
     let Some(library) = library() else {
         assert!(std::env::var_os(REQUIRED).is_none(), "{REQUIRED} is set, and no {LIBRARY} is there");
         return eprintln!("skipped: no {LIBRARY}; Debian has it in libfaketime");

@@ -1,4 +1,4 @@
-//! What several tests need to run the programs.
+//! Helpers of several tests that run the programs.
 
 use std::os::unix::net::UnixStream;
 use std::path::Path;
@@ -12,7 +12,7 @@ use perturb_learner::training::{Outcome, RunDirectory, train};
 use perturb_settings::TrainConfig;
 use tempfile::TempDir;
 
-/// How long anything may take that must not hang: much longer than it does, as the machine may be busy.
+/// Upper bound of every wait. It is long because the machine may be busy.
 pub const LIMIT: Duration = Duration::from_secs(300);
 
 pub fn server(workers: usize) -> PrivateServer {
@@ -43,8 +43,8 @@ pub fn perturb(arguments: &[&str]) -> Command {
     command
 }
 
-/// How `perturb` refuses these arguments, for a snapshot: the status and the words, with names for the texts that differ
-/// from run to run.
+/// Returns the status and the messages of a refused command, for a snapshot. `names` replaces texts that differ from
+/// run to run.
 #[track_caller]
 pub fn refusal(arguments: &[&str], names: &[(&str, &str)]) -> String {
     let output = perturb(arguments).output().expect("perturb runs");
@@ -58,7 +58,7 @@ pub fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// Waits until somebody listens at `socket`, which is there a moment before.
+/// Waits until a server listens at `socket`. The socket's file exists a moment earlier.
 pub fn wait_for_server(socket: &Path) {
     wait_for("a server", || UnixStream::connect(socket).is_ok());
 }
@@ -68,7 +68,7 @@ pub fn wait_for(what: &str, condition: impl FnMut() -> bool) {
     wait_within(LIMIT, what, condition);
 }
 
-/// Waits until `condition` holds, for so long at most.
+/// Waits until `condition` holds, at most for `limit`.
 pub fn wait_within(limit: Duration, what: &str, mut condition: impl FnMut() -> bool) {
     let start = Instant::now();
     while !condition() {
@@ -77,7 +77,7 @@ pub fn wait_within(limit: Duration, what: &str, mut condition: impl FnMut() -> b
     }
 }
 
-/// How `child` ends, which is to end by itself; where it does not, it is killed, so that a test fails rather than hangs.
+/// Waits for the end of `child`. Kills it after the limit, so that a test fails instead of hanging.
 #[track_caller]
 pub fn ended(child: Child) -> Output {
     let id = child.id();
@@ -95,7 +95,7 @@ pub fn ended(child: Child) -> Output {
     output
 }
 
-/// The process that `parent` started and that is called perturb-server.
+/// Returns the process called perturb-server that `parent` started.
 pub fn child_server(parent: u32) -> Option<u32> {
     let children = std::fs::read_to_string(format!("/proc/{parent}/task/{parent}/children")).ok()?;
     let is_server = |id: &u32| {
@@ -104,7 +104,7 @@ pub fn child_server(parent: u32) -> Option<u32> {
     children.split_whitespace().filter_map(|id| id.parse().ok()).find(is_server)
 }
 
-/// Whether a process runs; one that has ended and waits for its parent does not.
+/// Tells whether a process runs. Zombies do not run.
 pub fn is_running(id: u32) -> bool {
     std::fs::read_to_string(format!("/proc/{id}/stat")).is_ok_and(|stat| !stat.contains(") Z "))
 }

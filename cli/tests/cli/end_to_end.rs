@@ -21,11 +21,11 @@ use crate::common::{
 use rstest::rstest;
 use tch::Tensor;
 
-/// How long a training may go on without its server.
+/// Longest time that a training may continue without its server.
 const SOON: Duration = Duration::from_secs(20);
 
 #[test]
-fn a_policy_is_trained_written_and_tested_with_both_algorithms() {
+fn both_algorithms_train_save_and_test() {
     let server = [server(1)];
     let servers = Servers::connect(&addresses(&server)).expect("a connection");
     for algorithm in ["ppo", "a2c"] {
@@ -75,7 +75,7 @@ fn continuous_actions_are_learned_from() {
 }
 
 #[test]
-fn equal_seeds_give_equal_weights_with_any_number_of_servers_and_workers() {
+fn equal_seeds_give_equal_weights_on_any_servers() {
     let text = "environment = 'CartPole'\nversion = 'E'\nepisodes = 40\nnum_envs = 5\nn_steps = 32";
     let train_on = |servers: &[PrivateServer], text: &str| {
         let servers = Servers::connect(&addresses(servers)).expect("connections");
@@ -91,7 +91,7 @@ fn equal_seeds_give_equal_weights_with_any_number_of_servers_and_workers() {
 }
 
 #[test]
-fn recurrent_policies_are_trained_and_tested_alike_on_one_server_and_on_two() {
+fn recurrent_policies_are_equal_on_one_and_two_servers() {
     let both = [server(1), server(2)];
     let one = Servers::connect(&addresses(&both[..1])).expect("a connection");
     let two = Servers::connect(&addresses(&both)).expect("connections");
@@ -163,7 +163,7 @@ fn rollouts_keep_what_a_recurrent_policy_remembers() {
     assert_eq!(last_values, &second.values()[..N_ENVS], "looking ahead moves nothing on");
 }
 
-/// In each rollout from its own memory, and at the end of the episode.
+/// Each rollout begins with its own memory, and an episode's end resets it.
 #[test]
 fn libtorch_sees_the_values_that_a_recurrent_policy_saw() {
     let server = [server(1)];
@@ -200,7 +200,7 @@ fn libtorch_sees_the_values_that_a_recurrent_policy_saw() {
 }
 
 /// An LSTM of one cell that counts the steps: to the left in the first five, then to the right until the pole falls.
-/// Whoever remembers the episode before goes right at once, which ends sooner.
+/// A policy that remembers the previous episode goes right at once, which ends sooner.
 #[test]
 fn every_test_episode_begins_without_memories() {
     let server = [server(1)];
@@ -230,7 +230,7 @@ fn every_test_episode_begins_without_memories() {
 }
 
 #[test]
-fn a_test_gives_the_same_figures_on_any_number_of_servers_and_others_with_another_seed() {
+fn test_results_depend_on_the_seed_but_not_on_servers() {
     let both = [server(1), server(1)];
     let one = Servers::connect(&addresses(&both[..1])).expect("a connection");
     let two = Servers::connect(&addresses(&both)).expect("connections");
@@ -243,7 +243,7 @@ fn a_test_gives_the_same_figures_on_any_number_of_servers_and_others_with_anothe
 }
 
 #[test]
-fn a_refused_request_is_told_in_the_servers_words_and_the_session_lives_on() {
+fn a_refused_request_keeps_the_session_open() {
     let server = [server(1)];
     let servers = Servers::connect(&addresses(&server)).expect("a connection");
     let options = OpenOptions {
@@ -271,7 +271,7 @@ fn a_refused_request_is_told_in_the_servers_words_and_the_session_lives_on() {
 }
 
 #[test]
-fn a_server_that_is_killed_ends_the_training_soon_and_leaves_a_checkpoint() {
+fn a_killed_server_ends_the_training_with_a_checkpoint() {
     let out = tempfile::tempdir().expect("a directory");
     let path = out.path().to_str().expect("a path");
     let arguments = ["train", "--env", "CartPole", "--episodes", "1000000", "--out", path, "--server-wait", "0"];
@@ -288,14 +288,14 @@ fn a_server_that_is_killed_ends_the_training_soon_and_leaves_a_checkpoint() {
     let message = stderr(&output);
     assert!(message.contains("lost the server at unix:") && message.contains("signal: 9"), "{message}");
     let episodes = Checkpoint::load(out.path()).expect("a whole checkpoint").state.counters.episodes;
-    let kept = format!("the checkpoint after {episodes} episodes is kept in {path}; go on from there: perturb train");
+    let kept = format!("the checkpoint after {episodes} episodes is kept in {path}; resume it with: perturb train");
     assert!(message.contains(&kept), "{message}");
 }
 
 #[rstest]
 #[case::interrupt("-INT", 130)]
 #[case::terminate("-TERM", 143)]
-fn a_signal_ends_a_training_after_the_iteration_with_its_checkpoint(#[case] signal: &str, #[case] status: i32) {
+fn a_signal_ends_a_training_after_its_iteration(#[case] signal: &str, #[case] status: i32) {
     let out = tempfile::tempdir().expect("a directory");
     let path = out.path().to_str().expect("a path");
     let arguments = ["train", "--env", "CartPole", "--episodes", "1000000", "--out", path];
@@ -353,7 +353,7 @@ fn the_program_prints_the_catalogue() {
 }
 
 #[test]
-fn a_private_server_takes_as_many_environments_as_the_training_has() {
+fn a_private_server_accepts_all_environments() {
     let out = tempfile::tempdir().expect("a directory");
     let path = out.path().to_str().expect("a path");
     let settings = ["--set", "num_envs=20000", "--set", "n_steps=10", "--set", "n_epochs=1"];
@@ -363,7 +363,7 @@ fn a_private_server_takes_as_many_environments_as_the_training_has() {
 }
 
 #[test]
-fn a_reader_that_has_read_enough_ends_the_program_quietly() {
+fn a_closed_pipe_ends_the_program_quietly() {
     let out = tempfile::tempdir().expect("a directory");
     let run = out.path().join("run");
     let run = run.to_str().expect("a path");

@@ -1,34 +1,34 @@
-//! Training on servers that ask who comes, and over lines that change what passes.
+//! Training on servers with TLS and tokens, and over connections that change bytes.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
 use perturb_faults::certificates::Authority;
-use perturb_faults::{Course, Fault, Kind, Line};
+use perturb_faults::{Fault, FaultKind, FaultPlan, FaultyProxy};
 use rstest::rstest;
 use tempfile::TempDir;
 
 use crate::common::{ended, perturb, stderr};
 
-/// A server that asks for a certificate and a token, whose role may draw from D and R.
+/// A server that requires a client certificate and a token. The token's role may draw from D and R.
 pub struct Guarded {
     server: Child,
     directory: TempDir,
     pub address: String,
 }
 
-/// What a client has.
+/// Credentials of a client.
 #[derive(Clone, Copy)]
 pub struct Has {
-    /// The authority that it trusts.
+    /// Trusted certificate authority.
     ca: &'static str,
-    /// Its own certificate.
+    /// Client certificate.
     cert: Option<&'static str>,
     token: Option<&'static str>,
 }
 
-/// What lets it in.
+/// Returns valid credentials.
 pub const ALL: Has = Has { ca: "ca.pem", cert: Some("client"), token: Some("token") };
 
 const TOKENS: &str = "
@@ -47,7 +47,7 @@ impl Guarded {
         Self::until(2040)
     }
 
-    /// One whose certificate is good until that year.
+    /// Starts a server whose certificate is valid until this year.
     fn until(year: i32) -> Self {
         let directory = tempfile::tempdir().expect("a directory");
         let folder = directory.path();
@@ -81,7 +81,7 @@ impl Guarded {
         self.directory.path().join(name)
     }
 
-    /// Lets `command` have that.
+    /// Adds the credentials to the environment of `command`.
     pub fn equip(&self, command: &mut Command, has: Has) {
         command.env("PERTURB_CA", self.file(has.ca));
         if let Some(cert) = has.cert {
@@ -93,7 +93,7 @@ impl Guarded {
         }
     }
 
-    /// Trains at that address, on this version.
+    /// Trains at this address on this version.
     fn train(&self, address: &str, out: &str, version: &str, has: Has) -> Output {
         let mut command = perturb(&["train", "--server", address, "--server-wait", "100", "--version", version]);
         command.args(["--env", "CartPole", "--algorithm", "a2c", "--architecture", "ff"]);
@@ -110,7 +110,7 @@ impl Drop for Guarded {
     }
 }
 
-/// The weights that a training came to: their file's name, which counts the episodes, and its bytes.
+/// Returns the final weights of a training: the name of their file, which has the number of episodes, and its bytes.
 pub fn weights(run: &Path) -> (String, Vec<u8>) {
     let files = std::fs::read_dir(run.join("checkpoint")).expect("a checkpoint");
     let mut files = files.map(|file| file.expect("a file").path());
@@ -156,13 +156,13 @@ fn a_changed_byte_never_changes_what_is_learnt(#[case] is_servers: bool, #[case]
     let truth = weights(&guarded.file("truth"));
     let (mut reached, mut outlived) = (0, 0);
     for place in places {
-        let fault = Some(Fault { at: place, kind: Kind::Change });
+        let fault = Some(Fault { at: place, kind: FaultKind::BitFlip });
         let course = move |number| {
             let fault = fault.filter(|_| number == 0); // of the first connection
             let [from_server, from_client] = if is_servers { [fault, None] } else { [None, fault] };
-            Course { from_server, from_client, ..Course::default() }
+            FaultPlan { from_server, from_client, ..FaultPlan::default() }
         };
-        let line = Line::start(&guarded.address, course).expect("a port");
+        let line = FaultyProxy::start(&guarded.address, course).expect("a port");
         let out = format!("at-{place}");
         let trained = guarded.train(&format!("https://{}", line.address()), &out, "R", ALL);
         println!("a byte changed at {place}: status {}, {}", trained.status, stderr(&trained).trim());

@@ -1,4 +1,4 @@
-//! Whether a training kept away from its test sets, by a server's ledger.
+//! Proofs by a server's ledger that a training did not use its test sets.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -23,7 +23,7 @@ name = "train"
 draws = ["D", "R"]
 "#;
 
-/// A server that asks for tokens and keeps a ledger.
+/// A server that requires tokens and writes a ledger.
 struct Kept {
     server: Child,
     directory: TempDir,
@@ -55,7 +55,7 @@ impl Kept {
         self.directory.path().join(name)
     }
 
-    /// Runs `perturb` with somebody's token.
+    /// Runs `perturb` with a token.
     fn run(&self, token: &str, arguments: &[&str]) -> Output {
         let mut command = perturb(arguments);
         command.args(["--server", &self.address, "--server-wait", "0"]).current_dir(self.directory.path());
@@ -78,7 +78,7 @@ impl Kept {
         )
     }
 
-    /// What the ledger says of a policy: whether it is clean, and why.
+    /// Checks a policy by the ledger. Returns whether it is clean, and the messages.
     fn audit(&self, policy: &str, more: &[&str]) -> (bool, String) {
         let records = format!("{policy}.parquet");
         let audited =
@@ -95,7 +95,7 @@ impl Drop for Kept {
 }
 
 #[test]
-fn a_ledger_proves_that_a_training_never_drew_from_its_test_sets() {
+fn a_ledger_proves_training_apart_from_test_sets() {
     let kept = Kept::start();
     kept.train("trainer", "D", "policy");
     let cheating = kept.evaluate("trainer", "policy", "8");
@@ -109,7 +109,7 @@ fn a_ledger_proves_that_a_training_never_drew_from_its_test_sets() {
     let (clean, words) = kept.audit("policy", &["--head", &head.replace(|digit: char| digit.is_ascii_digit(), "x")]);
     assert!(!clean && words.contains("no line has the digest"), "{words}");
 
-    // One who looks at E before the training is done.
+    // This client plays E before the training is finished.
     kept.train("tester", "R", "leaked");
     assert!(kept.evaluate("tester", "leaked", "9").status.success());
     let (clean, words) = kept.audit("leaked", &[]);

@@ -1,9 +1,9 @@
-//! Trainings over lines with faults come to the weights that they come to without.
+//! Trainings over faulty connections give the same weights as without faults.
 
 use std::path::Path;
 use std::time::Duration;
 
-use perturb_faults::{Course, Dice, Kind, Line};
+use perturb_faults::{FaultKind, FaultPlan, FaultyProxy, SeededRng};
 use rstest::rstest;
 use tempfile::TempDir;
 
@@ -11,14 +11,14 @@ use crate::common::{ended, perturb, server, stderr};
 use crate::guarded::{ALL, Guarded, weights};
 use crate::patience::PPO_CART_POLE;
 
-/// Connections that have a fault; those behind them have none, so that it ends.
+/// Number of connections with a fault. Later connections have none, so that the training ends.
 const FAULTY: usize = 4;
-/// Where the first fault is at least: who cannot even begin is told so, and does not wait.
+/// Minimum position of the first fault. A client that cannot even begin fails at once and does not wait.
 const BEGUN: usize = 20_000;
-/// Beyond it there is no fault: a training's connection carries more, both ways.
+/// Maximum position of a fault. A training's connection carries more bytes in both directions.
 const MOST: u64 = 200_000;
 
-/// Trains at that address.
+/// Trains at this address.
 fn train(address: &str, out: &Path, guarded: Option<&Guarded>) -> (String, Vec<u8>) {
     let settings = out.with_extension("toml");
     std::fs::write(&settings, PPO_CART_POLE).expect("written");
@@ -32,11 +32,11 @@ fn train(address: &str, out: &Path, guarded: Option<&Guarded>) -> (String, Vec<u
     weights(out)
 }
 
-/// What becomes of a connection.
-fn course(dice: &mut Dice, number: usize) -> Course {
-    let mut course = Course { delay: Duration::from_micros(dice.below(1000)), ..Course::default() };
+/// Returns the faults of a connection.
+fn course(dice: &mut SeededRng, number: usize) -> FaultPlan {
+    let mut course = FaultPlan { delay: Duration::from_micros(dice.below(1000)), ..FaultPlan::default() };
     if number < FAULTY {
-        let mut fault = dice.fault(&Kind::LOSSES, MOST);
+        let mut fault = dice.fault(&FaultKind::LOSSES, MOST);
         fault.at += if number == 0 { BEGUN } else { 0 };
         let is_servers = dice.below(2) == 0;
         *(if is_servers { &mut course.from_server } else { &mut course.from_client }) = Some(fault);
@@ -48,7 +48,7 @@ fn course(dice: &mut Dice, number: usize) -> Course {
 #[rstest]
 #[case::plain(false)]
 #[case::encrypted(true)]
-fn a_training_over_a_line_with_faults_comes_to_the_same_weights(#[case] encrypted: bool) {
+fn a_training_over_a_faulty_line_gives_same_weights(#[case] encrypted: bool) {
     let out = TempDir::new().expect("a directory");
     let guarded = encrypted.then(Guarded::start);
     let own = (!encrypted).then(|| server(1));
@@ -57,8 +57,8 @@ fn a_training_over_a_line_with_faults_comes_to_the_same_weights(#[case] encrypte
         (None, own) => own.as_ref().expect("one of both").address().to_string(),
     };
     let truth = train(&address, &out.path().join("truth"), guarded.as_ref());
-    let mut dice = Dice::new();
-    let line = Line::start(&address, move |number| course(&mut dice, number)).expect("a port");
+    let mut dice = SeededRng::new();
+    let line = FaultyProxy::start(&address, move |number| course(&mut dice, number)).expect("a port");
     let scheme = if encrypted { "https://" } else { "" };
     let got = train(&format!("{scheme}{}", line.address()), &out.path().join("run"), guarded.as_ref());
     println!("{} faults on {} connections", line.faults(), line.connections());

@@ -1,4 +1,4 @@
-//! The tests of the program `perturb`, one program, so that libtorch is linked once. They need the program
+//! Tests of the program `perturb`. They are one program, so that libtorch is linked once, and need the program
 //! `perturb-server`: run `cargo build --release` first.
 
 mod common;

@@ -1,4 +1,4 @@
-//! Ways to misuse the programs, and to end them: what they say, with which status, and what remains.
+//! Misuse and interruption of the programs: their messages, exit status and remaining files.
 
 use std::collections::BTreeSet;
 use std::io::{Read, Write};
@@ -12,11 +12,11 @@ use tempfile::TempDir;
 
 use crate::common::{child_server, ended, kill, stderr, wait_for, wait_for_server};
 
-/// Two cells of a few seconds.
+/// A plan with two cells of a few seconds.
 const PLAN: &str = "environments = ['CartPole']\nversions = ['D']\nruns = 2\ntest_episodes = 12
 settings = { episodes = 100000 }\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\n";
 
-/// A folder to work in, with a place of its own for what is temporary.
+/// A working directory with its own folder for temporary files.
 struct Place(TempDir);
 
 impl Place {
@@ -42,7 +42,7 @@ impl Place {
         self.0.path().join(name)
     }
 
-    /// `perturb`, or `perturb-server`, as it is typed here.
+    /// Returns the command `perturb` or `perturb-server` with these words, in this directory.
     fn command(&self, words: &[&str]) -> Command {
         let perturb = Path::new(env!("CARGO_BIN_EXE_perturb"));
         let mut command = Command::new(perturb.with_file_name(words[0]));
@@ -59,7 +59,7 @@ impl Place {
         self.command(words).spawn().expect("started")
     }
 
-    /// Everything in here, but for what is in a checkpoint.
+    /// Returns all paths in the directory, without the contents of checkpoints.
     fn files(&self) -> BTreeSet<String> {
         fn list(folder: &Path, root: &Path, files: &mut BTreeSet<String>) {
             for entry in std::fs::read_dir(folder).expect("a list") {
@@ -75,7 +75,7 @@ impl Place {
         files
     }
 
-    /// How the program refuses these words, and what it leaves behind.
+    /// Runs a command. Returns its messages, its exit status and its new files.
     fn told(&self, words: &[&str]) -> String {
         let before = self.files();
         let output = self.output(words);
@@ -86,7 +86,7 @@ impl Place {
     }
 }
 
-/// What listens, and answers nobody in a way that perturb understands.
+/// Starts a server that answers every client with something that perturb does not understand.
 fn babbling() -> String {
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
     let address = listener.local_addr().expect("an address").to_string();
@@ -140,7 +140,7 @@ fn each_misuse_is_refused_with_a_remedy_and_leaves_nothing() {
         vec!["perturb", "evaluate", "--checkpoint", "run", "--records", "file/records.parquet"],
         vec!["perturb", "evaluate", "--checkpoint", "run", "--json", "tmp"],
         vec!["perturb", "ls", "--json", "tmp"],
-        vec!["perturb", "rates", "--json", "run"],
+        vec!["perturb", "rescore", "--json", "run"],
         vec!["perturb", "demo", "--out", "run"],
         vec!["perturb", "demo", "--env", "hoper", "--out", "new"],
         vec!["perturb", "evaluate", "--checkpoint", "run", "--success", "step=3"],
@@ -153,7 +153,7 @@ fn each_misuse_is_refused_with_a_remedy_and_leaves_nothing() {
         vec!["perturb", "plan", "missing.toml"],
         vec!["perturb", "plan", "wrong.toml", "--measure", "0"],
         vec!["perturb", "plan", "runs.toml"],
-        vec!["perturb", "plan", "plan.toml", "--from", "missing"],
+        vec!["perturb", "plan", "plan.toml", "--timings-from", "missing"],
         vec!["perturb", "run", "wrong.toml", "--out", "out"],
         vec!["perturb", "run", "plan.toml", "--out", "out", "--html", "missing/page.html"],
         vec!["perturb", "run", "plan.toml", "--out", "out", "--json", "missing/lines.jsonl"],
@@ -164,8 +164,8 @@ fn each_misuse_is_refused_with_a_remedy_and_leaves_nothing() {
         vec!["perturb", "train", "--env", "CartPole", "--out", "an experiment"],
         vec!["perturb", "report", "missing"],
         vec!["perturb", "audit", "missing"],
-        vec!["perturb", "rates", "missing.parquet"],
-        vec!["perturb", "rates", "plan.toml"],
+        vec!["perturb", "rescore", "missing.parquet"],
+        vec!["perturb", "rescore", "plan.toml"],
         vec!["perturb", "ls", "missing"],
         vec!["perturb", "serve", "missing"],
         vec!["perturb", "serve", "file"],
@@ -190,18 +190,18 @@ fn each_misuse_is_refused_with_a_remedy_and_leaves_nothing() {
     assert_snapshot!(names.iter().fold(said, |said, (long, name)| said.replace(long, name)));
 }
 
-/// Ctrl-C, once something has begun: what is said at last, and what remains, in which numbers do not matter.
+/// Checks Ctrl-C during a command: the last message and the remaining files, with all numbers replaced by N.
 #[rstest]
 #[case::train(
     "perturb train --env CartPole --episodes 1000000 --out run",
     "run/progress.csv",
-    "stopped by signal N after N of N episodes; go on with: perturb train --resume run",
+    "stopped by signal N after N of N episodes; resume with: perturb train --resume run",
     "run, run/checkpoint, run/config.toml, run/events.out.tfevents.N.perturb, run/monitor.csv, run/progress.csv"
 )]
 #[case::run(
     "perturb run plan.toml --out out",
     "out/plan.toml",
-    "stopped by signal N; the same command goes on: perturb run plan.toml --out out",
+    "stopped by signal N; resume with: perturb run plan.toml --out out",
     "out, out/cells, out/plan.toml"
 )]
 #[case::plan(
@@ -219,7 +219,7 @@ fn each_misuse_is_refused_with_a_remedy_and_leaves_nothing() {
 #[case::demo(
     "perturb demo --env CartPole --episodes 1000000 --out demo",
     "demo/trained-on-D/progress.csv",
-    "stopped by signal N; what is done is kept in demo",
+    "stopped by signal N; finished parts are kept in demo",
     "demo, demo/trained-on-D"
 )]
 #[case::heatmap(
@@ -246,7 +246,7 @@ fn ctrl_c_ends_soon_and_leaves_nothing_temporary(
     }
     let before = place.files();
     let child = place.start(&words.split(' ').collect::<Vec<_>>());
-    // Whatever has begun has a server, and that a folder.
+    // A command that has begun has a private server, which has a folder.
     let has_begun = || match begun {
         "tmp" => {
             child_server(child.id()).is_some() && place.path("tmp").read_dir().is_ok_and(|mut tmp| tmp.next().is_some())
@@ -272,13 +272,13 @@ fn without_numbers(text: &str) -> String {
     text.split(digits).filter(|part| !part.is_empty()).collect::<Vec<_>>().join("N")
 }
 
-/// What is in the folder of temporary files.
+/// Returns the contents of the folder for temporary files.
 fn temporary(place: &Place) -> Vec<String> {
     place.files().into_iter().filter(|file| file.starts_with("tmp/")).collect()
 }
 
 #[test]
-fn a_second_ctrl_c_and_even_kill_9_leave_no_temporary_folder() {
+fn a_second_ctrl_c_and_sigkill_leave_no_temporary_folder() {
     let place = Place::new();
     for signals in [&["-INT", "-INT"][..], &["-KILL"]] {
         let child = place.start(&["perturb", "train", "--env", "CartPole", "--episodes", "1000000", "--out", "run"]);
@@ -292,7 +292,7 @@ fn a_second_ctrl_c_and_even_kill_9_leave_no_temporary_folder() {
 }
 
 #[test]
-fn a_lost_server_is_a_sentence_with_the_command_that_goes_on() {
+fn a_lost_server_is_reported_with_the_resume_command() {
     let place = Place::new();
     let address = format!("unix:{}", place.path("socket").display());
     let mut server = place.command(&["perturb-server", "--listen", &address, "--log", "error"]);
@@ -309,12 +309,12 @@ fn a_lost_server_is_a_sentence_with_the_command_that_goes_on() {
     assert!(said.starts_with(&format!("perturb: lost the server at {address} ")), "{said}");
     assert!(said.contains("; the checkpoint after ") && !said.contains("h2") && !said.contains("transport"), "{said}");
     let again = format!("perturb train --resume 'my run' --server {address} --server-wait 0");
-    let command = format!("episodes is kept in my run; go on from there: {again}\n");
+    let command = format!("episodes is kept in my run; resume it with: {again}\n");
     assert!(said.ends_with(&command), "{said}");
 }
 
 #[test]
-fn what_is_quiet_says_nothing_and_what_is_json_is_on_standard_output() {
+fn quiet_prints_nothing_and_json_goes_to_stdout() {
     let place = Place::new();
     let trained = place.output(&["perturb", "-q", "train", "--env", "cart_pole", "--episodes", "5", "--out", "run"]);
     assert!(trained.status.success() && trained.stderr.is_empty(), "{}", stderr(&trained));
@@ -335,7 +335,7 @@ fn what_is_quiet_says_nothing_and_what_is_json_is_on_standard_output() {
     let refused = place.output(&["perturb", "-q", "evaluate", "--checkpoint", "missing"]);
     assert!(refused.status.code() == Some(2) && !refused.stderr.is_empty(), "an error is said nevertheless");
 
-    // What has --json says what came of it there, or in a file.
+    // Commands with --json write the result to standard output or to a file.
     let printed = |words: &str| -> serde_json::Value {
         let output = place.output(&words.split(' ').collect::<Vec<_>>());
         assert!(output.status.success(), "{words}: {}", stderr(&output));

@@ -1,5 +1,5 @@
-//! Servers are killed at random moments, and lines to them cut; what goes on comes to the bytes that it comes to
-//! undisturbed.
+//! Servers are killed and connections are cut at random moments. The results have the same bytes as without
+//! interruptions.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader};
@@ -11,7 +11,7 @@ use rstest::rstest;
 use tempfile::TempDir;
 
 use crate::common::{child_server, ended, kill, perturb, run, server, stderr, wait_for, wait_for_server};
-use perturb_faults::{Course, Dice, Fault, Kind, Line};
+use perturb_faults::{Fault, FaultKind, FaultPlan, FaultyProxy, SeededRng};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::client::Servers;
 
@@ -20,18 +20,18 @@ pub const PPO_CART_POLE: &str = "environment = 'CartPole'\nversion = 'R'\nalgori
 pub const A2C_PENDULUM: &str = "environment = 'Pendulum'\nversion = 'R'\nalgorithm = 'a2c'\narchitecture = 'ff'\n\
                                 episodes = 400\nnum_envs = 8\ncheckpoint_interval = 8";
 
-/// Whose servers are killed.
+/// Servers that are killed.
 #[derive(Clone, Copy, Debug)]
 enum Victim {
-    /// The only one, which the learner started itself.
+    /// The only server, a private one.
     Private,
-    /// The only one, which somebody starts again.
+    /// The only server, which is restarted.
     Named,
-    /// One of two, which somebody starts again.
+    /// One of two servers, which is restarted.
     OneOfTwo,
 }
 
-/// A server at a socket, which can be killed and started again.
+/// A server at a socket, which can be killed and restarted.
 pub struct Named {
     socket: PathBuf,
     child: Child,
@@ -58,7 +58,7 @@ impl Named {
         format!("unix:{}", self.socket.display())
     }
 
-    /// Its process.
+    /// Process of the server.
     pub fn id(&self) -> u32 {
         self.child.id()
     }
@@ -79,7 +79,7 @@ impl Drop for Named {
     }
 }
 
-/// The name of the policy's weights, and what the training counted.
+/// Returns the name of the weights' file, and the counters of the training.
 pub fn result(run: &Path) -> (String, u64, u64) {
     let checkpoint = Checkpoint::load(run).expect("a checkpoint");
     let counters = checkpoint.state.counters;
@@ -93,7 +93,7 @@ pub fn undisturbed(text: &str) -> (String, u64, u64) {
     result(out.path())
 }
 
-/// Starts a training, whose words go to a file.
+/// Starts a training. Its messages go to a file.
 pub fn train(folder: &TempDir, text: &str, arguments: &[&str]) -> (Child, PathBuf, PathBuf) {
     let (settings, out, said) =
         (folder.path().join("settings.toml"), folder.path().join("run"), folder.path().join("said"));
@@ -105,8 +105,8 @@ pub fn train(folder: &TempDir, text: &str, arguments: &[&str]) -> (Child, PathBu
     (child, out, said)
 }
 
-/// Trains while servers are killed, so many times at most; gives how often, and what it came to.
-fn harassed(text: &str, victim: Victim, most: usize, dice: &mut Dice) -> (usize, (String, u64, u64)) {
+/// Trains while servers are killed. Returns the number of kills and the result.
+fn harassed(text: &str, victim: Victim, most: usize, dice: &mut SeededRng) -> (usize, (String, u64, u64)) {
     let folder = tempfile::tempdir().expect("a directory");
     let names: &[&str] = match victim {
         Victim::Private => &[],
@@ -119,7 +119,7 @@ fn harassed(text: &str, victim: Victim, most: usize, dice: &mut Dice) -> (usize,
         Victim::Private => train(&folder, text, &["--workers", "1"]),
         Victim::Named | Victim::OneOfTwo => train(&folder, text, &["--server", &list]),
     };
-    // Before that, nothing is begun yet: a server that does not answer is a wrong one.
+    // Earlier nothing has begun yet, and a server that does not answer counts as a wrong address.
     wait_for("a training", || out.join("progress.csv").exists());
     let mut kills = 0;
     while kills < most {
@@ -155,13 +155,13 @@ fn harassed(text: &str, victim: Victim, most: usize, dice: &mut Dice) -> (usize,
 #[case(PPO_CART_POLE, Victim::OneOfTwo)]
 #[case(A2C_PENDULUM, Victim::Named)]
 #[case(A2C_PENDULUM, Victim::OneOfTwo)]
-fn a_training_outlives_its_servers_and_comes_to_the_same_weights(#[case] text: &str, #[case] victim: Victim) {
-    let (kills, got) = harassed(text, victim, 3, &mut Dice::new());
+fn a_training_gives_same_weights_after_servers_restart(#[case] text: &str, #[case] victim: Victim) {
+    let (kills, got) = harassed(text, victim, 3, &mut SeededRng::new());
     assert!(kills > 0, "it ended before anything was killed");
     assert_eq!(got, undisturbed(text), "after {kills} kills");
 }
 
-/// A server at a free port.
+/// Starts a server at a free port.
 struct AtPort {
     child: Child,
     address: String,
@@ -190,16 +190,16 @@ impl Drop for AtPort {
 #[rstest]
 #[case::the_server_acts(PPO_CART_POLE, &[])]
 #[case::the_learner_acts(A2C_PENDULUM, &["--act", "client"])]
-fn a_training_over_lines_that_break_goes_back_to_no_checkpoint(#[case] text: &str, #[case] arguments: &[&str]) {
-    let mut dice = Dice::new();
+fn a_training_over_breaking_lines_needs_no_checkpoint(#[case] text: &str, #[case] arguments: &[&str]) {
+    let mut dice = SeededRng::new();
     let folder = tempfile::tempdir().expect("a directory");
     let server = AtPort::new();
-    // The first connections have to say what the server can do.
+    // The first connections have no fault, because they list the server's environments.
     let course = move |number: usize| {
         let at = if number == 0 { 300_000 } else { dice.below(100_000) as usize };
-        Course { from_server: Some(Fault { at, kind: Kind::End }), ..Course::default() }
+        FaultPlan { from_server: Some(Fault { at, kind: FaultKind::Close }), ..FaultPlan::default() }
     };
-    let line = Line::start(&server.address, course).expect("a line");
+    let line = FaultyProxy::start(&server.address, course).expect("a line");
     let address = line.address();
     let arguments = [&["--server", &address], arguments].concat();
     let (child, out, said) = train(&folder, text, &arguments);
@@ -212,11 +212,11 @@ fn a_training_over_lines_that_break_goes_back_to_no_checkpoint(#[case] text: &st
     assert_eq!(result(&out), undisturbed(text), "after {} cuts", line.faults());
 }
 
-/// `make kill-test`: some minutes.
+/// Runs for some minutes: `make kill-test`.
 #[test]
 #[ignore = "takes minutes"]
 fn a_hundred_kills_change_no_weight() {
-    let mut dice = Dice::new();
+    let mut dice = SeededRng::new();
     for text in [PPO_CART_POLE, A2C_PENDULUM] {
         let expected = undisturbed(text);
         for victim in [Victim::Private, Victim::Named, Victim::OneOfTwo] {
@@ -248,7 +248,7 @@ fn a_server_that_stays_away_is_done_without() {
 }
 
 #[test]
-fn a_signal_ends_a_training_that_waits_and_it_says_how_to_go_on() {
+fn a_signal_ends_a_waiting_training_with_a_resume_hint() {
     let folder = tempfile::tempdir().expect("a directory");
     let mut one = Named::new(folder.path(), "a");
     let (mut child, out, said) = train(&folder, A2C_PENDULUM, &["--server", &one.address()]);
@@ -260,7 +260,7 @@ fn a_signal_ends_a_training_that_waits_and_it_says_how_to_go_on() {
     kill("-INT", child.id());
     assert_eq!(child.wait().expect("ended").code(), Some(130), "{}", words());
     let command = format!("perturb train --resume {} --server {}", out.display(), one.address());
-    assert!(words().contains("stopped by signal 2, waiting for a server: lost the server"), "{}", words());
+    assert!(words().contains("stopped by signal 2 while waiting for a server: lost the server"), "{}", words());
     assert!(words().trim_end().ends_with(&command), "{}", words());
 }
 
@@ -282,7 +282,7 @@ fn a_test_outlives_its_server() {
         victim = child_server(child.id());
         victim.is_some()
     });
-    // Connected, and in the middle of it, however fast the machine is.
+    // The client must be connected and in the middle of its work, however fast the machine is.
     std::thread::sleep(time / 3);
     kill("-KILL", victim.expect("a server"));
     let broken = ended(child);

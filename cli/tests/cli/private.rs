@@ -1,4 +1,4 @@
-//! What a learner that is killed leaves of its private server: nothing.
+//! A killed learner leaves nothing of its private server.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -8,7 +8,7 @@ use tempfile::TempDir;
 use crate::common::{child_server, is_running, perturb, wait_for};
 use perturb_learner::checkpoint::Checkpoint;
 
-/// Where a learner trains, and makes its server's folder.
+/// Folders for a learner's run and for its private server.
 struct Place(TempDir);
 
 impl Place {
@@ -22,21 +22,21 @@ impl Place {
         self.0.path().join(name)
     }
 
-    /// A training that does not end by itself.
+    /// Starts a training that does not end by itself.
     fn training(&self) -> Command {
         let mut command = perturb(&["train", "--env", "CartPole", "--episodes", "1000000", "--out"]);
         command.arg(self.path("run")).env("TMPDIR", self.path("tmp"));
         command
     }
 
-    /// How many folders of servers there are.
+    /// Returns the number of servers' folders.
     fn folders(&self) -> usize {
         self.path("tmp").read_dir().expect("a list").count()
     }
 }
 
 #[test]
-fn a_learner_that_is_killed_takes_its_server_along_and_the_servers_folder() {
+fn a_killed_learner_ends_its_server_and_its_folder() {
     let place = Place::new();
     let mut child = place.training().spawn().expect("perturb");
     wait_for("a checkpoint", || place.path("run/checkpoint/checkpoint.json").exists());
@@ -49,9 +49,9 @@ fn a_learner_that_is_killed_takes_its_server_along_and_the_servers_folder() {
     Checkpoint::load(&place.path("run")).expect("a whole checkpoint");
 }
 
-/// By the time that the server looks at its input, nobody holds the other end any more.
+/// When the server looks at its input, no process holds the other end any more.
 #[test]
-fn a_server_whose_learner_was_killed_before_it_began_ends_and_leaves_no_folder_either() {
+fn a_server_ends_when_its_learner_is_killed_at_the_start() {
     let place = Place::new();
     let late = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/cli/fixtures/late_server.sh");
     let program = Path::new(env!("CARGO_BIN_EXE_perturb")).with_file_name("perturb-server");

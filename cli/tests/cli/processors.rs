@@ -1,5 +1,5 @@
-//! The same seed gives the same weights on every x86-64 processor: server and learner under qemu's models of old ones, without
-//! AVX (Nehalem) and with AVX2 and FMA (Haswell), and on the one at hand.
+//! The same seed gives the same weights on every x86-64 processor: server and learner under qemu's models of old ones,
+//! without AVX (Nehalem) and with AVX2 and FMA (Haswell), and on the one at hand.
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -8,11 +8,11 @@ use rstest::rstest;
 
 use crate::common::{stderr, wait_for_server};
 
-/// Set to 1, qemu must be there.
+/// Environment variable. With the value 1 the test fails if qemu is missing.
 const REQUIRED: &str = "PERTURB_QEMU_REQUIRED";
 const QEMU: &str = "qemu-x86_64";
 
-/// `program` on a processor of qemu's, or on the one at hand.
+/// Returns the command of `program` on one of qemu's processors, or on this machine's.
 fn on(processor: Option<&str>, program: &Path) -> Command {
     let Some(processor) = processor else { return Command::new(program) };
     let mut command = Command::new(QEMU);
@@ -20,7 +20,7 @@ fn on(processor: Option<&str>, program: &Path) -> Command {
     command
 }
 
-/// Ends with its owner.
+/// A process that ends when this value is dropped.
 struct Server(Child);
 
 impl Drop for Server {
@@ -30,7 +30,7 @@ impl Drop for Server {
     }
 }
 
-/// The weights that a training of `arguments` ends with, as their file holds them.
+/// Trains with `arguments` and returns the bytes of the weights' file.
 fn weights(processor: Option<&str>, arguments: &[&str]) -> Vec<u8> {
     let directory = tempfile::tempdir().expect("a directory");
     let (socket, out) = (directory.path().join("socket"), directory.path().join("run"));

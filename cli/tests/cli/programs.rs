@@ -1,4 +1,4 @@
-//! What people see of longer work, and what helps them to find their way.
+//! Progress output of long commands, and help for users.
 
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
@@ -24,7 +24,7 @@ fn printed(output: &Output) -> String {
     String::from_utf8(output.stdout.clone()).expect("text")
 }
 
-/// On a terminal of 80 columns.
+/// Runs a command on a terminal of 80 columns.
 fn on_a_terminal(folder: &Path, command: &str) -> String {
     let path = Path::new(env!("CARGO_BIN_EXE_perturb")).parent().expect("a folder").display().to_string();
     let command = format!("stty cols 80 rows 24; PATH={path}:$PATH; {command}");
@@ -38,7 +38,7 @@ fn on_a_terminal(folder: &Path, command: &str) -> String {
     String::from_utf8(output.stdout).expect("text")
 }
 
-/// The rows of 80 columns that were drawn, without what moves the cursor.
+/// Returns the drawn rows of 80 columns without cursor movements.
 fn lines(drawn: &str) -> Vec<String> {
     let mut text = String::new();
     let mut rest = drawn.chars();
@@ -56,7 +56,7 @@ fn lines(drawn: &str) -> Vec<String> {
     rows.map(|row| row.trim_end().to_owned()).filter(|row| !row.is_empty()).collect()
 }
 
-/// What a terminal shows in the end.
+/// Returns the final contents of a terminal.
 fn screen(drawn: &str) -> Vec<String> {
     let (mut rows, mut row, mut column) = (vec![Vec::new()], 0_usize, 0_usize);
     let mut rest = drawn.chars();
@@ -97,7 +97,7 @@ fn screen(drawn: &str) -> Vec<String> {
 }
 
 #[test]
-fn a_bar_fits_80_columns_and_tells_the_time_that_is_left() {
+fn a_bar_fits_80_columns_and_shows_the_remaining_time() {
     let folder = folder();
     let train =
         "perturb train --env CartPole --version R+E --algorithm a2c --observe parameters --episodes 6000 --out run";
@@ -105,7 +105,7 @@ fn a_bar_fits_80_columns_and_tells_the_time_that_is_left() {
     let left = screen(&drawn);
     assert!(!left.iter().any(|row| row.contains(['█', '░'])), "nothing is left of the bar: {left:#?}");
     let drawn = lines(&drawn);
-    // The bar ends where the row does, and the figures begin the next one.
+    // The bar fills its row, and the figures begin in the next row.
     let bars = drawn.windows(2).filter(|rows| rows[0].contains('█') && rows[1].contains("/6 000 episodes, "));
     let mut count = 0;
     for rows in bars {
@@ -118,7 +118,7 @@ fn a_bar_fits_80_columns_and_tells_the_time_that_is_left() {
 }
 
 #[test]
-fn what_a_private_server_says_stands_in_lines_of_its_own_above_the_bar() {
+fn a_private_servers_log_appears_above_the_bar() {
     let folder = folder();
     let server = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/cli/fixtures/talking_server.sh");
     let program = Path::new(env!("CARGO_BIN_EXE_perturb")).with_file_name("perturb-server");
@@ -138,7 +138,7 @@ fn what_a_private_server_says_stands_in_lines_of_its_own_above_the_bar() {
 }
 
 #[test]
-fn a_run_shows_what_is_under_way_and_the_rates_of_what_is_done() {
+fn a_run_shows_cells_in_work_and_success_rates() {
     let folder = folder();
     let plan =
         "environments = ['CartPole', 'Pendulum']\nversions = ['D']\ntest_versions = ['D', 'E']\ntest_episodes = 5
@@ -147,7 +147,7 @@ fn a_run_shows_what_is_under_way_and_the_rates_of_what_is_done() {
     std::fs::write(folder.path().join("plan.toml"), plan).expect("written");
     let drawn = lines(&on_a_terminal(folder.path(), "perturb run plan.toml --out out --jobs 1"));
     let has = |part: &str| drawn.iter().any(|line| line.contains(part));
-    assert!(has("measuring what cells cost that begin later: 2 groups"), "{drawn:#?}");
+    assert!(has("measuring the duration of cells that begin later: 2 groups"), "{drawn:#?}");
     assert!(has("/4 cells, ") && has("  Pendulum") && has(" of training"), "{drawn:#?}");
     assert!(has("  done: CartPole a2c ff, trained on D: D ") && has(" left"), "{drawn:#?}");
     let ending = &drawn[drawn.len() - 5..];
@@ -158,7 +158,7 @@ fn a_run_shows_what_is_under_way_and_the_rates_of_what_is_done() {
 }
 
 #[test]
-fn a_run_has_a_place_of_its_own_unless_one_is_given_and_all_are_listed() {
+fn runs_get_a_default_folder_and_are_listed() {
     let folder = folder();
     let train = ["train", "--env", "CartPole", "--algorithm", "a2c", "--episodes", "30"];
     let output = run(folder.path(), &train);
@@ -191,7 +191,7 @@ fn a_run_has_a_place_of_its_own_unless_one_is_given_and_all_are_listed() {
     drop(lock);
     let table = printed(&run(folder.path(), &["ls"]));
     assert!(table.contains("runs/group/b") && table.contains(" of 30 episodes"), "{table}");
-    // Which is too wide for a terminal of 80 columns.
+    // The list is too wide for a terminal of 80 columns.
     let listed = lines(&on_a_terminal(folder.path(), "perturb ls"));
     let listed: Vec<String> = listed.into_iter().filter(|line| !line.is_empty()).collect();
     assert_eq!(listed.len(), 7, "{listed:#?}");
@@ -201,7 +201,7 @@ fn a_run_has_a_place_of_its_own_unless_one_is_given_and_all_are_listed() {
 }
 
 #[test]
-fn a_training_that_is_extended_is_one_with_the_larger_budget() {
+fn an_extended_training_equals_one_of_the_larger_budget() {
     let folder = folder();
     let train =
         ["train", "--env", "CartPole", "--version", "R", "--set", "checkpoint_interval=10", "--set", "num_envs=2"];
@@ -218,11 +218,11 @@ fn a_training_that_is_extended_is_one_with_the_larger_budget() {
     let config = |out: &str| read(&folder.path().join(out), "config.toml");
     assert_eq!(config("part"), config("whole"));
     let again = run(folder.path(), &["train", "--resume", "part"]);
-    assert!(stderr(&again).contains("; train on with --extend EPISODES"), "{}", stderr(&again));
+    assert!(stderr(&again).contains("; extend it with --extend EPISODES"), "{}", stderr(&again));
 }
 
 #[test]
-fn the_demo_says_what_is_lost_and_what_it_cost_beside_the_paper() {
+fn the_demo_compares_with_the_paper() {
     let folder = folder();
     let arguments = ["demo", "--env", "cartpole", "--episodes", "20", "--test-episodes", "20", "--out", "demo"];
     let text = printed(&run(folder.path(), &arguments));
@@ -234,7 +234,7 @@ fn the_demo_says_what_is_lost_and_what_it_cost_beside_the_paper() {
     assert!(read(folder.path(), "demo/trained-on-R/config.toml").contains("version = \"R\""));
     let picture = std::fs::read(folder.path().join("demo/heatmap.png")).expect("a picture");
     assert!(picture.starts_with(b"\x89PNG"));
-    // Nobody balances a pole after twenty episodes.
+    // No policy balances the pole after twenty episodes.
     assert!(text.contains("failure.gif") && folder.path().join("demo/failure.gif").exists(), "{text}");
 }
 

@@ -1,4 +1,4 @@
-//! Trainings that are broken off go on to the same bytes.
+//! Interrupted trainings give the same bytes after they are resumed.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -19,8 +19,8 @@ use insta::assert_snapshot;
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// Each algorithm with each architecture, discrete and continuous actions, and MuJoCo. Rollouts end in mid-episode,
-/// checkpoints come often and between two lines of progress.csv, and no number divides the next.
+/// Every algorithm with every architecture, discrete and continuous actions, and MuJoCo. Rollouts end within episodes,
+/// checkpoints are frequent and between two lines of progress.csv, and no number divides the next one.
 const RUNS: [&str; 9] = [
     "environment = 'CartPole'\nversion = 'E'\nalgorithm = 'a2c'\nepisodes = 90\nnum_envs = 5\nn_steps = 5\nlog_interval = 3\n\
      checkpoint_interval = 7",
@@ -43,7 +43,7 @@ const RUNS: [&str; 9] = [
      checkpoint_interval = 3",
 ];
 
-/// Copies a directory at this moment, which is what kill -9 would leave now.
+/// Copies a directory, as kill -9 would leave it now.
 fn copy(from: &Path, to: &Path) {
     fs::create_dir_all(to).expect("a directory");
     for entry in fs::read_dir(from).expect("a list") {
@@ -60,7 +60,7 @@ fn bytes(path: &Path) -> Vec<u8> {
     fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
-/// The names in a directory, sorted.
+/// Returns the sorted names in a directory.
 fn names(directory: &Path) -> Vec<String> {
     let entries = fs::read_dir(directory).expect("a list");
     let mut names: Vec<String> =
@@ -69,7 +69,7 @@ fn names(directory: &Path) -> Vec<String> {
     names
 }
 
-/// The cells of a log from its header on, without those of times.
+/// Returns the values of a log from its header on, without times.
 fn cells(run: &Path, name: &str) -> Vec<Vec<String>> {
     let text = read(run, name);
     let mut lines = text.lines().filter(|line| !line.starts_with('#')).map(|line| line.split(','));
@@ -93,7 +93,7 @@ fn events(run: &Path) -> PathBuf {
     run.join(name)
 }
 
-/// Whether two runs came to the same bytes.
+/// Checks that two runs have the same bytes.
 #[track_caller]
 fn assert_same(got: &Path, expected: &Path) {
     assert_eq!(Checkpoint::load(got).expect("a checkpoint"), Checkpoint::load(expected).expect("a checkpoint"));
@@ -112,7 +112,7 @@ fn assert_same(got: &Path, expected: &Path) {
     assert_eq!(bytes(&events(got)).len(), bytes(&events(expected)).len(), "a time has as many bytes as another");
 }
 
-/// Goes on with the run in `path` to its end.
+/// Resumes the run in `path` until its end.
 fn go_on(servers: &Servers, path: &Path) -> Result<Outcome, String> {
     let (directory, checkpoint, state) = RunDirectory::resume(path).map_err(|error| format!("{error:#}"))?;
     let outcome = resume(servers, &directory, (checkpoint, state), 1, &StopFlag::default(), |_| {});
@@ -125,7 +125,7 @@ fn servers_of(number: usize) -> (Vec<perturb_learner::client::PrivateServer>, Se
     (local, servers)
 }
 
-/// A run in mid-training, as a kill would leave it.
+/// Returns an unfinished run, as a kill would leave it.
 fn broken_off() -> TempDir {
     let (_server, servers) = servers_of(1);
     let (out, copied) = (tempfile::tempdir().expect("a directory"), tempfile::tempdir().expect("a directory"));
@@ -143,7 +143,7 @@ fn broken_off() -> TempDir {
 }
 
 #[test]
-fn snapshots_bring_a_batch_back_on_any_number_of_servers() {
+fn snapshots_restore_a_batch_on_any_number_of_servers() {
     let ((_one, one), (_two, two)) = (servers_of(1), servers_of(2));
     for (environment, width) in [("CartPole", 0), ("Hopper", 3)] {
         let n = 5;
@@ -198,7 +198,7 @@ fn snapshots_bring_a_batch_back_on_any_number_of_servers() {
     }
 }
 
-/// Copies of the directory stand for kills: in every iteration of the run before its checkpoint, if there is one.
+/// Copies of the directory simulate kills in every iteration of the run, before its checkpoint if there is one.
 #[test]
 fn a_run_goes_on_from_any_iteration_to_the_same_bytes() {
     let ((_one, one), (_two, two)) = (servers_of(1), servers_of(2));
@@ -213,7 +213,7 @@ fn a_run_goes_on_from_any_iteration_to_the_same_bytes() {
         let error = go_on(&one, &kills.path().join("1")).expect_err("there was no checkpoint yet");
         assert!(error.contains("ended before its first checkpoint, so there is nothing to resume"), "{error}");
         assert!(error.contains("--overwrite"), "{error}");
-        // The second, the last, and some between.
+        // The second copy, the last one, and some between.
         for iteration in [2, iterations / 3, iterations / 2 + 1, iterations] {
             let killed = kills.path().join(iteration.to_string());
             let servers = if iteration.is_multiple_of(2) { &one } else { &two };
@@ -252,7 +252,7 @@ fn a_run_that_was_stopped_goes_on_to_the_same_bytes() {
 
 /// Format 1 was written by perturb 0.1.0, in whose CartPole, revision 0, the fixture was trained.
 #[test]
-fn a_checkpoint_of_format_1_is_understood_and_one_of_another_revision_refused() {
+fn old_formats_load_and_other_revisions_are_refused() {
     let (_server, servers) = servers_of(1);
     let out = tempfile::tempdir().expect("a directory");
     copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/cli/fixtures/format_1"), out.path());
@@ -271,19 +271,19 @@ fn a_checkpoint_of_format_1_is_understood_and_one_of_another_revision_refused() 
     let advice = "resume with the version of perturb-server that it began with, or train again";
     assert_eq!(error, format!("the run was {revisions}; {advice}"));
 
-    // Were it of today's revision, it could be tested.
+    // A checkpoint of today's revision could be tested.
     edit(out.path(), "/environment_spec/revision", 1.into());
     let checkpoint = Checkpoint::load(out.path()).expect("a checkpoint");
     let tester = Tester::new(&servers, &checkpoint, options).expect("the environment is the same");
     tester.test(&[Version::D.into()], &StopFlag::default(), &mut |_, _| {}).expect("a test");
 }
 
-/// Episodes in the checkpoint on disk.
+/// Returns the number of episodes of the checkpoint on disk.
 fn episodes(run: &Path) -> u64 {
     Checkpoint::load(run).map_or(0, |checkpoint| checkpoint.state.counters.episodes)
 }
 
-/// Kills the learner `delay` after it has written a checkpoint of so many episodes.
+/// Kills the learner `delay` after it has written a checkpoint with this number of episodes.
 fn kill_after(mut child: Child, run: &Path, at_least: u64, delay: Duration) {
     wait_for("a checkpoint", || episodes(run) >= at_least);
     std::thread::sleep(delay);
@@ -293,7 +293,7 @@ fn kill_after(mut child: Child, run: &Path, at_least: u64, delay: Duration) {
 }
 
 #[test]
-fn a_learner_that_is_killed_again_and_again_comes_to_the_same_bytes() {
+fn a_learner_killed_repeatedly_gives_the_same_bytes() {
     let (local, servers) = servers_of(2);
     let both = addresses(&local).iter().map(ToString::to_string).collect::<Vec<_>>().join(",");
     for (text, budget) in RUNS.into_iter().zip([300, 160, 18, 18, 36, 27]) {
@@ -309,7 +309,7 @@ fn a_learner_that_is_killed_again_and_again_comes_to_the_same_bytes() {
 
         let child = perturb(&["train", "--config", settings, "--out", path_text]).spawn().expect("perturb");
         kill_after(child, &path, budget / 6, Duration::ZERO);
-        // What a kill between the files of a checkpoint would leave.
+        // A kill between the files of a checkpoint would leave this.
         for stray in
             [".tmp-checkpoint.json", "resume-00999999-0badf00d.safetensors", "weights-00999999-0badf00d.safetensors"]
         {
@@ -339,14 +339,14 @@ fn a_training_that_lost_its_server_says_how_to_go_on() {
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
     let kept = episodes(out.path());
     let expected = format!(
-        "the checkpoint after {kept} episodes is kept in {path}; go on from there: perturb train --resume {path} \
+        "the checkpoint after {kept} episodes is kept in {path}; resume it with: perturb train --resume {path} \
          --server-wait 0"
     );
     assert!(stderr(&output).contains(&expected), "{}", stderr(&output));
 
     let output = perturb(&["train", "--resume", path]).output().expect("perturb runs");
     assert!(output.status.success(), "{}", stderr(&output));
-    assert!(stderr(&output).contains(&format!("going on after {kept} of 400 episodes")), "{}", stderr(&output));
+    assert!(stderr(&output).contains(&format!("resuming after {kept} of 400 episodes")), "{}", stderr(&output));
     let (_servers, servers) = servers_of(1);
     let text = "environment = 'CartPole'\ncheckpoint_interval = 20\nepisodes = 400\nn_epochs = 2";
     assert_same(out.path(), run(&servers, text).0.path());
@@ -367,7 +367,7 @@ fn numbers_that_are_not_finite_leave_the_last_checkpoint() {
     assert_eq!(saved.state.counters.iterations, 1, "the one that was there before");
 }
 
-/// As a program wrote it that knew no checksum.
+/// Removes the checksum, as in files of earlier versions.
 fn edit(run: &Path, pointer: &str, value: Value) {
     let path = run.join("checkpoint/checkpoint.json");
     let mut document: Value = serde_json::from_slice(&bytes(&path)).expect("JSON");
@@ -377,7 +377,7 @@ fn edit(run: &Path, pointer: &str, value: Value) {
     fs::write(path, document.to_string()).expect("a file");
 }
 
-/// The file of the checkpoint whose name begins so.
+/// Returns the file of the checkpoint whose name begins with `start`.
 fn file(run: &Path, prefix: &str) -> PathBuf {
     let folder = run.join("checkpoint");
     folder.join(names(&folder).into_iter().find(|name| name.starts_with(prefix)).expect("a file"))
@@ -390,8 +390,8 @@ fn flip_a_bit(path: &Path) {
     fs::write(path, content).expect("a file");
 }
 
-/// What may happen to a run so that it cannot go on.
-/// What it is called, and how a run is damaged.
+/// Damage after which a run cannot be resumed.
+/// Name of the damage, and the function that causes it.
 type Damage = (&'static str, fn(&Path));
 
 const DAMAGES: &[Damage] = &[
@@ -444,10 +444,10 @@ fn a_run_that_cannot_be_resumed_says_why_and_is_not_changed() {
         let mut error = go_on(&servers, out.path()).expect_err(damage);
         error = error.replace(&out.path().display().to_string(), "RUN");
         for name in names(&base.path().join("checkpoint")) {
-            // Numbers of the training and a checksum are in the names.
+            // The names have numbers of the training and a checksum.
             error = error.replace(&name, name.split_once('-').map_or(&name, |(kind, _)| kind));
         }
-        // How long the log was depends on the times in it.
+        // The log's length depends on the times in it.
         let length = error.find("but had ").map(|start| start + "but had ".len());
         let digits = |start: usize| error[start..].chars().take_while(char::is_ascii_digit).count();
         if let Some((start, digits)) = length.map(|start| (start, digits(start))) {

@@ -1,4 +1,4 @@
-//! `perturb serve`: where it listens, and how it ends. What its pages show is tested in its package.
+//! `perturb serve`: its address and its end. Its package tests the contents of the pages.
 
 use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
 use std::net::TcpStream;
@@ -6,7 +6,7 @@ use std::process::Child;
 
 use crate::common::{LIMIT, ended, kill, perturb};
 
-/// Shows an empty folder; the address that is printed.
+/// Serves an empty folder and returns the printed address.
 fn start(folder: &std::path::Path, more: &[&str]) -> (Child, String) {
     let mut command = perturb(&["serve", "."]);
     let mut child = command.args(more).current_dir(folder).spawn().expect("started");
@@ -16,7 +16,7 @@ fn start(folder: &std::path::Path, more: &[&str]) -> (Child, String) {
 }
 
 #[test]
-fn ctrl_c_ends_it_at_once_also_while_somebody_looks_on() {
+fn ctrl_c_ends_it_at_once_with_an_open_page() {
     let folder = tempfile::tempdir().expect("a folder");
     let (child, address) = start(folder.path(), &["--address", "0"]);
     assert!(address.starts_with("127.0.0.1:"), "{address}");
@@ -30,7 +30,7 @@ fn ctrl_c_ends_it_at_once_also_while_somebody_looks_on() {
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(130), "{said}");
     assert!(said.ends_with("stopped by signal 2\n"), "{said}");
-    // What had been sent comes first; a limit that has passed is no end.
+    // Bytes that were sent before the end are read first. A timeout is not the end of the connection.
     match lines.find(Result::is_err) {
         None => {}
         Some(line) => {
@@ -57,6 +57,6 @@ fn an_address_that_others_reach_is_warned_about() {
     child.kill().expect("killed");
     let output = ended(child);
     let said = String::from_utf8_lossy(&output.stderr);
-    assert!(said.contains("anybody who reaches this address can see everything in the folder"), "{said}");
+    assert!(said.contains("everybody who reaches this address can see the whole folder"), "{said}");
     assert!(said.contains("so can any site that somebody who reaches it opens in a browser"), "{said}");
 }

@@ -11,7 +11,7 @@ use perturb_protocol::Version;
 
 use crate::common::{addresses, ended, kill, perturb, server, stderr, wait_for};
 
-/// Four cells of some seconds.
+/// A plan with four cells of some seconds.
 const PLAN: &str = "
 environments = ['CartPole', 'Pendulum']
 versions = ['E']
@@ -25,7 +25,7 @@ architectures = ['ff']
 grid = { learning_rate = [7e-3, 7e-4] }
 ";
 
-/// One folder with runs of [`PLAN`].
+/// A folder with runs of [`PLAN`].
 struct Runs {
     directory: tempfile::TempDir,
     plan: Plan,
@@ -48,7 +48,7 @@ impl Runs {
         command.arg(self.directory.path().join("plan.toml")).arg("--out").arg(self.out(name)).spawn().expect("started")
     }
 
-    /// A file of every cell, by id; `None` where there is none.
+    /// Returns a file of every cell by the cell's id; `None` if it is missing.
     fn files(&self, name: &str, file: &str) -> BTreeMap<String, Option<String>> {
         let folder = Folder::new(&self.out(name));
         let read = |id: &str| std::fs::read_to_string(folder.cell(id).path().join(file)).ok();
@@ -78,19 +78,19 @@ fn first(servers: &Servers) -> Address {
     servers.addresses().into_iter().next().expect("a connection")
 }
 
-/// A machine that accepts connections and never answers.
+/// Starts a server that accepts connections and never answers.
 fn silent() -> (TcpListener, Address) {
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
     let address = listener.local_addr().expect("an address").to_string().parse().expect("an address");
     (listener, address)
 }
 
-/// A server with a session that keeps it from ending, which it has been asked to do.
+/// Starts a server that drains, but cannot end because of an open session.
 fn shutting_down(with_session: impl FnOnce(&Address)) {
     let directory = tempfile::tempdir().expect("a directory");
     let socket = directory.path().join("socket");
     let address: Address = format!("unix:{}", socket.display()).parse().expect("an address");
-    // Not a private one, whose grace is short.
+    // A private server would end too soon.
     let program = Path::new(env!("CARGO_BIN_EXE_perturb")).with_file_name("perturb-server");
     let mut server = std::process::Command::new(program)
         .args(["--listen", &address.to_string(), "--log", "error", "--grace-seconds", "120"])
@@ -109,7 +109,7 @@ fn shutting_down(with_session: impl FnOnce(&Address)) {
 }
 
 #[test]
-fn a_run_spreads_its_cells_and_survives_the_death_of_a_server() {
+fn a_run_uses_all_servers_and_survives_a_lost_one() {
     let runs = Runs::new();
     let mut servers = vec![server(1), server(1)];
     let both = addresses(&servers);
@@ -118,7 +118,7 @@ fn a_run_spreads_its_cells_and_survives_the_death_of_a_server() {
     assert!(whole.values().all(Option::is_some));
 
     let run = runs.start("broken", &both);
-    // Cells 0 and 1 are begun first, 0 on the first server.
+    // Cells 0 and 1 begin first, cell 0 on the first server.
     wait_for("a training on each server", || {
         let trainings = runs.files("broken", "training/progress.csv");
         runs.plan.cells[..2].iter().all(|cell| trainings[&cell.id].is_some())
@@ -132,11 +132,11 @@ fn a_run_spreads_its_cells_and_survives_the_death_of_a_server() {
     let words = stderr(&again);
     assert!(again.status.success(), "{words}");
     assert!(words.contains(&format!("no server answers at {}", both[0])), "the other server is enough: {words}");
-    assert!(words.contains("going on with the other servers"), "{words}");
+    assert!(words.contains("continuing with the other servers"), "{words}");
 }
 
 #[test]
-fn turns_go_around_the_servers_and_pass_over_those_that_take_no_sessions() {
+fn sessions_rotate_over_servers_that_accept_them() {
     let servers = [server(1), server(1)];
     let both = addresses(&servers);
     for turn in 0..4 {
@@ -178,7 +178,7 @@ fn a_name_is_one_server_however_many_addresses_it_has() {
         .spawn()
         .expect("perturb-server");
     wait_for("the server", || std::fs::read(directory.path().join("out")).is_ok_and(|text| !text.is_empty()));
-    // Where localhost is ::1 too, nobody listens there.
+    // If localhost is also ::1, no server listens there.
     let name: Address = format!("localhost:{port}").parse().expect("an address");
     for turn in 0..3 {
         let one = Servers::connect_to_one(std::slice::from_ref(&name), turn).expect("a connection");

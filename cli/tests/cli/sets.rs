@@ -1,4 +1,4 @@
-//! Parameters of one's own from the experiment file to the report, and back to the episodes.
+//! Custom parameter sets, from the experiment file to the report and to replayed episodes.
 
 use std::path::Path;
 use std::process::Output;
@@ -44,7 +44,7 @@ name = 'ppo'
 architectures = ['ff']
 ";
 
-/// The experiment in a folder of its own.
+/// An experiment in a temporary folder.
 fn experiment() -> TempDir {
     let directory = tempfile::tempdir().expect("a directory");
     std::fs::write(directory.path().join("plan.toml"), PLAN).expect("written");
@@ -82,7 +82,7 @@ fn results(directory: &Path) -> Vec<CellResult> {
 }
 
 #[test]
-fn an_experiment_on_sets_runs_and_every_episode_can_be_played_again_on_one_and_on_two_servers() {
+fn episodes_of_sets_replay_on_one_and_two_servers() {
     let directory = experiment();
     stdout(&run(directory.path(), &["--jobs", "2"]));
     let out = directory.path().join("out");
@@ -135,7 +135,7 @@ fn parameters_are_those_of_the_sets(records: &Records) {
 }
 
 #[test]
-fn an_episode_that_comes_out_otherwise_is_told_and_is_a_failure() {
+fn a_different_replay_is_reported_as_failure() {
     let directory = experiment();
     stdout(&run(directory.path(), &["--cell", "0"]));
     let folder = Folder::new(&directory.path().join("out"));
@@ -160,7 +160,7 @@ fn an_episode_that_comes_out_otherwise_is_told_and_is_a_failure() {
 }
 
 #[test]
-fn sets_are_typed_judged_by_other_thresholds_and_played_again() {
+fn sets_are_tested_rescored_and_replayed() {
     let directory = tempfile::tempdir().expect("a directory");
     let [training, records] = ["training", "records"].map(|name| directory.path().join(name).display().to_string());
     let parameters = ["--parameters", "length=0.75..1.25,1.5", "mass=1"];
@@ -174,12 +174,14 @@ fn sets_are_typed_judged_by_other_thresholds_and_played_again() {
     assert!(config.contains("preset = \"paper\"\n") && config.contains("num_envs = 1\n"), "{config}");
     let tested = stdout(&perturb(&evaluate).args(["--parameters", "length=0.75..1.25"]).output().unwrap());
     assert!(tested.contains("Acrobot ppo ff (paper)") && tested.contains("success: steps at most 90"), "{tested}");
-    let rates = perturb(&["rates", &records, "--success", "text", "code", "steps=500"]).output().unwrap();
+    let rates = perturb(&["rescore", &records, "--success", "text", "code", "steps=500"]).output().unwrap();
     let text = stdout(&rates);
     for line in ["steps at most 80", "steps at most 90", "steps at most 500"] {
         assert!(text.contains(line), "{text}");
     }
+    // The old name of the command still works.
     let rates = perturb(&["rates", &records, "--success", "text", "code", "--json"]).output().unwrap();
+    assert!(stderr(&rates).contains("`perturb rates` is called `perturb rescore` now"), "{}", stderr(&rates));
     let told: serde_json::Value = serde_json::from_slice(&rates.stdout).expect("JSON and nothing else");
     let rates = told["rates"].as_array().expect("a rate for each set and rule");
     let rules: Vec<_> = rates.iter().map(|rate| rate["success"]["threshold"].as_f64().expect("a number")).collect();
@@ -191,7 +193,7 @@ fn sets_are_typed_judged_by_other_thresholds_and_played_again() {
 
 /// The text's rule counts Pendulum's last steps near upright, the code's the longest time.
 #[test]
-fn two_rules_that_count_different_steps_see_the_same_episodes() {
+fn rules_with_different_quantities_test_equal_episodes() {
     let directory = tempfile::tempdir().expect("a directory");
     let [training, text, code] =
         ["training", "text", "code"].map(|name| directory.path().join(name).display().to_string());
@@ -209,13 +211,13 @@ fn two_rules_that_count_different_steps_see_the_same_episodes() {
     assert!(of_text.iter().any(|(last, longest)| last < longest), "some fell from near upright: {of_text:?}");
     let rates = |records: &String| {
         let rules = ["--success", "text", "code", "steps=1", "steps_in_a_row=5"];
-        stdout(&perturb(&["rates", records]).args(rules).output().unwrap())
+        stdout(&perturb(&["rescore", records]).args(rules).output().unwrap())
     };
     assert_eq!(rates(&text), rates(&code));
 }
 
 #[test]
-fn what_no_environment_has_is_refused_before_anything_begins() {
+fn unknown_parameters_are_refused_at_the_start() {
     let directory = experiment();
     for (from, to, part) in [
         ("mass = 0.2", "size = 0.2", "`size`, but must be one of force, length, mass"),
@@ -234,7 +236,7 @@ fn what_no_environment_has_is_refused_before_anything_begins() {
     }
 }
 
-/// CartPole, on which an edit of the mass has no effect.
+/// CartPole with a fault: setting the mass has no effect.
 struct Stuck(Box<dyn Environment>);
 
 impl Stuck {
@@ -287,7 +289,7 @@ impl Environment for Stuck {
     }
 }
 
-/// A server in a thread of this process, with a catalogue that no program has.
+/// Starts a server in a thread of this process, with a catalogue for tests.
 struct InThread {
     address: String,
     shutdown: Option<oneshot::Sender<()>>,
@@ -323,7 +325,7 @@ impl Drop for InThread {
 }
 
 #[test]
-fn an_edit_that_does_not_take_effect_stops_a_training() {
+fn an_ineffective_parameter_edit_stops_a_training() {
     let directory = tempfile::tempdir().expect("a directory");
     let server = InThread::start(Catalogue::default().with(Stuck::spec()));
     let out = directory.path().join("out").display().to_string();

@@ -1,12 +1,12 @@
-//! Servers that are stopped under a training, say nothing for a while, and go on.
+//! Servers that stop during a training, are silent for a while, and continue.
 
 use rstest::rstest;
 
 use crate::common::{ended, kill, wait_for};
 use crate::patience::{A2C_PENDULUM, Named, PPO_CART_POLE, result, train, undisturbed};
-use perturb_faults::{Course, Dice, Line};
+use perturb_faults::{FaultPlan, FaultyProxy, SeededRng};
 
-/// Stops every thread of a server, which may answer until the last one has stopped.
+/// Stops every thread of a server. It may answer until the last thread has stopped.
 fn freeze(server: &Named) {
     kill("-STOP", server.id());
     let is_stopped = |task: std::io::Result<std::fs::DirEntry>| {
@@ -24,8 +24,8 @@ fn thaw(server: &Named) {
 #[rstest]
 #[case::the_only_one(PPO_CART_POLE, &["a"])]
 #[case::one_of_two(A2C_PENDULUM, &["a", "b"])]
-fn a_server_that_says_nothing_for_a_moment_is_waited_for(#[case] text: &str, #[case] names: &[&str]) {
-    let (folder, mut dice) = (tempfile::tempdir().expect("a directory"), Dice::new());
+fn a_briefly_silent_server_is_waited_for(#[case] text: &str, #[case] names: &[&str]) {
+    let (folder, mut dice) = (tempfile::tempdir().expect("a directory"), SeededRng::new());
     let named: Vec<Named> = names.iter().map(|name| Named::new(folder.path(), name)).collect();
     let list = named.iter().map(Named::address).collect::<Vec<_>>().join(",");
     let (mut child, out, said) = train(&folder, text, &["--server", &list]);
@@ -47,12 +47,12 @@ fn a_server_that_says_nothing_for_a_moment_is_waited_for(#[case] text: &str, #[c
     assert_eq!(result(&out), undisturbed(text), "after {stops} stops");
 }
 
-/// By TCP, where sessions have leases.
+/// Uses TCP, because sessions have leases there.
 #[test]
-fn a_server_that_speaks_again_after_it_was_taken_for_dead_has_its_session_taken_up() {
+fn a_session_resumes_when_a_silent_server_answers_again() {
     let folder = tempfile::tempdir().expect("a directory");
     let server = Named::new(folder.path(), "a");
-    let line = Line::start(&server.address(), |_| Course::default()).expect("a port");
+    let line = FaultyProxy::start(&server.address(), |_| FaultPlan::default()).expect("a port");
     let (child, out, said) = train(&folder, A2C_PENDULUM, &["--server", &line.address()]);
     wait_for("a checkpoint", || out.join("checkpoint/checkpoint.json").exists());
     freeze(&server);
@@ -67,7 +67,7 @@ fn a_server_that_speaks_again_after_it_was_taken_for_dead_has_its_session_taken_
 }
 
 #[test]
-fn a_server_of_two_that_says_nothing_for_long_is_done_without_and_harms_nobody_when_it_goes_on() {
+fn a_silent_server_of_two_is_replaced_by_the_other() {
     let folder = tempfile::tempdir().expect("a directory");
     let two = ["a", "b"].map(|name| Named::new(folder.path(), name));
     let list = two.iter().map(Named::address).collect::<Vec<_>>().join(",");

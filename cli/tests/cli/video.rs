@@ -17,7 +17,7 @@ use gif::{ColorOutput, DecodeOptions};
 use insta::assert_snapshot;
 use tempfile::TempDir;
 
-/// A policy that was trained for a moment.
+/// Trains a policy for a few episodes.
 fn trained(server: &PrivateServer, text: &str) -> (TempDir, Checkpoint) {
     let servers = Servers::connect(std::slice::from_ref(server.address())).expect("a connection");
     let (out, outcome) = run(&servers, text);
@@ -27,7 +27,7 @@ fn trained(server: &PrivateServer, text: &str) -> (TempDir, Checkpoint) {
 const CART_POLE: &str = "environment = 'CartPole'\nepisodes = 5\nnum_envs = 2\nn_steps = 32";
 const PENDULUM: &str = "environment = 'Pendulum'\nepisodes = 2\nnum_envs = 2\nn_steps = 64";
 
-/// `perturb video` of the checkpoint in `out`, small.
+/// Returns the command for a small video of the checkpoint in `out`.
 fn video(out: &TempDir, file: &Path, more: &[&str]) -> Command {
     let [out, file] = [out.path(), file].map(|path| path.to_str().expect("UTF-8"));
     let mut command = perturb(&["video", "--checkpoint", out, "--out", file, "--width", "240", "--height", "240"]);
@@ -41,13 +41,13 @@ fn done(mut command: Command) -> String {
     String::from_utf8(output.stdout).expect("UTF-8")
 }
 
-/// Steps of each episode, from the table that is printed.
+/// Returns the number of steps of each episode, from the printed table.
 fn lengths(stdout: &str) -> Vec<u64> {
     let rows = stdout.lines().skip(1).take_while(|line| line.starts_with(' '));
     rows.map(|row| row.split_whitespace().nth(2).and_then(|steps| steps.parse().ok()).expect("a number")).collect()
 }
 
-/// Size, delays in hundredths of a second, and what is seen at each frame: those before it, and on them its rectangle.
+/// Returns the size of a GIF, its delays in hundredths of a second, and the visible picture at each frame.
 fn decoded(path: &Path) -> ((u16, u16), Vec<u16>, Vec<Vec<u8>>) {
     let mut options = DecodeOptions::new();
     options.set_color_output(ColorOutput::RGBA);
@@ -103,7 +103,7 @@ fn a_gif_has_a_frame_for_each_start_and_each_step() {
             frames.iter().map(|frame| frame[bytes.clone()].to_vec()).collect::<HashSet<_>>().len()
         };
         let distinct = pixels(&frames, 0..240) as u64;
-        // A pendulum that hangs still for a moment may look the same in two frames.
+        // A pendulum at rest may look the same in two frames.
         assert!(distinct * 10 >= frames.len() as u64 * 9, "{distinct} of {} pictures differ", frames.len());
         assert_eq!(pixels(&frames, 240..usize::from(size.1)), frames.len(), "the text below differs in every frame");
 
@@ -130,7 +130,7 @@ fn a_gif_is_shown_as_fast_as_was_asked_for() {
 }
 
 #[test]
-fn a_gif_that_would_be_too_large_shows_fewer_frames_for_as_long() {
+fn large_gifs_show_fewer_frames_in_the_same_time() {
     let server = server(1);
     let (out, _) = trained(&server, PENDULUM);
     let folder = tempfile::tempdir().expect("a folder");
@@ -151,7 +151,7 @@ fn a_gif_that_would_be_too_large_shows_fewer_frames_for_as_long() {
     assert_eq!(delays.iter().filter(|&&delay| delay >= 200).count(), 20, "the end of each episode");
 }
 
-/// Plays with the library, into a file that is thrown away.
+/// Plays with the library and deletes the file.
 fn filmed(servers: &Servers, checkpoint: &Checkpoint, version: Version, episodes: u64) -> Footage {
     filmed_every(1, servers, checkpoint, version, episodes)
 }
@@ -235,7 +235,7 @@ fn a_contact_sheet_has_the_versions_side_by_side() {
     let set = 3 * 240 + 2 * 2;
     let across = 2 * set + 8;
     assert!(both.iter().all(|row| row.len() == 3 * across));
-    // Each side begins as a sheet of its version does, with the same episodes in the same rows.
+    // Each half equals the sheet of its version, with the same episodes in the same rows.
     for (version, start) in [("D", 0), ("E", set + 8)] {
         let (_, alone) = sheet("b.png", version);
         assert_eq!(alone.len(), both.len());
@@ -247,14 +247,14 @@ fn a_contact_sheet_has_the_versions_side_by_side() {
     }
     let refused = video(&out, &folder.path().join("c.png"), &["--fps", "5"]).output().expect("perturb");
     assert_eq!(refused.status.code(), Some(2));
-    assert!(stderr(&refused).contains("--fps is how fast a film is shown"), "{}", stderr(&refused));
+    assert!(stderr(&refused).contains("--fps is the speed of a film"), "{}", stderr(&refused));
     let refused = video(&out, &folder.path().join("c.png"), &["--server", &address, "--episodes", "100000"]);
     let refused = { refused }.output().expect("perturb");
     assert!(stderr(&refused).contains("give fewer episodes or smaller pictures"), "{}", stderr(&refused));
     assert!(!folder.path().join("c.png").exists());
 }
 
-/// What ffprobe says of a video's stream.
+/// Returns ffprobe's description of a video's stream.
 fn probed(path: &Path) -> String {
     let entries = "stream=codec_name,pix_fmt,width,height,r_frame_rate,color_space,nb_read_frames";
     let output = Command::new("ffprobe")
@@ -285,7 +285,7 @@ fn an_mp4_is_what_every_player_shows() {
     assert!(stdout.contains("at 1.00 × real time"), "{stdout}");
 
     let probed = probed(&file);
-    // 201 frames, the last one for two seconds of 20.
+    // 201 frames at 20 frames per second, the last one for two seconds.
     for expected in [
         "codec_name=h264",
         "pix_fmt=yuv420p",
@@ -302,7 +302,7 @@ fn an_mp4_is_what_every_player_shows() {
 }
 
 #[test]
-fn without_ffmpeg_an_mp4_is_refused_before_anything_is_played() {
+fn an_mp4_without_ffmpeg_is_refused_at_the_start() {
     let server = server(1);
     let (out, _) = trained(&server, CART_POLE);
     let folder = tempfile::tempdir().expect("a folder");
@@ -364,7 +364,7 @@ fn a_server_that_cannot_draw_says_why() {
     let (out, _) = trained(&server, "environment = 'Hopper'\nepisodes = 2\nnum_envs = 2\nn_steps = 32");
     let folder = tempfile::tempdir().expect("a folder");
     let mut command = video(&out, &folder.path().join("a.gif"), &["--workers", "1"]);
-    // No driver, for the private server, which inherits it.
+    // The private server inherits this variable and finds no driver.
     let output = command.env("__EGL_VENDOR_LIBRARY_FILENAMES", "/nowhere.json").output().expect("perturb");
     assert_eq!(output.status.code(), Some(1));
     let words = stderr(&output);
@@ -372,7 +372,7 @@ fn a_server_that_cannot_draw_says_why() {
     assert!(names(&folder).is_empty());
 }
 
-/// Seconds of processor time that a process took.
+/// Returns the processor time of a process, in seconds.
 fn processor_seconds(id: u32) -> f64 {
     let stat = std::fs::read_to_string(format!("/proc/{id}/stat")).expect("a process");
     let (_, fields) = stat.rsplit_once(')').expect("a name in brackets");
@@ -380,7 +380,7 @@ fn processor_seconds(id: u32) -> f64 {
     ticks.sum::<f64>() / 100.0
 }
 
-/// Begins a long video, calls `end` when some of it is made, and returns what `perturb` says then.
+/// Begins a long video, calls `end` when a part of it is made, and returns the output of `perturb`.
 fn broken_off(ending: &str, server: Option<&str>, end: impl FnOnce(u32)) -> (Output, Vec<PathBuf>) {
     let training = crate::common::server(1);
     let (out, _) = trained(&training, PENDULUM);
@@ -391,7 +391,7 @@ fn broken_off(ending: &str, server: Option<&str>, end: impl FnOnce(u32)) -> (Out
         command.args(["--server", address]);
     }
     let child = command.spawn().expect("perturb");
-    // A GIF is written at its end; the start alone takes a fraction of this.
+    // A GIF is written at the end. The start alone takes a fraction of this time.
     wait_for("the first frames", || processor_seconds(child.id()) > 0.5);
     end(child.id());
     (ended(child), names(&folder))

@@ -1,55 +1,58 @@
-//! Certificates, good and bad, made for a test.
+//! Valid and invalid certificates for tests.
 
 use rcgen::{BasicConstraints, CertificateParams, DistinguishedName, DnType, IsCa, Issuer, KeyPair, date_time_ymd};
 use std::path::{Path, PathBuf};
 
-const MADE: &str = "a certificate";
+const EXPECT: &str = "certificates can be made and written";
 
-/// An authority.
+/// A certificate authority.
 pub struct Authority {
     issuer: Issuer<'static, KeyPair>,
     pem: String,
 }
 
-/// A certificate's and a key's file.
-pub struct Pair {
-    /// The certificate, PEM.
+/// Files of a certificate and its key.
+pub struct CertificateFiles {
+    /// Certificate in PEM format.
     pub cert: PathBuf,
-    /// Its private key, PEM.
+    /// Private key in PEM format.
     pub key: PathBuf,
 }
 
 impl Authority {
-    /// One of this name, which is no other one's of the same name.
+    /// Makes an authority. Two authorities of the same name do not trust each other.
     ///
     /// # Panics
-    /// As all here, where a certificate or a file cannot be made.
+    /// Every function here panics if a certificate or a file cannot be made.
     pub fn new(name: &str) -> Self {
-        let mut params = CertificateParams::new(Vec::new()).expect(MADE);
+        let mut params = CertificateParams::new(Vec::new()).expect(EXPECT);
         params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
         params.distinguished_name = DistinguishedName::new();
         params.distinguished_name.push(DnType::CommonName, name);
-        let key = KeyPair::generate().expect(MADE);
-        let pem = params.self_signed(&key).expect(MADE).pem();
+        let key = KeyPair::generate().expect(EXPECT);
+        let pem = params.self_signed(&key).expect(EXPECT).pem();
         Self { issuer: Issuer::new(params, key), pem }
     }
 
-    /// The file of its own certificate.
+    /// Writes the authority's own certificate to a file.
     pub fn file(&self, directory: &Path, name: &str) -> PathBuf {
         let path = directory.join(name);
-        std::fs::write(&path, &self.pem).expect(MADE);
+        std::fs::write(&path, &self.pem).expect(EXPECT);
         path
     }
 
-    /// Files of a certificate for these names, good from 2020 until that year, written over what was there.
-    pub fn issue(&self, directory: &Path, file: &str, names: &[&str], until_year: i32) -> Pair {
+    /// Writes a certificate for these names, valid from 2020 until `until_year`. Replaces existing files.
+    pub fn issue(&self, directory: &Path, file: &str, names: &[&str], until_year: i32) -> CertificateFiles {
         let mut params =
-            CertificateParams::new(names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>()).expect(MADE);
+            CertificateParams::new(names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>()).expect(EXPECT);
         (params.not_before, params.not_after) = (date_time_ymd(2020, 1, 1), date_time_ymd(until_year, 1, 1));
-        let own = KeyPair::generate().expect(MADE);
-        let pair = Pair { cert: directory.join(format!("{file}.pem")), key: directory.join(format!("{file}.key")) };
-        std::fs::write(&pair.cert, params.signed_by(&own, &self.issuer).expect(MADE).pem()).expect(MADE);
-        std::fs::write(&pair.key, own.serialize_pem()).expect(MADE);
+        let own = KeyPair::generate().expect(EXPECT);
+        let pair = CertificateFiles {
+            cert: directory.join(format!("{file}.pem")),
+            key: directory.join(format!("{file}.key")),
+        };
+        std::fs::write(&pair.cert, params.signed_by(&own, &self.issuer).expect(EXPECT).pem()).expect(EXPECT);
+        std::fs::write(&pair.key, own.serialize_pem()).expect(EXPECT);
         pair
     }
 }

@@ -1,22 +1,24 @@
-//! Disks without room.
+//! Full disks.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-/// `command` where no file may get larger than so many blocks of 512 bytes: writing more is an error, "File too large".
-pub fn small_files(command: &Command, blocks: u32) -> Command {
-    // By default it would be a signal.
+/// Returns `command` with a limit on the size of files, in blocks of 512 bytes. Writing more fails with "File too
+/// large".
+pub fn with_file_limit(command: &Command, blocks: u32) -> Command {
+    // Without the trap, the signal SIGXFSZ would end the command.
     let script = "trap '' XFSZ; ulimit -f \"$1\"; shift; exec \"$@\"";
-    scripted(command, Command::new("sh").args(["-c", script, "sh", &blocks.to_string()]))
+    in_shell(command, Command::new("sh").args(["-c", script, "sh", &blocks.to_string()]))
 }
 
-/// `command`, run twice, first where `folder` is a disk of so many kB and then with all the room it wants; what is in the
-/// folder at the end is put into `kept`. Standard error has the first run's status in a line between the two. None where
-/// the system lets nobody mount such a disk.
-pub fn full_at_first(command: &Command, folder: &Path, kilobytes: u32, kept: &Path) -> Option<Command> {
+/// Returns a command that runs `command` twice: first with a disk of `kilobytes` at `folder`, then with enough space.
+///
+/// The folder's contents are copied to `copy` at the end. Standard error has a line with the first run's status between
+/// the two. Returns `None` if this user may not mount disks.
+pub fn on_full_then_free_disk(command: &Command, folder: &Path, kilobytes: u32, copy: &Path) -> Option<Command> {
     const NAMESPACE: [&str; 2] = ["--map-root-user", "--mount"];
-    let tried = Command::new("unshare").args(NAMESPACE).args(["mount", "-t", "tmpfs", "tmpfs"]).arg(folder).status();
-    tried.ok().filter(|status| status.success())?;
+    let mount = Command::new("unshare").args(NAMESPACE).args(["mount", "-t", "tmpfs", "tmpfs"]).arg(folder).status();
+    mount.ok().filter(|status| status.success())?;
     let script = "folder=$1 size=$2 kept=$3; shift 3
         mount -t tmpfs -o size=${size}k tmpfs \"$folder\" || exit 99
         \"$@\"; echo \"first status $?\" >&2
@@ -25,12 +27,12 @@ pub fn full_at_first(command: &Command, folder: &Path, kilobytes: u32, kept: &Pa
         cp -a \"$folder/.\" \"$kept\" || exit 99
         exit $status";
     let mut shell = Command::new("unshare");
-    shell.args(NAMESPACE).args(["sh", "-c", script, "sh"]).arg(folder).arg(kilobytes.to_string()).arg(kept);
-    Some(scripted(command, &mut shell))
+    shell.args(NAMESPACE).args(["sh", "-c", script, "sh"]).arg(folder).arg(kilobytes.to_string()).arg(copy);
+    Some(in_shell(command, &mut shell))
 }
 
-/// `shell` with all of `command` behind it.
-fn scripted(command: &Command, shell: &mut Command) -> Command {
+/// Returns `shell` with `command` as its last arguments.
+fn in_shell(command: &Command, shell: &mut Command) -> Command {
     let mut whole = Command::new(shell.get_program());
     whole.args(shell.get_args()).arg(command.get_program()).args(command.get_args());
     whole.stdout(Stdio::piped()).stderr(Stdio::piped());
@@ -50,20 +52,20 @@ mod tests {
     }
 
     #[test]
-    fn files_stay_small() {
+    fn files_do_not_exceed_the_limit() {
         let folder = tempfile::tempdir().expect("a folder");
-        let output = small_files(&writing(folder.path()), 32).output().expect("ended");
+        let output = with_file_limit(&writing(folder.path()), 32).output().expect("ended");
         let words = String::from_utf8_lossy(&output.stderr);
         assert!(!output.status.success() && words.contains("File too large"), "{words}");
         assert_eq!(std::fs::metadata(folder.path().join("file")).expect("a file").len(), 16 << 10);
     }
 
     #[test]
-    fn a_disk_is_full_at_first_and_what_is_written_then_is_kept() {
+    fn a_disk_is_full_at_first_and_free_later() {
         let [disk, kept] = [(); 2].map(|()| tempfile::tempdir().expect("a folder"));
         let (disk, kept) = (disk.path(), kept.path());
-        let Some(mut twice) = full_at_first(&writing(disk), disk, 100, kept) else {
-            return eprintln!("skipped: nobody may mount a disk here");
+        let Some(mut twice) = on_full_then_free_disk(&writing(disk), disk, 100, kept) else {
+            return eprintln!("skipped: this user may not mount disks");
         };
         let output = twice.output().expect("ended");
         let words = String::from_utf8_lossy(&output.stderr);

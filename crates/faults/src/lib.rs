@@ -1,14 +1,14 @@
-//! Bad luck for tests and benches, once for all of them:
+//! Fault injection for tests and benchmarks:
 //!
-//! - [`line`](mod@line): a proxy that delays, ends, halves, changes and half-closes what passes.
-//! - [`certificates`]: of authorities of a test's own, good and bad.
-//! - [`dice`]: where and when, by a seed that is printed and can be given.
-//! - [`disk`]: commands whose files have no room.
+//! - [`proxy`]: a proxy that delays, closes, drops and changes bytes.
+//! - [`certificates`]: valid and invalid certificates.
+//! - [`rng`]: random positions and times from a printed seed.
+//! - [`disk`]: commands on full disks.
 
 pub mod certificates;
-pub mod dice;
 pub mod disk;
-pub mod line;
+pub mod proxy;
+pub mod rng;
 
-pub use dice::Dice;
-pub use line::{Course, Fault, Kind, Line};
+pub use proxy::{Fault, FaultKind, FaultPlan, FaultyProxy};
+pub use rng::SeededRng;

@@ -1,7 +1,8 @@
 //! Import cycles between sibling modules.
 //!
-//! An import of `a::b` from `a::c::d` is an edge from `a::c` to `a::b`: each of two modules stands for everything below it, at
-//! the level at which their paths part. A module and its parent count as one, so imports between them are no edges.
+//! An import of `a::b` from `a::c::d` is an edge from `a::c` to `a::b`: each of two modules stands for everything below
+//! it, at the level at which their paths part. A module and its parent count as one, so imports between them are no
+//! edges.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt;

@@ -1,7 +1,8 @@
 //! Doc comments that open without a subject.
 //!
-//! A comment such as "What became of the request" has to be read to its end before one knows what it describes. A doc comment
-//! opens with its subject, or with a verb whose subject is the documented item: "Returns the result of the request".
+//! A comment such as "What became of the request" has to be read to its end before one knows what it describes. A doc
+//! comment opens with its subject, or with a verb whose subject is the documented item: "Returns the result of the
+//! request".
 
 use crate::source::{SourceTree, folder_of, is_test};
 

@@ -1,6 +1,7 @@
 //! Limits of every check by folder, and the exemptions of types that share a name.
 //!
-//! Both files are written in the part of TOML that they need: `[section]`, `key = value`, and comments on lines of their own.
+//! Both files are written in the part of TOML that they need: `[section]`, `key = value`, and comments on lines of
+//! their own.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::{self, Write as _};

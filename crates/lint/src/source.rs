@@ -64,7 +64,8 @@ impl SourceTree {
 
 /// Tells whether a file holds tests or fixtures.
 ///
-/// These are files below `tests`, `test` and `fixtures`, and files called `tests.rs`, `*_test.rs`, `*_tests.rs` or `test_*.py`.
+/// These are files below `tests`, `test` and `fixtures`, and files called `tests.rs`, `*_test.rs`, `*_tests.rs` or
+/// `test_*.py`.
 pub fn is_test(path: &str) -> bool {
     let (folders, name) = path.rsplit_once('/').unwrap_or(("", path));
     folders.split('/').any(|folder| matches!(folder, "tests" | "test" | "fixtures"))

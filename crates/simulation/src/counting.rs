@@ -1,4 +1,4 @@
-//! A session without environments: it counts its steps, whose actions say which number each is.
+//! A session without environments. It counts its steps, and each step's action is a number.
 
 use bytes::Bytes;
 use perturb::proto::{self, session_request::Request, session_response::Response};
@@ -9,9 +9,9 @@ use perturb::server::session::handler::{Reply, SessionHandler, StreamHandover};
 use perturb::server::session::lease::Leases;
 use perturb::server::transport::precheck::Field;
 
-use super::{Ledger, MOST_BYTES};
+use super::{Ledger, MAX_BYTES};
 
-/// A session that counts.
+/// A counting session.
 pub(super) struct Counting {
     leases: Leases<proto::SessionResponse>,
     ledger: Ledger,
@@ -20,7 +20,7 @@ pub(super) struct Counting {
 }
 
 impl Counting {
-    /// One that is not open.
+    /// Makes a session that is not open yet.
     pub(super) fn new(leases: Leases<proto::SessionResponse>, ledger: Ledger) -> Self {
         Self { leases, ledger, is_open: false, steps: 0 }
     }
@@ -34,7 +34,7 @@ impl Counting {
         Ok(Reply { handover: grant.map(StreamHandover::Lease), ..reply(Response::Opened(opened)) })
     }
 
-    /// The number that came, and how many steps there are now.
+    /// Replies with the number of the request and with the number of steps so far.
     fn step(&mut self, step: &proto::Step) -> Result<SessionReply, Error> {
         let number = step.actions[..].try_into().map(u64::from_le_bytes);
         let number = number.map_err(|_| Error::value("step.actions", step.actions.len(), "8 bytes"))?;
@@ -78,7 +78,7 @@ impl SessionHandler for Counting {
     }
 
     fn allowance(&self) -> Allowance {
-        Allowance { bytes: MOST_BYTES, entries: 1, covered: 0 }
+        Allowance { bytes: MAX_BYTES, entries: 1, covered: 0 }
     }
 
     fn is_open(&self) -> bool {

@@ -1,6 +1,7 @@
-//! A server whose sessions count, for clients in a simulation: the transport of sessions and their leases are the real
-//! ones, at both ends, and so is all of gRPC. Time and the network are those of [turmoil](https://docs.rs/turmoil), and
-//! there is no physics, whose threads would be in another time.
+//! A server with counting sessions, for tests in simulated time.
+//!
+//! gRPC, the transport of sessions and their leases are the real ones, in client and server. Time and network are
+//! simulated by [turmoil](https://docs.rs/turmoil). There is no physics, because its threads would use real time.
 #![cfg(feature = "turmoil")]
 
 mod counting;
@@ -31,24 +32,27 @@ use tonic::{Request, Response, Status, Streaming};
 
 use counting::Counting;
 
-/// What the server's machine is called.
+/// Name of the server's machine.
 pub const SERVER: &str = "server";
-/// How long a session is held without a stream.
+/// Time for which the server holds a session without a stream.
 pub const LEASE: Duration = Duration::from_secs(60);
 
 const PORT: u16 = 7471;
-/// How long either side says nothing before it is asked whether it lives, and how long that may take.
+/// Silence after which a peer sends a keepalive ping, and time for the answer to it.
 pub const KEEPALIVE: Duration = Duration::from_secs(1);
-/// How long a client waits for an answer to its connection.
-const SILENCE: Duration = Duration::from_secs(3);
-const HANDSHAKE: Duration = Duration::from_secs(10);
-const MOST_SESSIONS: usize = 4;
-const MOST_BYTES: usize = 1 << 20;
+/// Time that a client waits for its connection.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
+/// Time that a client has for opening a session.
+const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
+/// Maximum number of sessions.
+const MAX_SESSIONS: usize = 4;
+/// Memory budget of the server, and maximum size of a request.
+const MAX_BYTES: usize = 1 << 20;
 
-/// What the server's sessions have done, and what is left of them. Clones see the same.
+/// Steps and state of the server's sessions. Clones share them.
 #[derive(Clone)]
 pub struct Ledger {
-    /// The steps, in their order.
+    /// Numbers of the steps, in the order of the server.
     done: Arc<Mutex<Vec<u64>>>,
     numbers: Numbers,
     places: Places,
@@ -57,28 +61,28 @@ pub struct Ledger {
 
 impl Default for Ledger {
     fn default() -> Self {
-        let places = Places::new(MOST_SESSIONS, MOST_SESSIONS);
+        let places = Places::new(MAX_SESSIONS, MAX_SESSIONS);
         Self { done: Arc::default(), numbers: Numbers::default(), places, counters: ErrorCounters::default() }
     }
 }
 
 impl Ledger {
-    /// The numbers that clients stepped with, in the order in which the server did the steps.
+    /// Returns the numbers that clients stepped with, in the order of the server.
     pub fn done(&self) -> Vec<u64> {
         self.done.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// How often a session was taken up.
+    /// Returns the number of resumed sessions.
     pub fn resumed(&self) -> u64 {
         self.numbers.resumed()
     }
 
-    /// How often a session was asked for that there was not, or no more.
+    /// Returns the number of requests to resume a session that does not exist.
     pub fn unknown(&self) -> u64 {
         self.counters.counts().filter(|(kind, _)| *kind == ErrorKind::UnknownLease).map(|(_, count)| count).sum()
     }
 
-    /// Whether no session is left, with or without a stream.
+    /// Tells whether no session is left, with or without a stream.
     pub fn is_idle(&self) -> bool {
         self.places.taken() == 0 && self.numbers.detached() == 0
     }
@@ -88,26 +92,26 @@ impl Ledger {
     }
 }
 
-/// Serves on this machine of the simulation, until that ends.
+/// Serves on this machine of the simulation until the simulation ends.
 ///
 /// # Errors
 /// If the port is taken, or the transport fails.
 pub async fn serve(ledger: Ledger) -> turmoil::Result {
     let (_controller, drain) = Controller::new();
-    let budget = Budget::new(MOST_BYTES);
-    let limits = Limits { bytes: MOST_BYTES, handshake: HANDSHAKE, idle: None };
+    let budget = Budget::new(MAX_BYTES);
+    let limits = Limits { bytes: MAX_BYTES, handshake: HANDSHAKE_TIMEOUT, idle: None };
     let (places, numbers, counters) = (ledger.places.clone(), ledger.numbers.clone(), ledger.counters.clone());
     let sessions = Sessions::new(places, limits, drain, counters, Access::default(), numbers.clone());
     let counts = Counts::new::<Counting>();
     let service = Service { sessions, leases: Leases::new(LEASE, numbers), ledger, counts };
-    let transit = Transit { budget, limit: Some(LEASE), handshake: HANDSHAKE };
+    let transit = Transit { budget, limit: Some(LEASE), handshake: HANDSHAKE_TIMEOUT };
     let listener = turmoil::net::TcpListener::bind((Ipv4Addr::UNSPECIFIED, PORT)).await?;
     let connections = Places::new(usize::MAX, usize::MAX);
     let incoming = stream::unfold((listener, connections), |(listener, connections)| async {
         let (stream, address) = listener.accept().await.ok()?;
         let peer = Peer::at(address.ip());
         let place = connections.take(Some(peer)).ok()?;
-        let guarded = Guarded::new(stream, peer, place, HANDSHAKE);
+        let guarded = Guarded::new(stream, peer, place, HANDSHAKE_TIMEOUT);
         Some((Ok::<_, io::Error>(guarded), (listener, connections)))
     });
     Server::builder()
@@ -129,17 +133,18 @@ pub async fn connect() -> Result<Connection, ClientError> {
     Connection::open_by(&address, patience, stream).await
 }
 
-/// A cut line refuses connections at once in the simulation; in the world it says nothing.
+/// Connects to the server. A cut connection is refused at once in the simulation, but times out in reality, so this
+/// function waits first.
 async fn stream() -> io::Result<turmoil::net::TcpStream> {
     let stream = turmoil::net::TcpStream::connect((SERVER, PORT)).await;
     if stream.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::ConnectionRefused) {
-        tokio::time::sleep(SILENCE).await;
+        tokio::time::sleep(CONNECT_TIMEOUT).await;
         return Err(io::ErrorKind::TimedOut.into());
     }
     stream
 }
 
-/// The service of `perturb.v1`, with sessions that count.
+/// The service of `perturb.v1` with counting sessions.
 #[derive(Clone)]
 struct Service {
     sessions: Sessions,

@@ -1,42 +1,43 @@
-//! Leases over a line that is cut and held at random, in simulated time, by seeds: `PERTURB_SEED` gives the first,
-//! `PERTURB_SIMULATIONS` how many; a failure prints its seed.
+//! Leases over a connection that is cut and held at random, in simulated time.
+//!
+//! `PERTURB_SEED` is the first seed, `PERTURB_SIMULATIONS` the number of seeds. A failure prints its seed.
 
 use std::cell::RefCell;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::rc::Rc;
 use std::time::Duration;
 
-use perturb_faults::Dice;
-use perturb_faults::dice::SEED;
+use perturb_faults::SeededRng;
+use perturb_faults::rng::SEED_VARIABLE;
 use perturb_protocol::{ClientError, Stream, proto};
 use perturb_simulation::{KEEPALIVE, LEASE, Ledger, SERVER, connect, serve};
 use turmoil::{Builder, Sim};
 
 const CLIENT: &str = "client";
-/// Steps of a session.
+/// Number of steps of a session.
 const STEPS: u64 = 200;
-/// Requests that wait for their replies, at most.
-const AHEAD: u64 = 5;
-/// How long one is busy between two steps, at most; ms.
-const BUSY: u64 = 100;
-/// How long the line is good or bad at a time, at most; ms.
-const SPELL: u64 = 8_000;
-/// Simulations of each test unless a variable says how many.
+/// Maximum number of requests without a reply.
+const MAX_IN_FLIGHT: u64 = 5;
+/// Maximum pause between two steps, in milliseconds.
+const MAX_PAUSE_MS: u64 = 100;
+/// Maximum time between two changes of the connection, in milliseconds.
+const MAX_CHANGE_INTERVAL_MS: u64 = 8_000;
+/// Default number of simulations of each test.
 const SIMULATIONS: u64 = 50;
 
-/// What a client saw: when, in the simulation's time, and the numbers of each reply.
-type Seen = Rc<RefCell<Vec<(Duration, [u64; 2])>>>;
+/// Replies that a client received: the simulation's time, and the numbers of each reply.
+type Replies = Rc<RefCell<Vec<(Duration, [u64; 2])>>>;
 
-fn number(name: &str, usual: u64) -> u64 {
-    std::env::var(name).map_or(usual, |text| text.parse().expect("a number"))
+fn number(name: &str, default: u64) -> u64 {
+    std::env::var(name).map_or(default, |text| text.parse().expect("a number"))
 }
 
-/// For each seed.
+/// Runs `simulate` with each seed.
 fn simulations(simulate: impl Fn(u64)) {
-    let first = number(SEED, 1);
+    let first = number(SEED_VARIABLE, 1);
     for seed in first..first + number("PERTURB_SIMULATIONS", SIMULATIONS) {
         if let Err(failure) = catch_unwind(AssertUnwindSafe(|| simulate(seed))) {
-            eprintln!("{SEED}={seed} SIMULATIONS=1 make simulation-test simulates this again");
+            eprintln!("{SEED_VARIABLE}={seed} SIMULATIONS=1 make simulation-test simulates this again");
             resume_unwind(failure);
         }
     }
@@ -53,42 +54,42 @@ fn simulation(seed: u64, ledger: &Ledger) -> Sim<'static> {
 }
 
 async fn open() -> Result<Stream, ClientError> {
-    let open = proto::Open { lease: AHEAD as u32, ..Default::default() };
+    let open = proto::Open { lease: MAX_IN_FLIGHT as u32, ..Default::default() };
     Ok(Stream::open(&connect().await?, open).await?.0)
 }
 
-async fn ask(session: &mut Stream, number: u64) -> Result<(), ClientError> {
+async fn send_step(session: &mut Stream, number: u64) -> Result<(), ClientError> {
     session.send(proto::Step { actions: number.to_le_bytes().to_vec().into() }).await
 }
 
-async fn take(session: &mut Stream) -> Result<[u64; 2], ClientError> {
+async fn receive_step(session: &mut Stream) -> Result<[u64; 2], ClientError> {
     let stepped = session.receive::<proto::Step>().await?;
     let (numbers, _) = stepped.observations.as_chunks::<8>();
     Ok([0, 1].map(|i| u64::from_le_bytes(numbers[i])))
 }
 
-/// Takes all steps, some requests ahead, at its leisure.
-async fn play(seed: u64, seen: Seen) -> turmoil::Result {
-    let mut dice = Dice::of(seed);
-    let (mut session, mut asked) = (open().await?, 0);
+/// Takes all steps with some requests in flight and random pauses.
+async fn play(seed: u64, replies: Replies) -> turmoil::Result {
+    let mut rng = SeededRng::from_seed(seed);
+    let (mut session, mut sent) = (open().await?, 0);
     for received in 0..STEPS {
-        let ahead = 1 + dice.below(AHEAD);
-        while asked < STEPS.min(received + ahead) {
-            ask(&mut session, asked).await?;
-            asked += 1;
+        let in_flight = 1 + rng.below(MAX_IN_FLIGHT);
+        while sent < STEPS.min(received + in_flight) {
+            send_step(&mut session, sent).await?;
+            sent += 1;
         }
-        let reply = take(&mut session).await?;
-        seen.borrow_mut().push((turmoil::elapsed(), reply));
-        tokio::time::sleep(Duration::from_millis(dice.below(BUSY))).await;
+        let reply = receive_step(&mut session).await?;
+        replies.borrow_mut().push((turmoil::elapsed(), reply));
+        tokio::time::sleep(Duration::from_millis(rng.below(MAX_PAUSE_MS))).await;
     }
     session.close().await;
     Ok(())
 }
 
-/// Runs the simulation to its end on a line that is good and bad by turns; then it is good. Whether it was so for long
-/// enough before that what its client said last was heard: a cut that nobody has noticed yet swallows it.
+/// Runs the simulation to its end while the connection is interrupted at random. Returns whether the client's last
+/// message certainly arrived: a cut that nobody has noticed yet may swallow it.
 fn disturb(simulation: &mut Sim<'_>, seed: u64) -> bool {
-    let (mut dice, mut change, mut is_good) = (Dice::of(!seed), Duration::from_secs(1), true);
+    let (mut rng, mut change, mut is_good) = (SeededRng::from_seed(!seed), Duration::from_secs(1), true);
     let mut good_since = Duration::ZERO;
     loop {
         if simulation.elapsed() >= change {
@@ -96,14 +97,14 @@ fn disturb(simulation: &mut Sim<'_>, seed: u64) -> bool {
             simulation.repair(CLIENT, SERVER);
             is_good = !is_good;
             good_since = simulation.elapsed();
-            match dice.below(4) {
+            match rng.below(4) {
                 _ if is_good => {}
                 0 => simulation.hold(CLIENT, SERVER),
                 1 => simulation.partition_oneway(CLIENT, SERVER),
                 2 => simulation.partition_oneway(SERVER, CLIENT),
                 _ => simulation.partition(CLIENT, SERVER),
             }
-            change += Duration::from_millis(1 + dice.below(SPELL));
+            change += Duration::from_millis(1 + rng.below(MAX_CHANGE_INTERVAL_MS));
         }
         if simulation.step().expect("no client fails") {
             simulation.release(CLIENT, SERVER);
@@ -113,58 +114,58 @@ fn disturb(simulation: &mut Sim<'_>, seed: u64) -> bool {
     }
 }
 
-/// What a client saw over a bad line, and how often it took its session up.
+/// Returns the replies of a client over an interrupted connection, and how often it resumed its session.
 fn disturbed(seed: u64) -> (Vec<(Duration, [u64; 2])>, u64) {
-    let (ledger, seen) = (Ledger::default(), Seen::default());
+    let (ledger, replies) = (Ledger::default(), Replies::default());
     let mut simulation = simulation(seed, &ledger);
-    simulation.client(CLIENT, play(seed, Rc::clone(&seen)));
+    simulation.client(CLIENT, play(seed, Rc::clone(&replies)));
     let is_heard = disturb(&mut simulation, seed);
     assert_eq!(ledger.done(), (0..STEPS).collect::<Vec<_>>(), "each step is done once, in its order");
-    let numbers: Vec<_> = seen.borrow().iter().map(|(_, numbers)| *numbers).collect();
+    let numbers: Vec<_> = replies.borrow().iter().map(|(_, numbers)| *numbers).collect();
     assert_eq!(numbers, (0..STEPS).map(|step| [step, step + 1]).collect::<Vec<_>>(), "and each reply comes once");
-    // Its client has closed it, and no lease is waited for where that was heard.
-    let patience = Duration::from_secs(5) + if is_heard { Duration::ZERO } else { LEASE };
-    let end = simulation.elapsed() + patience;
+    // The client has closed the session. If that message was lost, the session ends with its lease.
+    let timeout = Duration::from_secs(5) + if is_heard { Duration::ZERO } else { LEASE };
+    let end = simulation.elapsed() + timeout;
     while simulation.elapsed() < end {
         simulation.step().expect("the server goes on");
     }
     assert!(ledger.is_idle(), "nothing is left of it");
-    (seen.take(), ledger.resumed())
+    (replies.take(), ledger.resumed())
 }
 
 #[test]
-fn over_a_line_that_is_cut_and_held_each_step_is_done_once_and_each_reply_comes_once() {
+fn interruptions_lose_and_repeat_no_step() {
     let resumed = RefCell::new(0);
     simulations(|seed| *resumed.borrow_mut() += disturbed(seed).1);
-    println!("sessions were taken up {} times", resumed.borrow());
-    assert!(*resumed.borrow() > 0, "no line was bad enough");
+    println!("sessions were resumed {} times", resumed.borrow());
+    assert!(*resumed.borrow() > 0, "no session was interrupted");
 }
 
 #[test]
-fn a_seed_gives_the_same_again_to_the_millisecond() {
-    let seed = number(SEED, 1);
+fn equal_seeds_give_equal_times() {
+    let seed = number(SEED_VARIABLE, 1);
     assert_eq!(disturbed(seed), disturbed(seed));
     assert_ne!(disturbed(seed), disturbed(seed + 1));
 }
 
-/// A client that steps once and again after `away`, on a line that is cut in between.
-fn cut_off(seed: u64, away: Duration) -> (Result<[u64; 2], ClientError>, Ledger) {
+/// Simulates a client that steps once, and again after `gap`. The connection is cut in between.
+fn cut_off(seed: u64, gap: Duration) -> (Result<[u64; 2], ClientError>, Ledger) {
     let (ledger, outcome) = (Ledger::default(), Rc::new(RefCell::new(None)));
     let mut simulation = simulation(seed, &ledger);
-    let told = Rc::clone(&outcome);
+    let result = Rc::clone(&outcome);
     simulation.client(CLIENT, async move {
         let mut session = open().await?;
-        ask(&mut session, 0).await?;
-        take(&mut session).await?;
+        send_step(&mut session, 0).await?;
+        receive_step(&mut session).await?;
         turmoil::partition(CLIENT, SERVER);
-        tokio::time::sleep(away).await;
+        tokio::time::sleep(gap).await;
         turmoil::repair(CLIENT, SERVER);
-        ask(&mut session, 1).await?;
-        *told.borrow_mut() = Some(take(&mut session).await);
+        send_step(&mut session, 1).await?;
+        *result.borrow_mut() = Some(receive_step(&mut session).await);
         Ok(())
     });
     simulation.run().expect("the client ends");
-    // The server notices that the client is gone, and holds a session as long as it said.
+    // The server notices that the client is gone, and holds its session until the lease ends.
     let end = simulation.elapsed() + 2 * LEASE;
     while !ledger.is_idle() && simulation.elapsed() < end {
         simulation.step().expect("the server goes on");
@@ -172,7 +173,7 @@ fn cut_off(seed: u64, away: Duration) -> (Result<[u64; 2], ClientError>, Ledger)
     (outcome.take().expect("the client was answered"), ledger)
 }
 
-/// Of two steps the client took one, then it asked for its session, which nobody knew any more.
+/// Checks that the client took one of two steps, and that its session was gone when it asked to resume it.
 #[track_caller]
 fn assert_gone(reply: &Result<[u64; 2], ClientError>, ledger: &Ledger) {
     assert!(matches!(reply, Err(ClientError::Lost { request: "a step", .. })), "{reply:?}");
@@ -180,9 +181,9 @@ fn assert_gone(reply: &Result<[u64; 2], ClientError>, ledger: &Ledger) {
 }
 
 #[test]
-fn a_session_is_taken_up_as_long_as_its_lease_holds_and_is_gone_after_that() {
+fn a_session_resumes_until_its_lease_ends() {
     simulations(|seed| {
-        // The server notices a cut after two seconds at most.
+        // The server notices a cut within two seconds.
         let (reply, ledger) = cut_off(seed, LEASE - Duration::from_secs(5));
         assert_eq!((reply.expect("it goes on"), ledger.done()), ([1, 2], vec![0, 1]));
         assert!(ledger.is_idle(), "its session is over");
@@ -193,18 +194,18 @@ fn a_session_is_taken_up_as_long_as_its_lease_holds_and_is_gone_after_that() {
 }
 
 #[test]
-fn a_client_whose_server_has_begun_anew_is_told_and_nothing_is_stepped() {
+fn a_restarted_server_refuses_to_resume() {
     simulations(|seed| {
         let (ledger, outcome) = (Ledger::default(), Rc::new(RefCell::new(None)));
         let mut simulation = simulation(seed, &ledger);
-        let told = Rc::clone(&outcome);
+        let result = Rc::clone(&outcome);
         simulation.client(CLIENT, async move {
             let mut session = open().await?;
-            ask(&mut session, 0).await?;
-            take(&mut session).await?;
+            send_step(&mut session, 0).await?;
+            receive_step(&mut session).await?;
             tokio::time::sleep(Duration::from_secs(10)).await;
-            ask(&mut session, 1).await?;
-            *told.borrow_mut() = Some(take(&mut session).await);
+            send_step(&mut session, 1).await?;
+            *result.borrow_mut() = Some(receive_step(&mut session).await);
             Ok(())
         });
         while simulation.elapsed() < Duration::from_secs(5) {

@@ -1,4 +1,4 @@
-//! `seeds DIR`: writes the seeds of each target to a folder of its name in DIR.
+//! `seeds DIR`: writes the valid inputs of each target to a folder of its name in DIR.
 
 use std::path::Path;
 

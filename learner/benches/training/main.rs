@@ -10,7 +10,7 @@
 
 use std::time::{Duration, Instant};
 
-use perturb_faults::{Course, Line};
+use perturb_faults::{FaultPlan, FaultyProxy};
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::client::{ActAt, Address, PrivateServer, Servers};
 use perturb_learner::logging::TimeShares;
@@ -38,7 +38,7 @@ fn main() -> Result<()> {
         }
     }
     if is_wanted("alone/delayed") {
-        let line = Line::start(&address.to_string(), |_| Course { delay: DELAY, ..Course::default() })?;
+        let line = FaultyProxy::start(&address.to_string(), |_| FaultPlan { delay: DELAY, ..FaultPlan::default() })?;
         alone("alone/delayed/act_server", &Servers::connect(&[line.address().parse()?])?)?;
     }
     let a2c = "algorithm = 'a2c'\nnum_envs = 1\nn_steps = 5";

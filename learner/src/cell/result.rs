@@ -138,13 +138,13 @@ fn command(cell: &Cell) -> String {
         evaluate(format!("--versions {}", versions.join(",")), *episodes);
     }
     // What a set of contexts is stands in the recorded episodes alone.
-    let own = |set: &TestSet| format!("--parameters {} --base {}", parameters(&set.drawn()), set.version);
+    let own = |set: &TestSet| format!("--parameters {} --base-version {}", parameters(&set.drawn()), set.version);
     for set in sets.iter().filter(|set| set.plain().is_none() && !set.drawn().is_empty()) {
         evaluate(own(set), *episodes);
     }
     if let Some((set, episodes)) = cell.selection_test() {
         let how = set.plain().map_or_else(|| own(&set), |version| format!("--versions {version}"));
-        evaluate(format!("{how} --selection"), episodes);
+        evaluate(format!("{how} --selection-episodes"), episodes);
     }
     text
 }

@@ -1,7 +1,7 @@
 //! The pages as HTML. Texts from files and addresses are escaped.
 //!
-//! A page consists of named parts. When something changes, an event has all parts as they would be in a new page, and the
-//! script replaces them. Curves are sent as numbers.
+//! A page consists of named parts. When something changes, an event has all parts as they would be in a new page, and
+//! the script replaces them. Curves are sent as numbers.
 
 pub(crate) mod experiment;
 pub(crate) mod index;

@@ -149,7 +149,8 @@ pub fn write(path: &Path, content: &str) {
     std::fs::write(path, content).unwrap();
 }
 
-/// Writes the files of a training with this number of episodes. Half of them are successes, and the returns are 0, 1, 2, …
+/// Writes the files of a training with this number of episodes. Half of them are successes, and the returns are 0, 1,
+/// 2, …
 pub fn write_training(path: &Path, episodes: usize) {
     let text = "environment = 'CartPole'\nalgorithm = 'a2c'\nepisodes = 200";
     let config = TrainConfig::from_table("the test", text.parse().unwrap()).unwrap();

@@ -3,7 +3,7 @@
 use super::{Bystander, clients::room_for};
 use crate::common::server::{self, Server, within};
 use perturb::proto::{Step, Stepped};
-use perturb_faults::{Course, Dice, Kind, Line};
+use perturb_faults::{FaultKind, FaultPlan, FaultyProxy, SeededRng};
 use perturb_protocol::{Address, ClientError, Connection, Patience, Stream};
 use std::{
     sync::{Arc, Mutex},
@@ -40,17 +40,17 @@ async fn faults_of_lines_end_sessions_and_change_none() {
     let bystander = Bystander::start(server.unix()).await;
     let mut truth = Vec::new();
     play(server.unix(), &mut truth).await.unwrap();
-    let (mut dice, courses) = (Dice::new(), Arc::new(Mutex::new(Vec::new())));
-    let drawn: Vec<Course> = (0..CLIENTS)
+    let (mut dice, courses) = (SeededRng::new(), Arc::new(Mutex::new(Vec::new())));
+    let drawn: Vec<FaultPlan> = (0..CLIENTS)
         .map(|_| {
-            let (fault, is_servers) = (Some(dice.fault(&Kind::ALL, MOST)), dice.below(2) == 0);
+            let (fault, is_servers) = (Some(dice.fault(&FaultKind::ALL, MOST)), dice.below(2) == 0);
             let delay = Duration::from_micros(dice.below(3000));
             let [from_server, from_client] = if is_servers { [fault, None] } else { [None, fault] };
-            Course { delay, from_server, from_client }
+            FaultPlan { delay, from_server, from_client }
         })
         .collect();
     let clients = drawn.into_iter().map(|course| {
-        let line = Line::start(server.tcp(), move |_| course).unwrap();
+        let line = FaultyProxy::start(server.tcp(), move |_| course).unwrap();
         let courses = Arc::clone(&courses);
         tokio::spawn(async move {
             let mut seen = Vec::new();
@@ -65,7 +65,7 @@ async fn faults_of_lines_end_sessions_and_change_none() {
     for (course, faults, seen, error) in courses.lock().unwrap().iter() {
         let kind = course.from_server.or(course.from_client).map(|fault| fault.kind);
         // A changed byte that nothing protects may be believed.
-        assert!(kind == Some(Kind::Change) || truth.starts_with(seen), "{course:?} changed what was seen");
+        assert!(kind == Some(FaultKind::BitFlip) || truth.starts_with(seen), "{course:?} changed what was seen");
         assert!(*faults > 0 || error.is_none(), "{course:?}: nothing happened, but {error:?}");
         (happened, noticed) = (happened + faults, noticed + usize::from(error.is_some()));
     }

@@ -3,8 +3,8 @@
 use super::{begin, connect, logged, steps, unauthenticated, unsafe_words};
 use crate::common::server::{self, Server, within};
 use perturb_faults::{
-    Course, Fault, Kind, Line,
-    certificates::{Authority, Pair},
+    Fault, FaultKind, FaultPlan, FaultyProxy,
+    certificates::{Authority, CertificateFiles},
 };
 use perturb_protocol::{
     ClientError,
@@ -29,7 +29,7 @@ impl Encrypted {
     fn start(names: &[&str], until_year: i32, more: &[(&str, &Path)]) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let authority = Authority::new("authority");
-        let Pair { cert, key } = authority.issue(directory.path(), "server", names, until_year);
+        let CertificateFiles { cert, key } = authority.issue(directory.path(), "server", names, until_year);
         let ca = authority.file(directory.path(), "ca.pem");
         let mut flags = vec!["--log", "debug", "--tls-cert", cert.to_str().unwrap()];
         flags.extend(["--tls-key", key.to_str().unwrap()]);
@@ -101,7 +101,7 @@ async fn a_server_may_ask_for_certificates_of_clients() {
     let good = clients.issue(directory.path(), "good", &["ann"], 2040);
     let old = clients.issue(directory.path(), "old", &["ann"], 2021);
     let bad = Authority::new("clients").issue(directory.path(), "bad", &["ann"], 2040);
-    let with = async |pair: &Pair| {
+    let with = async |pair: &CertificateFiles| {
         connect(encrypted.address(), &[(CA, &encrypted.ca), (CERT, &pair.cert), (KEY, &pair.key)]).await
     };
     let connection = with(&good).await.unwrap();
@@ -187,8 +187,9 @@ async fn with_tls_no_changed_byte_is_taken_for_the_servers() {
     let truth = played(encrypted.address().into()).await.unwrap();
     let mut errors = 0;
     for place in [3, 60, 200, 700, 1000, 1500, 2000, 3000, 4000, 6000] {
-        let from_server = Some(Fault { at: place, kind: Kind::Change });
-        let line = Line::start(encrypted.address(), move |_| Course { from_server, ..Course::default() }).unwrap();
+        let from_server = Some(Fault { at: place, kind: FaultKind::BitFlip });
+        let line = FaultyProxy::start(encrypted.address(), move |_| FaultPlan { from_server, ..FaultPlan::default() })
+            .unwrap();
         match played(format!("https://{}", line.address())).await {
             Ok(same) => assert_eq!(same, truth, "the byte at {place} was changed, and believed"),
             Err(error) => {

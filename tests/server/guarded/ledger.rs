@@ -122,7 +122,7 @@ async fn nothing_is_drawn_that_cannot_be_written_down() {
     let limited = |blocks: u32, path: &Path| {
         let mut server = command();
         server.arg("--ledger").arg(path).args(["--listen", "tcp://127.0.0.1:0"]);
-        disk::small_files(&server, blocks)
+        disk::with_file_limit(&server, blocks)
     };
     for (mut command, part) in [(limited(0, &path), "File too large"), (limited(9, Path::new("/dev/full")), "no file")]
     {

@@ -1,4 +1,4 @@
-//! What can be typed to plan, run and report an experiment.
+//! Arguments of the commands that plan, run and report an experiment.
 
 use std::path::PathBuf;
 
@@ -11,30 +11,31 @@ use super::{JsonArgs, ServerArgs, WaitArgs, at_least_one, natural};
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   perturb plan experiments/quick.toml                # measures for some seconds what it costs
-  perturb plan experiments/paper.toml --measure 0    # only says what it asks for
-  perturb plan experiments/quick.toml --missing runs/quick")]
+  perturb plan experiments/paper.toml --measure 0    # prints only what it consists of
+  perturb plan experiments/quick.toml --unfinished-in runs/quick")]
 pub struct PlanArgs {
     /// An experiment file, e.g. experiments/paper.toml.
     pub file: PathBuf,
-    /// List the cells with their indices and ids, which --json has then.
+    /// List all cells with their indices and ids. With --json they are written as JSON.
     #[arg(long)]
     pub cells: bool,
-    /// List the cells that have neither a result in this folder nor failed there, and nothing else; --json has these then.
+    /// List only the cells that have neither a result nor a failure in this folder. With --json they are written as
+    /// JSON.
     #[arg(long, value_name = "DIR", conflicts_with = "cells")]
-    pub missing: Option<PathBuf>,
+    pub unfinished_in: Option<PathBuf>,
     #[command(flatten)]
     pub json: JsonArgs,
-    /// Seconds that each group of trainings is measured; 0 measures nothing.
+    /// Seconds of measurement for each group of trainings; 0 measures nothing.
     #[arg(long, value_name = "SECONDS", default_value_t = 3, value_parser = natural::<u64>)]
     pub measure: u64,
-    /// Estimate from what cells took that are done in this folder, where there are any of the same environment and
-    /// method, e.g. a random tenth.
+    /// Estimate from the durations of the finished cells in this folder, e.g. of a random tenth. They apply to cells of
+    /// the same environment and method; the others are measured.
     #[arg(long, value_name = "DIR")]
-    pub from: Option<PathBuf>,
-    /// The --jobs of the run [default: one a core].
+    pub timings_from: Option<PathBuf>,
+    /// Value of --jobs for the planned run [default: one for each core].
     #[arg(long, value_name = "N", value_parser = at_least_one::<usize>)]
     pub jobs: Option<usize>,
-    /// The --group of the run.
+    /// Value of --group for the planned run.
     #[arg(long, value_name = "N", default_value_t = Grouping::USUAL, value_parser = at_least_one::<usize>)]
     pub group: usize,
     #[command(flatten)]
@@ -48,30 +49,30 @@ pub struct PlanArgs {
 pub struct RunArgs {
     /// An experiment file, e.g. experiments/quick.toml.
     pub plan: PathBuf,
-    /// Directory of the results; what is done there already is kept.
+    /// Directory of the results. Cells that are finished there are not run again.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Processes at a time, each of which does a group of cells [default: one a core; with --engine, one in each of its
-    /// jobs].
+    /// Number of processes at the same time; each runs a group of cells [default: one for each core; with --engine, one
+    /// in each job].
     #[arg(long, value_name = "N", value_parser = at_least_one::<usize>)]
     pub jobs: Option<usize>,
-    /// The most cells of one environment and architecture that a process does together; 1 for each by itself. It changes
-    /// no result.
+    /// Maximum number of cells that a process runs together; they have the same environment and architecture. 1 runs
+    /// each cell by itself. The number changes no result.
     #[arg(long, value_name = "N", default_value_t = Grouping::USUAL, value_parser = at_least_one::<usize>)]
     pub group: usize,
-    /// Try cells again that have failed.
+    /// Run failed cells again.
     #[arg(long)]
     pub retry_failed: bool,
-    /// Do these cells only, by index or id, separated by commas. A plan.toml that is in DIR stays as it is.
+    /// Run only these cells, by index or id, separated by commas. An existing plan.toml in DIR is not replaced.
     #[arg(long, value_name = "K", value_delimiter = ',')]
     pub cell: Vec<String>,
-    /// When nothing is left to do, also write the report, as `perturb report DIR --html FILE` does.
+    /// Write the report to this file at the end, as `perturb report DIR --html FILE` does.
     #[arg(long, value_name = "FILE", conflicts_with = "cell")]
     pub html: Option<PathBuf>,
-    /// Write what happens to each cell to this file, as JSON lines; `-`, or no name, prints them.
+    /// Write the events of each cell to this file as JSON lines. `-` or no name prints them.
     #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-", conflicts_with = "engine")]
     pub json: Option<PathBuf>,
-    /// Do the cells that a line of standard input names; stop when standard input is closed.
+    /// Run the cells that a line of standard input names. Stop when standard input is closed.
     #[arg(long, hide = true, requires = "server",
         conflicts_with_all = ["cell", "jobs", "group", "engine", "retry_failed", "html"])]
     pub worker: bool,
@@ -83,28 +84,29 @@ pub struct RunArgs {
     pub wait: WaitArgs,
 }
 
-/// Who schedules a run past one machine.
+/// Scheduling of a run on a cluster.
 #[derive(Args, Debug)]
 pub struct EngineArgs {
-    /// Submit the cells as jobs of this engine, watch them, and submit again what it lost. DIR and this program must be
-    /// at the same place on all its machines. --jobs and --workers are those of each of its jobs.
+    /// Submit the cells as jobs to this scheduler, watch them, and resubmit lost jobs. DIR and this program must have
+    /// the same paths on all machines. --jobs and --workers then apply to each job.
     #[arg(long, value_name = "NAME", ignore_case = true, conflicts_with = "cell")]
     pub engine: Option<Engine>,
-    /// Slurm's partition [default: Slurm's].
+    /// Partition of Slurm [default: Slurm's default].
     #[arg(long, value_name = "NAME", requires = "engine")]
     pub partition: Option<String>,
-    /// How long a job may take: minutes, or another of Slurm's forms, e.g. 1-12:00:00 [default: the partition's].
+    /// Time limit of a job: minutes, or another of Slurm's formats, e.g. 1-12:00:00 [default: the partition's limit].
     #[arg(long, value_name = "TIME", requires = "engine")]
     pub time: Option<TimeLimit>,
-    /// Jobs that may run at a time [default: as many as there is room for].
+    /// Maximum number of jobs that run at the same time [default: no limit].
     #[arg(long, value_name = "N", requires = "engine", value_parser = at_least_one::<u32>)]
     pub array_limit: Option<u32>,
-    /// Cells that a job does, of one environment and architecture [default: as many as take some minutes].
+    /// Number of cells in a job; they have the same environment and architecture [default: as many as take some
+    /// minutes].
     #[arg(long, value_name = "N", requires = "engine", value_parser = at_least_one::<usize>)]
     pub cells_per_job: Option<usize>,
 }
 
-/// A scheduler of jobs.
+/// A cluster's scheduler.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Engine {
     /// Slurm, with its commands sbatch, squeue and scontrol.
@@ -117,19 +119,19 @@ pub enum Engine {
   perturb report runs/quick --html quick.html        # one page with everything
   perturb report runs/quick assessed/mine --out report")]
 pub struct ReportArgs {
-    /// The --out of `perturb run`, folders of `Assessment.save` in Python, or one of the former and any number of the latter,
-    /// whose agents then stand in the same tables and pictures.
+    /// The --out folder of `perturb run`, folders that `Assessment.save` wrote in Python, or one experiment and any
+    /// number of assessments. Tables and pictures then have all agents together.
     #[arg(required = true, value_name = "DIR")]
     pub dirs: Vec<PathBuf>,
-    /// Where tables and pictures go [default: the folder report/ in that of the experiment; needed with assessments].
+    /// Folder for tables and pictures [default: report/ in the experiment's folder; required with assessments].
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// The rule by which configurations are selected [default: the plan's]. Of a plan with selection = "clean", `paper`
-    /// reports its tuning cells as the paper would; tables go to report/paper/.
+    /// Rule that selects configurations [default: the plan's rule]. For a plan with selection = "clean", `paper`
+    /// reports the tuning cells by the paper's rule and writes the tables to report/paper/.
     #[arg(long, value_name = "RULE")]
     pub selection: Option<Selection>,
-    /// Also write everything, with training curves and the heatmaps of `perturb heatmap`, as one HTML page that needs
-    /// nothing else.
+    /// Also write everything as one HTML page without other files, with training curves and the heatmaps of `perturb
+    /// heatmap`.
     #[arg(long, value_name = "FILE")]
     pub html: Option<PathBuf>,
 }
@@ -139,9 +141,9 @@ pub struct ReportArgs {
   perturb curves runs/quick
   perturb curves runs/quick --out pictures")]
 pub struct CurvesArgs {
-    /// The --out of `perturb run`.
+    /// The --out folder of `perturb run`.
     pub dir: PathBuf,
-    /// Where the pictures go [default: DIR/report].
+    /// Folder for the pictures [default: DIR/report].
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
 }

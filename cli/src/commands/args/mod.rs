@@ -1,5 +1,6 @@
-//! What can be typed.
+//! The command line's arguments.
 
+mod deprecated;
 mod experiments;
 mod testing;
 mod training;
@@ -17,29 +18,29 @@ use clap::{Arg, ArgAction, Args, CommandFactory, FromArgMatches, Parser, Subcomm
 pub use experiments::{CurvesArgs, Engine, PlanArgs, ReportArgs, RunArgs};
 use perturb_learner::client::Address;
 use perturb_protocol::names;
-pub use testing::{AuditArgs, EvaluateArgs, HeatmapArgs, RatesArgs, SetArgs, VideoArgs};
+pub use testing::{AuditArgs, EvaluateArgs, HeatmapArgs, RescoreArgs, SetArgs, VideoArgs};
 pub use training::{CompletionsArgs, DemoArgs, EnvsArgs, LsArgs, ManArgs, ServeArgs, TrainArgs};
 
 /// Trains policies over environment servers and tests whether they still work when the physics changes.
 ///
-/// Names are spelled as one likes: `cart-pole` or `perturb/CartPole-v1` is CartPole, `r` is R. What is typed beats a file,
-/// and a file the defaults. Results go to standard output, everything else to standard error.
+/// Names may be spelled in any case: `cart-pole` and `perturb/CartPole-v1` are CartPole, `r` is R. Options take
+/// precedence over files, and files over defaults. Results go to standard output, everything else to standard error.
 #[derive(Debug, Parser)]
 #[command(
     name = "perturb",
     version,
     after_help = "Examples:
-  perturb demo                                         # what this is about, in a few minutes
+  perturb demo                                         # an introduction of a few minutes
   perturb train --env Hopper --version R               # then: perturb evaluate, heatmap, video
-  perturb run experiments/quick.toml --out runs/quick  # a whole study; then: perturb report runs/quick
-Exit status: 0 done; 1 failed; 2 something that was given is missing or wrong; 128 + a signal's number."
+  perturb run experiments/quick.toml --out runs/quick  # an experiment; then: perturb report runs/quick
+Exit status: 0 success; 1 failure; 2 an argument or file is missing or wrong; 128 + N ended by signal N."
 )]
 pub struct Cli {
-    /// Say nothing on standard error but warnings and errors.
+    /// Print only warnings and errors on standard error.
     #[arg(short, long, global = true, conflicts_with = "verbose")]
     pub quiet: bool,
-    /// Say on standard error what perturb does; twice: all that it can say of it. RUST_LOG, e.g.
-    /// warn,h2=debug, says exactly what, also of its libraries.
+    /// Log to standard error; give it twice for all details. RUST_LOG sets a filter, e.g. warn,h2=debug, also for
+    /// dependencies.
     #[arg(short, long, global = true, action = ArgAction::Count)]
     pub verbose: u8,
     #[command(subcommand)]
@@ -47,13 +48,16 @@ pub struct Cli {
 }
 
 impl Cli {
-    /// What the process was given. A wrong command ends it with status 2.
-    pub fn of_process() -> Self {
-        let matches = Self::parser().get_matches();
+    /// Parses the process's arguments. Ends the process with status 2 if they are wrong. `warn` gets a sentence for
+    /// each old spelling.
+    pub fn from_process(warn: impl FnMut(String)) -> Self {
+        let arguments = deprecated::renamed(std::env::args_os().collect(), warn);
+        let matches = Self::parser().get_matches_from(arguments);
         Self::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
     }
 
-    /// The parser. A negative number is the value of the option before it, which then says what it takes.
+    /// Returns the parser. A negative number counts as the value of the option before it, so that the option's own
+    /// error is shown.
     pub fn parser() -> clap::Command {
         let with_negative = |arg: Arg| match arg.get_action().takes_values() {
             true => arg.allow_negative_numbers(true),
@@ -67,96 +71,95 @@ impl Cli {
 pub enum Command {
     /// List the environments with their parameters.
     Envs(EnvsArgs),
-    /// List the trainings and experiments in a folder: budget, result and state of each.
+    /// List the trainings and experiments in a folder with budget, result and state.
     Ls(LsArgs),
-    /// Show the trainings and experiments in a folder as they go, on a page in the browser.
+    /// Show the trainings and experiments in a folder on a live web page.
     Serve(ServeArgs),
     /// Train a policy.
     Train(Box<TrainArgs>),
     /// Test a trained policy.
     Evaluate(EvaluateArgs),
-    /// Train on default and on random physics, and see in a few minutes which policy still works where it was not trained.
+    /// Train on default and on random physics, and compare both policies where they were not trained.
     Demo(DemoArgs),
-    /// Say what an experiment file asks for, and what it costs.
+    /// Print what an experiment file consists of, and what it costs.
     Plan(PlanArgs),
-    /// Do all trainings and tests of an experiment file; called again, it goes on.
+    /// Run all trainings and tests of an experiment file, or resume them.
     Run(RunArgs),
-    /// Make tables of an experiment's results, beside the paper's.
+    /// Make tables of an experiment's results, with the paper's for comparison.
     Report(ReportArgs),
     /// Draw the training curves of an experiment.
     Curves(CurvesArgs),
-    /// Draw how trained policies do over two parameters: one policy, or those that an experiment selected.
+    /// Draw the success of policies over two parameters: of given policies, or of those that an experiment selected.
     Heatmap(HeatmapArgs),
     /// Film a trained policy.
     Video(VideoArgs),
-    /// Play recorded test episodes again and compare every byte of what came of them.
+    /// Replay recorded test episodes and compare every byte of the results.
     Audit(AuditArgs),
-    /// Success rates of recorded test episodes at any threshold, without playing them again.
-    Rates(RatesArgs),
-    /// Print what lets a shell complete perturb's commands and options.
+    /// Compute success rates of recorded test episodes at any threshold, without replaying them.
+    Rescore(RescoreArgs),
+    /// Print a script by which a shell completes commands and options.
     Completions(CompletionsArgs),
     /// Write perturb's manual pages.
     Man(ManArgs),
 }
 
-/// Where what came of a command goes, for other programs.
+/// Output for other programs.
 #[derive(Args, Clone, Debug)]
 pub struct JsonArgs {
-    /// Also write what came of it to this file, as JSON; `-`, or no name, prints it in place of all else.
+    /// Also write the result to this file as JSON. `-` or no name prints it and nothing else.
     #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
     pub json: Option<PathBuf>,
 }
 
-/// What a server takes.
-const MOST_WORKERS: usize = 1024;
+/// Maximum number of physics threads of a server.
+const MAX_WORKERS: usize = 1024;
 
-/// Where environments run.
+/// Servers of the environments.
 #[derive(Args, Clone, Debug)]
 pub struct ServerArgs {
-    /// Running servers, separated by commas: unix:/path, host:port, http://host:port or tcp://host:port, with TLS
-    /// https://host:port. Without this, perturb starts a server of its own, for each process that trains, and ends it
-    /// afterwards.
+    /// Addresses of running servers, separated by commas: unix:/path, host:port, http://host:port or tcp://host:port,
+    /// with TLS https://host:port [default: each training process starts a private server and stops it at the end].
     #[arg(long, value_name = "ADDRESS", value_delimiter = ',')]
     pub server: Vec<Address>,
-    /// Physics threads of each server that perturb starts itself [default: one a core, fewer where --jobs starts many
-    /// servers; 1 in a job of Slurm].
-    #[arg(long, value_name = "N", value_parser = |text: &str| within(text, 1..=MOST_WORKERS))]
+    /// Number of physics threads of each private server [default: one for each core, fewer if --jobs starts many
+    /// servers; 1 in a Slurm job].
+    #[arg(long, value_name = "N", value_parser = |text: &str| within(text, 1..=MAX_WORKERS))]
     pub workers: Option<usize>,
 }
 
-/// How long servers are waited for.
+/// Waiting for lost servers.
 #[derive(Args, Clone, Copy, Debug)]
 pub struct WaitArgs {
-    /// How long to wait for servers that were lost, before giving up; what was begun then goes on, to the same bytes. The
-    /// server that perturb started itself it starts again; of several, those that are back will do. 0 does not wait.
-    #[arg(long, value_name = "SECONDS", default_value_t = Self::USUAL, value_parser = natural::<u32>)]
+    /// Seconds to wait for lost servers before giving up; 0 does not wait. When a server is back, the work continues
+    /// with the same result. A private server is restarted. With several servers, the ones that are back are used.
+    #[arg(long, value_name = "SECONDS", default_value_t = Self::DEFAULT_SECONDS, value_parser = natural::<u32>)]
     pub server_wait: u32,
 }
 
 impl WaitArgs {
-    /// Unless told otherwise, s.
-    pub const USUAL: u32 = 900;
+    /// Default waiting time, in seconds.
+    pub const DEFAULT_SECONDS: u32 = 900;
 
-    /// As a time.
+    /// Returns the waiting time.
     pub fn time(self) -> Duration {
         Duration::from_secs(self.server_wait.into())
     }
 }
 
-/// Where trained and tested policies play.
+/// Servers and acting of trained and tested policies.
 #[derive(Args, Clone, Debug)]
 pub struct PlayArgs {
     #[command(flatten)]
     pub server: ServerArgs,
     #[command(flatten)]
     pub wait: WaitArgs,
-    /// Where actions are chosen, which changes no byte: at the server, if it can, for a whole rollout at a time; or here, at
-    /// every step.
+    /// Place where actions are chosen: at the server for whole rollouts, if it supports that, or in this process at
+    /// every step. It changes no result.
     #[arg(long, value_name = "WHERE", default_value = "server", value_parser = OneOf::new(&["server", "client"]))]
     pub act: String,
 }
 
-/// A parser of one of a few names, however it is spelled; --help and completions list them.
+/// Parses one of a few names, in any spelling. --help and completions list the names.
 #[derive(Clone)]
 struct OneOf(Vec<&'static str>);
 
@@ -170,8 +173,8 @@ impl TypedValueParser for OneOf {
     type Value = String;
 
     fn parse_ref(&self, command: &clap::Command, arg: Option<&Arg>, value: &OsStr) -> Result<String, clap::Error> {
-        let place = value.to_str().and_then(|written| names::find(written, self.0.iter().copied()));
-        let name = place.map_or(value, |place| OsStr::new(self.0[place]));
+        let index = value.to_str().and_then(|written| names::find(written, self.0.iter().copied()));
+        let name = index.map_or(value, |index| OsStr::new(self.0[index]));
         PossibleValuesParser::new(&self.0).parse_ref(command, arg, name)
     }
 
@@ -186,23 +189,23 @@ fn within<T: FromStr + PartialOrd + Display>(text: &str, range: RangeInclusive<T
 }
 
 fn at_least_one<T: TryFrom<u64>>(text: &str) -> Result<T, String> {
-    whole(text, 1)
+    whole_number(text, 1)
 }
 
 fn natural<T: TryFrom<u64>>(text: &str) -> Result<T, String> {
-    whole(text, 0)
+    whole_number(text, 0)
 }
 
-/// A whole number from `least` on that `T` can hold.
-fn whole<T: TryFrom<u64>>(text: &str, least: u64) -> Result<T, String> {
-    let number = text.parse::<u64>().ok().filter(|number| *number >= least);
+/// Parses a whole number that is at least `min` and that `T` can hold.
+fn whole_number<T: TryFrom<u64>>(text: &str, min: u64) -> Result<T, String> {
+    let number = text.parse::<u64>().ok().filter(|number| *number >= min);
     number.and_then(|number| T::try_from(number).ok()).ok_or_else(|| {
         if number.is_some() || (text.len() > 15 && text.bytes().all(|digit| digit.is_ascii_digit())) {
             return "expected a smaller number".to_owned();
         }
-        let meant = text.parse::<f64>().ok().filter(|x| x.fract() == 0.0 && *x >= least as f64 && *x < 1e15);
+        let meant = text.parse::<f64>().ok().filter(|x| x.fract() == 0.0 && *x >= min as f64 && *x < 1e15);
         let digits = meant.map_or_else(String::new, |number| format!(", in digits: {number}"));
-        format!("expected a whole number, at least {least}{digits}")
+        format!("expected a whole number, at least {min}{digits}")
     })
 }
 
@@ -218,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn names_are_spelled_as_one_likes() {
+    fn names_may_be_spelled_in_any_case() {
         let words = ["perturb", "train", "--algorithm", "EPOpt_PPO", "--architecture", "FF", "--preset", "Paper"];
         let Command::Train(train) = Cli::try_parse_from(words).unwrap().command else { panic!("another command") };
         assert_eq!(train.algorithm.as_deref(), Some("epopt-ppo"));
@@ -226,9 +229,11 @@ mod tests {
         let refused = Cli::try_parse_from(["perturb", "train", "--algorithm", "pppo"]).unwrap_err().to_string();
         assert!(refused.contains("a similar value exists: 'ppo'"), "{refused}");
         for (rule, meant) in [("TEXT", "text"), ("Code", "code"), ("steps=9", "steps=9")] {
-            let words = ["perturb", "rates", "file", "--success", rule];
-            let Command::Rates(rates) = Cli::try_parse_from(words).unwrap().command else { panic!("another command") };
-            assert_eq!(rates.success, [meant.parse().unwrap()]);
+            let words = ["perturb", "rescore", "file", "--success", rule];
+            let Command::Rescore(rescore) = Cli::try_parse_from(words).unwrap().command else {
+                panic!("another command")
+            };
+            assert_eq!(rescore.success, [meant.parse().unwrap()]);
         }
     }
 
@@ -236,9 +241,12 @@ mod tests {
     fn a_run_is_resumed_with_its_own_settings_only() {
         let cli = Cli::command();
         let train = cli.find_subcommand("train").unwrap();
-        let of = |name: &str| train.get_arguments().find(|argument| argument.get_id() == name).unwrap();
-        let refused: Vec<&str> =
-            train.get_arg_conflicts_with(of("resume")).iter().map(|argument| argument.get_id().as_str()).collect();
+        let argument = |name: &str| train.get_arguments().find(|argument| argument.get_id() == name).unwrap();
+        let refused: Vec<&str> = train
+            .get_arg_conflicts_with(argument("resume"))
+            .iter()
+            .map(|argument| argument.get_id().as_str())
+            .collect();
         for argument in train.get_arguments().map(|argument| argument.get_id().as_str()) {
             let accepted = ["resume", "extend", "json", "server", "server_wait", "workers", "act", "threads", "help"]
                 .contains(&argument);

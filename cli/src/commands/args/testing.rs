@@ -1,4 +1,4 @@
-//! What can be typed to test, film and judge what was trained.
+//! Arguments of the commands that test, film and check trained policies.
 
 use std::path::PathBuf;
 
@@ -12,10 +12,10 @@ use perturb_settings::sets::Assignment;
 use super::{JsonArgs, PlayArgs, ServerArgs, WaitArgs, at_least_one, natural, within};
 use crate::video::PIXELS;
 
-/// A rule of success, whose name may be spelled in any way.
+/// Parses a success rule. Its name may be spelled in any case.
 fn success_rule(text: &str) -> Result<Rule, ValueError> {
     let known = ["text", "code"];
-    names::find(text.trim(), known.into_iter()).map_or(text, |place| known[place]).parse()
+    names::find(text.trim(), known.into_iter()).map_or(text, |index| known[index]).parse()
 }
 
 #[derive(Args, Debug)]
@@ -24,8 +24,8 @@ fn success_rule(text: &str) -> Result<Rule, ValueError> {
   perturb evaluate --checkpoint runs/mine --versions E --episodes 200 --json -
   perturb evaluate --checkpoint runs/mine --parameters length=0.1..2.0/20 --records long.parquet")]
 pub struct EvaluateArgs {
-    /// The --out of a training, the checkpoint folder in it, the folder of a cell, or the name of a policy: the id of a cell
-    /// in results/ of the working directory, or in the folder that PERTURB_RESULTS names.
+    /// The --out folder of a training, its checkpoint folder, the folder of a cell, or a policy's name: the id of a
+    /// cell in results/ of the working directory, or in the folder that PERTURB_RESULTS names.
     #[arg(long, value_name = "DIR")]
     pub checkpoint: PathBuf,
     /// Versions to test on, separated by commas [default: D,R,E; none with --parameters or --contexts].
@@ -33,73 +33,73 @@ pub struct EvaluateArgs {
     pub versions: Vec<Version>,
     #[command(flatten)]
     pub set: SetArgs,
-    /// What decides about success: the rule of the paper's text, that of its published code, or a threshold of one's own for
-    /// what either compares, e.g. steps=90; `perturb envs` tells them [default: text].
+    /// Rule that decides about success: `text` for the paper's text, `code` for its published code, or another
+    /// threshold for the quantity that either compares, e.g. steps=90. `perturb envs` lists both rules [default: text].
     #[arg(long, value_name = "text|code|QUANTITY=NUMBER", value_parser = success_rule)]
     pub success: Option<Rule>,
-    /// Keep every test episode in this file, as Parquet: `perturb audit` plays them again, `perturb rates` judges them by
-    /// other thresholds, pandas and polars read it.
+    /// Write every test episode to this Parquet file. `perturb audit` replays the episodes, `perturb rescore` applies
+    /// other thresholds, and pandas and polars read the file.
     #[arg(long, value_name = "FILE")]
     pub records: Option<PathBuf>,
-    /// Episodes to test on each version or set; a grid or a list has at least one in each of its contexts. Of a policy
-    /// trained with RL² trials, of each of which the last episode counts.
+    /// Number of test episodes on each version or set. A grid or a list has at least one episode in each context. For a
+    /// policy trained with RL² it is the number of trials, of which the last episode counts.
     #[arg(long, value_name = "N", default_value_t = 1000, value_parser = at_least_one::<u64>)]
     pub episodes: u64,
-    /// Fixes the tests' randomness; its environments differ from those of any training, also with the same number
-    /// [default: the training's seed].
+    /// Random seed of the tests. Tests draw other environments than trainings, also with the same seed [default: the
+    /// training's seed].
     #[arg(long, value_name = "N", value_parser = natural::<u64>)]
     pub seed: Option<u64>,
-    /// Test with the episodes that select a configuration where an experiment file has selection = "clean"; no other test
-    /// has them.
+    /// Test with the episodes that select configurations in experiments with selection = "clean". No other test uses
+    /// these episodes.
     #[arg(long)]
-    pub selection: bool,
+    pub selection_episodes: bool,
     #[command(flatten)]
     pub json: JsonArgs,
     #[command(flatten)]
     pub play: PlayArgs,
 }
 
-/// Parameters beside those of the versions.
+/// Sets of parameters other than the versions.
 #[derive(Args, Clone, Debug)]
 pub struct SetArgs {
-    /// Parameters of your own: a value, intervals to draw from, or the points of a grid, of which all combinations are
-    /// taken; e.g. length=0.3..0.4,0.8..0.9 mass=0.1, or length=0.1..1.0/10 mass=0.1,0.2.
+    /// Parameters to test on: a value, intervals to draw from, or the points of a grid, e.g. length=0.3..0.4,0.8..0.9
+    /// mass=0.1, or length=0.1..1.0/10 mass=0.1,0.2. All combinations of a grid's points are tested.
     #[arg(long, value_name = "PARAMETER=VALUES", num_args = 1..)]
     pub parameters: Vec<Assignment>,
-    /// A list of parameters of your own: a CSV file whose header names them, a row for each context.
+    /// A list of parameters to test on: a CSV file whose header names parameters, with a row for each context.
     #[arg(long, value_name = "FILE", conflicts_with = "parameters")]
     pub contexts: Option<PathBuf>,
-    /// The version that parameters come from which these do not name.
+    /// Version that gives the parameters which --parameters or --contexts do not name.
     #[arg(long, value_name = "VERSION", default_value = "D")]
-    pub base: Version,
+    pub base_version: Version,
 }
 
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  perturb audit runs/quick                           # of each policy 30 episodes, spread over all of its tests
+  perturb audit runs/quick                           # 30 episodes of each policy, spread over all of its tests
   perturb audit long.parquet --checkpoint runs/long --all
-  perturb audit runs/quick --ledger ledger.jsonl     # plays nothing: which environments trained what")]
+  perturb audit runs/quick --ledger ledger.jsonl     # replays nothing: checks the training environments")]
 pub struct AuditArgs {
-    /// The --out of `perturb run`, the folder of one of its cells, the --records of `perturb evaluate`, or a folder of
-    /// `Assessment.save` in Python.
+    /// The --out folder of `perturb run`, the folder of one of its cells, the --records file of `perturb evaluate`, or
+    /// a folder that `Assessment.save` wrote in Python.
     pub dir: PathBuf,
-    /// The checkpoint that was tested, for a file of records: the --out of its training, the checkpoint folder in it, the
-    /// folder of its cell, or a name in results/ of the working directory, or in the folder that PERTURB_RESULTS names; for
-    /// the folder of an assessment those of all its policies that are perturb's.
+    /// Tested checkpoint of a records file: the --out folder of its training, its checkpoint folder, the folder of its
+    /// cell, or a name in results/ of the working directory or in the folder that PERTURB_RESULTS names. For an
+    /// assessment, give the checkpoints of all policies that perturb trained.
     #[arg(long, value_name = "DIR", num_args = 1..)]
     pub checkpoint: Vec<PathBuf>,
-    /// Episodes to play again of each policy, evenly spread over those that are recorded.
+    /// Number of episodes of each policy to replay, evenly spread over the recorded ones.
     #[arg(long, value_name = "N", default_value_t = 30, value_parser = at_least_one::<usize>)]
     pub episodes: usize,
-    /// Play all recorded episodes again.
+    /// Replay all recorded episodes.
     #[arg(long, conflicts_with = "episodes")]
     pub all: bool,
-    /// Play nothing, but prove by ledgers, those of all servers that trained (`perturb-server --ledger`), that the trainings
-    /// drew from what they say, and never from what was tested: no episode of a test, and no other test set.
+    /// Replay nothing, but check the ledgers of all servers that trained (`perturb-server --ledger`). They prove that
+    /// the trainings drew from the sets that they state, and never played a test episode or another test set.
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["episodes", "all"])]
     pub ledger: Vec<PathBuf>,
-    /// Digests that must be those of lines in the ledgers: what a server logged at its end, or an earlier audit printed,
-    /// proves that nothing before was changed.
+    /// Digests that the ledgers must contain: those that a server logged at its end, or that an earlier audit printed.
+    /// They prove that no earlier line was changed.
     #[arg(long, value_name = "DIGEST", num_args = 1.., requires = "ledger")]
     pub head: Vec<String>,
     #[command(flatten)]
@@ -112,13 +112,13 @@ pub struct AuditArgs {
 
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  perturb rates long.parquet                         # the --records of perturb evaluate
-  perturb rates long.parquet --success text code steps=85")]
-pub struct RatesArgs {
-    /// The folder of a cell of `perturb run`, or the --records of `perturb evaluate`.
+  perturb rescore long.parquet                       # the --records of perturb evaluate
+  perturb rescore long.parquet --success text code steps=85")]
+pub struct RescoreArgs {
+    /// The folder of a cell of `perturb run`, or the --records file of `perturb evaluate`.
     pub file: PathBuf,
-    /// Rules of success to judge the recorded episodes by, e.g. --success text code steps=85 [default: the one that they were
-    /// tested with].
+    /// Success rules to apply to the recorded episodes, e.g. --success text code steps=85 [default: the rule of the
+    /// test].
     #[arg(long, value_name = "text|code|QUANTITY=NUMBER", num_args = 1.., value_parser = success_rule)]
     pub success: Vec<Rule>,
     #[command(flatten)]
@@ -127,59 +127,58 @@ pub struct RatesArgs {
 
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  perturb heatmap --checkpoint runs/on-d runs/on-r --out d-beside-r
+  perturb heatmap --checkpoint runs/on-d runs/on-r --out d-and-r
   perturb heatmap runs/quick")]
 pub struct HeatmapArgs {
-    /// The --out of `perturb run`: every policy that was selected in one of its runs. What they do goes to its folder
-    /// heatmaps/, where what is there is kept; pictures of the means over runs go to report/.
+    /// The --out folder of `perturb run`: tests every policy that was selected in one of its runs. The results go to
+    /// its folder heatmaps/, and existing ones are kept. Pictures of the means over runs go to report/.
     #[arg(
         value_name = "DIR",
         required_unless_present = "checkpoint",
         conflicts_with_all = ["checkpoint", "parameters", "records", "out"]
     )]
     pub dir: Option<PathBuf>,
-    /// Policies instead, of one environment: the --out of each training, the checkpoint folder in it, the folder of a cell, or
-    /// a name in results/ of the working directory, or in the folder that PERTURB_RESULTS names. The picture shows the mean
-    /// over those of a method that were trained on the same, side by side with others.
+    /// Policies of one environment: for each the --out folder of its training, its checkpoint folder, the folder of a
+    /// cell, or a name in results/ of the working directory or in the folder that PERTURB_RESULTS names. The picture
+    /// has a panel for each method and training set, with the mean over its policies.
     #[arg(long, value_name = "DIR", num_args = 1..)]
     pub checkpoint: Vec<PathBuf>,
-    /// Test the policies of the first N runs only, and draw what is there of the others [default: of all runs].
+    /// Test only the policies of the first N runs. Existing heatmaps of other runs are drawn, too [default: all runs].
     #[arg(long, value_name = "N", conflicts_with = "checkpoint", value_parser = at_least_one::<u32>)]
     pub runs: Option<u32>,
-    /// The parameter along x, e.g. force; `perturb envs` lists them. Environments of DIR that lack one are left out
-    /// [default: the environment's usual two].
+    /// Parameter along the x axis, e.g. force; `perturb envs` lists them. Environments of DIR without this parameter
+    /// are left out [default: chosen by the environment].
     #[arg(long, value_name = "PARAMETER", requires = "y")]
     pub x: Option<String>,
-    /// The parameter along y, e.g. mass.
+    /// Parameter along the y axis, e.g. mass.
     #[arg(long, value_name = "PARAMETER", requires = "x")]
     pub y: Option<String>,
-    /// The version that other parameters come from: D, where each has its default, or R or E, of which they are drawn for
-    /// each episode.
+    /// Version that gives the other parameters. On D each has its default; on R and E they are drawn for each episode.
     #[arg(long, value_name = "VERSION", default_value = "D")]
-    pub base: Version,
-    /// Values of other parameters, e.g. force=7 [default: those of --base].
+    pub base_version: Version,
+    /// Values of other parameters, e.g. force=7 [default: those of --base-version].
     #[arg(long, value_name = "PARAMETER=VALUE", num_args = 1.., requires = "checkpoint")]
     pub parameters: Vec<Assignment>,
-    /// Make the heatmap again from the files .parquet that an earlier one left, one for each --checkpoint, without playing.
+    /// Draw the heatmap from the .parquet files of an earlier call, one for each --checkpoint, without testing again.
     #[arg(
         long,
         value_name = "FILE",
         num_args = 1..,
         requires = "checkpoint",
-        conflicts_with_all = ["grid", "episodes", "seed", "parameters", "base"]
+        conflicts_with_all = ["grid", "episodes", "seed", "parameters", "base_version"]
     )]
     pub records: Vec<PathBuf>,
-    /// Points along each axis, at most 100.
+    /// Number of points along each axis, at most 100.
     #[arg(long, value_name = "N", default_value_t = 40, value_parser = |text: &str| within(text, 1..=MOST_POINTS))]
     pub grid: usize,
-    /// Episodes of each policy at each point.
+    /// Number of episodes of each policy at each point.
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = at_least_one::<u64>)]
     pub episodes: u64,
-    /// Fixes the tests' randomness [default: each training's seed].
+    /// Random seed of the tests [default: each training's seed].
     #[arg(long, value_name = "N", value_parser = natural::<u64>)]
     pub seed: Option<u64>,
-    /// The files without their endings .csv, .svg, .png, .parquet [default: in the working directory, named after
-    /// environment, algorithm, architecture, version, seed and parameters].
+    /// Path of the files without the extensions .csv, .svg, .png and .parquet [default: in the working directory, named
+    /// after environment, algorithm, architecture, version, seed and parameters].
     #[arg(long, value_name = "PATH")]
     pub out: Option<PathBuf>,
     #[command(flatten)]
@@ -191,35 +190,34 @@ pub struct HeatmapArgs {
   perturb video --checkpoint runs/mine --version E --episodes 3 --out mine.gif
   perturb video --checkpoint runs/mine --version D,E --episodes 4 --out sheet.png")]
 pub struct VideoArgs {
-    /// The --out of a training, the checkpoint folder in it, the folder of a cell, or the name of a policy: the id of a cell
-    /// in results/ of the working directory, or in the folder that PERTURB_RESULTS names.
+    /// The --out folder of a training, its checkpoint folder, the folder of a cell, or a policy's name: the id of a
+    /// cell in results/ of the working directory, or in the folder that PERTURB_RESULTS names.
     #[arg(long, value_name = "DIR")]
     pub checkpoint: PathBuf,
-    /// Where the environment's parameters come from; of several, separated by commas, one after the other, in a contact
-    /// sheet side by side.
+    /// Versions that give the environment's parameters, separated by commas. A film shows them one after the other, a
+    /// contact sheet side by side.
     #[arg(long, value_delimiter = ',', default_value = "D")]
     pub version: Vec<Version>,
-    /// Parameters in place of the version's: a value, or intervals to draw from, e.g. length=0.8..0.9 mass=0.1.
+    /// Parameters that replace the version's: a value, or intervals to draw from, e.g. length=0.8..0.9 mass=0.1.
     #[arg(long, value_name = "PARAMETER=VALUES", num_args = 1..)]
     pub parameters: Vec<Assignment>,
-    /// Episodes to play on each version; of a policy trained with RL² all episodes of a trial are shown, one after the other.
+    /// Number of episodes on each version. For a policy trained with RL² all episodes of a trial are shown.
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = at_least_one::<u64>)]
     pub episodes: u64,
-    /// The video; its name ends in .mp4, for which ffmpeg must be installed, in .gif, or in .png for a contact sheet: one
-    /// picture, with some moments of each episode in a row.
+    /// File to write. Its name ends in .gif, in .mp4, which needs ffmpeg, or in .png for a contact sheet: one picture
+    /// with some moments of each episode in a row.
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,
-    /// Fixes all randomness; with the same number, `evaluate --episodes 1` tests the first episode [default: the
-    /// training's seed].
+    /// Random seed. With the same seed, `evaluate --episodes 1` tests the first episode [default: the training's seed].
     #[arg(long, value_name = "N", value_parser = natural::<u64>)]
     pub seed: Option<u64>,
     /// Width of the pictures, 240 to 2048 pixels [default: 480, in a contact sheet 240].
     #[arg(long, value_name = "PIXELS", value_parser = |text: &str| within(text, PIXELS))]
     pub width: Option<u32>,
-    /// Height of the pictures, 240 to 2048 pixels; the text below them comes in addition [default: as wide].
+    /// Height of the pictures without the text below them, 240 to 2048 pixels [default: the width].
     #[arg(long, value_name = "PIXELS", value_parser = |text: &str| within(text, PIXELS))]
     pub height: Option<u32>,
-    /// Steps shown in a second, 0.1 to 1000 [default: as many as the environment simulates in one: real time].
+    /// Steps shown per second, 0.1 to 1000 [default: real time].
     #[arg(long, value_name = "N", value_parser = |text: &str| within(text, 0.1..=1000.0))]
     pub fps: Option<f64>,
     #[command(flatten)]

@@ -9,30 +9,31 @@ use perturb_learner::checkpoint::Checkpoint;
 use perturb_records::Records;
 use perturb_records::ledger::{Head, Ledgers, Proof};
 
-use super::super::{args::AuditArgs, error::CommandError, error::Result, lasting_servers};
-use super::Tested;
+use super::super::{args::AuditArgs, error::CommandError, error::Result, reconnecting_servers};
+use super::RecordedPolicy;
 
-/// Says of each policy what the ledgers prove.
-pub(super) fn prove(args: &AuditArgs, tested: &[Tested]) -> Result<ExitCode> {
+/// Prints what the ledgers prove about each policy.
+pub(super) fn prove(args: &AuditArgs, recorded: &[RecordedPolicy]) -> Result<ExitCode> {
     let ledgers = Ledgers::read(&args.ledger, &args.head).map_err(CommandError::Failed)?;
-    let servers = lasting_servers(&args.server, args.wait)?;
+    let servers = reconnecting_servers(&args.server, args.wait)?;
     let (mut proofs, mut out) = (Vec::new(), std::io::stdout());
-    for one in tested {
-        let records = Records::read(&one.records)?;
-        let checkpoint = Checkpoint::load(&one.checkpoint)?;
-        let got = checkpoint.id().map_err(|reason| CommandError::Failed(format!("{}: {reason}", one.name)))?;
-        if got != records.about.policy {
-            let (of, name) = (&records.about.policy, &one.name);
-            let message = format!("{name}: the episodes were recorded of the policy {of}, the checkpoint is {got}");
+    for policy in recorded {
+        let name = policy.name.as_str();
+        let records = Records::read(&policy.records)?;
+        let checkpoint = Checkpoint::load(&policy.checkpoint)?;
+        let id = checkpoint.id().map_err(|reason| CommandError::Failed(format!("{name}: {reason}")))?;
+        if id != records.about.policy {
+            let expected = &records.about.policy;
+            let message = format!("{name}: the records are of policy {expected}, but the checkpoint is {id}");
             return Err(CommandError::Usage(message));
         }
         if records.about.tests.is_empty() {
-            return Err(CommandError::Failed(format!("{}: no test is recorded, so nothing can be proved", one.name)));
+            return Err(CommandError::Failed(format!("{name}: the records have no test, so nothing can be proved")));
         }
         let (training, counters) = (&checkpoint.state.config.common, checkpoint.state.counters);
         let environment = servers.environment(&training.environment)?;
         let episodes = counters.generated_episodes.max(counters.episodes);
-        proofs.push((one.name.as_str(), ledgers.prove(training, episodes, &environment, &records)));
+        proofs.push((name, ledgers.prove(training, episodes, &environment, &records)));
         if !args.json.is_printed() {
             proofs.last().map_or(Ok(()), |(name, proof)| print(name, proof, &records))?;
         }
@@ -43,9 +44,9 @@ pub(super) fn prove(args: &AuditArgs, tested: &[Tested]) -> Result<ExitCode> {
     args.json.write(json!({ "clean": clean, "policies": policies, "ledgers": heads }))?;
     if !args.json.is_printed() {
         for Head { path, lines, digest, unfinished } in ledgers.heads() {
-            let rest =
+            let partial =
                 if *unfinished > 0 { format!(", and {unfinished} bytes of an unfinished line") } else { String::new() };
-            writeln!(out, "{}: {lines} lines{rest}, unbroken up to --head {digest}", path.display())?;
+            writeln!(out, "{}: {lines} lines{partial}, unbroken up to --head {digest}", path.display())?;
         }
     }
     Ok(if clean == proofs.len() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
@@ -66,8 +67,8 @@ fn print(name: &str, proof: &Proof, records: &Records) -> std::io::Result<()> {
     let sessions = if proof.sessions == 1 { "session" } else { "sessions" };
     writeln!(
         out,
-        "{name}: {} drew its training in {} {sessions}, and before that ended no episode of the tests on {}, nor from \
-         another test set",
+        "{name}: {} drew its training in {} {sessions}. Before the training's end it played no episode of the tests on {} \
+         and none of another test set",
         tokens.join(" and "),
         proof.sessions,
         sets.join(", ")

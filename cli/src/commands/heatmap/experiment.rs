@@ -1,4 +1,4 @@
-//! The heatmaps of an experiment.
+//! Heatmaps of the policies that an experiment selected.
 
 use std::io::Write;
 use std::path::Path;
@@ -14,91 +14,90 @@ use perturb_protocol::names;
 use perturb_records::HeatmapKind;
 use perturb_report::{heatmap_pictures, save_heatmaps};
 
-use super::{options, test, wanted_axes};
+use super::{axes, options, test};
 use crate::commands::args::HeatmapArgs;
 use crate::commands::display::{note, say};
 use crate::commands::error::{CommandError, Result, system};
 use crate::commands::{plan_in, playing_servers};
 
-/// What became of places.
+/// Numbers of heatmaps.
 #[derive(Default)]
-struct Count {
-    /// Of environments with both parameters.
-    wanted: usize,
-    /// Without a heatmap, though there is a result.
+struct HeatmapCounts {
+    /// Heatmaps of environments that have both parameters.
+    total: usize,
+    /// Heatmaps that could not be made, although there is a result.
     failed: usize,
-    /// Environments that lack a parameter.
-    lacking: usize,
+    /// Environments without one of the parameters.
+    skipped_environments: usize,
 }
 
-/// Makes what is missing, and draws everything that is there.
+/// Makes the missing heatmaps, and draws all of them.
 pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
     let folder = Folder::new(directory);
     let plan = plan_in(&folder)?;
     let results = Results::read(&plan, &folder)?;
     let selections = results.select();
     let places = heatmap_places(&selections);
-    let wanted: Vec<&HeatmapPlace<'_>> =
+    let selected: Vec<&HeatmapPlace<'_>> =
         places.iter().filter(|place| args.runs.is_none_or(|runs| place.run <= runs)).collect();
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
-    let mut servers_of_all = None;
-    let mut count = Count::default();
-    for places in wanted.chunk_by(|a, b| a.environment == b.environment) {
-        let (done, waiting): (Vec<_>, Vec<_>) = places.iter().partition(|place| place.selected.is_some());
-        waiting.iter().for_each(|place| note(format_args!("{place}: {}", NoHeatmap::NoResult)));
-        if done.is_empty() {
+    let mut connected = None;
+    let mut counts = HeatmapCounts::default();
+    for places in selected.chunk_by(|a, b| a.environment == b.environment) {
+        let (finished, unfinished): (Vec<_>, Vec<_>) = places.iter().partition(|place| place.selected.is_some());
+        unfinished.iter().for_each(|place| note(format_args!("{place}: {}", NoHeatmap::NoResult)));
+        if finished.is_empty() {
             continue;
         }
-        let servers = match &mut servers_of_all {
+        let servers = match &mut connected {
             Some(servers) => servers,
             none => none.insert(playing_servers(&args.play)?),
         };
         let environment = servers.environment(places[0].environment)?;
-        if let Some(lack) = lack(args, &environment) {
-            note(format_args!("{lack}: left out"));
-            count.lacking += 1;
+        if let Some(reason) = missing_parameter(args, &environment) {
+            note(format_args!("{reason}: left out"));
+            counts.skipped_environments += 1;
             continue;
         }
-        let parameters = match wanted_axes(args, &environment) {
+        let parameters = match axes(args, &environment) {
             Ok(parameters) => parameters,
-            Err(why) => {
-                note(format_args!("{}: {why}", environment.name));
-                count.lacking += 1;
+            Err(error) => {
+                note(format_args!("{}: {error}", environment.name));
+                counts.skipped_environments += 1;
                 continue;
             }
         };
-        let kind = HeatmapKind { parameters, base: args.base };
-        count.wanted += done.len();
-        for place in done {
-            count.failed += usize::from(!make(args, &folder, place, &kind, servers, &stop)?);
+        let kind = HeatmapKind { parameters, base: args.base_version };
+        counts.total += finished.len();
+        for place in finished {
+            counts.failed += usize::from(!make(args, &folder, place, &kind, servers, &stop)?);
         }
     }
     let report = folder.path().join("report");
     for file in save_heatmaps(&heatmap_pictures(&selections, Some(&folder))?, &report)? {
         writeln!(std::io::stdout(), "{}.png, .svg and .csv", report.join(file).display())?;
     }
-    match count {
-        Count { failed, wanted, .. } if failed > 0 => {
-            Err(CommandError::Failed(format!("{failed} of {wanted} heatmaps could not be made")))
+    match counts {
+        HeatmapCounts { failed, total, .. } if failed > 0 => {
+            Err(CommandError::Failed(format!("{failed} of {total} heatmaps could not be made")))
         }
-        Count { wanted: 0, lacking, .. } if lacking > 0 => Err(CommandError::Failed(
-            "no environment of this experiment has two parameters to show: see `perturb envs`, and give --x and --y"
-                .into(),
+        HeatmapCounts { total: 0, skipped_environments, .. } if skipped_environments > 0 => Err(CommandError::Failed(
+            "no environment of this experiment has both parameters: see `perturb envs`, and give --x and --y".into(),
         )),
         _ => Ok(()),
     }
 }
 
-/// What an environment lacks of the parameters that are asked for.
-fn lack(args: &HeatmapArgs, environment: &proto::Environment) -> Option<String> {
+/// Returns a sentence about the parameter of --x or --y that an environment does not have.
+fn missing_parameter(args: &HeatmapArgs, environment: &proto::Environment) -> Option<String> {
     let known = environment.parameters.iter().map(|parameter| parameter.name.as_str());
-    let lacking = args.x.iter().chain(&args.y).find(|name| names::find(name, known.clone()).is_none())?;
-    let hint = names::did_you_mean(lacking, known.clone());
+    let missing = args.x.iter().chain(&args.y).find(|name| names::find(name, known.clone()).is_none())?;
+    let hint = names::did_you_mean(missing, known.clone());
     let known = known.collect::<Vec<_>>().join(", ");
-    Some(format!("{} has no parameter `{lacking}`{hint}, only {known}", environment.name))
+    Some(format!("{} has no parameter `{missing}`{hint}, only {known}", environment.name))
 }
 
-/// Makes a heatmap, unless it is there; whether it is there then.
+/// Makes a heatmap unless it exists. Returns whether it exists afterwards.
 fn make(
     args: &HeatmapArgs,
     folder: &Folder,
@@ -110,7 +109,7 @@ fn make(
     let Some(selected) = place.selected else { return Ok(false) };
     let options = options(args, kind, &selected.cell.config);
     if place.read(folder, kind)?.is_ok_and(|stored| stored.record.options == options) {
-        note(format_args!("{place}: is there already"));
+        note(format_args!("{place}: exists already"));
         return Ok(true);
     }
     let checkpoint = match checkpoint_of(folder, selected) {
@@ -121,22 +120,22 @@ fn make(
         }
     };
     let (heatmap, records) = test(servers, &checkpoint, &options, stop)
-        .map_err(|error| CommandError::Place { place: place.to_string(), source: Box::new(error) })?;
+        .map_err(|error| CommandError::Heatmaps { place: place.to_string(), source: Box::new(error) })?;
     let id = checkpoint.id().map_err(|reason| CommandError::Failed(format!("{place}: {reason}")))?;
     let path = heatmap_path(folder, selected.cell, kind);
-    // Before the heatmap, whose record is what tells that it is complete.
+    // The heatmap's own record is written last, because it marks the heatmap as complete.
     records.write(&path.with_added_extension("parquet"))?;
     store_heatmap(folder, selected.cell, id, options, &heatmap)?;
     writeln!(std::io::stdout(), "{}.csv and .parquet", path.display())?;
     Ok(true)
 }
 
-/// The checkpoint that a result comes from.
+/// Loads the checkpoint of a result.
 fn checkpoint_of(folder: &Folder, Selected { cell, result }: Selected<'_>) -> Result<Checkpoint> {
     let checkpoint = Checkpoint::load(&folder.cell(&cell.id).training())?;
     let (state, training) = (&checkpoint.state, &result.training);
     if training.settings != state.config.table() || training.counters != state.counters {
-        let message = format!("the checkpoint of {} is not the one that its result.json came from", cell.id);
+        let message = format!("the checkpoint of {} does not belong to its result.json", cell.id);
         return Err(CommandError::Failed(message));
     }
     Ok(checkpoint)

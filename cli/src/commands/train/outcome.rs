@@ -10,14 +10,14 @@ use perturb_settings::TrainConfig;
 use perturb_text::quoted;
 use serde_json::json;
 
-use super::super::again::{explain, resume_command};
 use super::super::args::TrainArgs;
 use super::super::display::note;
 use super::super::error::Result;
+use super::super::resume_hint::{resume_command, with_resume_command};
 use super::super::signal_code;
 
-/// Says what a training came to.
-pub(super) fn end(
+/// Prints the end of a training and returns the exit status.
+pub(super) fn finish(
     args: &TrainArgs,
     config: &TrainConfig,
     directory: &RunDirectory,
@@ -26,29 +26,29 @@ pub(super) fn end(
     let outcome = match outcome {
         Ok(outcome) => outcome,
         Err(TrainError::Stopped { signal, source }) => {
-            let lost = explain(*source, &args.play);
-            note(format_args!("stopped by signal {signal}, waiting for a server: {lost}"));
+            let error = with_resume_command(*source, &args.play);
+            note(format_args!("stopped by signal {signal} while waiting for a server: {error}"));
             return Ok(signal_code(signal));
         }
-        Err(error) => return Err(explain(error, &args.play)),
+        Err(error) => return Err(with_resume_command(error, &args.play)),
     };
     if !config.settings.is_random() {
         summarise(&outcome.progress);
     }
     if let Some(number) = outcome.signal {
         note(format_args!(
-            "stopped by signal {number} after {} of {} episodes; go on with: {}",
+            "stopped by signal {number} after {} of {} episodes; resume with: {}",
             outcome.progress.episodes,
             config.common.episodes,
             resume_command(directory.path(), &args.play)
         ));
     }
-    say(args, directory, &outcome.checkpoint.state, outcome.progress.recent, outcome.signal)?;
+    print_result(args, directory, &outcome.checkpoint.state, outcome.progress.recent, outcome.signal)?;
     Ok(outcome.signal.map_or(ExitCode::SUCCESS, signal_code))
 }
 
-/// Says where the policy is and, as JSON, what it is; `recent` are the means over the last 100 episodes.
-pub(super) fn say(
+/// Prints the path of the policy and writes the JSON result. `recent` has the means over the last 100 episodes.
+pub(super) fn print_result(
     args: &TrainArgs,
     directory: &RunDirectory,
     state: &State,
@@ -84,7 +84,7 @@ pub(super) fn say(
     Ok(writeln!(out, "test it: {command}")?)
 }
 
-/// A line of figures, with the shares of the time.
+/// Prints the training's figures and time shares.
 fn summarise(progress: &Progress) {
     let TimeShares { acting, waiting, updating } = progress.percent();
     let recent = match progress.recent {

@@ -1,21 +1,21 @@
-//! Faults of the machine, which are the run's errors and no cell's.
+//! Faults of the machine. They are errors of the run, not of its cells.
 
 use super::{Experiment, PLAN, succeeded};
 use crate::common::stderr;
 use perturb_faults::disk;
 
-/// Where no file may get larger than 16 KiB a checkpoint's weights do not fit.
+/// Limit on file sizes in blocks of 512 bytes. 16 KiB are too few for a checkpoint's weights.
 const BLOCKS: u32 = 32;
-/// A disk on which a cell begins, and does not end.
+/// Size of a disk on which a cell can begin but not finish.
 const KILOBYTES: u32 = 120;
 
 #[test]
-fn a_disk_that_refuses_ends_the_run_and_what_was_done_is_kept() {
+fn a_failing_disk_ends_the_run_and_keeps_results() {
     let experiment = Experiment::new(PLAN);
     let arguments = ["--cell", "0,1", "--jobs", "1"];
     succeeded(&experiment.run("undisturbed", &arguments));
 
-    let output = disk::small_files(&experiment.command("out", &arguments), BLOCKS).output().expect("ended");
+    let output = disk::with_file_limit(&experiment.command("out", &arguments), BLOCKS).output().expect("ended");
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains("the run cannot go on: CartPole-a2c-ff-D-") && said.contains("File too large"), "{said}");
@@ -31,7 +31,7 @@ fn a_disk_that_refuses_ends_the_run_and_what_was_done_is_kept() {
 }
 
 #[test]
-fn a_disk_that_is_full_ends_the_run_and_the_same_command_goes_on_once_there_is_room() {
+fn a_run_resumes_after_a_full_disk() {
     let experiment = Experiment::new(PLAN);
     let arguments = ["--cell", "0,1", "--jobs", "1"];
     succeeded(&experiment.run("undisturbed", &arguments));
@@ -41,7 +41,7 @@ fn a_disk_that_is_full_ends_the_run_and_the_same_command_goes_on_once_there_is_r
         std::fs::create_dir(folder).expect("a folder");
     }
     let command = experiment.command("disk/run", &arguments);
-    let Some(mut twice) = disk::full_at_first(&command, &disk, KILOBYTES, &kept) else {
+    let Some(mut twice) = disk::on_full_then_free_disk(&command, &disk, KILOBYTES, &kept) else {
         return eprintln!("skipped: nobody may mount a disk here");
     };
     let output = twice.output().expect("ended");

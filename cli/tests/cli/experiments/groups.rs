@@ -1,4 +1,4 @@
-//! What is told of the cells of a group, whatever does them.
+//! Events of the cells of a group.
 
 use perturb_experiment::scheduler::CellEvent;
 use perturb_experiment::{Failure, FailureMark, Folder};
@@ -9,7 +9,8 @@ use perturb_learner::client::Servers;
 use super::{Experiment, PLAN};
 use crate::common::{kill, server};
 
-/// Does these cells together, each with the failure that it may forget, and gives how each ended, in the plan's order.
+/// Runs these cells as a group, each with the failure that it may retry. Returns the end of each cell in the plan's
+/// order.
 fn ends(
     experiment: &Experiment,
     servers: &Servers,
@@ -34,7 +35,7 @@ fn ends(
 }
 
 #[test]
-fn each_cell_of_a_group_ends_once_whatever_the_others_do() {
+fn each_cell_of_a_group_ends_once() {
     let experiment = Experiment::new(PLAN);
     let (local, stop) = (server(1), StopFlag::default());
     let servers = Servers::connect(std::slice::from_ref(local.address())).unwrap_or_else(|error| panic!("{error}"));
@@ -55,7 +56,7 @@ fn each_cell_of_a_group_ends_once_whatever_the_others_do() {
     assert_eq!(ends(&experiment, &servers, &all, &stop), expected);
     drop(lock);
 
-    // One is asked to stop, then the server is lost, and then there is another.
+    // One cell is stopped, then the server is lost, and then there is another server.
     let left = [(1, None), (2, place(2).failure_mark())];
     stop.raise(15);
     let stopped = CellEvent::Stopped { signal: 15 };

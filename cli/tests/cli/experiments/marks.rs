@@ -1,4 +1,4 @@
-//! Tests of the policies of earlier moments.
+//! Intermediate evaluations during a training.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,8 @@ use perturb_learner::checkpoint::Checkpoint;
 use super::{Experiment, kill_all, succeeded};
 use crate::common::{perturb, stderr, wait_for};
 
-/// Two cells that reach every number of episodes exactly, and one of EPOpt, which learns from fewer episodes than it generates.
+/// A plan with two cells that reach every number of episodes exactly, and one of EPOpt, which learns from a part of its
+/// episodes.
 const PLAN: &str = "
 environments = ['CartPole']
 versions = ['D']
@@ -31,7 +32,7 @@ settings = { episodes_per_iteration = 20 }
 ";
 
 impl Experiment {
-    /// The bytes of all results, records and kept policies.
+    /// Returns the bytes of all results, records and stored policies.
     fn kept(&self, name: &str) -> BTreeMap<PathBuf, Vec<u8>> {
         let folder = Folder::new(&self.out(name));
         let mut files = BTreeMap::new();
@@ -57,7 +58,7 @@ fn add(place: &Path, name: &str, files: &mut BTreeMap<PathBuf, Vec<u8>>) {
 }
 
 #[test]
-fn policies_on_the_way_are_tested_and_change_nothing_however_often_a_run_is_killed() {
+fn intermediate_evaluations_survive_kills() {
     let experiment = Experiment::new(PLAN);
     succeeded(&experiment.run("whole", &["--jobs", "1"]));
     let whole = experiment.kept("whole");
@@ -106,9 +107,9 @@ fn policies_on_the_way_are_tested_and_change_nothing_however_often_a_run_is_kill
     assert!(text.contains("Generalisation against training"), "{text}{}", stderr(&output));
 }
 
-/// With a constant learning rate a training is the beginning of one with a larger budget.
+/// With a constant learning rate, a training equals the beginning of one with a larger budget.
 #[test]
-fn the_policy_of_a_mark_is_that_of_a_training_that_ends_there() {
+fn an_intermediate_policy_is_that_of_a_shorter_training() {
     let shorter = PLAN.replace("30, 60]", "30]").replace("= 60", "= 30");
     let [long, short] = [PLAN, &shorter].map(|plan| {
         let experiment = Experiment::new(plan);
@@ -129,9 +130,9 @@ fn the_policy_of_a_mark_is_that_of_a_training_that_ends_there() {
     assert_eq!(long.cell_result("out", 0).marks[&30].counters.episodes, 30, "reached exactly");
 }
 
-/// One that was deleted is made again.
+/// A deleted policy is made again.
 #[test]
-fn a_training_whose_kept_policies_are_gone_begins_again() {
+fn a_training_without_its_intermediate_policies_restarts() {
     let experiment = Experiment::new(PLAN);
     succeeded(&experiment.run("out", &["--cell", "0"]));
     let whole = experiment.kept("out");

@@ -20,7 +20,7 @@ use perturb_experiment::{Cell, CellResult, CellState, Folder, Plan};
 use crate::common::{is_running, kill, perturb, stderr, wait_for};
 use tempfile::TempDir;
 
-/// Eight cells of a second or so.
+/// A plan with eight cells of about a second.
 const PLAN: &str = "
 environments = ['CartPole', 'Pendulum']
 versions = ['D', 'E']
@@ -54,7 +54,7 @@ impl Experiment {
     fn command(&self, name: &str, arguments: &[&str]) -> Command {
         let mut command = perturb(&["run"]);
         command.arg(self.directory.path().join("file.toml")).arg("--out").arg(self.out(name)).args(arguments);
-        // Whether a training begins or goes on stands in its log then.
+        // With this filter the log says whether a training begins or resumes.
         command.env("RUST_LOG", "warn,perturb_learner::training=debug");
         command
     }
@@ -64,7 +64,7 @@ impl Experiment {
         child.wait_with_output().expect("ended")
     }
 
-    /// The page that `perturb report` makes of a run.
+    /// Returns the HTML page that `perturb report` makes of a run.
     fn page(&self, name: &str) -> String {
         let path = self.out("page.html");
         let mut command = perturb(&["report"]);
@@ -72,13 +72,13 @@ impl Experiment {
         std::fs::read_to_string(path).expect("a page")
     }
 
-    /// Small heatmaps of a run.
+    /// Makes small heatmaps of a run.
     fn heatmap(&self, name: &str, arguments: &[&str]) -> Output {
         let mut command = perturb(&["heatmap", "--grid", "2", "--episodes", "1"]);
         command.arg(self.out(name)).args(arguments).output().expect("ended")
     }
 
-    /// The bytes of all results.
+    /// Returns the bytes of all results.
     fn results(&self, name: &str) -> BTreeMap<String, Vec<u8>> {
         let folder = Folder::new(&self.out(name));
         let read = |id: &str| std::fs::read(folder.cell(id).path().join("result.json")).ok();
@@ -92,12 +92,12 @@ impl Experiment {
         }
     }
 
-    /// How often each cell's training was begun, or gone on with. The log of a group is that of its first cell.
+    /// Returns how often each cell's training was begun or resumed. A group has the log of its first cell.
     fn attempts(&self, name: &str) -> Vec<usize> {
         let folder = Folder::new(&self.out(name));
         let log = |cell: &Cell| std::fs::read_to_string(folder.cell(&cell.id).log()).unwrap_or_default();
         let logs: String = self.plan.cells.iter().map(log).collect();
-        // Not the warning that one begins again for want of a checkpoint, which names its folder, too.
+        // The warning about a missing checkpoint names the folder, too, and does not count.
         let begins =
             |line: &&str| ["begins", "goes on"].iter().any(|how| line.contains(&format!("training {how} directory=")));
         let lines: Vec<&str> = logs.lines().filter(begins).collect();
@@ -111,15 +111,15 @@ fn succeeded(output: &Output) {
     assert!(output.status.success(), "{}: {}", output.status, stderr(output));
 }
 
-/// The processes that `parent` started.
+/// Returns the processes that `parent` started.
 fn children(parent: u32) -> Vec<u32> {
     let list = std::fs::read_to_string(format!("/proc/{parent}/task/{parent}/children")).unwrap_or_default();
     list.split_whitespace().filter_map(|id| id.parse().ok()).collect()
 }
 
-/// Kills a run with -9, and waits until all that it started has ended.
+/// Kills a run with SIGKILL, and waits until all its processes have ended.
 fn kill_all(mut child: Child) {
-    // None between two processes.
+    // There may be none for a moment between two processes.
     let started = children(child.id());
     kill("-KILL", child.id());
     assert_eq!(child.wait().expect("ended").signal(), Some(9), "killed before its end");

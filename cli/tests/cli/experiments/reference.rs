@@ -1,11 +1,11 @@
-//! Lines to compare with.
+//! Rows of a report for comparison.
 
 use perturb_settings::Observe;
 
 use super::{Experiment, succeeded};
 use crate::common::{perturb, stderr};
 
-/// Six cells of the random policy, two of a learner.
+/// A plan with six cells of the random policy and two of a learner.
 const PLAN: &str = "
 environments = ['CartPole', 'Pendulum']
 versions = ['D', 'R', 'E']
@@ -24,7 +24,7 @@ architectures = ['ff']
 ";
 
 #[test]
-fn a_random_policy_is_tested_reported_and_played_again_like_any_other_but_not_trained() {
+fn random_policies_are_tested_reported_and_replayed() {
     let experiment = Experiment::new(PLAN);
     succeeded(&experiment.run("out", &["--jobs", "1"]));
     let random: Vec<_> = (0..8).map(|index| experiment.cell_result("out", index)).collect();
@@ -51,7 +51,7 @@ fn a_random_policy_is_tested_reported_and_played_again_like_any_other_but_not_tr
     succeeded(&output.expect("ended"));
 }
 
-/// Of two learners, whose policies see parameters or not, and of the random policy.
+/// A plan with two learners, of which one observes parameters, and the random policy.
 const SEEING: &str = "
 environments = ['Pendulum']
 versions = ['R']
@@ -77,8 +77,8 @@ architectures = ['ff']
 ";
 
 #[test]
-fn policies_that_see_parameters_are_a_row_of_their_own_and_played_again_and_drawn_like_any_other() {
-    // The grid names what [settings] name, too: it stands above them.
+fn policies_that_observe_parameters_have_a_row_of_their_own() {
+    // The grid has the same setting as [settings] and takes precedence.
     let experiment = Experiment::new(SEEING);
     succeeded(&experiment.run("out", &["--jobs", "1"]));
     let results: Vec<_> = (0..4).map(|index| experiment.cell_result("out", index)).collect();
@@ -137,7 +137,7 @@ fn a_checkpoint_knows_what_its_policy_sees() {
     assert!(stderr(&output).contains("possible values: state, parameters"), "{}", stderr(&output));
 }
 
-/// What is trained on both R and E, beside D.
+/// A plan that trains on R+E and on D.
 const BOTH: &str = "
 environments = ['CartPole']
 versions = ['D', 'R+E']
@@ -153,7 +153,7 @@ grid = { learning_rate = [7e-3, 7e-4] }
 ";
 
 #[test]
-fn what_is_trained_on_r_and_e_stands_beside_the_scenarios() {
+fn policies_trained_on_r_and_e_are_in_the_report() {
     let experiment = Experiment::new(BOTH);
     succeeded(&experiment.run("out", &["--jobs", "1"]));
     let results: Vec<_> = (0..4).map(|index| experiment.cell_result("out", index)).collect();

@@ -1,4 +1,4 @@
-//! What is made of a run: its report, heatmaps, curves.
+//! Reports, heatmaps and curves of a run.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use super::{Experiment, PLAN, kill_all, succeeded};
 use crate::common::{perturb, stderr, wait_for};
 
 #[test]
-fn a_report_is_the_same_however_often_the_run_was_broken_off() {
+fn reports_do_not_depend_on_interruptions() {
     let experiment = Experiment::new(&PLAN.replace("test_versions = ['D', 'R']", "test_versions = ['D', 'E']"));
     let report = |name: &str| {
         let page = experiment.out("page.html");
@@ -59,7 +59,7 @@ fn a_report_is_the_same_however_often_the_run_was_broken_off() {
 }
 
 #[test]
-fn a_run_writes_its_report_when_nothing_is_left_to_do() {
+fn a_run_writes_its_report_at_the_end() {
     let experiment = Experiment::new(&PLAN.replace("7e-3, 7e-4", "1e38, 7e-4"));
     let (page, again) = (experiment.out("pages/page.html"), experiment.out("again.html"));
     std::fs::create_dir(experiment.out("pages")).expect("a folder");
@@ -76,14 +76,14 @@ fn a_run_writes_its_report_when_nothing_is_left_to_do() {
     assert_eq!(names, 1, "nothing temporary stays");
 }
 
-/// A heatmap of the episodes that an earlier one left.
+/// Draws a heatmap from the recorded episodes of an earlier one.
 fn draw_again(training: &Path, directory: &Path, records: &str) -> Output {
     let mut command = perturb(&["heatmap", "--x", "force", "--y", "length", "--out", "again", "--checkpoint"]);
     command.arg(training).args(["--records", records]).current_dir(directory).output().expect("ended")
 }
 
 #[test]
-fn a_heatmap_is_drawn_of_two_parameters_and_others_are_refused() {
+fn a_heatmap_needs_two_known_parameters() {
     let experiment = Experiment::new(PLAN);
     succeeded(&experiment.run("out", &["--cell", "0"]));
     let training = Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[0].id).training();
@@ -139,19 +139,19 @@ fn a_heatmap_is_drawn_of_two_parameters_and_others_are_refused() {
     assert_eq!(draw(&["--x", "force"]).status.code(), Some(2), "one parameter is not enough");
 }
 
-/// A file's content as text.
+/// Returns a file's content as text.
 fn text(path: &Path) -> String {
     std::fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
-/// The figures of a heatmap's CSV, without its head.
+/// Returns the rows of a heatmap's CSV without the header.
 fn figures(path: &Path) -> Vec<Vec<f64>> {
     let numbers = |line: &str| line.split(',').map(|field| field.parse().expect("a number")).collect();
     text(path).lines().skip(1).map(numbers).collect()
 }
 
 #[test]
-fn a_heatmap_of_several_policies_is_their_mean_and_of_one_environment() {
+fn a_heatmap_of_several_policies_is_their_mean() {
     let experiment = Experiment::new(
         "environments = ['CartPole', 'Pendulum']\nversions = ['D']\nruns = 2
         test_episodes = 4\nsettings = { episodes = 40, num_envs = 4 }
@@ -190,13 +190,13 @@ fn a_heatmap_of_several_policies_is_their_mean_and_of_one_environment() {
         "{said}"
     );
     let output = draw(&[a, b, a], &small(&[]));
-    assert!(output.status.code() == Some(2) && stderr(&output).contains("twice: a mean is over different policies"));
+    assert!(output.status.code() == Some(2) && stderr(&output).contains("twice: give different policies"));
     let output = draw(&[a, b], &["--records", &records[0]]);
     let said = stderr(&output);
     assert!(output.status.code() == Some(2) && said.contains("1 files for 2 policies; give one for each"), "{said}");
 
-    // The third parameter, force: of D everywhere the default, of E drawn for each episode.
-    succeeded(&draw(&[a], &small(&["--base", "E"])));
+    // The third parameter is force: the default on D, drawn for each episode on E.
+    succeeded(&draw(&[a], &small(&["--base-version", "E"])));
     let forces = |name: &str| -> Vec<f64> {
         let records = Records::read(&at(name)).expect("records");
         let place = records.about.parameters.iter().position(|parameter| parameter.name == "force").expect("there");
@@ -213,39 +213,39 @@ fn a_heatmap_of_several_policies_is_their_mean_and_of_one_environment() {
     succeeded(&draw(&[a], &["--out", "again-e", "--records", of_e]));
     assert_eq!(text(&at("again-e.svg")), picture, "the file knows what was drawn");
 
-    succeeded(&draw(&[a], &small(&["--base", "R+E"])));
+    succeeded(&draw(&[a], &small(&["--base-version", "R+E"])));
     assert!(words(&text(&at("CartPole-a2c-ff-D-s1-length-mass-R-or-E.svg"))).contains("drawn from R+E"));
 }
 
-/// The texts of a picture, whose lines end where its width does.
+/// Returns the texts of a picture with their line breaks removed.
 fn words(svg: &str) -> String {
     let texts = svg.split("<text").skip(1).filter_map(|text| text.split_once('>')?.1.split_once('<'));
     texts.map(|(text, _)| text.trim()).collect::<Vec<_>>().join(" ")
 }
 
-/// Every file of a run's heatmaps.
+/// Returns every file of a run's heatmaps.
 fn heatmap_files(out: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let entries = std::fs::read_dir(out.join("heatmaps")).expect("a folder");
     let paths = entries.map(|entry| entry.expect("an entry").path());
     paths.map(|path| (path.clone(), std::fs::read(path).expect("read"))).collect()
 }
 
-/// What the heatmaps that a page shows are of.
+/// Returns the titles of the heatmaps on a page.
 fn embedded(page: &str) -> Vec<&str> {
     let names = page.split("aria-label=\"").skip(1).filter_map(|rest| rest.split('"').next());
     names.filter(|name| name.contains("mean return and success over ")).collect()
 }
 
-/// How many heatmaps are made, and how many were there already.
+/// Makes heatmaps. Returns the number of new ones and of existing ones.
 fn made(experiment: &Experiment, arguments: &[&str]) -> (usize, usize) {
     let output = experiment.heatmap("out", arguments);
     succeeded(&output);
     let made = String::from_utf8_lossy(&output.stdout).lines().filter(|line| line.ends_with(" and .parquet")).count();
-    (made, stderr(&output).matches("is there already").count())
+    (made, stderr(&output).matches("exists already").count())
 }
 
 #[test]
-fn heatmaps_of_an_experiment_are_made_once_and_are_in_its_report() {
+fn heatmaps_of_an_experiment_are_made_once() {
     let experiment = Experiment::new(&PLAN.replace("['D', 'R']", "['D', 'E']\nruns = 2"));
     succeeded(&experiment.run("out", &["--jobs", "2"]));
     let out = experiment.out("out");
@@ -253,7 +253,7 @@ fn heatmaps_of_an_experiment_are_made_once_and_are_in_its_report() {
     assert!(embedded(&without).is_empty());
     assert!(without.contains("not there: 8 of 8. <code>perturb heatmap DIR</code> makes them"));
 
-    // Two environments, trained on D and on E in two runs; the better of two configurations.
+    // Two environments are trained on D and on E in two runs. The better of two configurations is selected.
     assert_eq!(made(&experiment, &["--runs", "1"]), (4, 0));
     let partial = experiment.page("out");
     assert_eq!(embedded(&partial).len(), 2, "one of each environment");
@@ -275,7 +275,7 @@ fn heatmaps_of_an_experiment_are_made_once_and_are_in_its_report() {
         assert_eq!(text(&picture.with_extension("csv")).lines().count(), 9, "two columns of four points");
     }
 
-    // Half of the figures do not count, nor those of a result that has been replaced.
+    // Incomplete figures are made again, and so are those of a replaced result.
     let damaged = first.keys().find(|path| path.extension().is_some_and(|ending| ending == "csv")).expect("one");
     std::fs::write(damaged, b"mass,").expect("written");
     assert!(experiment.page("out").contains("not there: 1 of 8."));
@@ -293,7 +293,7 @@ fn heatmaps_of_an_experiment_are_made_once_and_are_in_its_report() {
     without_its_checkpoint(&experiment, id);
 }
 
-/// Without the checkpoint that a result came from there is no heatmap of it, and the others are made.
+/// A result without its checkpoint has no heatmap. The other heatmaps are made.
 fn without_its_checkpoint(experiment: &Experiment, id: &str) {
     std::fs::remove_dir_all(Folder::new(&experiment.out("out")).cell(id).training()).expect("deleted");
     let output = experiment.heatmap("out", &[]);
@@ -304,7 +304,7 @@ fn without_its_checkpoint(experiment: &Experiment, id: &str) {
 }
 
 #[test]
-fn heatmaps_of_an_experiment_are_over_any_parameters_that_its_environments_have() {
+fn heatmaps_of_an_experiment_have_any_two_parameters() {
     let plan = PLAN.replace("versions = ['D', 'E']", "versions = ['D']").replace("7e-3, 7e-4", "7e-4");
     let experiment = Experiment::new(&plan);
     succeeded(&experiment.run("out", &["--jobs", "2"]));
@@ -315,7 +315,7 @@ fn heatmaps_of_an_experiment_are_over_any_parameters_that_its_environments_have(
         "{}",
         stderr(&output)
     );
-    assert_eq!(made(&experiment, &["--base", "R"]), (2, 0));
+    assert_eq!(made(&experiment, &["--base-version", "R"]), (2, 0));
     assert_eq!(made(&experiment, &[]), (2, 0));
     let page = experiment.page("out");
     let [cart_pole, pendulum] =

@@ -1,4 +1,4 @@
-//! How a run does its cells: once each, whatever comes between.
+//! A run finishes each of its cells once, in spite of interruptions.
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command};
@@ -10,7 +10,7 @@ use super::{Experiment, PLAN, children, kill_all, succeeded};
 use crate::common::{child_server, ended, is_running, kill, perturb, stderr, wait_for};
 
 #[test]
-fn results_depend_neither_on_jobs_nor_on_groups_nor_on_kills() {
+fn results_do_not_depend_on_jobs_groups_or_kills() {
     let experiment = Experiment::new(PLAN);
     let cells = experiment.plan.cells.len();
     succeeded(&experiment.run("whole", &["--jobs", "1", "--group", "1"]));
@@ -37,7 +37,7 @@ fn results_depend_neither_on_jobs_nor_on_groups_nor_on_kills() {
 }
 
 #[test]
-fn a_group_whose_process_is_killed_is_done_all_the_same() {
+fn a_group_finishes_although_its_process_is_killed() {
     let experiment = Experiment::new(PLAN);
     let cells = ["--cell", "0,1,2"];
     succeeded(&experiment.run("whole", &[&cells[..], &["--group", "1"]].concat()));
@@ -102,7 +102,7 @@ fn two_runs_on_one_folder_share_the_cells() {
 }
 
 #[test]
-fn a_failed_cell_is_recorded_with_its_reason_and_the_others_are_done() {
+fn a_failed_cell_has_a_reason_and_the_others_run() {
     let experiment = Experiment::new(&PLAN.replace("7e-3, 7e-4", "1e38, 7e-4"));
     let output = experiment.run("out", &["--jobs", "2"]);
     assert_eq!(output.status.code(), Some(1));
@@ -126,9 +126,9 @@ fn a_failed_cell_is_recorded_with_its_reason_and_the_others_are_done() {
     assert_eq!(experiment.attempts("out")[failed.index], 2 * attempts[failed.index]);
 }
 
-/// What two runs that try again at once find failed: each failing cell is tried again once, by one of them.
+/// Two simultaneous runs with --retry-failed run each failed cell once, in one of them.
 #[test]
-fn two_runs_that_try_again_at_once_try_each_cell_once() {
+fn two_simultaneous_retries_run_each_cell_once() {
     let experiment = Experiment::new(&PLAN.replace("7e-3, 7e-4", "1e38, 2e38"));
     let cells = experiment.plan.cells.len();
     assert_eq!(experiment.run("out", &["--jobs", "2"]).status.code(), Some(1));
@@ -141,7 +141,7 @@ fn two_runs_that_try_again_at_once_try_each_cell_once() {
         command.stdout(std::fs::File::create(told).expect("a file")).spawn().expect("started")
     };
     let runs: Vec<Child> = told.iter().map(run).collect();
-    // Both have seen the failures: each has started a worker for a cell, which found it locked.
+    // Both runs have seen the failures. Each has started a worker that found its cell locked.
     let busy = |told: &PathBuf| std::fs::read_to_string(told).is_ok_and(|text| text.contains(r#""event":"busy""#));
     wait_for("two runs", || told.iter().all(busy));
     drop(held);
@@ -153,7 +153,7 @@ fn two_runs_that_try_again_at_once_try_each_cell_once() {
 }
 
 #[test]
-fn a_result_names_the_program_that_began_its_training_if_it_is_another() {
+fn a_result_names_the_program_that_began_the_training() {
     let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 1000, checkpoint_interval = 200"));
     let id = &experiment.plan.cells[0].id;
     let document =
@@ -166,7 +166,7 @@ fn a_result_names_the_program_that_began_its_training_if_it_is_another() {
     assert!(copied.expect("cp").success());
     let text = std::fs::read_to_string(document("other")).expect("a checkpoint");
     assert_eq!(text.matches(perturb_experiment::VERSION).count(), 1, "{text}");
-    // That program knew no checksum.
+    // Earlier versions wrote no checksum.
     let mut earlier: serde_json::Value =
         serde_json::from_str(&text.replace(perturb_experiment::VERSION, "0.0.9 (abc)")).expect("JSON");
     earlier["format_version"] = 2.into();
@@ -185,7 +185,7 @@ fn a_result_names_the_program_that_began_its_training_if_it_is_another() {
 }
 
 #[test]
-fn a_signal_stops_the_workers_and_the_same_command_goes_on() {
+fn a_signal_stops_the_workers_and_the_run_resumes() {
     let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 100"));
     for (name, code) in [("-INT", 130), ("-TERM", 143)] {
         let begun: usize = experiment.attempts("out").iter().sum();
@@ -196,7 +196,7 @@ fn a_signal_stops_the_workers_and_the_same_command_goes_on() {
         kill(name, id);
         let output = ended(child);
         assert_eq!(output.status.code(), Some(code), "{}", stderr(&output));
-        assert!(stderr(&output).contains("the same command goes on"));
+        assert!(stderr(&output).contains("resume with: perturb run"));
         wait_for("the end of what the run started", || !started.iter().any(|&id| is_running(id)));
     }
     succeeded(&experiment.run("out", &[]));
@@ -224,7 +224,7 @@ fn a_lost_server_is_no_cells_failure() {
 }
 
 #[test]
-fn a_run_starts_its_private_server_again_and_comes_to_the_same_results() {
+fn a_run_restarts_its_private_server_with_same_results() {
     let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 1000, checkpoint_interval = 20"));
     succeeded(&experiment.run("undisturbed", &["--jobs", "2"]));
     let child = experiment.command("out", &["--jobs", "1"]).spawn().expect("started"); // the only server is in use
@@ -232,7 +232,7 @@ fn a_run_starts_its_private_server_again_and_comes_to_the_same_results() {
     let checkpoint = || std::fs::read(cell.join("training/checkpoint/checkpoint.json")).ok();
     let (mut killed, mut at_its_end) = (None, None);
     for _ in 0..2 {
-        // Another one than when the last server was killed: the next one is in use.
+        // A different process means that the next server is in use.
         wait_for("a checkpoint", || checkpoint().is_some_and(|it| at_its_end.as_ref() != Some(&it)));
         let mut server = None;
         wait_for("a private server", || {
@@ -245,12 +245,12 @@ fn a_run_starts_its_private_server_again_and_comes_to_the_same_results() {
     let output = ended(child);
     succeeded(&output);
     let said = stderr(&output);
-    assert_eq!(said.matches("the private server ended with signal: 9 (SIGKILL); it is started again").count(), 2);
+    assert_eq!(said.matches("the private server ended with signal: 9 (SIGKILL); it was restarted").count(), 2);
     assert_eq!(experiment.results("out"), experiment.results("undisturbed"));
 }
 
 #[test]
-fn a_cell_that_somebody_works_on_is_left_alone_until_they_have_given_it_up() {
+fn locked_cells_are_skipped_until_the_lock_is_free() {
     let experiment = Experiment::new(PLAN);
     let place = Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[0].id);
     let lock = place.try_lock().expect("a file").expect("a lock");
@@ -265,7 +265,7 @@ fn a_cell_that_somebody_works_on_is_left_alone_until_they_have_given_it_up() {
 }
 
 #[test]
-fn a_wrong_command_is_refused_before_anything_is_done() {
+fn a_wrong_command_is_refused_at_the_start() {
     let experiment = Experiment::new(&PLAN.replace("'Pendulum'", "'Pendulums'"));
     let output = experiment.run("out", &[]);
     assert_eq!(output.status.code(), Some(2));
@@ -292,12 +292,12 @@ fn a_wrong_command_is_refused_before_anything_is_done() {
 }
 
 #[test]
-fn several_cells_are_done_and_the_missing_ones_listed() {
+fn named_cells_run_and_unfinished_ones_are_listed() {
     let experiment = Experiment::new(PLAN);
     let ids: Vec<&str> = experiment.plan.cells.iter().map(|cell| cell.id.as_str()).collect();
     let plan = |arguments: &[&str]| {
         let mut command = perturb(&["plan"]);
-        command.arg(experiment.out("file.toml")).args(arguments).arg("--missing").arg(experiment.out("out"));
+        command.arg(experiment.out("file.toml")).args(arguments).arg("--unfinished-in").arg(experiment.out("out"));
         let output = command.output().expect("ended");
         succeeded(&output);
         String::from_utf8(output.stdout).expect("text")
@@ -316,7 +316,7 @@ fn several_cells_are_done_and_the_missing_ones_listed() {
     assert_eq!(listed.as_array().map(Vec::len), Some(6));
     assert_eq!(listed[1], serde_json::json!({ "index": 2, "id": ids[2] }));
 
-    // Single cells leave the folder's plan as it is: theirs may be older.
+    // --cell does not replace the folder's plan, because its own may be older.
     let kept = || std::fs::read_to_string(experiment.out("out/plan.toml")).expect("a plan");
     std::fs::write(experiment.out("file.toml"), format!("{PLAN}\n# extended")).expect("written");
     for arguments in [&["--cell", "0", "--jobs", "1"][..], &["--cell", "0"]] {
@@ -360,7 +360,7 @@ fn the_shipped_files_ask_for_what_they_say() {
 }
 
 #[test]
-fn plan_prints_the_papers_counts_and_an_estimate_from_measurements() {
+fn plan_prints_counts_and_an_estimate() {
     let printed = |arguments: &[&str]| {
         let output = perturb(arguments).output().expect("ended");
         succeeded(&output);
@@ -383,14 +383,11 @@ fn plan_prints_the_papers_counts_and_an_estimate_from_measurements() {
     assert!(text.contains("8 cells in 4 groups of 2, 2 at a time") && text.contains("measured: 2 groups"), "{text}");
     assert!(text.contains("at most, if every episode") && text.contains(" with --jobs 2\n"), "{text}");
 
-    // Cells that are done say what others of their kind take.
+    // Finished cells give the duration of others of their kind.
     succeeded(&experiment.run("out", &["--cell", "0"]));
     let out = experiment.out("out").display().to_string();
-    let text = printed(&["plan", &file, "--measure", "1", "--from", &out]);
-    let from = format!("\nas those of the same environment and method took of 1 cell in {out}: 4 cells, ");
+    let text = printed(&["plan", &file, "--measure", "1", "--timings-from", &out]);
+    let from = format!("\nby the durations of 1 finished cell of the same environment and method in {out}: 4 cells, ");
     assert!(text.contains(&from) && text.contains("measured: 1 group for"), "{text}");
-    assert!(
-        text.contains("until the step limit: 4 cells") && text.contains("\nwhat is left there, 7 cells: "),
-        "{text}"
-    );
+    assert!(text.contains("until the step limit: 4 cells") && text.contains("\nunfinished there, 7 cells: "), "{text}");
 }

@@ -1,4 +1,4 @@
-//! The clean rule of selection: what is reported shares neither seeds nor episodes with what selects.
+//! The clean selection rule: reported tests share no seeds and no episodes with the selection.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -8,7 +8,7 @@ use perturb_records::{FILE, Records};
 use super::{Experiment, kill_all, succeeded};
 use crate::common::{perturb, stderr, wait_for};
 
-/// Four tuning cells, and four of what they select.
+/// A plan with four tuning cells and four selected cells.
 const PLAN: &str = "
 environments = ['CartPole']
 versions = ['D', 'E']
@@ -26,12 +26,12 @@ grid = { learning_rate = [7e-3, 7e-4] }
 ";
 
 impl Experiment {
-    /// All cells that a folder's results have the plan ask for.
+    /// Returns all cells of the plan, with those that the folder's results select.
     fn cells(&self, name: &str) -> Vec<Cell> {
         self.plan.in_folder(&Folder::new(&self.out(name))).expect("readable").cells
     }
 
-    /// The bytes of all that these came to.
+    /// Returns the bytes of all results of these cells.
     fn all_results(&self, name: &str) -> BTreeMap<String, [Vec<u8>; 2]> {
         let folder = Folder::new(&self.out(name));
         let read = |id: &str, file: &str| std::fs::read(folder.cell(id).path().join(file)).ok();
@@ -41,11 +41,15 @@ impl Experiment {
 }
 
 #[test]
-fn a_run_does_what_its_tuning_cells_select_however_often_it_is_killed() {
+fn selected_cells_run_after_any_number_of_kills() {
     let experiment = Experiment::new(PLAN);
     let output = experiment.run("whole", &["--jobs", "2"]);
     succeeded(&output);
-    assert!(stderr(&output).contains("tuning is done; 4 cells with what is selected"), "{}", stderr(&output));
+    assert!(
+        stderr(&output).contains("tuning is finished; 4 cells with the selected configurations"),
+        "{}",
+        stderr(&output)
+    );
     assert!(stderr(&output).contains("all 8 cells are done"), "{}", stderr(&output));
     let whole = experiment.all_results("whole");
     assert_eq!(whole.len(), 8);
@@ -60,13 +64,13 @@ fn a_run_does_what_its_tuning_cells_select_however_often_it_is_killed() {
     succeeded(&experiment.run("killed", &[]));
     assert_eq!(experiment.all_results("killed"), whole);
     let mut plan = perturb(&["plan"]);
-    let missing = plan.arg(experiment.out("killed/plan.toml")).arg("--missing").arg(experiment.out("killed"));
+    let missing = plan.arg(experiment.out("killed/plan.toml")).arg("--unfinished-in").arg(experiment.out("killed"));
     let output = missing.output().expect("ended");
     assert_eq!((output.status.code(), output.stdout), (Some(0), Vec::new()));
 }
 
 #[test]
-fn no_test_that_is_reported_has_a_seed_or_an_episode_of_one_that_selects() {
+fn reported_tests_share_nothing_with_selection_tests() {
     let experiment = Experiment::new(PLAN);
     succeeded(&experiment.run("out", &[]));
     let folder = Folder::new(&experiment.out("out"));
@@ -95,7 +99,7 @@ fn no_test_that_is_reported_has_a_seed_or_an_episode_of_one_that_selects() {
     let cell = &experiment.plan.cells[0];
     let Ok(CellState::Done(result)) = folder.state(cell) else { panic!("it is done") };
     let evaluate = result.command.split(" && ").last().expect("a command");
-    let expected = "perturb evaluate --checkpoint RUN --versions D --selection --episodes 9";
+    let expected = "perturb evaluate --checkpoint RUN --versions D --selection-episodes --episodes 9";
     assert_eq!(evaluate, expected);
     let training = folder.cell(&cell.id).training();
     let json = experiment.out("again.json");
@@ -107,7 +111,7 @@ fn no_test_that_is_reported_has_a_seed_or_an_episode_of_one_that_selects() {
 }
 
 #[test]
-fn a_selected_cell_can_be_done_alone_and_one_folder_is_reported_by_both_rules() {
+fn selected_cells_run_alone_and_both_rules_report() {
     let experiment = Experiment::new(PLAN);
     let tuning: Vec<&str> = experiment.plan.cells.iter().map(|cell| cell.id.as_str()).collect();
     let output = experiment.run("out", &["--cell", &tuning.join(",")]);

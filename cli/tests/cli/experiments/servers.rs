@@ -1,4 +1,4 @@
-//! The servers of runs: those that somebody starts, and starts again, and their own.
+//! Servers of runs: restarted ones and private ones.
 
 use std::fs::File;
 
@@ -9,7 +9,7 @@ use crate::common::{ended, wait_for};
 use crate::guarded::weights;
 use crate::patience::Named;
 
-/// Two cells of some seconds, one after the other.
+/// A plan with two cells of some seconds, one after the other.
 const PLAN: &str = "
 environments = ['CartPole', 'Pendulum']
 versions = ['E']
@@ -23,7 +23,7 @@ architectures = ['ff']
 ";
 
 #[test]
-fn a_run_outlives_its_named_server_and_comes_to_the_same_results_and_weights() {
+fn a_run_gives_same_results_after_its_server_restarts() {
     let experiment = Experiment::new(PLAN);
     let mut server = Named::new(experiment.directory.path(), "socket");
     let address = server.address();

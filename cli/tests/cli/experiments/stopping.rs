@@ -1,4 +1,4 @@
-//! Trainings that end by their success rate.
+//! Trainings that stop at a success rate.
 
 use perturb_experiment::Folder;
 use perturb_learner::checkpoint::Checkpoint;
@@ -6,7 +6,7 @@ use perturb_learner::checkpoint::Checkpoint;
 use super::{Experiment, succeeded};
 use crate::common::{perturb, stderr};
 
-/// Stops when a tenth of its last hundred episodes were successes.
+/// A plan whose trainings stop at 10 % success in the last hundred episodes.
 const PLAN: &str = "
 environments = ['CartPole']
 versions = ['D']
@@ -22,7 +22,7 @@ settings = { stop_at_success = 10 }
 ";
 
 #[test]
-fn a_training_that_stops_early_is_one_with_that_budget() {
+fn an_early_stop_equals_a_training_of_that_budget() {
     let early = Experiment::new(PLAN);
     succeeded(&early.run("out", &[]));
     let stopped = early.cell_result("out", 0);
@@ -44,7 +44,7 @@ fn a_training_that_stops_early_is_one_with_that_budget() {
     let weights = |experiment: &Experiment| Checkpoint::load(&training(experiment)).expect("a checkpoint").weights;
     assert!(weights(&early) == weights(&plain), "and its policy");
 
-    // What has stopped is not trained on, neither by hand nor by a run that lost the result.
+    // A stopped training is not continued, neither by `perturb train` nor by a run that has lost the result.
     let output = perturb(&["train", "--resume"]).arg(training(&early)).output().expect("ended");
     let said = stderr(&output);
     assert!(said.contains(&format!("it has {episodes} of 2000 episodes, and stopped at ")), "{said}");

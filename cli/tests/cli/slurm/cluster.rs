@@ -1,5 +1,5 @@
-//! A Slurm of two nodes on one machine, for a test: its daemons run in the foreground, as the user who tests, with
-//! everything in a temporary directory, and end with the test however it ends.
+//! A Slurm cluster of two nodes on one machine, for a test. Its daemons run in the foreground as the current user, with
+//! all files in a temporary directory, and end with the test.
 
 use std::fs;
 use std::net::TcpListener;
@@ -11,29 +11,29 @@ use crate::common::wait_within;
 use tempfile::TempDir;
 
 const PROGRAMS: [&str; 6] = ["munged", "slurmctld", "slurmd", "sbatch", "squeue", "sinfo"];
-/// How long the daemons may take to find each other.
+/// Time that the daemons have to connect to each other.
 const START_LIMIT: Duration = Duration::from_secs(60);
 
 pub struct Cluster {
     directory: TempDir,
-    /// munged, slurmctld, then a slurmd for each node.
+    /// Processes: munged, slurmctld, then a slurmd for each node.
     daemons: Vec<Child>,
 }
 
-/// Where a program is: on the PATH, or where Debian keeps daemons.
+/// Returns the path of a program: on the PATH, or in Debian's folders for daemons.
 fn find(program: &str) -> Option<PathBuf> {
     let path = std::env::var_os("PATH").unwrap_or_default();
     let directories = std::env::split_paths(&path).chain(["/usr/sbin".into()]);
     directories.map(|directory| directory.join(program)).find(|path| path.is_file())
 }
 
-/// A port that nobody listens on.
+/// Returns a free port.
 fn free_port() -> u16 {
     TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr()).expect("a port").port()
 }
 
 impl Cluster {
-    /// What is missing for a cluster; `None` if nothing is.
+    /// Returns the name of a missing program; `None` if all are installed.
     pub fn missing() -> Option<String> {
         let missing: Vec<&str> = PROGRAMS.into_iter().filter(|program| find(program).is_none()).collect();
         (!missing.is_empty()).then(|| format!("{} not installed", missing.join(", ")))
@@ -57,7 +57,7 @@ impl Cluster {
         let munged = ["--socket", "--key-file", "--pid-file", "--seed-file", "--log-file"]
             .map(|option| format!("{option}={}", file(&format!("munge{}", &option[1..]))))
             .map(|argument| argument.replace("munge-key-file", "key"));
-        // Temporary directories may be written by others, which it would refuse.
+        // munged refuses folders that other users can write, such as temporary directories.
         cluster.daemon("munged", &[&["--foreground".to_owned(), "--force".to_owned()], &munged[..]].concat());
         let socket = path.join("munge-socket");
         wait_within(START_LIMIT, "munged", || socket.exists());
@@ -73,7 +73,7 @@ impl Cluster {
         cluster
     }
 
-    /// One of Slurm's commands.
+    /// Returns one of Slurm's commands.
     pub fn command(&self, program: &str) -> Command {
         let mut command = Command::new(find(program).unwrap_or_else(|| program.into()));
         command.env("SLURM_CONF", self.configuration()).stdin(Stdio::null());
@@ -84,7 +84,7 @@ impl Cluster {
         self.directory.path().join("slurm.conf")
     }
 
-    /// The indices of the array's jobs that run on a node.
+    /// Returns the indices of the array's jobs that run on a node.
     pub fn running_on(&self, node: &str) -> Vec<usize> {
         let mut command = self.command("squeue");
         let output: Output =
@@ -97,7 +97,7 @@ impl Cluster {
             .collect()
     }
 
-    /// What happens when a node loses its power: slurmd and all that it started end at once.
+    /// Simulates a power loss: ends slurmd and all its processes at once.
     pub fn kill_node(&mut self, number: usize) {
         let slurmd = &mut self.daemons[1 + number];
         slurmd.kill().expect("killed");
@@ -115,7 +115,7 @@ impl Cluster {
     }
 
     fn daemon(&mut self, program: &str, arguments: &[String]) {
-        // Should the test be killed, the kernel ends the daemons.
+        // If the test is killed, the kernel ends the daemons.
         let mut command = self.command("setpriv");
         command.args(["--pdeathsig", "KILL"]).arg(find(program).expect("installed")).args(arguments);
         let log =
@@ -124,7 +124,7 @@ impl Cluster {
         self.daemons.push(command.spawn().expect("setpriv"));
     }
 
-    /// Everything that was started for this cluster, jobs and their processes too.
+    /// Returns all processes of this cluster, including jobs.
     fn processes(&self) -> Vec<u32> {
         let ours = format!("SLURM_CONF={}", self.configuration().display());
         let entries = fs::read_dir("/proc").expect("/proc").flatten();
@@ -132,7 +132,7 @@ impl Cluster {
         ids.filter(|&id| id != std::process::id() && environment(id).contains(&ours)).collect()
     }
 
-    /// What the daemons have said, for a test that fails.
+    /// Returns the daemons' logs, for a failed test.
     pub fn logs(&self) -> String {
         let names = ["slurmctld.log", "slurmd-n1.log", "slurmd-n2.log"];
         let tail = |name: &str| {
@@ -149,7 +149,7 @@ impl Drop for Cluster {
         if std::thread::panicking() {
             eprintln!("{}", self.logs());
         }
-        // Nothing is kept; the nodes first, so that nobody starts a job again.
+        // The nodes end first, so that no job is started again.
         for daemon in self.daemons.iter_mut().rev() {
             let _ = daemon.kill();
             let _ = daemon.wait();
@@ -165,7 +165,7 @@ impl Drop for Cluster {
     }
 }
 
-/// The variables that a process was started with.
+/// Returns the environment variables of a process.
 fn environment(id: u32) -> Vec<String> {
     let bytes = fs::read(format!("/proc/{id}/environ")).unwrap_or_default();
     bytes.split(|&byte| byte == 0).map(|variable| String::from_utf8_lossy(variable).into_owned()).collect()
@@ -181,7 +181,7 @@ fn kill(id: u32) {
     let _ = Command::new("kill").args(["-KILL", &id.to_string()]).stderr(Stdio::null()).status();
 }
 
-/// As small as it goes, and quick to notice a lost node and to give its jobs to another one.
+/// A minimal configuration that quickly notices a lost node and moves its jobs to another one.
 fn configuration(path: &Path) -> String {
     let output = |program: &str, argument: &str| {
         let output = Command::new(program).arg(argument).output().expect(program);

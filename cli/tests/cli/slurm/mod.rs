@@ -1,5 +1,5 @@
-//! A plan done by a real Slurm of two nodes, one of which dies. Needs Debian's packages slurmctld, slurmd, slurm-client
-//! and munge, and the program `perturb-server`; `make slurm-test` sees to both.
+//! A plan on a real Slurm cluster of two nodes, one of which fails. Needs Debian's packages slurmctld, slurmd,
+//! slurm-client and munge, and the program `perturb-server`. `make slurm-test` installs and builds them.
 
 mod cluster;
 
@@ -18,14 +18,14 @@ use tempfile::TempDir;
 use self::cluster::Cluster;
 use crate::common::{kill, perturb, stderr, wait_within};
 
-/// Set to 1, Slurm must be there.
+/// Environment variable. With the value 1 the tests fail if Slurm is missing.
 const REQUIRED: &str = "PERTURB_SLURM_REQUIRED";
-/// Names another experiment file than the one below, e.g. experiments/quick.toml.
+/// Environment variable with another experiment file than [`PLAN`], e.g. experiments/quick.toml.
 const PLAN_FILE: &str = "PERTURB_SLURM_PLAN";
-/// How long anything may take that must not hang.
+/// Upper bound of every wait.
 const LIMIT: Duration = Duration::from_secs(1800);
 
-/// Eight cells of a few seconds on a free core, with a checkpoint several times a second.
+/// A plan with eight cells of a few seconds on a free core, and several checkpoints per second.
 const PLAN: &str = "
 environments = ['CartPole', 'MountainCar']
 versions = ['D', 'E']
@@ -66,7 +66,7 @@ impl Experiment {
     fn run(&self, name: &str, arguments: &[&str]) -> Command {
         let mut command = perturb(&["run"]);
         command.arg(&self.file).arg("--out").arg(self.out(name)).args(arguments);
-        // Whether a training begins or goes on stands in its log then.
+        // With this filter the log says whether a training begins or resumes.
         command.env("RUST_LOG", "warn,perturb_learner::training=debug");
         command
     }
@@ -85,24 +85,24 @@ impl Experiment {
         self.cell("slurm", id).join("result.json")
     }
 
-    /// The bytes of all results.
+    /// Returns the bytes of all results.
     fn results(&self, name: &str) -> BTreeMap<&str, Vec<u8>> {
         let read = |id| fs::read(self.cell(name, id).join("result.json")).ok();
         self.plan.cells.iter().filter_map(|cell| Some((&*cell.id, read(&cell.id)?))).collect()
     }
 
-    /// What the cells' processes said. The log of a group is that of its first cell.
+    /// Returns the logs of the cells' processes. A group has the log of its first cell.
     fn logs(&self, name: &str) -> String {
         let log = |cell: &Cell| fs::read_to_string(self.cell(name, &cell.id).join("log.txt")).unwrap_or_default();
         self.plan.cells.iter().map(log).collect()
     }
 
-    /// How often a line with these words says something about a cell.
+    /// Returns the number of lines with these words about a cell.
     fn said(&self, name: &str, id: &str, words: &str) -> usize {
         self.logs(name).lines().filter(|line| line.contains(words) && line.contains(&format!("/{id}/"))).count()
     }
 
-    /// What `perturb report` prints and writes.
+    /// Returns the output and the files of `perturb report`.
     fn report(&self, name: &str) -> BTreeMap<String, Vec<u8>> {
         let page = self.out("page.html");
         let mut command = perturb(&["report"]);
@@ -116,7 +116,7 @@ impl Experiment {
         files
     }
 
-    /// The cells of the jobs of the only array.
+    /// Returns the cells of the jobs of the only array.
     fn jobs(&self, name: &str) -> Vec<Vec<String>> {
         let text = fs::read_to_string(self.out(name).join("slurm/1/cells.txt")).expect("a list");
         text.lines().map(|line| line.split(',').map(str::to_owned).collect()).collect()
@@ -127,12 +127,12 @@ fn end(child: Child) -> Output {
     child.wait_with_output().expect("ended")
 }
 
-/// Which file it is, and when it was written: another one would differ.
+/// Returns the inode and the modification time of a file. Another file would differ.
 fn identity(path: &Path) -> Option<(u64, i64, i64)> {
     fs::metadata(path).ok().map(|data| (data.ino(), data.mtime(), data.mtime_nsec()))
 }
 
-/// The test's sentences, which cargo does not hide as it hides those of `println!`.
+/// Prints a message of the test. cargo hides the output of `println!`, but not this one.
 fn say(sentence: &str) {
     let _ = writeln!(std::io::stderr(), "{sentence}");
 }
@@ -191,7 +191,7 @@ fn interrupted_and_begun_again(experiment: &Experiment, cluster: &Cluster) -> Ch
     experiment.on(cluster, "slurm", &arguments).spawn().expect("started")
 }
 
-/// Waits for a cell whose training on node n1 has begun and is not so far that it may end before the node is killed.
+/// Waits for a cell whose training on node n1 has begun and will not end before the node is killed.
 fn in_mid_training_on_n1(experiment: &Experiment, cluster: &Cluster, run: &mut Child) -> String {
     let jobs = experiment.jobs("slurm");
     let in_work = |id: &String| {
@@ -215,7 +215,7 @@ fn in_mid_training_on_n1(experiment: &Experiment, cluster: &Cluster, run: &mut C
     victim.expect("a cell")
 }
 
-/// Byte for byte.
+/// Checks that the results are equal, byte for byte.
 fn same_results_and_report(experiment: &Experiment) {
     assert_eq!(experiment.results("whole").len(), experiment.plan.cells.len());
     assert!(experiment.results("slurm") == experiment.results("whole"), "results differ");
@@ -226,7 +226,7 @@ fn same_results_and_report(experiment: &Experiment) {
     }
 }
 
-/// The one job that Slurm gave to the other node. Nothing was submitted twice.
+/// Returns the job that Slurm moved to the other node. Checks that nothing was submitted twice.
 fn job_that_moved(experiment: &Experiment) -> usize {
     assert!(!experiment.out("slurm/slurm/2").exists());
     let moved: Vec<usize> = (0..experiment.jobs("slurm").len())
@@ -239,10 +239,10 @@ fn job_that_moved(experiment: &Experiment) -> usize {
     moved[0]
 }
 
-/// A cell's id, and which file its result is and when it was written, if it is there.
+/// The id of a cell, with the inode and the modification time of its result if there is one.
 type DoneCell<'a> = (&'a str, Option<(u64, i64, i64)>);
 
-/// What was done stayed, and the training that was broken off went on from its checkpoint.
+/// Checks that finished cells were kept, and that the interrupted training resumed from its checkpoint.
 fn nothing_was_done_twice(experiment: &Experiment, victim: &str, moved: &[String], done: Vec<DoneCell<'_>>) {
     for (id, before) in done {
         assert_eq!(identity(&experiment.result(id)), before, "{id} was written again");
@@ -251,12 +251,12 @@ fn nothing_was_done_twice(experiment: &Experiment, victim: &str, moved: &[String
     let told: String = (0..experiment.jobs("slurm").len()).map(told).collect();
     for cell in &experiment.plan.cells {
         let said = |words: &str| experiment.said("slurm", &cell.id, words);
-        // Not the warning that a training begins again for want of a checkpoint, which names its folder, too.
+        // The warning about a missing checkpoint names the folder, too, and does not count.
         let (begun, gone_on) = (said("training begins directory="), said("training goes on directory="));
         if cell.id == victim {
             assert_eq!((begun, gone_on), (1, 1), "{}", cell.id);
         } else {
-            // Those of its group may have had no checkpoint yet, and begin again.
+            // Other trainings of its group may have had no checkpoint yet, and begin again.
             let most = 1 + usize::from(moved.contains(&cell.id));
             let logs = experiment.logs("slurm");
             assert!(
@@ -270,7 +270,7 @@ fn nothing_was_done_twice(experiment: &Experiment, victim: &str, moved: &[String
     }
 }
 
-/// What Slurm refuses is said in its words, and leaves nothing behind.
+/// Errors of Slurm are printed as they are, and no files are left.
 fn refusals(experiment: &Experiment, cluster: &Cluster) {
     for (option, value, words) in
         [("--partition", "nowhere", "invalid partition"), ("--array-limit", "0", "expected a whole number, at least 1")]
@@ -283,18 +283,18 @@ fn refusals(experiment: &Experiment, cluster: &Cluster) {
     assert!(!experiment.out("refused/slurm/1").exists());
 }
 
-/// Jobs use one server together, on the node that is left; how many cells a job does is estimated.
+/// Jobs share a server on the remaining node. The number of cells in a job is estimated.
 fn shared_server(experiment: &Experiment, cluster: &Cluster) {
     let server = PrivateServer::start(None).unwrap_or_else(|error| panic!("{error}"));
     let id = &experiment.plan.cells[0].id;
-    // The other cells have a result already.
+    // The other cells have results already.
     for cell in &experiment.plan.cells[1..] {
         let (from, to) = (experiment.cell("slurm", &cell.id), experiment.cell("shared", &cell.id));
         fs::create_dir_all(&to).expect("a folder");
         fs::copy(from.join("result.json"), to.join("result.json")).expect("copied");
     }
     let mut command = experiment.on(cluster, "shared", &["--server", &server.address().to_string()]);
-    // A job that started a server of its own would fail.
+    // A job with a private server would fail.
     let output = end(command.env("SBATCH_EXPORT", "ALL,PERTURB_SERVER=/nowhere").spawn().expect("started"));
     assert!(output.status.success(), "{}", stderr(&output));
     assert_eq!(experiment.jobs("shared"), [vec![id.clone()]]);

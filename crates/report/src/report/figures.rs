@@ -119,7 +119,7 @@ fn advice(heatmaps: &[HeatmapPicture]) -> Vec<String> {
     let makeable = missing.len() - waiting;
     let make = format!(
         "Heatmaps that are not there: {makeable} of {all}. `perturb heatmap DIR` makes them, where DIR is the folder of \
-         these results; `--x`, `--y` and `--base` say over what."
+         these results; `--x`, `--y` and `--base-version` say over what."
     );
     let wait = format!("Heatmaps that wait for the results of their trainings: {waiting} of {all}.");
     [(makeable, make), (waiting, wait)].into_iter().filter(|(count, _)| *count > 0).map(|(_, advice)| advice).collect()

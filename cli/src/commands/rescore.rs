@@ -1,4 +1,4 @@
-//! `perturb rates`.
+//! `perturb rescore`.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -9,29 +9,30 @@ use perturb_records::success::Criterion;
 use perturb_records::{FILE, Records, TestResult};
 use perturb_text::Table;
 
-use super::args::RatesArgs;
+use super::args::RescoreArgs;
 use super::error::{CommandError, Result};
 use super::require_file;
-use super::sets::spelled_rule;
+use super::sets::normalize_rule;
 
-/// What to give.
+/// Remedy for a missing file.
 const REMEDY: &str = "give the --records of `perturb evaluate`, or a cell of `perturb run`";
 
-pub(super) fn run(args: &RatesArgs) -> Result<()> {
+pub(super) fn run(args: &RescoreArgs) -> Result<()> {
     args.json.check()?;
-    let file = file_in(&args.file);
+    let file = records_file(&args.file);
     require_file(&file, REMEDY)?;
     let records = Records::read(&file)?;
     let about = &records.about;
-    let Some(own) = &about.success else {
-        let message = format!("{} does not say what its episodes achieved: test again", args.file.display());
+    let Some(tested) = &about.success else {
+        let message =
+            format!("{} does not record what its episodes achieved; test again with this version", args.file.display());
         return Err(CommandError::Failed(message));
     };
     let criteria: Vec<Criterion> = match &args.success[..] {
-        [] => vec![own.clone()],
+        [] => vec![tested.clone()],
         rules => {
-            let (text, code) = (about.text_success.as_ref().unwrap_or(own), about.code_success.as_ref());
-            let criterion = |rule| about.criterion(&spelled_rule(rule, Some(text), code)?);
+            let (text, code) = (about.text_success.as_ref().unwrap_or(tested), about.code_success.as_ref());
+            let criterion = |rule| about.criterion(&normalize_rule(rule, Some(text), code)?);
             rules.iter().map(criterion).collect::<Result<_, _>>()?
         }
     };
@@ -63,7 +64,7 @@ pub(super) fn run(args: &RatesArgs) -> Result<()> {
     Ok(())
 }
 
-/// The recorded episodes in `path`, which may be the folder that holds them.
-pub(super) fn file_in(path: &Path) -> PathBuf {
+/// Returns the file of recorded episodes at `path`, which may be the folder that holds it.
+pub(super) fn records_file(path: &Path) -> PathBuf {
     if path.is_dir() { path.join(FILE) } else { path.to_owned() }
 }

@@ -1,4 +1,4 @@
-//! Commands that are printed for people to paste.
+//! Commands in messages, for users to paste.
 
 use std::path::Path;
 
@@ -8,13 +8,13 @@ use perturb_text::quoted;
 use super::args::{PlayArgs, WaitArgs};
 use super::error::CommandError;
 
-/// What this process was given, as it was typed.
+/// Returns the command line of this process.
 pub(super) fn this_command() -> String {
     let words = std::env::args_os().skip(1).map(quoted);
     ["perturb".to_owned()].into_iter().chain(words).collect::<Vec<_>>().join(" ")
 }
 
-/// What goes on with the run in `path`, with the same servers.
+/// Returns the command that resumes the run in `path` with the same servers.
 pub(super) fn resume_command(path: &Path, play: &PlayArgs) -> String {
     let mut command = format!("perturb train --resume {}", quoted(path));
     let servers: Vec<String> = play.server.server.iter().map(ToString::to_string).collect();
@@ -24,19 +24,19 @@ pub(super) fn resume_command(path: &Path, play: &PlayArgs) -> String {
     if play.act == "client" {
         command += " --act client";
     }
-    if play.wait.server_wait != WaitArgs::USUAL {
+    if play.wait.server_wait != WaitArgs::DEFAULT_SECONDS {
         command += &format!(" --server-wait {}", play.wait.server_wait);
     }
     command
 }
 
-/// Says with what command a training goes on that failed.
-pub(super) fn explain(error: TrainError, play: &PlayArgs) -> CommandError {
+/// Adds the command that resumes the run to the error of a failed training.
+pub(super) fn with_resume_command(error: TrainError, play: &PlayArgs) -> CommandError {
     match &error {
         TrainError::Failed { last: Some(LastCheckpoint { run, .. }), source }
             if !matches!(**source, TrainError::Numbers(_)) =>
         {
-            CommandError::Failed(format!("{error}; go on from there: {}", resume_command(run, play)))
+            CommandError::Failed(format!("{error}; resume it with: {}", resume_command(run, play)))
         }
         _ => error.into(),
     }
@@ -48,11 +48,11 @@ mod tests {
     use crate::commands::args::ServerArgs;
 
     #[test]
-    fn a_run_goes_on_with_its_servers() {
+    fn the_command_has_the_same_servers() {
         let play = |servers: &[&str], act: &str| PlayArgs {
             server: ServerArgs { server: servers.iter().map(|text| text.parse().unwrap()).collect(), workers: None },
             act: act.into(),
-            wait: WaitArgs { server_wait: WaitArgs::USUAL },
+            wait: WaitArgs { server_wait: WaitArgs::DEFAULT_SECONDS },
         };
         assert_eq!(resume_command(Path::new("runs/a"), &play(&[], "server")), "perturb train --resume runs/a");
         assert_eq!(

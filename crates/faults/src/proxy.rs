@@ -1,0 +1,291 @@
+//! A proxy between a client and a server that injects faults.
+
+use std::io::{self, Read, Write};
+use std::net::{Shutdown, TcpListener, TcpStream};
+use std::os::unix::net::UnixStream;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc;
+use std::thread;
+use std::time::{Duration, Instant};
+
+/// Kind of a fault.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum FaultKind {
+    /// Flips the lowest bit of the byte.
+    BitFlip,
+    /// Closes both directions before the byte.
+    Close,
+    /// Drops all bytes from this one on, without closing the connection.
+    Blackhole,
+    /// Closes this direction before the byte. The other direction stays open.
+    HalfClose,
+}
+
+impl FaultKind {
+    /// Every kind of fault.
+    pub const ALL: [Self; 4] = [Self::BitFlip, Self::Close, Self::Blackhole, Self::HalfClose];
+    /// Kinds that lose bytes but change none.
+    pub const LOSSES: [Self; 3] = [Self::Close, Self::Blackhole, Self::HalfClose];
+}
+
+/// A fault of one direction of a connection.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Fault {
+    /// Position of the byte at which it happens, from 0.
+    pub at: usize,
+    /// Kind of the fault.
+    pub kind: FaultKind,
+}
+
+/// Faults of one connection.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct FaultPlan {
+    /// Delay of all bytes in both directions.
+    pub delay: Duration,
+    /// Fault of the server's bytes.
+    pub from_server: Option<Fault>,
+    /// Fault of the client's bytes.
+    pub from_client: Option<Fault>,
+}
+
+/// A running proxy. It runs until the process ends.
+pub struct FaultyProxy {
+    port: u16,
+    counts: Arc<ProxyCounts>,
+}
+
+#[derive(Default)]
+struct ProxyCounts {
+    connections: AtomicUsize,
+    faults: AtomicUsize,
+}
+
+impl FaultyProxy {
+    /// Listens at a port of this machine for the server at `address`: `unix:/PATH`, or host and port after any scheme.
+    /// `plan` returns the faults of a connection by its number, counted from 0.
+    ///
+    /// # Errors
+    /// [`io::Error`] if no port is free.
+    pub fn start(address: &str, plan: impl FnMut(usize) -> FaultPlan + Send + 'static) -> io::Result<Self> {
+        let listener = TcpListener::bind("127.0.0.1:0")?;
+        let proxy = Self { port: listener.local_addr()?.port(), counts: Arc::default() };
+        let server = Upstream::parse(address);
+        let counts = Arc::clone(&proxy.counts);
+        let mut plan = plan;
+        thread::spawn(move || {
+            for client in listener.incoming().flatten() {
+                let number = counts.connections.fetch_add(1, Ordering::Relaxed);
+                // If the server does not accept, the client's connection is closed.
+                let _ = server.connect().and_then(|server| connect(client, server, plan(number), &counts));
+            }
+        });
+        Ok(proxy)
+    }
+
+    /// Returns the proxy's host and port.
+    pub fn address(&self) -> String {
+        format!("127.0.0.1:{}", self.port)
+    }
+
+    /// Returns the number of connections so far.
+    pub fn connections(&self) -> usize {
+        self.counts.connections.load(Ordering::Relaxed)
+    }
+
+    /// Returns the number of faults that have happened. A fault after the last byte does not happen.
+    pub fn faults(&self) -> usize {
+        self.counts.faults.load(Ordering::Relaxed)
+    }
+}
+
+enum Upstream {
+    Tcp(String),
+    Unix(PathBuf),
+}
+
+impl Upstream {
+    fn parse(address: &str) -> Self {
+        match address.strip_prefix("unix:") {
+            Some(path) => Self::Unix(path.into()),
+            None => Self::Tcp(address.rsplit_once("//").map_or(address, |(_, authority)| authority).into()),
+        }
+    }
+
+    fn connect(&self) -> io::Result<Box<dyn Socket>> {
+        Ok(match self {
+            Self::Tcp(address) => Box::new(TcpStream::connect(address)?),
+            Self::Unix(path) => Box::new(UnixStream::connect(path)?),
+        })
+    }
+}
+
+/// A TCP or Unix socket.
+trait Socket: Read + Write + Send {
+    /// Returns another handle of the socket.
+    fn duplicate(&self) -> io::Result<Box<dyn Socket>>;
+    /// Shuts the socket down, unless it is closed already.
+    fn end(&self, how: Shutdown);
+}
+
+macro_rules! socket {
+    ($kind:ty) => {
+        impl Socket for $kind {
+            fn duplicate(&self) -> io::Result<Box<dyn Socket>> {
+                Ok(Box::new(self.try_clone()?))
+            }
+
+            fn end(&self, how: Shutdown) {
+                let _ = self.shutdown(how);
+            }
+        }
+    };
+}
+socket!(TcpStream);
+socket!(UnixStream);
+
+/// Forwards both directions of a connection.
+fn connect(client: TcpStream, server: Box<dyn Socket>, plan: FaultPlan, counts: &Arc<ProxyCounts>) -> io::Result<()> {
+    client.set_nodelay(true)?;
+    let client: Box<dyn Socket> = Box::new(client);
+    forward(client.duplicate()?, server.duplicate()?, plan.delay, plan.from_client, counts)?;
+    forward(server, client, plan.delay, plan.from_server, counts)
+}
+
+/// Forwards the bytes of one direction, each `delay` after its arrival.
+fn forward(
+    from: Box<dyn Socket>,
+    mut to: Box<dyn Socket>,
+    delay: Duration,
+    fault: Option<Fault>,
+    counts: &Arc<ProxyCounts>,
+) -> io::Result<()> {
+    let (sender, chunks) = mpsc::channel::<(Instant, Vec<u8>)>();
+    let (mut reader, counts) = (from.duplicate()?, Arc::clone(counts));
+    thread::spawn(move || {
+        let mut chunk = vec![0; 1 << 16];
+        while let Ok(count @ 1..) = reader.read(&mut chunk) {
+            if sender.send((Instant::now() + delay, chunk[..count].to_vec())).is_err() {
+                break;
+            }
+        }
+    });
+    thread::spawn(move || {
+        let mut received = 0;
+        for (due, mut chunk) in &chunks {
+            thread::sleep(due.saturating_duration_since(Instant::now()));
+            let position = fault.and_then(|fault| Some((fault.kind, fault.at.checked_sub(received)?)));
+            received += chunk.len();
+            let Some((kind, position)) = position.filter(|(_, position)| *position < chunk.len()) else {
+                match to.write_all(&chunk) {
+                    Ok(()) => continue,
+                    Err(_) => return from.end(Shutdown::Both),
+                }
+            };
+            counts.faults.fetch_add(1, Ordering::Relaxed);
+            if kind == FaultKind::BitFlip {
+                chunk[position] ^= 1;
+            } else {
+                chunk.truncate(position);
+            }
+            if to.write_all(&chunk).is_err() {
+                return from.end(Shutdown::Both);
+            }
+            match kind {
+                FaultKind::BitFlip => continue,
+                FaultKind::Close => {
+                    from.end(Shutdown::Both);
+                    return to.end(Shutdown::Both);
+                }
+                FaultKind::HalfClose => to.end(Shutdown::Write),
+                FaultKind::Blackhole => {}
+            }
+            // The sender must not notice, so its bytes are read and dropped.
+            for _ in &chunks {}
+            return;
+        }
+        to.end(Shutdown::Write);
+    });
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Upper bound of a wait.
+    const DEADLINE: Duration = Duration::from_secs(60);
+    /// Time without bytes after which the connection counts as silent.
+    const SILENCE: Duration = Duration::from_millis(300);
+
+    /// Sends `0123456789` through a proxy to an echo server. Returns the echoed bytes, and whether the connection was
+    /// closed.
+    fn echoed(plan: FaultPlan) -> (Vec<u8>, bool, FaultyProxy) {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
+        let address = listener.local_addr().expect("bound").to_string();
+        thread::spawn(move || {
+            for mut client in listener.incoming().flatten() {
+                let mut back = client.try_clone().expect("cloned");
+                thread::spawn(move || {
+                    let _ = io::copy(&mut client, &mut back);
+                    let _ = back.shutdown(Shutdown::Write);
+                });
+            }
+        });
+        let proxy = FaultyProxy::start(&format!("http://{address}"), move |_| plan).expect("a proxy");
+        let mut client = TcpStream::connect(proxy.address()).expect("connected");
+        client.set_read_timeout(Some(if plan.delay.is_zero() { SILENCE } else { DEADLINE })).expect("set");
+        client.write_all(b"0123456789").expect("sent");
+        let (mut echo, mut chunk) = (Vec::new(), [0; 64]);
+        let closed = loop {
+            match client.read(&mut chunk) {
+                Ok(0) => break true,
+                Ok(count) => echo.extend_from_slice(&chunk[..count]),
+                Err(error) => break error.kind() != io::ErrorKind::WouldBlock,
+            }
+            if echo.len() == 10 {
+                client.shutdown(Shutdown::Write).expect("open");
+            }
+        };
+        (echo, closed, proxy)
+    }
+
+    fn server_fault(kind: FaultKind) -> FaultPlan {
+        FaultPlan { from_server: Some(Fault { at: 4, kind }), ..FaultPlan::default() }
+    }
+
+    #[test]
+    fn bytes_without_faults_pass_unchanged() {
+        let (echo, closed, proxy) = echoed(FaultPlan::default());
+        assert_eq!((&echo[..], closed, proxy.faults(), proxy.connections()), (&b"0123456789"[..], true, 0, 1));
+    }
+
+    #[test]
+    fn each_kind_of_fault_happens_once() {
+        let (echo, closed, proxy) = echoed(server_fault(FaultKind::BitFlip));
+        assert_eq!((&echo[..], closed, proxy.faults()), (&b"0123556789"[..], true, 1));
+        let (echo, closed, proxy) = echoed(server_fault(FaultKind::Close));
+        assert_eq!((&echo[..], closed, proxy.faults()), (&b"0123"[..], true, 1));
+        let (echo, closed, proxy) = echoed(server_fault(FaultKind::HalfClose));
+        assert_eq!((&echo[..], closed, proxy.faults()), (&b"0123"[..], true, 1));
+        let (echo, closed, proxy) = echoed(server_fault(FaultKind::Blackhole));
+        assert_eq!((&echo[..], closed, proxy.faults()), (&b"0123"[..], false, 1), "the connection stays open");
+    }
+
+    #[test]
+    fn client_faults_leave_the_other_direction_open() {
+        let fault = |kind| FaultPlan { from_client: Some(Fault { at: 6, kind }), ..FaultPlan::default() };
+        let (echo, closed, _) = echoed(fault(FaultKind::HalfClose));
+        assert_eq!((&echo[..], closed), (&b"012345"[..], true), "the server saw the end, and its reply arrived");
+        assert_eq!(echoed(fault(FaultKind::BitFlip)).0, b"0123457789");
+    }
+
+    #[test]
+    fn delayed_bytes_arrive_later() {
+        let start = Instant::now();
+        let (echo, ..) = echoed(FaultPlan { delay: Duration::from_millis(100), ..FaultPlan::default() });
+        assert_eq!(echo, b"0123456789");
+        assert!(start.elapsed() >= Duration::from_millis(200), "the delay applies to both directions");
+    }
+}

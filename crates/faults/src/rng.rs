@@ -1,0 +1,79 @@
+//! Random numbers from a printed seed.
+
+use std::thread;
+use std::time::{Duration, SystemTime};
+
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
+
+use crate::proxy::{Fault, FaultKind};
+
+/// Environment variable with the seed.
+pub const SEED_VARIABLE: &str = "PERTURB_SEED";
+
+/// A random number generator for tests. The same seed gives the same numbers.
+pub struct SeededRng(ChaCha8Rng);
+
+impl Default for SeededRng {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl SeededRng {
+    /// Takes the seed from the variable [`SEED_VARIABLE`], or from the clock. Prints it, so that a failure can be
+    /// repeated.
+    ///
+    /// # Panics
+    /// If the variable is not a number.
+    pub fn new() -> Self {
+        let given = std::env::var(SEED_VARIABLE).ok().map(|text| text.parse().expect("PERTURB_SEED must be a number"));
+        let clock = || SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).map_or(0, |time| time.subsec_nanos());
+        let seed = given.unwrap_or_else(|| clock().into());
+        println!("{SEED_VARIABLE}={seed} repeats this test");
+        Self::from_seed(seed)
+    }
+
+    /// Makes the generator of this seed.
+    pub fn from_seed(seed: u64) -> Self {
+        Self(ChaCha8Rng::seed_from_u64(seed))
+    }
+
+    /// Returns a number below `end`, which is at least 1.
+    pub fn below(&mut self, end: u64) -> u64 {
+        self.0.next_u64() % end
+    }
+
+    /// Sleeps for `from` to `to` milliseconds.
+    pub fn wait(&mut self, from: u64, to: u64) {
+        thread::sleep(Duration::from_millis(from + self.below(to - from)));
+    }
+
+    /// Returns a fault of one of these kinds at a byte before `end`.
+    ///
+    /// It is as likely between bytes 100 and 1000 as between 1000 and 10 000, because the first bytes of a connection
+    /// negotiate most.
+    pub fn fault(&mut self, kinds: &[FaultKind], end: u64) -> Fault {
+        let kind = kinds[self.below(kinds.len() as u64) as usize];
+        let digits = u64::from(end.max(2).ilog2());
+        let high = 1 << (1 + self.below(digits));
+        Fault { at: self.below(high.min(end)) as usize, kind }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn faults_follow_from_the_seed() {
+        let faults = |seed| {
+            let mut rng = SeededRng::from_seed(seed);
+            [(); 50].map(|()| rng.fault(&FaultKind::ALL, 10_000))
+        };
+        assert_eq!(faults(3), faults(3));
+        assert_ne!(faults(3), faults(4));
+        assert!(faults(3).iter().all(|fault| fault.at < 10_000));
+        assert!(FaultKind::ALL.iter().all(|kind| faults(3).iter().any(|fault| fault.kind == *kind)));
+    }
+}
