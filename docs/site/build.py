@@ -2,12 +2,11 @@
 
     build.py PROGRAMS FOLDER
 
-PROGRAMS is where `perturb` and `perturb-server` are, FOLDER gets `source`, the pages as the generator reads them, and
-`site`. To be called from the repository's root. A link to nowhere, in a file or a page, ends it with status 1.
+PROGRAMS is the folder of `perturb` and `perturb-server`. FOLDER gets `source`, the pages for the generator, and `site`.
+Run it in the repository's root. A broken link in a file or page ends it with status 1.
 
-Pages are the repository's own markdown, whose links work where the files are. Here they get other places, and links
-follow: to pages, to copies of pictures and reports, and to copies of source files as pages; folders have none and are
-left as words.
+Pages are the repository's markdown files. Their links are changed to the site's addresses: to pages, to copies of
+pictures and reports, and to copies of source files as pages. Folders have no page, so links to them become plain text.
 """
 
 import os
@@ -19,7 +18,7 @@ from pathlib import Path
 
 import reference
 
-# Pages that are not in docs/ by their places in the site.
+# Pages from outside of docs/, by their paths in the site.
 ELSEWHERE = {
     "python/README.md": "python.md",
     "docker/README.md": "docker.md",
@@ -32,7 +31,7 @@ LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
 
 
 class Links:
-    """Where files of the repository are in the site; those that are not its pages by themselves come in when linked."""
+    """Maps files of the repository to the site. Files that are not pages are added when a page links to them."""
 
     def __init__(self):
         pages = map(str, Path("docs").rglob("*.md"))
@@ -41,7 +40,7 @@ class Links:
         self.broken = []
 
     def place(self, path):
-        """That of a file, which comes in if it is not there yet; None for a folder without a page."""
+        """Return the address of a file and add it to the site. Return None for a folder without a page."""
         if Path(path).is_dir():
             path = f"{path}/README.md"
             if not Path(path).exists():
@@ -53,7 +52,7 @@ class Links:
         return self.places[path]
 
     def follow(self, text, page):
-        """The same text with links as the site has them."""
+        """Return the text with the site's links."""
 
         def link(found):
             image, words, target = found.groups()
@@ -77,7 +76,7 @@ class Links:
 
 
 def indented(text):
-    """The same lists for Python-Markdown, which wants four spaces where GitHub wants two, and an empty line before."""
+    """Return the text with lists for Python-Markdown, which needs four spaces and an empty line before."""
     lines, in_list, in_code = [], False, False
     for line in text.splitlines():
         starts = re.match(r"(- |\d+\. )", line)
@@ -92,7 +91,7 @@ def indented(text):
 
 
 def stage(folder):
-    """Writes the repository's pages, and everything that they link to."""
+    """Write the repository's pages and everything that they link to."""
     links = Links()
     while links.waiting:
         path = links.waiting.pop()

@@ -15,13 +15,13 @@ LINK = re.compile(r"\[`([^`]+)`\]\(([^)#\s]+)#L(\d+)\)")
 
 
 def line_of(code, lines, number):
-    """The number of the line with `code` that is nearest to `number`, counted from 1; None if there is none."""
+    """Return the number of the line with `code` nearest to `number`, counted from 1. Return None if there is none."""
     found = [i for i, line in enumerate(lines, 1) if code in line]
     return min(found, key=lambda i: abs(i - number), default=None)
 
 
 def corrected(document, text, lines_of):
-    """The text with the numbers that its links should have; how many links there are; what is wrong with them."""
+    """Return the text with corrected line numbers, the number of links, and their faults."""
     count, wrong = 0, []
 
     def check(link):
@@ -45,13 +45,13 @@ def corrected(document, text, lines_of):
 
 
 def read_lines(path):
-    """The lines of a file; None if it does not exist."""
+    """Return the lines of a file, or None if it does not exist."""
     path = Path(path)
     return path.read_text().splitlines() if path.is_file() else None
 
 
 def broken(documents):
-    """How many links to lines these documents have; what is wrong with them."""
+    """Return the number of links to lines in these documents, and their faults."""
     checked = [corrected(document, document.read_text(), read_lines) for document in documents]
     return sum(count for _, count, _ in checked), [sentence for *_, wrong in checked for sentence in wrong]
 

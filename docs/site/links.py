@@ -1,5 +1,5 @@
-"""Follows the relative links of the repository's documents, as GitHub does, and of the built site. A link to a line of a
-source file must show what it says, see code_links.py.
+"""Checks the relative links of the repository's documents, by GitHub's rules, and of the built site. A link to a line of
+a source file must show the code that it names, see code_links.py.
 
     links.py SITE
 
@@ -20,7 +20,7 @@ DOCUMENTS += [Path(folder) / "README.md" for folder in ("python", "docker", "res
 
 
 class Page(html.parser.HTMLParser):
-    """The names and links of a page."""
+    """Anchors and links of an HTML page."""
 
     def __init__(self, text):
         super().__init__()
@@ -34,7 +34,7 @@ class Page(html.parser.HTMLParser):
 
 
 class Document:
-    """The same of a markdown file, by GitHub's rules."""
+    """Anchors and links of a markdown file, by GitHub's rules."""
 
     def __init__(self, text):
         prose = re.sub(r"^ *(```|~~~).*?^ *\1$", "", text, flags=re.MULTILINE | re.DOTALL)
@@ -48,17 +48,17 @@ class Document:
 
 
 def broken(paths, parse):
-    """Links of these files that lead nowhere; how many were followed."""
+    """Return the number of links in these files, and the broken ones."""
     parsed = {}
 
-    def of(path):
+    def parsed_file(path):
         if path not in parsed:
             parsed[path] = parse(path.read_text())
         return parsed[path]
 
     count, found = 0, []
     for path in paths:
-        for link in of(path).links:
+        for link in parsed_file(path).links:
             if re.match(r"[a-z]+:|//", link):
                 continue
             count += 1
@@ -67,14 +67,14 @@ def broken(paths, parse):
             target = Path(os.path.normpath(target))
             if not target.exists():
                 found.append(f"{path}: {link}")
-            elif name and target.suffix == path.suffix and unquote(name) not in of(target).names:
+            elif name and target.suffix == path.suffix and unquote(name) not in parsed_file(target).names:
                 found.append(f"{path}: {link}: no such heading")
     return count, found
 
 
 def main():
     site = Path(sys.argv[1])
-    # The page of errors is shown at any address: its links begin at the root. Reports are not pages of the site.
+    # The error page is shown at any address, so its links begin at the root. Reports are not pages of the site.
     pages = [page for page in site.rglob("*.html") if page.name not in ("404.html", "report.html")]
     wrong = []
     for what, paths, parse in (("documents", DOCUMENTS, Document), ("pages", pages, Page)):

@@ -1,4 +1,4 @@
-"""Looks at the built site in headless Chromium, on a desktop and on a telephone, light and dark.
+"""Checks the built site in headless Chromium, at the widths of a desktop and of a phone, light and dark.
 
     look.py CHROMIUM SITE PICTURES
 
@@ -21,7 +21,7 @@ sys.path.append(str(Path(__file__).parents[2] / "cli/tests/report_check"))
 from check import Browser
 
 WIDTHS = {1280: 900, 400: 800}
-# Pages that are drawn: one of each kind.
+# Pages of which pictures are made: one of each kind.
 DRAWN = [
     "index.html",
     "tutorials/train-break-mend.html",
@@ -37,8 +37,8 @@ DRAWN = [
     "results.html",
 ]
 WIDER = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
-# The search is in a tree of its own. What it shows: whether it is open, and its results.
-SHOWN = """
+# Script that returns whether the search is open, and its results. The search has its own shadow tree.
+SEARCH_STATE = """
 (() => {
   const tree = [...document.querySelectorAll('*')].map(element => element.shadowRoot).find(root => root);
   return [tree?.querySelector('dialog')?.open ?? false, tree?.querySelectorAll('[role=option]').length ?? 0];
@@ -98,11 +98,11 @@ def main():
 
 
 def searched(browser, words):
-    """How many results a search has, after some seconds at most: its script may not have come yet."""
+    """Return the number of a search's results. Wait some seconds, because its script may not be loaded yet."""
 
     def until(wanted, attempt):
         for _ in range(60):
-            shown = browser.call("Runtime.evaluate", expression=SHOWN, returnByValue=True)["result"]["value"]
+            shown = browser.call("Runtime.evaluate", expression=SEARCH_STATE, returnByValue=True)["result"]["value"]
             if shown[wanted]:
                 break
             attempt()
@@ -115,7 +115,7 @@ def searched(browser, words):
 
 
 def complaints(events, own):
-    """What pages asked of others, and said on the console."""
+    """Requests to other hosts, and messages on the console."""
     for event in events:
         method, said = event["method"], event["params"]
         if method == "Network.requestWillBeSent":

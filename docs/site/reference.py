@@ -1,4 +1,4 @@
-"""Pages of the site that are made from the sources.
+"""Makes the site's pages from the sources.
 
 Environments, leaderboard, commands, settings, experiment files, protocol, Python.
 
@@ -15,9 +15,9 @@ from pathlib import Path
 
 PAIRS = [(a, r) for a in ("a2c", "ppo", "epopt-a2c", "epopt-ppo") for r in ("ff", "rc")]
 PAIRS += [("rl2-a2c", "rc"), ("rl2-ppo", "rc")]
-# What the training whose defaults are asked for is told.
+# Arguments of the training whose defaults are shown.
 GIVEN = {"environment", "architecture"}
-# Policies of results/ that were trained with PPO on D and can be filmed, by where their study is told of. A step of
+# Policies of results/ that were trained with PPO on D and can be filmed, by the page about their experiment. A step of
 # MountainCar simulates a second.
 FILMED = {
     "beyond-the-paper": "results/beyond/confirm-2/cells/{}-ppo-ff-D-9bd6546b-s7/training",
@@ -27,7 +27,7 @@ FASTER = {"MountainCar": ["--fps", "30"]}
 
 
 def cell(text):
-    """Text that a table's cell can hold."""
+    """Return text escaped for a table's cell."""
     return str(text).replace("|", "\\|").replace("\n", " ")
 
 
@@ -56,7 +56,7 @@ def union(intervals):
 
 
 def environments(programs, folder):
-    """A page for each environment, by the catalogue, with the films that go into `folder`."""
+    """Return a page for each environment of the catalogue. Films are written to `folder`."""
     catalogue = json.loads(told(programs / "perturb-server", "--catalogue"))["environments"]
     pages = {}
     for entry in catalogue:
@@ -68,7 +68,7 @@ def environments(programs, folder):
 
 
 def film(programs, name, checkpoint, folder):
-    """Two episodes on E of a policy that was trained on D; what the program printed of them."""
+    """Film two episodes on E of a policy that was trained on D. Return the program's output."""
     target = folder / f"environments/{name}.mp4"
     target.parent.mkdir(parents=True, exist_ok=True)
     command = [programs / "perturb", "video", "--checkpoint", checkpoint, "--version", "E", "--episodes", "2"]
@@ -128,7 +128,7 @@ def channels(entries):
 
 
 def leaderboard():
-    """The trained policies of results/, by environment, those with the highest mean over D, R and E first."""
+    """Return the trained policies of results/ by environment, with the highest mean over D, R and E first."""
     kept = [path.parents[1] / "result.json" for path in Path("results").rglob("cells/*/training/checkpoint")]
     results = [json.loads(path.read_text()) for path in sorted(kept) if path.exists()]
     results = [result for result in results if set("DRE") <= set(result["results"])]
@@ -163,7 +163,7 @@ def row(result):
 
 
 def commands(programs):
-    """What the programs' --help says."""
+    """Return the page of the programs' --help."""
     page = "# Commands\n\nWhat `perturb --help` and `perturb-server --help` say.\n\n"
     overview = told(programs / "perturb", "--help")
     names = re.findall(r"^  ([a-z-]+) ", overview.split("Commands:")[1].split("\n\n")[0], re.MULTILINE)
@@ -175,7 +175,7 @@ def commands(programs):
 
 
 def help_of(text):
-    """A program's help as markdown: paragraphs, options and arguments as tables, other sections as printed."""
+    """Return a program's help as markdown: options and arguments as tables, other sections as printed."""
     page = ""
     for part in re.split(r"\n(?=[A-Z][\w ]*:(?:\n| ))", "\n" + text.strip() + "\n"):
         title, _, body = part.strip().partition(":")
@@ -191,7 +191,7 @@ def help_of(text):
 
 
 def entries(body):
-    """Options with what is said of them."""
+    """Return a table of options with their descriptions."""
     found = []
     for line in body.splitlines():
         start = re.match(r" {2,6}(-|<|\[)", line)
@@ -204,7 +204,7 @@ def entries(body):
 
 
 def prose(text):
-    """Words in which only code is marked: what looks like HTML or emphasis stays what it is."""
+    """Return text in which only code is marked up. Characters of HTML and emphasis are escaped."""
     parts = re.split(r"(`[^`]*`)", text)
     return "".join(p if p.startswith("`") else re.sub(r"([][<*_])", r"\\\1", p) for p in parts)
 
@@ -213,7 +213,7 @@ def prose(text):
 
 
 def documented(source, struct):
-    """The fields of a Rust struct with their comments."""
+    """Return the fields of a Rust struct with their comments."""
     body = re.search(rf"struct {struct} \{{\n(.*?)\n\}}", source, re.DOTALL).group(1)
     fields, words = [], []
     for line in map(str.strip, body.splitlines()):
@@ -228,7 +228,7 @@ def documented(source, struct):
 
 
 def settings(programs):
-    """Every setting: what it is by the comments of crates/settings/src/settings, its defaults by what the program resolves."""
+    """Return every setting with its comment in crates/settings/src/settings and with the program's defaults."""
     sources = "".join(path.read_text() for path in sorted(Path("crates/settings/src/settings").glob("*.rs")))
     defaults = {preset: resolved(programs, preset) for preset in ("perturb", "paper")}
     page = (
@@ -246,7 +246,7 @@ def settings(programs):
     ):
         rows = []
         for key, words in documented(sources, struct):
-            # The comments' defaults are the structs', which the program's stand over; it does not write all of its own.
+            # Comments have the structs' defaults. The program's own take precedence, but it does not write all of them.
             said = re.search(r" \(default: ([^()]*(?:\([^()]*\)[^()]*)*)\)", words)
             words = words.replace(said[0], "") if said else words
             ours, theirs = (
@@ -264,7 +264,7 @@ def of_key(defaults, key):
 
 
 def resolved(programs, preset):
-    """The settings of each pair, from the config.toml with which a training begins."""
+    """Return the settings of each pair, from the config.toml that a training writes at its start."""
     found = {}
     with tempfile.TemporaryDirectory() as folder:
         trainings = {pair: begin(programs, preset, pair, Path(folder) / "-".join(pair)) for pair in PAIRS}
@@ -287,7 +287,7 @@ def begin(programs, preset, pair, out):
 
 
 def spread(values):
-    """The commonest value, and who has others."""
+    """Return the most frequent value, and the pairs with other values."""
     commonest, _ = Counter(values.values()).most_common(1)[0]
     others = {}
     for pair, value in values.items():
@@ -298,7 +298,7 @@ def spread(values):
 
 
 def experiment_files():
-    """The keys of an experiment file, by the comments of crates/experiment/src/plan/file.rs."""
+    """Return the keys of an experiment file with their comments in crates/experiment/src/plan/file.rs."""
     source = Path("crates/experiment/src/plan/file.rs").read_text()
     page = "# Experiment files\n\nEvery key of the TOML files that `perturb plan` and `perturb run` read."
     page += " What they are for, with examples: [experiments](../experiments.md#the-file).\n\n"
@@ -318,7 +318,7 @@ def keys(found):
 
 
 def protocol():
-    """proto/perturb/v1/perturb.proto as a page: its comments, and tables of fields."""
+    """Return proto/perturb/v1/perturb.proto as a page: its comments, and tables of fields."""
     blocks, words = parse_proto(Path("proto/perturb/v1/perturb.proto").read_text())
     names = {name for _, name, _, _ in blocks}
     page = "# Protocol, field by field\n\n" + words + "\n\nHow the parts work together: [protocol](../protocol.md).\n\n"
@@ -335,7 +335,7 @@ def protocol():
 
 
 def parse_proto(text):
-    """Services, messages and enums in order, as (kind, name, words, members), and what is said of the whole."""
+    """Return services, messages and enums in order, as (kind, name, comment, members), and the file's comment."""
     blocks, words, one_of, whole = [], [], None, ""
     for line in map(str.strip, text.splitlines()):
         if line.startswith("//"):
@@ -361,7 +361,7 @@ def parse_proto(text):
 
 
 def joined(lines):
-    """A comment as markdown: its paragraphs and lists, and what is indented as code."""
+    """Return a comment as markdown: paragraphs, lists, and indented lines as code."""
     text = [""]
     for line in lines:
         if line.startswith("  ") and text[-1].startswith("- "):
@@ -381,10 +381,10 @@ def joined(lines):
 
 
 def python():
-    """What `import perturb` offers, from its docstrings."""
+    """Return the page of the Python package, from its docstrings."""
     source = Path("python/src/perturb/__init__.py").read_text()
     names = re.findall(r'"(\w+)"', source.split("__all__ = [")[1].split("]")[0])
-    # Where each is defined: modules may have the name of what they hold.
+    # Each name links to the module that defines it. A module may have the name of its content.
     imported = re.findall(r"from \.(\w+) import (?:\((.*?)\)|(.*?)\n)", source, re.DOTALL)
     modules = {name: module for module, several, one in imported for name in re.findall(r"\w+", several or one)}
     inner = re.findall(r"from \. import (\w+)\n", source)

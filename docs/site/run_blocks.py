@@ -28,7 +28,7 @@ BLOCK = re.compile(r"^(?:<!-- not run: (.*?) -->\n)?```(\w+)\n(.*?)^```$", re.MU
 
 
 class Page:
-    """A page's blocks, and the directory in which they run."""
+    """The code blocks of a page, and the directory in which they run."""
 
     def __init__(self, path, folder):
         self.path, self.folder = path, Path(folder)
@@ -37,7 +37,7 @@ class Page:
         self.sessions = []
 
     def run(self):
-        """Runs all blocks; gives how many ran, or ends the program."""
+        """Run all blocks. Return their number, or end the program if one fails."""
         ran, printed = 0, None
         for block in BLOCK.finditer(self.text):
             reason, language, code = block.groups()
@@ -58,7 +58,7 @@ class Page:
         return ran
 
     def shell(self, code, place):
-        # Into a file: a server that stays in the background would hold a pipe open.
+        # The output goes to a file, because a server in the background would hold a pipe open.
         with tempfile.TemporaryFile("w+") as output:
             command = ["bash", "-euo", "pipefail", "-c", code]
             process = subprocess.Popen(
@@ -77,7 +77,7 @@ class Page:
         try:
             with contextlib.redirect_stdout(printed), contextlib.chdir(self.folder):
                 exec(compile("\n" * int(place.rpartition(":")[2]) + code, self.path, "exec"), self.namespace)
-        except (Exception, SystemExit):  # noqa: BLE001, whatever a block raises
+        except (Exception, SystemExit):  # noqa: BLE001, a block may raise anything
             sys.exit(f"{printed.getvalue()}{traceback.format_exc()}\n{place}: python failed")
         return printed.getvalue()
 
@@ -94,7 +94,7 @@ class Page:
                 sys.exit(f"{self.path}: {target} is not what the page's blocks make: {made.stat().st_size} bytes")
 
     def end(self):
-        """Ends what its blocks left in the background."""
+        """End the processes that the blocks left in the background."""
         self.namespace.clear()
         for session in self.sessions:
             with contextlib.suppress(ProcessLookupError):
